@@ -1,0 +1,109 @@
+//! What a rule found: the unit every report is made of.
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+/// How bad a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    /// Worth knowing; nothing needs doing.
+    Info,
+    /// Probably unintended, or will hurt later.
+    Warning,
+    /// Will not load, or loads wrong weights.
+    Error,
+}
+
+impl Severity {
+    /// The word used in output.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Info => "info",
+            Self::Warning => "warning",
+            Self::Error => "error",
+        }
+    }
+}
+
+/// Where a finding points: a file, a place in it, a tensor.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct Location {
+    /// File name within the checkpoint.
+    pub file: Option<String>,
+    /// Line, from 1.
+    pub line: Option<usize>,
+    /// Column in characters, from 1.
+    pub column: Option<usize>,
+    /// JSON pointer (RFC 6901).
+    pub pointer: Option<String>,
+    /// Tensor name.
+    pub tensor: Option<String>,
+    /// Byte range in the file, for renderers that show the source.
+    #[serde(skip)]
+    pub span: Option<Range<usize>>,
+}
+
+/// What can be done about a finding.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct FixHint {
+    /// `safe`, `unsafe` or `manual`.
+    pub safety: String,
+    /// The step, as an imperative sentence.
+    pub title: String,
+}
+
+/// One finding of one rule.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Finding {
+    /// Rule code, `CFG004`.
+    pub code: String,
+    /// Rule name in kebab case; it states the fault.
+    pub name: String,
+    /// How bad it is.
+    pub severity: Severity,
+    /// One sentence that names the cause, with the figures at hand.
+    pub message: String,
+    /// Where; may be empty for the whole checkpoint.
+    pub locations: Vec<Location>,
+    /// The figures the message was made from.
+    pub evidence: Map<String, Value>,
+    /// What can be done.
+    pub fix: Option<FixHint>,
+}
+
+/// Lists of what the loader would say of the state dict; names are state-dict names.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct LoadReport {
+    /// Expected by the model class, not provided: newly initialised.
+    pub missing: Vec<String>,
+    /// Provided, not part of the model: ignored.
+    pub unexpected: Vec<String>,
+    /// In both, with different shapes: the load raises.
+    pub mismatched: Vec<Mismatch>,
+    /// Wrong, and reported by nobody.
+    pub silent: Vec<Silent>,
+}
+
+/// A tensor whose stored shape is not the expected one.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Mismatch {
+    /// State-dict name.
+    pub name: String,
+    /// Shape in the file.
+    pub stored: Vec<u64>,
+    /// Shape the class builds from the config.
+    pub expected: Vec<u64>,
+}
+
+/// A tensor that loads wrong without any message.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Silent {
+    /// State-dict name.
+    pub name: String,
+    /// Why: one of `indexed-but-absent`, `prefix-hijack`, `tied-over`.
+    pub reason: String,
+}

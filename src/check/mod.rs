@@ -1,0 +1,5 @@
+//! Compares what is there with what should be; pure functions from a checkpoint to findings.
+
+pub mod finding;
+
+pub use finding::{Finding, FixHint, Location, Severity};

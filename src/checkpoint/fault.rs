@@ -1,0 +1,89 @@
+//! A fault is something observed to be wrong in a file, before any rule has judged it.
+
+use std::ops::Range;
+
+use serde_json::{Map, Value};
+
+/// One observed fault: what kind, where, and the figures a message needs.
+///
+/// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself carries no
+/// severity and no prose.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fault {
+    /// Kebab-case name of the kind, one of those a rule can name (`"header-truncated"`).
+    pub kind: &'static str,
+    /// Where it was seen, most important place first. May be empty: then it is the whole checkpoint.
+    pub places: Vec<Place>,
+    /// Figures and names for the message, by the names the rule's message uses.
+    pub detail: Map<String, Value>,
+}
+
+impl Fault {
+    /// A fault of `kind` with no place and no detail yet.
+    #[must_use]
+    pub fn new(kind: &'static str) -> Self {
+        Self { kind, places: Vec::new(), detail: Map::new() }
+    }
+
+    /// Adds a place.
+    #[must_use]
+    pub fn at(mut self, place: Place) -> Self {
+        self.places.push(place);
+        self
+    }
+
+    /// Adds a named detail.
+    #[must_use]
+    pub fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
+        self.detail.insert(name.to_owned(), value.into());
+        self
+    }
+}
+
+/// A place in a checkpoint: a file, and optionally a byte range, a JSON pointer or a tensor in it.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Place {
+    /// File name within the checkpoint directory, unescaped.
+    pub file: Option<String>,
+    /// Byte range in the file's text.
+    pub span: Option<Range<usize>>,
+    /// JSON pointer (RFC 6901) into the file.
+    pub pointer: Option<String>,
+    /// Tensor name.
+    pub tensor: Option<String>,
+}
+
+impl Place {
+    /// The whole of a file.
+    #[must_use]
+    pub fn file(name: impl Into<String>) -> Self {
+        Self { file: Some(name.into()), ..Self::default() }
+    }
+
+    /// A tensor, in no particular file.
+    #[must_use]
+    pub fn tensor(name: impl Into<String>) -> Self {
+        Self { tensor: Some(name.into()), ..Self::default() }
+    }
+
+    /// Narrows to a byte range.
+    #[must_use]
+    pub fn span(mut self, span: Range<usize>) -> Self {
+        self.span = Some(span);
+        self
+    }
+
+    /// Narrows to a JSON pointer.
+    #[must_use]
+    pub fn pointer(mut self, pointer: impl Into<String>) -> Self {
+        self.pointer = Some(pointer.into());
+        self
+    }
+
+    /// Narrows to a tensor.
+    #[must_use]
+    pub fn in_tensor(mut self, tensor: impl Into<String>) -> Self {
+        self.tensor = Some(tensor.into());
+        self
+    }
+}

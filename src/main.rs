@@ -1,0 +1,3 @@
+//! The `ckpt-doctor` program.
+
+fn main() {}

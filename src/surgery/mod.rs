@@ -1,0 +1,1 @@
+//! Findings or a recipe become a plan; only this module writes checkpoints.
