@@ -1,1 +1,5 @@
 //! What should be: rules, architectures and recipes read from `rules/`, and their expressions.
+
+pub mod expression;
+
+pub use expression::{EvalError, Expression, Scope, Template};

@@ -1,0 +1,153 @@
+//! Functions of the data files that CEL does not have.
+
+use cel::common::types::{CelNull, CelString};
+use cel::common::value::Val;
+use cel::{ExecutionError, FunctionContext, Value as Cel};
+use serde_json::Value;
+
+use super::Scope;
+
+/// Longest list `range` makes.
+const RANGE_CAP: i64 = 100_000;
+
+type Outcome = Result<Value, String>;
+
+/// Adds all functions to a root scope.
+pub(super) fn register(scope: &mut Scope<'static>) {
+    scope.function("pow", pow);
+    scope.function("sum", sum);
+    scope.function("floor", |a| round(a, f64::floor));
+    scope.function("ceil", |a| round(a, f64::ceil));
+    scope.function("range", range);
+    scope.function("keys", keys);
+    scope.function("zpad", zpad);
+    scope.function("glob", |a| match a {
+        [Value::String(name), Value::String(pattern)] => Ok(glob(name, pattern).into()),
+        _ => Err("glob(name, pattern) takes two strings".to_owned()),
+    });
+    scope.add("min", cel::functions::min);
+    scope.add("max", cel::functions::max);
+    scope.add("get", get);
+}
+
+fn pow(arguments: &[Value]) -> Outcome {
+    let usage = || "pow(base, exponent) takes two integers, the exponent from 0".to_owned();
+    let [base, exponent] = arguments else { return Err(usage()) };
+    let (Some(base), Some(exponent)) = (base.as_i64(), exponent.as_u64()) else { return Err(usage()) };
+    let exponent = u32::try_from(exponent).map_err(|_| usage())?;
+    base.checked_pow(exponent).map(Value::from).ok_or_else(|| format!("{base}^{exponent} overflows"))
+}
+
+/// The sum of a list of integers, or of numbers when one is not an integer.
+fn sum(arguments: &[Value]) -> Outcome {
+    let [Value::Array(items)] = arguments else { return Err("sum(list) takes one list of numbers".to_owned()) };
+    if let Some(integers) = items.iter().map(Value::as_i64).collect::<Option<Vec<_>>>() {
+        let total = integers.into_iter().try_fold(0_i64, i64::checked_add);
+        return total.map(Value::from).ok_or_else(|| "the sum overflows".to_owned());
+    }
+    let numbers = items.iter().map(Value::as_f64).collect::<Option<Vec<_>>>();
+    numbers.map(|n| n.into_iter().sum::<f64>().into()).ok_or_else(|| "sum(list) takes numbers only".to_owned())
+}
+
+fn round(arguments: &[Value], to: fn(f64) -> f64) -> Outcome {
+    match arguments {
+        [Value::Number(n)] if n.is_i64() => Ok(Value::Number(n.clone())),
+        [Value::Number(n)] => {
+            let rounded = n.as_f64().map_or(f64::NAN, to);
+            // 2^53: beyond it a double is no longer exact, and no size is that large.
+            if rounded.abs() <= 9_007_199_254_740_992.0 {
+                #[expect(clippy::cast_possible_truncation, reason = "whole and within 2^53")]
+                let whole = rounded as i64;
+                Ok(whole.into())
+            } else {
+                Err(format!("{n} is out of range"))
+            }
+        }
+        _ => Err("one number expected".to_owned()),
+    }
+}
+
+fn range(arguments: &[Value]) -> Outcome {
+    match arguments {
+        [n] => match n.as_i64() {
+            Some(n) if n <= RANGE_CAP => Ok((0..n).collect::<Vec<_>>().into()),
+            _ => Err(format!("range(n) takes an integer up to {RANGE_CAP}")),
+        },
+        _ => Err("range(n) takes one integer".to_owned()),
+    }
+}
+
+fn keys(arguments: &[Value]) -> Outcome {
+    match arguments {
+        [Value::Object(map)] => Ok(map.keys().cloned().collect::<Vec<_>>().into()),
+        _ => Err("keys(map) takes one map".to_owned()),
+    }
+}
+
+fn zpad(arguments: &[Value]) -> Outcome {
+    match arguments {
+        [n, width] => match (n.as_u64(), width.as_u64()) {
+            (Some(n), Some(width @ 0..=64)) => {
+                let digits = n.to_string();
+                let zeros = usize::try_from(width).unwrap_or(0).saturating_sub(digits.len());
+                Ok(format!("{}{digits}", "0".repeat(zeros)).into())
+            }
+            _ => Err("zpad(n, width) takes two integers from 0, the width up to 64".to_owned()),
+        },
+        _ => Err("zpad(n, width) takes two integers".to_owned()),
+    }
+}
+
+/// `get(map, key, default)`: the default when the key is absent or null, or when `map` is null.
+///
+/// Looks into the borrowed map: turning a whole document into JSON for one key would be dear.
+fn get(context: &FunctionContext) -> Result<Cel, ExecutionError> {
+    let mut arguments = context.this.iter().chain(&context.args);
+    let (Some(map), Some(key), Some(default), None) =
+        (arguments.next(), arguments.next(), arguments.next(), arguments.next())
+    else {
+        return Err(context.error("get(map, key, default) takes three arguments"));
+    };
+    let is_null = |value: &dyn Val| value.downcast_ref::<CelNull>().is_some();
+    if is_null(map.as_ref()) {
+        return default.as_ref().try_into();
+    }
+    let (Some(indexer), Some(_)) = (map.as_ref().as_indexer(), key.as_ref().downcast_ref::<CelString>()) else {
+        return Err(context.error("get(map, key, default) takes a map and a string"));
+    };
+    match indexer.get(key.as_ref()) {
+        Ok(found) if !is_null(found.as_ref()) => found.as_ref().try_into(),
+        Ok(_) | Err(ExecutionError::NoSuchKey(_)) => default.as_ref().try_into(),
+        Err(e) => Err(e),
+    }
+}
+
+/// Whether `name` matches `pattern`, in which `*` is any run of characters and `?` any one.
+///
+/// Linear in memory, and in time at most the product of the two lengths.
+#[must_use]
+pub(super) fn glob(name: &str, pattern: &str) -> bool {
+    let (name, pattern): (Vec<char>, Vec<char>) = (name.chars().collect(), pattern.chars().collect());
+    let (mut n, mut p) = (0, 0);
+    let mut retry: Option<(usize, usize)> = None;
+    while let Some(c) = name.get(n) {
+        match pattern.get(p) {
+            Some('*') => {
+                retry = Some((p, n));
+                p += 1;
+            }
+            Some(q) if *q == '?' || q == c => {
+                n += 1;
+                p += 1;
+            }
+            _ => match &mut retry {
+                Some((star, from)) => {
+                    *from += 1;
+                    (p, n) = (*star + 1, *from);
+                }
+                None => return false,
+            },
+        }
+    }
+    pattern.get(p..).is_some_and(|rest| rest.iter().all(|c| *c == '*'))
+}

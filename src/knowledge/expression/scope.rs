@@ -1,0 +1,177 @@
+//! The names an expression can use, and the way between JSON and CEL values.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use cel::common::types::{CelBool, CelDouble, CelInt, CelList, CelMap, CelMapKey, CelNull, CelString};
+use cel::common::value::Val;
+use cel::{Context, ExecutionError, FunctionContext, Value as Cel};
+use serde_json::Value;
+
+use super::functions;
+
+/// An evaluation environment: variables and functions.
+///
+/// A root scope (`Scope::new`) holds functions and the big values; [`Scope::child`] borrows it and adds
+/// variables of its own, so that a loop index costs one small allocation.
+pub struct Scope<'p> {
+    context: Context<'p, 'static>,
+}
+
+impl Scope<'static> {
+    /// A root scope with the standard functions of CEL and those of the data files:
+    /// `pow sum floor ceil range min max get keys zpad glob`.
+    #[must_use]
+    pub fn new() -> Self {
+        let mut scope = Self { context: Context::with_env(Arc::clone(&super::ENV)) };
+        functions::register(&mut scope);
+        scope
+    }
+
+    /// Adds a function of any number of arguments; an `Err` becomes the expression's error.
+    ///
+    /// It can be called as `name(a, b)` and as `a.name(b)`.
+    ///
+    /// # Panics
+    /// When `name` is one of CEL's own functions, which would shadow it.
+    pub fn function(
+        &mut self,
+        name: &str,
+        f: impl Fn(&[Value]) -> Result<Value, String> + Send + Sync + 'static,
+    ) {
+        let call = move |context: &FunctionContext| -> Result<Cel, ExecutionError> {
+            let mut arguments = Vec::new();
+            for argument in context.this.iter().chain(&context.args) {
+                let value = Cel::try_from(argument.as_ref())?;
+                arguments.push(to_json(&value).ok_or_else(|| context.error("an argument has no JSON form"))?);
+            }
+            f(&arguments).map(|value| to_cel(&value)).map_err(|cause| context.error(cause))
+        };
+        self.add(name, call);
+    }
+
+    /// Adds a function of one string: `shape("model.norm.weight")`.
+    ///
+    /// # Panics
+    /// When `name` is one of CEL's own functions.
+    pub fn function1(&mut self, name: &str, f: impl Fn(&str) -> Value + Send + Sync + 'static) {
+        self.function(name, move |arguments| match arguments {
+            [Value::String(s)] => Ok(f(s)),
+            _ => Err("one string expected".to_owned()),
+        });
+    }
+
+    /// Adds a function of no argument.
+    ///
+    /// # Panics
+    /// When `name` is one of CEL's own functions.
+    pub fn function0(&mut self, name: &str, f: impl Fn() -> Value + Send + Sync + 'static) {
+        self.function(name, move |arguments| match arguments {
+            [] => Ok(f()),
+            _ => Err("no argument expected".to_owned()),
+        });
+    }
+
+    /// Adds a function of two strings.
+    ///
+    /// # Panics
+    /// When `name` is one of CEL's own functions.
+    pub fn function2(&mut self, name: &str, f: impl Fn(&str, &str) -> Value + Send + Sync + 'static) {
+        self.function(name, move |arguments| match arguments {
+            [Value::String(a), Value::String(b)] => Ok(f(a, b)),
+            _ => Err("two strings expected".to_owned()),
+        });
+    }
+
+    pub(super) fn add<T: 'static, F>(&mut self, name: &str, f: F)
+    where
+        F: cel::extractors::IntoFunction<T> + Send + Sync + 'static,
+    {
+        if let Err(e) = self.context.add_function(name, f) {
+            panic!("{e}");
+        }
+    }
+}
+
+impl Default for Scope<'static> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Scope<'_> {
+    /// Binds a variable. Integers become `int`, or `double` beyond 64 bits; objects become maps; null stays null.
+    ///
+    /// The value is converted here, once; expressions then borrow it.
+    pub fn bind(&mut self, name: &str, value: &Value) {
+        self.context.add_variable_as_val(name, to_val(value));
+    }
+
+    /// Binds an integer, such as a loop index. Beyond `i64` it becomes a `double`.
+    pub fn bind_int(&mut self, name: &str, value: u64) {
+        self.bind(name, &Value::from(value));
+    }
+
+    /// A scope inside this one: sees everything of it, binds names of its own.
+    #[must_use]
+    pub fn child(&self) -> Scope<'_> {
+        Scope { context: self.context.new_inner_scope() }
+    }
+
+    pub(super) fn context(&self) -> &Context<'_, 'static> {
+        &self.context
+    }
+}
+
+fn to_val(value: &Value) -> Box<dyn Val> {
+    match value {
+        Value::Null => Box::new(CelNull),
+        Value::Bool(b) => Box::new(CelBool::from(*b)),
+        Value::Number(n) => match n.as_i64() {
+            Some(i) => Box::new(CelInt::from(i)),
+            None => Box::new(CelDouble::from(n.as_f64().unwrap_or(f64::NAN))),
+        },
+        Value::String(s) => Box::new(CelString::from(s.clone())),
+        Value::Array(items) => Box::new(CelList::from(items.iter().map(to_val).collect::<Vec<_>>())),
+        Value::Object(map) => {
+            let map: HashMap<CelMapKey<'static>, Box<dyn Val>> =
+                map.iter().map(|(k, v)| (CelMapKey::from(k.clone()), to_val(v))).collect();
+            Box::new(CelMap::from(map))
+        }
+    }
+}
+
+/// The CEL value of a JSON value, for what functions return.
+pub(super) fn to_cel(value: &Value) -> Cel {
+    match value {
+        Value::Null => Cel::Null,
+        Value::Bool(b) => Cel::Bool(*b),
+        Value::Number(n) => n.as_i64().map_or_else(|| Cel::Float(n.as_f64().unwrap_or(f64::NAN)), Cel::Int),
+        Value::String(s) => Cel::String(Arc::new(s.clone())),
+        Value::Array(items) => Cel::List(Arc::new(items.iter().map(to_cel).collect())),
+        Value::Object(map) => {
+            let map: HashMap<String, Cel> = map.iter().map(|(k, v)| (k.clone(), to_cel(v))).collect();
+            Cel::Map(map.into())
+        }
+    }
+}
+
+/// The JSON value of a CEL value: non-finite numbers become null, objects have sorted keys.
+pub(super) fn to_json(value: &Cel) -> Option<Value> {
+    Some(match value {
+        Cel::Null => Value::Null,
+        Cel::Bool(b) => Value::Bool(*b),
+        Cel::Int(i) => Value::from(*i),
+        Cel::UInt(u) => Value::from(*u),
+        Cel::Float(f) => Value::from(*f),
+        Cel::String(s) => Value::String(s.to_string()),
+        Cel::List(items) => Value::Array(items.iter().map(to_json).collect::<Option<_>>()?),
+        Cel::Map(map) => {
+            // The crate's map has no order; sorted keys make every run alike.
+            let mut entries: Vec<_> = map.map.iter().map(|(k, v)| (k.to_string(), v)).collect();
+            entries.sort_by(|a, b| a.0.cmp(&b.0));
+            Value::Object(entries.into_iter().map(|(k, v)| Some((k, to_json(v)?))).collect::<Option<_>>()?)
+        }
+        _ => return None,
+    })
+}

@@ -1,0 +1,148 @@
+//! Messages with `{expression}` placeholders.
+
+use std::fmt;
+
+use serde::{Deserialize, Deserializer};
+use serde_json::Value;
+
+use super::{EvalError, Expression, ParseError, Scope};
+
+/// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Template {
+    source: String,
+    pieces: Vec<Piece>,
+}
+
+#[derive(Clone, PartialEq, Eq)]
+enum Piece {
+    Text(String),
+    Value(Expression),
+}
+
+impl Template {
+    /// Parses `source`.
+    ///
+    /// # Errors
+    /// When a brace has no partner, or a placeholder is not an expression.
+    pub fn parse(source: &str) -> Result<Self, ParseError> {
+        let mut pieces = Vec::new();
+        let mut text = String::new();
+        let mut rest = source;
+        let unpaired = |brace| ParseError { source_text: source.to_owned(), cause: format!("`{brace}` has no partner; write it twice for a literal one") };
+        while let Some(at) = rest.find(['{', '}']) {
+            let (before, tail) = rest.split_at(at);
+            text.push_str(before);
+            if let Some(after) = tail.strip_prefix("{{") {
+                text.push('{');
+                rest = after;
+            } else if let Some(after) = tail.strip_prefix("}}") {
+                text.push('}');
+                rest = after;
+            } else if let Some(body) = tail.strip_prefix('{') {
+                let end = closing_brace(body).ok_or_else(|| unpaired('{'))?;
+                if !text.is_empty() {
+                    pieces.push(Piece::Text(std::mem::take(&mut text)));
+                }
+                let (expression, after) = body.split_at(end);
+                pieces.push(Piece::Value(Expression::parse(expression)?));
+                rest = after.strip_prefix('}').unwrap_or(after);
+            } else {
+                return Err(unpaired('}'));
+            }
+        }
+        text.push_str(rest);
+        if !text.is_empty() {
+            pieces.push(Piece::Text(text));
+        }
+        Ok(Self { source: source.to_owned(), pieces })
+    }
+
+    /// The text it was parsed from.
+    #[must_use]
+    pub fn source(&self) -> &str {
+        &self.source
+    }
+
+    /// The expressions in its placeholders, in order.
+    pub fn expressions(&self) -> impl Iterator<Item = &Expression> {
+        self.pieces.iter().filter_map(|piece| match piece {
+            Piece::Value(expression) => Some(expression),
+            Piece::Text(_) => None,
+        })
+    }
+
+    /// The text with its values: strings bare, lists as `[2304, 1152]`. A placeholder that fails becomes `?`.
+    #[must_use]
+    pub fn render(&self, scope: &Scope<'_>) -> String {
+        self.fill(|expression| Ok(expression.eval(scope).map_or_else(|_| "?".to_owned(), |v| plain(&v)))).unwrap_or_default()
+    }
+
+    /// As [`Self::render`], but a placeholder that fails is an error.
+    ///
+    /// # Errors
+    /// When a placeholder cannot be evaluated.
+    pub fn try_render(&self, scope: &Scope<'_>) -> Result<String, EvalError> {
+        self.fill(|expression| expression.eval(scope).map(|v| plain(&v)))
+    }
+
+    fn fill(&self, value: impl Fn(&Expression) -> Result<String, EvalError>) -> Result<String, EvalError> {
+        let mut out = String::new();
+        for piece in &self.pieces {
+            match piece {
+                Piece::Text(text) => out.push_str(text),
+                Piece::Value(expression) => out.push_str(&value(expression)?),
+            }
+        }
+        Ok(out)
+    }
+}
+
+/// Where the placeholder that `body` starts in ends, past nested braces and quoted strings.
+fn closing_brace(body: &str) -> Option<usize> {
+    let mut depth = 0_usize;
+    let mut quote = None;
+    let mut escaped = false;
+    for (at, c) in body.char_indices() {
+        match (quote, c) {
+            (Some(_), _) if escaped => escaped = false,
+            (Some(_), '\\') => escaped = true,
+            (Some(q), c) if c == q => quote = None,
+            (Some(_), _) => {}
+            (None, '"' | '\'') => quote = Some(c),
+            (None, '{') => depth += 1,
+            (None, '}') if depth == 0 => return Some(at),
+            (None, '}') => depth -= 1,
+            (None, _) => {}
+        }
+    }
+    None
+}
+
+/// A value as it stands in a sentence.
+pub(super) fn plain(value: &Value) -> String {
+    match value {
+        Value::String(s) => s.clone(),
+        Value::Array(items) => format!("[{}]", items.iter().map(plain).collect::<Vec<_>>().join(", ")),
+        other => other.to_string(),
+    }
+}
+
+impl fmt::Display for Template {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.source)
+    }
+}
+
+impl fmt::Debug for Template {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:?}", self.source)
+    }
+}
+
+impl<'de> Deserialize<'de> for Template {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let source = String::deserialize(deserializer)?;
+        Self::parse(&source).map_err(serde::de::Error::custom)
+    }
+}

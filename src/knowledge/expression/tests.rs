@@ -1,0 +1,100 @@
+use serde_json::json;
+
+use super::*;
+
+fn eval(source: &str) -> Result<Value, EvalError> {
+    let mut scope = Scope::new();
+    scope.bind("c", &json!({ "hidden": 2304, "heads": 8, "none": null, "zero": 0, "big": 1e300, "min": i64::MIN,
+                             "huge": u64::MAX, "depths": [3, 4], "names": ["b", "a"], "sub": { "x": 1, "w": 2 }, "rate": 0.5 }));
+    Expression::parse(source).unwrap_or_else(|e| panic!("{e}")).eval(&scope)
+}
+
+#[test]
+fn evaluates_to_json() {
+    for (source, expected) in [
+        ("c.hidden % c.heads == 0 ? c.hidden / c.heads : -1", json!(288)),
+        ("pow(2, c.heads) + sum(c.depths)", json!(263)),
+        ("floor(c.rate * double(c.hidden)) + ceil(0.2)", json!(1153)),
+        ("get(c, 'none', 7) + get(c, 'absent', 8) + c.get('heads', 9)", json!(23)),
+        ("get(c.none, 'x', 1)", json!(1)),
+        ("keys(c.sub)", json!(["w", "x"])),
+        ("zpad(7, 5) + zpad(123456, 5)", json!("00007123456")),
+        ("glob('model.layers.3.norm', 'model.layers.*.n?rm')", json!(true)),
+        ("min(c.depths) + max(5, 6)", json!(9)),
+        ("range(3).map(i, i * i)", json!([0, 1, 4])),
+        ("size(c.depths)", json!(2)),
+        ("c.huge > 1.0", json!(true)),
+        ("has(c.none) && c.none == null && !has(c.absent)", json!(true)),
+        ("{'b': 1, 'a': c.sub}", json!({ "a": { "w": 2, "x": 1 }, "b": 1 })),
+    ] {
+        assert_eq!(eval(source).as_ref(), Ok(&expected), "{source}");
+    }
+}
+
+#[test]
+fn whatever_cannot_be_computed_is_an_error() {
+    for source in [
+        "c.hidden / c.zero", "c.hidden % c.zero", "c.min / -1", "c.min % -1", "-c.min", "c.min - 1", "pow(10, 30)", "pow(2, -1)",
+        "c.absent", "c.none.x", "nothing", "c.depths[2]", "c.depths[-1]", "c.names + 1", "floor(c.big)", "int(c.big)",
+        "range(100000000000)", "sum(c.names)", "sum([9223372036854775807, 1])", "zpad(1, 1000000)", "get(c)", "unknown_function(1)",
+        "c.hidden * c.rate", "c['a']['b']", "9223372036854775807 * 2",
+    ] {
+        let error = eval(source).expect_err(source);
+        assert_eq!(error.source_text, source);
+        assert!(!error.cause.is_empty() && error.cause.len() < 1000, "{error}");
+    }
+}
+
+#[test]
+fn typed_results() {
+    let scope = Scope::new();
+    let parse = |s| Expression::parse(s).expect(s);
+    assert_eq!(parse("2 * 3").eval_u64(&scope), Ok(6));
+    assert_eq!(parse("2 > 1").eval_bool(&scope), Ok(true));
+    for bad in ["-1", "1.5", "'6'", "9223372036854775807", "null", "true"] {
+        parse(bad).eval_u64(&scope).expect_err(bad);
+    }
+    assert_eq!(parse("1").eval_bool(&scope).expect_err("").to_string(), "`1`: true or false expected, got 1");
+}
+
+#[test]
+fn children_see_their_parents() {
+    let mut root = Scope::new();
+    root.bind("n", &json!(10));
+    root.function1("shape", |name| json!([name.len(), 2]));
+    root.function2("joined", |a, b| json!(format!("{a}{b}")));
+    root.function0("seven", || json!(7));
+    let expression = Expression::parse("shape('abc')[0] * n + i + seven() + size(joined('a', 'b'))").expect("CEL");
+    let mut child = root.child();
+    child.bind_int("i", 5);
+    let mut grandchild = child.child();
+    grandchild.bind_int("i", 6);
+    assert_eq!(expression.eval(&grandchild), Ok(json!(45)));
+    assert_eq!(expression.eval(&child), Ok(json!(44)));
+    assert!(expression.eval(&root).is_err());
+    assert_eq!(expression.variables(), ["i", "n"]);
+}
+
+#[test]
+fn templates_render_in_a_sentence() {
+    let mut scope = Scope::new();
+    scope.bind("c", &json!({ "name": "lm_head", "shape": [2304, 1152], "names": ["a", "b"] }));
+    let template = Template::parse("{c.name} is {c.shape}, not {{{size({'a': '}'})}}} or {c.names}: {c.absent}").expect("template");
+    assert_eq!(template.render(&scope), "lm_head is [2304, 1152], not {1} or [a, b]: ?");
+    assert!(template.try_render(&scope).is_err());
+    for bad in ["{", "a } b", "{c.}", "{}"] {
+        Template::parse(bad).expect_err(bad);
+    }
+}
+
+#[test]
+fn a_text_that_is_no_expression_is_a_serde_error_with_its_place() {
+    #[derive(serde::Deserialize, Debug)]
+    #[serde(deny_unknown_fields)]
+    struct File {
+        #[expect(dead_code, reason = "only its parsing is tested")]
+        when: Expression,
+    }
+    let error = json5::from_str::<File>("{\n  when: \"c.hidden +\",\n}").expect_err("no operand");
+    assert!(error.to_string().contains("`c.hidden +` is not an expression"), "{error}");
+}
