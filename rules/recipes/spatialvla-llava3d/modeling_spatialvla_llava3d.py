@@ -1,0 +1,19 @@
+"""SpatialVLA's model class around the language model that `text_config` names.
+
+SpatialVLA builds a Gemma 2 unless it is handed a language model; here it is handed one. Tensor names, the forward
+pass and the hook after loading are SpatialVLA's own.
+"""
+
+from transformers import AutoModelForCausalLM
+
+# transformers copies only the files that this one imports by itself, relatively and by name. The first two are
+# imported by modeling_spatialvla.py: without these lines they would stay behind, and loading would not find them.
+from .configuration_spatialvla import SpatialVLAConfig  # noqa: F401
+from .modeling_gemma2 import Gemma2ForCausalLM  # noqa: F401
+from .modeling_spatialvla import SpatialVLAForConditionalGeneration as _SpatialVLA
+
+
+class SpatialVLAForConditionalGeneration(_SpatialVLA):
+    def __init__(self, config, vision_model=None, vision_zoe_model=None, projector_model=None, language_model=None):
+        language_model = language_model or AutoModelForCausalLM.from_config(config.text_config)
+        super().__init__(config, vision_model, vision_zoe_model, projector_model, language_model)
