@@ -7,4 +7,4 @@ pub mod fault;
 pub mod shard;
 
 pub use fault::{Fault, Place};
-pub use shard::{Dtype, Shard, Tensor};
+pub use shard::{Dtype, Shard, Tensor, byte_len};

@@ -1,5 +1,9 @@
 //! What should be: rules, architectures and recipes read from `rules/`, and their expressions.
 
 pub mod expression;
+pub mod processor;
+pub mod recipe;
+pub mod rule;
+pub mod source;
 
 pub use expression::{EvalError, Expression, Scope, Template};

@@ -1,1 +1,6 @@
 //! Findings or a recipe become a plan; only this module writes checkpoints.
+
+pub mod apply;
+pub mod merge;
+pub mod plan;
+pub mod transform;

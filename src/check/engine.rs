@@ -1,0 +1,296 @@
+//! Runs rules over a checkpoint.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+
+use super::finding::{Finding, FixHint, LoadReport, Location, Severity};
+use super::load::{self, Stored};
+use super::{facts, index, modules, tokens};
+use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
+use crate::knowledge::processor::Processor;
+use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet, RuleSeverity};
+use crate::knowledge::{Expected, Library, Scope};
+
+/// Findings of one rule that are kept; the last one says how many more there are.
+const CAP: usize = 100;
+
+/// Places of one finding that are kept.
+const PLACES: usize = 20;
+
+/// What checking a checkpoint gave.
+#[derive(Debug, Clone, Default)]
+pub struct Outcome {
+    /// Architecture the load report was predicted with.
+    pub architecture: Option<String>,
+    /// Sorted by file, place and code.
+    pub findings: Vec<Finding>,
+    /// Absent when the architecture is unknown or there are no weights to speak of.
+    pub load: Option<LoadReport>,
+    /// The config with the class's defaults filled in; null when the architecture is unknown.
+    pub config: Value,
+}
+
+/// What a checker knows: rules, architectures, processors.
+#[derive(Debug)]
+pub struct Knowledge {
+    /// Rules.
+    pub rules: RuleSet,
+    /// Architectures.
+    pub library: Library,
+    /// Processors.
+    pub processors: Vec<Processor>,
+}
+
+impl Knowledge {
+    /// What is inside the program.
+    ///
+    /// # Errors
+    /// A data file that is not right; the house tests see to it that there is none.
+    pub fn embedded() -> Result<Self, crate::knowledge::source::DataError> {
+        Ok(Self { rules: RuleSet::embedded()?, library: Library::embedded(), processors: Processor::embedded()? })
+    }
+}
+
+/// Runs every rule over a checkpoint.
+#[must_use]
+pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
+    let mut faults = gathered(checkpoint);
+    faults.extend(index::compare(checkpoint));
+    faults.extend(modules::compare(checkpoint));
+    let stored = Stored::of(checkpoint);
+    let names = || stored.names();
+    let config = checkpoint.config();
+    let architecture = config.and_then(|c| knowledge.library.find(c, names()));
+    let mut outcome = Outcome { architecture: architecture.map(|a| a.name().to_owned()), ..Outcome::default() };
+    let mut expected: Option<Expected> = None;
+    match (config, architecture) {
+        (Some(config), Some(architecture)) => match architecture.expect(config) {
+            Ok(e) => expected = Some(e),
+            Err(problems) => {
+                let reason = problems.first().map_or("", String::as_str);
+                faults.push(
+                    Fault::new("config-incomputable")
+                        .at(Place::file("config.json"))
+                        .with("architecture", architecture.name())
+                        .with("reason", reason),
+                );
+            }
+        },
+        (Some(config), None) => faults.push(unknown_architecture(config)),
+        _ => {}
+    }
+    if let Some(expected) = &expected {
+        outcome.config = expected.config.clone();
+        if !stored.is_empty() {
+            let report = load::predict(expected, &stored);
+            faults.extend(load::faults(&report));
+            outcome.load = Some(report);
+        }
+    }
+    let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
+    let rows = embedding_rows(checkpoint);
+    faults.extend(tokens::compare(checkpoint, rows));
+    let opened = outcome.architecture.as_deref().and_then(|name| {
+        let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
+        let config = checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
+        tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
+    });
+    let scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
+    for rule in &knowledge.rules.rules {
+        if applies(rule, outcome.architecture.as_deref(), &scope) {
+            outcome.findings.extend(run(rule, checkpoint, &faults, &scope));
+        }
+    }
+    outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    outcome
+}
+
+fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
+    let place = f.locations.first();
+    (
+        place.and_then(|l| l.file.as_deref()),
+        place.and_then(|l| l.span.as_ref()).map_or(0, |s| s.start),
+        &f.code,
+        place.and_then(|l| l.tensor.as_deref()),
+        &f.message,
+    )
+}
+
+/// Everything the reader found wrong.
+fn gathered(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let mut faults = checkpoint.faults.clone();
+    faults.extend(checkpoint.documents.values().flat_map(|d| d.faults.clone()));
+    faults.extend(checkpoint.shards.values().flat_map(|s| s.faults.clone()));
+    faults.extend(checkpoint.index.iter().flat_map(|i| i.faults.clone()));
+    faults
+}
+
+fn unknown_architecture(config: &Value) -> Fault {
+    let text = |key: &str| config.get(key).and_then(Value::as_str).unwrap_or("none").to_owned();
+    let class = config.pointer("/architectures/0").and_then(Value::as_str).unwrap_or("none");
+    Fault::new("unknown-architecture")
+        .at(Place::file("config.json").pointer("/model_type"))
+        .with("model_type", text("model_type"))
+        .with("class", class)
+}
+
+/// Rows of the token embedding: what every token id has to stay below.
+fn embedding_rows(checkpoint: &Checkpoint) -> Option<u64> {
+    const NAMES: [&str; 5] = [
+        "embed_tokens.weight", "transformer.wte.weight", "word_embeddings.weight", "gpt_neox.embed_in.weight", "tok_embeddings.weight",
+    ];
+    checkpoint
+        .tensors()
+        .filter(|(_, t)| NAMES.iter().any(|n| t.name.ends_with(n)) && !t.name.contains("spatial_embed"))
+        .filter_map(|(_, t)| if t.shape.len() == 2 { t.shape.first().copied() } else { None })
+        .max()
+}
+
+fn applies(rule: &Rule, architecture: Option<&str>, scope: &Scope<'_>) -> bool {
+    let named = rule.applies.is_empty() || architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a));
+    named && rule.when.as_ref().is_none_or(|w| w.eval_bool(scope).unwrap_or(false))
+}
+
+fn run(rule: &Rule, checkpoint: &Checkpoint, faults: &[Fault], scope: &Scope<'_>) -> Vec<Finding> {
+    let mut findings = match &rule.check {
+        Check::Fault(check) => from_faults(rule, check, checkpoint, faults, scope),
+        Check::Assert(check) => from_assert(rule, check, checkpoint, scope),
+    };
+    let more = findings.len().saturating_sub(CAP);
+    if more > 0 {
+        findings.truncate(CAP);
+        if let Some(last) = findings.last_mut() {
+            last.message = format!("{} (and {more} more of {})", last.message, rule.code);
+            last.evidence.insert("more".to_owned(), json!(more));
+        }
+    }
+    findings
+}
+
+fn from_faults(rule: &Rule, check: &FaultCheck, checkpoint: &Checkpoint, faults: &[Fault], scope: &Scope<'_>) -> Vec<Finding> {
+    let mut matching = faults.iter().filter(|f| check.kinds.iter().any(|k| k == f.kind)).filter(|f| {
+        check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false))
+    });
+    if check.group {
+        let all: Vec<&Fault> = matching.collect();
+        let Some(first) = all.first() else { return Vec::new() };
+        let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
+        let mut evidence = first.detail.clone();
+        evidence.insert("count".to_owned(), json!(all.len()));
+        return vec![finding(rule, &fault_scope(scope, first, all.len()), locate(checkpoint, &places), evidence)];
+    }
+    let mut out = Vec::new();
+    // One more than the cap is enough to count past it cheaply: the rest is only counted.
+    for fault in matching.by_ref().take(CAP) {
+        let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
+        out.push(finding(rule, &fault_scope(scope, fault, 1), locate(checkpoint, &places), fault.detail.clone()));
+    }
+    let more = matching.count();
+    if more > 0 && let Some(last) = out.last_mut() {
+        last.message = format!("{} (and {more} more of {})", last.message, rule.code);
+        last.evidence.insert("more".to_owned(), json!(more));
+    }
+    out
+}
+
+/// A fault's details as variables, with `file`, `tensor` and `pointer` of its first place.
+fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'a> {
+    let mut inner = scope.child();
+    let place = fault.places.first().cloned().unwrap_or_default();
+    inner.bind("file", &json!(place.file));
+    inner.bind("tensor", &json!(place.tensor));
+    inner.bind("pointer", &json!(place.pointer));
+    inner.bind_int("count", count as u64);
+    for (name, value) in &fault.detail {
+        inner.bind(name, value);
+    }
+    inner
+}
+
+fn from_assert(rule: &Rule, check: &Assert, checkpoint: &Checkpoint, scope: &Scope<'_>) -> Vec<Finding> {
+    let Some(each) = &check.each else {
+        return one_assert(rule, check, checkpoint, scope).into_iter().collect();
+    };
+    let Ok(Value::Array(items)) = each.eval(scope) else { return Vec::new() };
+    let mut out = Vec::new();
+    for item in items {
+        let mut inner = scope.child();
+        inner.bind("it", &item);
+        out.extend(one_assert(rule, check, checkpoint, &inner));
+    }
+    out
+}
+
+fn one_assert(rule: &Rule, check: &Assert, checkpoint: &Checkpoint, scope: &Scope<'_>) -> Option<Finding> {
+    // A value that is not there cannot be wrong: whether it has to be there is another rule's question.
+    if check.that.eval_bool(scope).unwrap_or(true) {
+        return None;
+    }
+    let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
+    Some(finding(rule, scope, locate(checkpoint, &places), Map::new()))
+}
+
+fn place(at: &At, scope: &Scope<'_>) -> Place {
+    let render = |t: &Option<crate::knowledge::Template>| t.as_ref().map(|t| t.render(scope));
+    Place { file: render(&at.file), span: None, pointer: render(&at.pointer), tensor: render(&at.tensor) }
+}
+
+fn finding(rule: &Rule, scope: &Scope<'_>, locations: Vec<Location>, evidence: Map<String, Value>) -> Finding {
+    let severity = match rule.severity {
+        RuleSeverity::Info => Severity::Info,
+        RuleSeverity::Warning => Severity::Warning,
+        RuleSeverity::Error => Severity::Error,
+    };
+    Finding {
+        code: rule.code.clone(),
+        name: rule.name.clone(),
+        severity,
+        message: rule.message.render(scope),
+        locations,
+        evidence,
+        fix: rule.fix.as_ref().map(|f| FixHint { safety: f.safety.name().to_owned(), title: f.help.render(scope) }),
+    }
+}
+
+/// Turns places into locations with line and column; a pointer that names no value points at the nearest parent.
+fn locate(checkpoint: &Checkpoint, places: &[Place]) -> Vec<Location> {
+    let mut spans: BTreeMap<(&str, &str), Option<std::ops::Range<usize>>> = BTreeMap::new();
+    places
+        .iter()
+        .map(|place| {
+            let document = place.file.as_deref().and_then(|f| checkpoint.document(f));
+            let span = place.span.clone().or_else(|| {
+                let (file, pointer) = (place.file.as_deref()?, place.pointer.as_deref()?);
+                spans.entry((file, pointer)).or_insert_with(|| nearest(document?, pointer)).clone()
+            });
+            let text = document.and_then(|d| d.text.as_deref()).or_else(|| {
+                place.file.as_deref().and_then(|f| checkpoint.modules.get(f)).map(|m| m.text.as_ref())
+            });
+            let at = span.as_ref().zip(text).map(|(s, t)| line_column(t, s.start));
+            Location {
+                file: place.file.clone(),
+                line: at.map(|a| a.0),
+                column: at.map(|a| a.1),
+                pointer: place.pointer.clone(),
+                tensor: place.tensor.clone(),
+                span,
+            }
+        })
+        .collect()
+}
+
+fn nearest(document: &Document, pointer: &str) -> Option<std::ops::Range<usize>> {
+    let mut pointer = pointer;
+    loop {
+        if let Some(span) = document.locate(pointer) {
+            return Some(span);
+        }
+        pointer = pointer.rsplit_once('/')?.0;
+        // The whole document says nothing.
+        if pointer.is_empty() {
+            return None;
+        }
+    }
+}

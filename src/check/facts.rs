@@ -1,0 +1,83 @@
+//! What a rule's expressions see of a checkpoint.
+
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+
+use super::modules;
+use super::tokens::OpenedTokenizer;
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::Scope;
+
+/// Keys of tokenizer_config.json that hold thousands of entries; rules reach them through `tokenizer` and `id_of`.
+const BULKY: [&str; 2] = ["added_tokens_decoder", "additional_special_tokens"];
+
+/// Documents by the name expressions use.
+const DOCUMENTS: [(&str, &str); 6] = [
+    ("config", "config.json"),
+    ("generation", "generation_config.json"),
+    ("processor", "processor_config.json"),
+    ("preprocessor", "preprocessor_config.json"),
+    ("tokenizer_config", "tokenizer_config.json"),
+    ("special_tokens", "special_tokens_map.json"),
+];
+
+/// The variables and functions named in [`crate::knowledge::rule::Assert`].
+#[must_use]
+pub fn scope(
+    checkpoint: &Arc<Checkpoint>, architecture: Option<&str>, model: &Value, opened: Option<&OpenedTokenizer>, rows: Option<u64>,
+) -> Scope<'static> {
+    let mut scope = Scope::new();
+    for (name, file) in DOCUMENTS {
+        let value = checkpoint.document(file).and_then(|d| d.value.as_ref());
+        match value {
+            Some(Value::Object(map)) if name == "tokenizer_config" => {
+                let lean: Map<String, Value> =
+                    map.iter().filter(|(k, _)| !BULKY.contains(&k.as_str())).map(|(k, v)| (k.clone(), v.clone())).collect();
+                scope.bind(name, &Value::Object(lean));
+            }
+            Some(value) => scope.bind(name, value),
+            None => scope.bind(name, &Value::Null),
+        }
+    }
+    scope.bind("arch", &json!(architecture.unwrap_or_default()));
+    scope.bind("model", model);
+    let text = model.get("text_config").or_else(|| model.get("llm_config")).unwrap_or(model);
+    scope.bind("text", text);
+    scope.bind("tokenizer", &tokenizer(checkpoint));
+    scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
+    scope.bind("rows", &rows.map_or(Value::Null, Value::from));
+    scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
+    let has_weights = checkpoint.tensors().next().is_some();
+    scope.bind("has_weights", &json!(has_weights));
+    let here = Arc::clone(checkpoint);
+    scope.function1("shape", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.shape)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
+    let here = Arc::clone(checkpoint);
+    scope.function1("has_file", move |name| json!(here.has_file(name)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));
+    scope
+}
+
+fn tokenizer(checkpoint: &Checkpoint) -> Value {
+    let t = &checkpoint.tokenizer;
+    let special = |key: &str| {
+        let value = checkpoint
+            .document("tokenizer_config.json")
+            .and_then(|d| d.get(&format!("/{key}")))
+            .or_else(|| checkpoint.document("special_tokens_map.json").and_then(|d| d.get(&format!("/{key}"))))?;
+        let content = value.as_str().or_else(|| value.get("content").and_then(Value::as_str))?;
+        t.id_of(content)
+    };
+    json!({
+        "length": t.length(),
+        "base": t.base_size,
+        "class": t.class,
+        "added": t.added.len(),
+        "bos": special("bos_token"),
+        "eos": special("eos_token"),
+        "pad": special("pad_token"),
+    })
+}

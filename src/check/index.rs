@@ -1,0 +1,218 @@
+//! The index against the shards, and the shards against each other.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::Value;
+
+use crate::checkpoint::{Checkpoint, Fault, Place, Shard};
+
+/// The file that, when it is there, a loader takes without looking at an index.
+const SINGLE: &str = "model.safetensors";
+
+/// Whether a shard's entries can be taken at their word: the header was read to its end.
+fn readable(shard: &Shard) -> bool {
+    const UNREADABLE: [&str; 10] = [
+        "lfs-pointer", "not-safetensors", "empty-file", "file-too-short", "header-length-out-of-range", "header-too-large",
+        "header-not-utf8", "header-not-json", "header-too-deep", "unreadable-file",
+    ];
+    !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind) || f.kind == "not-a-regular-file")
+}
+
+/// Which shard holds a tensor of that name; the first when there are several.
+fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
+    let mut map: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for (shard, tensor) in checkpoint.tensors() {
+        let shards = map.entry(&tensor.name).or_default();
+        // A name twice in one shard is the reader's fault to report.
+        if shards.last() != Some(&shard.name.as_str()) {
+            shards.push(&shard.name);
+        }
+    }
+    map
+}
+
+/// Faults between index, shards and file names.
+#[must_use]
+pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let mut faults = Vec::new();
+    match &checkpoint.index {
+        Some(_) => with_index(checkpoint, &mut faults),
+        None => without_index(checkpoint, &mut faults),
+    }
+    faults
+}
+
+/// Weights, as far as file names tell: base-model shards, not adapters.
+fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
+    checkpoint
+        .shards
+        .keys()
+        .map(String::as_str)
+        .filter(|n| !n.starts_with("adapter_") && *n != "training_args.safetensors")
+        .collect()
+}
+
+fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
+    let Some(index) = &checkpoint.index else { return };
+    let mut referenced: BTreeMap<&str, usize> = BTreeMap::new();
+    for file in index.weight_map.values() {
+        let count = referenced.entry(file).or_default();
+        *count = count.saturating_add(1);
+    }
+    let is_there = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
+    let absent: Vec<(&str, usize)> = referenced.iter().filter(|(n, _)| !is_there(n)).map(|(n, c)| (*n, *c)).collect();
+    let all_absent = absent.len() == referenced.len();
+    if all_absent && !referenced.is_empty() {
+        let (first, _) = absent.first().copied().unwrap_or_default();
+        faults.push(
+            Fault::new("all-shards-absent")
+                .at(Place::file(&index.document))
+                .with("count", absent.len())
+                .with("tensors", index.weight_map.len())
+                .with("first", first),
+        );
+    } else {
+        for (name, tensors) in absent {
+            let similar = checkpoint.shards.keys().find(|s| s.eq_ignore_ascii_case(name));
+            let pointer = index.weight_map.iter().find(|(_, f)| *f == name).map(|(t, _)| pointer_to(t));
+            let fault = match similar {
+                Some(s) => Fault::new("shard-name-differs-in-case").with("similar", s.as_str()),
+                None => Fault::new("shard-missing"),
+            };
+            let place = Place { file: Some(index.document.clone()), pointer, ..Place::default() };
+            faults.push(fault.at(place).with("shard", name).with("tensors", tensors));
+        }
+    }
+    let holders = by_tensor(checkpoint);
+    // A name may lie in a shard that cannot be read: then nothing is known of it.
+    let all_read = referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(readable));
+    for (tensor, said) in &index.weight_map {
+        let Some(shard) = checkpoint.shards.get(said).filter(|s| readable(s)) else { continue };
+        let held = holders.get(tensor.as_str());
+        if held.is_some_and(|h| h.contains(&shard.name.as_str())) {
+            continue;
+        }
+        let place = Place::file(&index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
+        if let Some(other) = held.and_then(|h| h.first()) {
+            faults.push(Fault::new("index-names-other-shard").at(place).with("said", said.as_str()).with("held", *other));
+        } else if all_read {
+            faults.push(Fault::new("index-key-nowhere").at(place).with("said", said.as_str()));
+        }
+    }
+    for (tensor, shards) in &holders {
+        let mapped: Vec<&&str> = shards.iter().filter(|s| referenced.contains_key(**s)).collect();
+        if !index.weight_map.contains_key(*tensor) {
+            if let Some(shard) = mapped.first() {
+                let place = Place::file(**shard).in_tensor(*tensor);
+                faults.push(Fault::new("shard-tensor-not-in-index").at(place).with("index", index.document.as_str()));
+            }
+        } else if let (Some(first), Some(second)) = (mapped.first(), mapped.get(1)) {
+            let place = Place::file(**first).in_tensor(*tensor);
+            let kept = index.weight_map.get(*tensor).map_or("", String::as_str);
+            faults.push(Fault::new("tensor-in-two-shards").at(place).with("other", **second).with("kept", kept));
+        }
+    }
+    strays(checkpoint, &referenced, &holders, faults);
+    if all_read {
+        total_size(checkpoint, &referenced, faults);
+    }
+}
+
+/// Safetensors files that the index does not mention.
+fn strays(
+    checkpoint: &Checkpoint, referenced: &BTreeMap<&str, usize>, holders: &BTreeMap<&str, Vec<&str>>, faults: &mut Vec<Fault>,
+) {
+    let Some(index) = &checkpoint.index else { return };
+    let mut shared: BTreeMap<&str, u64> = BTreeMap::new();
+    for (tensor, shards) in holders {
+        if index.weight_map.contains_key(*tensor) {
+            for shard in shards {
+                let n = shared.entry(shard).or_default();
+                *n = n.saturating_add(1);
+            }
+        }
+    }
+    for name in shard_names(checkpoint) {
+        if referenced.contains_key(name) {
+            continue;
+        }
+        let twice = shared.get(name).copied().unwrap_or_default();
+        if name == SINGLE {
+            faults.push(
+                Fault::new("single-file-beside-index").at(Place::file(name)).with("index", index.document.as_str()).with("twice", twice),
+            );
+        } else if twice > 0 || numbered(name).is_some() {
+            faults.push(Fault::new("stray-shard").at(Place::file(name)).with("index", index.document.as_str()).with("twice", twice));
+        }
+    }
+}
+
+fn total_size(checkpoint: &Checkpoint, referenced: &BTreeMap<&str, usize>, faults: &mut Vec<Fault>) {
+    let Some(index) = &checkpoint.index else { return };
+    let Some(stated) = index.total_size.as_ref().and_then(whole) else { return };
+    let actual = referenced
+        .keys()
+        .filter_map(|n| checkpoint.shards.get(*n))
+        .flat_map(|s| &s.tensors)
+        .fold(0_u64, |n, t| n.saturating_add(t.len()));
+    if stated != actual {
+        faults.push(
+            Fault::new("total-size-wrong")
+                .at(Place::file(&index.document).pointer("/metadata/total_size"))
+                .with("stated", stated)
+                .with("actual", actual),
+        );
+    }
+}
+
+/// A byte count; transformers wrote it as a float for years.
+fn whole(value: &Value) -> Option<u64> {
+    if let Some(n) = value.as_u64() {
+        return Some(n);
+    }
+    let n = value.as_f64()?;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole, not negative and within 2^53")]
+    (n.fract() == 0.0 && (0.0..9e15).contains(&n)).then_some(n as u64)
+}
+
+/// Number and count of `model-00001-of-00002.safetensors`.
+fn numbered(name: &str) -> Option<(&str, u32, u32)> {
+    let stem = name.strip_suffix(".safetensors")?;
+    let (rest, count) = stem.rsplit_once("-of-")?;
+    let (prefix, number) = rest.rsplit_once('-')?;
+    Some((prefix, number.parse().ok()?, count.parse().ok()?))
+}
+
+fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
+    let names = shard_names(checkpoint);
+    if names.contains(&SINGLE) {
+        return;
+    }
+    let numbers: Vec<(&str, u32, u32)> = names.iter().filter_map(|n| numbered(n)).collect();
+    if let Some((prefix, _, count)) = numbers.first().copied() {
+        faults.push(Fault::new("index-missing").with("shards", numbers.len()).with("index", format!("{prefix}.safetensors.index.json")));
+        let present: BTreeSet<u32> = numbers.iter().map(|n| n.1).collect();
+        // Numbering from 00000 loads too; only then is number `count` not expected. `count` is a name's word: bounded.
+        let first = u32::from(!present.contains(&0));
+        let last = if first == 0 { count.saturating_sub(1) } else { count };
+        for n in (first..=last.min(10_000)).filter(|n| !present.contains(n)) {
+            let name = format!("{prefix}-{n:05}-of-{count:05}.safetensors");
+            faults.push(Fault::new("shard-missing").at(Place::file(&name)).with("shard", name.as_str()).with("tensors", Value::Null));
+        }
+        return;
+    }
+    if names.is_empty() && checkpoint.has_file("config.json") {
+        let pickle = checkpoint
+            .entries
+            .keys()
+            .find(|n| (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt"));
+        faults.push(match pickle {
+            Some(name) => Fault::new("pickle-weights").at(Place::file(name)),
+            None => Fault::new("no-weights"),
+        });
+    }
+}
+
+fn pointer_to(tensor: &str) -> String {
+    format!("/weight_map/{}", tensor.replace('~', "~0").replace('/', "~1"))
+}

@@ -1,0 +1,216 @@
+//! `auto_map`: whether each entry leads to a class in a module that is there and can import what it needs.
+
+use std::collections::BTreeSet;
+
+use serde_json::Value;
+
+use crate::checkpoint::open::is_plain_file_name;
+use crate::checkpoint::{Checkpoint, Fault, Module, Place};
+
+/// An `auto_map` entry: where it stands and what it says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Entry {
+    /// Document.
+    pub file: String,
+    /// JSON pointer of the string.
+    pub pointer: String,
+    /// `AutoConfig`, `AutoModel`, ….
+    pub key: String,
+    /// `module.Class`.
+    pub target: String,
+    /// Whether it stands in a sub-config, where loaders do not look.
+    pub nested: bool,
+}
+
+impl Entry {
+    /// Module and class of a well-formed local entry.
+    #[must_use]
+    pub fn parts(&self) -> Option<(&str, &str)> {
+        let (module, class) = self.target.split_once('.')?;
+        (!class.contains('.') && !self.target.contains("--") && !module.is_empty() && !class.is_empty())
+            .then_some((module, class))
+    }
+}
+
+/// Documents whose `auto_map` a loader reads.
+const DOCUMENTS: [&str; 4] = ["config.json", "processor_config.json", "preprocessor_config.json", "tokenizer_config.json"];
+
+/// Every `auto_map` entry of a checkpoint, outer ones first.
+#[must_use]
+pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
+    let mut out = Vec::new();
+    for name in DOCUMENTS {
+        let Some(value) = checkpoint.document(name).and_then(|d| d.value.as_ref()) else { continue };
+        let mut pending = vec![(String::new(), value, 0_usize)];
+        while let Some((pointer, value, depth)) = pending.pop() {
+            let Value::Object(map) = value else { continue };
+            if let Some(Value::Object(auto_map)) = map.get("auto_map") {
+                for (key, target) in auto_map {
+                    let base = format!("{pointer}/auto_map/{}", escape(key));
+                    let mut push = |pointer: String, target: &str| {
+                        let entry = Entry {
+                            file: name.to_owned(), pointer, key: key.clone(), target: target.to_owned(), nested: depth > 0,
+                        };
+                        out.push(entry);
+                    };
+                    match target {
+                        Value::String(s) => push(base, s),
+                        // Slow and fast tokenizer; null for none.
+                        Value::Array(items) => {
+                            for (i, item) in items.iter().enumerate() {
+                                if let Value::String(s) = item {
+                                    push(format!("{base}/{i}"), s);
+                                }
+                            }
+                        }
+                        _ => {}
+                    }
+                }
+            }
+            // Sub-configs lie one or two levels down; statistics and vocabularies are not searched.
+            if depth < 2 {
+                let inner = map.iter().filter(|(k, v)| v.is_object() && k.ends_with("config"));
+                pending.extend(inner.map(|(k, v)| (format!("{pointer}/{}", escape(k)), v, depth.saturating_add(1))));
+            }
+        }
+    }
+    out
+}
+
+fn escape(key: &str) -> String {
+    key.replace('~', "~0").replace('/', "~1")
+}
+
+/// A module and everything it imports relatively, itself first; and whether all of it is there.
+fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a Module>)> {
+    let mut seen: BTreeSet<String> = BTreeSet::from([root.to_owned()]);
+    let mut pending = vec![root.to_owned()];
+    let mut out = Vec::new();
+    while let Some(name) = pending.pop() {
+        let module = checkpoint.modules.get(&format!("{name}.py"));
+        for import in module.iter().flat_map(|m| m.relative_modules()) {
+            if seen.insert(import.clone()) {
+                pending.push(import);
+            }
+        }
+        out.push((name, module));
+    }
+    out
+}
+
+/// Modules that transformers copies for a root of a local directory: itself and its direct relative imports.
+///
+/// Source: `get_cached_module_file` and `check_imports` of transformers 4.47.0.
+fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
+    let direct = checkpoint.modules.get(&format!("{root}.py")).map(Module::relative_modules);
+    direct.into_iter().flatten().chain([root.to_owned()]).collect()
+}
+
+/// Faults of every `auto_map` entry.
+#[must_use]
+pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let entries = entries(checkpoint);
+    let mut faults = Vec::new();
+    let mut roots: BTreeSet<&str> = BTreeSet::new();
+    for entry in &entries {
+        let fault = |kind| {
+            Fault::new(kind)
+                .at(Place::file(&entry.file).pointer(&entry.pointer))
+                .with("target", entry.target.as_str())
+                .with("key", entry.key.as_str())
+        };
+        if let Some((repository, _)) = entry.target.split_once("--") {
+            faults.push(fault("auto-map-remote").with("repository", repository));
+            continue;
+        }
+        let module = entry.target.split('.').next().unwrap_or_default();
+        if entry.target.contains(['/', '\\']) || entry.target.starts_with('.') || !is_plain_file_name(&format!("{module}.py")) {
+            faults.push(fault("auto-map-unsafe-path"));
+            continue;
+        }
+        let Some((module, class)) = entry.parts() else {
+            faults.push(fault("auto-map-malformed").with("dots", entry.target.matches('.').count()));
+            continue;
+        };
+        let Some(parsed) = checkpoint.modules.get(&format!("{module}.py")) else {
+            let kind = if entry.nested { "auto-map-nested-missing" } else { "auto-map-module-missing" };
+            // Stop at one entry a module: the second says nothing new.
+            if entry.nested || roots.insert(module) {
+                faults.push(fault(kind).with("module", format!("{module}.py")));
+            }
+            continue;
+        };
+        if !entry.nested && !parsed.defines(class) {
+            faults.push(fault("auto-map-class-missing").with("module", format!("{module}.py")).with("class", class));
+        }
+        if !entry.nested && roots.insert(module) {
+            imports(checkpoint, &entries, entry, module, &mut faults);
+        }
+    }
+    faults
+}
+
+fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str, faults: &mut Vec<Fault>) {
+    // The config is always opened first, into the same folder of the module cache.
+    let mut at_hand = copied(checkpoint, root);
+    for config in entries.iter().filter(|e| e.key == "AutoConfig" && !e.nested && e.key != entry.key) {
+        if let Some((module, _)) = config.parts() {
+            at_hand.extend(copied(checkpoint, module));
+        }
+    }
+    let mut missing: BTreeSet<String> = BTreeSet::new();
+    let mut absent: BTreeSet<String> = BTreeSet::new();
+    for (name, module) in closure(checkpoint, root) {
+        if module.is_none() {
+            absent.insert(name);
+        } else if !at_hand.contains(&name) {
+            missing.insert(name);
+        }
+    }
+    for name in absent {
+        faults.push(
+            Fault::new("relative-import-missing")
+                .at(Place::file(format!("{root}.py")))
+                .with("module", format!("{root}.py"))
+                .with("import", format!("{name}.py"))
+                .with("target", entry.target.as_str()),
+        );
+    }
+    if !missing.is_empty() {
+        let names: Vec<String> = missing.into_iter().map(|n| format!("{n}.py")).collect();
+        faults.push(
+            Fault::new("alias-misses-import")
+                .at(Place::file(format!("{root}.py")))
+                .with("module", format!("{root}.py"))
+                .with("imports", names.join(", "))
+                .with("target", entry.target.as_str()),
+        );
+    }
+}
+
+/// Tokenizer classes that the processor behind `AutoProcessor` accepts, when its module says so in plain sight.
+///
+/// Looks in the entry's class, then in classes of its base names in the modules at hand.
+#[must_use]
+pub fn processor_tokenizers(checkpoint: &Checkpoint) -> Option<Vec<String>> {
+    // Once processor_config.json exists, only its auto_map counts.
+    let file = DOCUMENTS.into_iter().skip(1).take(2).find(|n| checkpoint.document(n).is_some())?;
+    let entry = entries(checkpoint).into_iter().find(|e| e.file == file && e.key == "AutoProcessor" && !e.nested)?;
+    let (module, class) = entry.parts()?;
+    let mut class = class.to_owned();
+    let mut module = checkpoint.modules.get(&format!("{module}.py"));
+    for _ in 0..8 {
+        let found = module.and_then(|m| m.class(&class)).or_else(|| checkpoint.modules.values().find_map(|m| m.class(&class)))?;
+        if !found.tokenizer_class.is_empty() {
+            return Some(found.tokenizer_class.clone());
+        }
+        // `class A(A)` of an alias: the base of that name lives in another module.
+        let base = found.bases.first()?.rsplit('.').next()?.to_owned();
+        module = checkpoint.modules.values().find(|m| {
+            m.class(&base).is_some_and(|c| !std::ptr::eq(c, found))
+        });
+        class = base;
+        module?;
+    }
+    None
+}

@@ -1,0 +1,142 @@
+//! Tokenizer ids: what a tokenizer holds once its processor is open, and whether the files agree.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value, json};
+
+use crate::checkpoint::tokenizer::AddedToken;
+use crate::checkpoint::{Checkpoint, Fault, Place, Tokenizer};
+use crate::knowledge::processor::Processor;
+use crate::knowledge::{EvalError, Scope};
+
+/// A bound on what a processor may add, whatever the counts in its config say.
+const MAX_ADDED: u64 = 1_000_000;
+
+/// A tokenizer with its processor's tokens in it.
+#[derive(Debug, Clone, Default)]
+pub struct OpenedTokenizer {
+    /// `len(tokenizer)` afterwards.
+    pub length: u64,
+    /// Ids of the named tokens, and what the processor's `let` computed.
+    pub named: BTreeMap<String, Value>,
+    /// All added tokens by id: those the tokenizer had, and the new ones.
+    pub added: BTreeMap<u64, AddedToken>,
+}
+
+impl OpenedTokenizer {
+    /// What expressions see as `tokens`.
+    #[must_use]
+    pub fn summary(&self) -> Value {
+        let mut map: Map<String, Value> = self.named.clone().into_iter().collect();
+        map.insert("length".to_owned(), json!(self.length));
+        Value::Object(map)
+    }
+}
+
+/// Adds a processor's tokens, as `add_tokens` does: one that is there keeps its id, a new one gets the next.
+///
+/// `Ok(None)` when the tokenizer has no vocabulary file, so that ids cannot be known.
+///
+/// # Errors
+/// When a count of the processor's config is missing or absurd.
+pub fn open_tokenizer(
+    tokenizer: &Tokenizer, processor: &Processor, config: &Value,
+) -> Result<Option<OpenedTokenizer>, EvalError> {
+    let Some(length) = tokenizer.length() else { return Ok(None) };
+    let mut scope = Scope::new();
+    scope.bind("processor", config);
+    let mut out = OpenedTokenizer { length, named: BTreeMap::new(), added: tokenizer.added.clone() };
+    for item in &processor.lets {
+        let value = item.is.eval(&scope)?;
+        scope.bind(&item.name, &value);
+        out.named.insert(item.name.clone(), value);
+    }
+    for run in &processor.add {
+        let count = run.count.as_ref().map_or(Ok(1), |e| e.eval_u64(&scope))?;
+        if count > MAX_ADDED {
+            let source_text = run.content.source().to_owned();
+            return Err(EvalError { source_text, cause: format!("{count} tokens: more than any tokenizer has") });
+        }
+        for i in 0..count {
+            let mut numbered = scope.child();
+            numbered.bind_int("i", i);
+            let content = run.content.try_render(&numbered)?;
+            let id = tokenizer.id_of(&content).unwrap_or_else(|| {
+                let id = out.length;
+                out.length = out.length.saturating_add(1);
+                out.added.insert(id, AddedToken::new(content, run.special, run.normalized));
+                id
+            });
+            if let Some(name) = run.name.as_ref().filter(|_| i == 0) {
+                out.named.insert(name.clone(), json!(id));
+            }
+        }
+    }
+    Ok(Some(out))
+}
+
+/// Faults of the tokenizer files among themselves and against the embedding.
+///
+/// `rows` are the stored rows of the token embedding, where they are known.
+#[must_use]
+pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
+    let tokenizer = &checkpoint.tokenizer;
+    let mut faults = Vec::new();
+    let decoder = "tokenizer_config.json";
+    if let Some(rows) = rows {
+        let above: Vec<(&u64, &AddedToken)> = tokenizer.added.range(rows..).collect();
+        if let (Some((first, token)), Some((last, _))) = (above.first(), above.last()) {
+            faults.push(
+                Fault::new("token-above-rows")
+                    .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{first}")))
+                    .with("count", above.len())
+                    .with("first", **first)
+                    .with("last", **last)
+                    .with("token", token.content.as_str())
+                    .with("rows", rows),
+            );
+        }
+    }
+    // A slow tokenizer numbers added tokens one after another: a hole shifts all that follow.
+    if let Some(base) = tokenizer.base_size.filter(|_| !checkpoint.has_file("tokenizer.json")) {
+        let mut expected = base;
+        for (id, token) in tokenizer.added.range(base..) {
+            if *id != expected {
+                faults.push(
+                    Fault::new("token-hole")
+                        .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
+                        .with("missing", expected)
+                        .with("next", *id)
+                        .with("token", token.content.as_str()),
+                );
+                break;
+            }
+            expected = expected.saturating_add(1);
+        }
+    }
+    let mut by_content: BTreeMap<&str, u64> = BTreeMap::new();
+    for (id, token) in &tokenizer.added {
+        if let Some(first) = by_content.insert(&token.content, *id) {
+            faults.push(
+                Fault::new("token-id-twice")
+                    .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
+                    .with("token", token.content.as_str())
+                    .with("first", first)
+                    .with("second", *id),
+            );
+        }
+    }
+    for (content, id) in &tokenizer.added_tokens_json {
+        if let Some(decoder_id) = by_content.get(content.as_str()).filter(|d| *d != id) {
+            let pointer = content.replace('~', "~0").replace('/', "~1");
+            faults.push(
+                Fault::new("added-tokens-disagree")
+                    .at(Place::file("added_tokens.json").pointer(format!("/{pointer}")))
+                    .with("token", content.as_str())
+                    .with("id", *id)
+                    .with("decoder_id", *decoder_id),
+            );
+        }
+    }
+    faults
+}

@@ -1,0 +1,224 @@
+//! Rules: what to look for, why it matters and what to say; one JSON5 file each.
+
+use serde::Deserialize;
+
+use super::expression::{Expression, Template};
+use super::source::{self, DataError};
+use crate::checkpoint::fault::FAULT_KINDS;
+
+/// How bad a rule's findings are; the words of the report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RuleSeverity {
+    /// Worth knowing; nothing needs doing.
+    Info,
+    /// Probably unintended, or will hurt later.
+    Warning,
+    /// Will not load, or loads wrong weights.
+    Error,
+}
+
+/// A rule as its file in `rules/checks/` gives it.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rule {
+    /// Family and number: `IDX003`.
+    pub code: String,
+    /// What is wrong, in kebab case: `shard-missing`.
+    pub name: String,
+    /// How bad it is.
+    pub severity: RuleSeverity,
+    /// One line.
+    pub summary: String,
+    /// Why it matters: what a loader does with it.
+    pub why: String,
+    /// Architectures it is about; empty for all.
+    #[serde(default)]
+    pub applies: Vec<String>,
+    /// When it is worth asking at all; an expression that cannot be evaluated counts as no.
+    #[serde(default)]
+    pub when: Option<Expression>,
+    /// What to look for.
+    pub check: Check,
+    /// The finding's sentence.
+    pub message: Template,
+    /// What can be done.
+    #[serde(default)]
+    pub fix: Option<Fix>,
+    /// Where the facts come from.
+    #[serde(default)]
+    pub references: Vec<String>,
+}
+
+/// The kinds of check. Adding a rule rarely needs another.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Check {
+    /// Reports faults of some kinds.
+    Fault(FaultCheck),
+    /// Reports where an expression is false.
+    Assert(Assert),
+}
+
+/// Faults of these kinds become findings; the message sees each fault's details as variables,
+/// and `file`, `tensor`, `pointer` of its first place.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FaultCheck {
+    /// Kinds, as the reader and the comparisons name them.
+    pub kinds: Vec<String>,
+    /// Only faults for which this holds; it sees what the message sees.
+    #[serde(default)]
+    pub only: Option<Expression>,
+    /// One finding for all of them instead of one each; the message sees the first one's details and `count`.
+    #[serde(default)]
+    pub group: bool,
+}
+
+/// A condition that must hold.
+///
+/// Expressions see the documents as `config`, `generation`, `processor`, `preprocessor`,
+/// `tokenizer_config`, `special_tokens` (null when absent or broken), `model` (the config with the
+/// class's defaults filled in), `text` (its language part), `arch`, `tokenizer`, and the functions
+/// `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`. A condition that cannot be
+/// evaluated because a value is not there is not a finding.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Assert {
+    /// A list; the condition is asked for each element, bound as `it`.
+    #[serde(default)]
+    pub each: Option<Expression>,
+    /// The condition.
+    pub that: Expression,
+    /// Where to point when it does not hold.
+    #[serde(default)]
+    pub at: Vec<At>,
+}
+
+/// A place named by a rule.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct At {
+    /// File name.
+    pub file: Option<Template>,
+    /// JSON pointer.
+    pub pointer: Option<Template>,
+    /// Tensor name.
+    pub tensor: Option<Template>,
+}
+
+/// How safe a fix is, as ruff grades it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Safety {
+    /// Restores bookkeeping; every tensor and value a loader reads stays.
+    Safe,
+    /// Changes what a loader would compute, on strong evidence.
+    Unsafe,
+    /// The information is not here; the exact next step is shown.
+    Manual,
+}
+
+impl Safety {
+    /// The word used in output.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Safe => "safe",
+            Self::Unsafe => "unsafe",
+            Self::Manual => "manual",
+        }
+    }
+}
+
+/// What can be done about a finding.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Fix {
+    /// How safe it is.
+    pub safety: Safety,
+    /// The step, as an imperative sentence.
+    pub help: Template,
+}
+
+/// All rules, by code.
+#[derive(Debug, Clone, Default)]
+pub struct RuleSet {
+    /// Sorted by code.
+    pub rules: Vec<Rule>,
+}
+
+impl RuleSet {
+    /// The rules inside the program.
+    ///
+    /// # Errors
+    /// [`DataError`] naming the file and the place; the house tests see to it that there is none.
+    pub fn embedded() -> Result<Self, DataError> {
+        Self::from_files(source::embedded("checks"))
+    }
+
+    /// Rules from named texts.
+    ///
+    /// # Errors
+    /// [`DataError`] for a text that is no rule, a code given twice, or an unknown kind of fault.
+    pub fn from_files<'a>(files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
+        let mut rules: Vec<Rule> = Vec::new();
+        for (path, text) in files {
+            let rule: Rule = source::parse(&path, text)?;
+            if let Check::Fault(f) = &rule.check
+                && let Some(kind) = f.kinds.iter().find(|k| !is_known_kind(k))
+            {
+                return Err(DataError::new(&path, format!("no such kind of fault: {kind}")));
+            }
+            if let Some(twin) = rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
+                return Err(DataError::new(&path, format!("{} {} is already taken by {}", rule.code, rule.name, twin.code)));
+            }
+            rules.push(rule);
+        }
+        rules.sort_by(|a, b| a.code.cmp(&b.code));
+        Ok(Self { rules })
+    }
+}
+
+/// Kinds of fault that the comparisons in `check` produce, beside those of the reader ([`FAULT_KINDS`]).
+pub const COMPARISON_KINDS: &[&str] = &[
+    "added-tokens-disagree",
+    "all-shards-absent",
+    "alias-misses-import",
+    "auto-map-class-missing",
+    "auto-map-malformed",
+    "auto-map-module-missing",
+    "auto-map-nested-missing",
+    "auto-map-remote",
+    "auto-map-unsafe-path",
+    "config-incomputable",
+    "index-key-nowhere",
+    "index-missing",
+    "index-names-other-shard",
+    "load-raises",
+    "missing-tensors",
+    "mismatched-tensor",
+    "no-weights",
+    "pickle-weights",
+    "prefix-hijack",
+    "relative-import-missing",
+    "shard-missing",
+    "shard-name-differs-in-case",
+    "shard-tensor-not-in-index",
+    "single-file-beside-index",
+    "stray-shard",
+    "tensor-in-two-shards",
+    "tied-over",
+    "token-above-rows",
+    "token-hole",
+    "token-id-twice",
+    "total-size-wrong",
+    "unexpected-tensors",
+    "unknown-architecture",
+];
+
+/// Whether some stage produces faults of this kind.
+#[must_use]
+pub fn is_known_kind(kind: &str) -> bool {
+    FAULT_KINDS.contains(&kind) || COMPARISON_KINDS.contains(&kind)
+}

@@ -1,0 +1,416 @@
+//! The one writer: a plan becomes a directory, by one rename, or nothing is there at all.
+//!
+//! Everything is written into a staging directory beside the target and synced before the rename, so
+//! nothing under the final name ever exists half-done. The staging directory has a fixed name and is
+//! locked while a run works on it: a second run sees the lock, and a run after a crash clears the rest.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rustix::fs::OFlags;
+
+use super::plan::{Plan, PlannedShard, PlannedTensor, Source, TensorRef};
+use super::transform;
+use crate::checkpoint::open::{Opened, open_regular};
+
+/// Set by the program's signal handler; a run under way then cleans up and stops.
+pub static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// Why nothing was written.
+#[derive(Debug, thiserror::Error)]
+pub enum ApplyError {
+    /// The target is in the way.
+    #[error("{path}: {reason}; choose an --out that does not exist yet or is an empty directory", path = path.display())]
+    Target {
+        /// The target.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The target and a donor overlap.
+    #[error("{path}: {reason}; donors are never written to, choose an --out elsewhere", path = path.display())]
+    Donor {
+        /// The target.
+        path: PathBuf,
+        /// How they overlap.
+        reason: String,
+    },
+    /// Another run holds the staging directory.
+    #[error("{path}: another run is writing there ({holder}); wait for it or choose another --out", path = path.display())]
+    Busy {
+        /// The target.
+        path: PathBuf,
+        /// Who holds it.
+        holder: String,
+    },
+    /// Not enough room.
+    #[error("{path}: no space: need {need} bytes, have {have}; free some or choose an --out on another disk", path = path.display())]
+    Space {
+        /// The directory that would hold the target.
+        path: PathBuf,
+        /// Bytes the plan takes.
+        need: u64,
+        /// Bytes free.
+        have: u64,
+    },
+    /// A donor changed while it was read.
+    #[error("{path}: {reason} while it was being read; nothing was written, run again when it is at rest", path = path.display())]
+    Changed {
+        /// The donor's file.
+        path: PathBuf,
+        /// What changed.
+        reason: String,
+    },
+    /// Ctrl-C.
+    #[error("interrupted; nothing was written")]
+    Interrupted,
+    /// Anything the system says.
+    #[error("{path}: {doing}: {error}", path = path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What was being done.
+        doing: &'static str,
+        /// What the system said.
+        error: io::Error,
+    },
+}
+
+fn io_at(path: &Path, doing: &'static str) -> impl FnOnce(io::Error) -> ApplyError {
+    move |error| ApplyError::Io { path: path.to_owned(), doing, error }
+}
+
+/// Checks that `out` may become a new directory: absent or empty, and apart from every donor.
+///
+/// Returns its parent and the path it will have, both resolved.
+///
+/// # Errors
+/// [`ApplyError::Target`] and [`ApplyError::Donor`]; [`ApplyError::Io`] when a path cannot be looked at.
+pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError> {
+    let target = |reason: &str| ApplyError::Target { path: out.to_owned(), reason: reason.to_owned() };
+    let name = match out.components().next_back() {
+        Some(std::path::Component::Normal(name)) => name.to_owned(),
+        // `.` and `..` name directories that exist; resolve them to find out which.
+        _ => fs::canonicalize(out)
+            .map_err(io_at(out, "resolving"))?
+            .file_name()
+            .ok_or_else(|| target("is the root directory"))?
+            .to_owned(),
+    };
+    match fs::symlink_metadata(out) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {}
+        Err(e) => return Err(io_at(out, "looking at")(e)),
+        Ok(m) if m.is_symlink() => {
+            // A link to a donor deserves the clearer message.
+            if let Ok(real) = fs::canonicalize(out) {
+                apart(out, &real, donors)?;
+            }
+            return Err(target("is a symbolic link"));
+        }
+        Ok(m) if !m.is_dir() => return Err(target("is a file")),
+        Ok(_) => {
+            let real = fs::canonicalize(out).map_err(io_at(out, "resolving"))?;
+            apart(out, &real, donors)?;
+            if fs::read_dir(out).map_err(io_at(out, "listing"))?.next().is_some() {
+                return Err(target("is a directory with files in it"));
+            }
+        }
+    }
+    let parent = match out.parent() {
+        Some(p) if !p.as_os_str().is_empty() => p,
+        _ => Path::new("."),
+    };
+    let real_parent = fs::canonicalize(parent).map_err(|e| match e.kind() {
+        io::ErrorKind::NotFound => target(&format!("its parent {} does not exist", parent.display())),
+        _ => io_at(parent, "resolving")(e),
+    })?;
+    if !real_parent.is_dir() {
+        return Err(target("its parent is not a directory"));
+    }
+    let real = if name == "." { real_parent.clone() } else { real_parent.join(name) };
+    apart(out, &real, donors)?;
+    Ok(real)
+}
+
+fn apart(out: &Path, real: &Path, donors: &[&Path]) -> Result<(), ApplyError> {
+    let identity = fs::metadata(real).ok().map(|m| (m.dev(), m.ino()));
+    for donor in donors {
+        let Ok(donor_real) = fs::canonicalize(donor) else { continue };
+        let same = identity.is_some() && identity == fs::metadata(&donor_real).ok().map(|m| (m.dev(), m.ino()));
+        let reason = if same || donor_real == real {
+            "is the donor"
+        } else if real.starts_with(&donor_real) {
+            "lies inside the donor"
+        } else if donor_real.starts_with(real) {
+            "contains the donor"
+        } else {
+            continue;
+        };
+        return Err(ApplyError::Donor { path: out.to_owned(), reason: format!("{reason} {}", donor.display()) });
+    }
+    Ok(())
+}
+
+/// The staging directory of a run, locked for as long as this value lives.
+struct Staging {
+    path: PathBuf,
+    _lock: File,
+    published: bool,
+}
+
+const OWNER: &str = ".owner";
+
+impl Staging {
+    fn new(out: &Path) -> Result<Self, ApplyError> {
+        let name = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let path = out.with_file_name(format!(".{name}.partial"));
+        // Two rounds: a run that ended between our open and our lock took the directory with it.
+        for _ in 0..2 {
+            match fs::create_dir(&path) {
+                Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&path, "creating")(e)),
+                _ => {}
+            }
+            let lock = OpenOptions::new()
+                .read(true)
+                .custom_flags(i32::try_from((OFlags::DIRECTORY | OFlags::NOFOLLOW).bits()).unwrap_or_default())
+                .open(&path)
+                .map_err(io_at(&path, "opening"))?;
+            match lock.try_lock() {
+                Ok(()) => {}
+                Err(TryLockError::WouldBlock) => {
+                    let holder = fs::read_to_string(path.join(OWNER)).unwrap_or_else(|_| "just started".to_owned());
+                    return Err(ApplyError::Busy { path: out.to_owned(), holder });
+                }
+                Err(TryLockError::Error(e)) => return Err(io_at(&path, "locking")(e)),
+            }
+            let held = lock.metadata().map_err(io_at(&path, "looking at"))?;
+            let same = fs::symlink_metadata(&path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
+            if !same {
+                continue;
+            }
+            let staging = Self { path, _lock: lock, published: false };
+            staging.clear()?;
+            let owner = staging.path.join(OWNER);
+            fs::write(&owner, format!("process {}", std::process::id())).map_err(io_at(&owner, "writing"))?;
+            return Ok(staging);
+        }
+        Err(ApplyError::Busy { path: out.to_owned(), holder: "it ended just now".to_owned() })
+    }
+
+    /// Removes what a crashed run left in it.
+    fn clear(&self) -> Result<(), ApplyError> {
+        for entry in fs::read_dir(&self.path).map_err(io_at(&self.path, "listing"))? {
+            let entry = entry.map_err(io_at(&self.path, "listing"))?;
+            let path = entry.path();
+            let is_dir = entry.file_type().map_err(io_at(&path, "looking at"))?.is_dir();
+            let removed = if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            removed.map_err(io_at(&path, "removing"))?;
+        }
+        Ok(())
+    }
+
+    /// Makes everything durable, then gives it its name.
+    fn publish(&mut self, out: &Path) -> Result<(), ApplyError> {
+        let owner = self.path.join(OWNER);
+        fs::remove_file(&owner).map_err(io_at(&owner, "removing"))?;
+        sync_dir(&self.path)?;
+        interrupted()?;
+        // rename(2) replaces an empty directory and refuses any other: exactly the rule for the target.
+        fs::rename(&self.path, out).map_err(io_at(out, "publishing"))?;
+        self.published = true;
+        if let Some(parent) = out.parent() {
+            sync_dir(parent)?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Staging {
+    fn drop(&mut self) {
+        if !self.published {
+            // Best effort: the error that brought us here is the one to report.
+            let _ = fs::remove_dir_all(&self.path);
+        }
+    }
+}
+
+fn sync_dir(path: &Path) -> Result<(), ApplyError> {
+    File::open(path).and_then(|d| d.sync_all()).map_err(io_at(path, "syncing"))
+}
+
+fn interrupted() -> Result<(), ApplyError> {
+    if INTERRUPTED.load(Ordering::Relaxed) { Err(ApplyError::Interrupted) } else { Ok(()) }
+}
+
+/// Writes `plan` as the directory `out` (a path from [`check_target`]); `progress` hears of bytes written.
+///
+/// # Errors
+/// An [`ApplyError`]; then the target is as it was and the staging directory is gone.
+pub fn apply(plan: &Plan, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+    let parent = out.parent().unwrap_or_else(|| Path::new("/"));
+    let space = rustix::fs::statvfs(parent).map_err(|e| io_at(parent, "asking for free space")(e.into()))?;
+    let have = space.f_bavail.saturating_mul(space.f_frsize);
+    if have < plan.len() {
+        return Err(ApplyError::Space { path: parent.to_owned(), need: plan.len(), have });
+    }
+    let mut staging = Staging::new(out)?;
+    for shard in &plan.shards {
+        write_shard(&staging.path.join(&shard.name), shard, progress)?;
+    }
+    for file in &plan.files {
+        interrupted()?;
+        let path = staging.path.join(&file.name);
+        let mut f = create(&path)?;
+        f.write_all(&file.bytes).and_then(|()| f.sync_all()).map_err(io_at(&path, "writing"))?;
+        progress(file.bytes.len() as u64);
+    }
+    staging.publish(out)
+}
+
+fn create(path: &Path) -> Result<File, ApplyError> {
+    let flags = i32::try_from(OFlags::NOFOLLOW.bits()).unwrap_or_default();
+    OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .custom_flags(flags)
+        .open(path)
+        .map_err(io_at(path, "creating"))
+}
+
+fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+    let mut out = create(path)?;
+    let header = shard.header();
+    out.write_all(&header).map_err(io_at(path, "writing"))?;
+    progress(header.len() as u64);
+    let mut donor: Option<Donor> = None;
+    for tensor in &shard.tensors {
+        interrupted()?;
+        let from = tensor.source.donor();
+        // Neighbouring tensors mostly share a donor file: keep it open.
+        if donor.as_ref().is_none_or(|d| d.path != from.path) {
+            if let Some(done) = donor.take() {
+                done.unchanged()?;
+            }
+            donor = Some(Donor::open(&from.path)?);
+        }
+        if let Some(d) = &mut donor {
+            write_tensor(&mut out, path, d, tensor, progress)?;
+        }
+    }
+    if let Some(done) = donor {
+        done.unchanged()?;
+    }
+    let want = (header.len() as u64).saturating_add(shard.data_len());
+    let is = out.metadata().map_err(io_at(path, "looking at"))?.len();
+    if is != want {
+        let error = io::Error::other(format!("wrote {is} bytes where the header says {want}"));
+        return Err(io_at(path, "writing")(error));
+    }
+    out.sync_all().map_err(io_at(path, "syncing"))
+}
+
+/// A donor's file, with what it looked like when it was opened.
+struct Donor {
+    path: PathBuf,
+    opened: Opened,
+}
+
+impl Donor {
+    fn open(path: &Path) -> Result<Self, ApplyError> {
+        let opened = open_regular(path, u64::MAX)
+            .map_err(|e| ApplyError::Changed { path: path.to_owned(), reason: format!("became unreadable ({e})") })?;
+        Ok(Self { path: path.to_owned(), opened })
+    }
+
+    fn unchanged(&self) -> Result<(), ApplyError> {
+        let now = self.opened.file.metadata().map_err(io_at(&self.path, "looking at"))?;
+        let was = &self.opened.identity;
+        let same = now.len() == was.size && (now.mtime(), now.mtime_nsec()) == was.mtime;
+        if same { Ok(()) } else { Err(self.changed("changed")) }
+    }
+
+    fn changed(&self, reason: &str) -> ApplyError {
+        ApplyError::Changed { path: self.path.clone(), reason: reason.to_owned() }
+    }
+
+    /// An error of a read: a short one means that the donor was cut off under us.
+    fn read_error(&self, error: io::Error) -> ApplyError {
+        if error.kind() == io::ErrorKind::UnexpectedEof {
+            self.changed("was cut short")
+        } else {
+            io_at(&self.path, "reading")(error)
+        }
+    }
+}
+
+/// Bytes moved between two looks at [`INTERRUPTED`].
+const SLICE: u64 = 64 * 1024 * 1024;
+
+fn write_tensor(
+    out: &mut File, path: &Path, donor: &mut Donor, tensor: &PlannedTensor, progress: &mut dyn FnMut(u64),
+) -> Result<(), ApplyError> {
+    match &tensor.source {
+        Source::Copy(from) => copy_range(out, path, donor, from, progress),
+        source => {
+            let from = source.donor();
+            let elem = tensor.dtype.bits() / 8;
+            let mut failed_read = None;
+            let result = {
+                let mut writer = BufWriter::with_capacity(256 * 1024, &mut *out);
+                let file = &donor.opened.file;
+                let mut read = |at: u64, buf: &mut [u8]| {
+                    if INTERRUPTED.load(Ordering::Relaxed) {
+                        return Err(io::Error::from(io::ErrorKind::Other));
+                    }
+                    file.read_exact_at(buf, from.offset.saturating_add(at)).map_err(|e| {
+                        let kind = e.kind();
+                        failed_read = Some(e);
+                        io::Error::from(kind)
+                    })
+                };
+                let made = match source {
+                    Source::Pad(_) => transform::pad(&mut read, elem, &from.shape, &tensor.shape, &mut writer),
+                    Source::GrowRows(_) => {
+                        let rows = from.shape.first().copied().unwrap_or_default();
+                        let width = tensor.shape.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d));
+                        let more = tensor.shape.first().copied().unwrap_or_default().saturating_sub(rows);
+                        transform::grow_rows(&mut read, tensor.dtype, rows, width, more, &mut writer)
+                    }
+                    Source::Copy(_) | Source::Reinit { .. } => {
+                        transform::reinit(&tensor.name, tensor.dtype, &tensor.shape, &mut writer)
+                    }
+                };
+                made.and_then(|()| writer.flush())
+            };
+            interrupted()?;
+            if let Some(e) = failed_read {
+                return Err(donor.read_error(e));
+            }
+            result.map_err(io_at(path, "writing"))?;
+            progress(tensor.len());
+            Ok(())
+        }
+    }
+}
+
+/// Moves a byte range inside the kernel where it can (`std::io::copy` uses `copy_file_range`).
+fn copy_range(
+    out: &mut File, path: &Path, donor: &mut Donor, from: &TensorRef, progress: &mut dyn FnMut(u64),
+) -> Result<(), ApplyError> {
+    donor.opened.file.seek(SeekFrom::Start(from.offset)).map_err(io_at(&donor.path, "reading"))?;
+    let mut left = from.len;
+    while left > 0 {
+        interrupted()?;
+        let slice = left.min(SLICE);
+        let copied = io::copy(&mut (&donor.opened.file).take(slice), out).map_err(io_at(path, "writing"))?;
+        if copied < slice {
+            return Err(donor.changed("was cut short"));
+        }
+        progress(copied);
+        left = left.saturating_sub(copied);
+    }
+    Ok(())
+}

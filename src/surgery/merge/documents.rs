@@ -1,0 +1,210 @@
+//! The JSON documents of a merge: a donor's, edited, or new ones.
+
+use serde_json::{Map, Value, json};
+
+use super::{Context, Draft, MergeError};
+use crate::checkpoint::Document;
+use crate::check::tokens::OpenedTokenizer;
+use crate::knowledge::recipe::{CODE_SWITCHES, DocumentSpec, Edit, GraftEdit, TokensForm};
+
+/// A document of the result and where it came from.
+pub(super) struct Built {
+    pub document: Document,
+    pub origin: String,
+}
+
+pub(super) fn build(context: &Context<'_>, draft: &mut Draft) -> Result<Vec<Built>, MergeError> {
+    let mut out = Vec::new();
+    for spec in &context.recipe.documents {
+        if context.holds(spec.when.as_ref(), &spec.name)?
+            && let Some(built) = one(context, spec, draft)?
+        {
+            out.push(built);
+        }
+    }
+    Ok(out)
+}
+
+fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<Option<Built>, MergeError> {
+    let donor = spec.from.as_ref().map(|role| (role, context.donor(role).and_then(|d| d.checkpoint.document(&spec.name))));
+    let (start, faultless) = match donor {
+        Some((_, Some(d))) => match &d.value {
+            Some(value) if value.is_object() => (Some((value.clone(), d)), d.faults.is_empty()),
+            _ => (None, false),
+        },
+        _ => (None, true),
+    };
+    let Some((mut value, source)) = start.map(|(v, d)| (v, Some(d))).or_else(|| {
+        (!spec.optional && faultless).then(|| (Value::Object(Map::new()), None))
+    }) else {
+        return match donor {
+            Some((role, Some(_))) => Err(MergeError::Donor(format!(
+                "the {role} donor's {} cannot be read as a JSON object; `ckpt-doctor check` on it says why", spec.name
+            ))),
+            _ => Ok(None),
+        };
+    };
+    if let Some(source) = source {
+        finite(spec, source, &mut value, draft)?;
+        let removed = strip_switches(&mut value);
+        if !removed.is_empty() && spec.name != "added_tokens.json" {
+            draft.repairs.push(format!(
+                "{}: {} of the donor left behind; a merge carries no key that makes a loader run code",
+                spec.name, removed.join(", ")
+            ));
+        }
+    }
+    for edit in &spec.edits {
+        apply(context, spec, edit, &mut value)?;
+    }
+    let role = spec.from.as_deref().unwrap_or_default();
+    let document = match source {
+        // Nothing changed: the donor's own bytes, not our spelling of them.
+        Some(d) if d.value.as_ref() == Some(&value) && d.faults.is_empty() => {
+            return Ok(Some(Built { document: d.clone(), origin: format!("{role} donor, unchanged") }));
+        }
+        _ => Document::from_value(&spec.name, value),
+    };
+    let origin = if source.is_some() { format!("{role} donor, edited") } else { "made by the recipe".to_owned() };
+    Ok(Some(Built { document, origin }))
+}
+
+/// Puts the recipe's value where the donor has `Infinity` or `NaN`: the result is strict JSON.
+fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut Draft) -> Result<(), MergeError> {
+    let mut places = Vec::new();
+    for fault in source.faults.iter().filter(|f| f.kind == "non-finite-number") {
+        let Some(pointer) = fault.places.first().and_then(|p| p.pointer.as_deref()) else { continue };
+        let Some(stand_in) = &spec.non_finite else {
+            return Err(MergeError::Donor(format!(
+                "{}{pointer} is not a finite number and the recipe has no stand-in for it; repair the donor first", spec.name
+            )));
+        };
+        let negative = fault.detail.get("literal").and_then(Value::as_str).is_some_and(|l| l.starts_with('-'));
+        if let Some(slot) = value.pointer_mut(pointer) {
+            *slot = match stand_in.as_f64() {
+                Some(n) if negative => Value::from(-n),
+                _ => stand_in.clone(),
+            };
+            places.push(pointer.to_owned());
+        }
+    }
+    if let (Some(first), Some(stand_in)) = (places.first(), &spec.non_finite) {
+        draft.repairs.push(format!(
+            "{}: {} number{} that strict JSON cannot say replaced by {stand_in}, the first at {first}",
+            spec.name, places.len(), if places.len() == 1 { "" } else { "s" }
+        ));
+    }
+    Ok(())
+}
+
+/// Removes [`CODE_SWITCHES`] at every level; returns those removed.
+fn strip_switches(value: &mut Value) -> Vec<String> {
+    let mut removed = Vec::new();
+    let mut pending = vec![value];
+    while let Some(value) = pending.pop() {
+        match value {
+            Value::Object(map) => {
+                for key in CODE_SWITCHES {
+                    if map.shift_remove(*key).is_some() {
+                        removed.push((*key).to_owned());
+                    }
+                }
+                pending.extend(map.values_mut());
+            }
+            Value::Array(items) => pending.extend(items.iter_mut()),
+            _ => {}
+        }
+    }
+    removed.sort();
+    removed.dedup();
+    // The recipe writes an auto_map of its own: leaving the donor's behind is not news.
+    removed.retain(|k| k != "auto_map");
+    removed
+}
+
+fn apply(context: &Context<'_>, spec: &DocumentSpec, edit: &Edit, value: &mut Value) -> Result<(), MergeError> {
+    match edit {
+        Edit::Set(set) => {
+            if context.holds(set.when.as_ref(), &spec.name)? {
+                let place = format!("{}{}", spec.name, set.at);
+                let to = set.to.eval(&context.scope).map_err(context.at(place))?;
+                put(value, &set.at, to).ok_or_else(|| not_there(context, spec, &set.at))?;
+            }
+        }
+        Edit::Tokens(edit) => {
+            if context.holds(edit.when.as_ref(), &spec.name)?
+                && let Some(tokens) = &context.tokens
+            {
+                put(value, &edit.at, added(tokens, edit.form)).ok_or_else(|| not_there(context, spec, &edit.at))?;
+            }
+        }
+        Edit::Graft(graft) => {
+            let config = grafted(context, graft)?;
+            put(value, &graft.at, config).ok_or_else(|| not_there(context, spec, &graft.at))?;
+        }
+        Edit::Remove(remove) => {
+            if context.holds(remove.when.as_ref(), &spec.name)? {
+                for pointer in &remove.at {
+                    take(value, pointer);
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The added tokens in one of transformers' forms.
+fn added(tokens: &OpenedTokenizer, form: TokensForm) -> Value {
+    let entries = tokens.added.iter().map(|(id, token)| match form {
+        TokensForm::Decoder => (id.to_string(), token.to_json()),
+        TokensForm::Ids => (token.content.clone(), json!(id)),
+    });
+    Value::Object(entries.collect())
+}
+
+fn not_there(context: &Context<'_>, spec: &DocumentSpec, pointer: &str) -> MergeError {
+    MergeError::Donor(format!("{}{pointer} cannot be set: something on the way is not an object (recipe {})", spec.name, context.recipe.recipe))
+}
+
+fn grafted(context: &Context<'_>, graft: &GraftEdit) -> Result<Value, MergeError> {
+    let config = context
+        .donor(&graft.from)
+        .and_then(|d| d.checkpoint.config())
+        .and_then(Value::as_object)
+        .ok_or_else(|| MergeError::Donor(format!("the {} donor has no readable config.json", graft.from)))?;
+    let left_out = |key: &str| {
+        graft.without.iter().any(|w| w.strip_suffix('*').map_or(w == key, |prefix| key.starts_with(prefix)))
+    };
+    let mut value =
+        Value::Object(config.iter().filter(|(k, _)| !left_out(k)).map(|(k, v)| (k.clone(), v.clone())).collect());
+    strip_switches(&mut value);
+    Ok(value)
+}
+
+/// Splits a pointer into its parent and its last key, unescaped.
+fn split(pointer: &str) -> Option<(&str, String)> {
+    let (parent, key) = pointer.rsplit_once('/')?;
+    Some((parent, key.replace("~1", "/").replace("~0", "~")))
+}
+
+/// Sets the value at `pointer`, making objects on the way; `None` when something else is in the way.
+fn put(root: &mut Value, pointer: &str, to: Value) -> Option<()> {
+    if pointer.is_empty() {
+        *root = to;
+        return Some(());
+    }
+    let (parent, key) = split(pointer)?;
+    if root.pointer(parent).is_none() {
+        put(root, parent, Value::Object(Map::new()))?;
+    }
+    root.pointer_mut(parent)?.as_object_mut()?.insert(key, to);
+    Some(())
+}
+
+fn take(root: &mut Value, pointer: &str) {
+    if let Some((parent, key)) = split(pointer)
+        && let Some(map) = root.pointer_mut(parent).and_then(Value::as_object_mut)
+    {
+        map.shift_remove(&key);
+    }
+}

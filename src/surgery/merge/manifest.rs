@@ -1,0 +1,77 @@
+//! `merge-manifest.json`: what went into a merged checkpoint, so that it can be made again and compared.
+
+use std::io::{self, Read};
+use std::path::Path;
+
+use serde_json::{Map, Value, json};
+use sha2::{Digest, Sha256};
+
+use super::{Donor, Draft, Options};
+use crate::checkpoint::open::open_regular;
+use crate::knowledge::recipe::Recipe;
+
+/// File name in the merged directory.
+pub const NAME: &str = "merge-manifest.json";
+
+/// The manifest: recipe, options, donors by hash, and the source of every tensor.
+///
+/// Donors are named by their role and hashes, never by a path, so that the same merge made elsewhere has the
+/// same manifest. With `all_bytes` whole shards are hashed, otherwise their headers.
+///
+/// # Errors
+/// When a donor's file cannot be read.
+pub fn manifest(recipe: &Recipe, options: &Options, donors: &[Donor], draft: &Draft, all_bytes: bool) -> io::Result<Value> {
+    let mut hashed = Map::new();
+    for donor in donors {
+        let mut documents = Map::new();
+        for (name, document) in &donor.checkpoint.documents {
+            if document.value.is_some() {
+                documents.insert(name.clone(), json!(hash(&donor.checkpoint.root.join(name))?));
+            }
+        }
+        let mut shards = Map::new();
+        for (name, shard) in &donor.checkpoint.shards {
+            let mut entry = json!({ "bytes": shard.file_len, "header_sha256": shard.header_sha256 });
+            if all_bytes && let Some(map) = entry.as_object_mut() {
+                map.insert("sha256".to_owned(), json!(hash(&donor.checkpoint.root.join(name))?));
+            }
+            shards.insert(name.clone(), entry);
+        }
+        hashed.insert(donor.role.clone(), json!({ "documents": documents, "shards": shards }));
+    }
+    let tensors: Vec<Value> = draft
+        .plan
+        .tensors()
+        .map(|(shard, t)| {
+            let from = t.source.donor();
+            json!({
+                "name": t.name, "shard": shard.name, "dtype": t.dtype.name(), "shape": t.shape,
+                "transform": t.source.word(),
+                "source": { "donor": from.donor, "name": from.name, "shape": from.shape },
+            })
+        })
+        .collect();
+    Ok(json!({
+        "schema": 1,
+        "tool": { "name": "ckpt-doctor", "version": env!("CARGO_PKG_VERSION") },
+        "recipe": recipe.recipe,
+        "options": options,
+        "donors": hashed,
+        "tensors": tensors,
+    }))
+}
+
+/// SHA-256 of a file, in hexadecimal.
+fn hash(path: &Path) -> io::Result<String> {
+    let mut opened = open_regular(path, u64::MAX).map_err(io::Error::other)?;
+    let mut hasher = Sha256::new();
+    let mut block = vec![0_u8; 1 << 20];
+    loop {
+        let n = opened.file.read(&mut block)?;
+        if n == 0 {
+            break;
+        }
+        hasher.update(block.get(..n).unwrap_or_default());
+    }
+    Ok(hasher.finalize().iter().map(|b| format!("{b:02x}")).collect())
+}

@@ -1,0 +1,108 @@
+//! What a merge planned and did, as data for every report.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+/// What a merge planned and did.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct MergeReport {
+    /// Recipe name.
+    pub recipe: String,
+    /// How far it came: `seam`, `donors`, `planned`, `dry-run`, `written`.
+    pub stage: String,
+    /// Where the result is or would be.
+    pub out: String,
+    /// Donor role to path.
+    pub donors: BTreeMap<String, String>,
+    /// Options in force, defaults included.
+    pub options: BTreeMap<String, String>,
+    /// Stages in the order they ran, with one line each.
+    pub stages: Vec<Stage>,
+    /// Seams that do not fit; non-empty means nothing was written.
+    pub seams: Vec<Seam>,
+    /// How many tensors came how: `copy`, `pad`, `grow-rows`, `reinit`.
+    pub transforms: BTreeMap<String, usize>,
+    /// The tensors that are not plain copies.
+    pub changed: Vec<ChangedTensor>,
+    /// Donor tensors that were left behind, by donor role and pattern.
+    pub dropped: Vec<Dropped>,
+    /// Repairs made on the way, one sentence each.
+    pub repairs: Vec<String>,
+    /// Files of the result and where each came from.
+    pub files: Vec<MergedFile>,
+    /// Tensors in the result.
+    pub tensors: usize,
+    /// Bytes of tensor data in the result.
+    pub bytes: u64,
+}
+
+/// One stage of the pipeline.
+#[derive(Debug, Clone, Serialize)]
+pub struct Stage {
+    /// Its name.
+    pub name: String,
+    /// What came of it.
+    pub outcome: String,
+}
+
+/// A seam that does not fit: two parts that must agree, and do not.
+#[derive(Debug, Clone, Serialize)]
+pub struct Seam {
+    /// What has to agree, in one sentence.
+    pub message: String,
+    /// The part that does not fit: name and shape as stored.
+    pub tensor: Option<ShapedName>,
+    /// The part it has to meet: name and shape.
+    pub meets: Option<ShapedName>,
+    /// Shape the result needs for `tensor`.
+    pub needed: Option<Vec<u64>>,
+    /// Options that would solve it, as typed on the command line: `--set projector=pad`.
+    pub options: Vec<String>,
+}
+
+/// A name with a shape.
+#[derive(Debug, Clone, Serialize)]
+pub struct ShapedName {
+    /// Donor role it comes from.
+    pub donor: String,
+    /// Tensor name in that donor.
+    pub name: String,
+    /// Its shape there.
+    pub shape: Vec<u64>,
+}
+
+/// A tensor of the result that is not a byte copy.
+#[derive(Debug, Clone, Serialize)]
+pub struct ChangedTensor {
+    /// Name in the result.
+    pub name: String,
+    /// How it was made.
+    pub transform: String,
+    /// Shape in the donor; absent when nothing was taken.
+    pub from: Option<Vec<u64>>,
+    /// Shape in the result.
+    pub to: Vec<u64>,
+}
+
+/// Donor tensors that were left behind.
+#[derive(Debug, Clone, Serialize)]
+pub struct Dropped {
+    /// Donor role.
+    pub donor: String,
+    /// Pattern of the recipe.
+    pub pattern: String,
+    /// How many tensors it matched.
+    pub count: usize,
+    /// Why the recipe drops them.
+    pub why: String,
+}
+
+/// A file of the result.
+#[derive(Debug, Clone, Serialize)]
+pub struct MergedFile {
+    /// File name.
+    pub name: String,
+    /// Where it came from.
+    pub origin: String,
+}

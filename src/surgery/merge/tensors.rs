@@ -1,0 +1,169 @@
+//! Which tensors the result has, where each comes from, and whether it fits.
+
+use std::collections::{BTreeMap, HashMap};
+
+use regex::Regex;
+use serde_json::Value;
+
+use super::documents::Built;
+use super::record::{ChangedTensor, Dropped, Seam, ShapedName};
+use super::{Context, Donor, Draft, MergeError};
+use crate::checkpoint::{Shard, Tensor};
+use crate::knowledge::Library;
+use crate::knowledge::recipe::TensorSpec;
+use crate::surgery::plan::{PlannedTensor, Source, TensorRef, into_shards};
+use crate::surgery::transform::can_compute;
+
+/// A tensor spec with its parts evaluated once.
+struct Rule<'a> {
+    spec: &'a TensorSpec,
+    names: Regex,
+    rename: Option<String>,
+    fit: String,
+}
+
+pub(super) fn build(
+    context: &Context<'_>, documents: &[Built], library: &Library, limit: u64, draft: &mut Draft,
+) -> Result<(), MergeError> {
+    let rules = rules(context)?;
+    let mut taken: Vec<(String, &Donor, &Shard, &Tensor, &Rule<'_>)> = Vec::new();
+    let mut dropped: BTreeMap<(String, String, String), usize> = BTreeMap::new();
+    for donor in context.donors {
+        for (shard, tensor) in donor.checkpoint.tensors() {
+            let rule = rules.iter().find(|r| r.spec.from == donor.role && r.names.is_match(&tensor.name));
+            match rule {
+                Some(rule) if rule.spec.drop.is_none() => {
+                    let name = match &rule.rename {
+                        Some(to) => rule.names.replace(&tensor.name, to.as_str()).into_owned(),
+                        None => tensor.name.clone(),
+                    };
+                    taken.push((name, donor, shard, tensor, rule));
+                }
+                other => {
+                    let (pattern, why) = other.map_or(("", "no entry of the recipe names them"), |r| {
+                        (r.spec.names.as_str(), r.spec.drop.as_deref().unwrap_or_default())
+                    });
+                    let key = (donor.role.clone(), pattern.to_owned(), why.to_owned());
+                    let count = dropped.entry(key).or_default();
+                    *count = count.saturating_add(1);
+                }
+            }
+        }
+    }
+    draft.dropped = dropped
+        .into_iter()
+        .map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why })
+        .collect();
+
+    let names: Vec<String> = taken.iter().map(|t| t.0.clone()).collect();
+    let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
+    let expected = expected_shapes(library, config, &names);
+    let mut tensors = Vec::new();
+    let mut seen: HashMap<String, String> = HashMap::new();
+    for (name, donor, shard, tensor, rule) in taken {
+        let from = TensorRef {
+            donor: donor.role.clone(),
+            path: donor.checkpoint.root.join(&shard.name),
+            name: tensor.name.clone(),
+            shape: tensor.shape.clone(),
+            offset: shard.data_start.saturating_add(tensor.begin),
+            len: tensor.len(),
+        };
+        if let Some(first) = seen.insert(name.clone(), tensor.name.clone()) {
+            return Err(MergeError::Recipe(format!(
+                "{}: {first} and {} would both become {name}", context.recipe.recipe, tensor.name
+            )));
+        }
+        let position = expected.get(&name).map_or(usize::MAX, |e| e.0);
+        let shape = expected.get(&name).map_or_else(|| tensor.shape.clone(), |e| e.1.clone());
+        match source(from, tensor, &shape, &rule.fit) {
+            Ok(source) => {
+                if !matches!(source, Source::Copy(_)) {
+                    draft.changed.push(ChangedTensor {
+                        name: name.clone(),
+                        transform: source.word().to_owned(),
+                        from: Some(tensor.shape.clone()),
+                        to: shape.clone(),
+                    });
+                }
+                tensors.push((position, PlannedTensor { name, dtype: tensor.dtype, shape, source }));
+            }
+            Err(why) => draft.seams.push(misfit(context, donor, tensor, rule, &name, shape, &why)),
+        }
+    }
+    // The class's own order, so that shards are cut where save_pretrained would cut them.
+    tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
+    draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
+    Ok(())
+}
+
+fn rules<'a>(context: &Context<'a>) -> Result<Vec<Rule<'a>>, MergeError> {
+    let mut out = Vec::new();
+    for spec in &context.recipe.tensors {
+        if !context.holds(spec.when.as_ref(), &spec.names)? {
+            continue;
+        }
+        let names = Regex::new(&spec.names)
+            .map_err(|e| MergeError::Recipe(format!("{}: {}: {e}", context.recipe.recipe, spec.names)))?;
+        let rename =
+            spec.rename.as_ref().map(|t| t.try_render(&context.scope)).transpose().map_err(context.at(spec.names.as_str()))?;
+        let fit = match &spec.fit {
+            None => "copy".to_owned(),
+            Some(e) => match e.eval(&context.scope).map_err(context.at(spec.names.as_str()))? {
+                Value::String(s) if matches!(s.as_str(), "copy" | "pad" | "grow-rows" | "reinit") => s,
+                other => {
+                    return Err(MergeError::Recipe(format!(
+                        "{}: fit of {} is {other}, not copy, pad, grow-rows or reinit", context.recipe.recipe, spec.names
+                    )));
+                }
+            },
+        };
+        out.push(Rule { spec, names, rename, fit });
+    }
+    Ok(out)
+}
+
+/// Position and shape of each tensor the class would build from the planned config.
+fn expected_shapes(library: &Library, config: Option<&Value>, names: &[String]) -> HashMap<String, (usize, Vec<u64>)> {
+    let Some(config) = config else { return HashMap::new() };
+    let found = library.find(config, names.iter().map(String::as_str)).and_then(|a| a.expect(config).ok());
+    found.map_or_else(HashMap::new, |e| {
+        e.tensors.iter().enumerate().map(|(i, (name, t))| (name.clone(), (i, t.shape.clone()))).collect()
+    })
+}
+
+/// How `tensor` becomes one of `shape`, or why it cannot.
+fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: &str) -> Result<Source, String> {
+    if fit != "reinit" && tensor.shape == shape {
+        return Ok(Source::Copy(from));
+    }
+    if fit == "copy" {
+        return Err("it is taken as it is".to_owned());
+    }
+    if !can_compute(tensor.dtype) {
+        return Err(format!("values of type {} can only be copied", tensor.dtype));
+    }
+    let same_rank = tensor.shape.len() == shape.len();
+    let nests = same_rank && tensor.shape.iter().zip(shape).all(|(have, want)| have <= want);
+    match fit {
+        "reinit" => Ok(Source::Reinit { instead_of: from }),
+        "pad" if nests => Ok(Source::Pad(from)),
+        "pad" => Err("padding cannot make it smaller".to_owned()),
+        _ if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => Ok(Source::GrowRows(from)),
+        _ => Err("only rows can be added".to_owned()),
+    }
+}
+
+fn misfit(
+    context: &Context<'_>, donor: &Donor, tensor: &Tensor, rule: &Rule<'_>, name: &str, needed: Vec<u64>, why: &str,
+) -> Seam {
+    Seam {
+        message: format!(
+            "{} of the {} donor is {:?}, {name} has to be {needed:?}, and {why}", tensor.name, donor.role, tensor.shape
+        ),
+        tensor: Some(ShapedName { donor: donor.role.clone(), name: tensor.name.clone(), shape: tensor.shape.clone() }),
+        meets: rule.spec.meets.as_ref().and_then(|m| context.shaped(m)),
+        needed: Some(needed),
+        options: rule.spec.options.iter().map(|o| format!("--set {o}")).collect(),
+    }
+}
