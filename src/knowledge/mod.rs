@@ -3,7 +3,6 @@
 pub mod expression;
 pub mod processor;
 pub mod recipe;
-pub mod rule;
 pub mod source;
 
 pub use expression::{EvalError, Expression, Scope, Template};
