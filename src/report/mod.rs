@@ -1,3 +1,95 @@
-//! One report, many renderers. Nothing here loads, checks or writes a checkpoint.
+//! One report, many renderers. Nothing here loads, checks, writes or prints.
+//!
+//! [`render`] turns a [`Report`] into text; where that text goes is the caller's business.
 
+mod collapse;
+mod concise;
+mod escape;
+mod excerpt;
+mod json;
+mod markdown;
 pub mod model;
+mod terminal;
+mod words;
+
+use std::fmt;
+use std::str::FromStr;
+
+pub use model::Report;
+
+/// How a report is written down.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Format {
+    /// For a terminal: source excerpts and tables.
+    #[default]
+    Full,
+    /// One line for each finding: `path/file:line:column: error[CODE] message`.
+    Concise,
+    /// The JSON contract, complete.
+    Json,
+    /// Markdown that is the same wherever it was made: no times, no directories.
+    Markdown,
+}
+
+impl Format {
+    /// Every format.
+    pub const ALL: [Self; 4] = [Self::Full, Self::Concise, Self::Json, Self::Markdown];
+
+    /// The word for it on the command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::Concise => "concise",
+            Self::Json => "json",
+            Self::Markdown => "markdown",
+        }
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// A word that names no format.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is not an output format; known are full, concise, json, markdown")]
+pub struct UnknownFormat(String);
+
+impl FromStr for Format {
+    type Err = UnknownFormat;
+
+    fn from_str(word: &str) -> Result<Self, UnknownFormat> {
+        Self::ALL.into_iter().find(|f| f.name() == word).ok_or_else(|| UnknownFormat(word.to_owned()))
+    }
+}
+
+/// How text for people is laid out. JSON takes no notice of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Style {
+    /// Whether to use ANSI colours (`full` only).
+    pub color: bool,
+    /// Width of the terminal in columns; `None` when there is none.
+    pub width: Option<usize>,
+    /// Longest list that is shown in full; what is beyond it becomes "and N more".
+    pub cap: usize,
+}
+
+impl Default for Style {
+    fn default() -> Self {
+        Self { color: false, width: None, cap: 20 }
+    }
+}
+
+/// Writes a report down. Text that is not empty ends with a line break.
+#[must_use]
+pub fn render(report: &Report, format: Format, style: Style) -> String {
+    match format {
+        Format::Full => terminal::render(report, style),
+        Format::Concise => concise::render(report, style.cap),
+        Format::Json => json::render(report),
+        Format::Markdown => markdown::render(report, style.cap),
+    }
+}

@@ -26,6 +26,19 @@ pub struct Report {
     pub summary: Summary,
 }
 
+impl Report {
+    /// Puts a report together: adds up the counts and states the verdict.
+    #[must_use]
+    pub fn new(checkpoints: Vec<CheckpointReport>, merge: Option<MergeReport>) -> Self {
+        let counts = checkpoints.iter().fold(Counts::default(), |sum, c| sum.plus(c.counts));
+        let seams = merge.as_ref().is_some_and(|m| !m.seams.is_empty());
+        let verdict = if seams { Severity::Error.name() } else { counts.verdict() };
+        let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts };
+        let tool = Tool { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") };
+        Self { schema: 1, tool, checkpoints, merge, summary }
+    }
+}
+
 /// Name and version of the program.
 #[derive(Debug, Clone, Serialize)]
 pub struct Tool {
@@ -78,6 +91,25 @@ impl Counts {
     pub fn of(findings: &[Finding]) -> Self {
         let n = |s| findings.iter().filter(|f| f.severity == s).count();
         Self { error: n(Severity::Error), warning: n(Severity::Warning), info: n(Severity::Info) }
+    }
+
+    /// Both together.
+    #[must_use]
+    pub const fn plus(self, other: Self) -> Self {
+        Self {
+            error: self.error.saturating_add(other.error),
+            warning: self.warning.saturating_add(other.warning),
+            info: self.info.saturating_add(other.info),
+        }
+    }
+
+    /// `clean`, or the worst severity present.
+    #[must_use]
+    pub const fn verdict(self) -> &'static str {
+        match self.worst() {
+            Some(severity) => severity.name(),
+            None => "clean",
+        }
     }
 
     /// The worst severity present.

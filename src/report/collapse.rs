@@ -1,0 +1,168 @@
+//! Collapses runs of numbered names: 26 `layers.N.mlp.up_proj.weight` become one line.
+
+use std::collections::BTreeMap;
+
+/// One pattern and how many names it stands for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Group {
+    /// A name, with `{0..25}` or `{0,3,5}` where several numbers occur.
+    pub pattern: String,
+    /// Names it stands for.
+    pub count: usize,
+}
+
+/// Numbers that occur at one place of a name, sorted.
+type Numbers = Vec<u64>;
+/// The text of a name between its numbers.
+type Words = Vec<String>;
+
+/// Collapses names into patterns, in the order in which each pattern's text first occurs.
+///
+/// A pattern stands for exactly the names given: numbers are only gathered where every combination
+/// occurs. A name that occurs twice counts twice only if it has no numbers in it.
+pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Group> {
+    let mut order: Vec<Words> = Vec::new();
+    let mut families: BTreeMap<Words, Vec<Vec<Numbers>>> = BTreeMap::new();
+    for name in names {
+        let (words, numbers) = split(name);
+        let members = families.entry(words).or_insert_with_key(|words| {
+            order.push(words.clone());
+            Vec::new()
+        });
+        members.push(numbers.into_iter().map(|n| vec![n]).collect());
+    }
+    let mut groups = Vec::new();
+    for words in order {
+        let mut members = families.remove(&words).unwrap_or_default();
+        for at in (0..words.len().saturating_sub(1)).rev() {
+            members = gather(members, at);
+        }
+        let plain = words.len() <= 1;
+        if plain {
+            groups.push(Group { pattern: words.concat(), count: members.len() });
+            continue;
+        }
+        groups.extend(members.into_iter().map(|numbers| Group {
+            pattern: pattern(&words, &numbers),
+            count: numbers.iter().map(Vec::len).fold(1, usize::saturating_mul),
+        }));
+    }
+    groups
+}
+
+/// Merges members that differ only in the numbers at `at`.
+fn gather(members: Vec<Vec<Numbers>>, at: usize) -> Vec<Vec<Numbers>> {
+    let mut alike: BTreeMap<Vec<Numbers>, Numbers> = BTreeMap::new();
+    for mut member in members {
+        let here = member.get_mut(at).map(std::mem::take).unwrap_or_default();
+        alike.entry(member).or_default().extend(here);
+    }
+    alike
+        .into_iter()
+        .map(|(mut member, mut here)| {
+            here.sort_unstable();
+            here.dedup();
+            if let Some(slot) = member.get_mut(at) {
+                *slot = here;
+            }
+            member
+        })
+        .collect()
+}
+
+/// Splits a name at the dotted parts that are plain numbers: n numbers, n + 1 words.
+fn split(name: &str) -> (Words, Vec<u64>) {
+    let mut words = vec![String::new()];
+    let mut numbers = Vec::new();
+    for (i, part) in name.split('.').enumerate() {
+        let dot = if i == 0 { "" } else { "." };
+        // `007` and numbers beyond u64 would not be spelled back as they were: they stay text.
+        let number = part.parse::<u64>().ok().filter(|n| n.to_string() == part);
+        if let Some(word) = words.last_mut() {
+            word.push_str(dot);
+            if number.is_none() {
+                word.push_str(part);
+            }
+        }
+        if let Some(n) = number {
+            numbers.push(n);
+            words.push(String::new());
+        }
+    }
+    (words, numbers)
+}
+
+fn pattern(words: &[String], numbers: &[Numbers]) -> String {
+    let mut out = String::new();
+    for (i, word) in words.iter().enumerate() {
+        out.push_str(word);
+        match numbers.get(i).map(Vec::as_slice) {
+            None => {}
+            Some([one]) => out.push_str(&one.to_string()),
+            Some(many) => {
+                out.push('{');
+                out.push_str(&ranges(many));
+                out.push('}');
+            }
+        }
+    }
+    out
+}
+
+/// `0..3,5`: both ends are included.
+fn ranges(numbers: &[u64]) -> String {
+    const PIECES: usize = 8;
+    let mut runs: Vec<(u64, u64)> = Vec::new();
+    for &n in numbers {
+        match runs.last_mut() {
+            Some((_, last)) if last.checked_add(1) == Some(n) => *last = n,
+            _ => runs.push((n, n)),
+        }
+    }
+    let mut pieces: Vec<String> = runs
+        .iter()
+        .take(PIECES)
+        .map(|(first, last)| if first == last { first.to_string() } else { format!("{first}..{last}") })
+        .collect();
+    if runs.len() > PIECES {
+        pieces.push("…".to_owned());
+    }
+    pieces.join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Group, collapse};
+
+    fn shown(names: &[&str]) -> Vec<(String, usize)> {
+        collapse(names.iter().copied()).into_iter().map(|Group { pattern, count }| (pattern, count)).collect()
+    }
+
+    #[test]
+    fn full_products_become_one_pattern() {
+        assert_eq!(shown(&["l.0.e.0.w", "l.0.e.1.w", "l.1.e.0.w", "l.1.e.1.w"]), [("l.{0..1}.e.{0..1}.w".to_owned(), 4)]);
+    }
+
+    #[test]
+    fn partial_products_stand_for_nothing_else() {
+        let shown = shown(&["l.0.e.0.w", "l.0.e.1.w", "l.1.e.0.w"]);
+        assert_eq!(shown, [("l.1.e.0.w".to_owned(), 1), ("l.0.e.{0..1}.w".to_owned(), 2)]);
+    }
+
+    #[test]
+    fn gaps_and_odd_spellings_are_kept() {
+        assert_eq!(shown(&["a.3.w", "a.0.w", "a.1.w", "lone", "b.007", "b.99999999999999999999999"]), [
+            ("a.{0..1,3}.w".to_owned(), 3),
+            ("lone".to_owned(), 1),
+            ("b.007".to_owned(), 1),
+            ("b.99999999999999999999999".to_owned(), 1),
+        ]);
+    }
+
+    #[test]
+    fn every_name_is_counted_once() {
+        let names: Vec<String> = (0..7).flat_map(|i| (0..i).map(move |j| format!("x.{i}.y.{j}"))).collect();
+        let total: usize = collapse(names.iter().map(String::as_str)).iter().map(|g| g.count).sum();
+        assert_eq!(total, names.len());
+    }
+}

@@ -1,0 +1,44 @@
+//! One line for each finding, for editors, `grep` and logs.
+
+use std::fmt::Write as _;
+
+use super::model::{CheckpointReport, Report};
+use super::words::{capped, more, name, place, sentence};
+
+pub fn render(report: &Report, cap: usize) -> String {
+    let mut out = String::new();
+    for checkpoint in &report.checkpoints {
+        findings(&mut out, checkpoint, cap);
+    }
+    if let Some(merge) = &report.merge {
+        for seam in merge.seams.iter().take(cap) {
+            let _ok = write!(out, "{}: error[seam] {}", name(&merge.recipe), sentence(&seam.message));
+            if !seam.options.is_empty() {
+                let _ok = write!(out, " (try {})", sentence(&seam.options.join(" or ")));
+            }
+            out.push('\n');
+        }
+        if let Some(more) = more(merge.seams.len(), cap) {
+            let _ok = writeln!(out, "{}: {more} seams", name(&merge.recipe));
+        }
+    }
+    out
+}
+
+fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
+    let (shown, hidden) = capped(&checkpoint.findings, cap);
+    for finding in shown {
+        let location = finding.locations.first();
+        out.push_str(&place(&checkpoint.path, location));
+        if let Some(line) = location.and_then(|l| l.line) {
+            let _ok = write!(out, ":{line}");
+            if let Some(column) = location.and_then(|l| l.column) {
+                let _ok = write!(out, ":{column}");
+            }
+        }
+        let _ok = writeln!(out, ": {}[{}] {}", finding.severity.name(), name(&finding.code), sentence(&finding.message));
+    }
+    for (code, n) in hidden {
+        let _ok = writeln!(out, "{}: and {n} more {}", name(&checkpoint.path), name(code));
+    }
+}

@@ -1,0 +1,250 @@
+//! Markdown. What it says depends on the checkpoints alone: no times, and for a merge no directories,
+//! because `merge-report.md` travels with the merged checkpoint and must come out the same anywhere.
+
+use std::fmt::Write as _;
+
+use super::collapse::{Group, collapse};
+use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
+use super::words::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
+use crate::check::finding::LoadReport;
+use crate::check::{Finding, Location};
+
+pub fn render(report: &Report, cap: usize) -> String {
+    let mut out = String::new();
+    if let Some(merge) = &report.merge {
+        merged(&mut out, merge, cap);
+    } else {
+        out.push_str("# Checkpoint report\n");
+    }
+    for checkpoint in &report.checkpoints {
+        section(&mut out, checkpoint, cap);
+    }
+    let _ok = writeln!(out, "\n---\n\nVerdict: **{}**. {}.", text(&report.summary.verdict), summary(report));
+    let _ok = writeln!(out, "\n{} {}", report.tool.name, report.tool.version);
+    out
+}
+
+fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
+    let title = match checkpoint.role.as_deref() {
+        Some(role) => text(role),
+        None => code(&name(&checkpoint.path)),
+    };
+    let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
+    let (tensors, size) = checkpoint.tensors;
+    let verdict = text(&checkpoint.verdict);
+    let _ok = writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
+    let (shown, hidden) = capped(&checkpoint.findings, cap);
+    for finding in shown {
+        render_finding(out, finding);
+    }
+    for (code, n) in hidden {
+        let _ok = writeln!(out, "\nand {n} more {}", text_name(code));
+    }
+    if let Some(load) = &checkpoint.load {
+        render_load(out, load, cap);
+    }
+}
+
+fn render_finding(out: &mut String, finding: &Finding) {
+    const PLACES: usize = 6;
+    let _ok = writeln!(out, "\n### {}[{}]: {}\n", finding.severity.name(), text_name(&finding.code), text(&sentence(&finding.message)));
+    let _ok = writeln!(out, "- rule: {}", text_name(&finding.name));
+    let mut places: Vec<String> = Vec::new();
+    for place in finding.locations.iter().filter_map(place) {
+        if places.last() != Some(&place) {
+            places.push(place);
+        }
+    }
+    for place in places.iter().take(PLACES) {
+        let _ok = writeln!(out, "- at: {place}");
+    }
+    if let Some(more) = more(places.len(), PLACES) {
+        let _ok = writeln!(out, "- {more}");
+    }
+    for tensor in tensors(&finding.locations, PLACES) {
+        let _ok = writeln!(out, "- tensor: {}", code(&tensor));
+    }
+    let figures = evidence(finding);
+    if !figures.is_empty() {
+        let _ok = writeln!(out, "- note: {}", text(&figures.join("; ")));
+    }
+    if let Some(hint) = &finding.fix {
+        let _ok = writeln!(out, "- help: {}", text(&fix(hint)));
+    }
+}
+
+fn place(location: &Location) -> Option<String> {
+    let mut parts = Vec::new();
+    if let Some(file) = &location.file {
+        let mut at = name(file);
+        for n in [location.line, location.column].into_iter().map_while(|n| n) {
+            let _ok = write!(at, ":{n}");
+        }
+        parts.push(code(&at));
+    }
+    parts.extend(location.pointer.as_deref().filter(|p| !p.is_empty()).map(|p| code(&name(p))));
+    (!parts.is_empty()).then(|| parts.join(" "))
+}
+
+fn render_load(out: &mut String, load: &LoadReport, cap: usize) {
+    let (missing, unexpected) = (load.missing.len(), load.unexpected.len());
+    let (mismatched, silent) = (load.mismatched.len(), load.silent.len());
+    let _ok = writeln!(
+        out,
+        "\nPredicted load: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"
+    );
+    let names = |list: &[String]| collapse(list.iter().map(String::as_str));
+    groups(out, "Missing: the loader initialises them anew", &names(&load.missing), cap);
+    groups(out, "Unexpected: the loader ignores them", &names(&load.unexpected), cap);
+    if !load.mismatched.is_empty() {
+        let rows: Vec<_> =
+            words::mismatched(load).into_iter().map(|[tensor, stored, expected]| [code(&tensor), stored, expected]).collect();
+        let _ok = writeln!(out, "\nMismatched: the load raises");
+        table(out, ["tensor", "stored", "expected"], &rows, cap);
+    }
+    for (reason, names) in words::silent(load) {
+        groups(out, &format!("Silent, reported by nobody: {}", text(&reason)), &names, cap);
+    }
+}
+
+fn groups(out: &mut String, title: &str, groups: &[Group], cap: usize) {
+    if groups.is_empty() {
+        return;
+    }
+    let _ok = writeln!(out, "\n{title}\n");
+    for group in groups.iter().take(cap) {
+        let times = if group.count > 1 { format!(" ({})", group.count) } else { String::new() };
+        let _ok = writeln!(out, "- {}{times}", code(&name(&group.pattern)));
+    }
+    if let Some(more) = more(groups.len(), cap) {
+        let _ok = writeln!(out, "- {more}");
+    }
+}
+
+fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
+    let _ok = writeln!(out, "# Merge report: {}", text_name(&merge.recipe));
+    let donors: Vec<_> = merge.donors.iter().map(|(role, path)| [text_name(role), code(&name(last(path)))]).collect();
+    table(out, ["donor", "directory"], &donors, cap);
+    if !merge.options.is_empty() {
+        let options: Vec<_> = merge.options.iter().map(|(k, v)| [text_name(k), code(&name(v))]).collect();
+        table(out, ["option", "value"], &options, cap);
+    }
+    let _ok = writeln!(out, "\n## Stages\n");
+    for (n, stage) in merge.stages.iter().enumerate().take(cap) {
+        let _ok = writeln!(out, "{}. {}: {}", n + 1, text_name(&stage.name), text(&sentence(&stage.outcome)));
+    }
+    seams(out, merge, cap);
+    if !merge.transforms.is_empty() {
+        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", text_name(how))).collect();
+        let _ok = writeln!(out, "\n## Tensors\n\n{}, {}: {}", plural(merge.tensors, "tensor"), bytes(merge.bytes), how.join(", "));
+    }
+    if !merge.changed.is_empty() {
+        let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
+        let rows: Vec<_> = merge
+            .changed
+            .iter()
+            .map(|c| [code(&name(&c.name)), text(&sentence(&c.transform)), from(c.from.as_deref()), shape(&c.to)])
+            .collect();
+        table(out, ["not a copy", "how", "from", "to"], &rows, cap);
+    }
+    if !merge.dropped.is_empty() {
+        let rows: Vec<_> = merge
+            .dropped
+            .iter()
+            .map(|d| [text_name(&d.donor), code(&name(&d.pattern)), d.count.to_string(), text(&sentence(&d.why))])
+            .collect();
+        let _ok = writeln!(out, "\n## Left behind");
+        table(out, ["donor", "tensors", "count", "why"], &rows, cap);
+    }
+    if !merge.repairs.is_empty() {
+        let _ok = writeln!(out, "\n## Repaired on the way\n");
+        for repair in merge.repairs.iter().take(cap) {
+            let _ok = writeln!(out, "- {}", text(&sentence(repair)));
+        }
+        if let Some(more) = more(merge.repairs.len(), cap) {
+            let _ok = writeln!(out, "- {more}");
+        }
+    }
+    if !merge.files.is_empty() {
+        let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
+        let _ok = writeln!(out, "\n## Files");
+        table(out, ["file", "from"], &rows, cap);
+    }
+}
+
+fn seams(out: &mut String, merge: &MergeReport, cap: usize) {
+    if merge.seams.is_empty() {
+        return;
+    }
+    let _ok = writeln!(out, "\n## Seams that do not fit\n\nNothing was written.");
+    for seam in merge.seams.iter().take(cap) {
+        let _ok = writeln!(out, "\n### {}", text(&sentence(&seam.message)));
+        let row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
+            [what.to_owned(), text_name(&part.donor), code(&name(&part.name)), shape(&part.shape), needed.map_or_else(String::new, shape)]
+        };
+        let tensor = seam.tensor.iter().map(|t| row("does not fit", t, seam.needed.as_deref()));
+        let rows: Vec<_> = tensor.chain(seam.meets.iter().map(|m| row("has to meet", m, None))).collect();
+        if !rows.is_empty() {
+            table(out, ["", "donor", "tensor", "shape", "needed"], &rows, cap);
+        }
+        if !seam.options.is_empty() {
+            let options: Vec<String> = seam.options.iter().take(cap).map(|o| code(&sentence(o))).collect();
+            let _ok = writeln!(out, "\nTry {}", options.join(" or "));
+        }
+    }
+    if let Some(more) = more(merge.seams.len(), cap) {
+        let _ok = writeln!(out, "\n{more}");
+    }
+}
+
+/// A table of at most `cap` rows; cells are Markdown already, but for pipes.
+fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N]], cap: usize) {
+    let _ok = writeln!(out, "\n| {} |\n|{}", header.join(" | "), " --- |".repeat(N));
+    for row in rows.iter().take(cap) {
+        let cells: Vec<String> = row.iter().map(|cell| cell.replace('|', "\\|")).collect();
+        let _ok = writeln!(out, "| {} |", cells.join(" | "));
+    }
+    if let Some(more) = more(rows.len(), cap) {
+        let _ok = writeln!(out, "\n{more}");
+    }
+}
+
+/// The last part of a path.
+fn last(path: &str) -> &str {
+    path.trim_end_matches('/').rsplit('/').next().unwrap_or(path)
+}
+
+fn text_name(raw: &str) -> String {
+    text(&name(raw))
+}
+
+/// Text that means only itself: every character Markdown or HTML could act on is escaped (pipes by [`table`]).
+fn text(plain: &str) -> String {
+    let mut out = String::with_capacity(plain.len());
+    let mut before = ' ';
+    let mut chars = plain.chars().peekable();
+    while let Some(c) = chars.next() {
+        match c {
+            // Within a word an underscore is only an underscore.
+            '_' if before.is_alphanumeric() && chars.peek().is_some_and(|c| c.is_alphanumeric()) => out.push(c),
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            // An at sign makes a mention.
+            '@' => out.push_str("&#64;"),
+            '\\' | '`' | '*' | '_' | '[' | ']' | '#' | '~' | '!' | '$' => out.extend(['\\', c]),
+            c => out.push(c),
+        }
+        before = c;
+    }
+    // A bare URL would become a link.
+    out.replace("://", ":&#8203;//").replace("www.", "www&#46;")
+}
+
+/// A code span of a text without line breaks.
+fn code(plain: &str) -> String {
+    let longest = plain.split(|c| c != '`').map(str::len).max().unwrap_or(0);
+    let fence = "`".repeat(longest.saturating_add(1));
+    let pad = if plain.starts_with('`') || plain.ends_with('`') || plain.is_empty() { " " } else { "" };
+    format!("{fence}{pad}{plain}{pad}{fence}")
+}

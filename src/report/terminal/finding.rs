@@ -1,0 +1,133 @@
+//! One finding, with the places it points at.
+
+use std::collections::BTreeSet;
+use std::ops::Range;
+
+use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer, Snippet};
+
+use super::super::excerpt::{cut, near};
+use super::super::model::CheckpointReport;
+use super::super::words::{evidence, fix, more, name, place, sentence, tensors};
+use super::super::Style;
+use crate::check::{Finding, Location, Severity};
+
+/// Most places shown for one finding.
+const PLACES: usize = 6;
+
+pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
+    let level = match finding.severity {
+        Severity::Error => Level::ERROR,
+        Severity::Warning => Level::WARNING,
+        Severity::Info => Level::INFO,
+    };
+    let title = level.primary_title(sentence(&finding.message)).id(name(&finding.code));
+    let mut group = Group::with_title(title);
+    let places = gather(&finding.locations, checkpoint);
+    let mut shown: Vec<Shown> = places.iter().take(PLACES).map(|one| show(one, checkpoint)).collect();
+    for one in &mut shown {
+        group = group.elements(one.elements.drain(..));
+    }
+    let note = |label: &'static str, text: String| Level::NOTE.with_name(label).message(text);
+    if let Some(more) = more(places.len(), PLACES) {
+        group = group.element(note("places", more));
+    }
+    for text in tensors(&finding.locations, PLACES) {
+        group = group.element(note("tensor", text));
+    }
+    group = group.element(note("rule", name(&finding.name)));
+    let figures = evidence(finding);
+    if !figures.is_empty() {
+        group = group.element(note("note", figures.join("; ")));
+    }
+    if let Some(hint) = &finding.fix {
+        group = group.element(Level::HELP.message(fix(hint)));
+    }
+    let renderer = if style.color { Renderer::styled() } else { Renderer::plain() };
+    let mut text = renderer.term_width(style.width.unwrap_or(140)).render(&[group]);
+    for (wrong, right) in shown.iter().filter_map(|one| one.column.as_ref()) {
+        text = text.replacen(wrong, right, 1);
+    }
+    // Without a line number to align with, arrows and notes would stand at the left margin.
+    if shown.iter().all(|one| !one.excerpt) { text.replace('\n', "\n ") } else { text }
+}
+
+/// One place: the locations that share an excerpt, or one location without any.
+struct Place<'a> {
+    locations: Vec<&'a Location>,
+    source: Option<&'a str>,
+}
+
+/// Locations in their order, neighbours in one file together, a file without a span once.
+fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<Place<'a>> {
+    let mut places: Vec<Place<'a>> = Vec::new();
+    let mut bare = BTreeSet::new();
+    for location in locations {
+        let Some(file) = location.file.as_deref() else { continue };
+        let source = checkpoint.sources.get(file).map(AsRef::as_ref).filter(|_| location.span.is_some());
+        if source.is_none() && !bare.insert((file, location.line, location.column, &location.pointer)) {
+            continue;
+        }
+        match places.last_mut() {
+            Some(place) if source.is_some() && place.source.is_some() && shares(place, location) => {
+                place.locations.push(location);
+            }
+            _ => places.push(Place { locations: vec![location], source }),
+        }
+    }
+    places
+}
+
+fn shares(place: &Place<'_>, location: &Location) -> bool {
+    let (Some(first), Some(last)) = (place.locations.first(), place.locations.last()) else { return false };
+    match (&first.span, &last.span, &location.span) {
+        (Some(a), Some(b), Some(c)) => first.file == location.file && near(a, c) && c.start >= b.start,
+        _ => false,
+    }
+}
+
+/// What a place comes to.
+struct Shown {
+    elements: Vec<Element<'static>>,
+    /// Whether an excerpt is among them.
+    excerpt: bool,
+    /// `path:line:column` as it will come out and as it has to be, where a line was cut at the left.
+    column: Option<(String, String)>,
+}
+
+fn show(place: &Place<'_>, checkpoint: &CheckpointReport) -> Shown {
+    let Some(first) = place.locations.first() else {
+        return Shown { elements: Vec::new(), excerpt: false, column: None };
+    };
+    let spans: Vec<Range<usize>> = place.locations.iter().filter_map(|l| l.span.clone()).collect();
+    let excerpt = place.source.and_then(|source| cut(source, &spans));
+    let line = first.line.or_else(|| place.source.zip(first.span.as_ref()).map(|(s, span)| line_of(s, span.start)));
+    let path = self::place(&checkpoint.path, Some(first));
+    let (Some(excerpt), Some(line)) = (excerpt, line) else {
+        let mut origin = Origin::path(path);
+        if let Some(line) = line {
+            origin = origin.line(line);
+        }
+        if let Some(column) = first.column {
+            origin = origin.char_column(column);
+        }
+        let mut elements = vec![Element::Origin(origin)];
+        let pointer = first.pointer.as_deref().filter(|p| !p.is_empty());
+        elements.extend(pointer.map(|p| Level::NOTE.with_name("at").message(name(p)).into()));
+        return Shown { elements, excerpt: false, column: None };
+    };
+    let column = first.column.filter(|_| excerpt.cut_left).zip(excerpt.marks.first()).map(|(column, mark)| {
+        let seen = excerpt.text.get(..mark.start).unwrap_or_default().chars().count();
+        (format!("{path}:{line}:{}", seen.saturating_add(1)), format!("{path}:{line}:{column}"))
+    });
+    let mut snippet = Snippet::source(excerpt.text).line_start(line).fold(false).path(path);
+    for (mark, location) in excerpt.marks.into_iter().zip(&place.locations) {
+        let label = location.pointer.as_deref().filter(|p| !p.is_empty()).map(name);
+        snippet = snippet.annotation(AnnotationKind::Primary.span(mark).label(label));
+    }
+    Shown { elements: vec![snippet.into()], excerpt: true, column }
+}
+
+fn line_of(source: &str, offset: usize) -> usize {
+    let before = source.as_bytes().iter().take(offset);
+    before.filter(|b| **b == b'\n').count().saturating_add(1)
+}

@@ -1,0 +1,66 @@
+//! The predicted load report: what the loader would say, and what it would not.
+
+use std::fmt::Write as _;
+
+use comfy_table::{ContentArrangement, Table, presets};
+
+use super::super::Style;
+use super::super::collapse::{Group, collapse};
+use super::super::words::{mismatched, more, name, silent};
+use super::paint::Paint;
+use crate::check::finding::LoadReport;
+
+pub fn render(out: &mut String, load: &LoadReport, style: Style) {
+    let paint = Paint(style.color);
+    let n = [load.missing.len(), load.unexpected.len(), load.mismatched.len(), load.silent.len()];
+    let line = format!("predicted load: {} missing, {} unexpected, {} mismatched, {} silent", n[0], n[1], n[2], n[3]);
+    if n == [0; 4] {
+        let _ok = writeln!(out, "  {}", paint.quiet(&line));
+        return;
+    }
+    let _ok = writeln!(out, "\n  {}", paint.strong(&line));
+    let names = |list: &[String]| collapse(list.iter().map(String::as_str));
+    list(out, "missing: the loader initialises them anew", &names(&load.missing), style);
+    list(out, "unexpected: the loader ignores them", &names(&load.unexpected), style);
+    if !load.mismatched.is_empty() {
+        let _ok = writeln!(out, "\n  mismatched: the load raises");
+        table(out, ["tensor", "stored", "expected"], &mismatched(load), style);
+    }
+    for (reason, groups) in silent(load) {
+        list(out, &format!("silent, reported by nobody: {reason}"), &groups, style);
+    }
+}
+
+fn list(out: &mut String, title: &str, groups: &[Group], style: Style) {
+    if groups.is_empty() {
+        return;
+    }
+    let _ok = writeln!(out, "\n  {title}");
+    for group in groups.iter().take(style.cap) {
+        let _ok = write!(out, "    {}", name(&group.pattern));
+        let _ok = if group.count > 1 { writeln!(out, "  ({})", group.count) } else { writeln!(out) };
+    }
+    if let Some(more) = more(groups.len(), style.cap) {
+        let _ok = writeln!(out, "    {more}");
+    }
+}
+
+/// A table of at most `style.cap` rows, two columns in from the left.
+pub fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N]], style: Style) {
+    const INDENT: usize = 2;
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_FULL_CONDENSED).set_header(header);
+    if let Some(width) = style.width {
+        table.set_content_arrangement(ContentArrangement::Dynamic);
+        table.set_width(u16::try_from(width.saturating_sub(INDENT)).unwrap_or(u16::MAX).max(40));
+    }
+    for row in rows.iter().take(style.cap) {
+        table.add_row(row);
+    }
+    for line in table.lines() {
+        let _ok = writeln!(out, "{:INDENT$}{line}", "");
+    }
+    if let Some(more) = more(rows.len(), style.cap) {
+        let _ok = writeln!(out, "    {more}");
+    }
+}

@@ -1,0 +1,99 @@
+//! What a merge planned and did.
+
+use std::fmt::Write as _;
+
+use super::super::Style;
+use super::super::model::{MergeReport, Seam, ShapedName};
+use super::super::words::{bytes, more, name, plural, sentence, shape};
+use super::load::table;
+use super::paint::Paint;
+
+pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
+    let paint = Paint(style.color);
+    let _ok = writeln!(out, "{} to {}", paint.strong(&format!("merge {}", name(&merge.recipe))), name(&merge.out));
+    for (role, path) in &merge.donors {
+        let _ok = writeln!(out, "  {:<10} {}", name(role), name(path));
+    }
+    if !merge.options.is_empty() {
+        let options: Vec<String> = merge.options.iter().map(|(k, v)| format!("{}={}", name(k), name(v))).collect();
+        let _ok = writeln!(out, "  {:<10} {}", "options", paint.quiet(&options.join(" ")));
+    }
+    stages(out, merge, style);
+    for seam in merge.seams.iter().take(style.cap) {
+        render_seam(out, seam, style);
+    }
+    list(out, "seams", merge.seams.len(), style, Vec::new());
+    changed(out, merge, style);
+    let dropped = merge.dropped.iter().map(|d| {
+        format!("{} of {}: {} ({})", plural(d.count, "tensor"), name(&d.donor), name(&d.pattern), sentence(&d.why))
+    });
+    list(out, "left behind", merge.dropped.len(), style, dropped.take(style.cap).collect());
+    let repairs = merge.repairs.iter().map(|r| sentence(r));
+    list(out, "repaired on the way", merge.repairs.len(), style, repairs.take(style.cap).collect());
+    if !merge.files.is_empty() {
+        let rows: Vec<_> = merge.files.iter().map(|f| [name(&f.name), sentence(&f.origin)]).collect();
+        let size = format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
+        let _ok = writeln!(out, "\n  {}: {size}", plural(merge.files.len(), "file"));
+        table(out, ["file", "from"], &rows, style);
+    }
+}
+
+fn stages(out: &mut String, merge: &MergeReport, style: Style) {
+    let widest = merge.stages.iter().map(|s| s.name.chars().count()).max().unwrap_or(0).min(24);
+    out.push('\n');
+    for (n, stage) in merge.stages.iter().enumerate().take(style.cap) {
+        let _ok = writeln!(out, "  {}. {:<widest$}  {}", n + 1, name(&stage.name), sentence(&stage.outcome));
+    }
+}
+
+fn render_seam(out: &mut String, seam: &Seam, style: Style) {
+    let paint = Paint(style.color);
+    let title = format!("{}: {}", paint.verdict("error", "error[seam]"), paint.strong(&sentence(&seam.message)));
+    let _ok = writeln!(out, "\n  {title}");
+    let mut rows = Vec::new();
+    let mut row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
+        rows.push([what.to_owned(), name(&part.donor), name(&part.name), shape(&part.shape), needed.map_or_else(String::new, shape)]);
+    };
+    if let Some(tensor) = &seam.tensor {
+        row("does not fit", tensor, seam.needed.as_deref());
+    }
+    if let Some(meets) = &seam.meets {
+        row("has to meet", meets, None);
+    }
+    if !rows.is_empty() {
+        table(out, ["", "donor", "tensor", "shape", "needed"], &rows, style);
+    }
+    for (n, option) in seam.options.iter().enumerate().take(style.cap) {
+        let word = if n == 0 { "help:" } else { "  or:" };
+        let _ok = writeln!(out, "  {} {}", paint.help(word), sentence(option));
+    }
+}
+
+fn changed(out: &mut String, merge: &MergeReport, style: Style) {
+    if merge.transforms.is_empty() {
+        return;
+    }
+    let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", name(how))).collect();
+    let _ok = writeln!(out, "\n  tensors: {}", how.join(", "));
+    if merge.changed.is_empty() {
+        return;
+    }
+    let rows: Vec<_> = merge
+        .changed
+        .iter()
+        .map(|c| [name(&c.name), sentence(&c.transform), c.from.as_deref().map_or_else(|| "new".to_owned(), shape), shape(&c.to)])
+        .collect();
+    table(out, ["not a copy", "how", "from", "to"], &rows, style);
+}
+
+fn list(out: &mut String, title: &str, total: usize, style: Style, shown: Vec<String>) {
+    if !shown.is_empty() {
+        let _ok = writeln!(out, "\n  {title}");
+    }
+    for line in shown {
+        let _ok = writeln!(out, "    {line}");
+    }
+    if let Some(more) = more(total, style.cap) {
+        let _ok = writeln!(out, "    {more} {title}");
+    }
+}

@@ -1,0 +1,59 @@
+//! The report for people at a terminal: source excerpts, tables, one verdict line at the end.
+
+mod finding;
+mod load;
+mod merge;
+mod paint;
+
+use std::fmt::Write as _;
+
+use self::paint::Paint;
+use super::Style;
+use super::model::{CheckpointReport, Report};
+use super::words::{bytes, capped, counts, name, plural, summary};
+
+pub fn render(report: &Report, style: Style) -> String {
+    let paint = Paint(style.color);
+    let mut out = String::new();
+    for checkpoint in &report.checkpoints {
+        header(&mut out, checkpoint, paint);
+        findings(&mut out, checkpoint, style);
+        if let Some(load) = &checkpoint.load {
+            load::render(&mut out, load, style);
+        }
+        out.push('\n');
+    }
+    if let Some(merge) = &report.merge {
+        merge::render(&mut out, merge, style);
+        out.push('\n');
+    }
+    let _ok = writeln!(out, "{}", paint.verdict(&report.summary.verdict, &summary(report)));
+    out
+}
+
+/// `fixtures/vision (donor vision): spatialvla, 690 tensors, 1.23 MB, clean`
+fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
+    out.push_str(&paint.strong(&name(&checkpoint.path)));
+    if let Some(role) = &checkpoint.role {
+        let _ok = write!(out, " ({})", name(role));
+    }
+    let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
+    let _ok = write!(out, ": {architecture}");
+    let (tensors, size) = checkpoint.tensors;
+    let _ok = write!(out, ", {}, {}", plural(tensors, "tensor"), bytes(size));
+    let found = counts(checkpoint.counts);
+    let verdict = if found.is_empty() { "clean" } else { &found };
+    let _ok = writeln!(out, ", {}", paint.verdict(&checkpoint.verdict, verdict));
+}
+
+fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
+    let (shown, hidden) = capped(&checkpoint.findings, style.cap);
+    for finding in shown {
+        out.push('\n');
+        out.push_str(&finding::render(finding, checkpoint, style));
+        out.push('\n');
+    }
+    for (code, n) in hidden {
+        let _ok = writeln!(out, "\nand {n} more {}", name(code));
+    }
+}

@@ -1,0 +1,39 @@
+//! Colours, or none.
+
+use annotate_snippets::renderer::{AnsiColor, Effects, Style};
+
+/// Paints text when it holds `true`.
+#[derive(Debug, Clone, Copy)]
+pub struct Paint(pub bool);
+
+impl Paint {
+    /// The subject of a section.
+    pub fn strong(self, text: &str) -> String {
+        self.with(Style::new().effects(Effects::BOLD), text)
+    }
+
+    /// What can be skipped.
+    pub fn quiet(self, text: &str) -> String {
+        self.with(Style::new().effects(Effects::DIMMED), text)
+    }
+
+    /// A way out.
+    pub fn help(self, text: &str) -> String {
+        self.with(AnsiColor::BrightCyan.on_default().effects(Effects::BOLD), text)
+    }
+
+    /// Text in the colour of a verdict: `clean`, `info`, `warning` or `error`.
+    pub fn verdict(self, verdict: &str, text: &str) -> String {
+        let color = match verdict {
+            "clean" => AnsiColor::Green,
+            "info" => AnsiColor::BrightBlue,
+            "warning" => AnsiColor::Yellow,
+            _ => AnsiColor::BrightRed,
+        };
+        self.with(color.on_default().effects(Effects::BOLD), text)
+    }
+
+    fn with(self, style: Style, text: &str) -> String {
+        if self.0 && !text.is_empty() { format!("{style}{text}{style:#}") } else { text.to_owned() }
+    }
+}

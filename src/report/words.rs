@@ -1,0 +1,229 @@
+//! Wording shared by the renderers: counts, sizes, shapes, evidence, and "and N more".
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use super::collapse::{Group, collapse};
+use super::escape::escape;
+use super::model::{Counts, Report};
+use crate::check::finding::LoadReport;
+use crate::check::{Finding, FixHint, Location};
+
+/// Longest name shown, in characters.
+const NAME: usize = 160;
+/// Longest sentence shown, in characters.
+const SENTENCE: usize = 1_000;
+/// Longest evidence value shown, in characters.
+const VALUE: usize = 200;
+/// Most evidence values shown for one finding.
+const VALUES: usize = 8;
+/// Most items shown of a list within evidence.
+const ITEMS: usize = 6;
+
+/// A name from a checkpoint, safe to show.
+pub fn name(text: &str) -> String {
+    escape(text, NAME)
+}
+
+/// A sentence that may quote a checkpoint, safe to show.
+pub fn sentence(text: &str) -> String {
+    escape(text, SENTENCE)
+}
+
+/// Whether a character steers a terminal, or hides or reorders text.
+pub fn hostile(c: char) -> bool {
+    c.is_control() || (!c.is_ascii() && !escape(c.encode_utf8(&mut [0; 4]), 1).starts_with(c))
+}
+
+/// `1 shard`, `2 shards`.
+pub fn plural(n: usize, noun: &str) -> String {
+    if n == 1 { format!("1 {noun}") } else { format!("{n} {noun}s") }
+}
+
+/// `2 errors, 1 warning, 3 info`; empty when there is nothing to count.
+pub fn counts(counts: Counts) -> String {
+    let mut parts = Vec::new();
+    if counts.error > 0 {
+        parts.push(plural(counts.error, "error"));
+    }
+    if counts.warning > 0 {
+        parts.push(plural(counts.warning, "warning"));
+    }
+    if counts.info > 0 {
+        parts.push(format!("{} info", counts.info));
+    }
+    parts.join(", ")
+}
+
+/// A size in decimal units, three digits: `8.06 GB`.
+pub fn bytes(n: u64) -> String {
+    const UNITS: [(&str, u64); 5] =
+        [("PB", 1_000_000_000_000_000), ("TB", 1_000_000_000_000), ("GB", 1_000_000_000), ("MB", 1_000_000), ("kB", 1_000)];
+    let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else {
+        return format!("{n} B");
+    };
+    let size = u128::from(size);
+    let hundredths = (u128::from(n) * 100 + size / 2) / size;
+    let (whole, rest) = (hundredths / 100, hundredths % 100);
+    if whole >= 100 {
+        format!("{whole} {unit}")
+    } else if whole >= 10 {
+        format!("{whole}.{} {unit}", rest / 10)
+    } else {
+        format!("{whole}.{rest:02} {unit}")
+    }
+}
+
+/// `[2304, 1152]`.
+pub fn shape(dims: &[u64]) -> String {
+    const DIMS: usize = 12;
+    let mut parts: Vec<String> = dims.iter().take(DIMS).map(u64::to_string).collect();
+    parts.extend(more(dims.len(), DIMS));
+    format!("[{}]", parts.join(", "))
+}
+
+/// `path/file`, or what there is of it.
+pub fn place(path: &str, location: Option<&Location>) -> String {
+    match location.and_then(|l| l.file.as_deref()) {
+        Some(file) if path.is_empty() || path == "." => name(file),
+        Some(file) => format!("{}/{}", name(path).trim_end_matches('/'), name(file)),
+        None => name(path),
+    }
+}
+
+/// The tensors among locations, numbered ones collapsed, at most `cap` lines and how many more.
+pub fn tensors(locations: &[Location], cap: usize) -> Vec<String> {
+    let groups = collapse(locations.iter().filter_map(|l| l.tensor.as_deref()));
+    let mut lines: Vec<String> = groups.iter().take(cap).map(|g| name(&g.pattern)).collect();
+    lines.extend(more(groups.len(), cap));
+    lines
+}
+
+/// Name pattern, stored and expected shape of the tensors that do not match; alike ones together.
+pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
+    let mut alike: BTreeMap<(&[u64], &[u64]), Vec<&str>> = BTreeMap::new();
+    for m in &load.mismatched {
+        alike.entry((&m.stored, &m.expected)).or_default().push(&m.name);
+    }
+    let rows = alike.into_iter().flat_map(|((stored, expected), names)| {
+        collapse(names).into_iter().map(move |g| [name(&g.pattern), shape(stored), shape(expected)])
+    });
+    rows.collect()
+}
+
+/// Silent tensors by reason, in words.
+pub fn silent(load: &LoadReport) -> Vec<(String, Vec<Group>)> {
+    let mut reasons: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for one in &load.silent {
+        reasons.entry(&one.reason).or_default().push(&one.name);
+    }
+    reasons.into_iter().map(|(reason, names)| (silence(reason), collapse(names))).collect()
+}
+
+/// Why a tensor loads wrong in silence, in words.
+fn silence(reason: &str) -> String {
+    match reason {
+        "indexed-but-absent" => "in the index and in no shard, so it stays random".to_owned(),
+        "prefix-hijack" => "one stray key with the base-model prefix, so every tensor is initialised anew".to_owned(),
+        "tied-over" => "tied to another tensor, which overwrites it".to_owned(),
+        other => name(other),
+    }
+}
+
+/// The verdict over everything, as one sentence without its full stop.
+pub fn summary(report: &Report) -> String {
+    let found = counts(report.summary.counts);
+    let checkpoints = plural(report.summary.checkpoints, "checkpoint");
+    let seams = report.merge.as_ref().map_or(0, |m| m.seams.len());
+    let verb = if seams == 1 { "does" } else { "do" };
+    let seam = format!("{} {verb} not fit, nothing was written", plural(seams, "seam"));
+    match (found.is_empty(), seams) {
+        (true, 0) => format!("All clean: {checkpoints}"),
+        (true, _) => seam,
+        (false, 0) => format!("Found {found} in {checkpoints}"),
+        (false, _) => format!("Found {found} in {checkpoints}; {seam}"),
+    }
+}
+
+/// What the message leaves unsaid: `key = value` for each piece of evidence whose value it does not quote.
+pub fn evidence(finding: &Finding) -> Vec<String> {
+    let mut unsaid: Vec<String> = finding
+        .evidence
+        .iter()
+        .map(|(key, v)| (key, value(v)))
+        .filter(|(_, text)| !quotes(&finding.message, text))
+        .map(|(key, text)| format!("{} = {text}", name(key)))
+        .collect();
+    let rest = more(unsaid.len(), VALUES);
+    unsaid.truncate(VALUES);
+    unsaid.extend(rest);
+    unsaid
+}
+
+/// The findings to show, at most `cap` of each code, and how many of which code are left out.
+pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, usize)>) {
+    let mut seen: BTreeMap<&str, usize> = BTreeMap::new();
+    let mut shown = Vec::new();
+    for finding in findings {
+        let n = seen.entry(&finding.code).or_default();
+        *n += 1;
+        if *n <= cap {
+            shown.push(finding);
+        }
+    }
+    let hidden = seen.into_iter().filter(|(_, n)| *n > cap).map(|(code, n)| (code, n - cap)).collect();
+    (shown, hidden)
+}
+
+/// `and 3 more`, when a list of `total` is cut at `cap`.
+pub fn more(total: usize, cap: usize) -> Option<String> {
+    total.checked_sub(cap).filter(|n| *n > 0).map(|n| format!("and {n} more"))
+}
+
+/// The step a fix proposes, with what kind of fix it is when it is not a manual one.
+pub fn fix(hint: &FixHint) -> String {
+    let title = sentence(&hint.title);
+    if hint.safety == "manual" { title } else { format!("{title} ({} fix)", name(&hint.safety)) }
+}
+
+fn value(v: &Value) -> String {
+    match v {
+        Value::String(s) => escape(s, VALUE),
+        Value::Array(items) => {
+            let mut parts: Vec<String> = items.iter().take(ITEMS).map(value).collect();
+            parts.extend(more(items.len(), ITEMS));
+            let text = parts.join(", ");
+            if items.iter().all(Value::is_string) { text } else { format!("[{text}]") }
+        }
+        other => escape(&other.to_string(), VALUE),
+    }
+}
+
+/// Whether `message` holds `text` as a word of its own.
+fn quotes(message: &str, text: &str) -> bool {
+    let joins = |c: Option<char>| c.is_some_and(|c| c.is_alphanumeric() || c == '_');
+    !text.is_empty()
+        && message.match_indices(text).any(|(at, _)| {
+            let (before, after) = message.split_at(at);
+            !joins(before.chars().next_back()) && !joins(after.strip_prefix(text).and_then(|rest| rest.chars().next()))
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{bytes, quotes};
+
+    #[test]
+    fn sizes_keep_three_digits() {
+        let shown: Vec<String> = [0, 999, 1_000, 12_345, 999_999, 8_055_709_462, u64::MAX].map(bytes).into();
+        assert_eq!(shown, ["0 B", "999 B", "1.00 kB", "12.3 kB", "1000 kB", "8.06 GB", "18446 PB"]);
+    }
+
+    #[test]
+    fn a_figure_inside_a_longer_one_is_not_quoted() {
+        assert!(quotes("7 heads do not divide 4096", "4096"));
+        assert!(!quotes("7 heads do not divide 4096", "40"));
+        assert!(!quotes("anything", ""));
+    }
+}
