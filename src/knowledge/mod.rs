@@ -1,8 +1,12 @@
 //! What should be: rules, architectures and recipes read from `rules/`, and their expressions.
 
+pub mod architecture;
 pub mod expression;
+pub mod library;
 pub mod processor;
 pub mod recipe;
 pub mod source;
 
+pub use architecture::{Architecture, Evidence, Expected, ExpectedTensor};
 pub use expression::{EvalError, Expression, Scope, Template};
+pub use library::Library;

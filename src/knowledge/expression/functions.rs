@@ -15,6 +15,7 @@ type Outcome = Result<Value, String>;
 /// Adds all functions to a root scope.
 pub(super) fn register(scope: &mut Scope<'static>) {
     scope.function("pow", pow);
+    scope.function("isqrt", isqrt);
     scope.function("sum", sum);
     scope.function("floor", |a| round(a, f64::floor));
     scope.function("ceil", |a| round(a, f64::ceil));
@@ -36,6 +37,14 @@ fn pow(arguments: &[Value]) -> Outcome {
     let (Some(base), Some(exponent)) = (base.as_i64(), exponent.as_u64()) else { return Err(usage()) };
     let exponent = u32::try_from(exponent).map_err(|_| usage())?;
     base.checked_pow(exponent).map(Value::from).ok_or_else(|| format!("{base}^{exponent} overflows"))
+}
+
+/// The whole part of an integer's square root.
+fn isqrt(arguments: &[Value]) -> Outcome {
+    match arguments {
+        [n] => n.as_i64().and_then(i64::checked_isqrt).map(Value::from).ok_or_else(|| format!("{n} has no square root")),
+        _ => Err("isqrt(n) takes one integer".to_owned()),
+    }
 }
 
 /// The sum of a list of integers, or of numbers when one is not an integer.

@@ -20,7 +20,7 @@ pub struct Scope<'p> {
 
 impl Scope<'static> {
     /// A root scope with the standard functions of CEL and those of the data files:
-    /// `pow sum floor ceil range min max get keys zpad glob`.
+    /// `pow isqrt sum floor ceil range min max get keys zpad glob`.
     #[must_use]
     pub fn new() -> Self {
         let mut scope = Self { context: Context::with_env(Arc::clone(&super::ENV)) };

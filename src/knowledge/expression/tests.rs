@@ -15,6 +15,7 @@ fn evaluates_to_json() {
         ("c.hidden % c.heads == 0 ? c.hidden / c.heads : -1", json!(288)),
         ("pow(2, c.heads) + sum(c.depths)", json!(263)),
         ("floor(c.rate * double(c.hidden)) + ceil(0.2)", json!(1153)),
+        ("isqrt(577 - 1)", json!(24)),
         ("get(c, 'none', 7) + get(c, 'absent', 8) + c.get('heads', 9)", json!(23)),
         ("get(c.none, 'x', 1)", json!(1)),
         ("keys(c.sub)", json!(["w", "x"])),
@@ -35,7 +36,7 @@ fn evaluates_to_json() {
 fn whatever_cannot_be_computed_is_an_error() {
     for source in [
         "c.hidden / c.zero", "c.hidden % c.zero", "c.min / -1", "c.min % -1", "-c.min", "c.min - 1", "pow(10, 30)", "pow(2, -1)",
-        "c.absent", "c.none.x", "nothing", "c.depths[2]", "c.depths[-1]", "c.names + 1", "floor(c.big)", "int(c.big)",
+        "c.absent", "c.none.x", "nothing", "c.depths[2]", "c.depths[-1]", "c.names + 1", "floor(c.big)", "isqrt(-1)", "int(c.big)",
         "range(100000000000)", "sum(c.names)", "sum([9223372036854775807, 1])", "zpad(1, 1000000)", "get(c)", "unknown_function(1)",
         "c.hidden * c.rate", "c['a']['b']", "9223372036854775807 * 2",
     ] {
