@@ -3,7 +3,11 @@
 #[path = "report/samples.rs"]
 mod samples;
 
+use ckpt_doctor::check::Location;
+use ckpt_doctor::check::finding::{LoadReport, Mismatch};
 use ckpt_doctor::report::{Format, Report, Style, render};
+
+use proptest::prelude::*;
 
 const PLAIN: Style = Style { color: false, width: Some(100), cap: 8 };
 
@@ -112,4 +116,34 @@ fn formats_are_spelled_as_they_are_read() {
         assert_eq!(format.to_string().parse(), Ok(format));
     }
     assert!("xml".parse::<Format>().is_err());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// Spans, names and sources come from files nobody vouches for: any of them renders, in bounds or not.
+    #[test]
+    fn whatever_a_checkpoint_holds_is_rendered(
+        source in "(\\PC|\\n|\\r|\\t|\u{1b}|字){0,200}",
+        spans in proptest::collection::vec((0_usize..700, 0_usize..300), 0..5),
+        names in proptest::collection::vec("(\\PC|\\.|[0-9]|字|\n){0,40}", 0..6),
+        width in 0_usize..90,
+        cap in 0_usize..4,
+    ) {
+        let mut report = samples::findings();
+        let checkpoint = &mut report.checkpoints[0];
+        checkpoint.sources.insert("config.json".to_owned(), source.as_str().into());
+        checkpoint.findings[0].locations = spans
+            .iter()
+            .map(|(start, len)| Location { file: Some("config.json".to_owned()), span: Some(*start..start + len), ..Location::default() })
+            .collect();
+        let mismatched = names.iter().map(|n| Mismatch { name: n.clone(), stored: vec![u64::MAX; 3], expected: vec![] }).collect();
+        checkpoint.load = Some(LoadReport { missing: names.clone(), unexpected: names, mismatched, silent: vec![] });
+        for format in Format::ALL {
+            for color in [false, true] {
+                let shown = render(&report, format, Style { color, width: Some(width), cap });
+                prop_assert!(shown.is_empty() || shown.ends_with('\n'));
+            }
+        }
+    }
 }

@@ -36,6 +36,25 @@ pub fn hostile(c: char) -> bool {
     c.is_control() || (!c.is_ascii() && !escape(c.encode_utf8(&mut [0; 4]), 1).starts_with(c))
 }
 
+/// Breaks text at spaces so that lines stay below `width` characters where words allow it.
+pub fn wrap(text: &str, width: Option<usize>) -> String {
+    let Some(width) = width else { return text.to_owned() };
+    let mut out = String::new();
+    let mut used: usize = 0;
+    for word in text.split(' ') {
+        let long = word.chars().count();
+        if used > 0 && used.saturating_add(long) >= width {
+            out.push('\n');
+            used = 0;
+        } else if !out.is_empty() {
+            out.push(' ');
+        }
+        out.push_str(word);
+        used = used.saturating_add(long).saturating_add(1);
+    }
+    out
+}
+
 /// `1 shard`, `2 shards`.
 pub fn plural(n: usize, noun: &str) -> String {
     if n == 1 { format!("1 {noun}") } else { format!("{n} {noun}s") }
@@ -212,7 +231,14 @@ fn quotes(message: &str, text: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{bytes, quotes};
+    use super::{bytes, quotes, wrap};
+
+    #[test]
+    fn lines_are_broken_at_spaces_alone() {
+        assert_eq!(wrap("one two three", Some(8)), "one two\nthree");
+        assert_eq!(wrap("incompressible a", Some(4)), "incompressible\na");
+        assert_eq!(wrap("one two three", None), "one two three");
+    }
 
     #[test]
     fn sizes_keep_three_digits() {

@@ -7,12 +7,14 @@ use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer,
 
 use super::super::excerpt::{cut, near};
 use super::super::model::CheckpointReport;
-use super::super::words::{evidence, fix, more, name, place, sentence, tensors};
+use super::super::words::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use super::super::Style;
 use crate::check::{Finding, Location, Severity};
 
 /// Most places shown for one finding.
 const PLACES: usize = 6;
+/// Columns that stand before the text of a note, with room for line numbers of four digits.
+const INDENT: usize = 16;
 
 pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
     let level = match finding.severity {
@@ -27,7 +29,8 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
     for one in &mut shown {
         group = group.elements(one.elements.drain(..));
     }
-    let note = |label: &'static str, text: String| Level::NOTE.with_name(label).message(text);
+    let width = style.width.map(|w| w.saturating_sub(INDENT));
+    let note = |label: &'static str, text: String| Level::NOTE.with_name(label).message(wrap(&text, width));
     if let Some(more) = more(places.len(), PLACES) {
         group = group.element(note("places", more));
     }
@@ -40,7 +43,7 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
         group = group.element(note("note", figures.join("; ")));
     }
     if let Some(hint) = &finding.fix {
-        group = group.element(Level::HELP.message(fix(hint)));
+        group = group.element(Level::HELP.message(wrap(&fix(hint), width)));
     }
     let renderer = if style.color { Renderer::styled() } else { Renderer::plain() };
     let mut text = renderer.term_width(style.width.unwrap_or(140)).render(&[group]);
