@@ -1,0 +1,177 @@
+#!/usr/bin/env python3
+"""Every combination of the options of spatialvla-llava3d: what must stop stops, what must load loads.
+
+    merge_matrix.py [VISION LANGUAGE [CODE]]
+
+The donors are the fixture's unless given; CODE is a directory to take SpatialVLA's Python modules from.
+"""
+
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+from peer import DONORS, SHARED, Tally, check, doctor, quiet, workplace
+
+OPTIONS = {
+    "projector": ("pad", "reinit", "keep"),
+    "spatial": ("off", "pad"),
+    "zoe": ("on", "off"),
+    "rows": ("grow", "keep"),
+    "tokenizer": ("plain", "baked"),
+    "layout": ("upstream", "wrapped"),
+}
+MODULES = ("configuration_spatialvla", "modeling_spatialvla", "modeling_gemma2", "processing_spatialvla", "action_tokenizer")
+
+
+def blame(choice):
+    """The options a refusal may name; none means that the merge must succeed."""
+    found = []
+    if choice["projector"] == "keep":
+        found.append("projector")
+    if choice["rows"] == "keep":
+        found.append("rows")
+    if choice["layout"] == "wrapped" and (choice["spatial"] == "pad" or choice["zoe"] == "on"):
+        found.append("layout")
+    return found
+
+
+def build(donors, out, settings):
+    vision, language, *code = donors
+    words = ["build-merged", "--recipe", "spatialvla-llava3d", "--vision", vision, "--language", language, "--out", out]
+    words += [w for d in code for w in ("--donor", f"code={d}")]
+    words += [w for name, value in settings.items() for w in ("--set", f"{name}={value}")]
+    return doctor(*words)
+
+
+def faults_on_loading(directory):
+    """Open a merged directory the way a user does; what is wrong with it, in words."""
+    import numpy
+    import torch
+    from PIL import Image
+    from transformers import AutoConfig, AutoModel, AutoProcessor, PreTrainedModel
+    from transformers.dynamic_module_utils import get_class_from_dynamic_module
+
+    path, wrong = str(directory), []
+    config = AutoConfig.from_pretrained(path, trust_remote_code=True)
+    cls = get_class_from_dynamic_module(config.auto_map["AutoModel"], path)
+    # SpatialVLA's own from_pretrained cannot hand the loading report through.
+    _, info = PreTrainedModel.from_pretrained.__func__(cls, path, config=config, output_loading_info=True)
+    wrong += [f"{kind} {names[:3]} of {len(names)}" for kind, names in info.items() if names]
+
+    model = AutoModel.from_pretrained(path, trust_remote_code=True).eval()
+    processor = AutoProcessor.from_pretrained(path, trust_remote_code=True)
+    tokenizer, actions = processor.tokenizer, processor.action_tokenizer
+    embedding, head = model.get_input_embeddings().weight, model.get_output_embeddings().weight
+    rows, text, last = len(embedding), config.text_config, actions.action_token_begin_idx + actions.vocab_size
+    for what, got, want in (
+        ("id of <image>", config.image_token_index, processor.image_token_id),
+        ("first action", config.action_token_begin_idx, actions.action_token_begin_idx),
+        ("number of actions", config.spatial_token_num, actions.vocab_size),
+        ("id of padding", config.pad_token_id, tokenizer.pad_token_id),
+        ("end of text", config.eos_token_id, tokenizer.eos_token_id),
+        ("vocab_size", text.vocab_size, rows),
+        ("rows of the head", len(head), rows),
+        ("tokens", len(tokenizer), rows),
+        ("end of the actions", last, rows),
+        ("kind of tokenizer", type(tokenizer).__name__, "LlamaTokenizerFast"),
+        ("one matrix for both ends", head.data_ptr() == embedding.data_ptr(), text.tie_word_embeddings),
+    ):
+        if got != want:
+            wrong.append(f"{what}: {got}, not {want}")
+
+    side = processor.image_processor.size["height"]
+    pixels = numpy.random.default_rng(0).integers(0, 255, (side, side, 3), dtype=numpy.uint8)
+    inputs = processor(images=[Image.fromarray(pixels)], text="pick the red cup", return_tensors="pt")
+    with torch.no_grad():
+        logits = model(**inputs).logits
+        made = model.generate(**inputs, max_new_tokens=2, do_sample=False)
+    if not torch.isfinite(logits).all() or logits.shape[-1] != rows:
+        wrong.append(f"logits: {list(logits.shape)}, finite: {bool(torch.isfinite(logits).all())}")
+    if made.shape[1] <= inputs["input_ids"].shape[1]:
+        wrong.append("generate made nothing")
+    return wrong
+
+
+def second_opinion(directory):
+    """The workplace's own loader script, where there is one."""
+    script = SHARED / "tools" / "load_merged.py"
+    if not script.exists():
+        return None
+    done = subprocess.run([sys.executable, script, directory, "--generate"], capture_output=True, text=True, timeout=120)
+    verdict = json.loads(done.stdout.splitlines()[-1])
+    return [] if verdict["ok"] else [f"load_merged.py: {verdict}"]
+
+
+def judge(tally, what, out):
+    """A merge that was written: `check` is content, and so is the loader."""
+    entry, code = check(out)
+    entry = next(iter(entry.values()))
+    ok = tally.expect(code == 0 and entry["verdict"] in ("clean", "info"), f"{what}: check says {entry['verdict']}, exit {code}",
+                      json.dumps(entry["findings"])[:1500])
+    try:
+        wrong = faults_on_loading(out)
+    except Exception as error:  # a merged directory may break the loader in any way
+        wrong = [f"{type(error).__name__}: {error}"]
+    ok &= tally.equal(wrong, [], f"{what}: loading")
+    other = second_opinion(out)
+    if other is not None:
+        ok &= tally.equal(other, [], f"{what}: second opinion")
+    return ok
+
+
+def forwarded(tally, donors, work, out):
+    """alias=forward: no donor modules in the output, the classes come from an installed package."""
+    package = work / "site" / "spatialvla_here"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    for name in MODULES:
+        shutil.copy(Path(donors[2 if len(donors) > 2 else 0]) / f"{name}.py", package)
+    sys.path.insert(0, str(package.parent))
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(package.parent), os.environ.get("PYTHONPATH"))))
+    code, stdout, stderr = build(donors, out, {"alias": f"forward:{package.name}"})
+    if tally.expect(code == 0, f"forward: exit {code}", (stdout + stderr)[-1500:]):
+        left = sorted(p.stem for p in out.glob("*.py") if p.stem in MODULES)
+        tally.equal(left, [], "forward: donor modules in the output")
+        judge(tally, "forward", out)
+
+
+def main():
+    donors = sys.argv[1:] or [DONORS / "spatialvla-tiny", DONORS / "llava3d-tiny"]
+    if len(donors) not in (2, 3):
+        sys.exit(__doc__)
+    tally, table = Tally(), []
+    with workplace() as work:
+        quiet()
+        for number, values in enumerate(itertools.product(*OPTIONS.values())):
+            choice, out = dict(zip(OPTIONS, values)), work / f"merged{number:02}"
+            what = " ".join(f"{k}={v}" for k, v in choice.items())
+            to_blame = blame(choice)
+            code, stdout, stderr = build(donors, out, choice)
+            said = (stdout + stderr)[-1500:]
+            if to_blame:
+                ok = tally.equal(code, 1, f"{what}: exit code")
+                ok &= tally.expect(not out.exists(), f"{what}: refused, and yet something was written")
+                ok &= tally.expect(any(f"{name}=" in stdout + stderr for name in to_blame),
+                                   f"{what}: the refusal names no setting of {to_blame}", said)
+                result = "stops" if ok else "WRONG"
+            else:
+                ok = tally.expect(code == 0, f"{what}: exit {code}", said) and judge(tally, what, out)
+                result = "loads" if ok else "WRONG"
+            table.append((*values, result))
+            shutil.rmtree(out, ignore_errors=True)
+        forwarded(tally, donors, work, work / "forwarded")
+        tally.equal([p.name for p in work.iterdir() if p.name.startswith(".")], [], "left behind beside the outputs")
+    widths = [max(map(len, column)) for column in zip(OPTIONS, *(row[:-1] for row in table))]
+    for row in [(*OPTIONS, "result"), *table]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 6))))
+    print(dict(Counter(row[-1] for row in table)))
+    tally.finish()
+
+
+if __name__ == "__main__":
+    main()
