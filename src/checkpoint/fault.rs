@@ -1,5 +1,6 @@
 //! A fault is something observed to be wrong in a file, before any rule has judged it.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use serde_json::{Map, Value};
@@ -85,5 +86,110 @@ impl Place {
     pub fn in_tensor(mut self, tensor: impl Into<String>) -> Self {
         self.tensor = Some(tensor.into());
         self
+    }
+}
+
+/// Every kind of fault this room can produce, sorted. Rules name kinds from this list.
+pub const FAULT_KINDS: &[&str] = &[
+    "appended-section",
+    "byte-order-mark",
+    "comment-in-json",
+    "dangling-symlink",
+    "data-hole",
+    "duplicate-header-key",
+    "duplicate-index-key",
+    "duplicate-json-key",
+    "empty-document",
+    "empty-file",
+    "entry-malformed",
+    "file-too-large",
+    "file-too-short",
+    "header-length-out-of-range",
+    "header-not-json",
+    "header-not-utf8",
+    "header-padding-not-spaces",
+    "header-too-deep",
+    "header-too-large",
+    "html-instead",
+    "huge-number",
+    "index-metadata-missing",
+    "index-unsafe-path",
+    "invalid-utf8",
+    "json-syntax",
+    "json-too-deep",
+    "json-too-many-values",
+    "lfs-pointer",
+    "lone-surrogate",
+    "merge-conflict-marker",
+    "metadata-not-strings",
+    "metadata-null",
+    "missing-comma",
+    "no-format-metadata",
+    "non-finite-number",
+    "not-a-regular-file",
+    "not-an-object",
+    "not-safetensors",
+    "nul-bytes",
+    "odd-tensor-name",
+    "offsets-out-of-order",
+    "partial-download",
+    "python-syntax",
+    "python-too-complex",
+    "shape-byte-mismatch",
+    "shape-overflow",
+    "shard-truncated",
+    "single-quoted-string",
+    "sub-byte-misaligned",
+    "symlink-loop",
+    "symlink-outside",
+    "tensors-overlap",
+    "total-size-malformed",
+    "trailing-bytes",
+    "trailing-comma",
+    "trailing-content",
+    "unknown-dtype",
+    "unreadable-file",
+    "vocabulary-malformed",
+    "weight-map-malformed",
+    "weight-map-missing",
+    "wrong-encoding",
+];
+
+/// How many faults of one kind one file may have before the rest are only counted.
+pub(crate) const KIND_CAP: usize = 64;
+
+/// Non-finite numbers are repaired one by one, so far more of them are kept.
+const NON_FINITE_CAP: usize = 4096;
+
+/// Collects the faults of one file, keeping at most a set number of each kind.
+#[derive(Debug, Default)]
+pub(crate) struct Faults {
+    list: Vec<Fault>,
+    /// How many of each kind were seen, and where the last one kept stands in `list`.
+    seen: BTreeMap<&'static str, (usize, usize)>,
+}
+
+impl Faults {
+    /// Adds a fault, or only counts it when there are enough of its kind.
+    pub(crate) fn push(&mut self, fault: Fault) {
+        let cap = if fault.kind == "non-finite-number" { NON_FINITE_CAP } else { KIND_CAP };
+        let (count, last) = self.seen.entry(fault.kind).or_insert((0, 0));
+        *count = count.saturating_add(1);
+        if *count <= cap {
+            *last = self.list.len();
+            self.list.push(fault);
+        }
+    }
+
+    /// The faults kept; the last of a kind that had too many says how many `more` there were.
+    pub(crate) fn into_vec(mut self) -> Vec<Fault> {
+        for (kind, (count, last)) in &self.seen {
+            let cap = if *kind == "non-finite-number" { NON_FINITE_CAP } else { KIND_CAP };
+            let more = count.saturating_sub(cap);
+            if more > 0 && let Some(fault) = self.list.get_mut(*last) {
+                fault.detail.insert("more".to_owned(), more.into());
+            }
+        }
+        self.list
     }
 }

@@ -3,8 +3,194 @@
 //! Bad content is never an error here. A broken `config.json` is a [`Document`] with faults and no
 //! tree; a broken shard is a [`Shard`] with faults and whatever entries could be read.
 
-pub mod fault;
-pub mod shard;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-pub use fault::{Fault, Place};
+use serde_json::Value;
+
+mod discover;
+pub mod document;
+pub mod fault;
+pub mod index;
+mod lfs;
+pub mod module;
+pub mod open;
+mod read;
+mod scan;
+pub mod shard;
+mod sniff;
+pub mod text;
+pub mod tokenizer;
+
+pub use discover::find_checkpoints;
+pub use document::Document;
+pub use fault::{FAULT_KINDS, Fault, Place};
+pub use index::{INDEX_NAME, Index};
+pub use lfs::LfsPointer;
+pub use module::Module;
+pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
+pub use sniff::looks_like;
+pub use text::{escape, line_column};
+pub use tokenizer::{Tokenizer, Vocabulary};
+
+/// A directory entry, and what it turned out to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum EntryKind {
+    /// A regular file.
+    #[default]
+    Regular,
+    /// A directory.
+    Directory,
+    /// A FIFO, which would hang a reader.
+    Fifo,
+    /// A socket.
+    Socket,
+    /// A device.
+    Device,
+    /// A symbolic link that leads nowhere, or in a circle; or nothing the system tells about.
+    Broken,
+}
+
+/// One entry of a checkpoint directory.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Entry {
+    /// What it is, after following symbolic links.
+    pub kind: EntryKind,
+    /// Bytes in the file, after following symbolic links; 0 for anything but a file.
+    pub size: u64,
+    /// What the symbolic link says, if it is one.
+    pub link: Option<String>,
+    /// The pointer, if the file is one.
+    pub lfs: Option<LfsPointer>,
+}
+
+/// A model directory: everything a rule can ask about, and no tensor bytes.
+#[derive(Debug, Clone, Default)]
+pub struct Checkpoint {
+    /// The directory.
+    pub root: PathBuf,
+    /// Everything directly in it that is not hidden, by name.
+    pub entries: BTreeMap<String, Entry>,
+    /// JSON documents, by file name.
+    pub documents: BTreeMap<String, Document>,
+    /// Safetensors shards, by file name; those on disk, whether an index names them or not.
+    pub shards: BTreeMap<String, Shard>,
+    /// The index, if there is one.
+    pub index: Option<Index>,
+    /// Python modules, by file name.
+    pub modules: BTreeMap<String, Module>,
+    /// The tokenizer.
+    pub tokenizer: Tokenizer,
+    /// Faults of the directory itself; [`Checkpoint::all_faults`] has those of its parts too.
+    pub faults: Vec<Fault>,
+}
+
+/// What a checkpoint that does not exist yet will consist of.
+#[derive(Debug, Clone, Default)]
+pub struct Parts {
+    /// JSON documents.
+    pub documents: Vec<Document>,
+    /// Shards.
+    pub shards: Vec<Shard>,
+    /// Python modules.
+    pub modules: Vec<Module>,
+    /// Vocabularies that no document holds, by file name (`tokenizer.model`); a donor's
+    /// [`Tokenizer::vocabularies`] can be passed on as they are.
+    pub vocabularies: BTreeMap<String, Arc<Vocabulary>>,
+    /// Other files, and sizes where they matter; files named above need no entry.
+    pub entries: BTreeMap<String, Entry>,
+}
+
+impl Checkpoint {
+    /// Reads a checkpoint directory.
+    ///
+    /// # Errors
+    /// When the directory itself cannot be read. Nothing in it can make this fail.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
+        read::open(path.as_ref())
+    }
+
+    /// A checkpoint that is not on disk yet, so that the same checks judge it as if it were.
+    #[must_use]
+    pub fn planned(root: impl Into<PathBuf>, parts: Parts) -> Self {
+        let Parts { documents, shards, modules, vocabularies, mut entries } = parts;
+        let mut entry = |name: &str, size: Option<usize>| {
+            let size = size.and_then(|s| u64::try_from(s).ok()).unwrap_or(0);
+            entries.entry(name.to_owned()).or_insert(Entry { size, ..Entry::default() });
+        };
+        documents.iter().for_each(|d| entry(&d.name, d.text.as_ref().map(|t| t.len())));
+        modules.iter().for_each(|m| entry(&m.name, m.text.as_ref().map(|t| t.len())));
+        shards.iter().for_each(|s| entry(&s.name, usize::try_from(s.file_len).ok()));
+        vocabularies.keys().for_each(|name| entry(name, None));
+        let mut checkpoint = Self {
+            root: root.into(),
+            entries,
+            documents: documents.into_iter().map(|d| (d.name.clone(), d)).collect(),
+            shards: shards.into_iter().map(|s| (s.name.clone(), s)).collect(),
+            modules: modules.into_iter().map(|m| (m.name.clone(), m)).collect(),
+            ..Self::default()
+        };
+        checkpoint.derive(vocabularies);
+        checkpoint
+    }
+
+    /// Derives index and tokenizer from the documents.
+    fn derive(&mut self, vocabularies: BTreeMap<String, Arc<Vocabulary>>) {
+        let files = tokenizer::VOCABULARY_FILES.into_iter().filter(|f| self.has_file(f)).map(str::to_owned).collect();
+        self.tokenizer = Tokenizer::of(&self.documents, vocabularies, files);
+        let name = if self.documents.contains_key(INDEX_NAME) {
+            Some(INDEX_NAME.to_owned())
+        } else {
+            self.documents.keys().find(|name| Index::is_index(name)).cloned()
+        };
+        if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
+            self.index = Some(Index::of(document));
+            // The index reports these itself, under a kind of its own.
+            document.faults.retain(|f| f.kind != "duplicate-json-key");
+        }
+    }
+
+    /// The value of `config.json`.
+    #[must_use]
+    pub fn config(&self) -> Option<&Value> {
+        self.documents.get("config.json")?.value.as_ref()
+    }
+
+    /// The document of this file name.
+    #[must_use]
+    pub fn document(&self, name: &str) -> Option<&Document> {
+        self.documents.get(name)
+    }
+
+    /// Whether there is a file of this name, of any kind but a directory or a broken link.
+    #[must_use]
+    pub fn has_file(&self, name: &str) -> bool {
+        self.entries.get(name).is_some_and(|e| !matches!(e.kind, EntryKind::Directory | EntryKind::Broken))
+    }
+
+    /// Every tensor of every shard, in the order of shard names and headers.
+    pub fn tensors(&self) -> impl Iterator<Item = (&Shard, &Tensor)> {
+        self.shards.values().flat_map(|shard| shard.tensors.iter().map(move |tensor| (shard, tensor)))
+    }
+
+    /// The tensor of this name: from the shard the index names, or else the first that has it.
+    ///
+    /// Looks through headers; to look up many names, collect [`Checkpoint::tensors`] once.
+    #[must_use]
+    pub fn tensor(&self, name: &str) -> Option<(&Shard, &Tensor)> {
+        let mapped = self.index.as_ref().and_then(|i| self.shards.get(i.weight_map.get(name)?));
+        let of = |shard: &'_ Shard| shard.tensors.iter().position(|t| t.name == name);
+        mapped.into_iter().chain(self.shards.values()).find_map(|s| Some((s, s.tensors.get(of(s)?)?)))
+    }
+
+    /// Faults of the directory and of everything in it, by file name within each kind of part.
+    pub fn all_faults(&self) -> impl Iterator<Item = &Fault> {
+        let documents = self.documents.values().flat_map(|d| &d.faults);
+        let index = self.index.iter().flat_map(|i| &i.faults);
+        let shards = self.shards.values().flat_map(|s| &s.faults);
+        let modules = self.modules.values().flat_map(|m| &m.faults);
+        self.faults.iter().chain(documents).chain(index).chain(shards).chain(modules).chain(&self.tokenizer.faults)
+    }
+}

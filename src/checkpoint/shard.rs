@@ -1,67 +1,22 @@
 //! A safetensors shard: its header entries, never its bytes.
+//!
+//! The header reader is our own: the `safetensors` crate stops at the first fault, accepts two tensors
+//! of one name, and panics on a crafted file when overflow checks are on.
 
 use std::collections::BTreeMap;
-use std::fmt;
+use std::path::Path;
 
-use super::Fault;
+use super::{Fault, Place};
 
-/// Element types of the safetensors format, as of safetensors 0.8 (22 of them).
-///
-/// Source: `safetensors::Dtype` in safetensors 0.8.0.
-#[allow(non_camel_case_types, reason = "the names are the format's own spelling")]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Dtype {
-    BOOL, F4, F6_E2M3, F6_E3M2, U8, I8, F8_E5M2, F8_E4M3, F8_E8M0, F8_E4M3FNUZ, F8_E5M2FNUZ,
-    I16, U16, F16, BF16, I32, U32, F32, C64, F64, I64, U64,
-}
+mod dtype;
+mod header;
+mod layout;
+mod read;
 
-impl Dtype {
-    /// All element types, in the format's alignment order (narrowest first).
-    pub const ALL: [Self; 22] = [
-        Self::BOOL, Self::F4, Self::F6_E2M3, Self::F6_E3M2, Self::U8, Self::I8, Self::F8_E5M2, Self::F8_E4M3,
-        Self::F8_E8M0, Self::F8_E4M3FNUZ, Self::F8_E5M2FNUZ, Self::I16, Self::U16, Self::F16, Self::BF16,
-        Self::I32, Self::U32, Self::F32, Self::C64, Self::F64, Self::I64, Self::U64,
-    ];
+pub use dtype::{Dtype, byte_len};
 
-    /// Width of one element in bits; sub-byte types are narrower than eight.
-    #[must_use]
-    pub const fn bits(self) -> u64 {
-        match self {
-            Self::F4 => 4,
-            Self::F6_E2M3 | Self::F6_E3M2 => 6,
-            Self::BOOL | Self::U8 | Self::I8 | Self::F8_E5M2 | Self::F8_E4M3 | Self::F8_E8M0
-            | Self::F8_E4M3FNUZ | Self::F8_E5M2FNUZ => 8,
-            Self::I16 | Self::U16 | Self::F16 | Self::BF16 => 16,
-            Self::I32 | Self::U32 | Self::F32 => 32,
-            Self::C64 | Self::F64 | Self::I64 | Self::U64 => 64,
-        }
-    }
-
-    /// The type of this spelling; the format is case-sensitive.
-    #[must_use]
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|d| d.name() == name)
-    }
-
-    /// The format's spelling.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::BOOL => "BOOL", Self::F4 => "F4", Self::F6_E2M3 => "F6_E2M3", Self::F6_E3M2 => "F6_E3M2",
-            Self::U8 => "U8", Self::I8 => "I8", Self::F8_E5M2 => "F8_E5M2", Self::F8_E4M3 => "F8_E4M3",
-            Self::F8_E8M0 => "F8_E8M0", Self::F8_E4M3FNUZ => "F8_E4M3FNUZ", Self::F8_E5M2FNUZ => "F8_E5M2FNUZ",
-            Self::I16 => "I16", Self::U16 => "U16", Self::F16 => "F16", Self::BF16 => "BF16",
-            Self::I32 => "I32", Self::U32 => "U32", Self::F32 => "F32", Self::C64 => "C64",
-            Self::F64 => "F64", Self::I64 => "I64", Self::U64 => "U64",
-        }
-    }
-}
-
-impl fmt::Display for Dtype {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
+/// Longest header the format allows, in bytes. Source: `MAX_HEADER_SIZE` in safetensors 0.8.0.
+pub const MAX_HEADER: u64 = 100_000_000;
 
 /// One header entry: a tensor's type, shape and byte range.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -92,14 +47,6 @@ impl Tensor {
     }
 }
 
-/// Bytes that `shape` elements of `dtype` take; `None` when the product overflows or does not end on a byte.
-#[must_use]
-pub fn byte_len(dtype: Dtype, shape: &[u64]) -> Option<u64> {
-    let elements = shape.iter().try_fold(1_u64, |n, d| n.checked_mul(*d))?;
-    let bits = elements.checked_mul(dtype.bits())?;
-    bits.is_multiple_of(8).then_some(bits / 8)
-}
-
 /// One safetensors file: what its header says, and what is wrong with it.
 #[derive(Debug, Clone, Default)]
 pub struct Shard {
@@ -113,8 +60,49 @@ pub struct Shard {
     pub tensors: Vec<Tensor>,
     /// `__metadata__`; `None` when the header has none.
     pub metadata: Option<BTreeMap<String, String>>,
+    /// The header could not be read to its end, so nothing follows from a tensor not being in it.
+    pub unread: bool,
+    /// Names of entries that are in the header but too malformed to be in `tensors`.
+    pub unreadable: Vec<String>,
     /// SHA-256 of the first `data_start` bytes, in hexadecimal; empty for a planned shard.
     pub header_sha256: String,
     /// Faults of the container.
     pub faults: Vec<Fault>,
+}
+
+impl Shard {
+    /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: what is
+    /// wrong becomes a fault.
+    #[must_use]
+    pub fn read(dir: &Path, name: &str) -> Self {
+        read::read(dir, name)
+    }
+
+    /// Reads a header from the first bytes of a file of `file_len` bytes.
+    ///
+    /// `head` must hold the length field and the header it states, if the file does; of a file that
+    /// is no safetensors file the first few hundred bytes tell what it is.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
+        let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
+        header::parse(shard, head)
+    }
+
+    /// A shard that could not be read at all.
+    #[must_use]
+    pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
+        Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
+    }
+
+    /// The entry of this name.
+    #[must_use]
+    pub fn tensor(&self, name: &str) -> Option<&Tensor> {
+        self.tensors.iter().find(|t| t.name == name)
+    }
+
+    /// The place that is this whole file.
+    #[must_use]
+    pub fn place(&self) -> Place {
+        Place::file(self.name.clone())
+    }
 }

@@ -1,0 +1,60 @@
+//! Finds the checkpoints that a path given by the user means.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// How many folders deep checkpoints are searched for.
+const MAX_DEPTH: usize = 6;
+
+/// The checkpoint directories at or below `path`, sorted.
+///
+/// A file means the checkpoint that owns it. A directory that is a checkpoint is the answer itself, and
+/// folders inside it (`checkpoint-500`, ONNX copies) are not searched; any other directory is searched
+/// to a depth of six. Hidden folders and links to folders are not followed. A path that does not
+/// exist comes back as it is, so that opening it says so.
+#[must_use]
+pub fn find_checkpoints(path: &Path) -> Vec<PathBuf> {
+    if path.is_dir() {
+        let mut found = Vec::new();
+        search(path, MAX_DEPTH, &mut found);
+        found.sort();
+        return found;
+    }
+    if path.exists() {
+        let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+        return vec![parent.to_owned()];
+    }
+    vec![path.to_owned()]
+}
+
+fn search(dir: &Path, depth: usize, found: &mut Vec<PathBuf>) {
+    let Ok(entries) = fs::read_dir(dir) else { return };
+    let mut folders = Vec::new();
+    for entry in entries.flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        let is_folder = entry.file_type().is_ok_and(|t| t.is_dir());
+        if !is_folder && marks_checkpoint(&name) {
+            found.push(dir.to_owned());
+            return;
+        }
+        if is_folder && !name.starts_with('.') {
+            folders.push(entry.path());
+        }
+    }
+    if let Some(depth) = depth.checked_sub(1) {
+        for folder in folders {
+            search(&folder, depth, found);
+        }
+    }
+}
+
+/// Whether a file of this name makes its directory a checkpoint.
+fn marks_checkpoint(name: &str) -> bool {
+    !name.starts_with('.')
+        && (name == "config.json"
+            || name == "adapter_config.json"
+            || name.ends_with(".safetensors")
+            || name.ends_with(".safetensors.index.json")
+            || name == "pytorch_model.bin.index.json")
+}

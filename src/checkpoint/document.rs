@@ -1,0 +1,130 @@
+//! A JSON document: its text, its value, and what is wrong with it.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use serde_json::Value;
+
+use super::Fault;
+use super::scan::{Scanner, Token};
+use super::text::pointer_steps;
+
+mod encoding;
+mod explain;
+mod read;
+
+pub use super::text::line_column;
+
+/// A JSON file of a checkpoint.
+#[derive(Debug, Clone, Default)]
+pub struct Document {
+    /// File name within the checkpoint.
+    pub name: String,
+    /// The file's text, byte for byte; `None` when the file is not UTF-8, so that every span in
+    /// this document counts bytes of the file.
+    pub text: Option<Arc<str>>,
+    /// What the text says. Non-finite and huge numbers are null here; of equal keys the last counts.
+    /// `None` when the text could not be understood to its end: then nothing follows from a key
+    /// not being there.
+    pub value: Option<Value>,
+    /// JSON pointers of large parts that `value` leaves out because [`super::Tokenizer`] holds them
+    /// in less space; the parts were read, and their faults are here.
+    pub left_out: Vec<&'static str>,
+    /// Faults of the document.
+    pub faults: Vec<Fault>,
+}
+
+impl Document {
+    /// Reads a document. Never fails: what is wrong becomes a fault.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
+        read::parse(name.into(), bytes)
+    }
+
+    /// A document that is to be written: two spaces of indent and a final line break, as Hugging Face
+    /// libraries write theirs.
+    #[must_use]
+    pub fn from_value(name: impl Into<String>, value: Value) -> Self {
+        let mut text = serde_json::to_string_pretty(&value).unwrap_or_default();
+        text.push('\n');
+        Self { name: name.into(), text: Some(text.into()), value: Some(value), ..Self::default() }
+    }
+
+    /// A document that could not be read at all.
+    #[must_use]
+    pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
+        Self { name: name.into(), faults: vec![fault], ..Self::default() }
+    }
+
+    /// The value at a JSON pointer.
+    #[must_use]
+    pub fn get(&self, pointer: &str) -> Option<&Value> {
+        self.value.as_ref()?.pointer(pointer)
+    }
+
+    /// Byte range of the value at a JSON pointer. Reads the text anew, in one pass for each step.
+    #[must_use]
+    pub fn locate(&self, pointer: &str) -> Option<Range<usize>> {
+        self.find(pointer).map(|found| found.value)
+    }
+
+    /// Byte range of the key, quotes included, that the last step of a JSON pointer names.
+    #[must_use]
+    pub fn locate_key(&self, pointer: &str) -> Option<Range<usize>> {
+        self.find(pointer)?.key
+    }
+
+    fn find(&self, pointer: &str) -> Option<Found> {
+        let text = self.text.as_deref()?;
+        let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
+        let mut found: Option<Found> = None;
+        for step in pointer_steps(pointer)? {
+            found = Some(child(text, found.map_or(start, |f| f.value.start), &step)?);
+        }
+        found.or_else(|| Some(Found { key: None, value: value_at(text, start)? }))
+    }
+}
+
+/// Where a member stands.
+#[derive(Debug, Clone)]
+struct Found {
+    key: Option<Range<usize>>,
+    value: Range<usize>,
+}
+
+/// Bytes of the value that starts at or after `start`.
+fn value_at(text: &str, start: usize) -> Option<Range<usize>> {
+    let mut scanner = Scanner::lenient(text, start);
+    let (token, span) = scanner.next().ok()??;
+    scanner.skip_rest_of(&token).ok()?;
+    Some(span.start..scanner.position())
+}
+
+/// The member `step` of the container that starts at `start`; of equal keys the last.
+fn child(text: &str, start: usize, step: &str) -> Option<Found> {
+    let mut scanner = Scanner::lenient(text, start);
+    let (open, _) = scanner.next().ok()??;
+    let mut last = None;
+    let mut index = 0_usize;
+    loop {
+        let (token, span) = scanner.next().ok()??;
+        match (open, token) {
+            (_, Token::EndObject | Token::EndArray) => return last,
+            (Token::BeginObject, Token::Key(key)) => {
+                let (first, value) = scanner.next().ok()??;
+                scanner.skip_rest_of(&first).ok()?;
+                if key.decode().0 == step {
+                    last = Some(Found { key: Some(span), value: value.start..scanner.position() });
+                }
+            }
+            (Token::BeginArray, first) => {
+                scanner.skip_rest_of(&first).ok()?;
+                if step.parse() == Ok(index) {
+                    return Some(Found { key: None, value: span.start..scanner.position() });
+                }
+                index = index.checked_add(1)?;
+            }
+            _ => return None,
+        }
+    }
+}

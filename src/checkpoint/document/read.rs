@@ -1,0 +1,207 @@
+//! From text to value and faults, in one pass.
+
+use std::ops::Range;
+
+use serde_json::Value;
+
+use super::encoding::{self, Decoded};
+use super::{Document, explain};
+use crate::checkpoint::fault::Faults;
+use crate::checkpoint::lfs::LfsPointer;
+use crate::checkpoint::scan::{MAX_DEPTH, ScanError, ScanErrorKind, Scanner, SlipKind, Token};
+use crate::checkpoint::sniff::looks_like;
+use crate::checkpoint::text::escape;
+use crate::checkpoint::{Fault, Place};
+
+mod build;
+mod duplicates;
+
+use build::Builder;
+use duplicates::Duplicates;
+
+/// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
+const MAX_DIGITS: usize = 4300;
+
+/// Parts of documents that are left out of the value: what a tokenizer holds in less space.
+fn left_out(name: &str) -> Vec<&'static str> {
+    match name {
+        "tokenizer.json" => vec!["/model/vocab", "/model/merges"],
+        "vocab.json" => vec![""],
+        _ => Vec::new(),
+    }
+}
+
+pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
+    let mut faults = Faults::default();
+    if let Some(fault) = not_json_at_all(&name, bytes) {
+        let text = std::str::from_utf8(bytes).ok().map(Into::into);
+        return Document { name, text, faults: vec![fault], ..Document::default() };
+    }
+    let Decoded { text, verbatim, faults: of_encoding } = encoding::decode(&name, bytes);
+    of_encoding.into_iter().for_each(|fault| faults.push(fault));
+
+    let mut reader = Reader { name: &name, verbatim, faults, left_out: left_out(&name) };
+    let body = reader.cut_nul_bytes(&text);
+    let value = reader.read(body);
+    if let Some(value) = &value
+        && !value.is_object()
+        && reader.left_out != [""]
+    {
+        let found = kind_of(value);
+        reader.faults.push(Fault::new("not-an-object").at(Place::file(&*name)).with("found", found));
+    }
+    let Reader { faults, left_out, .. } = reader;
+    let text = verbatim.then(|| text.into());
+    Document { name, text, value, left_out, faults: faults.into_vec() }
+}
+
+/// Files that were never meant to be this document.
+fn not_json_at_all(name: &str, bytes: &[u8]) -> Option<Fault> {
+    let place = Place::file(name);
+    if bytes.trim_ascii().is_empty() {
+        return Some(Fault::new("empty-document").at(place).with("size", bytes.len()));
+    }
+    if let Some(pointer) = LfsPointer::parse(bytes) {
+        return Some(Fault::new("lfs-pointer").at(place).with("oid", pointer.oid).with("size", pointer.size));
+    }
+    if bytes.iter().all(|b| *b == 0) {
+        return Some(Fault::new("nul-bytes").at(place).with("count", bytes.len()).with("all", true));
+    }
+    let what = looks_like(bytes)?;
+    Some(Fault::new("html-instead").at(place).with("looks_like", what))
+}
+
+fn kind_of(value: &Value) -> &'static str {
+    match value {
+        Value::Null => "null",
+        Value::Bool(_) => "a boolean",
+        Value::Number(_) => "a number",
+        Value::String(_) => "a string",
+        Value::Array(_) => "an array",
+        Value::Object(_) => "an object",
+    }
+}
+
+struct Reader<'n> {
+    name: &'n str,
+    verbatim: bool,
+    faults: Faults,
+    left_out: Vec<&'static str>,
+}
+
+impl Reader<'_> {
+    /// A place at `span`, when spans mean anything in this document.
+    fn place(&self, span: Range<usize>) -> Place {
+        let place = Place::file(self.name);
+        if self.verbatim { place.span(span) } else { place }
+    }
+
+    /// Reports NUL bytes, and returns the text before them when nothing but NULs follows.
+    fn cut_nul_bytes<'t>(&mut self, text: &'t str) -> &'t str {
+        let Some(first) = text.find('\0') else { return text };
+        let count = text.bytes().filter(|b| *b == 0).count();
+        let place = self.place(first..first.saturating_add(1));
+        self.faults.push(Fault::new("nul-bytes").at(place).with("count", count).with("all", false));
+        text.get(..first).filter(|_| text.trim_end_matches('\0').len() == first).unwrap_or(text)
+    }
+
+    /// Reads the text, or what is left of it when conflict markers are taken out.
+    fn read(&mut self, text: &str) -> Option<Value> {
+        let (value, error) = self.pass(text);
+        let Some(error) = error else { return value };
+        let markers = explain::conflict_markers(text);
+        if error.kind != ScanErrorKind::TooDeep && !markers.is_empty() {
+            for (span, marker) in &markers {
+                let fault = Fault::new("merge-conflict-marker").at(self.place(span.clone()));
+                self.faults.push(fault.with("marker", *marker));
+            }
+            // The second pass only serves the value; its faults would be consequences of the markers.
+            let faults = std::mem::take(&mut self.faults);
+            let (value, error) = self.pass(&explain::blank(text, &markers));
+            self.faults = faults;
+            return value.filter(|_| error.is_none());
+        }
+        self.explain(text, &error);
+        value.filter(|_| error.kind == ScanErrorKind::Trailing)
+    }
+
+    /// One pass over the text: the value, if it came to its end, and what ended the pass early.
+    fn pass(&mut self, text: &str) -> (Option<Value>, Option<ScanError>) {
+        let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
+        let mut scanner = Scanner::lenient(text, start);
+        let mut builder = Builder::new(self.left_out.clone());
+        let mut duplicates = Duplicates::new(text);
+        let error = loop {
+            let (token, span) = match scanner.next() {
+                Ok(Some(step)) => step,
+                Ok(None) => break None,
+                Err(error) => break Some(error),
+            };
+            duplicates.see(&token, &span, &builder);
+            self.see(&token, &span, &builder);
+            builder.see(&token);
+        };
+        for slip in &scanner.slips {
+            let kind = match slip.kind {
+                SlipKind::TrailingComma => "trailing-comma",
+                SlipKind::MissingComma => "missing-comma",
+                SlipKind::Comment => "comment-in-json",
+                SlipKind::SingleQuotes => "single-quoted-string",
+            };
+            let fault = Fault::new(kind).at(self.place(slip.span.clone()));
+            self.faults.push(fault);
+        }
+        for found in duplicates.into_found() {
+            let mut place = self.place(found.later);
+            place.pointer = found.pointer;
+            let first = self.place(found.first);
+            let fault = Fault::new("duplicate-json-key").at(place).at(first);
+            self.faults.push(fault.with("key", escape(&found.key, 200)).with("equal", found.equal));
+        }
+        if builder.overflowed() {
+            let fault = Fault::new("json-too-many-values").at(Place::file(self.name));
+            self.faults.push(fault.with("cap", build::MAX_NODES));
+        }
+        (builder.finish(), error)
+    }
+
+    /// Faults of single tokens.
+    fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &Builder) {
+        let fault = match token {
+            Token::NonFinite(literal) => Fault::new("non-finite-number").with("literal", *literal),
+            Token::Number(literal) if is_huge(literal) => {
+                Fault::new("huge-number").with("literal", escape(literal, 24)).with("digits", literal.len())
+            }
+            Token::String(text) | Token::Key(text) if text.decode().1 => Fault::new("lone-surrogate"),
+            _ => return,
+        };
+        let mut place = self.place(span.clone());
+        place.pointer = builder.pointer();
+        self.faults.push(fault.at(place));
+    }
+
+    /// Turns what ended a pass early into a fault.
+    fn explain(&mut self, text: &str, error: &ScanError) {
+        let found = text.get(error.span.clone()).unwrap_or_default().trim_end();
+        let place = self.place(error.span.start..error.span.start.saturating_add(found.len()));
+        self.faults.push(match error.kind {
+            ScanErrorKind::TooDeep => Fault::new("json-too-deep").at(place).with("cap", MAX_DEPTH),
+            ScanErrorKind::Syntax(reason) => {
+                Fault::new("json-syntax").at(place).with("reason", reason).with("found", escape(found, 40))
+            }
+            ScanErrorKind::Trailing => match explain::ini_section(found) {
+                Some(section) => Fault::new("appended-section").at(place).with("section", escape(section, 80)),
+                None => {
+                    let what = explain::trailing(found);
+                    Fault::new("trailing-content").at(place).with("what", what).with("bytes", found.len())
+                }
+            },
+        });
+    }
+}
+
+/// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
+/// double becomes infinite.
+fn is_huge(literal: &str) -> bool {
+    literal.len() > MAX_DIGITS || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
+}

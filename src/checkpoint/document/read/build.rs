@@ -1,0 +1,145 @@
+//! Builds a value from tokens, without recursion and within bounds.
+
+use serde_json::{Map, Number, Value};
+
+use super::is_huge;
+use crate::checkpoint::scan::Token;
+use crate::checkpoint::text::push_pointer;
+
+/// Most values kept of one document: a value takes some 100 bytes, so a 64 MiB `[0,0,0,…` would
+/// otherwise become gigabytes.
+pub(super) const MAX_NODES: usize = 2_000_000;
+
+/// Longest JSON pointer made for a fault.
+const MAX_POINTER: usize = 4096;
+
+enum Open {
+    /// The members so far, and the key whose value comes next.
+    Object(Map<String, Value>, String),
+    Array(Vec<Value>, usize),
+}
+
+pub(super) struct Builder {
+    stack: Vec<Open>,
+    root: Option<Value>,
+    nodes: usize,
+    left_out: Vec<&'static str>,
+    /// Depth of the part being left out, when inside one.
+    skipping: Option<usize>,
+}
+
+impl Builder {
+    pub(super) fn new(left_out: Vec<&'static str>) -> Self {
+        Self { stack: Vec::new(), root: None, nodes: 0, left_out, skipping: None }
+    }
+
+    /// Whether there were more values than are kept.
+    pub(super) const fn overflowed(&self) -> bool {
+        self.nodes > MAX_NODES
+    }
+
+    /// The whole value; `None` when there was none or too much.
+    pub(super) fn finish(self) -> Option<Value> {
+        if self.overflowed() { None } else { self.root }
+    }
+
+    /// JSON pointer of the value that comes next.
+    pub(super) fn pointer(&self) -> Option<String> {
+        let mut pointer = String::new();
+        for open in &self.stack {
+            match open {
+                Open::Object(_, key) => push_pointer(&mut pointer, key),
+                Open::Array(_, index) => push_pointer(&mut pointer, &index.to_string()),
+            }
+            if pointer.len() > MAX_POINTER {
+                return None;
+            }
+        }
+        Some(pointer)
+    }
+
+    /// JSON pointer of the innermost open container, when it is short enough to tell.
+    pub(super) fn container(&self) -> Option<String> {
+        self.pointer().map(|mut p| {
+            p.truncate(p.rfind('/').unwrap_or(0));
+            p
+        })
+    }
+
+    /// Takes one token.
+    pub(super) fn see(&mut self, token: &Token<'_>) {
+        match token {
+            Token::Key(key) => {
+                if let Some(Open::Object(_, next)) = self.stack.last_mut() {
+                    *next = key.decode().0.into_owned();
+                }
+            }
+            Token::BeginObject => {
+                self.begin();
+                self.stack.push(Open::Object(Map::new(), String::new()));
+            }
+            Token::BeginArray => {
+                self.begin();
+                self.stack.push(Open::Array(Vec::new(), 0));
+            }
+            Token::EndObject | Token::EndArray => {
+                let value = match self.stack.pop() {
+                    Some(Open::Object(map, _)) => Value::Object(map),
+                    Some(Open::Array(items, _)) => Value::Array(items),
+                    None => return,
+                };
+                let inside = self.skipping.is_some_and(|depth| depth < self.stack.len());
+                // The members were left out, the container itself stays.
+                if self.skipping == Some(self.stack.len()) {
+                    self.skipping = None;
+                }
+                if inside { self.advance() } else { self.put(value) }
+            }
+            Token::String(text) => self.leaf(|| Value::String(text.decode().0.into_owned())),
+            Token::Number(literal) => self.leaf(|| number(literal)),
+            Token::NonFinite(_) | Token::Null => self.leaf(|| Value::Null),
+            Token::Bool(value) => self.leaf(|| Value::Bool(*value)),
+        }
+    }
+
+    fn begin(&mut self) {
+        if self.skipping.is_none() && !self.left_out.is_empty() {
+            let here = self.pointer();
+            if self.left_out.iter().any(|p| here.as_deref() == Some(p)) {
+                self.skipping = Some(self.stack.len());
+            }
+        }
+    }
+
+    fn leaf(&mut self, make: impl FnOnce() -> Value) {
+        if self.skipping.is_some() { self.advance() } else { self.put(make()) }
+    }
+
+    fn put(&mut self, value: Value) {
+        self.nodes = self.nodes.saturating_add(1);
+        if !self.overflowed() {
+            match self.stack.last_mut() {
+                Some(Open::Object(map, key)) => {
+                    map.insert(std::mem::take(key), value);
+                }
+                Some(Open::Array(items, _)) => items.push(value),
+                None => self.root = Some(value),
+            }
+        }
+        self.advance();
+    }
+
+    fn advance(&mut self) {
+        if let Some(Open::Array(_, index)) = self.stack.last_mut() {
+            *index = index.saturating_add(1);
+        }
+    }
+}
+
+/// A number as written; null when no reader could hold it.
+fn number(literal: &str) -> Value {
+    if is_huge(literal) {
+        return Value::Null;
+    }
+    literal.parse::<Number>().map_or(Value::Null, Value::Number)
+}

@@ -1,0 +1,131 @@
+//! The index of a sharded checkpoint: which tensor is in which shard.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use super::fault::Faults;
+use super::open::is_plain_file_name;
+use super::text::{escape, push_pointer};
+use super::{Document, Fault, Place};
+
+/// The name transformers looks for first.
+pub const INDEX_NAME: &str = "model.safetensors.index.json";
+
+/// What `*.safetensors.index.json` says.
+#[derive(Debug, Clone, Default)]
+pub struct Index {
+    /// File name of the document.
+    pub document: String,
+    /// Tensor name to file name, without the entries whose file name is not a plain one.
+    pub weight_map: BTreeMap<String, String>,
+    /// `metadata.total_size` as it stands there.
+    pub total_size: Option<Value>,
+    /// Whether there is a `metadata` object.
+    pub has_metadata: bool,
+    /// The document could not be understood, so nothing follows from a tensor not being in it.
+    pub unread: bool,
+    /// Faults of the index; those of the document are in the document.
+    pub faults: Vec<Fault>,
+}
+
+impl Index {
+    /// Whether a file of this name is an index of safetensors shards.
+    #[must_use]
+    pub fn is_index(name: &str) -> bool {
+        name.ends_with(".safetensors.index.json")
+    }
+
+    /// Reads the index that `document` holds.
+    #[must_use]
+    pub fn of(document: &Document) -> Self {
+        let mut index = Self { document: document.name.clone(), ..Self::default() };
+        let mut faults = Faults::default();
+        let Some(Value::Object(root)) = &document.value else {
+            index.unread = true;
+            return index;
+        };
+        let at = |pointer: &str| Place::file(&*document.name).pointer(pointer);
+
+        match root.get("metadata") {
+            Some(Value::Object(metadata)) => {
+                index.has_metadata = true;
+                index.total_size = metadata.get("total_size").cloned();
+                let place = at("/metadata/total_size");
+                if let Some(found) = metadata.get("total_size").filter(|v| !is_size(v)) {
+                    let fault = Fault::new("total-size-malformed").at(place);
+                    faults.push(fault.with("found", escape(&found.to_string(), 60)));
+                }
+            }
+            other => {
+                let fault = Fault::new("index-metadata-missing").at(at(""));
+                faults.push(fault.with("present", other.is_some()));
+            }
+        }
+
+        match root.get("weight_map") {
+            Some(Value::Object(map)) => {
+                for (tensor, file) in map {
+                    let place = || {
+                        let mut pointer = "/weight_map".to_owned();
+                        push_pointer(&mut pointer, tensor);
+                        at(&pointer).in_tensor(tensor.clone())
+                    };
+                    match file.as_str() {
+                        Some(file) if is_plain_file_name(file) => {
+                            index.weight_map.insert(tensor.clone(), file.to_owned());
+                        }
+                        Some(file) => {
+                            let fault = Fault::new("index-unsafe-path").at(place());
+                            faults.push(fault.with("path", escape(file, 200)));
+                        }
+                        None => {
+                            let fault = Fault::new("weight-map-malformed").at(place());
+                            faults.push(fault.with("found", escape(&shown(file), 60)));
+                        }
+                    }
+                }
+            }
+            Some(other) => {
+                let fault = Fault::new("weight-map-malformed").at(at("/weight_map"));
+                faults.push(fault.with("found", escape(&shown(other), 60)));
+            }
+            None => faults.push(Fault::new("weight-map-missing").at(at(""))),
+        }
+
+        for fault in document.faults.iter().filter(|f| f.kind == "duplicate-json-key") {
+            faults.push(Fault { kind: "duplicate-index-key", ..fault.clone() });
+        }
+        index.faults = faults.into_vec();
+        index
+    }
+
+    /// `total_size` as a number of bytes, when it is one.
+    #[must_use]
+    pub fn total_bytes(&self) -> Option<u64> {
+        bytes(self.total_size.as_ref()?)
+    }
+}
+
+/// A number of bytes, written as an integer or, as transformers did for years, as a whole float.
+fn bytes(value: &Value) -> Option<u64> {
+    if let Some(bytes) = value.as_u64() {
+        return Some(bytes);
+    }
+    let float = value.as_f64()?;
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole, and within 0 and 2^63")]
+    (float.fract() == 0.0 && (0.0..9_223_372_036_854_775_808.0).contains(&float)).then_some(float as u64)
+}
+
+fn is_size(value: &Value) -> bool {
+    bytes(value).is_some()
+}
+
+/// A value in a few characters.
+fn shown(value: &Value) -> String {
+    match value {
+        Value::Array(_) => "an array".to_owned(),
+        Value::Object(_) => "an object".to_owned(),
+        other => other.to_string(),
+    }
+}

@@ -1,0 +1,113 @@
+//! Python modules of a checkpoint, read as text. Nothing in them is ever executed.
+
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::sync::Arc;
+
+use super::Fault;
+
+mod parse;
+
+/// A Python file: the facts a loader acts on before and while it imports it.
+#[derive(Debug, Clone, Default)]
+pub struct Module {
+    /// File name within the checkpoint.
+    pub name: String,
+    /// The text; `None` when it is not UTF-8.
+    pub text: Option<Arc<str>>,
+    /// Classes at any depth outside functions, in the order of the text.
+    pub classes: Vec<Class>,
+    /// `from .x import y` and `from . import x`, wherever they stand.
+    pub relative_imports: Vec<RelativeImport>,
+    /// `import x` and `from x import y`, wherever they stand.
+    pub imports: Vec<Import>,
+    /// Names bound at module level: classes, functions, assignments, imports.
+    pub names: BTreeSet<String>,
+    /// `from x import *` at module level: other names may be bound too.
+    pub star_import: bool,
+    /// The text could not be read to its end, so nothing follows from a name not being here.
+    pub unread: bool,
+    /// Faults of the module.
+    pub faults: Vec<Fault>,
+}
+
+/// A class statement.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Class {
+    /// Its name.
+    pub name: String,
+    /// Bytes of the name.
+    pub name_span: Range<usize>,
+    /// Bytes of the whole statement.
+    pub span: Range<usize>,
+    /// Base classes as written, without keyword arguments.
+    pub bases: Vec<String>,
+    /// The class attribute `tokenizer_class`, when it is a string or a tuple or list of them.
+    pub tokenizer_class: Option<Vec<String>>,
+}
+
+/// A relative import.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RelativeImport {
+    /// How many dots: 1 is the checkpoint directory itself.
+    pub level: usize,
+    /// The dotted module after the dots; for `from . import x` that is `x`, once for each name.
+    pub module: String,
+    /// Names taken from it; `*` for all, empty for `from . import x`.
+    pub names: Vec<String>,
+    /// Bytes of the statement.
+    pub span: Range<usize>,
+    /// Whether it stands where a failure is expected: in a `try`, under `if TYPE_CHECKING` or
+    /// `if is_..._available()`.
+    pub guarded: bool,
+}
+
+/// An absolute import.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Import {
+    /// First component of the dotted name, which is what has to be installed.
+    pub package: String,
+    /// Bytes of the statement.
+    pub span: Range<usize>,
+    /// Whether it stands where a failure is expected (see [`RelativeImport::guarded`]).
+    pub guarded: bool,
+    /// Whether it stands inside a function, and so does not run on import.
+    pub nested: bool,
+}
+
+impl Module {
+    /// Reads a module. Never fails: what is wrong becomes a fault.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
+        parse::parse(name.into(), bytes)
+    }
+
+    /// A module that could not be read at all.
+    #[must_use]
+    pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
+        Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
+    }
+
+    /// The class of this name; of several the last, which is the one Python keeps.
+    #[must_use]
+    pub fn class(&self, name: &str) -> Option<&Class> {
+        self.classes.iter().rev().find(|c| c.name == name)
+    }
+
+    /// Whether the module has this name once it is imported; `None` when that cannot be told.
+    #[must_use]
+    pub fn defines(&self, name: &str) -> Option<bool> {
+        if self.names.contains(name) {
+            Some(true)
+        } else if self.star_import || self.unread {
+            None
+        } else {
+            Some(false)
+        }
+    }
+
+    /// Packages that must be installed for the module to import: absolute, unguarded, not nested.
+    pub fn required_packages(&self) -> impl Iterator<Item = &Import> {
+        self.imports.iter().filter(|i| !i.guarded && !i.nested)
+    }
+}

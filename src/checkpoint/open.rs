@@ -1,0 +1,211 @@
+//! The one way a file of a checkpoint is opened.
+//!
+//! A FIFO under the name of a config would hang a plain `open` for ever, and a sparse six-gigabyte
+//! "config" would take all memory: both end here.
+
+use std::fs::{File, Metadata, OpenOptions};
+use std::io::Read as _;
+use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
+use thiserror::Error;
+
+use super::{Fault, Place};
+
+/// Most bytes read of a JSON document.
+pub const JSON_CAP: u64 = 64 << 20;
+/// Most bytes read of a vocabulary file or of `tokenizer.json`.
+pub const TOKENIZER_CAP: u64 = 512 << 20;
+/// Most bytes read of a Python module.
+pub const MODULE_CAP: u64 = 4 << 20;
+
+/// What tells one file from another, and from itself after a change.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Identity {
+    /// Device number.
+    pub dev: u64,
+    /// Inode number.
+    pub ino: u64,
+    /// Length in bytes.
+    pub size: u64,
+    /// Time of the last change of content: seconds and nanoseconds since 1970.
+    pub mtime: (i64, i64),
+}
+
+impl Identity {
+    /// Reads it off a file's metadata.
+    #[must_use]
+    pub fn of(metadata: &Metadata) -> Self {
+        Self {
+            dev: metadata.dev(),
+            ino: metadata.ino(),
+            size: metadata.len(),
+            mtime: (metadata.mtime(), metadata.mtime_nsec()),
+        }
+    }
+}
+
+/// An open regular file, and which one it is.
+#[derive(Debug)]
+pub struct Opened {
+    /// The file, open for reading only.
+    pub file: File,
+    /// What it was when it was opened.
+    pub identity: Identity,
+    cap: u64,
+}
+
+/// Why a file or directory was not opened.
+#[derive(Debug, Error)]
+pub enum OpenError {
+    /// Nothing of this name.
+    #[error("{} does not exist", path.display())]
+    NotFound { /// The path asked for.
+        path: PathBuf },
+    /// Something that is not a regular file.
+    #[error("{} is a {what}, not a regular file", path.display())]
+    NotRegular { /// The path asked for.
+        path: PathBuf, /// `FIFO`, `socket`, `device` or `directory`.
+        what: &'static str },
+    /// A file where a directory was wanted.
+    #[error("{} is not a directory", path.display())]
+    NotADirectory { /// The path asked for.
+        path: PathBuf },
+    /// More bytes than are read of such a file.
+    #[error("{} has {size} bytes; at most {cap} are read of such a file", path.display())]
+    TooLarge { /// The path asked for.
+        path: PathBuf, /// Bytes in the file.
+        size: u64, /// Bytes allowed.
+        cap: u64 },
+    /// A symbolic link to nothing.
+    #[error("{} is a symbolic link to {}, which does not exist", path.display(), target.display())]
+    DanglingLink { /// The path asked for.
+        path: PathBuf, /// What the link says.
+        target: PathBuf },
+    /// Symbolic links that lead in a circle.
+    #[error("{} is a symbolic link that leads back to itself", path.display())]
+    SymlinkLoop { /// The path asked for.
+        path: PathBuf },
+    /// Anything else the system said.
+    #[error("cannot read {}: {source}", path.display())]
+    Io { /// The path asked for.
+        path: PathBuf, /// The system's own error.
+        source: std::io::Error },
+}
+
+impl OpenError {
+    /// The error of one file as a fault of the checkpoint that has it under `name`.
+    #[must_use]
+    pub fn fault(&self, name: &str) -> Fault {
+        let fault = |kind| Fault::new(kind).at(Place::file(name));
+        match self {
+            Self::NotRegular { what, .. } => fault("not-a-regular-file").with("what", *what),
+            Self::TooLarge { size, cap, .. } => fault("file-too-large").with("size", *size).with("cap", *cap),
+            Self::DanglingLink { target, .. } => {
+                fault("dangling-symlink").with("target", target.to_string_lossy().into_owned())
+            }
+            Self::SymlinkLoop { .. } => fault("symlink-loop"),
+            Self::Io { source, .. } => fault("unreadable-file").with("reason", source.to_string()),
+            Self::NotFound { .. } | Self::NotADirectory { .. } => {
+                fault("unreadable-file").with("reason", "it does not exist")
+            }
+        }
+    }
+
+    /// The error behind a failed system call on `path`.
+    pub(crate) fn from_io(path: &Path, source: std::io::Error) -> Self {
+        let path = path.to_owned();
+        if source.raw_os_error() == Some(rustix::io::Errno::LOOP.raw_os_error()) {
+            return Self::SymlinkLoop { path };
+        }
+        if source.kind() == std::io::ErrorKind::NotFound {
+            return match std::fs::read_link(&path) {
+                Ok(target) => Self::DanglingLink { path, target },
+                Err(_) => Self::NotFound { path },
+            };
+        }
+        Self::Io { path, source }
+    }
+}
+
+/// What a file is, when it is not a regular one.
+pub(crate) fn irregular(metadata: &Metadata) -> Option<&'static str> {
+    let kind = metadata.file_type();
+    if kind.is_file() {
+        None
+    } else if kind.is_dir() {
+        Some("directory")
+    } else if kind.is_fifo() {
+        Some("FIFO")
+    } else if kind.is_socket() {
+        Some("socket")
+    } else {
+        Some("device")
+    }
+}
+
+/// Opens a regular file of at most `cap` bytes for reading; symbolic links are followed.
+///
+/// Asks what the file is before it opens it, because opening a device can do things, and again
+/// after, because it may have been swapped in between.
+///
+/// # Errors
+/// When there is no such file, it is not a regular one, or it has more than `cap` bytes.
+pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
+    let io = |source| OpenError::from_io(path, source);
+    let not_regular = |what| OpenError::NotRegular { path: path.to_owned(), what };
+    if let Some(what) = irregular(&std::fs::metadata(path).map_err(io)?) {
+        return Err(not_regular(what));
+    }
+    let flags = OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY;
+    let flags = i32::try_from(flags.bits()).unwrap_or(0);
+    let file = OpenOptions::new().read(true).custom_flags(flags).open(path).map_err(io)?;
+    let metadata = file.metadata().map_err(io)?;
+    if let Some(what) = irregular(&metadata) {
+        return Err(not_regular(what));
+    }
+    let identity = Identity::of(&metadata);
+    if identity.size > cap {
+        return Err(OpenError::TooLarge { path: path.to_owned(), size: identity.size, cap });
+    }
+    Ok(Opened { file, identity, cap })
+}
+
+/// Reads a whole regular file of at most `cap` bytes, even if it grows meanwhile.
+///
+/// # Errors
+/// As [`open_regular`], and when reading fails.
+pub fn read_capped(path: &Path, cap: u64) -> Result<Vec<u8>, OpenError> {
+    open_regular(path, cap)?.read_all(path)
+}
+
+impl Opened {
+    /// Reads everything, at most the cap it was opened with.
+    ///
+    /// # Errors
+    /// When reading fails or there is more than the cap allows; `path` is for the message.
+    pub fn read_all(&self, path: &Path) -> Result<Vec<u8>, OpenError> {
+        let mut bytes = Vec::with_capacity(usize::try_from(self.identity.size).unwrap_or(0));
+        let limit = self.cap.saturating_add(1);
+        (&self.file).take(limit).read_to_end(&mut bytes).map_err(|source| OpenError::from_io(path, source))?;
+        let size = u64::try_from(bytes.len()).unwrap_or(u64::MAX);
+        if size > self.cap {
+            return Err(OpenError::TooLarge { path: path.to_owned(), size, cap: self.cap });
+        }
+        Ok(bytes)
+    }
+}
+
+/// Whether a string from a checkpoint may become a file name: one plain component and nothing else.
+///
+/// Refuses separators of any system, drive letters and streams (`:`), control characters, `.` and
+/// `..`, the empty name, and more than 255 bytes.
+#[must_use]
+pub fn is_plain_file_name(name: &str) -> bool {
+    !name.is_empty()
+        && name.len() <= 255
+        && name != "."
+        && name != ".."
+        && !name.chars().any(|c| c.is_control() || matches!(c, '/' | '\\' | ':'))
+}

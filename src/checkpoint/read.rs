@@ -1,0 +1,156 @@
+//! Reads a directory into a [`Checkpoint`]: its own files, and none that a file in it names.
+
+use std::collections::BTreeMap;
+use std::fs::{self, Metadata};
+use std::path::{Component, Path};
+use std::sync::Arc;
+
+use super::lfs::MAX_POINTER;
+use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
+use super::{Checkpoint, Document, Entry, EntryKind, Fault, LfsPointer, Module, OpenError, Place, Shard, Vocabulary};
+use super::is_plain_file_name;
+
+/// Endings that a downloader gives to a file it has not finished.
+const UNFINISHED: [&str; 5] = [".incomplete", ".aria2", ".part", ".crdownload", ".download"];
+
+/// Documents with names of their own; besides them `*config.json` and `*.index.json` are read.
+const DOCUMENTS: [&str; 6] = [
+    "added_tokens.json", "chat_template.json", "special_tokens_map.json", "tokenizer.json", "vocab.json",
+    "dataset_statistics.json",
+];
+
+/// Vocabulary files that are no documents.
+const VOCABULARIES: [&str; 4] = ["tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.txt"];
+
+/// Whether a file is read as a JSON document.
+pub(super) fn is_document(name: &str) -> bool {
+    DOCUMENTS.contains(&name) || name.ends_with("config.json") || name.ends_with(".index.json")
+}
+
+pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
+    let io = |source| OpenError::from_io(root, source);
+    if !fs::metadata(root).map_err(io)?.is_dir() {
+        return Err(OpenError::NotADirectory { path: root.to_owned() });
+    }
+    let mut checkpoint = Checkpoint { root: root.to_owned(), ..Checkpoint::default() };
+    let mut vocabularies = BTreeMap::new();
+    let mut faults_of_vocabularies = Vec::new();
+    for name in names(root)? {
+        let entry = entry(root, &name, &mut checkpoint.faults);
+        let path = root.join(&name);
+        if entry.kind == EntryKind::Directory && !is_document(&name) && !name.ends_with(".safetensors") {
+            // A folder is a checkpoint of its own, or none of ours.
+        } else if name.ends_with(".safetensors") {
+            checkpoint.shards.insert(name.clone(), Shard::read(root, &name));
+        } else if is_document(&name) {
+            let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
+            let document = match read_capped(&path, cap) {
+                Ok(bytes) => Document::parse(&*name, &bytes),
+                Err(error) => Document::unread(&*name, error.fault(&name)),
+            };
+            checkpoint.documents.insert(name.clone(), document);
+        } else if name.ends_with(".py") {
+            let module = match read_capped(&path, MODULE_CAP) {
+                Ok(bytes) => Module::parse(&*name, &bytes),
+                Err(error) => Module::unread(&*name, error.fault(&name)),
+            };
+            checkpoint.modules.insert(name.clone(), module);
+        } else if VOCABULARIES.contains(&&*name) {
+            match vocabulary(&path, &name) {
+                Ok(vocabulary) => {
+                    vocabularies.insert(name.clone(), Arc::new(vocabulary));
+                }
+                Err(fault) => faults_of_vocabularies.push(*fault),
+            }
+        } else if entry.kind == EntryKind::Broken
+            && let Err(error) = fs::metadata(&path)
+        {
+            checkpoint.faults.push(OpenError::from_io(&path, error).fault(&name));
+        }
+        if let Some(of) = UNFINISHED.iter().find_map(|ending| name.strip_suffix(ending)) {
+            checkpoint.faults.push(Fault::new("partial-download").at(Place::file(&*name)).with("of", of));
+        }
+        checkpoint.entries.insert(name, entry);
+    }
+    checkpoint.derive(vocabularies);
+    checkpoint.tokenizer.faults = faults_of_vocabularies;
+    Ok(checkpoint)
+}
+
+/// Names in the directory, sorted. Hidden ones are the business of other tools; one that is no plain
+/// UTF-8 name cannot be one a loader asks for.
+fn names(root: &Path) -> Result<Vec<String>, OpenError> {
+    let io = |source| OpenError::from_io(root, source);
+    let mut names = Vec::new();
+    for entry in fs::read_dir(root).map_err(io)? {
+        if let Ok(name) = entry.map_err(io)?.file_name().into_string()
+            && !name.starts_with('.')
+            && is_plain_file_name(&name)
+        {
+            names.push(name);
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// What one entry is. Faults of the entry that no reader of its content would meet are added.
+fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
+    let path = root.join(name);
+    let link = fs::read_link(&path).ok();
+    let Ok(metadata) = fs::metadata(&path) else {
+        let link = link.map(|l| l.to_string_lossy().into_owned());
+        return Entry { kind: EntryKind::Broken, link, ..Entry::default() };
+    };
+    if let Some(target) = &link
+        && metadata.is_file()
+        && is_outside(root, &path, target)
+    {
+        let fault = Fault::new("symlink-outside").at(Place::file(name));
+        faults.push(fault.with("target", target.to_string_lossy().into_owned()));
+    }
+    let kind = kind_of(&metadata);
+    let size = if kind == EntryKind::Regular { metadata.len() } else { 0 };
+    let small = u64::try_from(MAX_POINTER).is_ok_and(|cap| size <= cap);
+    let lfs = if kind == EntryKind::Regular && size > 0 && small {
+        read_capped(&path, size).ok().and_then(|bytes| LfsPointer::parse(&bytes))
+    } else {
+        None
+    };
+    Entry { kind, size, link: link.map(|l| l.to_string_lossy().into_owned()), lfs }
+}
+
+fn kind_of(metadata: &Metadata) -> EntryKind {
+    match irregular(metadata) {
+        None => EntryKind::Regular,
+        Some("directory") => EntryKind::Directory,
+        Some("FIFO") => EntryKind::Fifo,
+        Some("socket") => EntryKind::Socket,
+        Some(_) => EntryKind::Device,
+    }
+}
+
+/// Whether a link leaves the directory for anything but a blob of the hub cache, whose snapshots
+/// are nothing but links to `../../blobs/…`.
+fn is_outside(root: &Path, path: &Path, target: &Path) -> bool {
+    let mut steps = target.components().skip_while(|c| *c == Component::ParentDir);
+    if target.starts_with("..") && steps.next() == Some(Component::Normal("blobs".as_ref())) {
+        return false;
+    }
+    match (fs::canonicalize(root), fs::canonicalize(path)) {
+        (Ok(root), Ok(path)) => !path.starts_with(root),
+        _ => false,
+    }
+}
+
+fn vocabulary(path: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {
+    let bytes = read_capped(path, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
+    let fault = |kind| Fault::new(kind).at(Place::file(name));
+    if let Some(pointer) = LfsPointer::parse(&bytes) {
+        return Err(fault("lfs-pointer").with("oid", pointer.oid).with("size", pointer.size).into());
+    }
+    if bytes.is_empty() {
+        return Err(fault("empty-file").into());
+    }
+    Vocabulary::parse(name, &bytes).map_err(|reason| fault("vocabulary-malformed").with("reason", reason).into())
+}

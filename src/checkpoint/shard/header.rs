@@ -1,0 +1,291 @@
+//! Reads a safetensors header: all of its faults, with the names of the tensors they belong to.
+
+use std::collections::BTreeMap;
+
+use sha2::{Digest as _, Sha256};
+
+use super::{Dtype, MAX_HEADER, Shard, Tensor, layout};
+use crate::checkpoint::fault::Faults;
+use crate::checkpoint::lfs::LfsPointer;
+use crate::checkpoint::scan::{ScanError, ScanErrorKind, Scanner, Token};
+use crate::checkpoint::sniff::looks_like;
+use crate::checkpoint::text::escape;
+use crate::checkpoint::{Fault, Place};
+
+mod entry;
+
+pub(super) use entry::Entry;
+
+/// `format` values that transformers opens. Source: `load_state_dict` in transformers 4.47.0.
+const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
+
+/// Fills in `shard`, which has its name and length, from the first bytes of the file.
+pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
+    let (header, data_start) = match frame(&shard, head) {
+        Ok(frame) => frame,
+        Err(fault) => {
+            shard.faults.push(*fault);
+            return shard;
+        }
+    };
+    shard.data_start = data_start;
+    shard.header_sha256 = hex(&Sha256::digest(head.get(..header.len().saturating_add(8)).unwrap_or(head)));
+
+    let mut faults = Faults::default();
+    let padding = |what: &str| Fault::new("header-padding-not-spaces").at(shard.place()).with("what", what);
+    let header = match header.strip_prefix(b"\xef\xbb\xbf") {
+        Some(rest) => {
+            faults.push(padding("a byte-order mark"));
+            rest
+        }
+        None => header,
+    };
+    let text = match std::str::from_utf8(header) {
+        Ok(text) => text,
+        Err(error) => {
+            faults.push(Fault::new("header-not-utf8").at(shard.place()).with("offset", error.valid_up_to()));
+            shard.faults = faults.into_vec();
+            return shard;
+        }
+    };
+
+    let mut reader = Reader { shard: &shard, scanner: Scanner::strict(text, 0), faults, entries: Vec::new(), metadata: Metadata::Absent };
+    let error = reader.object().err();
+    let Reader { mut faults, entries, metadata, .. } = reader;
+    let mut unread = true;
+    match error {
+        None => unread = false,
+        Some(ScanError { kind: ScanErrorKind::Trailing, span }) => {
+            unread = false;
+            let rest = text.get(span).unwrap_or_default();
+            faults.push(padding(match rest.trim_start().chars().next() {
+                Some('\0') => "NUL bytes",
+                Some('{') => "a second object",
+                _ => "other bytes",
+            }));
+        }
+        Some(ScanError { kind: ScanErrorKind::TooDeep, span }) => {
+            faults.push(Fault::new("header-too-deep").at(shard.place()).with("offset", span.start));
+        }
+        Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) => {
+            let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
+            faults.push(fault.with("offset", span.start));
+        }
+    }
+    if !unread {
+        check_format(&shard, &metadata, &mut faults);
+    }
+    shard.unread = unread;
+    shard.metadata = match metadata {
+        Metadata::Strings(strings) => Some(strings),
+        Metadata::Absent | Metadata::Null => None,
+    };
+    let entries = without_duplicates(&shard, entries, &mut faults);
+    layout::check(&shard, &entries, &mut faults);
+    for entry in entries {
+        match entry.into_tensor() {
+            Ok(tensor) => shard.tensors.push(tensor),
+            Err(name) => shard.unreadable.push(name),
+        }
+    }
+    shard.faults = faults.into_vec();
+    shard
+}
+
+/// The header's bytes and where the data region starts, if the file is framed like a safetensors file.
+fn frame<'a>(shard: &Shard, head: &'a [u8]) -> Result<(&'a [u8], u64), Box<Fault>> {
+    let fault = |kind| Fault::new(kind).at(shard.place());
+    let file_len = shard.file_len;
+    if file_len == 0 {
+        return Err(fault("empty-file").into());
+    }
+    let whole = u64::try_from(head.len()).is_ok_and(|len| len == file_len);
+    if let Some(pointer) = LfsPointer::parse(head).filter(|_| whole) {
+        return Err(fault("lfs-pointer").with("oid", pointer.oid).with("size", pointer.size).into());
+    }
+    if file_len < 8 {
+        return Err(fault("file-too-short").with("file_len", file_len).into());
+    }
+    let short = || Box::new(fault("unreadable-file").with("reason", "fewer bytes could be read than the file has"));
+    let length = head.first_chunk::<8>().ok_or_else(short)?;
+    let stated = u64::from_le_bytes(*length);
+    let available = file_len.saturating_sub(8);
+    if stated == 0 || stated > available || stated > MAX_HEADER {
+        if let Some(what) = other_format(head) {
+            return Err(fault("not-safetensors").with("what", what).into());
+        }
+        if stated > MAX_HEADER && stated <= available {
+            return Err(fault("header-too-large").with("stated", stated).with("cap", MAX_HEADER).into());
+        }
+        let big = u64::from_be_bytes(*length);
+        let big_endian = big >= 2 && big <= available.min(MAX_HEADER);
+        let fault = fault("header-length-out-of-range").with("stated", stated).with("file_len", file_len);
+        return Err(fault.with("big_endian", big_endian).into());
+    }
+    let end = stated.saturating_add(8);
+    let header = usize::try_from(end).ok().and_then(|end| head.get(8..end)).ok_or_else(short)?;
+    Ok((header, end))
+}
+
+/// What a file is whose length field makes no sense.
+fn other_format(head: &[u8]) -> Option<String> {
+    if let Some(what) = looks_like(head) {
+        return Some(what.to_owned());
+    }
+    let sample = head.get(..head.len().min(512)).unwrap_or_default();
+    if sample.iter().all(|b| *b == 0) {
+        return Some("nothing but NUL bytes".to_owned());
+    }
+    let text = sample.iter().all(|b| matches!(b, b' '..=b'~' | b'\t' | b'\n' | b'\r'));
+    let start = || escape(&String::from_utf8_lossy(sample).trim().chars().take(60).collect::<String>(), 60);
+    match sample.trim_ascii_start().first() {
+        Some(b'{' | b'[') if text => Some(format!("a JSON document: {}", start())),
+        Some(_) if text => Some(format!("a text file: {}", start())),
+        _ => None,
+    }
+}
+
+/// What `__metadata__` held.
+enum Metadata {
+    Absent,
+    Null,
+    Strings(BTreeMap<String, String>),
+}
+
+fn check_format(shard: &Shard, metadata: &Metadata, faults: &mut Faults) {
+    let format = match metadata {
+        Metadata::Strings(strings) => strings.get("format"),
+        Metadata::Absent | Metadata::Null => None,
+    };
+    if format.is_none_or(|f| !FORMATS.contains(&f.as_str())) {
+        let fault = Fault::new("no-format-metadata").at(shard.place());
+        faults.push(fault.with("format", format.map(|f| escape(f, 80))));
+    }
+}
+
+/// Keeps the last of equal names, as Python does, and reports the others.
+fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -> Vec<Entry> {
+    let mut order: Vec<usize> = (0..entries.len()).collect();
+    let name = |at: usize| entries.get(at).map(|e| e.name.as_str());
+    order.sort_by(|a, b| name(*a).cmp(&name(*b)).then(a.cmp(b)));
+    let mut drop = vec![false; entries.len()];
+    for pair in order.windows(2) {
+        if let [first, later] = pair
+            && name(*first) == name(*later)
+            && let Some(drop) = drop.get_mut(*first)
+        {
+            *drop = true;
+        }
+    }
+    for entry in entries.iter().zip(&drop).filter_map(|(e, d)| d.then_some(e)) {
+        let place = shard.place().in_tensor(entry.name.clone());
+        faults.push(Fault::new("duplicate-header-key").at(place).with("key", escape(&entry.name, 200)));
+    }
+    entries.into_iter().zip(drop).filter_map(|(e, d)| (!d).then_some(e)).collect()
+}
+
+struct Reader<'s, 't> {
+    shard: &'s Shard,
+    scanner: Scanner<'t>,
+    faults: Faults,
+    entries: Vec<Entry>,
+    metadata: Metadata,
+}
+
+/// A header that stops in the middle.
+fn ended() -> ScanError {
+    ScanError { kind: ScanErrorKind::Syntax("the header ends too early"), span: 0..0 }
+}
+
+impl<'t> Reader<'_, 't> {
+    fn token(&mut self) -> Result<Token<'t>, ScanError> {
+        Ok(self.scanner.next()?.ok_or_else(ended)?.0)
+    }
+
+    /// Reads the whole header.
+    fn object(&mut self) -> Result<(), ScanError> {
+        let first = self.token()?;
+        if first != Token::BeginObject {
+            return Err(ScanError { kind: ScanErrorKind::Syntax("the header is not an object"), span: 0..0 });
+        }
+        let mut metadata_seen = false;
+        while let Token::Key(key) = self.token()? {
+            let (name, lone) = key.decode();
+            if name == "__metadata__" {
+                if metadata_seen {
+                    let fault = Fault::new("duplicate-header-key").at(self.shard.place());
+                    self.faults.push(fault.with("key", "__metadata__"));
+                }
+                metadata_seen = true;
+                self.read_metadata()?;
+            } else {
+                self.check_name(&name, lone);
+                self.read_entry(name.into_owned())?;
+            }
+        }
+        // Anything but space after the object is an error of the scanner.
+        self.scanner.next().map(|_| ())
+    }
+
+    fn read_metadata(&mut self) -> Result<(), ScanError> {
+        let fault = Fault::new("metadata-not-strings").at(self.shard.place());
+        match self.token()? {
+            Token::Null => {
+                self.faults.push(Fault::new("metadata-null").at(self.shard.place()));
+                self.metadata = Metadata::Null;
+            }
+            Token::BeginObject => {
+                let mut strings = BTreeMap::new();
+                while let Token::Key(key) = self.token()? {
+                    let key = key.decode().0.into_owned();
+                    match self.token()? {
+                        Token::String(value) if !value.decode().1 => {
+                            let (label, value) = (escape(&key, 80), value.decode().0.into_owned());
+                            if strings.insert(key, value).is_some() {
+                                let fault = Fault::new("duplicate-header-key").at(self.shard.place());
+                                self.faults.push(fault.with("key", format!("__metadata__.{label}")));
+                            }
+                        }
+                        other => {
+                            self.scanner.skip_rest_of(&other)?;
+                            self.faults.push(fault.clone().with("key", escape(&key, 80)));
+                        }
+                    }
+                }
+                self.metadata = Metadata::Strings(strings);
+            }
+            other => {
+                self.scanner.skip_rest_of(&other)?;
+                self.faults.push(fault);
+            }
+        }
+        Ok(())
+    }
+
+    fn check_name(&mut self, name: &str, lone: bool) {
+        let reason = if lone {
+            "it has a lone surrogate"
+        } else if name.is_empty() {
+            "it is empty"
+        } else if name.len() > 1024 {
+            "it is longer than 1 KiB"
+        } else if name.chars().any(char::is_control) {
+            "it has control characters"
+        } else if name.starts_with('/') || name.contains('\\') || name.split('/').any(|part| part == "..") {
+            "it looks like a path"
+        } else {
+            return;
+        };
+        let place = self.shard.place().in_tensor(name);
+        self.faults.push(Fault::new("odd-tensor-name").at(place).with("reason", reason).with("bytes", name.len()));
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    bytes.iter().fold(String::new(), |mut out, byte| {
+        // Writing to a String cannot fail.
+        let _ = write!(out, "{byte:02x}");
+        out
+    })
+}

@@ -1,0 +1,141 @@
+//! One entry of a header.
+
+use super::{Dtype, Fault, Place, Reader, ScanError, Tensor, Token, escape};
+
+/// An entry as far as it could be read; a field is `None` when it is absent or malformed.
+pub(in crate::checkpoint::shard) struct Entry {
+    pub(in crate::checkpoint::shard) name: String,
+    pub(in crate::checkpoint::shard) dtype: Option<Dtype>,
+    pub(in crate::checkpoint::shard) shape: Option<Vec<u64>>,
+    /// Begin and end in the data region, in the order stated.
+    pub(in crate::checkpoint::shard) offsets: Option<(u64, u64)>,
+}
+
+impl Entry {
+    /// The tensor, or the name alone when a field could not be read.
+    pub(super) fn into_tensor(self) -> Result<Tensor, String> {
+        match (self.dtype, self.shape, self.offsets) {
+            (Some(dtype), Some(shape), Some((begin, end))) => Ok(Tensor { name: self.name, dtype, shape, begin, end }),
+            _ => Err(self.name),
+        }
+    }
+}
+
+/// More dimensions than any library has; a shape of millions of them only takes memory.
+const MAX_RANK: usize = 1024;
+
+/// What became of one field.
+enum Field<T> {
+    Absent,
+    Bad,
+    Good(T),
+}
+
+impl<T> Field<T> {
+    fn ok(self) -> Option<T> {
+        if let Self::Good(value) = self { Some(value) } else { None }
+    }
+}
+
+impl Reader<'_, '_> {
+    /// Reads the value of the entry `name`.
+    pub(super) fn read_entry(&mut self, name: String) -> Result<(), ScanError> {
+        let place = self.shard.place().in_tensor(name.clone());
+        let malformed = |reason: &str| Fault::new("entry-malformed").at(place.clone()).with("reason", reason);
+        let (mut dtype, mut shape, mut offsets) = (Field::Absent, Field::Absent, Field::Absent);
+        let first = self.token()?;
+        if first == Token::BeginObject {
+            while let Token::Key(key) = self.token()? {
+                let key = key.decode().0;
+                let seen = match &*key {
+                    "dtype" => !matches!(dtype, Field::Absent),
+                    "shape" => !matches!(shape, Field::Absent),
+                    "data_offsets" => !matches!(offsets, Field::Absent),
+                    _ => false,
+                };
+                if seen {
+                    self.faults.push(Fault::new("duplicate-header-key").at(place.clone()).with("key", &*key));
+                }
+                match &*key {
+                    "dtype" => dtype = self.dtype(&place)?,
+                    "shape" => {
+                        shape = self.numbers(MAX_RANK)?;
+                        if matches!(shape, Field::Bad) {
+                            self.faults.push(malformed("`shape` is not a list of natural numbers"));
+                        }
+                    }
+                    "data_offsets" => {
+                        offsets = match self.numbers(2)? {
+                            Field::Good(numbers) => match numbers.as_slice() {
+                                [begin, end] => Field::Good((*begin, *end)),
+                                _ => Field::Bad,
+                            },
+                            _ => Field::Bad,
+                        };
+                        if matches!(offsets, Field::Bad) {
+                            self.faults.push(malformed("`data_offsets` is not two natural numbers"));
+                        }
+                    }
+                    _ => {
+                        let value = self.token()?;
+                        self.scanner.skip_rest_of(&value)?;
+                    }
+                }
+            }
+            let absent = [
+                (matches!(dtype, Field::Absent), "it has no `dtype`"),
+                (matches!(shape, Field::Absent), "it has no `shape`"),
+                (matches!(offsets, Field::Absent), "it has no `data_offsets`"),
+            ];
+            for (_, reason) in absent.into_iter().filter(|(absent, _)| *absent) {
+                self.faults.push(malformed(reason));
+            }
+        } else {
+            self.scanner.skip_rest_of(&first)?;
+            self.faults.push(malformed("it is not an object"));
+        }
+        self.entries.push(Entry { name, dtype: dtype.ok(), shape: shape.ok(), offsets: offsets.ok() });
+        Ok(())
+    }
+
+    fn dtype(&mut self, place: &Place) -> Result<Field<Dtype>, ScanError> {
+        let token = self.token()?;
+        let Token::String(text) = token else {
+            self.scanner.skip_rest_of(&token)?;
+            self.faults.push(Fault::new("entry-malformed").at(place.clone()).with("reason", "`dtype` is not a string"));
+            return Ok(Field::Bad);
+        };
+        let name = text.decode().0;
+        Ok(if let Some(dtype) = Dtype::from_name(&name) {
+            Field::Good(dtype)
+        } else {
+            self.faults.push(Fault::new("unknown-dtype").at(place.clone()).with("dtype", escape(&name, 40)));
+            Field::Bad
+        })
+    }
+
+    /// Reads a list of at most `cap` natural numbers.
+    fn numbers(&mut self, cap: usize) -> Result<Field<Vec<u64>>, ScanError> {
+        let first = self.token()?;
+        if first != Token::BeginArray {
+            self.scanner.skip_rest_of(&first)?;
+            return Ok(Field::Bad);
+        }
+        let mut numbers = Vec::new();
+        let mut good = true;
+        loop {
+            match self.token()? {
+                Token::EndArray => break,
+                Token::Number(literal) if good && numbers.len() < cap => match literal.parse() {
+                    Ok(number) if !literal.starts_with('-') => numbers.push(number),
+                    _ => good = false,
+                },
+                other => {
+                    good = false;
+                    self.scanner.skip_rest_of(&other)?;
+                }
+            }
+        }
+        Ok(if good { Field::Good(numbers) } else { Field::Bad })
+    }
+}

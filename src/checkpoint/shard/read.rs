@@ -1,0 +1,61 @@
+//! Gets a shard's header off the disk, and no more than that.
+
+use std::os::unix::fs::FileExt as _;
+use std::path::Path;
+
+use super::{MAX_HEADER, Shard};
+use crate::checkpoint::open::{Opened, open_regular};
+use crate::checkpoint::sniff::looks_like;
+use crate::checkpoint::{Fault, Place};
+
+/// Enough to recognise what a file is, and most tiny headers whole.
+const SAMPLE: u64 = 4096;
+
+pub(super) fn read(dir: &Path, name: &str) -> Shard {
+    let opened = match open_regular(&dir.join(name), u64::MAX) {
+        Ok(opened) => opened,
+        Err(error) => return Shard::unread(name, error.fault(name)),
+    };
+    let head = match read_head(&opened) {
+        Ok(head) => head,
+        Err(error) => {
+            let fault = Fault::new("unreadable-file").at(Place::file(name)).with("reason", error.to_string());
+            return Shard { file_len: opened.identity.size, ..Shard::unread(name, fault) };
+        }
+    };
+    let mut shard = Shard::parse(name, opened.identity.size, &head);
+    name_trailing_bytes(&mut shard, &opened);
+    shard
+}
+
+fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
+    let size = opened.identity.size;
+    let mut head = vec![0; usize::try_from(size.min(SAMPLE)).unwrap_or(0)];
+    opened.file.read_exact_at(&mut head, 0)?;
+    let Some(stated) = head.first_chunk().map(|b| u64::from_le_bytes(*b)) else { return Ok(head) };
+    let end = stated.saturating_add(8);
+    if stated > MAX_HEADER || end > size {
+        return Ok(head);
+    }
+    let read = head.len();
+    head.resize(usize::try_from(end).unwrap_or(0).max(read), 0);
+    if let Some(rest) = head.get_mut(read..) {
+        opened.file.read_exact_at(rest, u64::try_from(read).unwrap_or(u64::MAX))?;
+    }
+    Ok(head)
+}
+
+/// Adds what the bytes behind the last tensor look like, when they are recognisable.
+fn name_trailing_bytes(shard: &mut Shard, opened: &Opened) {
+    for fault in shard.faults.iter_mut().filter(|f| f.kind == "trailing-bytes") {
+        let Some(count) = fault.detail.get("count").and_then(serde_json::Value::as_u64) else { continue };
+        let mut bytes = vec![0; usize::try_from(count.min(512)).unwrap_or(0)];
+        if opened.file.read_exact_at(&mut bytes, opened.identity.size.saturating_sub(count)).is_err() {
+            continue;
+        }
+        let what = looks_like(&bytes).or_else(|| bytes.iter().all(|b| *b == 0).then_some("NUL bytes"));
+        if let Some(what) = what {
+            fault.detail.insert("looks_like".to_owned(), what.into());
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! Strings and places from a checkpoint, made fit for people.
+
+use std::fmt::Write as _;
+
+/// Makes a string from a checkpoint safe to print, in at most about `cap` characters.
+///
+/// Control characters (ESC and line breaks included), bidirectional overrides and other invisible
+/// characters come out as `\u{..}`; what is cut off is marked with `…`.
+#[must_use]
+pub fn escape(text: &str, cap: usize) -> String {
+    let mut out = String::new();
+    for (count, c) in text.chars().enumerate() {
+        if count >= cap {
+            out.push('…');
+            break;
+        }
+        match c {
+            '\n' => out.push_str("\\n"),
+            '\r' => out.push_str("\\r"),
+            '\t' => out.push_str("\\t"),
+            c if c.is_control() || is_invisible(c) => {
+                // Writing to a String cannot fail.
+                let _ = write!(out, "\\u{{{:x}}}", u32::from(c));
+            }
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// Characters that reorder or hide text: bidirectional controls, zero-width characters, line
+/// separators, byte-order marks and tags.
+const fn is_invisible(c: char) -> bool {
+    matches!(c,
+        '\u{ad}' | '\u{61c}' | '\u{180e}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}'
+        | '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{fff0}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
+}
+
+/// Line and column of a byte offset, both from 1; the column counts characters.
+///
+/// An offset past the end means the end; one inside a character means that character.
+#[must_use]
+pub fn line_column(text: &str, offset: usize) -> (usize, usize) {
+    let mut offset = offset.min(text.len());
+    while !text.is_char_boundary(offset) {
+        offset = offset.saturating_sub(1);
+    }
+    let before = text.get(..offset).unwrap_or_default();
+    let line = before.bytes().filter(|b| *b == b'\n').count().saturating_add(1);
+    let start = before.rfind('\n').map_or(0, |at| at.saturating_add(1));
+    let column = before.get(start..).map_or(0, |t| t.chars().count()).saturating_add(1);
+    (line, column)
+}
+
+/// Appends one step to a JSON pointer, escaped as RFC 6901 asks.
+pub(crate) fn push_pointer(pointer: &mut String, step: &str) {
+    pointer.push('/');
+    for c in step.chars() {
+        match c {
+            '~' => pointer.push_str("~0"),
+            '/' => pointer.push_str("~1"),
+            c => pointer.push(c),
+        }
+    }
+}
+
+/// The steps of a JSON pointer, unescaped; `None` when it does not begin with `/` and is not empty.
+pub(crate) fn pointer_steps(pointer: &str) -> Option<Vec<String>> {
+    if pointer.is_empty() {
+        return Some(Vec::new());
+    }
+    let steps = pointer.strip_prefix('/')?;
+    Some(steps.split('/').map(|step| step.replace("~1", "/").replace("~0", "~")).collect())
+}

@@ -1,0 +1,223 @@
+//! What is known of the tokenizer without running it: which vocabulary, which added tokens, how many.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use serde_json::Value;
+
+use super::{Document, Fault};
+
+mod sentencepiece;
+mod vocabulary;
+
+pub use vocabulary::Vocabulary;
+
+/// Vocabulary files of the tokenizers in transformers; one of them must be there.
+pub const VOCABULARY_FILES: [&str; 8] = [
+    "tokenizer.json", "tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.json", "vocab.txt",
+    "tekken.json", "tiktoken.model",
+];
+
+/// Special-token attributes in the order transformers adds them. Source: `SPECIAL_TOKENS_ATTRIBUTES` in 4.47.0.
+const SPECIAL: [&str; 8] = [
+    "bos_token", "eos_token", "unk_token", "sep_token", "pad_token", "cls_token", "mask_token",
+    "additional_special_tokens",
+];
+
+/// A token added to the vocabulary, as one file states it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AddedToken {
+    /// Its id there.
+    pub id: u64,
+    /// Its text.
+    pub content: String,
+}
+
+/// Facts of a tokenizer.
+#[derive(Debug, Clone, Default)]
+pub struct Tokenizer {
+    /// Vocabulary files that are there, readable or not.
+    pub files: BTreeSet<String>,
+    /// Vocabularies that could be read, by file name.
+    pub vocabularies: BTreeMap<String, Arc<Vocabulary>>,
+    /// `tokenizer_class` of `tokenizer_config.json`.
+    pub tokenizer_class: Option<String>,
+    /// `added_tokens_decoder` of `tokenizer_config.json`, in its order; `None` when it has none.
+    pub added_tokens_decoder: Option<Vec<AddedToken>>,
+    /// `added_tokens.json`, in its order; `None` when there is none.
+    pub added_tokens_json: Option<Vec<AddedToken>>,
+    /// `added_tokens` of `tokenizer.json`, in its order; `None` when there is none.
+    pub tokenizer_json_added: Option<Vec<AddedToken>>,
+    /// Special tokens by attribute (`bos_token`), from `tokenizer_config.json` or, without an
+    /// `added_tokens_decoder` there, `special_tokens_map.json`. Additional ones have that attribute each.
+    pub special_tokens: Vec<(String, String)>,
+    /// The file the loader takes the vocabulary from.
+    pub source: Option<String>,
+    /// Faults of vocabulary files that are no documents.
+    pub faults: Vec<Fault>,
+    /// Every token beside the base vocabulary, with the id it has once loaded.
+    added: BTreeMap<String, u64>,
+    length: Option<u64>,
+}
+
+impl Tokenizer {
+    /// Derives the facts from documents and from vocabularies read elsewhere.
+    ///
+    /// `files` names the vocabulary files there are, whether they could be read or not.
+    #[must_use]
+    pub fn of(
+        documents: &BTreeMap<String, Document>,
+        mut vocabularies: BTreeMap<String, Arc<Vocabulary>>,
+        files: BTreeSet<String>,
+    ) -> Self {
+        for name in ["tokenizer.json", "vocab.json"] {
+            let pointer = if name == "vocab.json" { "" } else { "/model/vocab" };
+            if !vocabularies.contains_key(name)
+                && let Some(document) = documents.get(name)
+                && let Some(vocabulary) = Vocabulary::of_document(document, pointer)
+            {
+                vocabularies.insert(name.to_owned(), Arc::new(vocabulary));
+            }
+        }
+        let get = |name: &str, pointer: &str| documents.get(name)?.get(pointer);
+        let config = "tokenizer_config.json";
+        let decoder = get(config, "/added_tokens_decoder").and_then(Value::as_object).map(|map| {
+            map.iter().filter_map(|(id, token)| added(id.parse().ok()?, token)).collect::<Vec<_>>()
+        });
+        let json = get("added_tokens.json", "").and_then(Value::as_object).map(|map| {
+            map.iter().filter_map(|(content, id)| Some(AddedToken { id: id.as_u64()?, content: content.clone() })).collect()
+        });
+        let own = get("tokenizer.json", "/added_tokens").and_then(Value::as_array).map(|list| {
+            list.iter().filter_map(|token| added(token.get("id")?.as_u64()?, token)).collect()
+        });
+        let special_from = if decoder.is_some() { vec![config] } else { vec!["special_tokens_map.json", config] };
+        let mut tokenizer = Self {
+            files,
+            vocabularies,
+            tokenizer_class: get(config, "/tokenizer_class").and_then(Value::as_str).map(str::to_owned),
+            added_tokens_decoder: decoder,
+            added_tokens_json: json,
+            tokenizer_json_added: own,
+            special_tokens: special_tokens(&special_from, &get),
+            ..Self::default()
+        };
+        let prefix = get(config, "/add_prefix_space").is_some_and(|v| !v.is_null());
+        tokenizer.source = tokenizer.choose_source(prefix);
+        tokenizer.resolve();
+        tokenizer
+    }
+
+    /// Which file the vocabulary is taken from: `tokenizer.json`, unless the fast class rebuilds itself
+    /// from the slow one because `add_prefix_space` is set. Source: `LlamaTokenizerFast` and
+    /// `T5TokenizerFast` in transformers 4.47.0.
+    fn choose_source(&self, prefix_space: bool) -> Option<String> {
+        let class = self.tokenizer_class.as_deref().unwrap_or_default();
+        let rebuilt = prefix_space && (class.starts_with("Llama") || class.starts_with("T5"));
+        let slow = VOCABULARY_FILES.into_iter().skip(1).find(|f| self.files.contains(*f));
+        let source = match slow {
+            Some(slow) if rebuilt || !self.files.contains("tokenizer.json") => slow,
+            _ => VOCABULARY_FILES.into_iter().find(|f| self.files.contains(*f))?,
+        };
+        Some(source.to_owned())
+    }
+
+    /// The vocabulary the loader starts from, if it could be read.
+    #[must_use]
+    pub fn base(&self) -> Option<&Vocabulary> {
+        self.vocabularies.get(self.source.as_deref()?).map(AsRef::as_ref)
+    }
+
+    /// Added tokens by id as the files state them: `added_tokens_decoder`, or else `added_tokens.json`,
+    /// or else `tokenizer.json`.
+    #[must_use]
+    pub fn stated(&self) -> BTreeMap<u64, &str> {
+        let lists = [&self.added_tokens_decoder, &self.added_tokens_json, &self.tokenizer_json_added];
+        let list = lists.into_iter().flatten().next();
+        list.into_iter().flatten().map(|t| (t.id, t.content.as_str())).collect()
+    }
+
+    /// Tokens beside the base vocabulary, with the ids they have once loaded.
+    #[must_use]
+    pub const fn added(&self) -> &BTreeMap<String, u64> {
+        &self.added
+    }
+
+    /// `len(tokenizer)` in transformers; `None` when the vocabulary could not be read, or its class
+    /// adds tokens that no file names.
+    #[must_use]
+    pub const fn length(&self) -> Option<u64> {
+        self.length
+    }
+
+    /// The id a token has once loaded.
+    #[must_use]
+    pub fn id_of(&self, token: &str) -> Option<u64> {
+        self.added.get(token).copied().or_else(|| self.base()?.id_of(token))
+    }
+
+    /// Whether the tokenizer has this token.
+    #[must_use]
+    pub fn contains(&self, token: &str) -> bool {
+        self.id_of(token).is_some()
+    }
+
+    /// Works out ids and length as transformers does on load: stated tokens, then special ones.
+    fn resolve(&mut self) {
+        let base = self.base().cloned();
+        let fast = self.source.as_deref() == Some("tokenizer.json");
+        let in_base = |token: &str| base.as_ref().is_some_and(|b| b.id_of(token).is_some());
+        let base_len = base.as_ref().map_or(0, Vocabulary::len);
+        let mut ids: BTreeMap<String, u64> = BTreeMap::new();
+        let stated = self.added_tokens_decoder.as_ref().or(self.added_tokens_json.as_ref());
+        let mut later: Vec<&str> = Vec::new();
+        // Without the base vocabulary nothing can be worked out; what the files state is all there is.
+        if fast && base.is_some() {
+            let own = self.tokenizer_json_added.iter().flatten();
+            ids.extend(own.map(|t| (t.content.clone(), t.id)));
+            let mut stated: Vec<_> = stated.into_iter().flatten().collect();
+            stated.sort_by_key(|t| t.id);
+            later.extend(stated.iter().map(|t| t.content.as_str()));
+        } else {
+            let stated = stated.or(self.tokenizer_json_added.as_ref());
+            ids.extend(stated.into_iter().flatten().map(|t| (t.content.clone(), t.id)));
+        }
+        later.extend(self.special_tokens.iter().map(|(_, token)| token.as_str()));
+        let mut length = ids.keys().filter(|t| !in_base(t)).count();
+        let mut next = ids.values().max().map_or(0, |max| max.saturating_add(1)).max(base_len);
+        for token in later {
+            if !ids.contains_key(token) && !in_base(token) && base.is_some() {
+                ids.insert(token.to_owned(), next);
+                next = next.saturating_add(1);
+                length = length.saturating_add(1);
+            }
+        }
+        // Classes behind these two shift ids or add tokens of their own.
+        let known = !matches!(self.source.as_deref(), Some("spiece.model" | "sentencepiece.bpe.model"));
+        let more = u64::try_from(length).unwrap_or(u64::MAX);
+        self.length = base.filter(|_| known).map(|_| base_len.saturating_add(more));
+        self.added = ids;
+    }
+}
+
+fn added(id: u64, token: &Value) -> Option<AddedToken> {
+    let content = token.as_str().or_else(|| token.get("content")?.as_str())?;
+    Some(AddedToken { id, content: content.to_owned() })
+}
+
+/// Special tokens in the order they are added; of several files the first that names one.
+fn special_tokens<'v>(
+    files: &[&str],
+    get: &impl Fn(&str, &str) -> Option<&'v Value>,
+) -> Vec<(String, String)> {
+    let content = |v: &Value| v.as_str().or_else(|| v.get("content")?.as_str()).map(str::to_owned);
+    let mut tokens = Vec::new();
+    for name in SPECIAL {
+        let pointer = format!("/{name}");
+        let Some(value) = files.iter().find_map(|f| get(f, &pointer)) else { continue };
+        match value {
+            Value::Array(list) => tokens.extend(list.iter().filter_map(content).map(|t| (name.to_owned(), t))),
+            other => tokens.extend(content(other).map(|t| (name.to_owned(), t))),
+        }
+    }
+    tokens
+}

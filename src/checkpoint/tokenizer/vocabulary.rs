@@ -1,0 +1,124 @@
+//! A vocabulary in little memory: all tokens in one string, sorted.
+
+use super::super::Document;
+use super::super::scan::{Scanner, Token};
+use super::sentencepiece;
+
+/// Tokens and their ids. A 256 000-word vocabulary takes some 5 MB.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Vocabulary {
+    arena: String,
+    /// Start and end in `arena`, and the id; sorted by token, each token once.
+    tokens: Vec<(u32, u32, u32)>,
+    /// Highest id and one, or the number of tokens; whichever a list says.
+    len: u64,
+}
+
+impl Vocabulary {
+    /// Reads a vocabulary file that is no JSON document: `vocab.txt` (a token a line) or a
+    /// sentencepiece model.
+    ///
+    /// # Errors
+    /// With the reason, when the bytes are neither.
+    pub fn parse(name: &str, bytes: &[u8]) -> Result<Self, &'static str> {
+        if name.ends_with(".txt") {
+            let text = std::str::from_utf8(bytes).map_err(|_| "it is not UTF-8")?;
+            return Self::collect(text.lines().zip(0..));
+        }
+        Self::collect(sentencepiece::pieces(bytes)?.into_iter().zip(0..))
+    }
+
+    /// Reads the vocabulary at `pointer` of a document: an object of ids by token, or a list of pairs
+    /// of token and score.
+    pub(super) fn of_document(document: &Document, pointer: &str) -> Option<Self> {
+        let text = document.text.as_deref()?;
+        // A document that was not understood has no value, and no vocabulary either.
+        document.value.as_ref()?;
+        let span = document.locate(pointer)?;
+        let mut scanner = Scanner::lenient(text, span.start);
+        let mut entries = Vec::new();
+        match scanner.next().ok()??.0 {
+            Token::BeginObject => loop {
+                match scanner.next().ok()??.0 {
+                    Token::EndObject => break,
+                    Token::Key(key) => {
+                        let id = match scanner.next().ok()??.0 {
+                            Token::Number(id) => id.parse().ok()?,
+                            _ => return None,
+                        };
+                        entries.push((key.decode().0, id));
+                    }
+                    _ => return None,
+                }
+            },
+            Token::BeginArray => loop {
+                match scanner.next().ok()??.0 {
+                    Token::EndArray => break,
+                    Token::BeginArray => {
+                        let Token::String(token) = scanner.next().ok()??.0 else { return None };
+                        entries.push((token.decode().0, u32::try_from(entries.len()).ok()?));
+                        scanner.skip_rest_of(&Token::BeginArray).ok()?;
+                    }
+                    _ => return None,
+                }
+            },
+            _ => return None,
+        }
+        Self::collect(entries).ok()
+    }
+
+    fn collect(entries: impl IntoIterator<Item = (impl AsRef<str>, u32)>) -> Result<Self, &'static str> {
+        const TOO_LARGE: &str = "it is larger than 4 GiB";
+        let mut vocabulary = Self::default();
+        for (token, id) in entries {
+            let start = u32::try_from(vocabulary.arena.len()).map_err(|_| TOO_LARGE)?;
+            vocabulary.arena.push_str(token.as_ref());
+            let end = u32::try_from(vocabulary.arena.len()).map_err(|_| TOO_LARGE)?;
+            vocabulary.tokens.push((start, end, id));
+        }
+        let Self { arena, tokens, .. } = &mut vocabulary;
+        let text = |t: &(u32, u32, u32)| token(arena, *t);
+        tokens.sort_by(|a, b| text(a).cmp(text(b)).then(a.0.cmp(&b.0)));
+        // Of equal tokens the last counts, as in a Python dict.
+        tokens.reverse();
+        tokens.dedup_by(|a, b| text(a) == text(b));
+        tokens.reverse();
+        vocabulary.len = u64::try_from(vocabulary.tokens.len()).unwrap_or(u64::MAX);
+        Ok(vocabulary)
+    }
+
+    /// How many different tokens there are.
+    #[must_use]
+    pub const fn len(&self) -> u64 {
+        self.len
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The id of a token.
+    #[must_use]
+    pub fn id_of(&self, wanted: &str) -> Option<u64> {
+        let at = self.tokens.binary_search_by(|t| token(&self.arena, *t).cmp(wanted)).ok()?;
+        self.tokens.get(at).map(|t| u64::from(t.2))
+    }
+
+    /// Highest id, if there is any token.
+    #[must_use]
+    pub fn max_id(&self) -> Option<u64> {
+        self.tokens.iter().map(|t| u64::from(t.2)).max()
+    }
+
+    /// All tokens with their ids, sorted by token.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, u64)> {
+        self.tokens.iter().map(|t| (token(&self.arena, *t), u64::from(t.2)))
+    }
+}
+
+fn token(arena: &str, (start, end, _): (u32, u32, u32)) -> &str {
+    // u32 fits usize on every platform with more than 16 bits.
+    arena.get(start as usize..end as usize).unwrap_or_default()
+}
