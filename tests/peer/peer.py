@@ -98,6 +98,7 @@ def errors(entry):
 # Checkpoints as plain data: {shard file: {tensor name: (dtype, shape, bytes)}} and an index, if there is one.
 
 INDEX = "model.safetensors.index.json"
+WIDTH = {"F64": 8, "I64": 8, "F32": 4, "I32": 4, "F16": 2, "BF16": 2, "I16": 2, "I8": 1, "U8": 1, "BOOL": 1}
 
 
 def read_shard(path):
@@ -123,6 +124,21 @@ def write_shard(path, tensors):
         file.write(len(text).to_bytes(8, "little") + text)
         for _, _, data in tensors.values():
             file.write(data)
+
+
+def write_holes(path, tensors):
+    """A file with the header of `tensors`, name -> (dtype, shape), and no data written."""
+    header, at = {"__metadata__": {"format": "pt"}}, 0
+    for name, (dtype, shape) in tensors.items():
+        size = WIDTH[dtype]
+        for n in shape:
+            size *= n
+        header[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [at, at + size]}
+        at += size
+    text = json.dumps(header).encode()
+    with open(path, "wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        file.truncate(8 + len(text) + at)
 
 
 def read_index(directory):
