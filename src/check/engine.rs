@@ -33,7 +33,6 @@ pub struct Outcome {
 }
 
 /// What a checker knows: rules, architectures, processors.
-#[derive(Debug)]
 pub struct Knowledge {
     /// Rules.
     pub rules: RuleSet,
@@ -56,17 +55,17 @@ impl Knowledge {
 /// Runs every rule over a checkpoint.
 #[must_use]
 pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
-    let mut faults = gathered(checkpoint);
+    let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
     faults.extend(index::compare(checkpoint));
     faults.extend(modules::compare(checkpoint));
     let stored = Stored::of(checkpoint);
-    let names = || stored.names();
+    let evidence = stored.evidence();
     let config = checkpoint.config();
-    let architecture = config.and_then(|c| knowledge.library.find(c, names()));
+    let architecture = config.and_then(|c| knowledge.library.find(c, stored.names()));
     let mut outcome = Outcome { architecture: architecture.map(|a| a.name().to_owned()), ..Outcome::default() };
     let mut expected: Option<Expected> = None;
     match (config, architecture) {
-        (Some(config), Some(architecture)) => match architecture.expect(config) {
+        (Some(config), Some(architecture)) => match architecture.expect_given(config, &evidence) {
             Ok(e) => expected = Some(e),
             Err(problems) => {
                 let reason = problems.first().map_or("", String::as_str);
@@ -116,15 +115,6 @@ fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
         place.and_then(|l| l.tensor.as_deref()),
         &f.message,
     )
-}
-
-/// Everything the reader found wrong.
-fn gathered(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let mut faults = checkpoint.faults.clone();
-    faults.extend(checkpoint.documents.values().flat_map(|d| d.faults.clone()));
-    faults.extend(checkpoint.shards.values().flat_map(|s| s.faults.clone()));
-    faults.extend(checkpoint.index.iter().flat_map(|i| i.faults.clone()));
-    faults
 }
 
 fn unknown_architecture(config: &Value) -> Fault {
@@ -206,6 +196,7 @@ fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'
     for (name, value) in &fault.detail {
         inner.bind(name, value);
     }
+    inner.bind("fault", &Value::Object(fault.detail.clone()));
     inner
 }
 
@@ -266,7 +257,7 @@ fn locate(checkpoint: &Checkpoint, places: &[Place]) -> Vec<Location> {
                 spans.entry((file, pointer)).or_insert_with(|| nearest(document?, pointer)).clone()
             });
             let text = document.and_then(|d| d.text.as_deref()).or_else(|| {
-                place.file.as_deref().and_then(|f| checkpoint.modules.get(f)).map(|m| m.text.as_ref())
+                place.file.as_deref().and_then(|f| checkpoint.modules.get(f)).and_then(|m| m.text.as_deref())
             });
             let at = span.as_ref().zip(text).map(|(s, t)| line_column(t, s.start));
             Location {

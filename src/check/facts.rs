@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::modules;
 use super::tokens::OpenedTokenizer;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, Vocabulary};
 use crate::knowledge::Scope;
 
 /// Keys of tokenizer_config.json that hold thousands of entries; rules reach them through `tokenizer` and `id_of`.
@@ -48,6 +48,8 @@ pub fn scope(
     scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
     scope.bind("rows", &rows.map_or(Value::Null, Value::from));
     scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
+    let name = checkpoint.root.file_name().map(|n| n.to_string_lossy().into_owned());
+    scope.bind("directory", &json!(name.unwrap_or_default()));
     let has_weights = checkpoint.tensors().next().is_some();
     scope.bind("has_weights", &json!(has_weights));
     let here = Arc::clone(checkpoint);
@@ -63,19 +65,17 @@ pub fn scope(
 
 fn tokenizer(checkpoint: &Checkpoint) -> Value {
     let t = &checkpoint.tokenizer;
-    let special = |key: &str| {
-        let value = checkpoint
-            .document("tokenizer_config.json")
-            .and_then(|d| d.get(&format!("/{key}")))
-            .or_else(|| checkpoint.document("special_tokens_map.json").and_then(|d| d.get(&format!("/{key}"))))?;
-        let content = value.as_str().or_else(|| value.get("content").and_then(Value::as_str))?;
+    let special = |attribute: &str| {
+        let (_, content) = t.special_tokens.iter().find(|(a, _)| a == attribute)?;
         t.id_of(content)
     };
+    let entries = |file: &str| t.vocabularies.get(file).map(|v| v.len());
     json!({
         "length": t.length(),
-        "base": t.base_size,
-        "class": t.class,
-        "added": t.added.len(),
+        "base": t.base().map(Vocabulary::len),
+        "class": t.tokenizer_class,
+        "json_base": entries("tokenizer.json"),
+        "model_base": entries("tokenizer.model"),
         "bos": special("bos_token"),
         "eos": special("eos_token"),
         "pad": special("pad_token"),

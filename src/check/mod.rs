@@ -1,5 +1,11 @@
 //! Compares what is there with what should be; pure functions from a checkpoint to findings.
 
+pub mod engine;
+pub mod facts;
 pub mod finding;
+pub mod index;
+pub mod modules;
+pub mod tokens;
 
+pub use engine::{Knowledge, Outcome, check};
 pub use finding::{Finding, FixHint, Location, Severity};

@@ -4,8 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use crate::checkpoint::open::is_plain_file_name;
-use crate::checkpoint::{Checkpoint, Fault, Module, Place};
+use crate::checkpoint::{Checkpoint, Fault, Module, Place, is_plain_file_name};
 
 /// An `auto_map` entry: where it stands and what it says.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -81,6 +80,12 @@ fn escape(key: &str) -> String {
     key.replace('~', "~0").replace('/', "~1")
 }
 
+/// Modules beside this one that it imports.
+pub fn relative_modules(module: &Module) -> BTreeSet<String> {
+    let beside = module.relative_imports.iter().filter(|i| i.level == 1 && !i.module.is_empty());
+    beside.filter_map(|i| i.module.split('.').next()).map(str::to_owned).collect()
+}
+
 /// A module and everything it imports relatively, itself first; and whether all of it is there.
 fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a Module>)> {
     let mut seen: BTreeSet<String> = BTreeSet::from([root.to_owned()]);
@@ -88,7 +93,7 @@ fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'
     let mut out = Vec::new();
     while let Some(name) = pending.pop() {
         let module = checkpoint.modules.get(&format!("{name}.py"));
-        for import in module.iter().flat_map(|m| m.relative_modules()) {
+        for import in module.iter().flat_map(|m| relative_modules(m)) {
             if seen.insert(import.clone()) {
                 pending.push(import);
             }
@@ -102,7 +107,7 @@ fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'
 ///
 /// Source: `get_cached_module_file` and `check_imports` of transformers 4.47.0.
 fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
-    let direct = checkpoint.modules.get(&format!("{root}.py")).map(Module::relative_modules);
+    let direct = checkpoint.modules.get(&format!("{root}.py")).map(relative_modules);
     direct.into_iter().flatten().chain([root.to_owned()]).collect()
 }
 
@@ -140,7 +145,7 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             }
             continue;
         };
-        if !entry.nested && !parsed.defines(class) {
+        if !entry.nested && parsed.defines(class) == Some(false) {
             faults.push(fault("auto-map-class-missing").with("module", format!("{module}.py")).with("class", class));
         }
         if !entry.nested && roots.insert(module) {
@@ -172,7 +177,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
             Fault::new("relative-import-missing")
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
-                .with("import", format!("{name}.py"))
+                .with("imported", format!("{name}.py"))
                 .with("target", entry.target.as_str()),
         );
     }
@@ -201,8 +206,8 @@ pub fn processor_tokenizers(checkpoint: &Checkpoint) -> Option<Vec<String>> {
     let mut module = checkpoint.modules.get(&format!("{module}.py"));
     for _ in 0..8 {
         let found = module.and_then(|m| m.class(&class)).or_else(|| checkpoint.modules.values().find_map(|m| m.class(&class)))?;
-        if !found.tokenizer_class.is_empty() {
-            return Some(found.tokenizer_class.clone());
+        if let Some(classes) = &found.tokenizer_class {
+            return Some(classes.clone());
         }
         // `class A(A)` of an alias: the base of that name lives in another module.
         let base = found.bases.first()?.rsplit('.').next()?.to_owned();

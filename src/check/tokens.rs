@@ -4,8 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use crate::checkpoint::tokenizer::AddedToken;
-use crate::checkpoint::{Checkpoint, Fault, Place, Tokenizer};
+use crate::checkpoint::{Checkpoint, Fault, Place, Tokenizer, Vocabulary};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::{EvalError, Scope};
 
@@ -19,8 +18,19 @@ pub struct OpenedTokenizer {
     pub length: u64,
     /// Ids of the named tokens, and what the processor's `let` computed.
     pub named: BTreeMap<String, Value>,
-    /// All added tokens by id: those the tokenizer had, and the new ones.
-    pub added: BTreeMap<u64, AddedToken>,
+    /// The tokens that the processor adds, by id; those the tokenizer had are not among them.
+    pub new: BTreeMap<u64, NewToken>,
+}
+
+/// A token that a processor adds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewToken {
+    /// Its text.
+    pub content: String,
+    /// Whether the tokenizer treats it as special.
+    pub special: bool,
+    /// Whether text is normalised before it is looked for.
+    pub normalized: bool,
 }
 
 impl OpenedTokenizer {
@@ -45,7 +55,7 @@ pub fn open_tokenizer(
     let Some(length) = tokenizer.length() else { return Ok(None) };
     let mut scope = Scope::new();
     scope.bind("processor", config);
-    let mut out = OpenedTokenizer { length, named: BTreeMap::new(), added: tokenizer.added.clone() };
+    let mut out = OpenedTokenizer { length, ..OpenedTokenizer::default() };
     for item in &processor.lets {
         let value = item.is.eval(&scope)?;
         scope.bind(&item.name, &value);
@@ -64,7 +74,7 @@ pub fn open_tokenizer(
             let id = tokenizer.id_of(&content).unwrap_or_else(|| {
                 let id = out.length;
                 out.length = out.length.saturating_add(1);
-                out.added.insert(id, AddedToken::new(content, run.special, run.normalized));
+                out.new.insert(id, NewToken { content, special: run.special, normalized: run.normalized });
                 id
             });
             if let Some(name) = run.name.as_ref().filter(|_| i == 0) {
@@ -83,8 +93,9 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     let tokenizer = &checkpoint.tokenizer;
     let mut faults = Vec::new();
     let decoder = "tokenizer_config.json";
+    let stated = tokenizer.stated();
     if let Some(rows) = rows {
-        let above: Vec<(&u64, &AddedToken)> = tokenizer.added.range(rows..).collect();
+        let above: Vec<(&u64, &&str)> = stated.range(rows..).collect();
         if let (Some((first, token)), Some((last, _))) = (above.first(), above.last()) {
             faults.push(
                 Fault::new("token-above-rows")
@@ -92,22 +103,22 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
                     .with("count", above.len())
                     .with("first", **first)
                     .with("last", **last)
-                    .with("token", token.content.as_str())
+                    .with("token", **token)
                     .with("rows", rows),
             );
         }
     }
     // A slow tokenizer numbers added tokens one after another: a hole shifts all that follow.
-    if let Some(base) = tokenizer.base_size.filter(|_| !checkpoint.has_file("tokenizer.json")) {
+    if let Some(base) = tokenizer.base().map(Vocabulary::len).filter(|_| !checkpoint.has_file("tokenizer.json")) {
         let mut expected = base;
-        for (id, token) in tokenizer.added.range(base..) {
+        for (id, token) in stated.range(base..) {
             if *id != expected {
                 faults.push(
                     Fault::new("token-hole")
                         .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
                         .with("missing", expected)
                         .with("next", *id)
-                        .with("token", token.content.as_str()),
+                        .with("token", *token),
                 );
                 break;
             }
@@ -115,25 +126,25 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
         }
     }
     let mut by_content: BTreeMap<&str, u64> = BTreeMap::new();
-    for (id, token) in &tokenizer.added {
-        if let Some(first) = by_content.insert(&token.content, *id) {
+    for (id, token) in &stated {
+        if let Some(first) = by_content.insert(token, *id) {
             faults.push(
                 Fault::new("token-id-twice")
                     .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
-                    .with("token", token.content.as_str())
+                    .with("token", *token)
                     .with("first", first)
                     .with("second", *id),
             );
         }
     }
-    for (content, id) in &tokenizer.added_tokens_json {
-        if let Some(decoder_id) = by_content.get(content.as_str()).filter(|d| *d != id) {
-            let pointer = content.replace('~', "~0").replace('/', "~1");
+    for added in tokenizer.added_tokens_json.iter().flatten() {
+        if let Some(decoder_id) = by_content.get(added.content.as_str()).filter(|d| **d != added.id) {
+            let pointer = added.content.replace('~', "~0").replace('/', "~1");
             faults.push(
                 Fault::new("added-tokens-disagree")
                     .at(Place::file("added_tokens.json").pointer(format!("/{pointer}")))
-                    .with("token", content.as_str())
-                    .with("id", *id)
+                    .with("token", added.content.as_str())
+                    .with("id", added.id)
                     .with("decoder_id", *decoder_id),
             );
         }

@@ -5,6 +5,7 @@ pub mod expression;
 pub mod library;
 pub mod processor;
 pub mod recipe;
+pub mod rule;
 pub mod source;
 
 pub use architecture::{Architecture, Evidence, Expected, ExpectedTensor};

@@ -165,6 +165,12 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
             let _ok = writeln!(out, "- {more}");
         }
     }
+    if !merge.notes.is_empty() {
+        let _ok = writeln!(out, "\n## To know\n");
+        for note in &merge.notes {
+            let _ok = writeln!(out, "- {}", text(&sentence(note)));
+        }
+    }
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
         let _ok = writeln!(out, "\n## Files");

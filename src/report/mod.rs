@@ -2,6 +2,7 @@
 //!
 //! [`render`] turns a [`Report`] into text; where that text goes is the caller's business.
 
+mod build;
 mod collapse;
 mod concise;
 mod escape;

@@ -1,7 +1,6 @@
 //! Findings or a recipe become a plan; only this module writes checkpoints.
 
-pub mod merge {
-    pub mod record;
-}
+pub mod apply;
+pub mod merge;
 pub mod plan;
 pub mod transform;

@@ -266,6 +266,7 @@ fn merge() -> MergeReport {
             why: "the vision donor's tower takes its place".to_owned(),
         }],
         repairs: vec!["3 Infinity values in processor_config.json became 0.0".to_owned()],
+        notes: vec!["the projector must be trained".to_owned()],
         files: vec![
             MergedFile { name: "config.json".to_owned(), origin: "recipe".to_owned() },
             MergedFile { name: "tokenizer.model".to_owned(), origin: "language donor".to_owned() },
@@ -293,7 +294,7 @@ pub fn merge_seam() -> Report {
     merge.stages.push(stage("plan", "stopped: 1 seam does not fit"));
     (merge.tensors, merge.bytes) = (0, 0);
     (merge.transforms, merge.changed, merge.dropped) = Default::default();
-    (merge.repairs, merge.files) = Default::default();
+    (merge.repairs, merge.notes, merge.files) = Default::default();
     let shaped = |donor: &str, name: &str, shape: [u64; 2]| {
         Some(ShapedName { donor: donor.to_owned(), name: name.to_owned(), shape: shape.into() })
     };

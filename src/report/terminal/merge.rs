@@ -30,6 +30,8 @@ pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
     list(out, "left behind", merge.dropped.len(), style, dropped.take(style.cap).collect());
     let repairs = merge.repairs.iter().map(|r| sentence(r));
     list(out, "repaired on the way", merge.repairs.len(), style, repairs.take(style.cap).collect());
+    let notes = merge.notes.iter().map(|n| sentence(n));
+    list(out, "to know", merge.notes.len(), style, notes.take(style.cap).collect());
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [name(&f.name), sentence(&f.origin)]).collect();
         let size = format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));

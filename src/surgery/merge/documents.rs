@@ -3,7 +3,7 @@
 use serde_json::{Map, Value, json};
 
 use super::{Context, Draft, MergeError};
-use crate::checkpoint::Document;
+use crate::checkpoint::{Document, Vocabulary};
 use crate::check::tokens::OpenedTokenizer;
 use crate::knowledge::recipe::{CODE_SWITCHES, DocumentSpec, Edit, GraftEdit, TokensForm};
 
@@ -135,7 +135,7 @@ fn apply(context: &Context<'_>, spec: &DocumentSpec, edit: &Edit, value: &mut Va
             if context.holds(edit.when.as_ref(), &spec.name)?
                 && let Some(tokens) = &context.tokens
             {
-                put(value, &edit.at, added(tokens, edit.form)).ok_or_else(|| not_there(context, spec, &edit.at))?;
+                put(value, &edit.at, added(context, tokens, edit.form)).ok_or_else(|| not_there(context, spec, &edit.at))?;
             }
         }
         Edit::Graft(graft) => {
@@ -153,13 +153,31 @@ fn apply(context: &Context<'_>, spec: &DocumentSpec, edit: &Edit, value: &mut Va
     Ok(())
 }
 
-/// The added tokens in one of transformers' forms.
-fn added(tokens: &OpenedTokenizer, form: TokensForm) -> Value {
-    let entries = tokens.added.iter().map(|(id, token)| match form {
-        TokensForm::Decoder => (id.to_string(), token.to_json()),
-        TokensForm::Ids => (token.content.clone(), json!(id)),
-    });
-    Value::Object(entries.collect())
+/// The added tokens in one of transformers' forms: the base donor's as it states them, then the new ones.
+fn added(context: &Context<'_>, tokens: &OpenedTokenizer, form: TokensForm) -> Value {
+    let base = context.recipe.tokens.as_ref().and_then(|t| context.donor(&t.base)).map(|d| &d.checkpoint);
+    let mut map = Map::new();
+    match form {
+        TokensForm::Decoder => {
+            let stated = base.and_then(|c| c.document("tokenizer_config.json")?.get("/added_tokens_decoder")?.as_object());
+            map.extend(stated.into_iter().flatten().map(|(k, v)| (k.clone(), v.clone())));
+            for (id, token) in &tokens.new {
+                let entry = json!({
+                    "content": token.content, "lstrip": false, "normalized": token.normalized, "rstrip": false,
+                    "single_word": false, "special": token.special,
+                });
+                map.insert(id.to_string(), entry);
+            }
+        }
+        TokensForm::Ids => {
+            // Only what lies beyond the vocabulary, as save_pretrained writes it.
+            let size = base.and_then(|c| c.tokenizer.base()).map_or(0, Vocabulary::len);
+            let had = base.into_iter().flat_map(|c| c.tokenizer.added()).filter(|(_, id)| **id >= size);
+            map.extend(had.map(|(content, id)| (content.clone(), json!(id))));
+            map.extend(tokens.new.iter().map(|(id, token)| (token.content.clone(), json!(id))));
+        }
+    }
+    Value::Object(map)
 }
 
 fn not_there(context: &Context<'_>, spec: &DocumentSpec, pointer: &str) -> MergeError {

@@ -8,6 +8,7 @@ use serde_json::{Map, Value, json};
 use super::documents::Built;
 use super::record::MergedFile;
 use super::{Context, Draft, MergeError};
+use crate::check::modules::relative_modules;
 use crate::checkpoint::Document;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
 use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
@@ -90,7 +91,7 @@ fn closure(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>
         for role in &spec.from {
             let Some(parsed) = context.donor(role).and_then(|d| d.checkpoint.modules.get(&name)) else { continue };
             if let Some(file) = read(context, role, &name)? {
-                pending.extend(parsed.relative_modules());
+                pending.extend(relative_modules(parsed));
                 found.insert(name, file);
                 break;
             }

@@ -7,6 +7,7 @@ mod documents;
 mod files;
 pub mod manifest;
 mod options;
+pub mod pipeline;
 pub mod record;
 mod tensors;
 

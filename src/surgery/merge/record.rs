@@ -29,6 +29,8 @@ pub struct MergeReport {
     pub dropped: Vec<Dropped>,
     /// Repairs made on the way, one sentence each.
     pub repairs: Vec<String>,
+    /// What a person should know of the result, one sentence each.
+    pub notes: Vec<String>,
     /// Files of the result and where each came from.
     pub files: Vec<MergedFile>,
     /// Tensors in the result.

@@ -9,7 +9,7 @@ use super::documents::Built;
 use super::record::{ChangedTensor, Dropped, Seam, ShapedName};
 use super::{Context, Donor, Draft, MergeError};
 use crate::checkpoint::{Shard, Tensor};
-use crate::knowledge::Library;
+use crate::knowledge::{Evidence, Library};
 use crate::knowledge::recipe::TensorSpec;
 use crate::surgery::plan::{PlannedTensor, Source, TensorRef, into_shards};
 use crate::surgery::transform::can_compute;
@@ -55,9 +55,10 @@ pub(super) fn build(
         .map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why })
         .collect();
 
-    let names: Vec<String> = taken.iter().map(|t| t.0.clone()).collect();
+    let evidence: Evidence = taken.iter().map(|t| (t.0.clone(), Some(t.3.shape.clone()))).collect();
+    let names = taken.iter().map(|t| t.0.as_str());
     let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
-    let expected = expected_shapes(library, config, &names);
+    let expected = expected_shapes(library, config, names, &evidence);
     let mut tensors = Vec::new();
     let mut seen: HashMap<String, String> = HashMap::new();
     for (name, donor, shard, tensor, rule) in taken {
@@ -124,9 +125,11 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<Rule<'a>>, MergeError> {
 }
 
 /// Position and shape of each tensor the class would build from the planned config.
-fn expected_shapes(library: &Library, config: Option<&Value>, names: &[String]) -> HashMap<String, (usize, Vec<u64>)> {
+fn expected_shapes<'n>(
+    library: &Library, config: Option<&Value>, names: impl Iterator<Item = &'n str>, evidence: &Evidence,
+) -> HashMap<String, (usize, Vec<u64>)> {
     let Some(config) = config else { return HashMap::new() };
-    let found = library.find(config, names.iter().map(String::as_str)).and_then(|a| a.expect(config).ok());
+    let found = library.find(config, names).and_then(|a| a.expect_given(config, evidence).ok());
     found.map_or_else(HashMap::new, |e| {
         e.tensors.iter().enumerate().map(|(i, (name, t))| (name.clone(), (i, t.shape.clone()))).collect()
     })

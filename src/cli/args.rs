@@ -1,0 +1,142 @@
+//! What can be typed.
+
+use std::path::PathBuf;
+
+use ckpt_doctor::check::Severity;
+use ckpt_doctor::report::Format;
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Validates, repairs and merges model checkpoint directories from their files alone.
+#[derive(Debug, Parser)]
+#[command(name = "ckpt-doctor", version, propagate_version = true)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The subcommands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Check checkpoint directories
+    Check(CheckArgs),
+    /// Build one checkpoint from parts of two
+    BuildMerged(BuildMergedArgs),
+}
+
+/// How and where to report, and what counts as a failure.
+#[derive(Debug, Args)]
+pub struct ReportArgs {
+    /// Format of the report on standard output
+    #[arg(long, value_name = "FMT", default_value = "full", value_parser = parse_format)]
+    pub output_format: Format,
+    /// Also write the report to a file; may be given several times
+    #[arg(long, value_name = "FMT=FILE", value_parser = parse_report)]
+    pub report: Vec<(Format, PathBuf)>,
+    /// Least severity that makes the exit code 1
+    #[arg(long, value_name = "SEVERITY", default_value = "error")]
+    pub fail_on: FailOn,
+    /// Exit with 0 whatever is found
+    #[arg(long)]
+    pub exit_zero: bool,
+    /// When to use colours
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    pub color: Color,
+}
+
+/// Arguments of `check`.
+#[derive(Debug, Args)]
+pub struct CheckArgs {
+    /// Checkpoint directories, directories that hold some, or files of checkpoints
+    #[arg(value_name = "PATH", default_value = ".")]
+    pub paths: Vec<PathBuf>,
+    /// How to report.
+    #[command(flatten)]
+    pub report: ReportArgs,
+}
+
+/// Arguments of `build-merged`.
+#[derive(Debug, Args)]
+#[command(after_help = "Without --recipe the donors' architectures choose it.\n\
+Exit codes: 0 the merged checkpoint is written and sound, 1 a donor or a seam stopped it, 2 it could not be tried.")]
+pub struct BuildMergedArgs {
+    /// A merge.json5 that names recipe, donors, options and out
+    #[arg(value_name = "MERGE_FILE", conflicts_with_all = ["recipe", "donor", "vision", "language"])]
+    pub file: Option<PathBuf>,
+    /// Recipe: a name, or a JSON5 file
+    #[arg(long, value_name = "NAME|FILE")]
+    pub recipe: Option<String>,
+    /// Donor in a role; may be given several times
+    #[arg(long, value_name = "ROLE=DIR", value_parser = parse_pair)]
+    pub donor: Vec<(String, String)>,
+    /// Short for --donor vision=DIR
+    #[arg(long, value_name = "DIR")]
+    pub vision: Option<PathBuf>,
+    /// Short for --donor language=DIR
+    #[arg(long, value_name = "DIR")]
+    pub language: Option<PathBuf>,
+    /// Directory to make: must not exist, or be empty
+    #[arg(long, value_name = "DIR", required_unless_present = "file")]
+    pub out: Option<PathBuf>,
+    /// Option of the recipe; may be given several times
+    #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
+    pub set: Vec<(String, String)>,
+    /// Stop before anything is written
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Record the SHA-256 of every byte of the donors, not only of documents and headers
+    #[arg(long)]
+    pub hash: bool,
+    /// How to report.
+    #[command(flatten)]
+    pub report: ReportArgs,
+}
+
+/// Least severity that fails.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FailOn {
+    /// Anything at all.
+    Info,
+    /// Warnings and errors.
+    Warning,
+    /// Errors.
+    Error,
+}
+
+impl FailOn {
+    /// The severity it names.
+    pub const fn severity(self) -> Severity {
+        match self {
+            Self::Info => Severity::Info,
+            Self::Warning => Severity::Warning,
+            Self::Error => Severity::Error,
+        }
+    }
+}
+
+/// When to use colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Color {
+    /// On a terminal.
+    Auto,
+    /// Always.
+    Always,
+    /// Never.
+    Never,
+}
+
+fn parse_format(word: &str) -> Result<Format, String> {
+    word.parse().map_err(|e: ckpt_doctor::report::UnknownFormat| e.to_string())
+}
+
+fn parse_pair(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((name, value)) if !name.is_empty() && !value.is_empty() => Ok((name.to_owned(), value.to_owned())),
+        _ => Err("write it as NAME=VALUE".to_owned()),
+    }
+}
+
+fn parse_report(text: &str) -> Result<(Format, PathBuf), String> {
+    let (format, file) = parse_pair(text).map_err(|_| "write it as FMT=FILE".to_owned())?;
+    Ok((parse_format(&format)?, PathBuf::from(file)))
+}

@@ -1,0 +1,138 @@
+//! `build-merged`.
+
+use std::collections::BTreeMap;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use anyhow::{Context, bail};
+use ckpt_doctor::check::Knowledge;
+use ckpt_doctor::checkpoint::open::{JSON_CAP, read_capped};
+use ckpt_doctor::knowledge::recipe::{MergeFile, Recipe};
+use ckpt_doctor::knowledge::source;
+use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::{Format, Report, Style, render};
+use ckpt_doctor::surgery::apply::{ApplyError, INTERRUPTED};
+use ckpt_doctor::surgery::merge::pipeline::{self, PipelineError, Request, Run};
+
+use super::args::BuildMergedArgs;
+use super::{FINDINGS, output};
+
+/// What a shell expects of a program that Ctrl-C ended.
+const INTERRUPTED_CODE: u8 = 130;
+
+/// Runs `build-merged`.
+pub fn run(args: &BuildMergedArgs) -> anyhow::Result<u8> {
+    let request = request(args)?;
+    let knowledge = Knowledge::embedded()?;
+    ctrlc::set_handler(|| INTERRUPTED.store(true, Ordering::Relaxed)).context("setting up Ctrl-C")?;
+    let terminal = std::io::stderr().is_terminal();
+    let mut last = 0;
+    let mut progress = |done: u64, total: u64| {
+        let percent = done.saturating_mul(100).checked_div(total).unwrap_or(100);
+        if terminal && percent > last {
+            last = percent;
+            output::progress(percent);
+        }
+    };
+    let summary = |run: &Run| render(&report(run, true), Format::Markdown, Style { cap: 1000, ..Style::default() });
+    let run = match pipeline::run(&request, &knowledge, &summary, &mut progress) {
+        Ok(run) => run,
+        Err(PipelineError::Apply(ApplyError::Interrupted)) => {
+            output::note("interrupted; nothing was written");
+            return Ok(INTERRUPTED_CODE);
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let by_severity = output::finish(&report(&run, false), &args.report)?;
+    // What matters is the result; findings on a donor that the merge repaired are told, not counted.
+    Ok(match run.record.stage.as_str() {
+        "written" | "dry-run" if args.report.exit_zero || !result_fails(&run, args) => super::CLEAN,
+        "written" | "dry-run" => by_severity.max(FINDINGS),
+        _ => FINDINGS,
+    })
+}
+
+fn result_fails(run: &Run, args: &BuildMergedArgs) -> bool {
+    let result = run.looked.iter().rfind(|l| !l.role.starts_with("donor"));
+    result.is_some_and(|l| l.outcome.findings.iter().any(|f| f.severity >= args.report.fail_on.severity()))
+}
+
+/// The report of a run; `portable` names directories by their last component, for a file that travels.
+fn report(run: &Run, portable: bool) -> Report {
+    let name = |path: &Path| match path.file_name() {
+        Some(name) if portable => name.to_string_lossy().into_owned(),
+        _ => path.display().to_string(),
+    };
+    let checkpoints = run
+        .looked
+        .iter()
+        .map(|l| CheckpointReport::new(name(&l.path), Some(l.role.clone()), &l.checkpoint, &l.outcome))
+        .collect();
+    let mut record = run.record.clone();
+    if portable {
+        record.out = name(Path::new(&record.out));
+        record.donors = record.donors.iter().map(|(role, dir)| (role.clone(), name(Path::new(dir)))).collect();
+    }
+    Report::new(checkpoints, Some(record))
+}
+
+fn request(args: &BuildMergedArgs) -> anyhow::Result<Request> {
+    let mut options: BTreeMap<String, String> = BTreeMap::new();
+    let mut donors: BTreeMap<String, PathBuf> = BTreeMap::new();
+    let (mut recipe, mut out, mut base) = (args.recipe.clone(), args.out.clone(), PathBuf::new());
+    if let Some(path) = &args.file {
+        let file: MergeFile = source::parse(&path.display().to_string(), &text(path)?)?;
+        base = path.parent().unwrap_or(Path::new("")).to_owned();
+        recipe = file.recipe;
+        for (role, dir) in &file.donors {
+            let dir = dir.as_str().with_context(|| format!("{}: donor {role} is not a path", path.display()))?;
+            donors.insert(role.clone(), base.join(dir));
+        }
+        for (name, value) in &file.options {
+            let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+            options.insert(name.clone(), value);
+        }
+        out = out.or_else(|| Some(base.join(file.out)));
+    }
+    let short = [("vision", &args.vision), ("language", &args.language)];
+    let typed = args.donor.iter().map(|(role, dir)| (role.clone(), PathBuf::from(dir)));
+    for (role, dir) in typed.chain(short.into_iter().filter_map(|(r, d)| Some((r.to_owned(), d.clone()?)))) {
+        if donors.insert(role.clone(), dir).is_some() {
+            bail!("donor {role} is given twice");
+        }
+    }
+    if donors.is_empty() {
+        bail!("no donors: give --vision DIR and --language DIR, or a merge file");
+    }
+    // The command line has the last word over the file, but not over itself.
+    let mut typed = BTreeMap::new();
+    for (name, value) in &args.set {
+        if typed.insert(name.clone(), value.clone()).is_some() {
+            bail!("option {name} is given twice");
+        }
+    }
+    options.extend(typed);
+    let recipe = recipe.map(|name| find_recipe(&name, &base)).transpose()?;
+    let out = out.context("no --out")?;
+    Ok(Request { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
+}
+
+/// A recipe by name, or from a file.
+fn find_recipe(name: &str, base: &Path) -> anyhow::Result<Recipe> {
+    let embedded = Recipe::embedded()?;
+    if let Some(recipe) = embedded.iter().find(|r| r.recipe == name) {
+        return Ok(recipe.clone());
+    }
+    let path = base.join(name);
+    if path.extension().is_some_and(|e| e == "json5" || e == "json") {
+        return Ok(Recipe::parse(&path.display().to_string(), &text(&path)?)?);
+    }
+    let names: Vec<&str> = embedded.iter().map(|r| r.recipe.as_str()).collect();
+    bail!("no recipe {name}; there are {}, or a path of a .json5 file", names.join(", "));
+}
+
+fn text(path: &Path) -> anyhow::Result<String> {
+    let bytes = read_capped(path, JSON_CAP).with_context(|| path.display().to_string())?;
+    String::from_utf8(bytes).with_context(|| format!("{}: not UTF-8", path.display()))
+}

@@ -1,0 +1,35 @@
+//! The command line: what was typed, what that means, what is printed, which code the program ends with.
+
+mod args;
+mod build_merged;
+mod check;
+mod output;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+/// Nothing at or above `--fail-on`.
+const CLEAN: u8 = 0;
+/// Findings at or above `--fail-on`, or a merge that stopped.
+const FINDINGS: u8 = 1;
+/// It could not be tried.
+const FAILED: u8 = 2;
+
+/// Runs the program.
+pub fn main() -> ExitCode {
+    let command = args::Cli::parse().command;
+    let result = match &command {
+        args::Command::Check(args) => check::run(args),
+        args::Command::BuildMerged(args) => build_merged::run(args),
+    };
+    match result {
+        Ok(code) => ExitCode::from(code),
+        Err(error) => {
+            // Names in an error may come from a checkpoint: nothing of them may reach the terminal raw.
+            let lines: Vec<String> = error.chain().map(|e| ckpt_doctor::checkpoint::escape(&e.to_string(), 4000)).collect();
+            output::note(&format!("error: {}", lines.join(": ")));
+            ExitCode::from(FAILED)
+        }
+    }
+}

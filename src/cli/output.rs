@@ -1,0 +1,54 @@
+//! The only place that prints and writes reports.
+
+use std::fs;
+use std::io::{IsTerminal, Write};
+
+use anyhow::Context;
+use ckpt_doctor::report::{Format, Report, Style, render};
+
+use super::args::{Color, ReportArgs};
+use super::{CLEAN, FINDINGS};
+
+/// A line on standard error.
+#[expect(clippy::print_stderr, reason = "this is where the program talks")]
+pub fn note(line: &str) {
+    eprintln!("{line}");
+}
+
+/// Prints the report and writes those asked for; returns the exit code by severity.
+pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
+    let terminal = std::io::stdout().is_terminal();
+    let color = match args.color {
+        Color::Always => true,
+        Color::Never => false,
+        // https://no-color.org
+        Color::Auto => terminal && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()),
+    };
+    let width = terminal.then(columns).flatten();
+    let text = render(report, args.output_format, Style { color, width, ..Style::default() });
+    for (format, file) in &args.report {
+        let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };
+        fs::write(file, render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
+    }
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        // The reader of a pipe has seen enough.
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => {}
+        other => other.context("writing to standard output")?,
+    }
+    let worst = report.checkpoints.iter().filter_map(|c| c.counts.worst()).max();
+    let fails = !args.exit_zero && worst.is_some_and(|s| s >= args.fail_on.severity());
+    Ok(if fails { FINDINGS } else { CLEAN })
+}
+
+/// Columns of the terminal.
+fn columns() -> Option<usize> {
+    let size = rustix::termios::tcgetwinsize(std::io::stdout()).ok()?;
+    (size.ws_col > 0).then_some(usize::from(size.ws_col))
+}
+
+/// Progress on a terminal, on one line.
+#[expect(clippy::print_stderr, reason = "this is where the program talks")]
+pub fn progress(percent: u64) {
+    eprint!("\rwriting {percent:3} %{}", if percent >= 100 { "\r             \r" } else { "" });
+}

@@ -1,0 +1,35 @@
+//! From what a check found to what a report says.
+
+use std::collections::BTreeMap;
+
+use super::model::{CheckpointReport, Counts};
+use crate::check::Outcome;
+use crate::checkpoint::Checkpoint;
+
+impl CheckpointReport {
+    /// The report on one checkpoint, named as the user named it.
+    #[must_use]
+    pub fn new(path: impl Into<String>, role: Option<String>, checkpoint: &Checkpoint, outcome: &Outcome) -> Self {
+        let counts = Counts::of(&outcome.findings);
+        let mut sources = BTreeMap::new();
+        for file in outcome.findings.iter().flat_map(|f| &f.locations).filter_map(|l| l.file.as_ref()) {
+            let document = checkpoint.document(file).and_then(|d| d.text.clone());
+            let text = document.or_else(|| checkpoint.modules.get(file).and_then(|m| m.text.clone()));
+            if let Some(text) = text {
+                sources.insert(file.clone(), text);
+            }
+        }
+        let bytes = checkpoint.tensors().fold(0_u64, |n, (_, t)| n.saturating_add(t.len()));
+        Self {
+            path: path.into(),
+            role,
+            architecture: outcome.architecture.clone(),
+            verdict: counts.verdict().to_owned(),
+            counts,
+            findings: outcome.findings.clone(),
+            load: outcome.load.clone(),
+            sources,
+            tensors: (checkpoint.tensors().count(), bytes),
+        }
+    }
+}
