@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::checkpoint::Shard;
+use crate::checkpoint::{Checkpoint, Shard};
 use crate::knowledge::Evidence;
 
 /// The file a loader takes before it looks for an index.
@@ -20,15 +20,23 @@ pub struct Stored {
 }
 
 impl Stored {
+    /// What a loader finds in this checkpoint.
+    #[must_use]
+    pub fn of(checkpoint: &Checkpoint) -> Self {
+        let index = checkpoint.index.as_ref().filter(|index| !index.unread);
+        Self::new(index.map(|index| &index.weight_map), checkpoint.shards.values())
+    }
+
     /// From an index, tensor name to file name, and the shards that are there.
     ///
-    /// A `model.safetensors` beside an index wins. Without either, which no loader opens, all shards are taken together.
+    /// A `model.safetensors` beside an index wins. Without either no loader opens anything; then the shards that
+    /// an index would name are taken together.
     #[must_use]
     pub fn new<'s>(index: Option<&BTreeMap<String, String>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
         let shards: BTreeMap<&str, &Shard> = shards.into_iter().map(|s| (s.name.as_str(), s)).collect();
         match (shards.get(SINGLE), index) {
             (Some(single), _) => Self::together([*single]),
-            (None, None) => Self::together(shards.into_values()),
+            (None, None) => Self::together(shards.into_values().filter(|s| s.name.starts_with("model"))),
             (None, Some(index)) => {
                 let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
                 let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
