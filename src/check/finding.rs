@@ -86,6 +86,9 @@ pub struct LoadReport {
     pub mismatched: Vec<Mismatch>,
     /// Wrong, and reported by nobody.
     pub silent: Vec<Silent>,
+    /// The exception the loader stops with before it reports any list.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub raises: Option<String>,
 }
 
 /// A tensor whose stored shape is not the expected one.

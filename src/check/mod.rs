@@ -4,6 +4,7 @@ pub mod engine;
 pub mod facts;
 pub mod finding;
 pub mod index;
+pub mod load;
 pub mod modules;
 pub mod tokens;
 

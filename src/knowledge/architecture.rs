@@ -37,12 +37,6 @@ impl Evidence {
         self.shapes.contains_key(name)
     }
 
-    /// Whether a tensor's name starts with `prefix`.
-    #[must_use]
-    pub fn has_prefix(&self, prefix: &str) -> bool {
-        self.under(prefix).next().is_some()
-    }
-
     /// One more than the largest number that follows `prefix` in a tensor's name; 0 when none does.
     #[must_use]
     pub fn count(&self, prefix: &str) -> u64 {
@@ -50,17 +44,21 @@ impl Evidence {
             let rest = name.strip_prefix(prefix)?;
             rest.split_once('.').map_or(rest, |(index, _)| index).parse().ok()
         };
-        self.under(prefix).filter_map(index).max().map_or(0, |n| n.saturating_add(1))
-    }
-
-    fn under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = &'a str> {
-        self.shapes.range(prefix.to_owned()..).map(|(name, _)| name.as_str()).take_while(move |name| name.starts_with(prefix))
+        let names = self.shapes.range(prefix.to_owned()..).map(|(name, _)| name.as_str());
+        names.take_while(|name| name.starts_with(prefix)).filter_map(index).max().map_or(0, |n| n.saturating_add(1))
     }
 }
 
 impl FromIterator<(String, Option<Vec<u64>>)> for Evidence {
     fn from_iter<I: IntoIterator<Item = (String, Option<Vec<u64>>)>>(tensors: I) -> Self {
         Self { shapes: Arc::new(tensors.into_iter().collect()) }
+    }
+}
+
+/// Names alone.
+impl<'n> FromIterator<&'n str> for Evidence {
+    fn from_iter<I: IntoIterator<Item = &'n str>>(names: I) -> Self {
+        names.into_iter().map(|name| (name.to_owned(), None)).collect()
     }
 }
 

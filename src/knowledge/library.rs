@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 use include_dir::{Dir, include_dir};
 use serde_json::Value;
 
-use super::architecture::{Architecture, Blueprint, Evidence};
+use super::architecture::{Architecture, Blueprint};
 
 static ARCHITECTURES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules/architectures");
 
@@ -65,33 +65,43 @@ impl Library {
     /// The class in `architectures` decides; where it is absent, or custom code may stand behind an unknown
     /// name (`auto_map`), `model_type` does. Where several files describe one class, the tensors choose.
     #[must_use]
-    pub fn find(&self, config: &Value, evidence: &Evidence) -> Option<Architecture<'_>> {
+    pub fn find<'n>(&self, config: &Value, names: impl IntoIterator<Item = &'n str>) -> Option<Architecture<'_>> {
+        let mut names = names.into_iter();
         let class = config.get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
         if let Some(class) = class {
             let base = |blueprint: &Blueprint| blueprint.base_class.as_deref() == Some(class);
             let named = |blueprint: &Blueprint| base(blueprint) || blueprint.classes.iter().any(|c| c == class);
-            if let Some(blueprint) = self.choose(class, named, evidence) {
+            if let Some(blueprint) = self.choose(class, named, &mut names) {
                 return Some(Architecture::new(self, blueprint, base(blueprint)));
             }
             config.get("auto_map")?;
         }
         let model_type = config.get("model_type").and_then(Value::as_str)?;
         let typed = |blueprint: &Blueprint| blueprint.model_types.iter().any(|t| t == model_type);
-        self.choose(model_type, typed, evidence).map(|blueprint| Architecture::new(self, blueprint, false))
+        self.choose(model_type, typed, &mut names).map(|blueprint| Architecture::new(self, blueprint, false))
     }
 
     pub(super) fn blueprint(&self, name: &str) -> Option<&Blueprint> {
         self.files.iter().find(|file| file.stem == name).map(File::blueprint)
     }
 
-    fn choose(&self, word: &str, fits: impl Fn(&Blueprint) -> bool, evidence: &Evidence) -> Option<&Blueprint> {
+    fn choose<'n>(
+        &self, word: &str, fits: impl Fn(&Blueprint) -> bool, names: &mut impl Iterator<Item = &'n str>,
+    ) -> Option<&Blueprint> {
         let quoted = format!("{word:?}");
         // A file that does not contain the word need not be parsed.
         let candidates: Vec<&Blueprint> =
             self.files.iter().filter(|f| f.text.contains(&quoted)).map(File::blueprint).filter(|b| fits(b)).collect();
-        let spoken_for = |b: &&&Blueprint| b.chosen_by.iter().any(|prefix| evidence.has_prefix(prefix));
-        let plain = |b: &&&Blueprint| b.chosen_by.is_empty();
-        candidates.iter().find(spoken_for).or_else(|| candidates.iter().find(plain)).copied()
+        let (chosen, plain): (Vec<_>, Vec<_>) = candidates.into_iter().partition(|b| !b.chosen_by.is_empty());
+        let speaks_for = |b: &Blueprint, name: &str| b.chosen_by.iter().any(|prefix| name.starts_with(prefix));
+        let mut voted = names.filter_map(|name| chosen.iter().find(|b| speaks_for(b, name)));
+        if chosen.is_empty() { None } else { voted.next().copied() }.or_else(|| plain.first().copied())
+    }
+}
+
+impl std::fmt::Debug for Library {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_list().entries(self.names()).finish()
     }
 }
 

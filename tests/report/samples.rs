@@ -170,6 +170,7 @@ fn load() -> LoadReport {
             Silent { name: "spatial_embed_tokens.weight".to_owned(), reason: "indexed-but-absent".to_owned() },
             Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned() },
         ],
+        raises: None,
     }
 }
 
@@ -215,6 +216,7 @@ pub fn hostile() -> Report {
         unexpected: vec![HOSTILE.to_owned()],
         mismatched: vec![Mismatch { name: HOSTILE.to_owned(), stored: vec![1; 10_000], expected: vec![u64::MAX] }],
         silent: vec![Silent { name: HOSTILE.to_owned(), reason: HOSTILE.to_owned() }],
+        raises: None,
     });
     Report::new(vec![checkpoint], None)
 }

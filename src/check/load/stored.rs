@@ -1,0 +1,95 @@
+//! What the loader finds in a checkpoint: keys, and the tensors behind them.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::checkpoint::{Checkpoint, Shard};
+use crate::knowledge::Evidence;
+
+/// The file a loader takes before it looks for an index.
+const SINGLE: &str = "model.safetensors";
+
+/// Keys and tensors as the loader sees them.
+///
+/// Keys come from the index alone, values from every shard the index names: a tensor in a shard and not in
+/// the index is used, and still reported missing.
+#[derive(Debug, Clone, Default)]
+pub struct Stored {
+    keys: BTreeSet<String>,
+    shapes: BTreeMap<String, Vec<u64>>,
+    absent: BTreeSet<String>,
+}
+
+impl Stored {
+    /// What a loader finds in this checkpoint.
+    #[must_use]
+    pub fn of(checkpoint: &Checkpoint) -> Self {
+        let index = checkpoint.index.as_ref().filter(|index| !index.unread);
+        Self::new(index.map(|index| &index.weight_map), checkpoint.shards.values())
+    }
+
+    /// From an index, tensor name to file name, and the shards that are there.
+    ///
+    /// A `model.safetensors` beside an index wins. Without either no loader opens anything; then the shards that
+    /// an index would name are taken together.
+    #[must_use]
+    pub fn new<'s>(index: Option<&BTreeMap<String, String>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
+        let shards: BTreeMap<&str, &Shard> = shards.into_iter().map(|s| (s.name.as_str(), s)).collect();
+        match (shards.get(SINGLE), index) {
+            (Some(single), _) => Self::together([*single]),
+            (None, None) => Self::together(shards.into_values().filter(|s| s.name.starts_with("model"))),
+            (None, Some(index)) => {
+                let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
+                let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
+                // A shard that is not there or could not be read may hold anything.
+                let all_read = opened.len() == files.len() && opened.iter().all(|s| !s.tensors.is_empty() || s.faults.is_empty());
+                let Self { shapes, .. } = Self::together(opened);
+                let keys: BTreeSet<String> = index.keys().cloned().collect();
+                let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();
+                Self { keys, shapes, absent }
+            }
+        }
+    }
+
+    fn together<'s>(shards: impl IntoIterator<Item = &'s Shard>) -> Self {
+        let tensors = shards.into_iter().flat_map(|s| &s.tensors);
+        let shapes: BTreeMap<String, Vec<u64>> = tensors.map(|t| (t.name.clone(), t.shape.clone())).collect();
+        Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new() }
+    }
+
+    /// Names and shapes of one file.
+    #[must_use]
+    pub fn from_shapes(shapes: BTreeMap<String, Vec<u64>>) -> Self {
+        Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new() }
+    }
+
+    /// What the loader reads as keys.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.keys.iter().map(String::as_str)
+    }
+
+    /// Whether there is nothing to load.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.keys.is_empty() && self.shapes.is_empty()
+    }
+
+    /// The stored tensors, for what an architecture reads off them.
+    #[must_use]
+    pub fn evidence(&self) -> Evidence {
+        self.keys.iter().chain(self.shapes.keys()).map(|name| (name.clone(), self.shapes.get(name).cloned())).collect()
+    }
+
+    /// Tensors in the files the loader opens, by name.
+    pub(super) fn shapes(&self) -> impl Iterator<Item = (&str, &[u64])> {
+        self.shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_slice()))
+    }
+
+    /// Keys that are in no shard although every shard was read.
+    pub(super) fn absent(&self) -> impl Iterator<Item = &str> {
+        self.absent.iter().map(String::as_str)
+    }
+
+    pub(super) fn is_absent(&self, key: &str) -> bool {
+        self.absent.contains(key)
+    }
+}

@@ -1,0 +1,157 @@
+use std::collections::BTreeMap;
+
+use serde_json::json;
+
+use super::*;
+use crate::checkpoint::{Dtype, Shard, Tensor};
+use crate::knowledge::{ExpectedTensor, Library};
+
+type Shapes = BTreeMap<String, Vec<u64>>;
+
+fn llama(tie: bool) -> Expected {
+    let config = json!({ "architectures": ["LlamaForCausalLM"], "hidden_size": 4, "intermediate_size": 8, "num_attention_heads": 2,
+        "num_hidden_layers": 1, "vocab_size": 10, "tie_word_embeddings": tie });
+    Library::embedded().find(&config, []).expect("llama").expect(&config).expect("built")
+}
+
+fn all(expected: &Expected) -> Shapes {
+    expected.tensors.iter().map(|(name, t)| (name.clone(), t.shape.clone())).collect()
+}
+
+fn shard(name: &str, tensors: &Shapes) -> Shard {
+    let tensor = |(name, shape): (&String, &Vec<u64>)| Tensor { name: name.clone(), dtype: Dtype::BF16, shape: shape.clone(), begin: 0, end: 0 };
+    Shard { name: name.to_owned(), tensors: tensors.iter().map(tensor).collect(), ..Shard::default() }
+}
+
+fn reasons(report: &LoadReport) -> Vec<(&str, &str)> {
+    report.silent.iter().map(|s| (s.name.as_str(), s.reason.as_str())).collect()
+}
+
+#[test]
+fn a_whole_checkpoint_loads_clean() {
+    let expected = llama(false);
+    let report = predict(&expected, &Stored::from_shapes(all(&expected)));
+    assert_eq!(report, LoadReport::default());
+    assert!(faults(&report).is_empty());
+}
+
+#[test]
+fn textual_renames_apply_anywhere_and_one_at_a_time() {
+    assert_eq!(keys::renamed("a.gamma.beta"), "a.gamma.bias");
+    assert_eq!(keys::renamed("gamma_1.gamma"), "weight_1.weight");
+    assert_eq!(keys::renamed("conv.weight_g"), "conv.parametrizations.weight.original0");
+    assert_eq!(keys::renamed("conv.weight_v.weight_g"), "conv.weight_v.parametrizations.weight.original0");
+    assert_eq!(keys::renamed("conv.weight"), "conv.weight");
+}
+
+#[test]
+fn base_model_keys_load_into_a_class_with_a_head() {
+    let expected = llama(false);
+    let mut stored: Shapes = all(&expected).into_iter().filter_map(|(n, s)| Some((n.strip_prefix("model.")?.to_owned(), s))).collect();
+    let report = predict(&expected, &Stored::from_shapes(stored.clone()));
+    assert_eq!((report.missing, report.unexpected, report.raises), (vec!["lm_head.weight".to_owned()], vec![], None));
+    // The same with the head beside them raises.
+    stored.insert("lm_head.weight".to_owned(), vec![10, 4]);
+    let report = predict(&expected, &Stored::from_shapes(stored));
+    assert!(report.raises.as_deref().is_some_and(|r| r.starts_with("ValueError: The state dictionary")));
+    assert_eq!(faults(&report).iter().map(|f| f.kind).collect::<Vec<_>>(), ["load-raises"]);
+}
+
+#[test]
+fn a_full_checkpoint_loads_into_the_base_class() {
+    let whole = llama(false);
+    let config = json!({ "architectures": ["LlamaModel"], "hidden_size": 4, "intermediate_size": 8, "num_attention_heads": 2,
+        "num_hidden_layers": 1, "vocab_size": 10 });
+    let base = Library::embedded().find(&config, []).expect("llama").expect(&config).expect("built");
+    let mut stored = all(&whole);
+    stored.insert("model.norm.weight".to_owned(), vec![5]);
+    let report = predict(&base, &Stored::from_shapes(stored));
+    assert_eq!((report.missing.len(), report.unexpected), (0, vec!["lm_head.weight".to_owned()]));
+    assert_eq!(report.mismatched, [Mismatch { name: "model.norm.weight".to_owned(), stored: vec![5], expected: vec![4] }]);
+    assert!(report.silent.is_empty());
+}
+
+#[test]
+fn one_stray_key_with_the_prefix_hijacks_the_whole_model() {
+    let mut expected = Expected { base_model_prefix: "model".to_owned(), ..Expected::default() };
+    for name in ["vision_tower.w", "language_model.model.w"] {
+        expected.tensors.insert(name.to_owned(), ExpectedTensor { shape: vec![2], ..ExpectedTensor::default() });
+    }
+    let mut stored = all(&expected);
+    stored.insert("modelx.weight".to_owned(), vec![1]);
+    let report = predict(&expected, &Stored::from_shapes(stored));
+    assert_eq!(report.missing, ["model.language_model.model.w", "model.vision_tower.w"]);
+    assert_eq!(report.unexpected, ["language_model.model.w", "modelx.weight", "vision_tower.w"]);
+    assert_eq!(reasons(&report), [("modelx.weight", "prefix-hijack")]);
+    let faults = faults(&report);
+    assert_eq!(faults.iter().map(|f| f.kind).collect::<Vec<_>>(), ["prefix-hijack"]);
+    assert_eq!(faults[0].detail["tensor"], json!("modelx.weight"));
+}
+
+#[test]
+fn tied_tensors_stand_for_each_other() {
+    let expected = llama(true);
+    let mut stored = all(&expected);
+    let report = predict(&expected, &Stored::from_shapes(stored.clone()));
+    assert_eq!(reasons(&report), [("lm_head.weight", "tied-over")]);
+    stored.remove("lm_head.weight");
+    assert_eq!(predict(&expected, &Stored::from_shapes(stored.clone())), LoadReport::default());
+    stored.remove("model.embed_tokens.weight");
+    assert_eq!(predict(&expected, &Stored::from_shapes(stored)).missing, ["lm_head.weight", "model.embed_tokens.weight"]);
+}
+
+#[test]
+fn the_index_says_what_is_there_and_the_shards_what_is_loaded() {
+    let expected = llama(false);
+    let (norm, head) = ("model.norm.weight".to_owned(), "lm_head.weight".to_owned());
+    let mut index: BTreeMap<String, String> = expected.tensors.keys().map(|n| (n.clone(), "a.safetensors".to_owned())).collect();
+    let mut first = all(&expected);
+    let report = |index: &BTreeMap<String, String>, shards: &[Shard]| predict(&expected, &Stored::new(Some(index), shards));
+    assert_eq!(report(&index, &[shard("a.safetensors", &first)]), LoadReport::default());
+
+    // In the index and in no shard: nothing is reported, and it stays random.
+    first.remove(&norm);
+    let found = report(&index, &[shard("a.safetensors", &first)]);
+    assert_eq!((found.missing.len(), reasons(&found)), (0, vec![(norm.as_str(), "indexed-but-absent")]));
+
+    // In a shard the index names for others: loaded all the same.
+    index.insert(head.clone(), "b.safetensors".to_owned());
+    let second = Shapes::from([(norm.clone(), vec![4]), (head.clone(), vec![10, 4])]);
+    let shards = [shard("a.safetensors", &first), shard("b.safetensors", &second)];
+    assert_eq!(report(&index, &shards), LoadReport::default());
+
+    // A shard that is not there may hold it.
+    assert_eq!(report(&index, &shards[..1]), LoadReport::default());
+
+    // In a shard and not in the index: reported missing.
+    index.remove(&norm);
+    assert_eq!(report(&index, &shards).missing, [norm]);
+
+    // A single file beside the index wins.
+    let stale = shard("model.safetensors", &Shapes::from([(head.clone(), vec![10, 4])]));
+    let found = report(&index, &[stale, shards[0].clone(), shards[1].clone()]);
+    assert_eq!((found.missing.len(), found.unexpected.len()), (11, 0));
+    let loose = [shard("model-00001-of-00002.safetensors", &first), shard("adapter_model.safetensors", &second)];
+    assert_eq!(Stored::new(None, &loose).names().count(), first.len());
+}
+
+#[test]
+fn an_optional_group_is_whole_or_absent() {
+    let mut expected = llama(false);
+    for name in ["model.tower.a", "model.tower.b"] {
+        expected.tensors.insert(name.to_owned(), ExpectedTensor { shape: vec![2], optional: Some("tower".to_owned()), ..ExpectedTensor::default() });
+    }
+    let mut stored = all(&expected);
+    stored.remove("model.tower.a");
+    assert_eq!(predict(&expected, &Stored::from_shapes(stored.clone())).missing, ["model.tower.a"]);
+    stored.remove("model.tower.b");
+    assert_eq!(predict(&expected, &Stored::from_shapes(stored)), LoadReport::default());
+}
+
+#[test]
+fn faults_name_a_few_tensors_and_count_the_rest() {
+    let report = LoadReport { missing: (0..7).map(|i| format!("t{i}")).collect(), ..LoadReport::default() };
+    let faults = faults(&report);
+    assert_eq!(faults[0].detail["names"], json!("t0, t1, t2, t3, t4 and 2 more"));
+    assert_eq!((faults[0].kind, &faults[0].detail["count"], faults[0].places.len()), ("missing-tensors", &json!(7), 5));
+}
