@@ -5,7 +5,6 @@
 mod build;
 mod collapse;
 mod concise;
-mod escape;
 mod excerpt;
 mod json;
 mod markdown;

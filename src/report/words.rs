@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::collapse::{Group, collapse};
-use super::escape::escape;
 use super::model::{Counts, Report};
 use crate::check::finding::LoadReport;
 use crate::check::{Finding, FixHint, Location};
+use crate::checkpoint::escape;
 
 /// Longest name shown, in characters.
 const NAME: usize = 160;

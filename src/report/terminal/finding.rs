@@ -10,6 +10,7 @@ use super::super::model::CheckpointReport;
 use super::super::words::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use super::super::Style;
 use crate::check::{Finding, Location, Severity};
+use crate::checkpoint::line_column;
 
 /// Most places shown for one finding.
 const PLACES: usize = 6;
@@ -103,14 +104,17 @@ fn show(place: &Place<'_>, checkpoint: &CheckpointReport) -> Shown {
     };
     let spans: Vec<Range<usize>> = place.locations.iter().filter_map(|l| l.span.clone()).collect();
     let excerpt = place.source.and_then(|source| cut(source, &spans));
-    let line = first.line.or_else(|| place.source.zip(first.span.as_ref()).map(|(s, span)| line_of(s, span.start)));
+    let counted = || place.source.zip(first.span.as_ref()).map(|(source, span)| line_column(source, span.start));
+    let place_in_file = first.line.zip(first.column).or_else(counted);
+    let line = place_in_file.map(|(line, _)| line).or(first.line);
+    let column = place_in_file.map(|(_, column)| column);
     let path = self::place(&checkpoint.path, Some(first));
     let (Some(excerpt), Some(line)) = (excerpt, line) else {
         let mut origin = Origin::path(path);
         if let Some(line) = line {
             origin = origin.line(line);
         }
-        if let Some(column) = first.column {
+        if let Some(column) = column {
             origin = origin.char_column(column);
         }
         let mut elements = vec![Element::Origin(origin)];
@@ -118,7 +122,7 @@ fn show(place: &Place<'_>, checkpoint: &CheckpointReport) -> Shown {
         elements.extend(pointer.map(|p| Level::NOTE.with_name("at").message(name(p)).into()));
         return Shown { elements, excerpt: false, column: None };
     };
-    let column = first.column.filter(|_| excerpt.cut_left).zip(excerpt.marks.first()).map(|(column, mark)| {
+    let column = column.filter(|_| excerpt.cut_left).zip(excerpt.marks.first()).map(|(column, mark)| {
         let seen = excerpt.text.get(..mark.start).unwrap_or_default().chars().count();
         (format!("{path}:{line}:{}", seen.saturating_add(1)), format!("{path}:{line}:{column}"))
     });
@@ -128,9 +132,4 @@ fn show(place: &Place<'_>, checkpoint: &CheckpointReport) -> Shown {
         snippet = snippet.annotation(AnnotationKind::Primary.span(mark).label(label));
     }
     Shown { elements: vec![snippet.into()], excerpt: true, column }
-}
-
-fn line_of(source: &str, offset: usize) -> usize {
-    let before = source.as_bytes().iter().take(offset);
-    before.filter(|b| **b == b'\n').count().saturating_add(1)
 }
