@@ -93,7 +93,8 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     faults.extend(tokens::compare(checkpoint, rows));
     let opened = outcome.architecture.as_deref().and_then(|name| {
         let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
-        let config = checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
+        let config =
+            checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
     let scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
@@ -129,7 +130,11 @@ fn unknown_architecture(config: &Value) -> Fault {
 /// Rows of the token embedding: what every token id has to stay below.
 fn embedding_rows(checkpoint: &Checkpoint) -> Option<u64> {
     const NAMES: [&str; 5] = [
-        "embed_tokens.weight", "transformer.wte.weight", "word_embeddings.weight", "gpt_neox.embed_in.weight", "tok_embeddings.weight",
+        "embed_tokens.weight",
+        "transformer.wte.weight",
+        "word_embeddings.weight",
+        "gpt_neox.embed_in.weight",
+        "tok_embeddings.weight",
     ];
     checkpoint
         .tensors()
@@ -159,10 +164,17 @@ fn run(rule: &Rule, checkpoint: &Checkpoint, faults: &[Fault], scope: &Scope<'_>
     findings
 }
 
-fn from_faults(rule: &Rule, check: &FaultCheck, checkpoint: &Checkpoint, faults: &[Fault], scope: &Scope<'_>) -> Vec<Finding> {
-    let mut matching = faults.iter().filter(|f| check.kinds.iter().any(|k| k == f.kind)).filter(|f| {
-        check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false))
-    });
+fn from_faults(
+    rule: &Rule,
+    check: &FaultCheck,
+    checkpoint: &Checkpoint,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+) -> Vec<Finding> {
+    let mut matching = faults
+        .iter()
+        .filter(|f| check.kinds.iter().any(|k| k == f.kind))
+        .filter(|f| check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false)));
     if check.group {
         let all: Vec<&Fault> = matching.collect();
         let Some(first) = all.first() else { return Vec::new() };
@@ -178,7 +190,9 @@ fn from_faults(rule: &Rule, check: &FaultCheck, checkpoint: &Checkpoint, faults:
         out.push(finding(rule, &fault_scope(scope, fault, 1), locate(checkpoint, &places), fault.detail.clone()));
     }
     let more = matching.count();
-    if more > 0 && let Some(last) = out.last_mut() {
+    if more > 0
+        && let Some(last) = out.last_mut()
+    {
         last.message = format!("{} (and {more} more of {})", last.message, rule.code);
         last.evidence.insert("more".to_owned(), json!(more));
     }

@@ -25,15 +25,22 @@ const DOCUMENTS: [(&str, &str); 6] = [
 /// The variables and functions named in [`crate::knowledge::rule::Assert`].
 #[must_use]
 pub fn scope(
-    checkpoint: &Arc<Checkpoint>, architecture: Option<&str>, model: &Value, opened: Option<&OpenedTokenizer>, rows: Option<u64>,
+    checkpoint: &Arc<Checkpoint>,
+    architecture: Option<&str>,
+    model: &Value,
+    opened: Option<&OpenedTokenizer>,
+    rows: Option<u64>,
 ) -> Scope<'static> {
     let mut scope = Scope::new();
     for (name, file) in DOCUMENTS {
         let value = checkpoint.document(file).and_then(|d| d.value.as_ref());
         match value {
             Some(Value::Object(map)) if name == "tokenizer_config" => {
-                let lean: Map<String, Value> =
-                    map.iter().filter(|(k, _)| !BULKY.contains(&k.as_str())).map(|(k, v)| (k.clone(), v.clone())).collect();
+                let lean: Map<String, Value> = map
+                    .iter()
+                    .filter(|(k, _)| !BULKY.contains(&k.as_str()))
+                    .map(|(k, v)| (k.clone(), v.clone()))
+                    .collect();
                 scope.bind(name, &Value::Object(lean));
             }
             Some(value) => scope.bind(name, value),

@@ -12,8 +12,16 @@ const SINGLE: &str = "model.safetensors";
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
 fn readable(shard: &Shard) -> bool {
     const UNREADABLE: [&str; 10] = [
-        "lfs-pointer", "not-safetensors", "empty-file", "file-too-short", "header-length-out-of-range", "header-too-large",
-        "header-not-utf8", "header-not-json", "header-too-deep", "unreadable-file",
+        "lfs-pointer",
+        "not-safetensors",
+        "empty-file",
+        "file-too-short",
+        "header-length-out-of-range",
+        "header-too-large",
+        "header-not-utf8",
+        "header-not-json",
+        "header-too-deep",
+        "unreadable-file",
     ];
     !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind) || f.kind == "not-a-regular-file")
 }
@@ -94,7 +102,8 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         }
         let place = Place::file(&index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
         if let Some(other) = held.and_then(|h| h.first()) {
-            faults.push(Fault::new("index-names-other-shard").at(place).with("said", said.as_str()).with("held", *other));
+            faults
+                .push(Fault::new("index-names-other-shard").at(place).with("said", said.as_str()).with("held", *other));
         } else if all_read {
             faults.push(Fault::new("index-key-nowhere").at(place).with("said", said.as_str()));
         }
@@ -120,7 +129,10 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
 
 /// Safetensors files that the index does not mention.
 fn strays(
-    checkpoint: &Checkpoint, referenced: &BTreeMap<&str, usize>, holders: &BTreeMap<&str, Vec<&str>>, faults: &mut Vec<Fault>,
+    checkpoint: &Checkpoint,
+    referenced: &BTreeMap<&str, usize>,
+    holders: &BTreeMap<&str, Vec<&str>>,
+    faults: &mut Vec<Fault>,
 ) {
     let Some(index) = &checkpoint.index else { return };
     let mut shared: BTreeMap<&str, u64> = BTreeMap::new();
@@ -139,10 +151,18 @@ fn strays(
         let twice = shared.get(name).copied().unwrap_or_default();
         if name == SINGLE {
             faults.push(
-                Fault::new("single-file-beside-index").at(Place::file(name)).with("index", index.document.as_str()).with("twice", twice),
+                Fault::new("single-file-beside-index")
+                    .at(Place::file(name))
+                    .with("index", index.document.as_str())
+                    .with("twice", twice),
             );
         } else if twice > 0 || numbered(name).is_some() {
-            faults.push(Fault::new("stray-shard").at(Place::file(name)).with("index", index.document.as_str()).with("twice", twice));
+            faults.push(
+                Fault::new("stray-shard")
+                    .at(Place::file(name))
+                    .with("index", index.document.as_str())
+                    .with("twice", twice),
+            );
         }
     }
 }
@@ -190,22 +210,30 @@ fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     }
     let numbers: Vec<(&str, u32, u32)> = names.iter().filter_map(|n| numbered(n)).collect();
     if let Some((prefix, _, count)) = numbers.first().copied() {
-        faults.push(Fault::new("index-missing").with("shards", numbers.len()).with("index", format!("{prefix}.safetensors.index.json")));
+        faults.push(
+            Fault::new("index-missing")
+                .with("shards", numbers.len())
+                .with("index", format!("{prefix}.safetensors.index.json")),
+        );
         let present: BTreeSet<u32> = numbers.iter().map(|n| n.1).collect();
         // Numbering from 00000 loads too; only then is number `count` not expected. `count` is a name's word: bounded.
         let first = u32::from(!present.contains(&0));
         let last = if first == 0 { count.saturating_sub(1) } else { count };
         for n in (first..=last.min(10_000)).filter(|n| !present.contains(n)) {
             let name = format!("{prefix}-{n:05}-of-{count:05}.safetensors");
-            faults.push(Fault::new("shard-missing").at(Place::file(&name)).with("shard", name.as_str()).with("tensors", Value::Null));
+            faults.push(
+                Fault::new("shard-missing")
+                    .at(Place::file(&name))
+                    .with("shard", name.as_str())
+                    .with("tensors", Value::Null),
+            );
         }
         return;
     }
     if names.is_empty() && checkpoint.has_file("config.json") {
-        let pickle = checkpoint
-            .entries
-            .keys()
-            .find(|n| (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt"));
+        let pickle = checkpoint.entries.keys().find(|n| {
+            (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt")
+        });
         faults.push(match pickle {
             Some(name) => Fault::new("pickle-weights").at(Place::file(name)),
             None => Fault::new("no-weights"),

@@ -32,7 +32,8 @@ impl Entry {
 }
 
 /// Documents whose `auto_map` a loader reads.
-const DOCUMENTS: [&str; 4] = ["config.json", "processor_config.json", "preprocessor_config.json", "tokenizer_config.json"];
+const DOCUMENTS: [&str; 4] =
+    ["config.json", "processor_config.json", "preprocessor_config.json", "tokenizer_config.json"];
 
 /// Every `auto_map` entry of a checkpoint, outer ones first.
 #[must_use]
@@ -48,7 +49,11 @@ pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
                     let base = format!("{pointer}/auto_map/{}", escape(key));
                     let mut push = |pointer: String, target: &str| {
                         let entry = Entry {
-                            file: name.to_owned(), pointer, key: key.clone(), target: target.to_owned(), nested: depth > 0,
+                            file: name.to_owned(),
+                            pointer,
+                            key: key.clone(),
+                            target: target.to_owned(),
+                            nested: depth > 0,
                         };
                         out.push(entry);
                     };
@@ -129,7 +134,10 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             continue;
         }
         let module = entry.target.split('.').next().unwrap_or_default();
-        if entry.target.contains(['/', '\\']) || entry.target.starts_with('.') || !is_plain_file_name(&format!("{module}.py")) {
+        if entry.target.contains(['/', '\\'])
+            || entry.target.starts_with('.')
+            || !is_plain_file_name(&format!("{module}.py"))
+        {
             faults.push(fault("auto-map-unsafe-path"));
             continue;
         }
@@ -205,15 +213,15 @@ pub fn processor_tokenizers(checkpoint: &Checkpoint) -> Option<Vec<String>> {
     let mut class = class.to_owned();
     let mut module = checkpoint.modules.get(&format!("{module}.py"));
     for _ in 0..8 {
-        let found = module.and_then(|m| m.class(&class)).or_else(|| checkpoint.modules.values().find_map(|m| m.class(&class)))?;
+        let found = module
+            .and_then(|m| m.class(&class))
+            .or_else(|| checkpoint.modules.values().find_map(|m| m.class(&class)))?;
         if let Some(classes) = &found.tokenizer_class {
             return Some(classes.clone());
         }
         // `class A(A)` of an alias: the base of that name lives in another module.
         let base = found.bases.first()?.rsplit('.').next()?.to_owned();
-        module = checkpoint.modules.values().find(|m| {
-            m.class(&base).is_some_and(|c| !std::ptr::eq(c, found))
-        });
+        module = checkpoint.modules.values().find(|m| m.class(&base).is_some_and(|c| !std::ptr::eq(c, found)));
         class = base;
         module?;
     }

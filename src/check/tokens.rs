@@ -50,7 +50,9 @@ impl OpenedTokenizer {
 /// # Errors
 /// When a count of the processor's config is missing or absurd.
 pub fn open_tokenizer(
-    tokenizer: &Tokenizer, processor: &Processor, config: &Value,
+    tokenizer: &Tokenizer,
+    processor: &Processor,
+    config: &Value,
 ) -> Result<Option<OpenedTokenizer>, EvalError> {
     let Some(length) = tokenizer.length() else { return Ok(None) };
     let mut scope = Scope::new();

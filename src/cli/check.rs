@@ -23,7 +23,10 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<u8> {
         }
         let found = find_checkpoints(path);
         if found.is_empty() {
-            bail!("{}: no checkpoint there (no config.json, adapter_config.json, index or *.safetensors)", path.display());
+            bail!(
+                "{}: no checkpoint there (no config.json, adapter_config.json, index or *.safetensors)",
+                path.display()
+            );
         }
         for dir in found {
             // Two files of one checkpoint, as pre-commit passes them, are one checkpoint.

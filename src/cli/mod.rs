@@ -27,7 +27,8 @@ pub fn main() -> ExitCode {
         Ok(code) => ExitCode::from(code),
         Err(error) => {
             // Names in an error may come from a checkpoint: nothing of them may reach the terminal raw.
-            let lines: Vec<String> = error.chain().map(|e| ckpt_doctor::checkpoint::escape(&e.to_string(), 4000)).collect();
+            let lines: Vec<String> =
+                error.chain().map(|e| ckpt_doctor::checkpoint::escape(&e.to_string(), 4000)).collect();
             output::note(&format!("error: {}", lines.join(": ")));
             ExitCode::from(FAILED)
         }

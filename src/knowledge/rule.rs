@@ -171,7 +171,10 @@ impl RuleSet {
                 return Err(DataError::new(&path, format!("no such kind of fault: {kind}")));
             }
             if let Some(twin) = rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
-                return Err(DataError::new(&path, format!("{} {} is already taken by {}", rule.code, rule.name, twin.code)));
+                return Err(DataError::new(
+                    &path,
+                    format!("{} {} is already taken by {}", rule.code, rule.name, twin.code),
+                ));
             }
             rules.push(rule);
         }

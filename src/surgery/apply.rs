@@ -272,12 +272,7 @@ pub fn apply(plan: &Plan, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(
 
 fn create(path: &Path) -> Result<File, ApplyError> {
     let flags = i32::try_from(OFlags::NOFOLLOW.bits()).unwrap_or_default();
-    OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .custom_flags(flags)
-        .open(path)
-        .map_err(io_at(path, "creating"))
+    OpenOptions::new().write(true).create_new(true).custom_flags(flags).open(path).map_err(io_at(path, "creating"))
 }
 
 fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
@@ -350,7 +345,11 @@ impl Donor {
 const SLICE: u64 = 64 * 1024 * 1024;
 
 fn write_tensor(
-    out: &mut File, path: &Path, donor: &mut Donor, tensor: &PlannedTensor, progress: &mut dyn FnMut(u64),
+    out: &mut File,
+    path: &Path,
+    donor: &mut Donor,
+    tensor: &PlannedTensor,
+    progress: &mut dyn FnMut(u64),
 ) -> Result<(), ApplyError> {
     match &tensor.source {
         Source::Copy(from) => copy_range(out, path, donor, from, progress),
@@ -398,7 +397,11 @@ fn write_tensor(
 
 /// Moves a byte range inside the kernel where it can (`std::io::copy` uses `copy_file_range`).
 fn copy_range(
-    out: &mut File, path: &Path, donor: &mut Donor, from: &TensorRef, progress: &mut dyn FnMut(u64),
+    out: &mut File,
+    path: &Path,
+    donor: &mut Donor,
+    from: &TensorRef,
+    progress: &mut dyn FnMut(u64),
 ) -> Result<(), ApplyError> {
     donor.opened.file.seek(SeekFrom::Start(from.offset)).map_err(io_at(&donor.path, "reading"))?;
     let mut left = from.len;

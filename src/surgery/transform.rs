@@ -82,7 +82,12 @@ fn copy(read: &mut ReadAt<'_>, mut offset: u64, mut len: u64, out: &mut dyn Writ
 /// Whatever reading or writing says; [`io::ErrorKind::InvalidInput`] for shapes that do not nest.
 pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut dyn Write) -> io::Result<()> {
     fn inner(
-        read: &mut ReadAt<'_>, at: &mut u64, elem: u64, from: &[u64], to: &[u64], out: &mut dyn Write,
+        read: &mut ReadAt<'_>,
+        at: &mut u64,
+        elem: u64,
+        from: &[u64],
+        to: &[u64],
+        out: &mut dyn Write,
     ) -> io::Result<()> {
         let stride = |dims: &[u64]| dims.iter().fold(elem, |n, d| n.saturating_mul(*d));
         match (from.split_first(), to.split_first()) {
@@ -105,7 +110,10 @@ pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut
                 }
                 zeros(out, t.saturating_sub(*f).saturating_mul(stride(to_rest)))
             }
-            _ => Err(io::Error::new(io::ErrorKind::InvalidInput, "a tensor can only be padded to a larger shape of its rank")),
+            _ => Err(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                "a tensor can only be padded to a larger shape of its rank",
+            )),
         }
     }
     inner(read, &mut 0, elem, from, to, out)
@@ -119,7 +127,12 @@ pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut
 /// # Errors
 /// Whatever reading or writing says.
 pub fn grow_rows(
-    read: &mut ReadAt<'_>, dtype: Dtype, rows: u64, width: u64, more: u64, out: &mut dyn Write,
+    read: &mut ReadAt<'_>,
+    dtype: Dtype,
+    rows: u64,
+    width: u64,
+    more: u64,
+    out: &mut dyn Write,
 ) -> io::Result<()> {
     let row_len = usize::try_from(width.saturating_mul(dtype.bits() / 8)).map_err(io::Error::other)?;
     let mut row = vec![0_u8; row_len];

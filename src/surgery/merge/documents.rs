@@ -3,8 +3,8 @@
 use serde_json::{Map, Value, json};
 
 use super::{Context, Draft, MergeError};
-use crate::checkpoint::{Document, Vocabulary};
 use crate::check::tokens::OpenedTokenizer;
+use crate::checkpoint::{Document, Vocabulary};
 use crate::knowledge::recipe::{CODE_SWITCHES, DocumentSpec, Edit, GraftEdit, TokensForm};
 
 /// A document of the result and where it came from.
@@ -26,7 +26,8 @@ pub(super) fn build(context: &Context<'_>, draft: &mut Draft) -> Result<Vec<Buil
 }
 
 fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<Option<Built>, MergeError> {
-    let donor = spec.from.as_ref().map(|role| (role, context.donor(role).and_then(|d| d.checkpoint.document(&spec.name))));
+    let donor =
+        spec.from.as_ref().map(|role| (role, context.donor(role).and_then(|d| d.checkpoint.document(&spec.name))));
     let (start, faultless) = match donor {
         Some((_, Some(d))) => match &d.value {
             Some(value) if value.is_object() => (Some((value.clone(), d)), d.faults.is_empty()),
@@ -34,12 +35,14 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
         },
         _ => (None, true),
     };
-    let Some((mut value, source)) = start.map(|(v, d)| (v, Some(d))).or_else(|| {
-        (!spec.optional && faultless).then(|| (Value::Object(Map::new()), None))
-    }) else {
+    let Some((mut value, source)) = start
+        .map(|(v, d)| (v, Some(d)))
+        .or_else(|| (!spec.optional && faultless).then(|| (Value::Object(Map::new()), None)))
+    else {
         return match donor {
             Some((role, Some(_))) => Err(MergeError::Donor(format!(
-                "the {role} donor's {} cannot be read as a JSON object; `ckpt-doctor check` on it says why", spec.name
+                "the {role} donor's {} cannot be read as a JSON object; `ckpt-doctor check` on it says why",
+                spec.name
             ))),
             _ => Ok(None),
         };
@@ -50,7 +53,8 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
         if !removed.is_empty() && spec.name != "added_tokens.json" {
             draft.repairs.push(format!(
                 "{}: {} of the donor left behind; a merge carries no key that makes a loader run code",
-                spec.name, removed.join(", ")
+                spec.name,
+                removed.join(", ")
             ));
         }
     }
@@ -76,7 +80,8 @@ fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut
         let Some(pointer) = fault.places.first().and_then(|p| p.pointer.as_deref()) else { continue };
         let Some(stand_in) = &spec.non_finite else {
             return Err(MergeError::Donor(format!(
-                "{}{pointer} is not a finite number and the recipe has no stand-in for it; repair the donor first", spec.name
+                "{}{pointer} is not a finite number and the recipe has no stand-in for it; repair the donor first",
+                spec.name
             )));
         };
         let negative = fault.detail.get("literal").and_then(Value::as_str).is_some_and(|l| l.starts_with('-'));
@@ -91,7 +96,9 @@ fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut
     if let (Some(first), Some(stand_in)) = (places.first(), &spec.non_finite) {
         draft.repairs.push(format!(
             "{}: {} number{} that strict JSON cannot say replaced by {stand_in}, the first at {first}",
-            spec.name, places.len(), if places.len() == 1 { "" } else { "s" }
+            spec.name,
+            places.len(),
+            if places.len() == 1 { "" } else { "s" }
         ));
     }
     Ok(())
@@ -135,7 +142,8 @@ fn apply(context: &Context<'_>, spec: &DocumentSpec, edit: &Edit, value: &mut Va
             if context.holds(edit.when.as_ref(), &spec.name)?
                 && let Some(tokens) = &context.tokens
             {
-                put(value, &edit.at, added(context, tokens, edit.form)).ok_or_else(|| not_there(context, spec, &edit.at))?;
+                put(value, &edit.at, added(context, tokens, edit.form))
+                    .ok_or_else(|| not_there(context, spec, &edit.at))?;
             }
         }
         Edit::Graft(graft) => {
@@ -159,7 +167,8 @@ fn added(context: &Context<'_>, tokens: &OpenedTokenizer, form: TokensForm) -> V
     let mut map = Map::new();
     match form {
         TokensForm::Decoder => {
-            let stated = base.and_then(|c| c.document("tokenizer_config.json")?.get("/added_tokens_decoder")?.as_object());
+            let stated =
+                base.and_then(|c| c.document("tokenizer_config.json")?.get("/added_tokens_decoder")?.as_object());
             map.extend(stated.into_iter().flatten().map(|(k, v)| (k.clone(), v.clone())));
             for (id, token) in &tokens.new {
                 let entry = json!({
@@ -181,7 +190,10 @@ fn added(context: &Context<'_>, tokens: &OpenedTokenizer, form: TokensForm) -> V
 }
 
 fn not_there(context: &Context<'_>, spec: &DocumentSpec, pointer: &str) -> MergeError {
-    MergeError::Donor(format!("{}{pointer} cannot be set: something on the way is not an object (recipe {})", spec.name, context.recipe.recipe))
+    MergeError::Donor(format!(
+        "{}{pointer} cannot be set: something on the way is not an object (recipe {})",
+        spec.name, context.recipe.recipe
+    ))
 }
 
 fn grafted(context: &Context<'_>, graft: &GraftEdit) -> Result<Value, MergeError> {

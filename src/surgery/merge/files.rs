@@ -39,11 +39,16 @@ pub(super) fn build(context: &Context<'_>, documents: Vec<Built>, draft: &mut Dr
         }
     }
     if let Some(index) = index(draft) {
-        files.push(PlannedFile { name: index.name.clone(), bytes: bytes_of(&index), origin: "made from the shards".to_owned() });
+        files.push(PlannedFile {
+            name: index.name.clone(),
+            bytes: bytes_of(&index),
+            origin: "made from the shards".to_owned(),
+        });
         draft.documents.push(index);
     }
     // A loader starts at config.json: it comes last, so that even a copy cut short is not taken for a checkpoint.
-    let (config, others): (Vec<Built>, Vec<Built>) = documents.into_iter().partition(|b| b.document.name == "config.json");
+    let (config, others): (Vec<Built>, Vec<Built>) =
+        documents.into_iter().partition(|b| b.document.name == "config.json");
     for built in others.into_iter().chain(config) {
         files.push(PlannedFile {
             name: built.document.name.clone(),
@@ -110,7 +115,11 @@ fn filled(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFile, Mer
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         text = text.replace(&format!("{{{{{key}}}}}"), &value);
     }
-    Ok(PlannedFile { name: spec.name.clone(), bytes: text.into_bytes().into(), origin: "alias of the recipe".to_owned() })
+    Ok(PlannedFile {
+        name: spec.name.clone(),
+        bytes: text.into_bytes().into(),
+        origin: "alias of the recipe".to_owned(),
+    })
 }
 
 /// The index, when there is more than one shard; one shard needs none.

@@ -20,7 +20,13 @@ pub const NAME: &str = "merge-manifest.json";
 ///
 /// # Errors
 /// When a donor's file cannot be read.
-pub fn manifest(recipe: &Recipe, options: &Options, donors: &[Donor], draft: &Draft, all_bytes: bool) -> io::Result<Value> {
+pub fn manifest(
+    recipe: &Recipe,
+    options: &Options,
+    donors: &[Donor],
+    draft: &Draft,
+    all_bytes: bool,
+) -> io::Result<Value> {
     let mut hashed = Map::new();
     for donor in donors {
         let mut documents = Map::new();

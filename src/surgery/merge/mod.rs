@@ -16,13 +16,13 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-pub use options::resolve as resolve_options;
 use super::plan::Plan;
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::{Checkpoint, Document};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::recipe::{Recipe, SeamTensor};
 use crate::knowledge::{EvalError, Library, Scope};
+pub use options::resolve as resolve_options;
 use record::{ChangedTensor, Dropped, MergedFile, Seam, ShapedName};
 
 /// Options in force, by name.
@@ -117,9 +117,7 @@ impl Context<'_> {
 ///
 /// # Errors
 /// A [`MergeError`] when the recipe cannot be followed at all with these donors and options.
-pub fn draft(
-    recipe: &Recipe, donors: &[Donor], options: &Options, library: &Library,
-) -> Result<Draft, MergeError> {
+pub fn draft(recipe: &Recipe, donors: &[Donor], options: &Options, library: &Library) -> Result<Draft, MergeError> {
     let context = context(recipe, donors, options)?;
     let mut draft = Draft::default();
     for (i, seam) in recipe.seams.iter().enumerate() {
@@ -201,10 +199,9 @@ impl Context<'_> {
         let Some(spec) = &self.recipe.tokens else { return Ok(()) };
         if self.tokens.is_none() {
             let processors = Processor::embedded().map_err(|e| MergeError::Recipe(e.to_string()))?;
-            let processor = processors
-                .iter()
-                .find(|p| p.processor == spec.processor)
-                .ok_or_else(|| MergeError::Recipe(format!("{}: no processor {}", self.recipe.recipe, spec.processor)))?;
+            let processor = processors.iter().find(|p| p.processor == spec.processor).ok_or_else(|| {
+                MergeError::Recipe(format!("{}: no processor {}", self.recipe.recipe, spec.processor))
+            })?;
             let donor = self
                 .donor(&spec.base)
                 .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;

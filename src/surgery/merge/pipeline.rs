@@ -88,7 +88,10 @@ pub enum PipelineError {
 /// # Errors
 /// A [`PipelineError`]; nothing was written then.
 pub fn run(
-    request: &Request, knowledge: &Knowledge, report: &dyn Fn(&Run) -> String, progress: &mut dyn FnMut(u64, u64),
+    request: &Request,
+    knowledge: &Knowledge,
+    report: &dyn Fn(&Run) -> String,
+    progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Run, PipelineError> {
     let mut run = Run::default();
     run.record.out = request.out.display().to_string();
@@ -125,7 +128,12 @@ pub fn run(
         note(&mut run, "plan", &count(drafted.seams.len(), "seam does not fit", "seams do not fit"));
         return Ok(run);
     }
-    let planned = format!("{} tensors, {} bytes in {}", run.record.tensors, run.record.bytes, count(drafted.plan.shards.len(), "shard", "shards"));
+    let planned = format!(
+        "{} tensors, {} bytes in {}",
+        run.record.tensors,
+        run.record.bytes,
+        count(drafted.plan.shards.len(), "shard", "shards")
+    );
     note(&mut run, "plan", &planned);
 
     let preview = Arc::new(preview(&drafted, &out, &donors));
@@ -170,7 +178,8 @@ fn choose(run: &Run) -> Result<Recipe, PipelineError> {
             let plays = |spec: &crate::knowledge::recipe::DonorSpec| {
                 let donor = run.looked.iter().find(|l| l.role == format!("donor {}", spec.role));
                 donor.map_or(spec.optional, |l| {
-                    spec.architectures.is_empty() || l.outcome.architecture.as_ref().is_some_and(|a| spec.architectures.contains(a))
+                    spec.architectures.is_empty()
+                        || l.outcome.architecture.as_ref().is_some_and(|a| spec.architectures.contains(a))
                 })
             };
             recipe.donors.iter().all(plays)
@@ -183,11 +192,22 @@ fn choose(run: &Run) -> Result<Recipe, PipelineError> {
             let are: Vec<String> = run
                 .looked
                 .iter()
-                .map(|l| format!("{} is {}", l.role, l.outcome.architecture.as_deref().unwrap_or("of an unknown architecture")))
+                .map(|l| {
+                    format!(
+                        "{} is {}",
+                        l.role,
+                        l.outcome.architecture.as_deref().unwrap_or("of an unknown architecture")
+                    )
+                })
                 .collect();
-            Err(MergeError::Donor(format!("no recipe fits these donors: {}; give one with --recipe", are.join(", "))).into())
+            Err(MergeError::Donor(format!("no recipe fits these donors: {}; give one with --recipe", are.join(", ")))
+                .into())
         }
-        _ => Err(MergeError::Donor(format!("several recipes fit these donors: {}; choose one with --recipe", names.join(", "))).into()),
+        _ => Err(MergeError::Donor(format!(
+            "several recipes fit these donors: {}; choose one with --recipe",
+            names.join(", ")
+        ))
+        .into()),
     }
 }
 
@@ -196,13 +216,18 @@ fn roles(recipe: &Recipe, request: &Request) -> Result<(), MergeError> {
     for role in request.donors.keys() {
         if !recipe.donors.iter().any(|d| d.role == *role) {
             let known: Vec<&str> = recipe.donors.iter().map(|d| d.role.as_str()).collect();
-            return Err(MergeError::Option(format!("recipe {} has no donor {role}; it has {}", recipe.recipe, known.join(", "))));
+            return Err(MergeError::Option(format!(
+                "recipe {} has no donor {role}; it has {}",
+                recipe.recipe,
+                known.join(", ")
+            )));
         }
     }
     for spec in recipe.donors.iter().filter(|d| !d.optional) {
         if !request.donors.contains_key(&spec.role) {
             return Err(MergeError::Option(format!(
-                "recipe {} needs a {} donor, {}: --donor {}=DIR", recipe.recipe, spec.role, spec.what, spec.role
+                "recipe {} needs a {} donor, {}: --donor {}=DIR",
+                recipe.recipe, spec.role, spec.what, spec.role
             )));
         }
     }
@@ -217,7 +242,11 @@ fn fits(recipe: &Recipe, run: &Run) -> Result<(), MergeError> {
         if !is.is_some_and(|a| spec.architectures.iter().any(|s| s == a)) {
             return Err(MergeError::Donor(format!(
                 "{}: the {} donor has to be {} ({}), this is {}",
-                looked.path.display(), spec.role, spec.architectures.join(" or "), spec.what, is.unwrap_or("of an unknown architecture")
+                looked.path.display(),
+                spec.role,
+                spec.architectures.join(" or "),
+                spec.what,
+                is.unwrap_or("of an unknown architecture")
             )));
         }
     }
@@ -291,7 +320,10 @@ fn preview(drafted: &Draft, out: &Path, donors: &[Donor]) -> Checkpoint {
         } else if !drafted.documents.iter().any(|d| d.name == file.name) {
             let vocabulary = donors.iter().find_map(|d| vocabulary(d, &file.name));
             parts.vocabularies.extend(vocabulary.map(|v| (file.name.clone(), v)));
-            parts.entries.insert(file.name.clone(), crate::checkpoint::Entry { size: file.bytes.len() as u64, ..Default::default() });
+            parts.entries.insert(
+                file.name.clone(),
+                crate::checkpoint::Entry { size: file.bytes.len() as u64, ..Default::default() },
+            );
         }
     }
     Checkpoint::planned(out, parts)
@@ -304,7 +336,12 @@ fn vocabulary(donor: &Donor, name: &str) -> Option<Arc<Vocabulary>> {
 
 /// Adds the manifest and the report to the plan.
 fn accompany(
-    drafted: &mut Draft, run: &mut Run, recipe: &Recipe, options: &Options, donors: &[Donor], request: &Request,
+    drafted: &mut Draft,
+    run: &mut Run,
+    recipe: &Recipe,
+    options: &Options,
+    donors: &[Donor],
+    request: &Request,
     report: &dyn Fn(&Run) -> String,
 ) -> Result<(), PipelineError> {
     let value = manifest::manifest(recipe, options, donors, drafted, request.hash).map_err(PipelineError::Manifest)?;

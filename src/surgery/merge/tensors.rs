@@ -9,8 +9,8 @@ use super::documents::Built;
 use super::record::{ChangedTensor, Dropped, Seam, ShapedName};
 use super::{Context, Donor, Draft, MergeError};
 use crate::checkpoint::{Shard, Tensor};
-use crate::knowledge::{Evidence, Library};
 use crate::knowledge::recipe::TensorSpec;
+use crate::knowledge::{Evidence, Library};
 use crate::surgery::plan::{PlannedTensor, Source, TensorRef, into_shards};
 use crate::surgery::transform::can_compute;
 
@@ -23,7 +23,11 @@ struct Rule<'a> {
 }
 
 pub(super) fn build(
-    context: &Context<'_>, documents: &[Built], library: &Library, limit: u64, draft: &mut Draft,
+    context: &Context<'_>,
+    documents: &[Built],
+    library: &Library,
+    limit: u64,
+    draft: &mut Draft,
 ) -> Result<(), MergeError> {
     let rules = rules(context)?;
     let mut taken: Vec<(String, &Donor, &Shard, &Tensor, &Rule<'_>)> = Vec::new();
@@ -50,10 +54,8 @@ pub(super) fn build(
             }
         }
     }
-    draft.dropped = dropped
-        .into_iter()
-        .map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why })
-        .collect();
+    draft.dropped =
+        dropped.into_iter().map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect();
 
     let evidence: Evidence = taken.iter().map(|t| (t.0.clone(), Some(t.3.shape.clone()))).collect();
     let names = taken.iter().map(|t| t.0.as_str());
@@ -72,7 +74,8 @@ pub(super) fn build(
         };
         if let Some(first) = seen.insert(name.clone(), tensor.name.clone()) {
             return Err(MergeError::Recipe(format!(
-                "{}: {first} and {} would both become {name}", context.recipe.recipe, tensor.name
+                "{}: {first} and {} would both become {name}",
+                context.recipe.recipe, tensor.name
             )));
         }
         let position = expected.get(&name).map_or(usize::MAX, |e| e.0);
@@ -106,15 +109,20 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<Rule<'a>>, MergeError> {
         }
         let names = Regex::new(&spec.names)
             .map_err(|e| MergeError::Recipe(format!("{}: {}: {e}", context.recipe.recipe, spec.names)))?;
-        let rename =
-            spec.rename.as_ref().map(|t| t.try_render(&context.scope)).transpose().map_err(context.at(spec.names.as_str()))?;
+        let rename = spec
+            .rename
+            .as_ref()
+            .map(|t| t.try_render(&context.scope))
+            .transpose()
+            .map_err(context.at(spec.names.as_str()))?;
         let fit = match &spec.fit {
             None => "copy".to_owned(),
             Some(e) => match e.eval(&context.scope).map_err(context.at(spec.names.as_str()))? {
                 Value::String(s) if matches!(s.as_str(), "copy" | "pad" | "grow-rows" | "reinit") => s,
                 other => {
                     return Err(MergeError::Recipe(format!(
-                        "{}: fit of {} is {other}, not copy, pad, grow-rows or reinit", context.recipe.recipe, spec.names
+                        "{}: fit of {} is {other}, not copy, pad, grow-rows or reinit",
+                        context.recipe.recipe, spec.names
                     )));
                 }
             },
@@ -126,7 +134,10 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<Rule<'a>>, MergeError> {
 
 /// Position and shape of each tensor the class would build from the planned config.
 fn expected_shapes<'n>(
-    library: &Library, config: Option<&Value>, names: impl Iterator<Item = &'n str>, evidence: &Evidence,
+    library: &Library,
+    config: Option<&Value>,
+    names: impl Iterator<Item = &'n str>,
+    evidence: &Evidence,
 ) -> HashMap<String, (usize, Vec<u64>)> {
     let Some(config) = config else { return HashMap::new() };
     let found = library.find(config, names).and_then(|a| a.expect_given(config, evidence).ok());
@@ -158,11 +169,18 @@ fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: &str) -> Result<
 }
 
 fn misfit(
-    context: &Context<'_>, donor: &Donor, tensor: &Tensor, rule: &Rule<'_>, name: &str, needed: Vec<u64>, why: &str,
+    context: &Context<'_>,
+    donor: &Donor,
+    tensor: &Tensor,
+    rule: &Rule<'_>,
+    name: &str,
+    needed: Vec<u64>,
+    why: &str,
 ) -> Seam {
     Seam {
         message: format!(
-            "{} of the {} donor is {:?}, {name} has to be {needed:?}, and {why}", tensor.name, donor.role, tensor.shape
+            "{} of the {} donor is {:?}, {name} has to be {needed:?}, and {why}",
+            tensor.name, donor.role, tensor.shape
         ),
         tensor: Some(ShapedName { donor: donor.role.clone(), name: tensor.name.clone(), shape: tensor.shape.clone() }),
         meets: rule.spec.meets.as_ref().and_then(|m| context.shaped(m)),
