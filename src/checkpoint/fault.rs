@@ -110,6 +110,7 @@ pub const FAULT_KINDS: &[&str] = &[
     "header-padding-not-spaces",
     "header-too-deep",
     "header-too-large",
+    "header-too-many-entries",
     "html-instead",
     "huge-number",
     "index-metadata-missing",

@@ -6,25 +6,15 @@
 //! `serde_json` could not serve: it keeps the last of two equal keys without a word, has no byte
 //! ranges, and (with `arbitrary_precision`) turns a crafted object into a number.
 
-use std::borrow::Cow;
 use std::ops::Range;
+
+mod atoms;
+mod text;
+
+pub(crate) use text::Text;
 
 /// Deepest nesting read; what `serde_json` reads with its limit of 128.
 pub(crate) const MAX_DEPTH: usize = 127;
-
-/// A string as it stands in the text, without its quotes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Text<'a> {
-    raw: &'a str,
-    escaped: bool,
-}
-
-impl<'a> Text<'a> {
-    /// The string after unescaping, and whether it held a lone surrogate (replaced by U+FFFD).
-    pub(crate) fn decode(self) -> (Cow<'a, str>, bool) {
-        if self.escaped { unescape(self.raw) } else { (Cow::Borrowed(self.raw), false) }
-    }
-}
 
 /// One token of JSON as Python's `json` reads it: strict JSON and the three non-finite literals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,6 +32,9 @@ pub(crate) enum Token<'a> {
     Bool(bool),
     Null,
 }
+
+/// Most slips kept of one text.
+const SLIP_CAP: usize = 100_000;
 
 /// A slip that a lenient scan reads past.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -105,7 +98,7 @@ pub(crate) struct Scanner<'a> {
     last_end: usize,
     /// The comma just read, for a trailing one.
     comma: Option<Range<usize>>,
-    /// Slips read past so far; a strict scan makes none.
+    /// Slips read past so far, the first [`SLIP_CAP`] of them; a strict scan makes none.
     pub(crate) slips: Vec<Slip>,
 }
 
@@ -170,7 +163,7 @@ impl<'a> Scanner<'a> {
                         }
                         (b'}', true) | (b']', false) => return Ok(Some(self.close(object, at))),
                         _ if self.lenient && starts(byte, object) => {
-                            self.slips.push(Slip { kind: SlipKind::MissingComma, span: self.last_end..self.last_end });
+                            self.slip(SlipKind::MissingComma, self.last_end..self.last_end);
                             self.comma = None;
                             self.expect = if object { Expect::Key } else { Expect::Value };
                         }
@@ -243,7 +236,7 @@ impl<'a> Scanner<'a> {
             return Err(self.unexpected("unexpected `/`"));
         };
         self.pos = at.saturating_add(len);
-        self.slips.push(Slip { kind: SlipKind::Comment, span: at..self.pos });
+        self.slip(SlipKind::Comment, at..self.pos);
         Ok(())
     }
 
@@ -257,7 +250,7 @@ impl<'a> Scanner<'a> {
     fn close_after_comma(&mut self, object: bool, at: usize) -> Step<'a> {
         match self.comma.take() {
             Some(span) if self.lenient => {
-                self.slips.push(Slip { kind: SlipKind::TrailingComma, span });
+                self.slip(SlipKind::TrailingComma, span);
                 Ok(Some(self.close(object, at)))
             }
             _ => Err(self.unexpected("a comma before the closing bracket")),
@@ -290,122 +283,9 @@ impl<'a> Scanner<'a> {
         Ok((token, at..self.pos))
     }
 
-    fn word(&mut self, at: usize) -> Result<Token<'a>, ScanError> {
-        const WORDS: [(&str, Token<'static>); 5] = [
-            ("true", Token::Bool(true)),
-            ("false", Token::Bool(false)),
-            ("null", Token::Null),
-            ("NaN", Token::NonFinite("NaN")),
-            ("Infinity", Token::NonFinite("Infinity")),
-        ];
-        let rest = self.text.get(at..).unwrap_or_default();
-        for (word, token) in WORDS {
-            if rest.starts_with(word) {
-                self.pos = at.saturating_add(word.len());
-                return Ok(token);
-            }
-        }
-        let reason = match rest.chars().next() {
-            Some('T' | 'F' | 'N') if ["True", "False", "None"].iter().any(|w| rest.starts_with(w)) => {
-                "a Python literal instead of `true`, `false` or `null`"
-            }
-            Some('+') => "a number with a leading `+`",
-            Some('.') => "a number without a digit before the point",
-            Some('\'') => "a string in single quotes",
-            Some(',' | '}' | ']') => "a value is missing",
-            Some(c) if c.is_alphanumeric() => "a word without quotes",
-            _ => "unexpected character",
-        };
-        Err(self.unexpected(reason))
-    }
-
-    fn digits(&mut self) -> usize {
-        let start = self.pos;
-        while matches!(self.peek(), Some(b'0'..=b'9')) {
-            self.pos = self.pos.saturating_add(1);
-        }
-        self.pos.saturating_sub(start)
-    }
-
-    fn number(&mut self, at: usize) -> Result<Token<'a>, ScanError> {
-        if self.peek() == Some(b'-') {
-            self.pos = self.pos.saturating_add(1);
-            let rest = self.text.get(self.pos..).unwrap_or_default();
-            if rest.starts_with("Infinity") {
-                self.pos = self.pos.saturating_add("Infinity".len());
-                return Ok(Token::NonFinite("-Infinity"));
-            }
-        }
-        let first = self.peek();
-        let whole = self.digits();
-        if whole == 0 {
-            return Err(self.syntax(at, self.pos, "a minus sign without a number"));
-        }
-        if first == Some(b'0') && whole > 1 {
-            return Err(self.syntax(at, self.pos, "a number with a leading zero"));
-        }
-        if self.peek() == Some(b'.') {
-            self.pos = self.pos.saturating_add(1);
-            if self.digits() == 0 {
-                return Err(self.syntax(at, self.pos, "a number without a digit after the point"));
-            }
-        }
-        if matches!(self.peek(), Some(b'e' | b'E')) {
-            self.pos = self.pos.saturating_add(1);
-            if matches!(self.peek(), Some(b'+' | b'-')) {
-                self.pos = self.pos.saturating_add(1);
-            }
-            if self.digits() == 0 {
-                return Err(self.syntax(at, self.pos, "a number without a digit in its exponent"));
-            }
-        }
-        Ok(Token::Number(self.text.get(at..self.pos).unwrap_or_default()))
-    }
-
-    /// Reads a string whose opening `quote` is at the position.
-    fn string(&mut self, quote: u8) -> Result<Text<'a>, ScanError> {
-        let open = self.pos;
-        let start = open.saturating_add(1);
-        let mut at = start;
-        let mut escaped = false;
-        loop {
-            match self.byte(at) {
-                Some(b) if b == quote => break,
-                Some(b'\\') => {
-                    escaped = true;
-                    at = at.saturating_add(self.escape_len(at, quote)?);
-                }
-                Some(0..=0x1f) => {
-                    return Err(self.syntax(at, at.saturating_add(1), "a control character inside a string"));
-                }
-                Some(_) => at = at.saturating_add(1),
-                None => return Err(self.syntax(open, self.text.len(), "a string that is never closed")),
-            }
-        }
-        self.pos = at.saturating_add(1);
-        self.last_end = self.pos;
-        if quote == b'\'' {
-            self.slips.push(Slip { kind: SlipKind::SingleQuotes, span: open..self.pos });
-        }
-        Ok(Text { raw: self.text.get(start..at).unwrap_or_default(), escaped })
-    }
-
-    /// Bytes of the escape at `at`, checked.
-    fn escape_len(&self, at: usize, quote: u8) -> Result<usize, ScanError> {
-        let after = at.saturating_add(1);
-        match self.byte(after) {
-            Some(b'"' | b'\\' | b'/' | b'b' | b'f' | b'n' | b'r' | b't') => Ok(2),
-            Some(b'\'') if quote == b'\'' => Ok(2),
-            Some(b'u') => {
-                let hex = self.text.as_bytes().get(at.saturating_add(2)..at.saturating_add(6)).unwrap_or_default();
-                if hex.len() == 4 && hex.iter().all(u8::is_ascii_hexdigit) {
-                    Ok(6)
-                } else {
-                    Err(self.syntax(at, after.saturating_add(1), "`\\u` without four hexadecimal digits"))
-                }
-            }
-            Some(b) if b.is_ascii() => Err(self.syntax(at, after.saturating_add(1), "an escape that JSON does not have")),
-            _ => Err(self.syntax(at, after, "an escape that JSON does not have")),
+    fn slip(&mut self, kind: SlipKind, span: Range<usize>) {
+        if self.slips.len() < SLIP_CAP {
+            self.slips.push(Slip { kind, span });
         }
     }
 
@@ -435,52 +315,4 @@ const fn starts(byte: u8, object: bool) -> bool {
         b'{' | b'[' | b'-' | b'0'..=b'9' | b't' | b'f' | b'n' | b'N' | b'I' => !object,
         _ => false,
     }
-}
-
-/// Resolves escapes that [`Scanner::escape_len`] has accepted.
-fn unescape(raw: &str) -> (Cow<'_, str>, bool) {
-    let mut out = String::with_capacity(raw.len());
-    let mut lone = false;
-    let mut rest = raw;
-    while let Some(at) = rest.find('\\') {
-        out.push_str(rest.get(..at).unwrap_or_default());
-        let escape = rest.get(at.saturating_add(1)..).unwrap_or_default();
-        let mut used = 1;
-        match escape.as_bytes().first() {
-            Some(b'n') => out.push('\n'),
-            Some(b't') => out.push('\t'),
-            Some(b'r') => out.push('\r'),
-            Some(b'b') => out.push('\u{8}'),
-            Some(b'f') => out.push('\u{c}'),
-            Some(b'u') => {
-                let high = hex4(escape, 1);
-                let low = if escape.get(5..7) == Some("\\u") { hex4(escape, 7) } else { None };
-                used = 5;
-                match (high, low) {
-                    (Some(h @ 0xd800..=0xdbff), Some(l @ 0xdc00..=0xdfff)) => {
-                        used = 11;
-                        let scalar = 0x1_0000 + ((h - 0xd800) << 10) + (l - 0xdc00);
-                        out.push(char::from_u32(scalar).unwrap_or(char::REPLACEMENT_CHARACTER));
-                    }
-                    (Some(h), _) => match char::from_u32(h) {
-                        Some(c) => out.push(c),
-                        None => {
-                            lone = true;
-                            out.push(char::REPLACEMENT_CHARACTER);
-                        }
-                    },
-                    (None, _) => out.push(char::REPLACEMENT_CHARACTER),
-                }
-            }
-            Some(b) => out.push(char::from(*b)),
-            None => used = 0,
-        }
-        rest = escape.get(used..).unwrap_or_default();
-    }
-    out.push_str(rest);
-    (Cow::Owned(out), lone)
-}
-
-fn hex4(text: &str, at: usize) -> Option<u32> {
-    u32::from_str_radix(text.get(at..at.checked_add(4)?)?, 16).ok()
 }

@@ -9,8 +9,8 @@ use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::{Fault, Place};
 
-/// Most syntax nodes looked at; a 4 MiB module of honest Python has about a million.
-const MAX_NODES: usize = 4_000_000;
+/// Most syntax nodes looked at: some 3 MB of honest Python, ten times the largest module known.
+const MAX_NODES: usize = 1_000_000;
 
 /// How often the parser may ask whether to go on. It asks about every hundred steps.
 const MAX_PROGRESS: usize = 200_000;

@@ -67,6 +67,9 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
         Some(ScanError { kind: ScanErrorKind::TooDeep, span }) => {
             faults.push(Fault::new("header-too-deep").at(shard.place()).with("offset", span.start));
         }
+        Some(ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), .. }) => {
+            faults.push(Fault::new("header-too-many-entries").at(shard.place()).with("cap", MAX_ENTRIES));
+        }
         Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) => {
             let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
             faults.push(fault.with("offset", span.start));
@@ -145,6 +148,10 @@ fn other_format(head: &[u8]) -> Option<String> {
     }
 }
 
+/// Most entries read of one header, tensors and metadata apart; the largest models have some hundred
+/// thousand, and each takes more memory than its bytes.
+const MAX_ENTRIES: usize = 1_000_000;
+
 /// What `__metadata__` held.
 enum Metadata {
     Absent,
@@ -192,6 +199,13 @@ struct Reader<'s, 't> {
     metadata: Metadata,
 }
 
+/// Why a header of too many entries is not read on.
+const TOO_MANY: &str = "too many entries";
+
+fn too_many() -> ScanError {
+    ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), span: 0..0 }
+}
+
 /// A header that stops in the middle.
 fn ended() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax("the header ends too early"), span: 0..0 }
@@ -210,6 +224,9 @@ impl<'t> Reader<'_, 't> {
         }
         let mut metadata_seen = false;
         while let Token::Key(key) = self.token()? {
+            if self.entries.len() >= MAX_ENTRIES {
+                return Err(too_many());
+            }
             let (name, lone) = key.decode();
             if name == "__metadata__" {
                 if metadata_seen {
@@ -237,6 +254,9 @@ impl<'t> Reader<'_, 't> {
             Token::BeginObject => {
                 let mut strings = BTreeMap::new();
                 while let Token::Key(key) = self.token()? {
+                    if strings.len() >= MAX_ENTRIES {
+                        return Err(too_many());
+                    }
                     let key = key.decode().0.into_owned();
                     match self.token()? {
                         Token::String(value) if !value.decode().1 => {

@@ -40,8 +40,9 @@ impl<T> Field<T> {
 impl Reader<'_, '_> {
     /// Reads the value of the entry `name`.
     pub(super) fn read_entry(&mut self, name: String) -> Result<(), ScanError> {
-        let place = self.shard.place().in_tensor(name.clone());
-        let malformed = |reason: &str| Fault::new("entry-malformed").at(place.clone()).with("reason", reason);
+        let shard = self.shard;
+        let place = || shard.place().in_tensor(name.clone());
+        let malformed = |reason: &str| Fault::new("entry-malformed").at(place()).with("reason", reason);
         let (mut dtype, mut shape, mut offsets) = (Field::Absent, Field::Absent, Field::Absent);
         let first = self.token()?;
         if first == Token::BeginObject {
@@ -54,10 +55,10 @@ impl Reader<'_, '_> {
                     _ => false,
                 };
                 if seen {
-                    self.faults.push(Fault::new("duplicate-header-key").at(place.clone()).with("key", &*key));
+                    self.faults.push(Fault::new("duplicate-header-key").at(place()).with("key", &*key));
                 }
                 match &*key {
-                    "dtype" => dtype = self.dtype(&place)?,
+                    "dtype" => dtype = self.dtype(place)?,
                     "shape" => {
                         shape = self.numbers(MAX_RANK)?;
                         if matches!(shape, Field::Bad) {
@@ -98,18 +99,18 @@ impl Reader<'_, '_> {
         Ok(())
     }
 
-    fn dtype(&mut self, place: &Place) -> Result<Field<Dtype>, ScanError> {
+    fn dtype(&mut self, place: impl Fn() -> Place) -> Result<Field<Dtype>, ScanError> {
         let token = self.token()?;
         let Token::String(text) = token else {
             self.scanner.skip_rest_of(&token)?;
-            self.faults.push(Fault::new("entry-malformed").at(place.clone()).with("reason", "`dtype` is not a string"));
+            self.faults.push(Fault::new("entry-malformed").at(place()).with("reason", "`dtype` is not a string"));
             return Ok(Field::Bad);
         };
         let name = text.decode().0;
         Ok(if let Some(dtype) = Dtype::from_name(&name) {
             Field::Good(dtype)
         } else {
-            self.faults.push(Fault::new("unknown-dtype").at(place.clone()).with("dtype", escape(&name, 40)));
+            self.faults.push(Fault::new("unknown-dtype").at(place()).with("dtype", escape(&name, 40)));
             Field::Bad
         })
     }
