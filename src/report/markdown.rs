@@ -34,8 +34,8 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     let verdict = text(&checkpoint.verdict);
     let _ok = writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in shown {
-        render_finding(out, finding);
+    for finding in words::alike(shown) {
+        render_finding(out, &finding);
     }
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", text_name(code));

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::collapse::{Group, collapse};
-use super::model::{Counts, Report};
+use super::model::{Counts, MergeReport, Report};
 use crate::check::finding::LoadReport;
 use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
@@ -150,18 +150,32 @@ fn silence(reason: &str) -> String {
     }
 }
 
-/// The verdict over everything, as one sentence without its full stop.
+/// The verdict over everything, as sentences without the last full stop.
 pub fn summary(report: &Report) -> String {
     let found = counts(report.summary.counts);
     let checkpoints = plural(report.summary.checkpoints, "checkpoint");
-    let seams = report.merge.as_ref().map_or(0, |m| m.seams.len());
-    let verb = if seams == 1 { "does" } else { "do" };
-    let seam = format!("{} {verb} not fit, nothing was written", plural(seams, "seam"));
-    match (found.is_empty(), seams) {
-        (true, 0) => format!("All clean: {checkpoints}"),
-        (true, _) => seam,
-        (false, 0) => format!("Found {found} in {checkpoints}"),
-        (false, _) => format!("Found {found} in {checkpoints}; {seam}"),
+    let outcome = report.merge.as_ref().and_then(outcome);
+    match (outcome, found.is_empty()) {
+        (None, true) => format!("All clean: {checkpoints}"),
+        (None, false) => format!("Found {found} in {checkpoints}"),
+        (Some(outcome), true) => outcome,
+        (Some(outcome), false) => format!("{outcome}. Found {found} in {checkpoints}"),
+    }
+}
+
+/// What came of a merge; `None` while it is not known, as in the report that is written with the result.
+fn outcome(merge: &MergeReport) -> Option<String> {
+    let size = || format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
+    match merge.stage.as_str() {
+        "seam" => {
+            let verb = if merge.seams.len() == 1 { "does" } else { "do" };
+            Some(format!("Nothing written: {} {verb} not fit", plural(merge.seams.len(), "seam")))
+        }
+        "donors" => Some("Nothing written: a donor is not sound".to_owned()),
+        "planned" => Some("Nothing written: the planned checkpoint is not sound".to_owned()),
+        "dry-run" => Some(format!("Nothing written, as asked: {} planned", size())),
+        "written" => Some(format!("Written: {}", size())),
+        _ => None,
     }
 }
 
@@ -193,6 +207,23 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
     }
     let hidden = seen.into_iter().filter(|(_, n)| *n > cap).map(|(code, n)| (code, n - cap)).collect();
     (shown, hidden)
+}
+
+/// Findings that say the same of several places, as one each.
+pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
+    let mut together: Vec<Finding> = Vec::new();
+    for finding in findings {
+        let same = |last: &Finding| {
+            (&last.code, last.severity, &last.message, &last.fix)
+                == (&finding.code, finding.severity, &finding.message, &finding.fix)
+                && evidence(last) == evidence(finding)
+        };
+        match together.last_mut() {
+            Some(last) if same(last) => last.locations.extend(finding.locations.iter().cloned()),
+            _ => together.push(finding.clone()),
+        }
+    }
+    together
 }
 
 /// `and 3 more`, when a list of `total` is cut at `cap`.

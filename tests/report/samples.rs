@@ -138,13 +138,17 @@ pub fn findings() -> Report {
         .collect();
     unmapped.fix = fix("safe", "Rebuild the index from the shard headers");
 
+    let twin = |file: &str| Finding {
+        locations: vec![Location { file: Some(file.to_owned()), ..Location::default() }],
+        ..finding("LFS002", "lfs-pointer", Severity::Error, "a git-lfs pointer, not the file", json!({}))
+    };
     let no_span = Finding {
         locations: vec![Location { file: Some("config.json".to_owned()), pointer: Some("/text_config".to_owned()), ..Location::default() }],
         ..finding("CFG001", "text-config-missing", Severity::Warning, "config.json has no text_config", json!({}))
     };
     let nowhere = finding("TOK001", "no-tokenizer", Severity::Info, "no tokenizer file: not checked", json!({}));
 
-    let all = vec![no_span, ids, unmapped, module, infinity, nowhere];
+    let all = vec![twin("a.json"), twin("b.json"), no_span, ids, unmapped, module, infinity, nowhere];
     let mut checkpoint = checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
     checkpoint.load = Some(load());
     Report::new(vec![checkpoint], None)
@@ -279,8 +283,10 @@ fn merge() -> MergeReport {
 }
 
 pub fn merge_ok() -> Report {
+    let note = || finding("TOK006", "tokenizer-needs-conversion", Severity::Info, "protobuf is needed", json!({}));
     let parts = ["donor vision", "donor language", "planned", "written"].map(|role| {
-        let mut part = checkpoint(if role.starts_with("donor") { "donors/x" } else { "out/merged" }, vec![], &[]);
+        let donor = role.starts_with("donor");
+        let mut part = if donor { checkpoint("donors/x", vec![], &[]) } else { checkpoint("out/merged", vec![note()], &[]) };
         part.role = Some(role.to_owned());
         part.load = Some(LoadReport::default());
         part

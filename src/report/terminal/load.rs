@@ -18,7 +18,7 @@ pub fn render(out: &mut String, load: &LoadReport, style: Style) {
         let _ok = writeln!(out, "  {}", paint.quiet(&line));
         return;
     }
-    let _ok = writeln!(out, "\n  {}", paint.strong(&line));
+    let _ok = writeln!(out, "  {}", paint.strong(&line));
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
     list(out, "missing: the loader initialises them anew", &names(&load.missing), style);
     list(out, "unexpected: the loader ignores them", &names(&load.unexpected), style);

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::super::Style;
 use super::super::model::{MergeReport, Seam, ShapedName};
-use super::super::words::{bytes, more, name, plural, sentence, shape};
+use super::super::words::{bytes, more, name, plural, sentence, shape, wrap};
 use super::load::table;
 use super::paint::Paint;
 
@@ -16,13 +16,17 @@ pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
     }
     if !merge.options.is_empty() {
         let options: Vec<String> = merge.options.iter().map(|(k, v)| format!("{}={}", name(k), name(v))).collect();
-        let _ok = writeln!(out, "  {:<10} {}", "options", paint.quiet(&options.join(" ")));
+        let _ok = writeln!(out, "  {:<10} {}", "options", paint.quiet(&hang(&options.join(" "), 13, style)));
     }
     stages(out, merge, style);
     for seam in merge.seams.iter().take(style.cap) {
         render_seam(out, seam, style);
     }
-    list(out, "seams", merge.seams.len(), style, Vec::new());
+    if !merge.seams.is_empty() {
+        list(out, "seams", merge.seams.len(), style, Vec::new());
+        // The rest of the plan is not what stands in the way.
+        return;
+    }
     changed(out, merge, style);
     let dropped = merge.dropped.iter().map(|d| {
         format!("{} of {}: {} ({})", plural(d.count, "tensor"), name(&d.donor), name(&d.pattern), sentence(&d.why))
@@ -44,7 +48,8 @@ fn stages(out: &mut String, merge: &MergeReport, style: Style) {
     let widest = merge.stages.iter().map(|s| s.name.chars().count()).max().unwrap_or(0).min(24);
     out.push('\n');
     for (n, stage) in merge.stages.iter().enumerate().take(style.cap) {
-        let _ok = writeln!(out, "  {}. {:<widest$}  {}", n + 1, name(&stage.name), sentence(&stage.outcome));
+        let outcome = hang(&sentence(&stage.outcome), widest.saturating_add(7), style);
+        let _ok = writeln!(out, "  {}. {:<widest$}  {outcome}", n + 1, name(&stage.name));
     }
 }
 
@@ -93,9 +98,14 @@ fn list(out: &mut String, title: &str, total: usize, style: Style, shown: Vec<St
         let _ok = writeln!(out, "\n  {title}");
     }
     for line in shown {
-        let _ok = writeln!(out, "    {line}");
+        let _ok = writeln!(out, "    - {}", hang(&line, 6, style));
     }
     if let Some(more) = more(total, style.cap) {
         let _ok = writeln!(out, "    {more} {title}");
     }
+}
+
+/// Wraps text that starts `indent` columns in, so that the lines after the first start there too.
+fn hang(text: &str, indent: usize, style: Style) -> String {
+    wrap(text, style.width.map(|w| w.saturating_sub(indent))).replace('\n', &format!("\n{:indent$}", ""))
 }

@@ -10,18 +10,24 @@ use std::fmt::Write as _;
 use self::paint::Paint;
 use super::Style;
 use super::model::{CheckpointReport, Report};
-use super::words::{bytes, capped, counts, name, plural, summary};
+use super::words::{alike, bytes, capped, counts, name, plural, summary};
 
 pub fn render(report: &Report, style: Style) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
+    let mut above: Option<&CheckpointReport> = None;
     for checkpoint in &report.checkpoints {
         header(&mut out, checkpoint, paint);
-        findings(&mut out, checkpoint, style);
-        if let Some(load) = &checkpoint.load {
-            load::render(&mut out, load, style);
+        if above.is_some_and(|a| repeats(a, checkpoint)) {
+            let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
+        } else {
+            findings(&mut out, checkpoint, style);
+            if let Some(load) = &checkpoint.load {
+                load::render(&mut out, load, style);
+            }
         }
         out.push('\n');
+        above = Some(checkpoint);
     }
     if let Some(merge) = &report.merge {
         merge::render(&mut out, merge, style);
@@ -29,6 +35,12 @@ pub fn render(report: &Report, style: Style) -> String {
     }
     let _ok = writeln!(out, "{}", paint.verdict(&report.summary.verdict, &summary(report)));
     out
+}
+
+/// Whether a checkpoint has the findings of the one above it: what was planned is usually what was written.
+fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
+    !checkpoint.findings.is_empty()
+        && (&above.path, &above.findings, &above.load) == (&checkpoint.path, &checkpoint.findings, &checkpoint.load)
 }
 
 /// `fixtures/vision (donor vision): spatialvla, 690 tensors, 1.23 MB, clean`
@@ -48,12 +60,15 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
 
 fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     let (shown, hidden) = capped(&checkpoint.findings, style.cap);
-    for finding in shown {
+    for finding in alike(shown) {
         out.push('\n');
-        out.push_str(&finding::render(finding, checkpoint, style));
+        out.push_str(&finding::render(&finding, checkpoint, style));
         out.push('\n');
     }
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", name(code));
+    }
+    if !checkpoint.findings.is_empty() {
+        out.push('\n');
     }
 }
