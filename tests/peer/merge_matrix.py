@@ -25,7 +25,9 @@ OPTIONS = {
     "tokenizer": ("plain", "baked"),
     "layout": ("upstream", "wrapped"),
 }
-MODULES = ("configuration_spatialvla", "modeling_spatialvla", "modeling_gemma2", "processing_spatialvla", "action_tokenizer")
+MODULES = (
+    "configuration_spatialvla", "modeling_spatialvla", "modeling_gemma2", "processing_spatialvla", "action_tokenizer",
+)
 
 
 def blame(choice):
@@ -102,17 +104,18 @@ def second_opinion(directory):
     script = SHARED / "tools" / "load_merged.py"
     if not script.exists():
         return None
-    done = subprocess.run([sys.executable, script, directory, "--generate"], capture_output=True, text=True, timeout=120)
+    words = [sys.executable, script, directory, "--generate"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     verdict = json.loads(done.stdout.splitlines()[-1])
     return [] if verdict["ok"] else [f"load_merged.py: {verdict}"]
 
 
 def judge(tally, what, out):
     """A merge that was written: `check` is content, and so is the loader."""
-    entry, code = check(out)
-    entry = next(iter(entry.values()))
-    ok = tally.expect(code == 0 and entry["verdict"] in ("clean", "info"), f"{what}: check says {entry['verdict']}, exit {code}",
-                      json.dumps(entry["findings"])[:1500])
+    entries, code = check(out)
+    verdict, findings = (next(iter(entries.values()))[key] for key in ("verdict", "findings"))
+    ok = tally.expect(code == 0 and verdict in ("clean", "info"), f"{what}: check says {verdict}, exit {code}",
+                      json.dumps(findings)[:1500])
     try:
         wrong = faults_on_loading(out)
     except Exception as error:  # a merged directory may break the loader in any way

@@ -259,7 +259,8 @@ SHARDED = [index_other_shard, index_ghost, index_ghost_unknown, index_forgets, i
 
 # What is mutated: name -> a function that saves it.
 
-VISION = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=28, patch_size=14)
+VISION = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=28,
+              patch_size=14)
 TEXT = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, num_key_value_heads=2,
             head_dim=8, vocab_size=96)
 ZOE = dict(
@@ -270,7 +271,7 @@ ZOE = dict(
     bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0, "name": "nyu"},
                         {"n_bins": 8, "min_depth": 0.001, "max_depth": 80.0, "name": "kitti"}],
     backbone_config=dict(
-        model_type="beit", hidden_size=32, num_hidden_layers=4, num_attention_heads=2, intermediate_size=64,
+        hidden_size=32, num_hidden_layers=4, num_attention_heads=2, intermediate_size=64,
         image_size=64, patch_size=16, layer_scale_init_value=0.1, use_relative_position_bias=True,
         out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False),
 )
@@ -282,7 +283,7 @@ def stock():
 
     vision = dict(VISION, model_type="siglip_vision_model", vision_use_head=False)
     clip = dict(VISION, model_type="clip_vision_model", projection_dim=16)
-    zoe = dict(ZOE, backbone_config=t.BeitConfig(**{k: v for k, v in ZOE["backbone_config"].items() if k != "model_type"}))
+    zoe = dict(ZOE, backbone_config=t.BeitConfig(**ZOE["backbone_config"]))
     yield "llama", t.LlamaForCausalLM, t.LlamaConfig(**TEXT), "20KB"
     yield "llama-tied", t.LlamaForCausalLM, t.LlamaConfig(**TEXT, tie_word_embeddings=True), "1GB"
     yield "llama-biased", t.LlamaForCausalLM, t.LlamaConfig(**TEXT, attention_bias=True, mlp_bias=True), "1GB"
@@ -290,11 +291,14 @@ def stock():
     yield "siglip", t.SiglipVisionModel, t.SiglipVisionConfig(**VISION), "20KB"
     yield "clip", t.CLIPVisionModel, t.CLIPVisionConfig(**VISION), "1GB"
     yield "paligemma", t.PaliGemmaForConditionalGeneration, t.PaliGemmaConfig(
-        text_config=dict(TEXT, model_type="gemma"), vision_config=dict(vision), projection_dim=32), "40KB"
+        text_config=dict(TEXT, model_type="gemma"), vision_config=dict(vision), projection_dim=32,
+        image_token_index=95), "40KB"
     yield "paligemma-llama", t.PaliGemmaForConditionalGeneration, t.PaliGemmaConfig(
-        text_config=dict(TEXT, model_type="llama"), vision_config=dict(vision), projection_dim=32), "40KB"
+        text_config=dict(TEXT, model_type="llama"), vision_config=dict(vision), projection_dim=32,
+        image_token_index=95), "40KB"
     yield "llava", t.LlavaForConditionalGeneration, t.LlavaConfig(
-        text_config=t.LlamaConfig(**TEXT), vision_config=t.CLIPVisionConfig(**VISION)), "40KB"
+        text_config=t.LlamaConfig(**TEXT), vision_config=t.CLIPVisionConfig(**VISION),
+        image_token_index=95), "40KB"
     yield "zoedepth", t.ZoeDepthForDepthEstimation, t.ZoeDepthConfig(**zoe), "60KB"
 
 
@@ -303,7 +307,7 @@ def loader_report(cls, directory):
     from transformers import PreTrainedModel
 
     try:
-        # Not cls.from_pretrained: SpatialVLA's own does more after loading, and an incomplete model may not survive it.
+        # Not cls.from_pretrained: SpatialVLA's own does more after loading, which a broken model may not survive.
         _, info = PreTrainedModel.from_pretrained.__func__(
             cls, str(directory), output_loading_info=True, ignore_mismatched_sizes=True)
     except Exception as error:  # whatever it is, it did not load
@@ -311,7 +315,7 @@ def loader_report(cls, directory):
     return {
         "missing": sorted(info["missing_keys"]),
         "unexpected": sorted(info["unexpected_keys"]),
-        "mismatched": sorted([name, list(stored), list(expected)] for name, stored, expected in info["mismatched_keys"]),
+        "mismatched": sorted([name, list(here), list(there)] for name, here, there in info["mismatched_keys"]),
     }
 
 
@@ -330,7 +334,8 @@ def differences(got, want):
     for kind in want:
         for sign, here, there in (("+", got, want), ("-", want, got)):
             only = [x for x in here[kind] if x not in there[kind]]
-            lines += [f"{sign} {kind}: {only[:4]}{f' and {len(only) - 4} more' if len(only) > 4 else ''}"] if only else []
+            if only:
+                lines.append(f"{sign} {kind}: {only[:4]}, {len(only)} in all")
     return "\n    ".join(lines) or "same entries, other counts"
 
 
