@@ -93,3 +93,8 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
         Format::Markdown => markdown::render(report, style.cap),
     }
 }
+
+/// The Rust in README.md compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;

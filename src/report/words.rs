@@ -184,9 +184,9 @@ pub fn evidence(finding: &Finding) -> Vec<String> {
     let mut unsaid: Vec<String> = finding
         .evidence
         .iter()
-        .map(|(key, v)| (key, value(v)))
-        .filter(|(_, text)| !quotes(&finding.message, text))
-        .map(|(key, text)| format!("{} = {text}", name(key)))
+        .map(|(key, v)| (key, v, value(v)))
+        .filter(|(_, v, text)| !quotes(&finding.message, v.as_str().unwrap_or(text)))
+        .map(|(key, _, text)| format!("{} = {text}", name(key)))
         .collect();
     let rest = more(unsaid.len(), VALUES);
     unsaid.truncate(VALUES);
