@@ -187,7 +187,9 @@ impl Faults {
         for (kind, (count, last)) in &self.seen {
             let cap = if *kind == "non-finite-number" { NON_FINITE_CAP } else { KIND_CAP };
             let more = count.saturating_sub(cap);
-            if more > 0 && let Some(fault) = self.list.get_mut(*last) {
+            if more > 0
+                && let Some(fault) = self.list.get_mut(*last)
+            {
                 fault.detail.insert("more".to_owned(), more.into());
             }
         }

@@ -12,6 +12,10 @@ pub struct LfsPointer {
 /// Pointer files are smaller than this (git-lfs docs/spec.md: "less than 1024 bytes").
 pub(crate) const MAX_POINTER: usize = 1024;
 
+/// Addresses a pointer's first line may name, newest first.
+const VERSIONS: [&str; 3] =
+    ["https://git-lfs.github.com/spec/", "https://hawser.github.com/spec/", "http://git-media.io/v/"];
+
 impl LfsPointer {
     /// Reads a pointer, `None` when the bytes are anything else.
     ///
@@ -25,8 +29,6 @@ impl LfsPointer {
         let text = std::str::from_utf8(bytes).ok()?;
         let mut lines = text.trim().lines().map(str::trim_end);
         let version = lines.next()?.strip_prefix("version ")?;
-        const VERSIONS: [&str; 3] =
-            ["https://git-lfs.github.com/spec/", "https://hawser.github.com/spec/", "http://git-media.io/v/"];
         if !VERSIONS.iter().any(|v| version.starts_with(v)) {
             return None;
         }

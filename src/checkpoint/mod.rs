@@ -120,10 +120,18 @@ impl Checkpoint {
             let size = size.and_then(|s| u64::try_from(s).ok()).unwrap_or(0);
             entries.entry(name.to_owned()).or_insert(Entry { size, ..Entry::default() });
         };
-        documents.iter().for_each(|d| entry(&d.name, d.text.as_ref().map(|t| t.len())));
-        modules.iter().for_each(|m| entry(&m.name, m.text.as_ref().map(|t| t.len())));
-        shards.iter().for_each(|s| entry(&s.name, usize::try_from(s.file_len).ok()));
-        vocabularies.keys().for_each(|name| entry(name, None));
+        for document in &documents {
+            entry(&document.name, document.text.as_ref().map(|t| t.len()));
+        }
+        for module in &modules {
+            entry(&module.name, module.text.as_ref().map(|t| t.len()));
+        }
+        for shard in &shards {
+            entry(&shard.name, usize::try_from(shard.file_len).ok());
+        }
+        for name in vocabularies.keys() {
+            entry(name, None);
+        }
         let mut checkpoint = Self {
             root: root.into(),
             entries,

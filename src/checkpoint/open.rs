@@ -61,37 +61,56 @@ pub struct Opened {
 pub enum OpenError {
     /// Nothing of this name.
     #[error("{} does not exist", path.display())]
-    NotFound { /// The path asked for.
-        path: PathBuf },
+    NotFound {
+        /// The path asked for.
+        path: PathBuf,
+    },
     /// Something that is not a regular file.
     #[error("{} is a {what}, not a regular file", path.display())]
-    NotRegular { /// The path asked for.
-        path: PathBuf, /// `FIFO`, `socket`, `device` or `directory`.
-        what: &'static str },
+    NotRegular {
+        /// The path asked for.
+        path: PathBuf,
+        /// `FIFO`, `socket`, `device` or `directory`.
+        what: &'static str,
+    },
     /// A file where a directory was wanted.
     #[error("{} is not a directory", path.display())]
-    NotADirectory { /// The path asked for.
-        path: PathBuf },
+    NotADirectory {
+        /// The path asked for.
+        path: PathBuf,
+    },
     /// More bytes than are read of such a file.
     #[error("{} has {size} bytes; at most {cap} are read of such a file", path.display())]
-    TooLarge { /// The path asked for.
-        path: PathBuf, /// Bytes in the file.
-        size: u64, /// Bytes allowed.
-        cap: u64 },
+    TooLarge {
+        /// The path asked for.
+        path: PathBuf,
+        /// Bytes in the file.
+        size: u64,
+        /// Bytes allowed.
+        cap: u64,
+    },
     /// A symbolic link to nothing.
     #[error("{} is a symbolic link to {}, which does not exist", path.display(), target.display())]
-    DanglingLink { /// The path asked for.
-        path: PathBuf, /// What the link says.
-        target: PathBuf },
+    DanglingLink {
+        /// The path asked for.
+        path: PathBuf,
+        /// What the link says.
+        target: PathBuf,
+    },
     /// Symbolic links that lead in a circle.
     #[error("{} is a symbolic link that leads back to itself", path.display())]
-    SymlinkLoop { /// The path asked for.
-        path: PathBuf },
+    SymlinkLoop {
+        /// The path asked for.
+        path: PathBuf,
+    },
     /// Anything else the system said.
     #[error("cannot read {}: {source}", path.display())]
-    Io { /// The path asked for.
-        path: PathBuf, /// The system's own error.
-        source: std::io::Error },
+    Io {
+        /// The path asked for.
+        path: PathBuf,
+        /// The system's own error.
+        source: std::io::Error,
+    },
 }
 
 impl OpenError {

@@ -5,22 +5,31 @@ use std::fs::{self, Metadata};
 use std::path::{Component, Path};
 use std::sync::Arc;
 
+use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
 use super::{Checkpoint, Document, Entry, EntryKind, Fault, LfsPointer, Module, OpenError, Place, Shard, Vocabulary};
-use super::is_plain_file_name;
 
 /// Endings that a downloader gives to a file it has not finished.
 const UNFINISHED: [&str; 5] = [".incomplete", ".aria2", ".part", ".crdownload", ".download"];
 
 /// Documents with names of their own; besides them `*config.json` and `*.index.json` are read.
 const DOCUMENTS: [&str; 6] = [
-    "added_tokens.json", "chat_template.json", "special_tokens_map.json", "tokenizer.json", "vocab.json",
+    "added_tokens.json",
+    "chat_template.json",
+    "special_tokens_map.json",
+    "tokenizer.json",
+    "vocab.json",
     "dataset_statistics.json",
 ];
 
 /// Vocabulary files that are no documents.
 const VOCABULARIES: [&str; 4] = ["tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.txt"];
+
+/// Whether the name ends so; loaders compare names as they are, and so do we.
+fn has_ending(name: &str, ending: &str) -> bool {
+    Path::new(name).extension().is_some_and(|e| e == ending)
+}
 
 /// Whether a file is read as a JSON document.
 pub(super) fn is_document(name: &str) -> bool {
@@ -49,7 +58,7 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
                 Err(error) => Document::unread(&*name, error.fault(&name)),
             };
             checkpoint.documents.insert(name.clone(), document);
-        } else if name.ends_with(".py") {
+        } else if has_ending(&name, "py") {
             let module = match read_capped(&path, MODULE_CAP) {
                 Ok(bytes) => Module::parse(&*name, &bytes),
                 Err(error) => Module::unread(&*name, error.fault(&name)),

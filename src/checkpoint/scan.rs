@@ -140,7 +140,11 @@ impl<'a> Scanner<'a> {
             self.skip_space()?;
             let at = self.pos;
             let Some(byte) = self.peek() else {
-                return if self.expect == Expect::Done { Ok(None) } else { Err(self.syntax(at, at, self.ends_inside())) };
+                return if self.expect == Expect::Done {
+                    Ok(None)
+                } else {
+                    Err(self.syntax(at, at, self.ends_inside()))
+                };
             };
             match self.expect {
                 Expect::Done => {

@@ -14,13 +14,25 @@ pub use vocabulary::Vocabulary;
 
 /// Vocabulary files of the tokenizers in transformers; one of them must be there.
 pub const VOCABULARY_FILES: [&str; 8] = [
-    "tokenizer.json", "tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.json", "vocab.txt",
-    "tekken.json", "tiktoken.model",
+    "tokenizer.json",
+    "tokenizer.model",
+    "spiece.model",
+    "sentencepiece.bpe.model",
+    "vocab.json",
+    "vocab.txt",
+    "tekken.json",
+    "tiktoken.model",
 ];
 
 /// Special-token attributes in the order transformers adds them. Source: `SPECIAL_TOKENS_ATTRIBUTES` in 4.47.0.
 const SPECIAL: [&str; 8] = [
-    "bos_token", "eos_token", "unk_token", "sep_token", "pad_token", "cls_token", "mask_token",
+    "bos_token",
+    "eos_token",
+    "unk_token",
+    "sep_token",
+    "pad_token",
+    "cls_token",
+    "mask_token",
     "additional_special_tokens",
 ];
 
@@ -81,15 +93,17 @@ impl Tokenizer {
         }
         let get = |name: &str, pointer: &str| documents.get(name)?.get(pointer);
         let config = "tokenizer_config.json";
-        let decoder = get(config, "/added_tokens_decoder").and_then(Value::as_object).map(|map| {
-            map.iter().filter_map(|(id, token)| added(id.parse().ok()?, token)).collect::<Vec<_>>()
-        });
+        let decoder = get(config, "/added_tokens_decoder")
+            .and_then(Value::as_object)
+            .map(|map| map.iter().filter_map(|(id, token)| added(id.parse().ok()?, token)).collect::<Vec<_>>());
         let json = get("added_tokens.json", "").and_then(Value::as_object).map(|map| {
-            map.iter().filter_map(|(content, id)| Some(AddedToken { id: id.as_u64()?, content: content.clone() })).collect()
+            map.iter()
+                .filter_map(|(content, id)| Some(AddedToken { id: id.as_u64()?, content: content.clone() }))
+                .collect()
         });
-        let own = get("tokenizer.json", "/added_tokens").and_then(Value::as_array).map(|list| {
-            list.iter().filter_map(|token| added(token.get("id")?.as_u64()?, token)).collect()
-        });
+        let own = get("tokenizer.json", "/added_tokens")
+            .and_then(Value::as_array)
+            .map(|list| list.iter().filter_map(|token| added(token.get("id")?.as_u64()?, token)).collect());
         let special_from = if decoder.is_some() { vec![config] } else { vec!["special_tokens_map.json", config] };
         let mut tokenizer = Self {
             files,
@@ -205,10 +219,7 @@ fn added(id: u64, token: &Value) -> Option<AddedToken> {
 }
 
 /// Special tokens in the order they are added; of several files the first that names one.
-fn special_tokens<'v>(
-    files: &[&str],
-    get: &impl Fn(&str, &str) -> Option<&'v Value>,
-) -> Vec<(String, String)> {
+fn special_tokens<'v>(files: &[&str], get: &impl Fn(&str, &str) -> Option<&'v Value>) -> Vec<(String, String)> {
     let content = |v: &Value| v.as_str().or_else(|| v.get("content")?.as_str()).map(str::to_owned);
     let mut tokens = Vec::new();
     for name in SPECIAL {

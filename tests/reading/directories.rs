@@ -1,10 +1,10 @@
 //! Rows F, P and D of the hazards: the directory and what is in it.
 
-use std::sync::LazyLock;
 use std::fs::{self, File};
 use std::os::unix::fs::symlink;
 use std::os::unix::net::UnixListener;
 use std::path::Path;
+use std::sync::LazyLock;
 
 use ckpt_doctor::checkpoint::open::{JSON_CAP, MODULE_CAP, read_capped};
 use ckpt_doctor::checkpoint::{
@@ -82,8 +82,12 @@ fn cases() -> Vec<Case> {
             // The path of a socket is short by nature; the folder's own may not be.
             drop(UnixListener::bind(root.join("config.json")).unwrap());
         }),
-        case("dangling", &["dangling-symlink"], &|root| symlink("../../blobs/gone", root.join("model.safetensors")).unwrap()),
-        case("dangling neighbour", &["dangling-symlink"], &|root| symlink("gone", root.join("pytorch_model.bin")).unwrap()),
+        case("dangling", &["dangling-symlink"], &|root| {
+            symlink("../../blobs/gone", root.join("model.safetensors")).unwrap();
+        }),
+        case("dangling neighbour", &["dangling-symlink"], &|root| {
+            symlink("gone", root.join("pytorch_model.bin")).unwrap();
+        }),
         case("loop", &["symlink-loop"], &|root| symlink("config.json", root.join("config.json")).unwrap()),
         case("6 GiB config", &["file-too-large"], &|root| sparse(&root.join("config.json"), 6 << 30)),
         case("large module", &["file-too-large"], &|root| sparse(&root.join("m.py"), MODULE_CAP + 1)),
@@ -122,7 +126,8 @@ fn no_file_is_opened_because_another_names_it() {
     fs::write(&outside, file(br#"{"__metadata__":{"format":"pt"}}"#, 0)).unwrap();
     let root = dir.path().join("model");
     fs::create_dir(&root).unwrap();
-    let index = json!({"metadata": {}, "weight_map": {"a": "../secret.safetensors", "b": outside, "c": "model.safetensors"}});
+    let index =
+        json!({"metadata": {}, "weight_map": {"a": "../secret.safetensors", "b": outside, "c": "model.safetensors"}});
     fs::write(root.join("model.safetensors.index.json"), index.to_string()).unwrap();
     let checkpoint = Checkpoint::open(&root).unwrap();
     let index = checkpoint.index.as_ref().unwrap();

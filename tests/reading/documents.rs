@@ -56,7 +56,7 @@ fn cases() -> Vec<Case> {
         one("trailing comma", "trailing-comma", br#"{"a": [1, 2,], "b": 1}"#),
         one("missing comma", "missing-comma", b"{\"a\": 1\n \"b\": [1 2]}"),
         one("comment", "comment-in-json", b"{\"a\": 1 // one\n, /* two */ \"b\": 2}"),
-        one("single quotes", "single-quoted-string", br#"{'a': 'it\'s'}"#),
+        one("single quotes", "single-quoted-string", br"{'a': 'it\'s'}"),
         one("byte-order mark", "byte-order-mark", b"\xef\xbb\xbf{\"a\": 1}"),
         one("UTF-16 with mark", "wrong-encoding", &bom16),
         one("UTF-16 without", "wrong-encoding", &utf16(r#"{"a": 1}"#, false)),
@@ -89,7 +89,7 @@ fn cases() -> Vec<Case> {
         one("leading zero", "json-syntax", br#"{"a": 012}"#),
         one("tab in a string", "json-syntax", b"{\"a\": \"x\ty\"}"),
         one("two commas", "json-syntax", br#"{"a": 1,, "b": 2}"#),
-        one("comma only", "json-syntax", br#"{,}"#),
+        one("comma only", "json-syntax", br"{,}"),
         one("two million zeros", "json-too-many-values", many.as_bytes()),
         Case::new("slips together", &["missing-comma", "trailing-comma"], faults("{\"a\": 1\n\"b\": 2,\n}")),
         index("index", &[], &format!(r#"{{{meta},"weight_map":{{"a":"model-00001-of-00002.safetensors"}}}}"#)),
@@ -104,7 +104,16 @@ fn cases() -> Vec<Case> {
         index("tensor twice", &["duplicate-index-key"], &format!(r#"{{{meta},"weight_map":{{"a":"x","a":"y"}}}}"#)),
     ];
     let unsafe_paths = [
-        "../x.safetensors", "/dev/zero", "/etc/passwd", "a/b.safetensors", "a\\\\b", "C:x", ".", "..", "", "a\\u0000b",
+        "../x.safetensors",
+        "/dev/zero",
+        "/etc/passwd",
+        "a/b.safetensors",
+        "a\\\\b",
+        "C:x",
+        ".",
+        "..",
+        "",
+        "a\\u0000b",
         "/proc/self/environ",
     ];
     let unsafe_paths = unsafe_paths.map(str::to_owned).into_iter().chain([format!("{}.safetensors", "x".repeat(5000))]);
@@ -176,7 +185,7 @@ fn understood_documents_have_a_value_and_others_none() {
     assert_eq!(value(b"{\"a\": 1}\0\0"), Some(json!({"a": 1})));
     // A key that is absent here may be in the part that is missing.
     assert_eq!(value(b"{\"a\": 1, \"b\""), None);
-    assert_eq!(value(&[b'['; 100_000]), None);
+    assert_eq!(value("[".repeat(100_000).as_bytes()), None);
 }
 
 #[test]

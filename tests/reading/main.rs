@@ -3,7 +3,14 @@
 //! Each table gives bytes and the exact set of fault kinds they must come out as; an empty set is a
 //! promise that an oddity is clean.
 
-#![allow(clippy::unwrap_used, reason = "a panic is a failed test")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    reason = "a panic is a failed test"
+)]
+#![allow(clippy::cast_possible_truncation, reason = "all figures here are small")]
+#![allow(clippy::disallowed_methods, reason = "tests build the files they read")]
 
 use std::collections::BTreeSet;
 

@@ -55,7 +55,9 @@ a, b = 1, 2
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
-    let case = |label, expected: &[&'static str], bytes: &[u8]| Case::new(label, expected, Module::parse("m.py", bytes).faults);
+    let case = |label, expected: &[&'static str], bytes: &[u8]| {
+        Case::new(label, expected, Module::parse("m.py", bytes).faults)
+    };
     let nested = "(".repeat(100_000);
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n";
     // More syntax than is read of one module, within the size that is read.
@@ -95,13 +97,16 @@ fn imports_relative_and_absolute() {
     let relative: Vec<_> =
         module.relative_imports.iter().map(|i| (i.level, i.module.as_str(), i.names.join(","), i.guarded)).collect();
     let name = str::to_owned;
-    assert_eq!(relative, [
-        (1, "configuration_x", name("XConfig,YConfig"), false),
-        (1, "action_tokenizer", name(""), false),
-        (2, "up", name("z"), false),
-        (1, "star", name("*"), false),
-        (1, "maybe", name("m"), true),
-    ]);
+    assert_eq!(
+        relative,
+        [
+            (1, "configuration_x", name("XConfig,YConfig"), false),
+            (1, "action_tokenizer", name(""), false),
+            (2, "up", name("z"), false),
+            (1, "star", name("*"), false),
+            (1, "maybe", name("m"), true),
+        ]
+    );
     let required: Vec<_> = module.required_packages().map(|i| i.package.as_str()).collect();
     assert_eq!(required, ["typing", "torch", "numpy", "transformers", "always"]);
     assert!(module.imports.iter().any(|i| i.package == "lazily" && i.nested));

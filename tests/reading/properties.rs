@@ -31,8 +31,27 @@ fn json() -> impl Strategy<Value = Value> {
 /// Text in which little is left of a document: bytes changed, cut out, put in.
 fn mutated(bytes: Vec<u8>) -> impl Strategy<Value = Vec<u8>> {
     let piece = prop::sample::select(vec![
-        &b","[..], b"{", b"}", b"[", b"]", b"\"", b"\\", b"'", b"//", b"/*", b"NaN", b"-", b"1e", b"\0", b"\xff", b":",
-        b"\\ud800", b"=======\n", b" ", b"0", b"99999999999999999999",
+        &b","[..],
+        b"{",
+        b"}",
+        b"[",
+        b"]",
+        b"\"",
+        b"\\",
+        b"'",
+        b"//",
+        b"/*",
+        b"NaN",
+        b"-",
+        b"1e",
+        b"\0",
+        b"\xff",
+        b":",
+        b"\\ud800",
+        b"=======\n",
+        b" ",
+        b"0",
+        b"99999999999999999999",
     ]);
     prop::collection::vec((any::<prop::sample::Index>(), 0..4_usize, piece), 0..4).prop_map(move |edits| {
         let mut bytes = bytes.clone();
@@ -47,7 +66,15 @@ fn mutated(bytes: Vec<u8>) -> impl Strategy<Value = Vec<u8>> {
 
 fn tensors() -> impl Strategy<Value = Vec<(String, Dtype, Vec<usize>)>> {
     let dtype = prop::sample::select(vec![
-        Dtype::BOOL, Dtype::U8, Dtype::F8_E4M3, Dtype::F16, Dtype::BF16, Dtype::F32, Dtype::I64, Dtype::C64, Dtype::F4,
+        Dtype::BOOL,
+        Dtype::U8,
+        Dtype::F8_E4M3,
+        Dtype::F16,
+        Dtype::BF16,
+        Dtype::F32,
+        Dtype::I64,
+        Dtype::C64,
+        Dtype::F4,
     ]);
     let one = ("[a-z][a-z.0-9é]{0,11}", dtype, prop::collection::vec(0..5_usize, 0..4));
     prop::collection::vec(one, 0..6).prop_map(|mut list| {

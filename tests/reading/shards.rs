@@ -42,10 +42,12 @@ fn cases() -> Vec<Case> {
         bytes.extend(vec![0xee; rest]);
         bytes
     };
-    let huge: Vec<_> = (0..8).map(|i| {
-        let size = (1_u64 << 61) - 1;
-        entry(&format!("t{i}"), "U8", &format!("[{size}]"), i * size, (i + 1) * size)
-    }).collect();
+    let huge: Vec<_> = (0..8)
+        .map(|i| {
+            let size = (1_u64 << 61) - 1;
+            entry(&format!("t{i}"), "U8", &format!("[{size}]"), i * size, (i + 1) * size)
+        })
+        .collect();
     let deep = format!("{{\"a\":{}{}}}", "[".repeat(100_000), "]".repeat(100_000));
     let crowd = format!("{{{}\"\":0}}", "\"\":0,".repeat(1_000_001));
     let two = |a: &str, b: &str| of(&format!("{a},{b}"), 8);
@@ -58,7 +60,11 @@ fn cases() -> Vec<Case> {
         raw("leading space", &[], &with(" \n", "")),
         raw("20 MB padding", &[], &with("", &" ".repeat(20_000_000))),
         raw("unaligned header", &[], &with("", " ")),
-        case("unaligned tensors", &[], of(&[entry("a", "U8", "[1]", 0, 1), entry("b", "F32", "[1]", 1, 5)].join(","), 5)),
+        case(
+            "unaligned tensors",
+            &[],
+            of(&[entry("a", "U8", "[1]", 0, 1), entry("b", "F32", "[1]", 1, 5)].join(","), 5),
+        ),
         case("any order", &[], two(&entry("a", "F32", "[1]", 4, 8), &entry("b", "F32", "[1]", 0, 4))),
         case("no elements", &[], of(&[entry("a", "F32", "[3,0]", 0, 0), entry("b", "U8", "[1]", 0, 1)].join(","), 1)),
         case("no dimensions", &[], of(&entry("a", "F64", "[]", 0, 8), 8)),
@@ -73,27 +79,51 @@ fn cases() -> Vec<Case> {
         raw("length 2^63", &["header-length-out-of-range"], &length(1 << 63, 20)),
         raw("length 2^64-8", &["header-length-out-of-range"], &length(u64::MAX - 7, 20)),
         raw("big-endian", &["header-length-out-of-range"], &swapped),
-        case("length over the format's limit", &["header-too-large"],
-            Shard::parse("m.safetensors", 1 << 40, &length(100_000_001, 20)).faults),
+        case(
+            "length over the format's limit",
+            &["header-too-large"],
+            Shard::parse("m.safetensors", 1 << 40, &length(100_000_001, 20)).faults,
+        ),
         case("header not read", &["unreadable-file"], Shard::parse("m.safetensors", 1 << 40, &length(1000, 20)).faults),
         // C2, C3: arithmetic.
         case("eight of 2^61-1", &["shard-truncated"], of(&huge.join(","), 8)),
         case("product overflows", &["shape-overflow"], of(&entry("a", "U8", "[4294967296,4294967296,2]", 0, 4), 4)),
         case("wraps to the size", &["shape-overflow"], of(&entry("a", "F32", "[4611686018427387905]", 0, 4), 4)),
         case("zero after overflow", &["shape-overflow"], of(&entry("a", "U8", "[9223372036854775808,4,0]", 0, 0), 0)),
-        case("offset 2^64", &["entry-malformed"], of(r#""a":{"dtype":"U8","shape":[0],"data_offsets":[0,18446744073709551616]}"#, 0)),
-        case("largest offset", &["shape-byte-mismatch", "shard-truncated"], of(&entry("a", "U8", "[1]", 0, u64::MAX), 1)),
+        case(
+            "offset 2^64",
+            &["entry-malformed"],
+            of(r#""a":{"dtype":"U8","shape":[0],"data_offsets":[0,18446744073709551616]}"#, 0),
+        ),
+        case(
+            "largest offset",
+            &["shape-byte-mismatch", "shard-truncated"],
+            of(&entry("a", "U8", "[1]", 0, u64::MAX), 1),
+        ),
         // C4: duplicates.
         case("tensor twice", &["duplicate-header-key"], of(&format!("{},{}", f(0, 4), f(0, 4)), 4)),
-        case("twice by escape", &["duplicate-header-key"],
-            of(&format!("{},{}", f(0, 4), entry("\\u0061", "U8", "[4]", 0, 4)), 4)),
-        case("field twice", &["duplicate-header-key"], of(r#""a":{"dtype":"U8","dtype":"U8","shape":[1],"data_offsets":[0,1]}"#, 1)),
-        raw("metadata twice", &["duplicate-header-key"],
-            &file(br#"{"__metadata__":{"format":"pt"},"__metadata__":{"format":"pt"}}"#, 0)),
+        case(
+            "twice by escape",
+            &["duplicate-header-key"],
+            of(&format!("{},{}", f(0, 4), entry("\\u0061", "U8", "[4]", 0, 4)), 4),
+        ),
+        case(
+            "field twice",
+            &["duplicate-header-key"],
+            of(r#""a":{"dtype":"U8","dtype":"U8","shape":[1],"data_offsets":[0,1]}"#, 1),
+        ),
+        raw(
+            "metadata twice",
+            &["duplicate-header-key"],
+            &file(br#"{"__metadata__":{"format":"pt"},"__metadata__":{"format":"pt"}}"#, 0),
+        ),
         case("metadata key twice", &["duplicate-header-key"], meta(r#"{"format":"pt","format":"pt"}"#)),
         // C5, C6: overlap and holes.
-        case("overlap", &["tensors-overlap", "trailing-bytes"],
-            two(&entry("a", "F32", "[1]", 0, 4), &entry("b", "F32", "[1]", 2, 6))),
+        case(
+            "overlap",
+            &["tensors-overlap", "trailing-bytes"],
+            two(&entry("a", "F32", "[1]", 0, 4), &entry("b", "F32", "[1]", 2, 6)),
+        ),
         case("the same bytes", &["tensors-overlap"], of(&[f(0, 4), entry("b", "F32", "[1]", 0, 4)].join(","), 4)),
         case("empty inside another", &["tensors-overlap"], of(&[f(0, 4), entry("b", "F32", "[0]", 2, 2)].join(","), 4)),
         case("hole", &["data-hole"], of(&[entry("a", "U8", "[1]", 0, 1), entry("b", "U8", "[1]", 2, 3)].join(","), 3)),
@@ -119,14 +149,20 @@ fn cases() -> Vec<Case> {
         case("metadata a number", &["metadata-not-strings", "no-format-metadata"], meta("7")),
         case("metadata value a number", &["metadata-not-strings"], meta(r#"{"format":"pt","n":1}"#)),
         case("metadata null", &["metadata-null", "no-format-metadata"], meta("null")),
-        case("metadata a tensor", &["metadata-not-strings", "no-format-metadata"],
-            meta(r#"{"dtype":"U8","shape":[0],"data_offsets":[0,0]}"#)),
+        case(
+            "metadata a tensor",
+            &["metadata-not-strings", "no-format-metadata"],
+            meta(r#"{"dtype":"U8","shape":[0],"data_offsets":[0,0]}"#),
+        ),
         raw("no metadata", &["no-format-metadata"], &file(b"{}", 0)),
         case("unknown format", &["no-format-metadata"], meta(r#"{"format":"np"}"#)),
         // C12, C13.
         raw("deep", &["header-too-deep"], &file(deep.as_bytes(), 0)),
-        raw("a million entries", &["header-too-many-entries", "entry-malformed", "odd-tensor-name", "duplicate-header-key"],
-            &file(crowd.as_bytes(), 0)),
+        raw(
+            "a million entries",
+            &["header-too-many-entries", "entry-malformed", "odd-tensor-name", "duplicate-header-key"],
+            &file(crowd.as_bytes(), 0),
+        ),
         raw("not UTF-8", &["header-not-utf8"], &file(b"{\"\xff\":1}", 0)),
         raw("not JSON", &["header-not-json"], &file(b"{\"a\":", 0)),
         raw("trailing comma", &["header-not-json"], &file(b"{\"__metadata__\":{\"format\":\"pt\"},}", 0)),
@@ -174,7 +210,9 @@ fn faults_name_file_tensor_and_figures() {
 #[test]
 fn every_fault_of_a_header_is_reported_not_the_first_alone() {
     let entries = [
-        entry("a", "F99", "[1]", 0, 4), entry("b", "F32", "[2]", 4, 8), entry("", "U8", "[1]", 8, 9),
+        entry("a", "F99", "[1]", 0, 4),
+        entry("b", "F32", "[2]", 4, 8),
+        entry("", "U8", "[1]", 8, 9),
         r#""c":{"dtype":"U8"}"#.to_owned(),
     ];
     let shard = read(&file(format!("{{{}}}", entries.join(",")).as_bytes(), 9));
@@ -188,7 +226,8 @@ fn every_fault_of_a_header_is_reported_not_the_first_alone() {
 
 #[test]
 fn entries_keep_header_order_and_the_last_of_two_wins() {
-    let entries = [entry("b", "U8", "[4]", 0, 4), entry("a", "U8", "[1]", 4, 5), entry("b", "F32", "[1]", 0, 4)].join(",");
+    let entries =
+        [entry("b", "U8", "[4]", 0, 4), entry("a", "U8", "[1]", 4, 5), entry("b", "F32", "[1]", 0, 4)].join(",");
     let shard = read(&file(format!("{{{entries}}}").as_bytes(), 5));
     let names: Vec<_> = shard.tensors.iter().map(|t| (t.name.as_str(), t.dtype.name())).collect();
     assert_eq!(names, [("a", "U8"), ("b", "F32")]);

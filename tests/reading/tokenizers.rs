@@ -1,14 +1,14 @@
 //! Vocabularies and added tokens.
 
-use std::sync::LazyLock;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::sync::LazyLock;
 
 use ckpt_doctor::checkpoint::{Document, Tokenizer, Vocabulary};
 use serde_json::json;
 
-use crate::{Case, hold};
 use crate::directories::open_with;
+use crate::{Case, hold};
 
 /// A sentencepiece model of these pieces.
 pub fn sentencepiece(pieces: &[&str]) -> Vec<u8> {
@@ -51,7 +51,8 @@ fn faults_of_vocabularies() {
 }
 
 fn tokenizer(documents: Vec<Document>, model: Option<Vec<u8>>) -> Tokenizer {
-    let mut files: BTreeSet<String> = documents.iter().map(|d| d.name.clone()).filter(|n| n == "tokenizer.json").collect();
+    let mut files: BTreeSet<String> =
+        documents.iter().map(|d| d.name.clone()).filter(|n| n == "tokenizer.json").collect();
     let mut vocabularies = BTreeMap::new();
     if let Some(bytes) = model {
         files.insert("tokenizer.model".into());
@@ -60,7 +61,7 @@ fn tokenizer(documents: Vec<Document>, model: Option<Vec<u8>>) -> Tokenizer {
     Tokenizer::of(&documents.into_iter().map(|d| (d.name.clone(), d)).collect(), vocabularies, files)
 }
 
-fn document(name: &str, value: serde_json::Value) -> Document {
+fn document(name: &str, value: &serde_json::Value) -> Document {
     Document::parse(name, value.to_string().as_bytes())
 }
 
@@ -69,8 +70,11 @@ fn a_slow_tokenizer_counts_pieces_stated_tokens_and_missing_special_ones() {
     let config = json!({"tokenizer_class": "LlamaTokenizer", "added_tokens_decoder": {
         "0": {"content": "<unk>"}, "4": {"content": "<image>"}, "6": {"content": "<x>"}},
         "bos_token": {"content": "<s>"}, "pad_token": "<pad>"});
-    let extra = document("added_tokens.json", json!({"<image>": 9, "<other>": 10}));
-    let tokenizer = tokenizer(vec![document("tokenizer_config.json", config), extra], Some(sentencepiece(&["<unk>", "<s>", "</s>", "a"])));
+    let extra = document("added_tokens.json", &json!({"<image>": 9, "<other>": 10}));
+    let tokenizer = tokenizer(
+        vec![document("tokenizer_config.json", &config), extra],
+        Some(sentencepiece(&["<unk>", "<s>", "</s>", "a"])),
+    );
     assert_eq!(tokenizer.source.as_deref(), Some("tokenizer.model"));
     assert_eq!(tokenizer.base().unwrap().len(), 4);
     // 4 pieces, <image>, <x>, <pad>; added_tokens.json does not count beside a decoder.
@@ -88,7 +92,7 @@ fn a_fast_tokenizer_keeps_its_own_ids_and_appends_the_rest() {
     let fast = json!({"added_tokens": [{"id": 3, "content": "<image>", "special": true}],
         "model": {"type": "BPE", "vocab": {"<unk>": 0, "a": 1, "\u{e9}": 2}, "merges": []}});
     let config = json!({"added_tokens_decoder": {"7": {"content": "<image>"}, "9": {"content": "<late>"}}});
-    let documents = vec![document("tokenizer.json", fast), document("tokenizer_config.json", config)];
+    let documents = vec![document("tokenizer.json", &fast), document("tokenizer_config.json", &config)];
     let tokenizer = tokenizer(documents.clone(), Some(sentencepiece(&["<unk>"])));
     assert_eq!(tokenizer.source.as_deref(), Some("tokenizer.json"));
     assert_eq!(tokenizer.length(), Some(5));
@@ -103,8 +107,9 @@ fn a_fast_tokenizer_keeps_its_own_ids_and_appends_the_rest() {
 
 #[test]
 fn add_prefix_space_makes_llama_take_the_sentencepiece_model() {
-    let fast = document("tokenizer.json", json!({"model": {"vocab": [["<unk>", 0.0], ["a", -1.5]]}}));
-    let config = document("tokenizer_config.json", json!({"tokenizer_class": "LlamaTokenizer", "add_prefix_space": true}));
+    let fast = document("tokenizer.json", &json!({"model": {"vocab": [["<unk>", 0.0], ["a", -1.5]]}}));
+    let config =
+        document("tokenizer_config.json", &json!({"tokenizer_class": "LlamaTokenizer", "add_prefix_space": true}));
     let with = tokenizer(vec![fast.clone(), config], Some(sentencepiece(&["<unk>"])));
     assert_eq!((with.source.as_deref(), with.length()), (Some("tokenizer.model"), Some(1)));
     let without = tokenizer(vec![fast], Some(sentencepiece(&["<unk>"])));
@@ -114,7 +119,7 @@ fn add_prefix_space_makes_llama_take_the_sentencepiece_model() {
 #[test]
 fn nothing_is_said_of_the_length_of_a_vocabulary_that_could_not_be_read() {
     let broken = Document::parse("tokenizer.json", b"{\"model\": {\"vocab\": {\"a\": 0");
-    let config = document("tokenizer_config.json", json!({"added_tokens_decoder": {"5": {"content": "<x>"}}}));
+    let config = document("tokenizer_config.json", &json!({"added_tokens_decoder": {"5": {"content": "<x>"}}}));
     let tokenizer = tokenizer(vec![broken, config], None);
     assert_eq!(tokenizer.length(), None);
     assert_eq!(tokenizer.id_of("<x>"), Some(5));

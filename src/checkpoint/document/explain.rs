@@ -9,7 +9,9 @@ pub(super) fn conflict_markers(text: &str) -> Vec<(Range<usize>, &'static str)> 
     let mut at = 0_usize;
     for line in text.split_inclusive('\n') {
         let body = line.trim_end();
-        if let Some(marker) = MARKERS.into_iter().find(|m| body == *m || body.strip_prefix(m).is_some_and(|r| r.starts_with(' '))) {
+        if let Some(marker) =
+            MARKERS.into_iter().find(|m| body == *m || body.strip_prefix(m).is_some_and(|r| r.starts_with(' ')))
+        {
             found.push((at..at.saturating_add(body.len()), marker));
         }
         at = at.saturating_add(line.len());

@@ -38,7 +38,9 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
         return Document { name, text, faults: vec![fault], ..Document::default() };
     }
     let Decoded { text, verbatim, faults: of_encoding } = encoding::decode(&name, bytes);
-    of_encoding.into_iter().for_each(|fault| faults.push(fault));
+    for fault in of_encoding {
+        faults.push(fault);
+    }
 
     let mut reader = Reader { name: &name, verbatim, faults, left_out: left_out(&name) };
     let body = reader.cut_nul_bytes(&text);
@@ -189,13 +191,14 @@ impl Reader<'_> {
             ScanErrorKind::Syntax(reason) => {
                 Fault::new("json-syntax").at(place).with("reason", reason).with("found", escape(found, 40))
             }
-            ScanErrorKind::Trailing => match explain::ini_section(found) {
-                Some(section) => Fault::new("appended-section").at(place).with("section", escape(section, 80)),
-                None => {
+            ScanErrorKind::Trailing => {
+                if let Some(section) = explain::ini_section(found) {
+                    Fault::new("appended-section").at(place).with("section", escape(section, 80))
+                } else {
                     let what = explain::trailing(found);
                     Fault::new("trailing-content").at(place).with("what", what).with("bytes", found.len())
                 }
-            },
+            }
         });
     }
 }
@@ -203,5 +206,6 @@ impl Reader<'_> {
 /// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
 /// double becomes infinite.
 fn is_huge(literal: &str) -> bool {
-    literal.len() > MAX_DIGITS || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
+    literal.len() > MAX_DIGITS
+        || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
 }

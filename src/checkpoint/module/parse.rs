@@ -38,12 +38,11 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Module {
     };
     let mut module = Module { name, text: Some(text.into()), ..Module::default() };
     let mut faults = Faults::default();
-    match tree_of(text) {
-        Some(tree) => Reader { text, module: &mut module, faults: &mut faults }.walk(&tree),
-        None => {
-            module.unread = true;
-            faults.push(Fault::new("python-too-complex").at(place));
-        }
+    if let Some(tree) = tree_of(text) {
+        Reader { text, module: &mut module, faults: &mut faults }.walk(&tree);
+    } else {
+        module.unread = true;
+        faults.push(Fault::new("python-too-complex").at(place));
     }
     module.faults = faults.into_vec();
     module
@@ -154,7 +153,6 @@ impl<'a> Reader<'a> {
                 // `a = b = c` nests on the right.
                 Some(scope)
             }
-            "for_statement" | "with_item" | "as_pattern" | "named_expression" => Some(scope),
             _ => Some(scope),
         }
     }
@@ -256,7 +254,8 @@ impl<'a> Reader<'a> {
             let dotted = item.child_by_field_name("name").unwrap_or(item);
             let package = self.str(dotted).split('.').next().unwrap_or_default().trim().to_owned();
             if top {
-                let bound = item.child_by_field_name("alias").map_or_else(|| package.clone(), |a| self.str(a).to_owned());
+                let bound =
+                    item.child_by_field_name("alias").map_or_else(|| package.clone(), |a| self.str(a).to_owned());
                 self.module.names.insert(bound);
             }
             let span = node.byte_range();
@@ -295,7 +294,13 @@ impl<'a> Reader<'a> {
                 self.module.relative_imports.push(import);
             }
         } else {
-            self.module.relative_imports.push(RelativeImport { level, module: module.to_owned(), names, span, guarded });
+            self.module.relative_imports.push(RelativeImport {
+                level,
+                module: module.to_owned(),
+                names,
+                span,
+                guarded,
+            });
         }
     }
 }

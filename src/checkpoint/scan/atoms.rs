@@ -82,6 +82,10 @@ impl<'a> Scanner<'a> {
         let mut at = start;
         let mut escaped = false;
         loop {
+            let rest = self.text.as_bytes().get(at..).unwrap_or_default();
+            at = at.saturating_add(
+                rest.iter().position(|b| *b == quote || *b == b'\\' || *b < 0x20).unwrap_or(rest.len()),
+            );
             match self.byte(at) {
                 Some(b) if b == quote => break,
                 Some(b'\\') => {
@@ -117,7 +121,9 @@ impl<'a> Scanner<'a> {
                     Err(self.syntax(at, after.saturating_add(1), "`\\u` without four hexadecimal digits"))
                 }
             }
-            Some(b) if b.is_ascii() => Err(self.syntax(at, after.saturating_add(1), "an escape that JSON does not have")),
+            Some(b) if b.is_ascii() => {
+                Err(self.syntax(at, after.saturating_add(1), "an escape that JSON does not have"))
+            }
             _ => Err(self.syntax(at, after, "an escape that JSON does not have")),
         }
     }

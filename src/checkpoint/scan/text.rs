@@ -38,16 +38,13 @@ fn unescape(raw: &str) -> (Cow<'_, str>, bool) {
                 match (high, low) {
                     (Some(h @ 0xd800..=0xdbff), Some(l @ 0xdc00..=0xdfff)) => {
                         used = 11;
-                        let scalar = 0x1_0000 + ((h - 0xd800) << 10) + (l - 0xdc00);
-                        out.push(char::from_u32(scalar).unwrap_or(char::REPLACEMENT_CHARACTER));
+                        out.extend(char::decode_utf16([h, l]).map(|c| c.unwrap_or(char::REPLACEMENT_CHARACTER)));
                     }
-                    (Some(h), _) => match char::from_u32(h) {
-                        Some(c) => out.push(c),
-                        None => {
-                            lone = true;
-                            out.push(char::REPLACEMENT_CHARACTER);
-                        }
-                    },
+                    (Some(unit), _) => {
+                        let c = char::from_u32(unit.into());
+                        lone |= c.is_none();
+                        out.push(c.unwrap_or(char::REPLACEMENT_CHARACTER));
+                    }
                     (None, _) => out.push(char::REPLACEMENT_CHARACTER),
                 }
             }
@@ -60,6 +57,6 @@ fn unescape(raw: &str) -> (Cow<'_, str>, bool) {
     (Cow::Owned(out), lone)
 }
 
-fn hex4(text: &str, at: usize) -> Option<u32> {
-    u32::from_str_radix(text.get(at..at.checked_add(4)?)?, 16).ok()
+fn hex4(text: &str, at: usize) -> Option<u16> {
+    u16::from_str_radix(text.get(at..at.checked_add(4)?)?, 16).ok()
 }

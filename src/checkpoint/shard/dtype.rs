@@ -5,19 +5,59 @@ use std::fmt;
 /// Element types of the safetensors format, as of safetensors 0.8 (22 of them).
 ///
 /// Source: `safetensors::Dtype` in safetensors 0.8.0.
+#[allow(missing_docs, reason = "each name says all there is")]
 #[allow(non_camel_case_types, reason = "the names are the format's own spelling")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Dtype {
-    BOOL, F4, F6_E2M3, F6_E3M2, U8, I8, F8_E5M2, F8_E4M3, F8_E8M0, F8_E4M3FNUZ, F8_E5M2FNUZ,
-    I16, U16, F16, BF16, I32, U32, F32, C64, F64, I64, U64,
+    BOOL,
+    F4,
+    F6_E2M3,
+    F6_E3M2,
+    U8,
+    I8,
+    F8_E5M2,
+    F8_E4M3,
+    F8_E8M0,
+    F8_E4M3FNUZ,
+    F8_E5M2FNUZ,
+    I16,
+    U16,
+    F16,
+    BF16,
+    I32,
+    U32,
+    F32,
+    C64,
+    F64,
+    I64,
+    U64,
 }
 
 impl Dtype {
     /// All element types, in the format's alignment order (narrowest first).
     pub const ALL: [Self; 22] = [
-        Self::BOOL, Self::F4, Self::F6_E2M3, Self::F6_E3M2, Self::U8, Self::I8, Self::F8_E5M2, Self::F8_E4M3,
-        Self::F8_E8M0, Self::F8_E4M3FNUZ, Self::F8_E5M2FNUZ, Self::I16, Self::U16, Self::F16, Self::BF16,
-        Self::I32, Self::U32, Self::F32, Self::C64, Self::F64, Self::I64, Self::U64,
+        Self::BOOL,
+        Self::F4,
+        Self::F6_E2M3,
+        Self::F6_E3M2,
+        Self::U8,
+        Self::I8,
+        Self::F8_E5M2,
+        Self::F8_E4M3,
+        Self::F8_E8M0,
+        Self::F8_E4M3FNUZ,
+        Self::F8_E5M2FNUZ,
+        Self::I16,
+        Self::U16,
+        Self::F16,
+        Self::BF16,
+        Self::I32,
+        Self::U32,
+        Self::F32,
+        Self::C64,
+        Self::F64,
+        Self::I64,
+        Self::U64,
     ];
 
     /// Width of one element in bits; sub-byte types are narrower than eight.
@@ -26,8 +66,14 @@ impl Dtype {
         match self {
             Self::F4 => 4,
             Self::F6_E2M3 | Self::F6_E3M2 => 6,
-            Self::BOOL | Self::U8 | Self::I8 | Self::F8_E5M2 | Self::F8_E4M3 | Self::F8_E8M0
-            | Self::F8_E4M3FNUZ | Self::F8_E5M2FNUZ => 8,
+            Self::BOOL
+            | Self::U8
+            | Self::I8
+            | Self::F8_E5M2
+            | Self::F8_E4M3
+            | Self::F8_E8M0
+            | Self::F8_E4M3FNUZ
+            | Self::F8_E5M2FNUZ => 8,
             Self::I16 | Self::U16 | Self::F16 | Self::BF16 => 16,
             Self::I32 | Self::U32 | Self::F32 => 32,
             Self::C64 | Self::F64 | Self::I64 | Self::U64 => 64,
@@ -44,12 +90,28 @@ impl Dtype {
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
-            Self::BOOL => "BOOL", Self::F4 => "F4", Self::F6_E2M3 => "F6_E2M3", Self::F6_E3M2 => "F6_E3M2",
-            Self::U8 => "U8", Self::I8 => "I8", Self::F8_E5M2 => "F8_E5M2", Self::F8_E4M3 => "F8_E4M3",
-            Self::F8_E8M0 => "F8_E8M0", Self::F8_E4M3FNUZ => "F8_E4M3FNUZ", Self::F8_E5M2FNUZ => "F8_E5M2FNUZ",
-            Self::I16 => "I16", Self::U16 => "U16", Self::F16 => "F16", Self::BF16 => "BF16",
-            Self::I32 => "I32", Self::U32 => "U32", Self::F32 => "F32", Self::C64 => "C64",
-            Self::F64 => "F64", Self::I64 => "I64", Self::U64 => "U64",
+            Self::BOOL => "BOOL",
+            Self::F4 => "F4",
+            Self::F6_E2M3 => "F6_E2M3",
+            Self::F6_E3M2 => "F6_E3M2",
+            Self::U8 => "U8",
+            Self::I8 => "I8",
+            Self::F8_E5M2 => "F8_E5M2",
+            Self::F8_E4M3 => "F8_E4M3",
+            Self::F8_E8M0 => "F8_E8M0",
+            Self::F8_E4M3FNUZ => "F8_E4M3FNUZ",
+            Self::F8_E5M2FNUZ => "F8_E5M2FNUZ",
+            Self::I16 => "I16",
+            Self::U16 => "U16",
+            Self::F16 => "F16",
+            Self::BF16 => "BF16",
+            Self::I32 => "I32",
+            Self::U32 => "U32",
+            Self::F32 => "F32",
+            Self::C64 => "C64",
+            Self::F64 => "F64",
+            Self::I64 => "I64",
+            Self::U64 => "U64",
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Reads a safetensors header: all of its faults, with the names of the tensors they belong to.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
 use sha2::{Digest as _, Sha256};
 
@@ -49,7 +49,13 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
         }
     };
 
-    let mut reader = Reader { shard: &shard, scanner: Scanner::strict(text, 0), faults, entries: Vec::new(), metadata: Metadata::Absent };
+    let mut reader = Reader {
+        shard: &shard,
+        scanner: Scanner::strict(text, 0),
+        faults,
+        entries: Vec::new(),
+        metadata: Metadata::Absent,
+    };
     let error = reader.object().err();
     let Reader { mut faults, entries, metadata, .. } = reader;
     let mut unread = true;
@@ -172,15 +178,10 @@ fn check_format(shard: &Shard, metadata: &Metadata, faults: &mut Faults) {
 
 /// Keeps the last of equal names, as Python does, and reports the others.
 fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -> Vec<Entry> {
-    let mut order: Vec<usize> = (0..entries.len()).collect();
-    let name = |at: usize| entries.get(at).map(|e| e.name.as_str());
-    order.sort_by(|a, b| name(*a).cmp(&name(*b)).then(a.cmp(b)));
     let mut drop = vec![false; entries.len()];
-    for pair in order.windows(2) {
-        if let [first, later] = pair
-            && name(*first) == name(*later)
-            && let Some(drop) = drop.get_mut(*first)
-        {
+    let mut last: HashMap<&str, usize> = HashMap::with_capacity(entries.len());
+    for (at, entry) in entries.iter().enumerate() {
+        if let Some(drop) = last.insert(&entry.name, at).and_then(|earlier| drop.get_mut(earlier)) {
             *drop = true;
         }
     }

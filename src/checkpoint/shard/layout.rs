@@ -30,8 +30,8 @@ pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
             if let Some(other) = holder {
                 fault = fault.at(shard.place().in_tensor(other.name.clone()));
             }
-            let shared = filled.min(*end).saturating_sub(*begin);
-            faults.push(fault.with("begin", *begin).with("bytes", shared));
+            let common = filled.min(*end).saturating_sub(*begin);
+            faults.push(fault.with("begin", *begin).with("bytes", common));
         }
         if *end > filled || holder.is_none() {
             filled = filled.max(*end);

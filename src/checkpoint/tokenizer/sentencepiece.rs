@@ -4,7 +4,7 @@
 const MAX_PIECES: usize = 4_000_000;
 
 /// Piece strings in id order. Source: `ModelProto` (field 1, repeated `SentencePiece`) and
-/// `SentencePiece` (field 1, the string) in sentencepiece_model.proto.
+/// `SentencePiece` (field 1, the string) in `sentencepiece_model.proto`.
 pub(super) fn pieces(bytes: &[u8]) -> Result<Vec<&str>, &'static str> {
     let mut pieces = Vec::new();
     let mut rest = bytes;

@@ -21,7 +21,7 @@ impl Vocabulary {
     /// # Errors
     /// With the reason, when the bytes are neither.
     pub fn parse(name: &str, bytes: &[u8]) -> Result<Self, &'static str> {
-        if name.ends_with(".txt") {
+        if name == "vocab.txt" {
             let text = std::str::from_utf8(bytes).map_err(|_| "it is not UTF-8")?;
             return Self::collect(text.lines().zip(0..));
         }

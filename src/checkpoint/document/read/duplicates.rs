@@ -43,7 +43,14 @@ pub(super) struct Duplicates<'t> {
 
 impl<'t> Duplicates<'t> {
     pub(super) fn new(text: &'t str) -> Self {
-        Self { text, hasher: RandomState::new(), keys: Vec::new(), frames: Vec::new(), found: Vec::new(), budget: REREAD_CAP }
+        Self {
+            text,
+            hasher: RandomState::new(),
+            keys: Vec::new(),
+            frames: Vec::new(),
+            found: Vec::new(),
+            budget: REREAD_CAP,
+        }
     }
 
     /// Takes one token; `builder` has not seen it yet.
@@ -80,7 +87,8 @@ impl<'t> Duplicates<'t> {
                 push_pointer(&mut pointer, &later.name);
                 pointer
             });
-            let equal = same(self.text.get(first.value).unwrap_or_default(), self.text.get(later.value).unwrap_or_default());
+            let equal =
+                same(self.text.get(first.value).unwrap_or_default(), self.text.get(later.value).unwrap_or_default());
             self.found.push(Duplicate { key: later.name, pointer, first: first.key, later: later.key, equal });
         }
     }
