@@ -1,5 +1,12 @@
 //! What each format makes of reports written by hand.
 
+#![allow(
+    clippy::arithmetic_side_effects,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test that panics has failed, and that is all"
+)]
+
 #[path = "report/samples.rs"]
 mod samples;
 
@@ -48,7 +55,8 @@ fn hostile_strings_are_harmless() {
     let report = samples::hostile();
     for format in Format::ALL {
         let shown = show(&report, format);
-        let bad = |c: &char| (c.is_control() && *c != '\n') || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+        let bad =
+            |c: &char| (c.is_control() && *c != '\n') || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
         assert_eq!(shown.chars().find(bad), None, "{format}");
         if format != Format::Json {
             assert!(shown.len() < 20_000, "{format} takes {} bytes", shown.len());

@@ -1,5 +1,7 @@
 //! What README.md shows is what comes out.
 
+#![allow(clippy::disallowed_methods, reason = "reads the project's own files and writes to a temporary directory")]
+
 use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
@@ -33,8 +35,10 @@ fn shown(readme: &str) -> Vec<Shown<'_>> {
 fn fits(shown: &[&str], real: &[&str]) -> bool {
     match shown.split_first() {
         None => real.is_empty(),
-        Some((&"...", rest)) => (0..=real.len()).any(|skip| fits(rest, &real[skip..])),
-        Some((first, rest)) => real.split_first().is_some_and(|(line, real)| line.trim_end() == *first && fits(rest, real)),
+        Some((&"...", rest)) => (0..=real.len()).any(|skip| real.get(skip..).is_some_and(|real| fits(rest, real))),
+        Some((first, rest)) => {
+            real.split_first().is_some_and(|(line, real)| line.trim_end() == *first && fits(rest, real))
+        }
     }
 }
 
@@ -48,7 +52,8 @@ fn the_readme_shows_what_comes_out() {
     assert!(copied.success());
     fs::create_dir(place.path().join("target")).unwrap();
     let program = Path::new(env!("CARGO_BIN_EXE_ckpt-doctor")).parent().unwrap();
-    let path = env::join_paths([program.to_owned()].into_iter().chain(env::split_paths(&env::var_os("PATH").unwrap()))).unwrap();
+    let path = env::join_paths([program.to_owned()].into_iter().chain(env::split_paths(&env::var_os("PATH").unwrap())))
+        .unwrap();
 
     let all = shown(&readme);
     assert!(all.iter().any(|s| s.command.starts_with("ckpt-doctor check")), "the tour is gone");

@@ -140,7 +140,10 @@ mod tests {
 
     #[test]
     fn full_products_become_one_pattern() {
-        assert_eq!(shown(&["l.0.e.0.w", "l.0.e.1.w", "l.1.e.0.w", "l.1.e.1.w"]), [("l.{0..1}.e.{0..1}.w".to_owned(), 4)]);
+        assert_eq!(
+            shown(&["l.0.e.0.w", "l.0.e.1.w", "l.1.e.0.w", "l.1.e.1.w"]),
+            [("l.{0..1}.e.{0..1}.w".to_owned(), 4)]
+        );
     }
 
     #[test]
@@ -151,12 +154,15 @@ mod tests {
 
     #[test]
     fn gaps_and_odd_spellings_are_kept() {
-        assert_eq!(shown(&["a.3.w", "a.0.w", "a.1.w", "lone", "b.007", "b.99999999999999999999999"]), [
-            ("a.{0..1,3}.w".to_owned(), 3),
-            ("lone".to_owned(), 1),
-            ("b.007".to_owned(), 1),
-            ("b.99999999999999999999999".to_owned(), 1),
-        ]);
+        assert_eq!(
+            shown(&["a.3.w", "a.0.w", "a.1.w", "lone", "b.007", "b.99999999999999999999999"]),
+            [
+                ("a.{0..1,3}.w".to_owned(), 3),
+                ("lone".to_owned(), 1),
+                ("b.007".to_owned(), 1),
+                ("b.99999999999999999999999".to_owned(), 1),
+            ]
+        );
     }
 
     #[test]

@@ -36,7 +36,8 @@ fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
                 let _ok = write!(out, ":{column}");
             }
         }
-        let _ok = writeln!(out, ": {}[{}] {}", finding.severity.name(), name(&finding.code), sentence(&finding.message));
+        let _ok =
+            writeln!(out, ": {}[{}] {}", finding.severity.name(), name(&finding.code), sentence(&finding.message));
     }
     for (code, n) in hidden {
         let _ok = writeln!(out, "{}: and {n} more {}", name(&checkpoint.path), name(code));

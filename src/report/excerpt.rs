@@ -84,7 +84,11 @@ pub fn cut(source: &str, spans: &[Range<usize>]) -> Option<Excerpt> {
 }
 
 #[cfg(test)]
-#[allow(clippy::single_range_in_vec_init, reason = "a list of one span is meant")]
+#[allow(
+    clippy::arithmetic_side_effects,
+    clippy::single_range_in_vec_init,
+    reason = "a list of one span is meant, and tests may panic"
+)]
 mod tests {
     use super::cut;
 

@@ -32,7 +32,8 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
     let (tensors, size) = checkpoint.tensors;
     let verdict = text(&checkpoint.verdict);
-    let _ok = writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
+    let _ok =
+        writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
     let (shown, hidden) = capped(&checkpoint.findings, cap);
     for finding in words::alike(shown) {
         render_finding(out, &finding);
@@ -47,7 +48,13 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
 
 fn render_finding(out: &mut String, finding: &Finding) {
     const PLACES: usize = 6;
-    let _ok = writeln!(out, "\n### {}[{}]: {}\n", finding.severity.name(), text_name(&finding.code), text(&sentence(&finding.message)));
+    let _ok = writeln!(
+        out,
+        "\n### {}[{}]: {}\n",
+        finding.severity.name(),
+        text_name(&finding.code),
+        text(&sentence(&finding.message))
+    );
     let _ok = writeln!(out, "- rule: {}", text_name(&finding.name));
     let mut places: Vec<String> = Vec::new();
     for place in finding.locations.iter().filter_map(place) {
@@ -93,12 +100,17 @@ fn render_load(out: &mut String, load: &LoadReport, cap: usize) {
         out,
         "\nPredicted load: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"
     );
+    if let Some(exception) = &load.raises {
+        let _ok = writeln!(out, "\nBefore any of these is reported, the loader raises: {}", text(&sentence(exception)));
+    }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
     groups(out, "Missing: the loader initialises them anew", &names(&load.missing), cap);
     groups(out, "Unexpected: the loader ignores them", &names(&load.unexpected), cap);
     if !load.mismatched.is_empty() {
-        let rows: Vec<_> =
-            words::mismatched(load).into_iter().map(|[tensor, stored, expected]| [code(&tensor), stored, expected]).collect();
+        let rows: Vec<_> = words::mismatched(load)
+            .into_iter()
+            .map(|[tensor, stored, expected]| [code(&tensor), stored, expected])
+            .collect();
         let _ok = writeln!(out, "\nMismatched: the load raises");
         table(out, ["tensor", "stored", "expected"], &rows, cap);
     }
@@ -130,13 +142,19 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
         table(out, ["option", "value"], &options, cap);
     }
     let _ok = writeln!(out, "\n## Stages\n");
-    for (n, stage) in merge.stages.iter().enumerate().take(cap) {
-        let _ok = writeln!(out, "{}. {}: {}", n + 1, text_name(&stage.name), text(&sentence(&stage.outcome)));
+    for (n, stage) in (1_usize..).zip(&merge.stages).take(cap) {
+        let _ok = writeln!(out, "{n}. {}: {}", text_name(&stage.name), text(&sentence(&stage.outcome)));
     }
     seams(out, merge, cap);
     if !merge.transforms.is_empty() {
         let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", text_name(how))).collect();
-        let _ok = writeln!(out, "\n## Tensors\n\n{}, {}: {}", plural(merge.tensors, "tensor"), bytes(merge.bytes), how.join(", "));
+        let _ok = writeln!(
+            out,
+            "\n## Tensors\n\n{}, {}: {}",
+            plural(merge.tensors, "tensor"),
+            bytes(merge.bytes),
+            how.join(", ")
+        );
     }
     if !merge.changed.is_empty() {
         let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
@@ -186,7 +204,13 @@ fn seams(out: &mut String, merge: &MergeReport, cap: usize) {
     for seam in merge.seams.iter().take(cap) {
         let _ok = writeln!(out, "\n### {}", text(&sentence(&seam.message)));
         let row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
-            [what.to_owned(), text_name(&part.donor), code(&name(&part.name)), shape(&part.shape), needed.map_or_else(String::new, shape)]
+            [
+                what.to_owned(),
+                text_name(&part.donor),
+                code(&name(&part.name)),
+                shape(&part.shape),
+                needed.map_or_else(String::new, shape),
+            ]
         };
         let tensor = seam.tensor.iter().map(|t| row("does not fit", t, seam.needed.as_deref()));
         let rows: Vec<_> = tensor.chain(seam.meets.iter().map(|m| row("has to meet", m, None))).collect();

@@ -7,9 +7,7 @@ use serde::Serialize;
 
 use crate::check::finding::LoadReport;
 use crate::check::{Finding, Severity};
-pub use crate::surgery::merge::record::{
-    ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage,
-};
+pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 
 /// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 1).
 #[derive(Debug, Clone, Serialize)]

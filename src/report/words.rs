@@ -77,13 +77,18 @@ pub fn counts(counts: Counts) -> String {
 
 /// A size in decimal units, three digits: `8.06 GB`.
 pub fn bytes(n: u64) -> String {
-    const UNITS: [(&str, u64); 5] =
-        [("PB", 1_000_000_000_000_000), ("TB", 1_000_000_000_000), ("GB", 1_000_000_000), ("MB", 1_000_000), ("kB", 1_000)];
+    const UNITS: [(&str, u64); 5] = [
+        ("PB", 1_000_000_000_000_000),
+        ("TB", 1_000_000_000_000),
+        ("GB", 1_000_000_000),
+        ("MB", 1_000_000),
+        ("kB", 1_000),
+    ];
     let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else {
         return format!("{n} B");
     };
     let size = u128::from(size);
-    let hundredths = (u128::from(n) * 100 + size / 2) / size;
+    let hundredths = u128::from(n).saturating_mul(100).saturating_add(size / 2).checked_div(size).unwrap_or_default();
     let (whole, rest) = (hundredths / 100, hundredths % 100);
     if whole >= 100 {
         format!("{whole} {unit}")
@@ -196,17 +201,19 @@ pub fn evidence(finding: &Finding) -> Vec<String> {
 
 /// The findings to show, at most `cap` of each code, and how many of which code are left out.
 pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, usize)>) {
-    let mut seen: BTreeMap<&str, usize> = BTreeMap::new();
     let mut shown = Vec::new();
+    let mut seen: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
     for finding in findings {
-        let n = seen.entry(&finding.code).or_default();
-        *n += 1;
-        if *n <= cap {
+        let (kept, hidden) = seen.entry(&finding.code).or_default();
+        if *kept < cap {
+            *kept = kept.saturating_add(1);
             shown.push(finding);
+        } else {
+            *hidden = hidden.saturating_add(1);
         }
     }
-    let hidden = seen.into_iter().filter(|(_, n)| *n > cap).map(|(code, n)| (code, n - cap)).collect();
-    (shown, hidden)
+    let hidden = seen.into_iter().filter(|(_, (_, hidden))| *hidden > 0).map(|(code, (_, hidden))| (code, hidden));
+    (shown, hidden.collect())
 }
 
 /// Findings that say the same of several places, as one each.

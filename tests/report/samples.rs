@@ -56,6 +56,7 @@ pub fn at(file: &str, source: &str, what: &str, nth: usize, pointer: &str) -> Lo
     }
 }
 
+#[allow(clippy::unnecessary_wraps, reason = "it fills an optional field")]
 pub fn fix(safety: &str, title: &str) -> Option<FixHint> {
     Some(FixHint { safety: safety.to_owned(), title: title.to_owned() })
 }
@@ -85,7 +86,8 @@ const PROCESSOR: &str = r#"{
 }
 "#;
 
-const CONFIG: &str = "{\n  \"model_type\": \"spatialvla\",\n  \"image_token_index\": -200,\n\t\"projection_dim\": 2048\n}\n";
+const CONFIG: &str =
+    "{\n  \"model_type\": \"spatialvla\",\n  \"image_token_index\": -200,\n\t\"projection_dim\": 2048\n}\n";
 
 /// Each severity, with and without a place, and every kind of load difference.
 pub fn findings() -> Report {
@@ -97,7 +99,15 @@ pub fn findings() -> Report {
         json!({ "count": 3, "literal": "Infinity" }),
     );
     infinity.locations = (0..3)
-        .map(|n| at("processor_config.json", PROCESSOR, "Infinity", n, &format!("/statistics/rh20t/action/std/{}", [0, 1, 3][n])))
+        .map(|n| {
+            at(
+                "processor_config.json",
+                PROCESSOR,
+                "Infinity",
+                n,
+                &format!("/statistics/rh20t/action/std/{}", [0, 1, 3][n]),
+            )
+        })
         .collect();
     infinity.fix = fix("unsafe", "Write 0.0: `std` is not read when actions are decoded");
 
@@ -143,13 +153,18 @@ pub fn findings() -> Report {
         ..finding("LFS002", "lfs-pointer", Severity::Error, "a git-lfs pointer, not the file", json!({}))
     };
     let no_span = Finding {
-        locations: vec![Location { file: Some("config.json".to_owned()), pointer: Some("/text_config".to_owned()), ..Location::default() }],
+        locations: vec![Location {
+            file: Some("config.json".to_owned()),
+            pointer: Some("/text_config".to_owned()),
+            ..Location::default()
+        }],
         ..finding("CFG001", "text-config-missing", Severity::Warning, "config.json has no text_config", json!({}))
     };
     let nowhere = finding("TOK001", "no-tokenizer", Severity::Info, "no tokenizer file: not checked", json!({}));
 
     let all = vec![twin("a.json"), twin("b.json"), no_span, ids, unmapped, module, infinity, nowhere];
-    let mut checkpoint = checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
+    let mut checkpoint =
+        checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
     checkpoint.load = Some(load());
     Report::new(vec![checkpoint], None)
 }
@@ -174,14 +189,16 @@ fn load() -> LoadReport {
             Silent { name: "spatial_embed_tokens.weight".to_owned(), reason: "indexed-but-absent".to_owned() },
             Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned() },
         ],
-        raises: None,
+        raises: Some("ValueError: The state dictionary is corrupted.".to_owned()),
     }
 }
 
 /// More of everything than anyone wants to read.
 pub fn long_lists() -> Report {
     let mut findings: Vec<Finding> = (0..40)
-        .map(|n| finding("IDX001", "shard-missing", Severity::Error, &format!("shard {n} is not there"), json!({ "n": n })))
+        .map(|n| {
+            finding("IDX001", "shard-missing", Severity::Error, &format!("shard {n} is not there"), json!({ "n": n }))
+        })
         .collect();
     findings.push(finding(
         "IDX009",
@@ -192,25 +209,43 @@ pub fn long_lists() -> Report {
     ));
     let mut places = finding("DOC001", "duplicate-key", Severity::Warning, "9 keys occur twice", json!({}));
     places.locations = (0..9)
-        .map(|n| Location { file: Some(format!("part-{n}.json")), line: Some(n + 1), column: Some(3), ..Location::default() })
+        .map(|n| Location {
+            file: Some(format!("part-{n}.json")),
+            line: Some(n + 1),
+            column: Some(3),
+            ..Location::default()
+        })
         .collect();
     findings.push(places);
     let mut checkpoint = checkpoint("models/long", findings, &[]);
     let odd = |what: &str| (0..30).map(|n| format!("{what}_{n}")).collect::<Vec<_>>();
-    checkpoint.load = Some(LoadReport { missing: odd("missing"), unexpected: odd("unexpected"), ..LoadReport::default() });
+    checkpoint.load =
+        Some(LoadReport { missing: odd("missing"), unexpected: odd("unexpected"), ..LoadReport::default() });
     Report::new(vec![checkpoint], None)
 }
 
 /// A string that tries every trick on every format.
-pub const HOSTILE: &str = "a\u{1b}[2J\u{9b}31m\u{202e}txt\n# h | `b` <img src=x onerror=alert(1)> [l](javascript:x) **b** \u{7}@all\u{2028}";
+pub const HOSTILE: &str =
+    "a\u{1b}[2J\u{9b}31m\u{202e}txt\n# h | `b` <img src=x onerror=alert(1)> [l](javascript:x) **b** \u{7}@all\u{2028}";
 
 pub fn hostile() -> Report {
     let source = format!("{{\"{}\": \u{1b}]0;owned\u{7}NaN}}", "k".repeat(5_000));
     let evil = format!("{HOSTILE}{}", "z".repeat(100_000));
-    let mut one = finding(&evil, &evil, Severity::Error, &evil, Value::Object(Map::from_iter([(evil.clone(), json!([evil, { &evil[..]: 1 }]))])));
+    let mut one = finding(
+        &evil,
+        &evil,
+        Severity::Error,
+        &evil,
+        Value::Object(Map::from_iter([(evil.clone(), json!([evil, { &evil[..]: 1 }]))])),
+    );
     one.locations = vec![
         Location { file: Some("config.json".to_owned()), ..at(HOSTILE, &source, "NaN", 0, HOSTILE) },
-        Location { file: Some(evil.clone()), tensor: Some(evil.clone()), pointer: Some(evil.clone()), ..Location::default() },
+        Location {
+            file: Some(evil.clone()),
+            tensor: Some(evil.clone()),
+            pointer: Some(evil.clone()),
+            ..Location::default()
+        },
     ];
     one.fix = fix(HOSTILE, HOSTILE);
     let mut checkpoint = checkpoint(HOSTILE, vec![one], &[("config.json", &source)]);
@@ -286,7 +321,8 @@ pub fn merge_ok() -> Report {
     let note = || finding("TOK006", "tokenizer-needs-conversion", Severity::Info, "protobuf is needed", json!({}));
     let parts = ["donor vision", "donor language", "planned", "written"].map(|role| {
         let donor = role.starts_with("donor");
-        let mut part = if donor { checkpoint("donors/x", vec![], &[]) } else { checkpoint("out/merged", vec![note()], &[]) };
+        let mut part =
+            if donor { checkpoint("donors/x", vec![], &[]) } else { checkpoint("out/merged", vec![note()], &[]) };
         part.role = Some(role.to_owned());
         part.load = Some(LoadReport::default());
         part
@@ -296,7 +332,7 @@ pub fn merge_ok() -> Report {
 
 pub fn merge_seam() -> Report {
     let mut merge = merge();
-    merge.stage = "seam".to_owned();
+    "seam".clone_into(&mut merge.stage);
     merge.options.insert("projector".to_owned(), "keep".to_owned());
     merge.stages.truncate(2);
     merge.stages.push(stage("plan", "stopped: 1 seam does not fit"));

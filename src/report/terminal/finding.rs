@@ -5,10 +5,10 @@ use std::ops::Range;
 
 use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer, Snippet};
 
+use super::super::Style;
 use super::super::excerpt::{cut, near};
 use super::super::model::CheckpointReport;
 use super::super::words::{evidence, fix, more, name, place, sentence, tensors, wrap};
-use super::super::Style;
 use crate::check::{Finding, Location, Severity};
 use crate::checkpoint::line_column;
 

@@ -6,7 +6,7 @@ use comfy_table::{ContentArrangement, Table, presets};
 
 use super::super::Style;
 use super::super::collapse::{Group, collapse};
-use super::super::words::{mismatched, more, name, silent};
+use super::super::words::{mismatched, more, name, sentence, silent};
 use super::paint::Paint;
 use crate::check::finding::LoadReport;
 
@@ -14,11 +14,15 @@ pub fn render(out: &mut String, load: &LoadReport, style: Style) {
     let paint = Paint(style.color);
     let n = [load.missing.len(), load.unexpected.len(), load.mismatched.len(), load.silent.len()];
     let line = format!("predicted load: {} missing, {} unexpected, {} mismatched, {} silent", n[0], n[1], n[2], n[3]);
-    if n == [0; 4] {
+    if n == [0; 4] && load.raises.is_none() {
         let _ok = writeln!(out, "  {}", paint.quiet(&line));
         return;
     }
     let _ok = writeln!(out, "  {}", paint.strong(&line));
+    if let Some(exception) = &load.raises {
+        let _ok = writeln!(out, "\n  before any of these is reported, the loader raises");
+        let _ok = writeln!(out, "    {}", sentence(exception));
+    }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
     list(out, "missing: the loader initialises them anew", &names(&load.missing), style);
     list(out, "unexpected: the loader ignores them", &names(&load.unexpected), style);

@@ -47,9 +47,9 @@ pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
 fn stages(out: &mut String, merge: &MergeReport, style: Style) {
     let widest = merge.stages.iter().map(|s| s.name.chars().count()).max().unwrap_or(0).min(24);
     out.push('\n');
-    for (n, stage) in merge.stages.iter().enumerate().take(style.cap) {
+    for (n, stage) in (1_usize..).zip(&merge.stages).take(style.cap) {
         let outcome = hang(&sentence(&stage.outcome), widest.saturating_add(7), style);
-        let _ok = writeln!(out, "  {}. {:<widest$}  {outcome}", n + 1, name(&stage.name));
+        let _ok = writeln!(out, "  {n}. {:<widest$}  {outcome}", name(&stage.name));
     }
 }
 
@@ -59,7 +59,13 @@ fn render_seam(out: &mut String, seam: &Seam, style: Style) {
     let _ok = writeln!(out, "\n  {title}");
     let mut rows = Vec::new();
     let mut row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
-        rows.push([what.to_owned(), name(&part.donor), name(&part.name), shape(&part.shape), needed.map_or_else(String::new, shape)]);
+        rows.push([
+            what.to_owned(),
+            name(&part.donor),
+            name(&part.name),
+            shape(&part.shape),
+            needed.map_or_else(String::new, shape),
+        ]);
     };
     if let Some(tensor) = &seam.tensor {
         row("does not fit", tensor, seam.needed.as_deref());
@@ -88,7 +94,14 @@ fn changed(out: &mut String, merge: &MergeReport, style: Style) {
     let rows: Vec<_> = merge
         .changed
         .iter()
-        .map(|c| [name(&c.name), sentence(&c.transform), c.from.as_deref().map_or_else(|| "new".to_owned(), shape), shape(&c.to)])
+        .map(|c| {
+            [
+                name(&c.name),
+                sentence(&c.transform),
+                c.from.as_deref().map_or_else(|| "new".to_owned(), shape),
+                shape(&c.to),
+            ]
+        })
         .collect();
     table(out, ["not a copy", "how", "from", "to"], &rows, style);
 }
