@@ -110,7 +110,6 @@ pub const FAULT_KINDS: &[&str] = &[
     "header-padding-not-spaces",
     "header-too-deep",
     "header-too-large",
-    "header-too-many-entries",
     "html-instead",
     "huge-number",
     "index-metadata-missing",

@@ -74,7 +74,7 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
             faults.push(Fault::new("header-too-deep").at(shard.place()).with("offset", span.start));
         }
         Some(ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), .. }) => {
-            faults.push(Fault::new("header-too-many-entries").at(shard.place()).with("cap", MAX_ENTRIES));
+            faults.push(Fault::new("json-too-many-values").at(shard.place()).with("cap", MAX_ENTRIES));
         }
         Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) => {
             let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
@@ -155,8 +155,8 @@ fn other_format(head: &[u8]) -> Option<String> {
 }
 
 /// Most entries read of one header, tensors and metadata apart; the largest models have some hundred
-/// thousand, and each takes more memory than its bytes.
-const MAX_ENTRIES: usize = 1_000_000;
+/// thousand over all shards, and each takes more memory than its bytes.
+const MAX_ENTRIES: usize = 500_000;
 
 /// What `__metadata__` held.
 enum Metadata {
@@ -261,11 +261,12 @@ impl<'t> Reader<'_, 't> {
                     let key = key.decode().0.into_owned();
                     match self.token()? {
                         Token::String(value) if !value.decode().1 => {
-                            let (label, value) = (escape(&key, 80), value.decode().0.into_owned());
-                            if strings.insert(key, value).is_some() {
+                            if strings.contains_key(&key) {
+                                let label = format!("__metadata__.{}", escape(&key, 80));
                                 let fault = Fault::new("duplicate-header-key").at(self.shard.place());
-                                self.faults.push(fault.with("key", format!("__metadata__.{label}")));
+                                self.faults.push(fault.with("key", label));
                             }
+                            strings.insert(key, value.decode().0.into_owned());
                         }
                         other => {
                             self.scanner.skip_rest_of(&other)?;
