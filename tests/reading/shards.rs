@@ -49,7 +49,7 @@ fn cases() -> Vec<Case> {
         })
         .collect();
     let deep = format!("{{\"a\":{}{}}}", "[".repeat(100_000), "]".repeat(100_000));
-    let crowd: String = (0..500_000).map(|i| format!("\"{i}\":\"\",")).collect();
+    let crowd = (0..500_000).map(|i| format!("\"{i}\":\"\",")).collect::<Vec<_>>().concat();
     let two = |a: &str, b: &str| of(&format!("{a},{b}"), 8);
     let meta = |text: &str| read(&file(format!("{{\"__metadata__\":{text}}}").as_bytes(), 0)).faults;
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n";
