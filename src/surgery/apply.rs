@@ -14,6 +14,7 @@ use rustix::fs::OFlags;
 
 use super::plan::{Plan, PlannedShard, PlannedTensor, Source, TensorRef};
 use super::transform;
+use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::{Opened, open_regular};
 
 /// Set by the program's signal handler; a run under way then cleans up and stops.
@@ -304,7 +305,10 @@ fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn FnMut(u64))
         let error = io::Error::other(format!("wrote {is} bytes where the header says {want}"));
         return Err(io_at(path, "writing")(error));
     }
-    out.sync_all().map_err(io_at(path, "syncing"))
+    out.sync_all().map_err(io_at(path, "syncing"))?;
+    // mmap needs a readable handle; `out` is write-only so that nothing is read back by accident.
+    let written = open_regular(path, u64::MAX).map_err(|e| io_at(path, "opening")(io::Error::other(e)))?;
+    accepted_by_safetensors(&written.file).map_err(io_at(path, "verifying"))
 }
 
 /// A donor's file, with what it looked like when it was opened.

@@ -4,3 +4,4 @@ pub mod apply;
 pub mod merge;
 pub mod plan;
 pub mod transform;
+pub mod verify;
