@@ -9,7 +9,7 @@ use super::tokens::OpenedTokenizer;
 use crate::checkpoint::{Checkpoint, Vocabulary};
 use crate::knowledge::Scope;
 
-/// Keys of tokenizer_config.json that hold thousands of entries; rules reach them through `tokenizer` and `id_of`.
+/// Keys of `tokenizer_config.json` that hold thousands of entries; rules reach them through `tokenizer` and `id_of`.
 const BULKY: [&str; 2] = ["added_tokens_decoder", "additional_special_tokens"];
 
 /// Documents by the name expressions use.

@@ -1,6 +1,7 @@
 //! The only place that prints and writes reports.
 
 use std::fs;
+use std::path::Path;
 use std::io::{IsTerminal, Write};
 
 use anyhow::Context;
@@ -28,7 +29,7 @@ pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
     let text = render(report, args.output_format, Style { color, width, ..Style::default() });
     for (format, file) in &args.report {
         let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };
-        fs::write(file, render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
+        write(file, render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
     }
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -39,6 +40,12 @@ pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
     let worst = report.checkpoints.iter().filter_map(|c| c.counts.worst()).max();
     let fails = !args.exit_zero && worst.is_some_and(|s| s >= args.fail_on.severity());
     Ok(if fails { FINDINGS } else { CLEAN })
+}
+
+/// Writes a report where the user asked for it.
+#[expect(clippy::disallowed_methods, reason = "a report, not a checkpoint")]
+fn write(file: &Path, text: String) -> std::io::Result<()> {
+    fs::write(file, text)
 }
 
 /// Columns of the terminal.

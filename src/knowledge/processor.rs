@@ -6,7 +6,7 @@ use super::expression::{Expression, Template};
 use super::source::{self, DataError};
 
 /// A processor as its file in `rules/processors/` gives it. Expressions see the checkpoint's
-/// `processor` (processor_config.json) and what `let` has named so far.
+/// `processor` (`processor_config.json`) and what `let` has named so far.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Processor {

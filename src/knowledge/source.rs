@@ -47,6 +47,7 @@ pub fn parse<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError
 }
 
 /// The `.json5` files below `rules/<folder>`, in path order.
+#[must_use]
 pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {
     fn walk(dir: &'static Dir<'static>, out: &mut Vec<(String, &'static str)>) {
         for file in dir.files() {

@@ -1,10 +1,9 @@
 //! The one writer: a plan becomes a directory, by one rename, or nothing is there at all.
 //!
-//! Everything is written into a staging directory beside the target and synced before the rename, so
-//! nothing under the final name ever exists half-done. The staging directory has a fixed name and is
-//! locked while a run works on it: a second run sees the lock, and a run after a crash clears the rest.
+//! Everything is written into a [`Staging`] directory beside the target and synced before the rename, so
+//! nothing under the final name ever exists half-done.
 
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
@@ -13,6 +12,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rustix::fs::OFlags;
 
 use super::plan::{Plan, PlannedShard, PlannedTensor, Source, TensorRef};
+use super::staging::Staging;
 use super::transform;
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::{Opened, open_regular};
@@ -80,7 +80,7 @@ pub enum ApplyError {
     },
 }
 
-fn io_at(path: &Path, doing: &'static str) -> impl FnOnce(io::Error) -> ApplyError {
+pub(super) fn io_at(path: &Path, doing: &'static str) -> impl FnOnce(io::Error) -> ApplyError {
     move |error| ApplyError::Io { path: path.to_owned(), doing, error }
 }
 
@@ -155,93 +155,6 @@ fn apart(out: &Path, real: &Path, donors: &[&Path]) -> Result<(), ApplyError> {
     Ok(())
 }
 
-/// The staging directory of a run, locked for as long as this value lives.
-struct Staging {
-    path: PathBuf,
-    _lock: File,
-    published: bool,
-}
-
-const OWNER: &str = ".owner";
-
-impl Staging {
-    fn new(out: &Path) -> Result<Self, ApplyError> {
-        let name = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let path = out.with_file_name(format!(".{name}.partial"));
-        // Two rounds: a run that ended between our open and our lock took the directory with it.
-        for _ in 0..2 {
-            match fs::create_dir(&path) {
-                Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&path, "creating")(e)),
-                _ => {}
-            }
-            let lock = OpenOptions::new()
-                .read(true)
-                .custom_flags(i32::try_from((OFlags::DIRECTORY | OFlags::NOFOLLOW).bits()).unwrap_or_default())
-                .open(&path)
-                .map_err(io_at(&path, "opening"))?;
-            match lock.try_lock() {
-                Ok(()) => {}
-                Err(TryLockError::WouldBlock) => {
-                    let holder = fs::read_to_string(path.join(OWNER)).unwrap_or_else(|_| "just started".to_owned());
-                    return Err(ApplyError::Busy { path: out.to_owned(), holder });
-                }
-                Err(TryLockError::Error(e)) => return Err(io_at(&path, "locking")(e)),
-            }
-            let held = lock.metadata().map_err(io_at(&path, "looking at"))?;
-            let same = fs::symlink_metadata(&path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
-            if !same {
-                continue;
-            }
-            let staging = Self { path, _lock: lock, published: false };
-            staging.clear()?;
-            let owner = staging.path.join(OWNER);
-            fs::write(&owner, format!("process {}", std::process::id())).map_err(io_at(&owner, "writing"))?;
-            return Ok(staging);
-        }
-        Err(ApplyError::Busy { path: out.to_owned(), holder: "it ended just now".to_owned() })
-    }
-
-    /// Removes what a crashed run left in it.
-    fn clear(&self) -> Result<(), ApplyError> {
-        for entry in fs::read_dir(&self.path).map_err(io_at(&self.path, "listing"))? {
-            let entry = entry.map_err(io_at(&self.path, "listing"))?;
-            let path = entry.path();
-            let is_dir = entry.file_type().map_err(io_at(&path, "looking at"))?.is_dir();
-            let removed = if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
-            removed.map_err(io_at(&path, "removing"))?;
-        }
-        Ok(())
-    }
-
-    /// Makes everything durable, then gives it its name.
-    fn publish(&mut self, out: &Path) -> Result<(), ApplyError> {
-        let owner = self.path.join(OWNER);
-        fs::remove_file(&owner).map_err(io_at(&owner, "removing"))?;
-        sync_dir(&self.path)?;
-        interrupted()?;
-        // rename(2) replaces an empty directory and refuses any other: exactly the rule for the target.
-        fs::rename(&self.path, out).map_err(io_at(out, "publishing"))?;
-        self.published = true;
-        if let Some(parent) = out.parent() {
-            sync_dir(parent)?;
-        }
-        Ok(())
-    }
-}
-
-impl Drop for Staging {
-    fn drop(&mut self) {
-        if !self.published {
-            // Best effort: the error that brought us here is the one to report.
-            let _ = fs::remove_dir_all(&self.path);
-        }
-    }
-}
-
-fn sync_dir(path: &Path) -> Result<(), ApplyError> {
-    File::open(path).and_then(|d| d.sync_all()).map_err(io_at(path, "syncing"))
-}
-
 fn interrupted() -> Result<(), ApplyError> {
     if INTERRUPTED.load(Ordering::Relaxed) { Err(ApplyError::Interrupted) } else { Ok(()) }
 }
@@ -257,17 +170,18 @@ pub fn apply(plan: &Plan, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(
     if have < plan.len() {
         return Err(ApplyError::Space { path: parent.to_owned(), need: plan.len(), have });
     }
-    let mut staging = Staging::new(out)?;
+    let staging = Staging::new(out)?;
     for shard in &plan.shards {
-        write_shard(&staging.path.join(&shard.name), shard, progress)?;
+        write_shard(&staging.content().join(&shard.name), shard, progress)?;
     }
     for file in &plan.files {
         interrupted()?;
-        let path = staging.path.join(&file.name);
+        let path = staging.content().join(&file.name);
         let mut f = create(&path)?;
         f.write_all(&file.bytes).and_then(|()| f.sync_all()).map_err(io_at(&path, "writing"))?;
         progress(file.bytes.len() as u64);
     }
+    interrupted()?;
     staging.publish(out)
 }
 

@@ -3,5 +3,6 @@
 pub mod apply;
 pub mod merge;
 pub mod plan;
+mod staging;
 pub mod transform;
 pub mod verify;

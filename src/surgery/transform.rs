@@ -50,7 +50,7 @@ pub type ReadAt<'a> = dyn FnMut(u64, &mut [u8]) -> io::Result<()> + 'a;
 
 /// Writes `count` zero bytes.
 fn zeros(out: &mut dyn Write, mut count: u64) -> io::Result<()> {
-    let block = [0_u8; 64 * 1024];
+    let block = [0_u8; 16 * 1024];
     while count > 0 {
         let n = usize::try_from(count).map_or(block.len(), |c| c.min(block.len()));
         out.write_all(block.get(..n).unwrap_or(&block))?;

@@ -1,5 +1,6 @@
 //! `merge-manifest.json`: what went into a merged checkpoint, so that it can be made again and compared.
 
+use std::fmt::Write;
 use std::io::{self, Read};
 use std::path::Path;
 
@@ -79,5 +80,10 @@ fn hash(path: &Path) -> io::Result<String> {
         }
         hasher.update(block.get(..n).unwrap_or_default());
     }
-    Ok(hasher.finalize().iter().map(|b| format!("{b:02x}")).collect())
+    let mut hex = String::with_capacity(64);
+    for byte in hasher.finalize() {
+        // Writing to a String cannot fail.
+        let _ = write!(hex, "{byte:02x}");
+    }
+    Ok(hex)
 }

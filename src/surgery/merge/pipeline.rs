@@ -114,7 +114,7 @@ pub fn run(
     run.record.recipe = recipe.recipe.clone();
     roles(&recipe, request)?;
     let options = resolve_options(&recipe, &request.options)?;
-    run.record.options = options.clone();
+    run.record.options.clone_from(&options);
     if !sound(&recipe, &mut run) {
         return Ok(run);
     }
