@@ -10,7 +10,8 @@ use std::sync::Arc;
 use super::record::{MergeReport, Stage};
 use super::{Donor, Draft, MergeError, Options, draft, manifest, resolve_options};
 use crate::check::{Knowledge, Outcome, Severity, check};
-use crate::checkpoint::{Checkpoint, Module, OpenError, Parts, Vocabulary};
+use crate::checkpoint::tokenizer::VOCABULARY_FILES;
+use crate::checkpoint::{Checkpoint, Document, Entry, Module, OpenError, Parts, Vocabulary};
 use crate::knowledge::recipe::Recipe;
 use crate::surgery::apply::{ApplyError, apply, check_target};
 use crate::surgery::plan::PlannedFile;
@@ -136,7 +137,7 @@ pub fn run(
     );
     note(&mut run, "plan", &planned);
 
-    let preview = Arc::new(preview(&drafted, &out, &donors));
+    let preview = Arc::new(preview(&drafted, &out));
     if !judged(&mut run, "planned", &request.out, preview, knowledge) {
         "planned".clone_into(&mut run.record.stage);
         return Ok(run);
@@ -311,27 +312,24 @@ fn record(record: &mut MergeReport, drafted: &Draft) {
 }
 
 /// The planned checkpoint as a reader would see it.
-fn preview(drafted: &Draft, out: &Path, donors: &[Donor]) -> Checkpoint {
+fn preview(drafted: &Draft, out: &Path) -> Checkpoint {
     let mut parts = Parts { documents: drafted.documents.clone(), ..Parts::default() };
     parts.shards = drafted.plan.shards.iter().map(crate::surgery::plan::PlannedShard::preview).collect();
     for file in &drafted.plan.files {
         if file.name.ends_with(".py") {
             parts.modules.push(Module::parse(file.name.as_str(), &file.bytes));
         } else if !drafted.documents.iter().any(|d| d.name == file.name) {
-            let vocabulary = donors.iter().find_map(|d| vocabulary(d, &file.name));
-            parts.vocabularies.extend(vocabulary.map(|v| (file.name.clone(), v)));
-            parts.entries.insert(
-                file.name.clone(),
-                crate::checkpoint::Entry { size: file.bytes.len() as u64, ..Default::default() },
-            );
+            if file.name.ends_with(".json") {
+                parts.documents.push(Document::parse(file.name.as_str(), &file.bytes));
+            } else if VOCABULARY_FILES.contains(&file.name.as_str())
+                && let Ok(vocabulary) = Vocabulary::parse(&file.name, &file.bytes)
+            {
+                parts.vocabularies.insert(file.name.clone(), Arc::new(vocabulary));
+            }
+            parts.entries.insert(file.name.clone(), Entry { size: file.bytes.len() as u64, ..Entry::default() });
         }
     }
     Checkpoint::planned(out, parts)
-}
-
-/// A donor's vocabulary, parsed already.
-fn vocabulary(donor: &Donor, name: &str) -> Option<Arc<Vocabulary>> {
-    donor.checkpoint.tokenizer.vocabularies.get(name).cloned()
 }
 
 /// Adds the manifest and the report to the plan.
