@@ -1,0 +1,127 @@
+//! `check` from the outside: which directories, which places, which exit code.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+fn donor(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors").join(name)
+}
+
+fn doctor(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).output().unwrap()
+}
+
+fn report(args: &[&str]) -> (Option<i32>, Value) {
+    let output = doctor(args);
+    let value = serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {output:?}"));
+    (output.status.code(), value)
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        fs::copy(entry.path(), to.join(entry.file_name())).unwrap();
+    }
+}
+
+#[test]
+fn infinity_and_missing_modules_are_named_with_their_places() {
+    let work = TempDir::new().unwrap();
+    let dir = work.path().join("spatialvla-tiny");
+    copy(&donor("spatialvla-tiny"), &dir);
+    for entry in fs::read_dir(&dir).unwrap().map(|e| e.unwrap().path()).filter(|p| p.extension().is_some_and(|e| e == "py")) {
+        fs::remove_file(entry).unwrap();
+    }
+    let (code, report) = report(&["check", dir.to_str().unwrap(), "--output-format", "json"]);
+    assert_eq!(code, Some(1));
+    let findings: Vec<&Value> = report["checkpoints"][0]["findings"].as_array().unwrap().iter().collect();
+    let serious: Vec<Value> = findings
+        .iter()
+        .filter(|f| f["severity"] != "info")
+        .map(|f| json!([f["code"], f["locations"][0]["file"], f["locations"][0]["line"], f["locations"][0]["column"], f["locations"][0]["pointer"]]))
+        .collect();
+    assert_eq!(
+        serious,
+        [
+            json!(["AUT001", "config.json", 8, 19, "/auto_map/AutoConfig"]),
+            json!(["AUT001", "config.json", 9, 18, "/auto_map/AutoModel"]),
+            json!(["AUT001", "processor_config.json", 22, 22, "/auto_map/AutoProcessor"]),
+            json!(["JSN001", "processor_config.json", 128, 11, "/statistics/rh20t_rlds~11.0.0/action/std/0"]),
+            json!(["JSN001", "processor_config.json", 129, 11, "/statistics/rh20t_rlds~11.0.0/action/std/1"]),
+            json!(["JSN001", "processor_config.json", 130, 11, "/statistics/rh20t_rlds~11.0.0/action/std/2"]),
+        ]
+    );
+}
+
+#[test]
+fn directories_are_searched_and_files_mean_their_checkpoint() {
+    let work = TempDir::new().unwrap();
+    let zoo = work.path().join("zoo");
+    copy(&donor("llava3d-tiny"), &zoo.join("a"));
+    copy(&donor("llava3d-tiny"), &zoo.join("deep/b"));
+    let paths = |args: &[&str]| -> Vec<String> {
+        let (_, report) = report(&[&["check", "--output-format", "json"], args].concat());
+        report["checkpoints"].as_array().unwrap().iter().map(|c| c["path"].as_str().unwrap().to_owned()).collect()
+    };
+    let (a, b) = (zoo.join("a"), zoo.join("deep/b"));
+    let names = |dirs: &[&Path]| -> Vec<String> { dirs.iter().map(|d| d.to_str().unwrap().to_owned()).collect() };
+    assert_eq!(paths(&[zoo.to_str().unwrap()]), names(&[&a, &b]));
+    // pre-commit passes files, several of one checkpoint.
+    let (config, index) = (a.join("config.json"), a.join("model.safetensors.index.json"));
+    assert_eq!(paths(&[config.to_str().unwrap(), index.to_str().unwrap()]), names(&[&a]));
+}
+
+#[test]
+fn exit_codes_follow_the_severity_asked_for() {
+    let vision = donor("spatialvla-tiny");
+    let vision = vision.to_str().unwrap();
+    let code = |args: &[&str]| doctor(&[&["check", vision], args].concat()).status.code();
+    // The published oddities are warnings: below the default of errors.
+    assert_eq!(code(&[]), Some(0));
+    assert_eq!(code(&["--fail-on", "warning"]), Some(1));
+    assert_eq!(code(&["--fail-on", "info"]), Some(1));
+    assert_eq!(code(&["--fail-on", "info", "--exit-zero"]), Some(0));
+    let work = TempDir::new().unwrap();
+    let nothing = doctor(&["check", work.path().to_str().unwrap()]);
+    assert_eq!(nothing.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&nothing.stderr).contains("no checkpoint there"));
+    assert_eq!(doctor(&["check", "/no/such/place"]).status.code(), Some(2));
+    assert_eq!(doctor(&["check", vision, "--output-format", "tea"]).status.code(), Some(2));
+}
+
+#[test]
+fn reports_can_be_written_beside_the_terminal() {
+    let work = TempDir::new().unwrap();
+    let (json, markdown) = (work.path().join("r.json"), work.path().join("r.md"));
+    let run = doctor(&[
+        "check", donor("llava3d-tiny").to_str().unwrap(),
+        "--report", &format!("json={}", json.display()), "--report", &format!("markdown={}", markdown.display()),
+    ]);
+    assert_eq!(run.status.code(), Some(0));
+    let value: Value = serde_json::from_slice(&fs::read(json).unwrap()).unwrap();
+    assert_eq!((value["schema"].as_u64(), value["summary"]["verdict"].as_str()), (Some(1), Some("clean")));
+    assert!(fs::read_to_string(markdown).unwrap().contains("llava3d-tiny"));
+}
+
+#[test]
+fn a_fifo_does_not_hang_and_hostile_names_do_not_reach_the_terminal() {
+    let work = TempDir::new().unwrap();
+    let dir = work.path().join("c");
+    copy(&donor("llava3d-tiny"), &dir);
+    fs::remove_file(dir.join("generation_config.json")).unwrap();
+    assert!(Command::new("mkfifo").arg(dir.join("generation_config.json")).status().unwrap().success());
+    let index = dir.join("model.safetensors.index.json");
+    let text = fs::read_to_string(&index).unwrap().replacen("lm_head.weight", "lm\\u001b[2Jhead.weight", 1);
+    fs::write(&index, text).unwrap();
+    for format in ["full", "concise", "json", "markdown"] {
+        let run = doctor(&["check", dir.to_str().unwrap(), "--output-format", format]);
+        assert_eq!(run.status.code(), Some(1), "{format}");
+        assert!(!run.stdout.contains(&0x1b) && !run.stderr.contains(&0x1b), "{format}");
+        assert!(String::from_utf8_lossy(&run.stdout).contains("FIFO"), "{format}");
+    }
+}
