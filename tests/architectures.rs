@@ -1,5 +1,12 @@
 //! Architectures against the tensor maps of real and tiny checkpoints, name for name and shape for shape.
 
+#![allow(
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    clippy::disallowed_methods,
+    reason = "a test that panics has failed; its data is the project's own"
+)]
+
 mod data;
 
 use ckpt_doctor::knowledge::{Evidence, Expected, Library};
@@ -94,7 +101,11 @@ fn every_class_builds_the_state_dict_transformers_builds() {
         assert_same(&shapes(&expected), &record.state_dict(), &record.class);
         if let Some(buffers) = &record.buffers {
             assert_eq!(&expected.buffers.iter().cloned().collect::<Vec<_>>(), buffers, "{}", record.class);
-            let ties = expected.tensors.iter().filter_map(|(n, t)| Some(vec![n.clone(), t.tied_to.clone()?])).collect::<Vec<_>>();
+            let ties = expected
+                .tensors
+                .iter()
+                .filter_map(|(n, t)| Some(vec![n.clone(), t.tied_to.clone()?]))
+                .collect::<Vec<_>>();
             assert_eq!(ties, record.tied, "{}", record.class);
         }
         seen += 1;
@@ -125,7 +136,10 @@ fn hostile_configs_are_refused_in_a_sentence() {
         (json!({ "num_attention_heads": null }), "num_attention_heads"),
         (json!({ "hidden_size": -1 }), "size of 0 to 2^53"),
         (json!({ "hidden_size": "4096" }), "hidden_size"),
-        (json!({ "hidden_size": 9_223_372_036_854_775_807_i64, "head_dim": 128, "num_attention_heads": 1 }), "size of 0 to 2^53"),
+        (
+            json!({ "hidden_size": 9_223_372_036_854_775_807_i64, "head_dim": 128, "num_attention_heads": 1 }),
+            "size of 0 to 2^53",
+        ),
         (json!({ "num_key_value_heads": 9_223_372_036_854_775_807_i64 }), "verflow"),
         (json!({ "vocab_size": 1e300 }), "size of 0 to 2^53"),
     ] {
@@ -138,15 +152,18 @@ fn hostile_configs_are_refused_in_a_sentence() {
 #[test]
 fn compositions_name_the_part_that_cannot_be_built() {
     let library = Library::embedded();
-    let refuse = |config: Value| library.find(&config, []).expect("known").expect(&config).expect_err("refused").join("; ");
+    let refuse =
+        |config: Value| library.find(&config, []).expect("known").expect(&config).expect_err("refused").join("; ");
     let said = refuse(json!({ "model_type": "paligemma", "text_config": { "model_type": "mamba" } }));
     assert_eq!(said, "`text_config.model_type` is \"mamba\"; known here: gemma, gemma2, llama");
     let said = refuse(json!({ "model_type": "spatialvla", "vision_zoe_config": null }));
     assert_eq!(said, "`vision_zoe_config` is absent");
     let said = refuse(json!({ "model_type": "llava", "vision_config": { "patch_size": 0 } }));
     assert_eq!(said, "vision_config: patch_size is 0");
-    let said = refuse(json!({ "model_type": "zoedepth", "bin_configurations": [{ "name": "x".repeat(2000), "n_bins": 1 }, { "name": "y", "n_bins": 1 }],
-        "num_patch_transformer_layers": 0, "patch_transformer_hidden_size": 8 , "patch_transformer_intermediate_size": 8 }));
+    let said = refuse(
+        json!({ "model_type": "zoedepth", "bin_configurations": [{ "name": "x".repeat(2000), "n_bins": 1 }, { "name": "y", "n_bins": 1 }],
+        "num_patch_transformer_layers": 0, "patch_transformer_hidden_size": 8 , "patch_transformer_intermediate_size": 8 }),
+    );
     assert!(said.contains("a tensor name of"), "{said}");
 }
 
@@ -159,7 +176,9 @@ fn the_class_decides_and_model_type_where_it_cannot() {
     assert_eq!(found(json!({ "model_type": "clip_vision_model" })), some("clip_vision_model"));
     assert_eq!(found(json!({ "architectures": ["LlamaForSequenceClassification"], "model_type": "llama" })), None);
     assert_eq!(
-        found(json!({ "architectures": ["MyAlias"], "model_type": "spatialvla", "auto_map": { "AutoModel": "alias.MyAlias" } })),
+        found(
+            json!({ "architectures": ["MyAlias"], "model_type": "spatialvla", "auto_map": { "AutoModel": "alias.MyAlias" } })
+        ),
         some("spatialvla")
     );
     assert_eq!(found(json!({ "model_type": "beit" })), None);
@@ -191,6 +210,10 @@ fn a_user_adds_an_architecture_or_replaces_one() {
     let config = json!({ "architectures": ["Mlp"], "n": 2 });
     let expected = library.find(&config, []).expect("added").expect(&config).expect("built");
     assert_eq!(expected.tensors.keys().collect::<Vec<_>>(), ["l.0.weight", "l.1.weight", "l.1.bias"]);
+    let endless = r#"{ architecture: "m", summary: "", classes: ["M"], sources: [], tensors: { "": { part: { by_model_type: { m: "m" }, untyped: "m" } } } }"#;
+    library.add(endless).expect("parses");
+    let refused = library.architecture("m").expect("added").expect(&json!({})).expect_err("a part of itself");
+    assert_eq!(refused, ["parts are nested more than 8 deep"]);
     let error = library.add(&text.replace("bias", "bais")).expect_err("misspelt");
     assert!(error.contains("bais"), "{error}");
 }

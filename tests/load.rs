@@ -1,5 +1,12 @@
 //! Predicted load reports against what transformers 4.47.0 said of the same files.
 
+#![allow(
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    clippy::disallowed_methods,
+    reason = "a test that panics has failed; its data is the project's own"
+)]
+
 mod data;
 
 use ckpt_doctor::check::finding::LoadReport;
@@ -24,7 +31,8 @@ fn difference(record: &Record, stored: Map, load: &Load) -> Option<String> {
     let mut predicted: Vec<_> = report.mismatched.into_iter().map(|m| (m.name, m.stored, m.expected)).collect();
     predicted.sort();
     let same = report.missing == load.missing && report.unexpected == load.unexpected && predicted == mismatched;
-    (!same).then(|| format!("missing {:?}, unexpected {:?}, mismatched {predicted:?}", report.missing, report.unexpected))
+    (!same)
+        .then(|| format!("missing {:?}, unexpected {:?}, mismatched {predicted:?}", report.missing, report.unexpected))
 }
 
 #[test]

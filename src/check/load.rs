@@ -18,8 +18,7 @@ pub use stored::Stored;
 const NAMES_SHOWN: usize = 5;
 
 /// What transformers 4.47.0 says when a class with a head is given base-model keys without prefix, and the head.
-const CORRUPTED: &str =
-    "ValueError: The state dictionary of the model you are trying to load is corrupted. Are you sure it was properly saved?";
+const CORRUPTED: &str = "ValueError: The state dictionary of the model you are trying to load is corrupted. Are you sure it was properly saved?";
 
 /// Predicts the loader's lists for a class and the tensors it is given.
 ///
@@ -31,7 +30,8 @@ pub fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     let file: BTreeSet<String> = stored.names().map(keys::renamed).collect();
     let spelling = Spelling::of(expected, &file);
     let groups = present_groups(expected, &file);
-    let in_class = || expected.tensors.iter().filter(|(_, t)| t.optional.as_ref().is_none_or(|g| groups.contains(g.as_str())));
+    let in_class =
+        || expected.tensors.iter().filter(|(_, t)| t.optional.as_ref().is_none_or(|g| groups.contains(g.as_str())));
 
     let model: BTreeMap<String, &str> = in_class().map(|(name, _)| (spelling.in_file(name), name.as_str())).collect();
     let buffers: BTreeSet<String> = expected.buffers.iter().map(|name| spelling.in_file(name)).collect();
@@ -47,7 +47,8 @@ pub fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
             missing.retain(|name| !group.contains(name));
         }
         let kept: Vec<&String> = group.iter().filter(|name| file.contains(*name) && !stored.is_absent(name)).collect();
-        silent.extend(kept.into_iter().skip(1).map(|name| Silent { name: name.clone(), reason: "tied-over".to_owned() }));
+        silent
+            .extend(kept.into_iter().skip(1).map(|name| Silent { name: name.clone(), reason: "tied-over".to_owned() }));
     }
     for name in stored.absent().filter(|name| model.contains_key(&keys::renamed(name))) {
         silent.push(Silent { name: name.to_owned(), reason: "indexed-but-absent".to_owned() });

@@ -58,7 +58,12 @@ impl Expression {
     pub fn parse(source: &str) -> Result<Self, ParseError> {
         let program = ENV.compile(source).map_err(|errors| ParseError {
             source_text: source.to_owned(),
-            cause: errors.errors.iter().map(|e| format!("column {}: {}", e.pos.1, e.msg)).collect::<Vec<_>>().join("; "),
+            cause: errors
+                .errors
+                .iter()
+                .map(|e| format!("column {}: {}", e.pos.1, e.msg))
+                .collect::<Vec<_>>()
+                .join("; "),
         })?;
         Ok(Self { source: source.into(), program: Arc::new(program) })
     }

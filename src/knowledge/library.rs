@@ -70,15 +70,15 @@ impl Library {
         let class = config.get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
         if let Some(class) = class {
             let base = |blueprint: &Blueprint| blueprint.base_class.as_deref() == Some(class);
-            let named = |blueprint: &Blueprint| base(blueprint) || blueprint.classes.iter().any(|c| c == class);
-            if let Some(blueprint) = self.choose(class, named, &mut names) {
+            let of_class = |blueprint: &Blueprint| base(blueprint) || blueprint.classes.iter().any(|c| c == class);
+            if let Some(blueprint) = self.choose(class, of_class, &mut names) {
                 return Some(Architecture::new(self, blueprint, base(blueprint)));
             }
             config.get("auto_map")?;
         }
         let model_type = config.get("model_type").and_then(Value::as_str)?;
-        let typed = |blueprint: &Blueprint| blueprint.model_types.iter().any(|t| t == model_type);
-        self.choose(model_type, typed, &mut names).map(|blueprint| Architecture::new(self, blueprint, false))
+        let fits = |blueprint: &Blueprint| blueprint.model_types.iter().any(|t| t == model_type);
+        self.choose(model_type, fits, &mut names).map(|blueprint| Architecture::new(self, blueprint, false))
     }
 
     pub(super) fn blueprint(&self, name: &str) -> Option<&Blueprint> {
@@ -86,7 +86,10 @@ impl Library {
     }
 
     fn choose<'n>(
-        &self, word: &str, fits: impl Fn(&Blueprint) -> bool, names: &mut impl Iterator<Item = &'n str>,
+        &self,
+        word: &str,
+        fits: impl Fn(&Blueprint) -> bool,
+        names: &mut impl Iterator<Item = &'n str>,
     ) -> Option<&Blueprint> {
         let quoted = format!("{word:?}");
         // A file that does not contain the word need not be parsed.
@@ -109,7 +112,9 @@ impl File {
     /// # Panics
     /// When a file in the program does not parse; a test reads them all.
     fn blueprint(&self) -> &Blueprint {
-        self.parsed.get_or_init(|| parse(&self.text).unwrap_or_else(|e| panic!("rules/architectures/{}.json5: {e}", self.stem)))
+        self.parsed.get_or_init(|| {
+            parse(&self.text).unwrap_or_else(|e| panic!("rules/architectures/{}.json5: {e}", self.stem))
+        })
     }
 }
 

@@ -12,7 +12,10 @@ pub(super) fn renamed(key: &str) -> String {
         ("weight_g", "parametrizations.weight.original0"),
         ("weight_v", "parametrizations.weight.original1"),
     ];
-    RENAMES.iter().find(|(from, _)| key.contains(from)).map_or_else(|| key.to_owned(), |(from, to)| key.replace(from, to))
+    RENAMES
+        .iter()
+        .find(|(from, _)| key.contains(from))
+        .map_or_else(|| key.to_owned(), |(from, to)| key.replace(from, to))
 }
 
 /// How names of the file and of the class differ.

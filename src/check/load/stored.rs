@@ -41,7 +41,8 @@ impl Stored {
                 let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
                 let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
                 // A shard that is not there or could not be read may hold anything.
-                let all_read = opened.len() == files.len() && opened.iter().all(|s| !s.tensors.is_empty() || s.faults.is_empty());
+                let all_read =
+                    opened.len() == files.len() && opened.iter().all(|s| !s.tensors.is_empty() || s.faults.is_empty());
                 let Self { shapes, .. } = Self::together(opened);
                 let keys: BTreeSet<String> = index.keys().cloned().collect();
                 let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();

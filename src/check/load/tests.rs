@@ -19,7 +19,13 @@ fn all(expected: &Expected) -> Shapes {
 }
 
 fn shard(name: &str, tensors: &Shapes) -> Shard {
-    let tensor = |(name, shape): (&String, &Vec<u64>)| Tensor { name: name.clone(), dtype: Dtype::BF16, shape: shape.clone(), begin: 0, end: 0 };
+    let tensor = |(name, shape): (&String, &Vec<u64>)| Tensor {
+        name: name.clone(),
+        dtype: Dtype::BF16,
+        shape: shape.clone(),
+        begin: 0,
+        end: 0,
+    };
     Shard { name: name.to_owned(), tensors: tensors.iter().map(tensor).collect(), ..Shard::default() }
 }
 
@@ -47,7 +53,8 @@ fn textual_renames_apply_anywhere_and_one_at_a_time() {
 #[test]
 fn base_model_keys_load_into_a_class_with_a_head() {
     let expected = llama(false);
-    let mut stored: Shapes = all(&expected).into_iter().filter_map(|(n, s)| Some((n.strip_prefix("model.")?.to_owned(), s))).collect();
+    let mut stored: Shapes =
+        all(&expected).into_iter().filter_map(|(n, s)| Some((n.strip_prefix("model.")?.to_owned(), s))).collect();
     let report = predict(&expected, &Stored::from_shapes(stored.clone()));
     assert_eq!((report.missing, report.unexpected, report.raises), (vec!["lm_head.weight".to_owned()], vec![], None));
     // The same with the head beside them raises.
@@ -67,7 +74,10 @@ fn a_full_checkpoint_loads_into_the_base_class() {
     stored.insert("model.norm.weight".to_owned(), vec![5]);
     let report = predict(&base, &Stored::from_shapes(stored));
     assert_eq!((report.missing.len(), report.unexpected), (0, vec!["lm_head.weight".to_owned()]));
-    assert_eq!(report.mismatched, [Mismatch { name: "model.norm.weight".to_owned(), stored: vec![5], expected: vec![4] }]);
+    assert_eq!(
+        report.mismatched,
+        [Mismatch { name: "model.norm.weight".to_owned(), stored: vec![5], expected: vec![4] }]
+    );
     assert!(report.silent.is_empty());
 }
 
@@ -97,16 +107,21 @@ fn tied_tensors_stand_for_each_other() {
     stored.remove("lm_head.weight");
     assert_eq!(predict(&expected, &Stored::from_shapes(stored.clone())), LoadReport::default());
     stored.remove("model.embed_tokens.weight");
-    assert_eq!(predict(&expected, &Stored::from_shapes(stored)).missing, ["lm_head.weight", "model.embed_tokens.weight"]);
+    assert_eq!(
+        predict(&expected, &Stored::from_shapes(stored)).missing,
+        ["lm_head.weight", "model.embed_tokens.weight"]
+    );
 }
 
 #[test]
 fn the_index_says_what_is_there_and_the_shards_what_is_loaded() {
     let expected = llama(false);
     let (norm, head) = ("model.norm.weight".to_owned(), "lm_head.weight".to_owned());
-    let mut index: BTreeMap<String, String> = expected.tensors.keys().map(|n| (n.clone(), "a.safetensors".to_owned())).collect();
+    let mut index: BTreeMap<String, String> =
+        expected.tensors.keys().map(|n| (n.clone(), "a.safetensors".to_owned())).collect();
     let mut first = all(&expected);
-    let report = |index: &BTreeMap<String, String>, shards: &[Shard]| predict(&expected, &Stored::new(Some(index), shards));
+    let report =
+        |index: &BTreeMap<String, String>, shards: &[Shard]| predict(&expected, &Stored::new(Some(index), shards));
     assert_eq!(report(&index, &[shard("a.safetensors", &first)]), LoadReport::default());
 
     // In the index and in no shard: nothing is reported, and it stays random.
@@ -139,7 +154,10 @@ fn the_index_says_what_is_there_and_the_shards_what_is_loaded() {
 fn an_optional_group_is_whole_or_absent() {
     let mut expected = llama(false);
     for name in ["model.tower.a", "model.tower.b"] {
-        expected.tensors.insert(name.to_owned(), ExpectedTensor { shape: vec![2], optional: Some("tower".to_owned()), ..ExpectedTensor::default() });
+        expected.tensors.insert(
+            name.to_owned(),
+            ExpectedTensor { shape: vec![2], optional: Some("tower".to_owned()), ..ExpectedTensor::default() },
+        );
     }
     let mut stored = all(&expected);
     stored.remove("model.tower.a");

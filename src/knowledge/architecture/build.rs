@@ -33,7 +33,7 @@ pub(super) fn build(
     let Value::Object(config) = config else { return Err(vec!["the config is not an object".to_owned()]) };
     let mut builder = Builder { library, evidence, expected: Expected::default(), steps: 0 };
     let outcome = builder.resolve(blueprint, config.clone(), 0).and_then(|config| {
-        builder.emit(blueprint, &config, "", None)?;
+        builder.emit(blueprint, &config, Place::default())?;
         Ok(config)
     });
     match outcome {
@@ -56,15 +56,22 @@ struct Builder<'a> {
 }
 
 /// Where an entry stands: what its name starts with, and the optional group it is in.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Place<'a> {
     prefix: &'a str,
     optional: Option<&'a str>,
+    /// How many parts it is inside.
+    depth: usize,
 }
 
 impl<'a> Builder<'a> {
     /// Fills in defaults: static ones, then sub-configs, then computed ones.
-    fn resolve(&self, blueprint: &Blueprint, mut config: Map<String, Value>, depth: usize) -> Outcome<Map<String, Value>> {
+    fn resolve(
+        &self,
+        blueprint: &Blueprint,
+        mut config: Map<String, Value>,
+        depth: usize,
+    ) -> Outcome<Map<String, Value>> {
         if depth > DEPTH_CAP {
             return Err(Refusal(format!("parts are nested more than {DEPTH_CAP} deep")));
         }
@@ -78,9 +85,11 @@ impl<'a> Builder<'a> {
             if let Kind::Part(part @ Part { config: Some(key), .. }) = &member.kind
                 && holds(member.when.as_ref(), &scope)?
             {
-                let sub = self.sub_config(part, config.get(key), &scope, key)?;
+                let sub = sub_config(part, config.get(key), &scope, key)?;
                 let blueprint = self.part_blueprint(part, &sub, key)?;
-                let sub = self.resolve(blueprint, sub, depth + 1).map_err(|Refusal(e)| Refusal(format!("{key}: {e}")))?;
+                let sub = self
+                    .resolve(blueprint, sub, depth.saturating_add(1))
+                    .map_err(|Refusal(e)| Refusal(format!("{key}: {e}")))?;
                 config.insert(key.clone(), Value::Object(sub));
             }
         }
@@ -106,21 +115,6 @@ impl<'a> Builder<'a> {
         Ok(config)
     }
 
-    /// The sub-config of a part: as given, or what the composition builds without one.
-    fn sub_config(&self, part: &Part, given: Option<&Value>, scope: &Scope<'_>, key: &str) -> Outcome<Map<String, Value>> {
-        let mut sub = match (given, &part.absent) {
-            (Some(Value::Object(map)), _) => map.clone(),
-            (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
-            (None | Some(Value::Null), None) => return Err(Refusal(format!("`{key}` is absent"))),
-            (Some(_), _) => return Err(Refusal(format!("`{key}` is not an object"))),
-        };
-        if !sub.contains_key("model_type") {
-            sub.insert("model_type".to_owned(), part.untyped.clone().into());
-        }
-        sub.extend(evaluated(&part.set, scope)?);
-        Ok(sub)
-    }
-
     fn part_blueprint(&self, part: &Part, sub: &Map<String, Value>, key: &str) -> Outcome<&'a Blueprint> {
         let model_type = sub.get("model_type").and_then(Value::as_str).unwrap_or_default();
         let name = part.by_model_type.get(model_type).and_then(Value::as_str).ok_or_else(|| {
@@ -131,14 +125,16 @@ impl<'a> Builder<'a> {
         self.library.blueprint(name).ok_or_else(|| Refusal(format!("no architecture is called {name}")))
     }
 
-    fn emit(&mut self, blueprint: &Blueprint, config: &Map<String, Value>, prefix: &str, optional: Option<&str>) -> Outcome<()> {
+    fn emit(&mut self, blueprint: &Blueprint, config: &Map<String, Value>, place: Place<'_>) -> Outcome<()> {
         let mut scope = self.scope(config);
         for (name, expression) in &blueprint.lets {
             let value = expression.eval(&scope)?;
             scope.bind(name, &value);
         }
-        let place = Place { prefix, optional };
-        blueprint.tensors.iter().try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, &scope, config, place))
+        blueprint
+            .tensors
+            .iter()
+            .try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, &scope, config, place))
     }
 
     fn repeat(
@@ -150,7 +146,9 @@ impl<'a> Builder<'a> {
         config: &Map<String, Value>,
         place: Place<'_>,
     ) -> Outcome<()> {
-        let Some(((index, count), inner)) = repeats.split_first() else { return self.member(name, member, scope, config, place) };
+        let Some(((index, count), inner)) = repeats.split_first() else {
+            return self.member(name, member, scope, config, place);
+        };
         let count_of = count.eval_u64(scope)?;
         if count_of > TENSOR_CAP as u64 {
             return Err(Refusal(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
@@ -171,7 +169,7 @@ impl<'a> Builder<'a> {
         config: &Map<String, Value>,
         place: Place<'_>,
     ) -> Outcome<()> {
-        self.steps += 1;
+        self.steps = self.steps.saturating_add(1);
         if self.steps > STEP_CAP || self.expected.tensors.len() > TENSOR_CAP {
             return Err(Refusal(format!("the config asks for more than {TENSOR_CAP} tensors")));
         }
@@ -187,7 +185,7 @@ impl<'a> Builder<'a> {
         if name.len() > NAME_CAP {
             return Err(Refusal(format!("the config makes a tensor name of {} bytes", name.len())));
         }
-        let place = Place { prefix: place.prefix, optional: member.optional.as_deref().or(place.optional) };
+        let place = Place { optional: member.optional.as_deref().or(place.optional), ..place };
         match &member.kind {
             Kind::Tensor { shape, tied } => {
                 let shape = dimensions(shape, &scope)?;
@@ -208,26 +206,38 @@ impl<'a> Builder<'a> {
             }
             Kind::Group(members) => {
                 let place = Place { prefix: &name, ..place };
-                members.iter().try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, &scope, config, place))
+                members
+                    .iter()
+                    .try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, &scope, config, place))
             }
             Kind::Part(part) => {
                 let key = part.config.as_deref().unwrap_or(&name);
-                let sub = match part.config.as_ref().and_then(|key| config.get(key)) {
-                    // Resolved already, with the config it is a part of.
-                    Some(Value::Object(sub)) => sub.clone(),
-                    _ => {
-                        let sub = self.sub_config(part, Some(&Value::Object(Map::new())), &scope, key)?;
-                        self.resolve(self.part_blueprint(part, &sub, key)?, sub, 1)?
-                    }
+                let resolved = part.config.as_ref().and_then(|key| config.get(key)).and_then(Value::as_object);
+                let depth = place.depth.saturating_add(1);
+                let sub = if let Some(sub) = resolved {
+                    sub.clone()
+                } else {
+                    let sub = sub_config(part, Some(&Value::Object(Map::new())), &scope, key)?;
+                    self.resolve(self.part_blueprint(part, &sub, key)?, sub, depth)?
                 };
-                self.emit(self.part_blueprint(part, &sub, key)?, &sub, &name, place.optional)
+                let place = Place { prefix: &name, depth, ..place };
+                self.emit(self.part_blueprint(part, &sub, key)?, &sub, place)
             }
         }
     }
 
-    fn tensor(&mut self, name: String, shape: Vec<u64>, tied: Option<&Tied>, scope: &Scope<'_>, place: Place<'_>) -> Outcome<()> {
+    fn tensor(
+        &mut self,
+        name: String,
+        shape: Vec<u64>,
+        tied: Option<&Tied>,
+        scope: &Scope<'_>,
+        place: Place<'_>,
+    ) -> Outcome<()> {
         let tied_to = match tied {
-            Some(tied) if holds(tied.when.as_ref(), scope)? => Some(format!("{}{}", place.prefix, tied.to.try_render(scope)?)),
+            Some(tied) if holds(tied.when.as_ref(), scope)? => {
+                Some(format!("{}{}", place.prefix, tied.to.try_render(scope)?))
+            }
             _ => None,
         };
         let tensor = ExpectedTensor { shape, tied_to, optional: place.optional.map(str::to_owned) };
@@ -273,4 +283,19 @@ fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> Outcome<Map<String,
         None => Ok(value.clone()),
     };
     map.iter().map(|(k, v)| Ok((k.clone(), value(v)?))).collect()
+}
+
+/// The sub-config of a part: as given, or what the composition builds without one.
+fn sub_config(part: &Part, given: Option<&Value>, scope: &Scope<'_>, key: &str) -> Outcome<Map<String, Value>> {
+    let mut sub = match (given, &part.absent) {
+        (Some(Value::Object(map)), _) => map.clone(),
+        (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
+        (None | Some(Value::Null), None) => return Err(Refusal(format!("`{key}` is absent"))),
+        (Some(_), _) => return Err(Refusal(format!("`{key}` is not an object"))),
+    };
+    if !sub.contains_key("model_type") {
+        sub.insert("model_type".to_owned(), part.untyped.clone().into());
+    }
+    sub.extend(evaluated(&part.set, scope)?);
+    Ok(sub)
 }

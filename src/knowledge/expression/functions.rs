@@ -42,7 +42,9 @@ fn pow(arguments: &[Value]) -> Outcome {
 /// The whole part of an integer's square root.
 fn isqrt(arguments: &[Value]) -> Outcome {
     match arguments {
-        [n] => n.as_i64().and_then(i64::checked_isqrt).map(Value::from).ok_or_else(|| format!("{n} has no square root")),
+        [n] => {
+            n.as_i64().and_then(i64::checked_isqrt).map(Value::from).ok_or_else(|| format!("{n} has no square root"))
+        }
         _ => Err("isqrt(n) takes one integer".to_owned()),
     }
 }
@@ -143,16 +145,16 @@ pub(super) fn glob(name: &str, pattern: &str) -> bool {
         match pattern.get(p) {
             Some('*') => {
                 retry = Some((p, n));
-                p += 1;
+                p = p.saturating_add(1);
             }
             Some(q) if *q == '?' || q == c => {
-                n += 1;
-                p += 1;
+                n = n.saturating_add(1);
+                p = p.saturating_add(1);
             }
             _ => match &mut retry {
                 Some((star, from)) => {
-                    *from += 1;
-                    (p, n) = (*star + 1, *from);
+                    *from = from.saturating_add(1);
+                    (p, n) = (star.saturating_add(1), *from);
                 }
                 None => return false,
             },

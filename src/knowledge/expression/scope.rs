@@ -34,11 +34,7 @@ impl Scope<'static> {
     ///
     /// # Panics
     /// When `name` is one of CEL's own functions, which would shadow it.
-    pub fn function(
-        &mut self,
-        name: &str,
-        f: impl Fn(&[Value]) -> Result<Value, String> + Send + Sync + 'static,
-    ) {
+    pub fn function(&mut self, name: &str, f: impl Fn(&[Value]) -> Result<Value, String> + Send + Sync + 'static) {
         let call = move |context: &FunctionContext| -> Result<Cel, ExecutionError> {
             let mut arguments = Vec::new();
             for argument in context.this.iter().chain(&context.args) {

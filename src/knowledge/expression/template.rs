@@ -29,7 +29,10 @@ impl Template {
         let mut pieces = Vec::new();
         let mut text = String::new();
         let mut rest = source;
-        let unpaired = |brace| ParseError { source_text: source.to_owned(), cause: format!("`{brace}` has no partner; write it twice for a literal one") };
+        let unpaired = |brace| ParseError {
+            source_text: source.to_owned(),
+            cause: format!("`{brace}` has no partner; write it twice for a literal one"),
+        };
         while let Some(at) = rest.find(['{', '}']) {
             let (before, tail) = rest.split_at(at);
             text.push_str(before);
@@ -75,7 +78,8 @@ impl Template {
     /// The text with its values: strings bare, lists as `[2304, 1152]`. A placeholder that fails becomes `?`.
     #[must_use]
     pub fn render(&self, scope: &Scope<'_>) -> String {
-        self.fill(|expression| Ok(expression.eval(scope).map_or_else(|_| "?".to_owned(), |v| plain(&v)))).unwrap_or_default()
+        self.fill(|expression| Ok(expression.eval(scope).map_or_else(|_| "?".to_owned(), |v| plain(&v))))
+            .unwrap_or_default()
     }
 
     /// As [`Self::render`], but a placeholder that fails is an error.
@@ -100,7 +104,7 @@ impl Template {
 
 /// Where the placeholder that `body` starts in ends, past nested braces and quoted strings.
 fn closing_brace(body: &str) -> Option<usize> {
-    let mut depth = 0_usize;
+    let mut open = 0_usize;
     let mut quote = None;
     let mut escaped = false;
     for (at, c) in body.char_indices() {
@@ -108,12 +112,13 @@ fn closing_brace(body: &str) -> Option<usize> {
             (Some(_), _) if escaped => escaped = false,
             (Some(_), '\\') => escaped = true,
             (Some(q), c) if c == q => quote = None,
-            (Some(_), _) => {}
             (None, '"' | '\'') => quote = Some(c),
-            (None, '{') => depth += 1,
-            (None, '}') if depth == 0 => return Some(at),
-            (None, '}') => depth -= 1,
-            (None, _) => {}
+            (None, '{') => open = open.saturating_add(1),
+            (None, '}') => match open.checked_sub(1) {
+                Some(less) => open = less,
+                None => return Some(at),
+            },
+            _ => {}
         }
     }
     None

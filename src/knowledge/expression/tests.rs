@@ -35,10 +35,32 @@ fn evaluates_to_json() {
 #[test]
 fn whatever_cannot_be_computed_is_an_error() {
     for source in [
-        "c.hidden / c.zero", "c.hidden % c.zero", "c.min / -1", "c.min % -1", "-c.min", "c.min - 1", "pow(10, 30)", "pow(2, -1)",
-        "c.absent", "c.none.x", "nothing", "c.depths[2]", "c.depths[-1]", "c.names + 1", "floor(c.big)", "isqrt(-1)", "int(c.big)",
-        "range(100000000000)", "sum(c.names)", "sum([9223372036854775807, 1])", "zpad(1, 1000000)", "get(c)", "unknown_function(1)",
-        "c.hidden * c.rate", "c['a']['b']", "9223372036854775807 * 2",
+        "c.hidden / c.zero",
+        "c.hidden % c.zero",
+        "c.min / -1",
+        "c.min % -1",
+        "-c.min",
+        "c.min - 1",
+        "pow(10, 30)",
+        "pow(2, -1)",
+        "c.absent",
+        "c.none.x",
+        "nothing",
+        "c.depths[2]",
+        "c.depths[-1]",
+        "c.names + 1",
+        "floor(c.big)",
+        "isqrt(-1)",
+        "int(c.big)",
+        "range(100000000000)",
+        "sum(c.names)",
+        "sum([9223372036854775807, 1])",
+        "zpad(1, 1000000)",
+        "get(c)",
+        "unknown_function(1)",
+        "c.hidden * c.rate",
+        "c['a']['b']",
+        "9223372036854775807 * 2",
     ] {
         let error = eval(source).expect_err(source);
         assert_eq!(error.source_text, source);
@@ -80,7 +102,8 @@ fn children_see_their_parents() {
 fn templates_render_in_a_sentence() {
     let mut scope = Scope::new();
     scope.bind("c", &json!({ "name": "lm_head", "shape": [2304, 1152], "names": ["a", "b"] }));
-    let template = Template::parse("{c.name} is {c.shape}, not {{{size({'a': '}'})}}} or {c.names}: {c.absent}").expect("template");
+    let template = Template::parse("{c.name} is {c.shape}, not {{{size({'a': '}'})}}} or {c.names}: {c.absent}")
+        .expect("template");
     assert_eq!(template.render(&scope), "lm_head is [2304, 1152], not {1} or [a, b]: ?");
     assert!(template.try_render(&scope).is_err());
     for bad in ["{", "a } b", "{c.}", "{}"] {
