@@ -62,6 +62,10 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
         apply(context, spec, edit, &mut value)?;
     }
     let role = spec.from.as_deref().unwrap_or_default();
+    if let Some(d) = source.filter(|d| !d.left_out.is_empty() && d.value.as_ref() != Some(&value)) {
+        // Its vocabulary was not read into the value: writing the value would lose it.
+        return Err(MergeError::Recipe(format!("{}: {} can be copied, not edited", context.recipe.recipe, d.name)));
+    }
     let document = match source {
         // Nothing changed: the donor's own bytes, not our spelling of them.
         Some(d) if d.value.as_ref() == Some(&value) && d.faults.is_empty() => {
