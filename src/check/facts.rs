@@ -81,6 +81,7 @@ fn tokenizer(checkpoint: &Checkpoint) -> Value {
         "length": t.length(),
         "base": t.base().map(Vocabulary::len),
         "class": t.tokenizer_class,
+        "source": t.source,
         "json_base": entries("tokenizer.json"),
         "model_base": entries("tokenizer.model"),
         "bos": special("bos_token"),

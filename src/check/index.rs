@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
+use unicode_normalization::UnicodeNormalization as _;
 
 use crate::checkpoint::{Checkpoint, Fault, Place, Shard};
 
@@ -62,6 +63,10 @@ fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
 
 fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     let Some(index) = &checkpoint.index else { return };
+    // An index that could not be understood says nothing of what is not in it.
+    if index.weight_map.is_empty() {
+        return;
+    }
     let mut referenced: BTreeMap<&str, usize> = BTreeMap::new();
     for file in index.weight_map.values() {
         let count = referenced.entry(file).or_default();
@@ -70,7 +75,7 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     let is_there = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
     let absent: Vec<(&str, usize)> = referenced.iter().filter(|(n, _)| !is_there(n)).map(|(n, c)| (*n, *c)).collect();
     let all_absent = absent.len() == referenced.len();
-    if all_absent && !referenced.is_empty() {
+    if all_absent {
         let (first, _) = absent.first().copied().unwrap_or_default();
         faults.push(
             Fault::new("all-shards-absent")
@@ -81,10 +86,10 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         );
     } else {
         for (name, tensors) in absent {
-            let similar = checkpoint.shards.keys().find(|s| s.eq_ignore_ascii_case(name));
+            let similar = similar(checkpoint, name);
             let pointer = index.weight_map.iter().find(|(_, f)| *f == name).map(|(t, _)| pointer_to(t));
             let fault = match similar {
-                Some(s) => Fault::new("shard-name-differs-in-case").with("similar", s.as_str()),
+                Some(s) => Fault::new("shard-name-differs-in-case").with("similar", s),
                 None => Fault::new("shard-missing"),
             };
             let place = Place { file: Some(index.document.clone()), pointer, ..Place::default() };
@@ -97,7 +102,8 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     for (tensor, said) in &index.weight_map {
         let Some(shard) = checkpoint.shards.get(said).filter(|s| readable(s)) else { continue };
         let held = holders.get(tensor.as_str());
-        if held.is_some_and(|h| h.contains(&shard.name.as_str())) {
+        let unreadable = || checkpoint.shards.values().any(|s| s.unreadable.contains(tensor));
+        if held.is_some_and(|h| h.contains(&shard.name.as_str())) || (held.is_none() && unreadable()) {
             continue;
         }
         let place = Place::file(&index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
@@ -108,8 +114,14 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
             faults.push(Fault::new("index-key-nowhere").at(place).with("said", said.as_str()));
         }
     }
+    // Entries that name no file are the reader's fault to report.
+    let unusable: BTreeSet<&str> =
+        index.faults.iter().flat_map(|f| &f.places).filter_map(|place| place.tensor.as_deref()).collect();
     for (tensor, shards) in &holders {
         let mapped: Vec<&&str> = shards.iter().filter(|s| referenced.contains_key(**s)).collect();
+        if unusable.contains(tensor) {
+            continue;
+        }
         if !index.weight_map.contains_key(*tensor) {
             if let Some(shard) = mapped.first() {
                 let place = Place::file(**shard).in_tensor(*tensor);
@@ -122,7 +134,8 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         }
     }
     strays(checkpoint, &referenced, &holders, faults);
-    if all_read {
+    // The size of an entry that could not be read is not known.
+    if all_read && referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(|s| s.unreadable.is_empty())) {
         total_size(checkpoint, &referenced, faults);
     }
 }
@@ -145,7 +158,8 @@ fn strays(
         }
     }
     for name in shard_names(checkpoint) {
-        if referenced.contains_key(name) {
+        // Under a name that differs in case only it is missing already.
+        if referenced.contains_key(name) || referenced.keys().any(|r| similar(checkpoint, r) == Some(name)) {
             continue;
         }
         let twice = shared.get(name).copied().unwrap_or_default();
@@ -239,6 +253,16 @@ fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
             None => Fault::new("no-weights"),
         });
     }
+}
+
+/// The shard whose name differs from this one only in what some file systems ignore.
+fn similar<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<&'c str> {
+    checkpoint.shards.keys().map(String::as_str).find(|s| *s != name && folded(s) == folded(name))
+}
+
+/// A name as file systems that ignore case and composition of characters compare it.
+fn folded(name: &str) -> String {
+    name.nfc().flat_map(char::to_lowercase).collect()
 }
 
 fn pointer_to(tensor: &str) -> String {

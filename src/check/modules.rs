@@ -180,6 +180,15 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
             missing.insert(name);
         }
     }
+    let packages = needed_packages(checkpoint, root);
+    if !packages.is_empty() {
+        faults.push(
+            Fault::new("module-needs-package")
+                .at(Place::file(format!("{root}.py")))
+                .with("module", format!("{root}.py"))
+                .with("packages", packages.into_iter().collect::<Vec<_>>().join(", ")),
+        );
+    }
     for name in absent {
         faults.push(
             Fault::new("relative-import-missing")
@@ -200,6 +209,90 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
         );
     }
 }
+
+/// Packages that loading a root's modules asks for, beside what comes with Python and transformers.
+///
+/// transformers looks for every import outside a `try`, in functions too. Source: `get_imports` of 4.47.0.
+fn needed_packages<'a>(checkpoint: &'a Checkpoint, root: &str) -> BTreeSet<&'a str> {
+    let modules = closure(checkpoint, root).into_iter().filter_map(|(_, module)| module);
+    let imports = modules.flat_map(|m| m.imports.iter().filter(|i| !i.guarded));
+    imports.map(|i| i.package.as_str()).filter(|p| !AT_HAND.contains(p)).collect()
+}
+
+/// What comes with Python, and with transformers and torch.
+const AT_HAND: [&str; 71] = [
+    "PIL",
+    "__future__",
+    "abc",
+    "argparse",
+    "ast",
+    "asyncio",
+    "base64",
+    "bisect",
+    "builtins",
+    "collections",
+    "contextlib",
+    "copy",
+    "csv",
+    "ctypes",
+    "dataclasses",
+    "datetime",
+    "decimal",
+    "enum",
+    "filelock",
+    "fractions",
+    "functools",
+    "gc",
+    "glob",
+    "hashlib",
+    "heapq",
+    "html",
+    "huggingface_hub",
+    "importlib",
+    "inspect",
+    "io",
+    "itertools",
+    "json",
+    "logging",
+    "math",
+    "mimetypes",
+    "multiprocessing",
+    "numbers",
+    "numpy",
+    "operator",
+    "os",
+    "packaging",
+    "pathlib",
+    "pickle",
+    "platform",
+    "queue",
+    "random",
+    "re",
+    "regex",
+    "requests",
+    "safetensors",
+    "shutil",
+    "string",
+    "struct",
+    "subprocess",
+    "sys",
+    "tempfile",
+    "textwrap",
+    "threading",
+    "time",
+    "tokenizers",
+    "torch",
+    "torchvision",
+    "tqdm",
+    "traceback",
+    "transformers",
+    "types",
+    "typing",
+    "typing_extensions",
+    "urllib",
+    "uuid",
+    "warnings",
+];
 
 /// Tokenizer classes that the processor behind `AutoProcessor` accepts, when its module says so in plain sight.
 ///

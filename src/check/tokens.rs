@@ -20,6 +20,8 @@ pub struct OpenedTokenizer {
     pub named: BTreeMap<String, Value>,
     /// The tokens that the processor adds, by id; those the tokenizer had are not among them.
     pub new: BTreeMap<u64, NewToken>,
+    /// The first token of a numbered run whose id does not follow the one before it.
+    pub scattered: Option<String>,
 }
 
 /// A token that a processor adds.
@@ -39,6 +41,7 @@ impl OpenedTokenizer {
     pub fn summary(&self) -> Value {
         let mut map: Map<String, Value> = self.named.clone().into_iter().collect();
         map.insert("length".to_owned(), json!(self.length));
+        map.insert("scattered".to_owned(), json!(self.scattered));
         Value::Object(map)
     }
 }
@@ -69,16 +72,23 @@ pub fn open_tokenizer(
             let source_text = run.content.source().to_owned();
             return Err(EvalError { source_text, cause: format!("{count} tokens: more than any tokenizer has") });
         }
+        let mut expected = None;
         for i in 0..count {
             let mut numbered = scope.child();
             numbered.bind_int("i", i);
             let content = run.content.try_render(&numbered)?;
-            let id = tokenizer.id_of(&content).unwrap_or_else(|| {
+            let known = tokenizer.id_of(&content);
+            let follows = expected.is_none_or(|e| e == known.unwrap_or(out.length));
+            if run.name.is_some() && !follows && out.scattered.is_none() {
+                out.scattered = Some(content.clone());
+            }
+            let id = known.unwrap_or_else(|| {
                 let id = out.length;
                 out.length = out.length.saturating_add(1);
                 out.new.insert(id, NewToken { content, special: run.special, normalized: run.normalized });
                 id
             });
+            expected = id.checked_add(1);
             if let Some(name) = run.name.as_ref().filter(|_| i == 0) {
                 out.named.insert(name.clone(), json!(id));
             }

@@ -60,7 +60,7 @@ pub enum Check {
     Assert(Assert),
 }
 
-/// Faults of these kinds become findings; the message sees each fault's details as variables,
+/// Faults of these kinds become findings; the message sees each fault's `kind` and details as variables,
 /// and `file`, `tensor`, `pointer` of its first place.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -200,6 +200,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "index-names-other-shard",
     "load-raises",
     "missing-tensors",
+    "module-needs-package",
     "mismatched-tensor",
     "no-weights",
     "pickle-weights",

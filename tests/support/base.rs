@@ -1,0 +1,102 @@
+//! Sound checkpoints that cases start from.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use ckpt_doctor::check::Knowledge;
+use ckpt_doctor::surgery::merge::pipeline::{self, Request};
+use serde_json::Value;
+
+use super::project;
+use super::weights::{Shard, Weights};
+
+/// Names of all bases.
+///
+/// `llama` and `paligemma` are documents in `fixtures/bases` with weights made for them; `spatialvla` is the donor
+/// without the data set whose statistics have three `Infinity`; the merged ones are built from the donors.
+pub const BASES: &[&str] =
+    &["llama", "llama-sharded", "paligemma", "spatialvla", "llava3d", "merged", "merged-baked", "merged-wrapped"];
+
+/// Makes every base below `root`.
+pub fn make_all(root: &Path, knowledge: &Knowledge) -> BTreeMap<&'static str, PathBuf> {
+    BASES
+        .iter()
+        .map(|name| {
+            let dir = root.join(name);
+            match *name {
+                "llama" => documents("llama", &dir, 1, knowledge),
+                "llama-sharded" => documents("llama", &dir, 2, knowledge),
+                "paligemma" => documents("paligemma", &dir, 1, knowledge),
+                "spatialvla" => {
+                    copy(&project().join("fixtures/donors/spatialvla-tiny"), &dir);
+                    let file = dir.join("processor_config.json");
+                    let text = fs::read_to_string(&file).expect("text").replace("Infinity", "1.0");
+                    let mut value: Value = serde_json::from_str(&text).expect("JSON");
+                    value["statistics"].as_object_mut().expect("an object").shift_remove("rh20t_rlds/1.0.0");
+                    fs::write(file, serde_json::to_string_pretty(&value).expect("JSON")).expect("write");
+                }
+                "llava3d" => copy(&project().join("fixtures/donors/llava3d-tiny"), &dir),
+                "merged" => merge(&dir, &[("shard-size", "300KB")], knowledge),
+                "merged-baked" => merge(&dir, &[("tokenizer", "baked")], knowledge),
+                "merged-wrapped" => {
+                    merge(&dir, &[("layout", "wrapped"), ("spatial", "off"), ("zoe", "off")], knowledge);
+                }
+                other => panic!("no base {other}"),
+            }
+            (*name, dir)
+        })
+        .collect()
+}
+
+/// Copies the files of a directory, links as links.
+pub fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("a directory");
+    for entry in fs::read_dir(from).unwrap_or_else(|e| panic!("{}: {e}", from.display())) {
+        let entry = entry.expect("an entry");
+        fs::copy(entry.path(), to.join(entry.file_name())).expect("copy");
+    }
+}
+
+/// The documents of `fixtures/bases/<name>`, and the tensors that their class has.
+fn documents(name: &str, dir: &Path, shards: usize, knowledge: &Knowledge) {
+    copy(&project().join("fixtures/bases").join(name), dir);
+    let config: Value =
+        serde_json::from_str(&fs::read_to_string(dir.join("config.json")).expect("text")).expect("JSON");
+    let architecture = knowledge.library.find(&config, []).expect("a known class");
+    let expected = architecture.expect(&config).unwrap_or_else(|e| panic!("{name}: {e:?}"));
+    let tensors: Vec<_> = expected.tensors.iter().filter(|(_, t)| t.tied_to.is_none()).collect();
+    let mut weights = Weights::default();
+    let each = tensors.len().div_ceil(shards);
+    for (i, part) in tensors.chunks(each).enumerate() {
+        let file = match shards {
+            1 => "model.safetensors".to_owned(),
+            n => format!("model-{:05}-of-{n:05}.safetensors", i + 1),
+        };
+        let mut shard = Shard::new(&file);
+        for (name, tensor) in part {
+            shard.add(name, "BF16", &tensor.shape);
+        }
+        weights.shards.push(shard);
+    }
+    weights.write(dir);
+    if shards > 1 {
+        weights.write_index(dir);
+    }
+}
+
+fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {
+    let donors = project().join("fixtures/donors");
+    let request = Request {
+        recipe: None,
+        donors: [("vision", "spatialvla-tiny"), ("language", "llava3d-tiny")]
+            .map(|(role, dir)| (role.to_owned(), donors.join(dir)))
+            .into(),
+        options: options.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
+        out: out.to_owned(),
+        dry_run: false,
+        hash: false,
+    };
+    let run = pipeline::run(&request, knowledge, &|_| String::new(), &mut |_, _| {}).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(run.record.stage, "written", "{}: {:?}", out.display(), run.looked.last().map(|l| &l.outcome.findings));
+}

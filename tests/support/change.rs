@@ -1,0 +1,311 @@
+//! What a case does to its base.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{CWD, FileType, Mode, mknodat};
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::base;
+use super::weights::{Shard, Weights, join, split};
+
+/// One change. Those of tensors keep shards and index sound; those of headers and bytes do not.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Change {
+    /// Removes a file.
+    Remove(String),
+    /// Renames a file.
+    Move { from: String, to: String },
+    /// Copies a file.
+    Copy { from: String, to: String },
+    /// Writes a file, in place of what was there.
+    Write { file: String, bytes: Bytes },
+    /// Adds to the end of a file.
+    Append { file: String, bytes: Bytes },
+    /// Puts bytes before a file's own.
+    Prepend { file: String, bytes: Bytes },
+    /// Takes bytes off the end.
+    Cut { file: String, bytes: usize },
+    /// A file of so many bytes, none of them stored.
+    Sparse { file: String, bytes: u64 },
+    /// Replaces text that stands there exactly once.
+    Replace { file: String, find: String, with: String },
+    /// Replaces text wherever it stands.
+    ReplaceAll { file: String, find: String, with: String },
+    /// Sets a JSON value.
+    Set { file: String, at: String, to: Value },
+    /// Removes a member of a JSON object or list.
+    Drop { file: String, at: String },
+    /// Stores a text file in another encoding: `utf-16le`, `utf-8-bom`.
+    Encode { file: String, to: String },
+    /// Puts a FIFO there.
+    Fifo(String),
+    /// Puts a symbolic link there.
+    Link { file: String, to: String },
+    /// Makes a folder of that name.
+    Folder(String),
+    /// Names the checkpoint's directory.
+    Directory(String),
+
+    /// Adds a tensor to the last shard, or to this one.
+    AddTensor {
+        name: String,
+        shape: Vec<u64>,
+        #[serde(default)]
+        dtype: Option<String>,
+        #[serde(default)]
+        file: Option<String>,
+    },
+    /// Removes the tensors whose name starts so.
+    DropTensors(String),
+    /// Changes how the names that start so start.
+    RenameTensors { from: String, to: String },
+    /// Gives a tensor another shape.
+    Reshape { name: String, shape: Vec<u64> },
+    /// Gives every tensor another dtype's name and width.
+    Retype { name: String, dtype: String },
+    /// Writes a shard of these tensors, of no index.
+    Shard { file: String, tensors: Vec<(String, Vec<u64>)> },
+
+    /// Sets a value in a shard's header.
+    Header { file: String, at: String, to: Value },
+    /// Removes a value of a shard's header.
+    HeaderDrop { file: String, at: String },
+    /// Replaces text of a shard's header, once.
+    HeaderReplace { file: String, find: String, with: String },
+    /// Writes a whole header before the data.
+    HeaderBytes { file: String, bytes: Bytes },
+    /// Puts bytes before a shard's header.
+    HeaderPrepend { file: String, bytes: Bytes },
+    /// Writes the data of a shard anew.
+    Data { file: String, bytes: Bytes },
+    /// Adds bytes to a shard's header.
+    HeaderAppend { file: String, bytes: Bytes },
+    /// Sets the first eight bytes.
+    HeaderLength { file: String, bytes: Bytes },
+}
+
+/// Bytes: text, hexadecimal, or parts that repeat.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(untagged)]
+pub enum Bytes {
+    Text(String),
+    Parts(Vec<Part>),
+}
+
+/// Bytes, once or many times.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Part {
+    #[serde(default)]
+    text: String,
+    #[serde(default)]
+    hex: String,
+    #[serde(default)]
+    times: Option<usize>,
+}
+
+impl Bytes {
+    fn get(&self) -> Vec<u8> {
+        let parts = match self {
+            Self::Text(text) => return text.clone().into_bytes(),
+            Self::Parts(parts) => parts,
+        };
+        let mut out = Vec::new();
+        for part in parts {
+            let digits: Vec<char> = part.hex.chars().filter(|c| !c.is_whitespace()).collect();
+            let byte = |pair: &[char]| u8::from_str_radix(&pair.iter().collect::<String>(), 16).expect("hexadecimal");
+            let mut bytes: Vec<u8> = digits.chunks(2).map(byte).collect();
+            bytes.extend_from_slice(part.text.as_bytes());
+            out.extend(bytes.repeat(part.times.unwrap_or(1)));
+        }
+        out
+    }
+}
+
+/// Makes a case's checkpoint below `room` and returns its directory.
+pub fn make(case: &str, base: &Path, changes: &[Change], room: &Path) -> PathBuf {
+    let named = changes.iter().find_map(|c| if let Change::Directory(name) = c { Some(name.as_str()) } else { None });
+    let dir = room.join(named.unwrap_or("checkpoint"));
+    base::copy(base, &dir);
+    for change in changes {
+        apply(change, &dir).unwrap_or_else(|e| panic!("{case}: {change:?}: {e}"));
+    }
+    dir
+}
+
+fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
+    let at = |file: &str| dir.join(file);
+    match change {
+        Change::Remove(file) => fs::remove_file(at(file)),
+        Change::Move { from, to } => fs::rename(at(from), at(to)),
+        Change::Copy { from, to } => fs::copy(at(from), at(to)).map(|_| ()),
+        Change::Write { file, bytes } => fs::write(at(file), bytes.get()),
+        Change::Append { file, bytes } => rewrite(&at(file), |old| [old, bytes.get()].concat()),
+        Change::Prepend { file, bytes } => rewrite(&at(file), |old| [bytes.get(), old].concat()),
+        Change::Cut { file, bytes } => rewrite(&at(file), |mut old| {
+            old.truncate(old.len() - bytes);
+            old
+        }),
+        Change::Sparse { file, bytes } => fs::File::create(at(file))?.set_len(*bytes),
+        Change::Replace { file, find, with } => {
+            rewrite(&at(file), |old| once(&String::from_utf8(old).expect("text"), find, with).into_bytes())
+        }
+        Change::ReplaceAll { file, find, with } => rewrite(&at(file), |old| {
+            let text = String::from_utf8(old).expect("text");
+            assert!(text.contains(find.as_str()), "{find} must stand there");
+            text.replace(find.as_str(), with).into_bytes()
+        }),
+        Change::Set { file, at: pointer, to } => json(&at(file), |value| set(value, pointer, to)),
+        Change::Drop { file, at: pointer } => json(&at(file), |value| drop_at(value, pointer)),
+        Change::Encode { file, to } => rewrite(&at(file), |old| encode(&String::from_utf8(old).expect("text"), to)),
+        Change::Fifo(file) => {
+            let _ = fs::remove_file(at(file));
+            Ok(mknodat(CWD, at(file), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?)
+        }
+        Change::Link { file, to } => {
+            let _ = fs::remove_file(at(file));
+            std::os::unix::fs::symlink(to, at(file))
+        }
+        Change::Folder(name) => fs::create_dir(at(name)),
+        Change::Directory(_) => Ok(()),
+        Change::Header { .. }
+        | Change::HeaderDrop { .. }
+        | Change::HeaderReplace { .. }
+        | Change::HeaderBytes { .. }
+        | Change::HeaderAppend { .. }
+        | Change::HeaderPrepend { .. }
+        | Change::Data { .. }
+        | Change::HeaderLength { .. } => header(change, dir),
+        Change::AddTensor { .. }
+        | Change::DropTensors(_)
+        | Change::RenameTensors { .. }
+        | Change::Reshape { .. }
+        | Change::Retype { .. }
+        | Change::Shard { .. } => {
+            tensors(change, dir);
+            Ok(())
+        }
+    }
+}
+
+fn tensors(change: &Change, dir: &Path) {
+    if let Change::Shard { file, tensors } = change {
+        let mut shard = Shard::new(file);
+        tensors.iter().for_each(|(name, shape)| shard.add(name, "BF16", shape));
+        return Weights { shards: vec![shard] }.write(dir);
+    }
+    let mut weights = Weights::read(dir);
+    match change {
+        Change::AddTensor { name, shape, dtype, file } => {
+            let wanted = |s: &Shard| file.as_ref().is_none_or(|f| *f == s.file);
+            let shard = weights.shards.iter_mut().rfind(|s| wanted(s)).expect("a shard of that name");
+            shard.add(name, dtype.as_deref().unwrap_or("BF16"), shape);
+        }
+        Change::DropTensors(prefix) => {
+            weights.assert_prefix(prefix);
+            weights.shards.iter_mut().for_each(|s| s.tensors.retain(|t| !t.name.starts_with(prefix)));
+        }
+        Change::RenameTensors { from, to } => {
+            weights.assert_prefix(from);
+            for tensor in weights.shards.iter_mut().flat_map(|s| &mut s.tensors) {
+                if let Some(rest) = tensor.name.strip_prefix(from.as_str()) {
+                    tensor.name = format!("{to}{rest}");
+                }
+            }
+        }
+        Change::Reshape { name, shape } => {
+            let shard = weights.holder(name);
+            let place = shard.tensors.iter().position(|t| t.name == *name).expect("held");
+            let old = shard.tensors.remove(place);
+            shard.add(name, &old.dtype, shape);
+        }
+        Change::Retype { name, dtype } => {
+            let shard = weights.holder(name);
+            let place = shard.tensors.iter().position(|t| t.name == *name).expect("held");
+            let old = shard.tensors.remove(place);
+            shard.add(name, dtype, &old.shape);
+        }
+        other => panic!("{other:?} is no change of tensors"),
+    }
+    weights.write_back(dir);
+}
+
+fn header(change: &Change, dir: &Path) -> std::io::Result<()> {
+    let with = |file: &String, edit: &dyn Fn(&str) -> Vec<u8>| {
+        rewrite(&dir.join(file), |old| {
+            let (header, data) = split(&old);
+            join(&edit(header), data)
+        })
+    };
+    let value = |header: &str, edit: &dyn Fn(&mut Value)| {
+        let mut value = serde_json::from_str(header).expect("JSON");
+        edit(&mut value);
+        value.to_string().into_bytes()
+    };
+    match change {
+        Change::Header { file, at, to } => with(file, &|old| value(old, &|v| set(v, at, to))),
+        Change::HeaderDrop { file, at } => with(file, &|old| value(old, &|v| drop_at(v, at))),
+        Change::HeaderReplace { file, find, with: text } => with(file, &|old| once(old, find, text).into_bytes()),
+        Change::HeaderBytes { file, bytes } => with(file, &|_| bytes.get()),
+        Change::HeaderAppend { file, bytes } => with(file, &|old| [old.as_bytes(), &bytes.get()].concat()),
+        Change::HeaderPrepend { file, bytes } => with(file, &|old| [&bytes.get(), old.as_bytes()].concat()),
+        Change::Data { file, bytes } => rewrite(&dir.join(file), |old| join(split(&old).0.as_bytes(), &bytes.get())),
+        Change::HeaderLength { file, bytes } => rewrite(&dir.join(file), |old| [&bytes.get(), &old[8..]].concat()),
+        other => panic!("{other:?} is no change of a header"),
+    }
+}
+
+fn rewrite(path: &Path, edit: impl FnOnce(Vec<u8>) -> Vec<u8>) -> std::io::Result<()> {
+    fs::write(path, edit(fs::read(path)?))
+}
+
+fn json(path: &Path, edit: impl FnOnce(&mut Value)) -> std::io::Result<()> {
+    let mut value = serde_json::from_slice(&fs::read(path)?)?;
+    edit(&mut value);
+    fs::write(path, serde_json::to_string_pretty(&value)?)
+}
+
+fn once(text: &str, find: &str, with: &str) -> String {
+    assert_eq!(text.matches(find).count(), 1, "{find} must stand there once");
+    text.replace(find, with)
+}
+
+fn parent<'v, 'p>(value: &'v mut Value, pointer: &'p str) -> (&'v mut Value, String) {
+    let (above, key) = pointer.rsplit_once('/').expect("a pointer");
+    let above = value.pointer_mut(above).unwrap_or_else(|| panic!("{pointer} has no parent"));
+    (above, key.replace("~1", "/").replace("~0", "~"))
+}
+
+fn set(value: &mut Value, pointer: &str, to: &Value) {
+    match parent(value, pointer) {
+        (Value::Object(map), key) => {
+            map.insert(key, to.clone());
+        }
+        (Value::Array(items), key) => items[key.parse::<usize>().expect("a number")] = to.clone(),
+        _ => panic!("{pointer} lies in no container"),
+    }
+}
+
+fn drop_at(value: &mut Value, pointer: &str) {
+    match parent(value, pointer) {
+        (Value::Object(map), key) => {
+            map.shift_remove(&key).unwrap_or_else(|| panic!("no {pointer}"));
+        }
+        (Value::Array(items), key) => {
+            items.remove(key.parse().expect("a number"));
+        }
+        _ => panic!("{pointer} lies in no container"),
+    }
+}
+
+fn encode(text: &str, to: &str) -> Vec<u8> {
+    match to {
+        "utf-8-bom" => [b"\xef\xbb\xbf", text.as_bytes()].concat(),
+        "utf-16le" => [0xff, 0xfe].into_iter().chain(text.encode_utf16().flat_map(u16::to_le_bytes)).collect(),
+        "utf-32be" => text.chars().flat_map(|c| u32::from(c).to_be_bytes()).collect(),
+        other => panic!("no encoding {other}"),
+    }
+}

@@ -1,0 +1,208 @@
+//! Fixtures: a sound base, a few changes, and what has to be said of the result.
+//!
+//! A case is one small JSON5 file. `fixtures/rules/<CODE>/<case>.json5` trips its rule; `fixtures/sound/<case>.json5`
+//! is odd and right. The checkpoint itself is made in a temporary directory, so that no broken weights lie in the
+//! repository.
+
+#![allow(dead_code, reason = "each test binary uses its share")]
+#![allow(clippy::disallowed_methods, reason = "fixtures are written, not checkpoints")]
+
+mod base;
+mod change;
+mod weights;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, OnceLock};
+
+use ckpt_doctor::check::finding::{Finding, Severity};
+use ckpt_doctor::check::{Knowledge, Outcome, check};
+use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::knowledge::Library;
+use ckpt_doctor::knowledge::processor::Processor;
+use ckpt_doctor::knowledge::rule::RuleSet;
+use ckpt_doctor::knowledge::source;
+use serde::Deserialize;
+
+pub use base::BASES;
+use change::Change;
+
+/// One case.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Case {
+    /// `JSN001/infinity`, or `sound/padded-header`.
+    #[serde(skip)]
+    pub name: String,
+    /// Rule that has to speak; none for a sound case.
+    #[serde(skip)]
+    pub code: Option<String>,
+    /// One of [`BASES`].
+    base: String,
+    /// Applied in order.
+    #[serde(default)]
+    changes: Vec<Change>,
+    /// What has to be said; absent for a sound case.
+    #[serde(default)]
+    pub expect: Option<Expect>,
+}
+
+/// What the rule has to say; fields left out may be anything.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Expect {
+    pub severity: Severity,
+    #[serde(default)]
+    pub file: Option<String>,
+    #[serde(default)]
+    pub tensor: Option<String>,
+    #[serde(default)]
+    pub pointer: Option<String>,
+    #[serde(default)]
+    pub line: Option<usize>,
+    /// A part of the message.
+    #[serde(default)]
+    pub says: Option<String>,
+    /// How many findings of the rule; one when absent.
+    #[serde(default)]
+    pub count: Option<usize>,
+}
+
+/// A case and what was found.
+pub struct Tried {
+    pub case: Case,
+    pub outcome: Outcome,
+    /// Codes found in the base alone.
+    pub before: BTreeSet<String>,
+}
+
+impl Tried {
+    /// Findings of the case's own rule.
+    pub fn own(&self) -> Vec<&Finding> {
+        self.outcome.findings.iter().filter(|f| Some(&f.code) == self.case.code.as_ref()).collect()
+    }
+
+    /// Every code found, with how often when it is more than once.
+    pub fn codes(&self) -> String {
+        let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+        for finding in &self.outcome.findings {
+            *counts.entry(&finding.code).or_default() += 1;
+        }
+        let words = counts.into_iter().map(|(code, n)| if n == 1 { code.to_owned() } else { format!("{code}×{n}") });
+        words.collect::<Vec<_>>().join(" ")
+    }
+}
+
+/// The project's directory.
+pub fn project() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Files with this ending below a folder, sorted.
+pub fn files(folder: &Path, ending: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut pending = vec![folder.to_owned()];
+    while let Some(folder) = pending.pop() {
+        for entry in fs::read_dir(&folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display())) {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                pending.push(path);
+            } else if path.to_string_lossy().ends_with(ending) {
+                found.push(path);
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The rules as they are on disk, so that one can be tried without compiling.
+pub fn rules() -> RuleSet {
+    let texts = texts("rules/checks");
+    RuleSet::from_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
+        .unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Path below the project and text of every JSON5 file in a folder.
+pub fn texts(folder: &str) -> Vec<(String, String)> {
+    let read = |path: PathBuf| {
+        let name = path.strip_prefix(project()).expect("inside").to_string_lossy().into_owned();
+        (name, fs::read_to_string(path).expect("text"))
+    };
+    files(&project().join(folder), ".json5").into_iter().map(read).collect()
+}
+
+/// All that a checker knows.
+pub fn knowledge() -> Knowledge {
+    Knowledge { rules: rules(), library: Library::embedded(), processors: Processor::embedded().expect("processors") }
+}
+
+/// All cases, by name.
+pub fn cases() -> Vec<Case> {
+    let parse = |(path, text): (String, String), folder: &str| {
+        let mut case: Case = source::parse(&path, &text).unwrap_or_else(|e| panic!("{e}"));
+        let name = path.strip_prefix(folder).and_then(|p| p.strip_suffix(".json5")).expect("its folder");
+        name.clone_into(&mut case.name);
+        case
+    };
+    let mut cases = Vec::new();
+    for file in texts("fixtures/rules") {
+        let mut case = parse(file, "fixtures/rules/");
+        let code = case.name.split_once('/').unwrap_or_else(|| panic!("{} lies in no rule's folder", case.name)).0;
+        case.code = Some(code.to_owned());
+        assert!(case.expect.is_some(), "{} expects nothing", case.name);
+        cases.push(case);
+    }
+    for file in texts("fixtures/sound") {
+        let case = parse(file, "fixtures/");
+        assert!(case.expect.is_none(), "{} is sound and expects a finding", case.name);
+        cases.push(case);
+    }
+    let plain = BASES.iter().map(|base| Case {
+        name: format!("base/{base}"),
+        code: None,
+        base: (*base).to_owned(),
+        changes: Vec::new(),
+        expect: None,
+    });
+    cases.extend(plain);
+    cases
+}
+
+/// Every case, made and checked, once for all tests of a binary.
+pub fn tried() -> &'static [Tried] {
+    static TRIED: OnceLock<Vec<Tried>> = OnceLock::new();
+    TRIED.get_or_init(try_all)
+}
+
+fn try_all() -> Vec<Tried> {
+    let knowledge = knowledge();
+    let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
+    let bases = base::make_all(&temporary.path().join("bases"), &knowledge);
+    let look = |dir: &Path| check(&Arc::new(Checkpoint::open(dir).expect("a directory")), &knowledge);
+    let before: BTreeMap<&str, Outcome> = bases.iter().map(|(name, dir)| (*name, look(dir))).collect();
+
+    let cases = cases();
+    let pending = Mutex::new(cases.into_iter().enumerate());
+    let done = Mutex::new(BTreeMap::new());
+    let next = || pending.lock().expect("no panic").next();
+    let work = || {
+        while let Some((number, case)) = next() {
+            let base = bases.get(case.base.as_str()).unwrap_or_else(|| panic!("{}: no base {}", case.name, case.base));
+            let room = temporary.path().join(number.to_string());
+            let made = change::make(&case.name, base, &case.changes, &room);
+            let outcome = look(&made);
+            let before = before[case.base.as_str()].findings.iter().map(|f| f.code.clone()).collect();
+            fs::remove_dir_all(&room).expect("removing a fixture");
+            done.lock().expect("no panic").insert(number, Tried { case, outcome, before });
+        }
+    };
+    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(8);
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(work);
+        }
+    });
+    done.into_inner().expect("no panic").into_values().collect()
+}
