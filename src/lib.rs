@@ -4,8 +4,8 @@
 //! [`checkpoint`] reads what is there, [`knowledge`] says what should be, [`check`] compares the
 //! two, [`surgery`] plans and writes changes, [`report`] renders. No module imports from a later one.
 
+pub mod check;
 pub mod checkpoint;
 pub mod knowledge;
-pub mod check;
-pub mod surgery;
 pub mod report;
+pub mod surgery;

@@ -34,7 +34,9 @@ fn infinity_and_missing_modules_are_named_with_their_places() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("spatialvla-tiny");
     copy(&donor("spatialvla-tiny"), &dir);
-    for entry in fs::read_dir(&dir).unwrap().map(|e| e.unwrap().path()).filter(|p| p.extension().is_some_and(|e| e == "py")) {
+    for entry in
+        fs::read_dir(&dir).unwrap().map(|e| e.unwrap().path()).filter(|p| p.extension().is_some_and(|e| e == "py"))
+    {
         fs::remove_file(entry).unwrap();
     }
     let (code, report) = report(&["check", dir.to_str().unwrap(), "--output-format", "json"]);
@@ -43,7 +45,15 @@ fn infinity_and_missing_modules_are_named_with_their_places() {
     let serious: Vec<Value> = findings
         .iter()
         .filter(|f| f["severity"] != "info")
-        .map(|f| json!([f["code"], f["locations"][0]["file"], f["locations"][0]["line"], f["locations"][0]["column"], f["locations"][0]["pointer"]]))
+        .map(|f| {
+            json!([
+                f["code"],
+                f["locations"][0]["file"],
+                f["locations"][0]["line"],
+                f["locations"][0]["column"],
+                f["locations"][0]["pointer"]
+            ])
+        })
         .collect();
     assert_eq!(
         serious,
@@ -99,8 +109,12 @@ fn reports_can_be_written_beside_the_terminal() {
     let work = TempDir::new().unwrap();
     let (json, markdown) = (work.path().join("r.json"), work.path().join("r.md"));
     let run = doctor(&[
-        "check", donor("llava3d-tiny").to_str().unwrap(),
-        "--report", &format!("json={}", json.display()), "--report", &format!("markdown={}", markdown.display()),
+        "check",
+        donor("llava3d-tiny").to_str().unwrap(),
+        "--report",
+        &format!("json={}", json.display()),
+        "--report",
+        &format!("markdown={}", markdown.display()),
     ]);
     assert_eq!(run.status.code(), Some(0));
     let value: Value = serde_json::from_slice(&fs::read(json).unwrap()).unwrap();

@@ -41,7 +41,10 @@ fn content(dir: &Path) -> BTreeMap<String, Vec<u8>> {
 
 /// Bytes and times of a directory.
 fn state(dir: &Path) -> BTreeMap<String, (Vec<u8>, SystemTime)> {
-    content(dir).into_iter().map(|(n, b)| (n.clone(), (b, fs::metadata(dir.join(n)).unwrap().modified().unwrap()))).collect()
+    content(dir)
+        .into_iter()
+        .map(|(n, b)| (n.clone(), (b, fs::metadata(dir.join(n)).unwrap().modified().unwrap())))
+        .collect()
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -71,8 +74,14 @@ fn the_default_merge_is_written_whole_and_checks_clean() {
     let run = tiny(&out, &["--output-format", "json"]);
     assert_eq!(run.status.code(), Some(0), "{}", text(&run));
     let report = json(&run);
-    let stages: Vec<&str> =
-        report.pointer("/merge/stages").unwrap().as_array().unwrap().iter().map(|s| s["name"].as_str().unwrap()).collect();
+    let stages: Vec<&str> = report
+        .pointer("/merge/stages")
+        .unwrap()
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|s| s["name"].as_str().unwrap())
+        .collect();
     assert_eq!(stages, ["donors", "recipe", "plan", "check planned", "write", "check written"]);
     assert_eq!(report["merge"]["transforms"], serde_json::json!({ "copy": 349, "grow-rows": 2, "pad": 3 }));
     let written = report["checkpoints"].as_array().unwrap().last().unwrap().clone();
@@ -82,7 +91,11 @@ fn the_default_merge_is_written_whole_and_checks_clean() {
         assert_eq!(written["load"][list], serde_json::json!([]), "{list}");
     }
     assert_eq!(names(work.path()), ["merged"]);
-    assert_eq!(before, (state(&donor("spatialvla-tiny")), state(&donor("llava3d-tiny"))), "donors are never written to");
+    assert_eq!(
+        before,
+        (state(&donor("spatialvla-tiny")), state(&donor("llava3d-tiny"))),
+        "donors are never written to"
+    );
     let check = doctor(&["check", out.to_str().unwrap(), "--fail-on", "warning"]);
     assert_eq!(check.status.code(), Some(0), "{}", text(&check));
     // Strict JSON throughout, though the donor has Infinity.
@@ -153,8 +166,12 @@ fn every_combination_of_options_merges_clean_or_stops_at_a_seam() {
                     for tokenizer in ["plain", "baked"] {
                         for layout in ["upstream", "wrapped"] {
                             let options = [
-                                format!("projector={projector}"), format!("spatial={spatial}"), format!("zoe={zoe}"),
-                                format!("rows={rows}"), format!("tokenizer={tokenizer}"), format!("layout={layout}"),
+                                format!("projector={projector}"),
+                                format!("spatial={spatial}"),
+                                format!("zoe={zoe}"),
+                                format!("rows={rows}"),
+                                format!("tokenizer={tokenizer}"),
+                                format!("layout={layout}"),
                             ];
                             let mut args: Vec<&str> = options.iter().flat_map(|o| ["--set", o.as_str()]).collect();
                             args.extend(["--output-format", "json"]);
@@ -167,13 +184,19 @@ fn every_combination_of_options_merges_clean_or_stops_at_a_seam() {
                             if fits {
                                 assert_eq!(run.status.code(), Some(0), "{options:?}\n{}", text(&run));
                                 let written = report["checkpoints"].as_array().unwrap().last().unwrap();
-                                assert!(["clean", "info"].contains(&written["verdict"].as_str().unwrap()), "{options:?}");
+                                assert!(
+                                    ["clean", "info"].contains(&written["verdict"].as_str().unwrap()),
+                                    "{options:?}"
+                                );
                                 merged += 1;
                                 fs::remove_dir_all(&out).unwrap();
                             } else {
                                 assert_eq!(run.status.code(), Some(1), "{options:?}\n{}", text(&run));
                                 assert_eq!(report["merge"]["stage"], "seam", "{options:?}");
-                                assert!(!report["merge"]["seams"][0]["options"].as_array().unwrap().is_empty(), "{options:?}");
+                                assert!(
+                                    !report["merge"]["seams"][0]["options"].as_array().unwrap().is_empty(),
+                                    "{options:?}"
+                                );
                             }
                             assert_eq!(names(work.path()), Vec::<String>::new(), "{options:?}");
                         }
@@ -192,8 +215,13 @@ fn a_seam_names_both_tensors_both_shapes_and_the_options() {
     let said = text(&run);
     assert_eq!(run.status.code(), Some(1));
     for word in [
-        "multi_modal_projector.linear.weight", "[48, 32]", "[64, 32]", "model.embed_tokens.weight", "[340, 64]",
-        "--set projector=pad", "--set projector=reinit",
+        "multi_modal_projector.linear.weight",
+        "[48, 32]",
+        "[64, 32]",
+        "model.embed_tokens.weight",
+        "[340, 64]",
+        "--set projector=pad",
+        "--set projector=reinit",
     ] {
         assert!(said.contains(word), "{word} is not in\n{said}");
     }
@@ -262,17 +290,29 @@ fn a_damaged_donor_stops_the_merge_and_says_why() {
     let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n";
     type Damage = fn(&Path);
     let cases: [(&str, Damage, &[&str]); 5] = [
-        ("missing", |d| fs::remove_file(d.join("model-00002-of-00005.safetensors")).unwrap(), &["model-00002-of-00005.safetensors", "not there"]),
+        (
+            "missing",
+            |d| fs::remove_file(d.join("model-00002-of-00005.safetensors")).unwrap(),
+            &["model-00002-of-00005.safetensors", "not there"],
+        ),
         ("pointer", |_| {}, &["model-00003-of-00005.safetensors", "git-lfs pointer", "git lfs pull"]),
-        ("fifo", |d| {
-            fs::remove_file(d.join("config.json")).unwrap();
-            assert!(Command::new("mkfifo").arg(d.join("config.json")).status().unwrap().success());
-        }, &["config.json", "FIFO"]),
-        ("truncated", |d| {
-            let path = d.join("model-00004-of-00005.safetensors");
-            let bytes = fs::read(&path).unwrap();
-            fs::write(&path, &bytes[..bytes.len() - 100]).unwrap();
-        }, &["model-00004-of-00005.safetensors", "cut short", "100"]),
+        (
+            "fifo",
+            |d| {
+                fs::remove_file(d.join("config.json")).unwrap();
+                assert!(Command::new("mkfifo").arg(d.join("config.json")).status().unwrap().success());
+            },
+            &["config.json", "FIFO"],
+        ),
+        (
+            "truncated",
+            |d| {
+                let path = d.join("model-00004-of-00005.safetensors");
+                let bytes = fs::read(&path).unwrap();
+                fs::write(&path, &bytes[..bytes.len() - 100]).unwrap();
+            },
+            &["model-00004-of-00005.safetensors", "cut short", "100"],
+        ),
         ("broken-json", |d| fs::write(d.join("config.json"), "{\"model_type\": ").unwrap(), &["config.json"]),
     ];
     for (name, damage, words) in cases {

@@ -1,8 +1,8 @@
 //! The only place that prints and writes reports.
 
 use std::fs;
-use std::path::Path;
 use std::io::{IsTerminal, Write};
+use std::path::Path;
 
 use anyhow::Context;
 use ckpt_doctor::report::{Format, Report, Style, render};
