@@ -1,4 +1,12 @@
 //! `check` from the outside: which directories, which places, which exit code.
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    clippy::disallowed_methods,
+    missing_docs,
+    reason = "a test that panics has failed, as it should"
+)]
 
 use std::fs;
 use std::path::{Path, PathBuf};

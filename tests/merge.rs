@@ -1,4 +1,12 @@
 //! `build-merged` from the outside: what it writes, what it refuses, and that donors stay as they are.
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    clippy::disallowed_methods,
+    missing_docs,
+    reason = "a test that panics has failed, as it should"
+)]
 
 use std::collections::BTreeMap;
 use std::fs;

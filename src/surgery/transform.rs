@@ -189,7 +189,7 @@ mod tests {
     fn reader(bytes: Vec<u8>) -> impl FnMut(u64, &mut [u8]) -> io::Result<()> {
         move |at, buf| {
             let at = usize::try_from(at).unwrap();
-            buf.copy_from_slice(&bytes[at..at + buf.len()]);
+            buf.copy_from_slice(&bytes[at..][..buf.len()]);
             Ok(())
         }
     }

@@ -112,7 +112,7 @@ pub fn run(
         Some(recipe) => recipe.clone(),
         None => choose(&run)?,
     };
-    run.record.recipe = recipe.recipe.clone();
+    run.record.recipe.clone_from(&recipe.recipe);
     roles(&recipe, request)?;
     let options = resolve_options(&recipe, &request.options)?;
     run.record.options.clone_from(&options);
