@@ -1,5 +1,11 @@
 //! Every rule on every fixture: each case trips its own rule, and nobody else's unseen.
 
+#![allow(
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "the input is this project's own, and a test that cannot go on says so"
+)]
+
 mod support;
 
 use std::fmt::Write as _;

@@ -89,7 +89,10 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
             let similar = similar(checkpoint, name);
             let pointer = index.weight_map.iter().find(|(_, f)| *f == name).map(|(t, _)| pointer_to(t));
             let fault = match similar {
-                Some(s) => Fault::new("shard-name-differs-in-case").with("similar", s),
+                Some(s) => {
+                    let by = if name.eq_ignore_ascii_case(s) { "case" } else { "Unicode normalisation" };
+                    Fault::new("shard-name-differs-in-case").with("similar", s).with("by", by)
+                }
                 None => Fault::new("shard-missing"),
             };
             let place = Place { file: Some(index.document.clone()), pointer, ..Place::default() };

@@ -194,7 +194,9 @@ fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
 fn tensors(change: &Change, dir: &Path) {
     if let Change::Shard { file, tensors } = change {
         let mut shard = Shard::new(file);
-        tensors.iter().for_each(|(name, shape)| shard.add(name, "BF16", shape));
+        for (name, shape) in tensors {
+            shard.add(name, "BF16", shape);
+        }
         return Weights { shards: vec![shard] }.write(dir);
     }
     let mut weights = Weights::read(dir);
@@ -273,7 +275,7 @@ fn once(text: &str, find: &str, with: &str) -> String {
     text.replace(find, with)
 }
 
-fn parent<'v, 'p>(value: &'v mut Value, pointer: &'p str) -> (&'v mut Value, String) {
+fn parent<'v>(value: &'v mut Value, pointer: &str) -> (&'v mut Value, String) {
     let (above, key) = pointer.rsplit_once('/').expect("a pointer");
     let above = value.pointer_mut(above).unwrap_or_else(|| panic!("{pointer} has no parent"));
     (above, key.replace("~1", "/").replace("~0", "~"))

@@ -6,6 +6,12 @@
 
 #![allow(dead_code, reason = "each test binary uses its share")]
 #![allow(clippy::disallowed_methods, reason = "fixtures are written, not checkpoints")]
+#![allow(
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    reason = "the input is this project's own, and a test that cannot go on says so"
+)]
 
 mod base;
 mod change;

@@ -78,7 +78,7 @@ impl Shard {
             header.insert(tensor.name.clone(), entry);
         }
         let mut header = Value::Object(header).to_string();
-        while header.len() % 8 != 0 {
+        while !header.len().is_multiple_of(8) {
             header.push(' ');
         }
         fs::write(dir.join(&self.file), join(header.as_bytes(), &data)).expect("write");
