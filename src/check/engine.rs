@@ -89,6 +89,9 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
                 checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
             report.missing.retain(|name| !unreadable.contains(name.as_str()));
             faults.extend(load::faults(&report));
+            // Rules about the index name the shard; the lists alone would read as if all were well.
+            let absent = index::first_absent_shard(checkpoint);
+            report.raises = report.raises.or_else(|| absent.map(|name| format!("FileNotFoundError: {name}")));
             outcome.load = Some(report);
         }
     }

@@ -61,6 +61,16 @@ fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
         .collect()
 }
 
+/// The first shard that the index names and that is not there, when others are: the loader stops at it.
+#[must_use]
+pub fn first_absent_shard(checkpoint: &Checkpoint) -> Option<&str> {
+    let index = checkpoint.index.as_ref()?;
+    let mut named = index.weight_map.values();
+    let is_there = |name: &&String| checkpoint.has_file(name);
+    let some = named.clone().any(|name| is_there(&name)) && !checkpoint.has_file(SINGLE);
+    named.find(|name| some && !is_there(name)).map(String::as_str)
+}
+
 fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     let Some(index) = &checkpoint.index else { return };
     // An index that could not be understood says nothing of what is not in it.
