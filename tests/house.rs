@@ -19,7 +19,7 @@ use ckpt_doctor::knowledge::recipe::Recipe;
 use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, Rule, RuleSet, RuleSeverity};
 use ckpt_doctor::knowledge::{Library, source};
 use regex::Regex;
-use support::{cases, files, project, rules, texts};
+use support::{cases, files, keys, project, rules, texts};
 
 /// Fails with every line of `wrong`.
 #[track_caller]
@@ -243,6 +243,14 @@ const FAMILIES: &[(&str, &str)] = &[
     ("SEC", "Code that runs unasked"),
 ];
 
+/// The forms of data files, and the sources that read them.
+const KEYS: &[(&str, &str)] = &[
+    ("Keys of a rule", "rule.rs"),
+    ("Keys of an architecture", "architecture/blueprint.rs"),
+    ("Keys of a processor", "processor.rs"),
+    ("Keys of a recipe and of a merge file", "recipe.rs"),
+];
+
 fn page() -> String {
     let rules = rules().rules;
     let mut page = format!(
@@ -250,7 +258,7 @@ fn page() -> String {
          {} rules, one file each in `checks/<family>/<CODE>.json5`: what to look for, why it matters, what to say and what to do.\n\
          An **error** will not load, or loads wrong weights; a **warning** is probably not meant, or will hurt later; **info** is\n\
          worth knowing. A fix is **safe** (only bookkeeping changes), **unsafe** (what a loader computes changes) or **manual**\n\
-         (the next step is shown). Each rule has cases in `../fixtures/rules/<CODE>/`.\n",
+         (the next step is shown). Each rule has cases in `../fixtures/rules/<CODE>/`. The keys of every kind of file stand below.\n",
         rules.len()
     );
     let mut left: BTreeMap<&str, Vec<&Rule>> = BTreeMap::new();
@@ -273,6 +281,10 @@ fn page() -> String {
         }
     }
     assert!(left.is_empty(), "families without a title: {:?}", left.keys());
+    for (title, file) in KEYS {
+        let source = fs::read_to_string(project().join("src/knowledge").join(file)).expect("text");
+        let _ = write!(page, "\n## {title}\n{}", keys::tables(&source));
+    }
     page
 }
 

@@ -79,9 +79,12 @@ pub struct FaultCheck {
 ///
 /// Expressions see the documents as `config`, `generation`, `processor`, `preprocessor`,
 /// `tokenizer_config`, `special_tokens` (null when absent or broken), `model` (the config with the
-/// class's defaults filled in), `text` (its language part), `arch`, `tokenizer`, and the functions
-/// `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`. A condition that cannot be
-/// evaluated because a value is not there is not a finding.
+/// class's defaults filled in), `text` (its language part), `arch`, `rows` (of the token embedding),
+/// `tokenizer` (`length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`),
+/// `tokens` (what the processor makes of it, by the names in `rules/processors/`, with `length` and
+/// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, and the functions `shape(tensor)`,
+/// `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`. A condition that cannot be evaluated because
+/// a value is not there is not a finding.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Assert {

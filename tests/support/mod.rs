@@ -15,6 +15,7 @@
 
 mod base;
 mod change;
+pub mod keys;
 mod weights;
 
 use std::collections::{BTreeMap, BTreeSet};

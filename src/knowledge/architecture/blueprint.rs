@@ -60,7 +60,9 @@ pub(crate) struct Blueprint {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Requirement {
+    /// The condition.
     pub that: Expression,
+    /// What to say when it does not hold.
     pub message: Template,
 }
 
@@ -116,31 +118,45 @@ pub(crate) struct Part {
     pub set: Map<String, Value>,
 }
 
+/// An entry of `tensors` as it is written: its name is a template, and it says one of `shape`, `weight`, `buffer`,
+/// `tensors`, `part`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawMember {
+    /// The entry counts only then.
     #[serde(default)]
     when: Option<Expression>,
+    /// Names that run from 0 to below their counts, in the entry's name as `{i}`.
     #[serde(default, deserialize_with = "ordered")]
     repeat: Vec<(String, Expression)>,
+    /// Names for what is said often, in order.
     #[serde(default, rename = "let", deserialize_with = "ordered")]
     lets: Vec<(String, Expression)>,
+    /// Name of a group that a checkpoint has whole or not at all.
     #[serde(default)]
     optional: Option<String>,
+    /// One tensor of this name: its dimensions, outermost first.
     #[serde(default)]
     shape: Option<Vec<Expression>>,
+    /// `NAME.weight` of these dimensions.
     #[serde(default)]
     weight: Option<Vec<Expression>>,
+    /// Beside `weight`: when there is a `NAME.bias` of the first dimension.
     #[serde(default)]
     bias: Option<Expression>,
+    /// Tensor whose storage it shares.
     #[serde(default)]
     tied_to: Option<Template>,
+    /// It does so only then.
     #[serde(default)]
     tied_when: Option<Expression>,
+    /// A buffer that is in the model and not in its state dict.
     #[serde(default)]
     buffer: bool,
+    /// Entries whose names start with this one's.
     #[serde(default, deserialize_with = "ordered_option")]
     tensors: Option<Vec<(Template, Member)>>,
+    /// Another architecture under this prefix.
     #[serde(default)]
     part: Option<Part>,
 }
