@@ -292,11 +292,13 @@ fn a_target_in_the_way_is_refused() {
     assert_eq!(merge(&vision, &donor("llava3d-tiny"), &empty, &[]).status.code(), Some(0));
 }
 
+/// What is done to a donor.
+type Damage = fn(&Path);
+
 #[test]
 fn a_damaged_donor_stops_the_merge_and_says_why() {
     let work = TempDir::new().unwrap();
     let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n";
-    type Damage = fn(&Path);
     let cases: [(&str, Damage, &[&str]); 5] = [
         (
             "missing",

@@ -83,7 +83,7 @@ fn request(args: &BuildMergedArgs) -> anyhow::Result<Request> {
     let (mut recipe, mut out, mut base) = (args.recipe.clone(), args.out.clone(), PathBuf::new());
     if let Some(path) = &args.file {
         let file: MergeFile = source::parse(&path.display().to_string(), &text(path)?)?;
-        base = path.parent().unwrap_or(Path::new("")).to_owned();
+        path.parent().unwrap_or(Path::new("")).clone_into(&mut base);
         recipe = file.recipe;
         for (role, dir) in &file.donors {
             let dir = dir.as_str().with_context(|| format!("{}: donor {role} is not a path", path.display()))?;

@@ -55,7 +55,8 @@ fn stages(out: &mut String, merge: &MergeReport, style: Style) {
 
 fn render_seam(out: &mut String, seam: &Seam, style: Style) {
     let paint = Paint(style.color);
-    let title = format!("{}: {}", paint.verdict("error", "error[seam]"), paint.strong(&sentence(&seam.message)));
+    let said = hang(&sentence(&seam.message), 4, style);
+    let title = format!("{}:\n    {}", paint.verdict("error", "error[seam]"), paint.strong(&said));
     let _ok = writeln!(out, "\n  {title}");
     let mut rows = Vec::new();
     let mut row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {

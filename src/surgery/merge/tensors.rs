@@ -152,7 +152,7 @@ fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: &str) -> Result<
         return Ok(Source::Copy(from));
     }
     if fit == "copy" {
-        return Err("it is taken as it is".to_owned());
+        return Err(String::new());
     }
     if !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
@@ -179,8 +179,12 @@ fn misfit(
 ) -> Seam {
     Seam {
         message: format!(
-            "{} of the {} donor is {:?}, {name} has to be {needed:?}, and {why}",
-            tensor.name, donor.role, tensor.shape
+            "{} of the {} donor is {:?}, {} has to be {needed:?}{}{why}",
+            tensor.name,
+            donor.role,
+            tensor.shape,
+            if name == tensor.name { "in the merged model it" } else { name },
+            if why.is_empty() { "" } else { "; " },
         ),
         tensor: Some(ShapedName { donor: donor.role.clone(), name: tensor.name.clone(), shape: tensor.shape.clone() }),
         meets: rule.spec.meets.as_ref().and_then(|m| context.shaped(m)),
