@@ -343,6 +343,23 @@ fn a_damaged_donor_stops_the_merge_and_says_why() {
 }
 
 #[test]
+fn a_donor_document_that_says_two_things_is_refused() {
+    let work = TempDir::new().unwrap();
+    let language = work.path().join("language");
+    copy(&donor("llava3d-tiny"), &language);
+    let path = language.join("config.json");
+    let config = fs::read_to_string(&path).unwrap();
+    fs::write(&path, config.replacen('{', "{ \"rms_norm_eps\": 0.1,", 1)).unwrap();
+    let out = work.path().join("out");
+    let run = merge(&donor("spatialvla-tiny"), &language, &out, &[]);
+    assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+    for word in ["language", "config.json", "rms_norm_eps", "twice"] {
+        assert!(text(&run).contains(word), "{word}: {}", text(&run));
+    }
+    assert_eq!(names(work.path()), ["language"]);
+}
+
+#[test]
 fn a_dry_run_writes_nothing_and_tells_the_plan() {
     let work = TempDir::new().unwrap();
     let run = tiny(&work.path().join("out"), &["--dry-run", "--output-format", "json"]);

@@ -48,6 +48,7 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
         };
     };
     if let Some(source) = source {
+        unambiguous(source, spec.from.as_deref().unwrap_or_default())?;
         finite(spec, source, &mut value, draft)?;
         let removed = strip_switches(&mut value);
         if !removed.is_empty() && spec.name != "added_tokens.json" {
@@ -200,10 +201,28 @@ fn not_there(context: &Context<'_>, spec: &DocumentSpec, pointer: &str) -> Merge
     ))
 }
 
+/// Refuses a document with a key twice: which value a reader takes depends on the reader.
+fn unambiguous(document: &Document, role: &str) -> Result<(), MergeError> {
+    let twice = document
+        .faults
+        .iter()
+        .find(|f| f.kind == "duplicate-json-key" && f.detail.get("equal").is_none_or(|e| *e == Value::Bool(false)));
+    twice.map_or(Ok(()), |fault| {
+        let key = fault.detail.get("key").and_then(Value::as_str).unwrap_or_default();
+        Err(MergeError::Donor(format!(
+            "the {role} donor's {} has the key \"{key}\" twice with different values; remove the one that is not meant",
+            document.name
+        )))
+    })
+}
+
 fn grafted(context: &Context<'_>, graft: &GraftEdit) -> Result<Value, MergeError> {
-    let config = context
-        .donor(&graft.from)
-        .and_then(|d| d.checkpoint.config())
+    let document = context.donor(&graft.from).and_then(|d| d.checkpoint.document("config.json"));
+    if let Some(document) = document {
+        unambiguous(document, &graft.from)?;
+    }
+    let config = document
+        .and_then(|d| d.value.as_ref())
         .and_then(Value::as_object)
         .ok_or_else(|| MergeError::Donor(format!("the {} donor has no readable config.json", graft.from)))?;
     let left_out = |key: &str| {
