@@ -147,3 +147,27 @@ fn a_fifo_does_not_hang_and_hostile_names_do_not_reach_the_terminal() {
         assert!(String::from_utf8_lossy(&run.stdout).contains("FIFO"), "{format}");
     }
 }
+
+#[test]
+fn rules_can_be_chosen_listed_and_explained() {
+    let vision = donor("spatialvla-tiny");
+    let vision = vision.to_str().unwrap();
+    let codes = |args: &[&str]| -> Vec<String> {
+        let (_, report) = report(&[&["check", vision, "--output-format", "json"], args].concat());
+        let findings = report["checkpoints"][0]["findings"].as_array().unwrap().clone();
+        findings.iter().map(|f| f["code"].as_str().unwrap().to_owned()).collect()
+    };
+    assert_eq!(codes(&["--select", "JSN"]), ["JSN001", "JSN001", "JSN001"]);
+    assert_eq!(codes(&["--ignore", "non-finite-number,PRC"]), Vec::<String>::new());
+    let wrong = doctor(&["check", vision, "--ignore", "non-finite-numbr"]);
+    assert_eq!(wrong.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&wrong.stderr).contains("did you mean non-finite-number?"));
+
+    let list = doctor(&["rules"]);
+    let list = String::from_utf8(list.stdout).unwrap();
+    assert!(list.lines().any(|l| l.split_whitespace().eq(["IDX005", "error", "shard-missing"])), "{list}");
+    let one = doctor(&["explain", "shard-missing"]);
+    assert_eq!(one.status.code(), Some(0));
+    insta::assert_snapshot!("explain", String::from_utf8(one.stdout).unwrap());
+    assert_eq!(doctor(&["explain", "IDX999"]).status.code(), Some(2));
+}

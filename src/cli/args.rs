@@ -22,6 +22,18 @@ pub enum Command {
     Check(CheckArgs),
     /// Build one checkpoint from parts of two
     BuildMerged(BuildMergedArgs),
+    /// Say all there is to say of one rule
+    Explain(ExplainArgs),
+    /// List the rules
+    Rules,
+}
+
+/// Arguments of `explain`.
+#[derive(Debug, Args)]
+pub struct ExplainArgs {
+    /// Code or name: IDX005, shard-missing
+    #[arg(value_name = "RULE")]
+    pub rule: String,
 }
 
 /// How and where to report, and what counts as a failure.
@@ -50,6 +62,12 @@ pub struct CheckArgs {
     /// Checkpoint directories, directories that hold some, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
+    /// Only these rules: codes, starts of codes (JSN), or names; comma-separated
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    pub select: Vec<String>,
+    /// All but these rules; where both name one, the longer word wins
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    pub ignore: Vec<String>,
     /// How to report.
     #[command(flatten)]
     pub report: ReportArgs,

@@ -14,7 +14,8 @@ use super::output;
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs) -> anyhow::Result<u8> {
-    let knowledge = Knowledge::embedded()?;
+    let mut knowledge = Knowledge::embedded()?;
+    knowledge.rules.choose(&args.select, &args.ignore)?;
     let mut seen = BTreeSet::new();
     let mut reports = Vec::new();
     for path in &args.paths {

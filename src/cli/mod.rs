@@ -4,6 +4,7 @@ mod args;
 mod build_merged;
 mod check;
 mod output;
+mod rules;
 
 use std::process::ExitCode;
 
@@ -22,6 +23,8 @@ pub fn main() -> ExitCode {
     let result = match &command {
         args::Command::Check(args) => check::run(args),
         args::Command::BuildMerged(args) => build_merged::run(args),
+        args::Command::Explain(args) => rules::explain(args),
+        args::Command::Rules => rules::list(),
     };
     match result {
         Ok(code) => ExitCode::from(code),

@@ -31,15 +31,20 @@ pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
         let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };
         write(file, render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
     }
-    let mut out = std::io::stdout().lock();
-    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        // The reader of a pipe has seen enough.
-        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => {}
-        other => other.context("writing to standard output")?,
-    }
+    print(&text)?;
     let worst = report.checkpoints.iter().filter_map(|c| c.counts.worst()).max();
     let fails = !args.exit_zero && worst.is_some_and(|s| s >= args.fail_on.severity());
     Ok(if fails { FINDINGS } else { CLEAN })
+}
+
+/// Prints to standard output.
+pub fn print(text: &str) -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        // The reader of a pipe has seen enough.
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other.context("writing to standard output"),
+    }
 }
 
 /// Writes a report where the user asked for it.

@@ -6,6 +6,7 @@ pub mod library;
 pub mod processor;
 pub mod recipe;
 pub mod rule;
+pub mod selection;
 pub mod source;
 
 pub use architecture::{Architecture, Evidence, Expected, ExpectedTensor};
