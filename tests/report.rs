@@ -4,9 +4,12 @@
     clippy::arithmetic_side_effects,
     clippy::expect_used,
     clippy::indexing_slicing,
+    clippy::unwrap_used,
     reason = "a test that panics has failed, and that is all"
 )]
 
+#[path = "report/formats.rs"]
+mod formats;
 #[path = "report/samples.rs"]
 mod samples;
 
@@ -58,7 +61,7 @@ fn hostile_strings_are_harmless() {
         let bad =
             |c: &char| (c.is_control() && *c != '\n') || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
         assert_eq!(shown.chars().find(bad), None, "{format}");
-        if format != Format::Json {
+        if !matches!(format, Format::Json | Format::Jsonl) {
             assert!(shown.len() < 20_000, "{format} takes {} bytes", shown.len());
             insta::assert_snapshot!(format!("hostile-{format}"), shown);
         }

@@ -1,17 +1,67 @@
-//! The JSON contract, complete and indented.
+//! The JSON contract: complete and indented, or a line for each finding.
 
 use std::fmt::Write as _;
 
+use serde::Serialize;
+
 use super::Report;
+use super::model::{Summary, Tool};
 use super::words::hostile;
 
 pub fn render(report: &Report) -> String {
-    let text = match serde_json::to_string_pretty(report) {
+    pretty(report)
+}
+
+/// Any JSON, indented and safe to show.
+pub fn pretty<T: Serialize>(value: &T) -> String {
+    harmless(&written(serde_json::to_string_pretty(value)))
+}
+
+/// A finding in a line of its own; the summary is the last line.
+///
+/// Every line is an object, and `type` says of what: `finding`, `seam` or `summary`. Keys are those of the contract.
+pub fn lines(report: &Report) -> String {
+    let mut lines = Vec::new();
+    for checkpoint in &report.checkpoints {
+        let (path, role) = (&checkpoint.path, &checkpoint.role);
+        let line = |finding| Line { r#type: "finding", path, role, said: finding };
+        lines.extend(checkpoint.findings.iter().map(|f| written(serde_json::to_string(&line(f)))));
+    }
+    if let Some(merge) = &report.merge {
+        let line = |seam| Line { r#type: "seam", path: &merge.out, role: &None, said: seam };
+        lines.extend(merge.seams.iter().map(|s| written(serde_json::to_string(&line(s)))));
+    }
+    let summary = Last { r#type: "summary", schema: report.schema, tool: &report.tool, summary: &report.summary };
+    lines.push(written(serde_json::to_string(&summary)));
+    harmless(&lines.join("\n"))
+}
+
+#[derive(Serialize)]
+struct Line<'a, T> {
+    r#type: &'static str,
+    /// The checkpoint, as the user named it; for a seam, where the merge was to go.
+    path: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    role: &'a Option<String>,
+    #[serde(flatten)]
+    said: &'a T,
+}
+
+#[derive(Serialize)]
+struct Last<'a> {
+    r#type: &'static str,
+    schema: u32,
+    tool: &'a Tool,
+    #[serde(flatten)]
+    summary: &'a Summary,
+}
+
+fn written(json: serde_json::Result<String>) -> String {
+    match json {
         Ok(text) => text,
         // Maps here have string keys and every number is finite, so this is for readers only.
         Err(error) => format!("{{\"error\": \"{}\"}}", error.to_string().escape_default()),
-    };
-    harmless(&text)
+    }
 }
 
 /// Spells characters that steer a terminal or reorder text as `\u` escapes: the same JSON, safe to show.

@@ -3,6 +3,7 @@
 //! [`render`] turns a [`Report`] into text; where that text goes is the caller's business.
 
 mod build;
+mod ci;
 mod collapse;
 mod concise;
 mod excerpt;
@@ -27,13 +28,33 @@ pub enum Format {
     Concise,
     /// The JSON contract, complete.
     Json,
+    /// The findings of the JSON contract, one object a line, and a summary in the last.
+    Jsonl,
+    /// Workflow commands that GitHub Actions shows beside the files.
+    Github,
+    /// The Code Quality report of GitLab.
+    Gitlab,
+    /// `JUnit` XML: a test suite for each checkpoint.
+    Junit,
+    /// SARIF 2.1.0, for code scanning.
+    Sarif,
     /// Markdown that is the same wherever it was made: no times, no directories.
     Markdown,
 }
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 4] = [Self::Full, Self::Concise, Self::Json, Self::Markdown];
+    pub const ALL: [Self; 9] = [
+        Self::Full,
+        Self::Concise,
+        Self::Json,
+        Self::Jsonl,
+        Self::Github,
+        Self::Gitlab,
+        Self::Junit,
+        Self::Sarif,
+        Self::Markdown,
+    ];
 
     /// The word for it on the command line.
     #[must_use]
@@ -42,6 +63,11 @@ impl Format {
             Self::Full => "full",
             Self::Concise => "concise",
             Self::Json => "json",
+            Self::Jsonl => "jsonl",
+            Self::Github => "github",
+            Self::Gitlab => "gitlab",
+            Self::Junit => "junit",
+            Self::Sarif => "sarif",
             Self::Markdown => "markdown",
         }
     }
@@ -55,7 +81,7 @@ impl fmt::Display for Format {
 
 /// A word that names no format.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is not an output format; known are full, concise, json, markdown")]
+#[error("`{0}` is not an output format; known are full, concise, json, jsonl, github, gitlab, junit, sarif, markdown")]
 pub struct UnknownFormat(String);
 
 impl FromStr for Format {
@@ -66,7 +92,7 @@ impl FromStr for Format {
     }
 }
 
-/// How text for people is laid out. JSON takes no notice of it.
+/// How text for people is laid out. Formats for programs take no notice of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Style {
     /// Whether to use ANSI colours (`full` only).
@@ -90,6 +116,11 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
         Format::Full => terminal::render(report, style),
         Format::Concise => concise::render(report, style.cap),
         Format::Json => json::render(report),
+        Format::Jsonl => json::lines(report),
+        Format::Github => ci::github::render(report),
+        Format::Gitlab => ci::gitlab::render(report),
+        Format::Junit => ci::junit::render(report),
+        Format::Sarif => ci::sarif::render(report),
         Format::Markdown => markdown::render(report, style.cap),
     }
 }

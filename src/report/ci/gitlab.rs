@@ -1,0 +1,56 @@
+//! The Code Quality report of GitLab: an array of findings.
+//!
+//! <https://docs.gitlab.com/ci/testing/code_quality/#code-quality-report-format>
+
+use serde::Serialize;
+
+use super::{file, groups};
+use crate::check::Severity;
+use crate::report::Report;
+use crate::report::json;
+use crate::report::words::name;
+
+#[derive(Serialize)]
+struct Entry {
+    description: String,
+    check_name: String,
+    fingerprint: String,
+    severity: &'static str,
+    location: Place,
+}
+
+#[derive(Serialize)]
+struct Place {
+    path: String,
+    lines: Lines,
+}
+
+#[derive(Serialize)]
+struct Lines {
+    begin: usize,
+}
+
+pub fn render(report: &Report) -> String {
+    let mut entries = Vec::new();
+    for group in groups(report) {
+        for item in group.items {
+            let first = item.locations.first();
+            let path = first.and_then(|l| file(&group.path, l)).unwrap_or_else(|| group.path.clone());
+            // A line is required; a file without lines and a whole directory begin at the first.
+            let begin = first.and_then(|l| l.line).unwrap_or(1);
+            let severity = match item.severity {
+                Severity::Error => "major",
+                Severity::Warning => "minor",
+                Severity::Info => "info",
+            };
+            entries.push(Entry {
+                description: item.message,
+                check_name: name(item.code),
+                fingerprint: item.fingerprint,
+                severity,
+                location: Place { path, lines: Lines { begin } },
+            });
+        }
+    }
+    json::pretty(&entries)
+}

@@ -1,0 +1,82 @@
+//! `JUnit` XML: a test suite for each checkpoint, a test case for each finding.
+//!
+//! Errors and warnings are failures; what is only worth knowing is a skipped test, which fails nothing. A clean
+//! checkpoint is one test that passed. No times are written: there are none to tell.
+
+use std::fmt::Write as _;
+
+use quick_junit::{NonSuccessKind, TestCase, TestCaseStatus, TestSuite};
+
+use super::{Group, Item, PATH, file, groups, spot};
+use crate::check::Severity;
+use crate::checkpoint::escape;
+use crate::report::Report;
+use crate::report::words::{more, name, tensors};
+
+/// Most places told of one finding.
+const PLACES: usize = 100;
+
+pub fn render(report: &Report) -> String {
+    let mut out = quick_junit::Report::new(report.tool.name);
+    for group in groups(report) {
+        let mut suite = TestSuite::new(words(&group.title));
+        if group.items.is_empty() {
+            let mut case = TestCase::new("clean", TestCaseStatus::success());
+            case.set_classname(words(&group.path));
+            suite.add_test_case(case);
+        }
+        suite.add_test_cases(group.items.iter().map(|item| case(&group, item)));
+        out.add_test_suite(suite);
+    }
+    let mut text = match out.to_string() {
+        Ok(text) => text,
+        // Writing to memory does not fail, so this is for readers only.
+        Err(error) => format!("<!-- {} -->", words(&error.to_string()).replace("--", "- ")),
+    };
+    if !text.ends_with('\n') {
+        text.push('\n');
+    }
+    text
+}
+
+fn case(group: &Group<'_>, item: &Item<'_>) -> TestCase {
+    let mut status = match item.severity {
+        Severity::Error | Severity::Warning => TestCaseStatus::non_success(NonSuccessKind::Failure),
+        Severity::Info => TestCaseStatus::skipped(),
+    };
+    status.set_type(item.severity.name()).set_message(legal(&item.message)).set_description(legal(&told(group, item)));
+    let first = item.locations.first();
+    let place = first.and_then(|l| file(&group.path, l)).unwrap_or_else(|| group.path.clone());
+    let mut case = TestCase::new(legal(&format!("{} {}", name(item.code), name(item.name))), status);
+    case.set_classname(words(&place));
+    case
+}
+
+/// The whole finding in lines.
+fn told(group: &Group<'_>, item: &Item<'_>) -> String {
+    let mut out = item.message.clone();
+    let mut places: Vec<String> = item.locations.iter().map(|l| escape(&spot(&group.path, l), PATH)).collect();
+    places.dedup();
+    for place in places.iter().take(PLACES) {
+        let _infallible = write!(out, "\nat {place}");
+    }
+    if let Some(more) = more(places.len(), PLACES) {
+        let _infallible = write!(out, "\n{more}");
+    }
+    for tensor in tensors(item.locations, PLACES) {
+        let _infallible = write!(out, "\ntensor {tensor}");
+    }
+    if let Some(help) = &item.help {
+        let _infallible = write!(out, "\nhelp: {help}");
+    }
+    out
+}
+
+fn words(text: &str) -> String {
+    legal(&escape(text, PATH))
+}
+
+/// Text without the two characters no XML holds that [`escape`] leaves as they are.
+fn legal(text: &str) -> String {
+    text.replace(['\u{fffe}', '\u{ffff}'], "\u{fffd}")
+}

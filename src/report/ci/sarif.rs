@@ -1,0 +1,243 @@
+//! SARIF 2.1.0, the format code scanning services take.
+//!
+//! <https://docs.oasis-open.org/sarif/sarif/v2.1.0/sarif-v2.1.0.html>; the numbers below are its sections.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::{Group, Item, file, groups};
+use crate::check::{Location, Severity};
+use crate::report::words::{name, sentence};
+use crate::report::{Report, json};
+
+const SCHEMA: &str = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json";
+/// Most locations of one result: GitHub takes no more.
+const LOCATIONS: usize = 1_000;
+/// What relative paths start from: by custom the root of the sources, which the reader knows.
+const SOURCES: &str = "%SRCROOT%";
+/// What absolute paths start from.
+const ROOT: &str = "ROOT";
+
+#[derive(Serialize)]
+struct Log {
+    #[serde(rename = "$schema")]
+    schema: &'static str,
+    version: &'static str,
+    runs: [Run; 1],
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Run {
+    tool: Tool,
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    original_uri_base_ids: BTreeMap<&'static str, Base>,
+    column_kind: &'static str,
+    results: Vec<Found>,
+}
+
+#[derive(Serialize)]
+struct Tool {
+    driver: Driver,
+}
+
+#[derive(Serialize)]
+struct Driver {
+    name: &'static str,
+    version: &'static str,
+    rules: Vec<Rule>,
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Rule {
+    id: String,
+    name: String,
+    short_description: Text,
+    help: Text,
+}
+
+#[derive(Serialize)]
+struct Text {
+    text: String,
+}
+
+#[derive(Serialize)]
+struct Base {
+    uri: &'static str,
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Found {
+    rule_id: String,
+    rule_index: usize,
+    level: &'static str,
+    message: Text,
+    locations: Vec<Place>,
+    partial_fingerprints: BTreeMap<&'static str, String>,
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Place {
+    physical_location: Physical,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    logical_locations: Vec<Logical>,
+}
+
+#[derive(Serialize, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Physical {
+    artifact_location: Artifact,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    region: Option<Region>,
+}
+
+#[derive(Serialize, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Artifact {
+    uri: String,
+    uri_base_id: &'static str,
+}
+
+#[derive(Serialize, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Region {
+    start_line: usize,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    start_column: Option<usize>,
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Logical {
+    fully_qualified_name: String,
+    kind: &'static str,
+}
+
+pub fn render(report: &Report) -> String {
+    let mut rules: Vec<Rule> = Vec::new();
+    let mut known: BTreeMap<String, usize> = BTreeMap::new();
+    let mut results = Vec::new();
+    for group in groups(report) {
+        for item in &group.items {
+            let id = name(item.code);
+            let rule_index = *known.entry(id.clone()).or_insert_with(|| {
+                rules.push(rule(id.clone(), item));
+                rules.len().saturating_sub(1)
+            });
+            let partial_fingerprints = BTreeMap::from([("checkpointFinding/v1", item.fingerprint.clone())]);
+            results.push(Found {
+                rule_id: id,
+                rule_index,
+                level: level(item.severity),
+                message: text(&item.message),
+                locations: locations(&group, item),
+                partial_fingerprints,
+            });
+        }
+    }
+    let absolute = |place: &Place| place.physical_location.artifact_location.uri_base_id == ROOT;
+    let mut original_uri_base_ids = BTreeMap::new();
+    if results.iter().flat_map(|r| &r.locations).any(absolute) {
+        original_uri_base_ids.insert(ROOT, Base { uri: "file:///" });
+    }
+    let tool = Tool { driver: Driver { name: report.tool.name, version: report.tool.version, rules } };
+    // Columns of findings count characters (3.14.17).
+    let run = Run { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
+    json::pretty(&Log { schema: SCHEMA, version: "2.1.0", runs: [run] })
+}
+
+const fn level(severity: Severity) -> &'static str {
+    match severity {
+        Severity::Error => "error",
+        Severity::Warning => "warning",
+        Severity::Info => "note",
+    }
+}
+
+fn rule(id: String, item: &Item<'_>) -> Rule {
+    let why = if item.code == "seam" {
+        String::new()
+    } else {
+        format!("`ckpt-doctor explain {id}` says what it means and what to do.")
+    };
+    let step = item.help.iter().map(|step| format!("{step}. "));
+    let help = step.chain([why]).collect::<String>().trim_end().to_owned();
+    let stated = sentence(&item.name.replace('-', " "));
+    let help = if help.is_empty() { stated.clone() } else { help };
+    Rule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
+}
+
+/// The places of a finding, tensors of the same place together; the checkpoint if it has none.
+fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<Place> {
+    let mut places: Vec<Place> = Vec::new();
+    for location in item.locations.iter().take(LOCATIONS) {
+        let place = physical(group, location);
+        let named = [(&location.pointer, "value"), (&location.tensor, "tensor")].into_iter();
+        let named = named.filter_map(|(what, kind)| Some((what.as_deref().filter(|w| !w.is_empty())?, kind)));
+        let logical = named.map(|(what, kind)| Logical { fully_qualified_name: name(what), kind });
+        match places.last_mut() {
+            Some(last) if last.physical_location == place => last.logical_locations.extend(logical),
+            _ => places.push(Place { physical_location: place, logical_locations: logical.collect() }),
+        }
+    }
+    if places.is_empty() {
+        places.push(Place { physical_location: physical(group, &Location::default()), logical_locations: Vec::new() });
+    }
+    places
+}
+
+fn physical(group: &Group<'_>, location: &Location) -> Physical {
+    let found = file(&group.path, location);
+    let region = location
+        .line
+        .filter(|_| found.is_some())
+        .map(|start_line| Region { start_line, start_column: location.column });
+    let path = found.as_deref().unwrap_or(&group.path);
+    let (uri, uri_base_id) = match path.strip_prefix('/') {
+        Some(below) => (uri(below), ROOT),
+        None => (uri(path), SOURCES),
+    };
+    Physical { artifact_location: Artifact { uri, uri_base_id }, region }
+}
+
+/// A path as a relative reference (RFC 3986): only unreserved characters and `/` stand for themselves.
+fn uri(path: &str) -> String {
+    let mut out = String::with_capacity(path.len());
+    for byte in path.bytes() {
+        if byte.is_ascii_alphanumeric() || b"-._~/".contains(&byte) {
+            out.push(char::from(byte));
+        } else {
+            let _infallible = write!(out, "%{byte:02X}");
+        }
+    }
+    // The directory itself is no empty reference.
+    if out.is_empty() { ".".to_owned() } else { out }
+}
+
+/// Plain text in which nothing is a link (3.11.6).
+fn text(plain: &str) -> Text {
+    let linked = plain.contains("](");
+    Text { text: if linked { plain.replace('[', "\\[").replace(']', "\\]") } else { plain.to_owned() } }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{text, uri};
+
+    #[test]
+    fn every_byte_that_means_something_is_percent_encoded() {
+        assert_eq!(uri("a b/c:d?e#f%20[é]"), "a%20b/c%3Ad%3Fe%23f%2520%5B%C3%A9%5D");
+        assert_eq!(uri(""), ".");
+    }
+
+    #[test]
+    fn words_make_no_link() {
+        assert_eq!(text("[a](javascript:x)").text, "\\[a\\](javascript:x)");
+        assert_eq!(text("is [1, 2]").text, "is [1, 2]");
+    }
+}
