@@ -16,7 +16,7 @@ use std::fs;
 use ckpt_doctor::checkpoint::fault::FAULT_KINDS;
 use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::recipe::Recipe;
-use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, Rule, RuleSet, RuleSeverity};
+use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, Rule, RuleSet, Severity};
 use ckpt_doctor::knowledge::{Library, source};
 use regex::Regex;
 use support::{cases, files, keys, project, rules, texts};
@@ -84,7 +84,7 @@ fn rules_are_written_alike() {
             hold(IMPERATIVES.contains(&first_word(help)), "the help starts with a verb of the list in tests/house.rs");
         }
         // Information may leave nothing to be done; what is wrong never does.
-        hold(rule.fix.is_some() || rule.severity == RuleSeverity::Info, "a rule above info says what to do");
+        hold(rule.fix.is_some() || rule.severity == Severity::Info, "a rule above info says what to do");
     }
     none(&wrong);
 }
@@ -270,9 +270,9 @@ fn page() -> String {
             write!(page, "\n## {title}\n\n| code | name | severity | what is wrong | fix |\n|---|---|---|---|---|\n");
         for rule in left.remove(family).unwrap_or_default() {
             let severity = match rule.severity {
-                RuleSeverity::Error => "error",
-                RuleSeverity::Warning => "warning",
-                RuleSeverity::Info => "info",
+                Severity::Error => "error",
+                Severity::Warning => "warning",
+                Severity::Info => "info",
             };
             let fix = rule.fix.as_ref().map_or("", |f| f.safety.name());
             let path = format!("checks/{}/{}.json5", family.to_lowercase(), rule.code);

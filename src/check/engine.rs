@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, FixHint, LoadReport, Location, Severity};
+use super::finding::{Finding, FixHint, LoadReport, Location};
 use super::load::{self, Stored};
 use super::{facts, index, modules, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
 use crate::knowledge::processor::Processor;
-use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet, RuleSeverity};
+use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
 use crate::knowledge::{Expected, Library, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
@@ -257,15 +257,10 @@ fn place(at: &At, scope: &Scope<'_>) -> Place {
 }
 
 fn finding(rule: &Rule, scope: &Scope<'_>, locations: Vec<Location>, evidence: Map<String, Value>) -> Finding {
-    let severity = match rule.severity {
-        RuleSeverity::Info => Severity::Info,
-        RuleSeverity::Warning => Severity::Warning,
-        RuleSeverity::Error => Severity::Error,
-    };
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity,
+        severity: rule.severity,
         message: rule.message.render(scope),
         locations,
         evidence,

@@ -2,32 +2,10 @@
 
 use std::ops::Range;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::{Map, Value};
 
-/// How bad a finding is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Severity {
-    /// Worth knowing; nothing needs doing.
-    Info,
-    /// Probably unintended, or will hurt later.
-    Warning,
-    /// Will not load, or loads wrong weights.
-    Error,
-}
-
-impl Severity {
-    /// The word used in output.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Info => "info",
-            Self::Warning => "warning",
-            Self::Error => "error",
-        }
-    }
-}
+pub use crate::knowledge::rule::Severity;
 
 /// Where a finding points: a file, a place in it, a tensor.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]

@@ -1,15 +1,15 @@
 //! Rules: what to look for, why it matters and what to say; one JSON5 file each.
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::expression::{Expression, Template};
 use super::source::{self, DataError};
 use crate::checkpoint::fault::FAULT_KINDS;
 
-/// How bad a rule's findings are; the words of the report.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+/// How bad a finding is; a rule says it for all of its findings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum RuleSeverity {
+pub enum Severity {
     /// Worth knowing; nothing needs doing.
     Info,
     /// Probably unintended, or will hurt later.
@@ -18,7 +18,7 @@ pub enum RuleSeverity {
     Error,
 }
 
-impl RuleSeverity {
+impl Severity {
     /// The word used in output.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -39,7 +39,7 @@ pub struct Rule {
     /// What is wrong, in kebab case: `shard-missing`.
     pub name: String,
     /// How bad it is.
-    pub severity: RuleSeverity,
+    pub severity: Severity,
     /// One line.
     pub summary: String,
     /// Why it matters: what a loader does with it.
