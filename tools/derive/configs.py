@@ -1,0 +1,374 @@
+"""Small random configs, and the other values one of their keys may take.
+
+A *raw* config is what a config class is given: a dict with only the keys that are set on purpose, so that everything
+the class computes from them stays computed. A *flat* config is what the class made of it: {"text_config.hidden_size": 64}.
+"""
+import re
+
+import transformers
+from transformers.models.auto.configuration_auto import CONFIG_MAPPING
+
+CONFIG_BASE = getattr(transformers, "PretrainedConfig", None) or transformers.PreTrainedConfig
+
+# Keys that never decide a name or a shape: no samples are spent on them, and no expression may use them.
+NOISE = re.compile(
+    r"(token_id|token_index|token_ids)$|^(bos|eos|pad|cls|sep|unk|mask)_token$|dropout|drop_|initializer|_eps$|epsilon|^use_cache|dtype"
+    r"|transformers_version|name_or_path|architectures|label2id|id2label|rope_(theta|type|scaling)|rope_param|temperature|_coef|coefficient"
+    r"|mask_time|mask_feature|max_length|^num_beams|chunk_size_feed|problem_type|return_dict|output_(hidden_st|att|sco)|^ctc_|finetuning|loss"
+    r"|torchscript|pruned|min_length|^top_[kp]|penalty|diversity|suppress|begin_|num_return|sampling_rate|tokenizer_class|prefix$|attn_implementation"
+    r"|model_type$|task_specific|keys_to_ignore|is_encoder_decoder|^cross_attention_hidden|tf_legacy|use_bfloat|remove_invalid|early_stopping"
+    r"|gradient_check|^base_model_(tp|pp)|scale_embedding|logit_scale|softcap|_multiplier$|init_std|init_range|_init$|^training|^chunk_length|transformers_weights")
+
+# What a key is about, by its name.
+LAYERS = re.compile(r"(.*_)?(num_hidden_layers|n_layers?|num_layers|layers|depth|num_hidden_groups|num_blocks|resampler_depth|num_adapter_layers)$")
+HEADS = re.compile(r"(.*_)?(num_attention_heads|n_heads?|num_heads|attention_heads|heads)$")
+KV_HEADS = re.compile(r"(.*_)?(num_key_value_heads|num_kv_heads|n_head_kv|n_kv_heads)$")
+WIDTH = re.compile(r"(hidden_size|d_model|n_embd|dim|embed_dim|emb_dim|hidden_dim|(en|de)coder_hidden_size|hidden_size_global|width)$")
+HEAD_WIDTH = re.compile(r"(.*_)?(head_dim|d_kv|attention_head_size)$")
+INNER = re.compile(r"(.*_)?(intermediate_size|ffn_dim|mlp_dim|d_ff|d_inner|n_inner|ffn_hidden_size|feedforward_dim|ff_dim|dim_feedforward)$")
+VOCAB = re.compile(r"(.*_)?vocab_size$|vocab_size_.*")
+POSITIONS = re.compile(r"(max_position_embeddings|n_positions|max_(source|target|text|speech)_positions|max_seq_len(gth)?|seq_length|n_ctx)$")
+EXPERTS = re.compile(r"(num_experts|num_local_experts|n_routed_experts|moe_num_experts)$")
+PER_TOKEN = re.compile(r"(num_experts_per_tok(en)?|moe_topk|moe_top_k|moe_k)$")
+SMALL = re.compile(r"(.*_)?(lora_rank|rope_head_dim|nope_head_dim|v_head_dim|projection_dim|output_dim|embedding_size|d_state|state_size"
+                   r"|classifier_proj_size|fusion_hidden_size|bottleneck_features|num_queries|codevector_dim|embd_pdim|proj_dim)$")
+FLAG = re.compile(r"bias|^tie_|norm|^use_|rel_pos|abs_pos|mask_token|adapter|gated|parallel|pool|multi_query|share|swiglu|projection|k_eq_v|relative|alibi"
+                  r"|new_decoder|distill|head|attention|conv|gate|position|embed|proj|^add_|^has_|^is_|^with_")
+FIXED_FLAG = re.compile(r"use_cache|torchscript|pretrained|timm|kernels|bfloat|prune|tf_|return|output_|is_encoder_decoder|is_composition|use_mems|flash|triton|mask_time")
+RATIO = re.compile(r"ratio|expan|factor|mult|width|alpha|scale|fraction")
+SIZES = re.compile(r"hidden|channel|dim|size|width|embed|filters|planes")
+OPTIONAL = re.compile(r"dim|size|heads|rank|inner|num_|layers|experts|hidden|channel|width|shared|interval|freq|period|n_|length|stride")
+
+# Which language and vision models a composition is tried with besides its own default.
+TEXTS = {"llava": ["llama", "mistral", "qwen2", "gemma", "phi3"], "llava_next": ["llama", "mistral", "qwen2"], "paligemma": ["gemma", "gemma2"],
+         "vipllava": ["llama", "mistral"], "llava_onevision": ["qwen2", "llama"], "idefics2": ["mistral", "llama"], "idefics3": ["llama", "mistral"],
+         "smolvlm": ["llama", "mistral"], "internvl": ["qwen2", "llama"], "mistral3": ["mistral", "llama"], "blip-2": ["opt", "t5"],
+         "instructblip": ["opt", "t5"], "video_llava": ["llama", "mistral"], "llava_next_video": ["llama", "mistral"], "instructblipvideo": ["opt", "t5"]}
+VISIONS = {"llava": ["clip_vision_model", "siglip_vision_model", "pixtral"], "llava_next": ["clip_vision_model", "siglip_vision_model"], "vipllava": ["clip_vision_model", "siglip_vision_model"],
+           "llava_onevision": ["siglip_vision_model", "clip_vision_model"], "mistral3": ["pixtral"], "paligemma": ["siglip_vision_model"]}
+PAIRS = {"encoder-decoder": (("encoder", "bert"), ("decoder", "bert")), "speech-encoder-decoder": (("encoder", "wav2vec2"), ("decoder", "bert")),
+         "vision-encoder-decoder": (("encoder", "vit"), ("decoder", "gpt2")), "vision-text-dual-encoder": (("vision_config", "vit"), ("text_config", "bert"))}
+
+
+def subconfigs(config):
+    """{key: config object} of the configs inside a config."""
+    return {k: v for k, v in vars(config).items() if isinstance(v, CONFIG_BASE)}
+
+
+def flatten(config, prefix="", out=None):
+    """Every value of a config, those of configs inside it under dotted names, label tables as their size."""
+    out = {} if out is None else out
+    d = config if isinstance(config, dict) else config.to_dict()
+    for k, v in d.items():
+        if k in ("id2label", "label2id"):
+            if k == "id2label" and isinstance(v, dict):
+                out[prefix + "num_labels"] = len(v)
+        elif k.startswith("_") or not isinstance(k, str):
+            continue
+        elif isinstance(v, dict):
+            if len(v) < 80 and not k.startswith("task_specific"):
+                flatten(v, f"{prefix}{k}.", out)
+        elif v is None or isinstance(v, (bool, int, float, str)):
+            out[prefix + k] = v
+        elif isinstance(v, (list, tuple)) and len(v) < 300:
+            out[prefix + k] = plain(v)
+    if not isinstance(config, dict) and not prefix and "num_labels" not in out and isinstance(getattr(config, "num_labels", None), int):
+        out["num_labels"] = config.num_labels
+    return out
+
+
+def plain(v):
+    """`v` with lists for tuples, as JSON has it."""
+    if isinstance(v, (list, tuple)):
+        return [plain(x) for x in v]
+    if isinstance(v, dict):
+        return {str(k): plain(x) for k, x in v.items()}
+    return v if v is None or isinstance(v, (bool, int, float, str)) else str(v)
+
+
+def copied(raw):
+    return {k: copied(v) if isinstance(v, dict) else list(v) if isinstance(v, list) else v for k, v in raw.items()}
+
+
+def changed(raw, key, value):
+    """A copy of `raw` with the value at a dotted key replaced."""
+    out = copied(raw)
+    d = out
+    *path, leaf = key.split(".")
+    for p in path:
+        d = d.setdefault(p, {})
+        if not isinstance(d, dict):
+            raise KeyError(key)
+    d[leaf] = value
+    return out
+
+
+def is_int(v):
+    return isinstance(v, int) and not isinstance(v, bool)
+
+
+# ---- bases ---------------------------------------------------------------------------------------------------
+
+def skeleton(model_type, config_class, rng):
+    """What must be given before a class can be built at all, with the parts chosen at random where there is a choice."""
+    if model_type in PAIRS:
+        out = {}
+        for key, mt in PAIRS[model_type]:
+            extra = {"is_decoder": True, "add_cross_attention": True} if key == "decoder" else {}
+            out[key] = {"model_type": mt, **extra}
+        return out
+    raw = {}
+    for key, table in (("text_config", TEXTS), ("vision_config", VISIONS)):
+        known = [t for t in table.get(model_type, []) if t in CONFIG_MAPPING]
+        if known and rng.random() < .65:
+            raw[key] = {"model_type": rng.choice(known)}
+    d = config_class(**copied(raw)).to_dict()
+    backbone = d.get("backbone_config")
+    if d.get("use_timm_backbone") or isinstance(backbone, dict) and backbone.get("model_type") == "timm_backbone":
+        raw["backbone_config"] = {"model_type": "resnet", "out_features": ["stage2", "stage3", "stage4"]}    # timm needs its own library
+        if "use_timm_backbone" in d:
+            raw.update(use_timm_backbone=False, use_pretrained_backbone=False, backbone=None)
+    return raw
+
+
+def random_raw(model_type, config_class, rng, keep=1.0):
+    """A random small config. `keep` below 1 leaves more and more at the class's defaults, for classes hard to please."""
+    raw = skeleton(model_type, config_class, rng)
+    base = config_class(**copied(raw))
+    over = vary(base, rng, keep)
+    merge(over, raw)
+    settle(model_type, over, base, rng)
+    return over
+
+
+def merge(into, other):
+    for k, v in other.items():
+        if isinstance(v, dict) and isinstance(into.get(k), dict):
+            merge(into[k], v)
+        else:
+            into[k] = v
+
+
+def vary(base, rng, keep):
+    """Overrides for one config object, in step with one another: heads divide widths, groups divide heads."""
+    over = {}
+    for name, sub in subconfigs(base).items():
+        over[name] = vary(sub, rng, keep)
+        if sub.model_type:
+            over[name]["model_type"] = sub.model_type
+    d = {k: v for k, v in base.to_dict().items() if not k.startswith("_") and k not in over and not isinstance(v, dict)}
+    heads = rng.choice([2, 4, 4, 6, 8])
+    head_width = rng.choice([8, 16, 16, 24, 32])
+    staged = any(isinstance(d.get(k), list) for k in ("depths", "num_heads", "hidden_sizes"))
+    kv = rng.choice([h for h in (1, 2, 4, heads) if heads % h == 0])
+    width = rng.choice([24, 48, 96]) if staged else heads * head_width
+    layers = rng.randint(1, 4)
+    for k in sorted(d, key=str):
+        v, must = d[k], False
+        new = None
+        if isinstance(v, bool):
+            if FLAG.search(k) and not FIXED_FLAG.search(k) and rng.random() < .28:
+                new = not v
+        elif k in ("num_labels",) or NOISE.search(k) and k != "pad_token_id":
+            continue
+        elif isinstance(v, list):
+            new = vary_list(k, v, rng)
+            must = new is not None and "depth" in k
+        elif LAYERS.match(k) and is_int(v) and v and "feat_extract" not in k:
+            new, must = (layers if rng.random() < .6 else rng.randint(1, 4)), v > 4
+        elif KV_HEADS.match(k):
+            new = kv if is_int(v) or rng.random() < .5 else None
+        elif HEADS.match(k) and is_int(v):
+            new = heads
+        elif HEAD_WIDTH.match(k):
+            if is_int(v) or rng.random() < .4:
+                new = rng.choice([8, 16, 24, 32]) if rng.random() < .6 else head_width
+        elif not is_int(v):
+            continue
+        elif WIDTH.match(k):
+            new = width
+        elif INNER.match(k) and v > 0:
+            new = 8 * rng.randint(2, 12)
+        elif VOCAB.match(k) and v > 1 and "type" not in k:
+            new = rng.randint(120, 400)
+        elif POSITIONS.match(k) and v > 1:
+            new = rng.randint(24, 96)
+        elif EXPERTS.match(k) and v > 1:
+            new = rng.choice([2, 4, 8])
+        elif PER_TOKEN.match(k) and v > 1:
+            new = rng.choice([1, 2])
+        elif k in ("n_group", "topk_group"):
+            new = 1
+        elif k == "first_k_dense_replace":
+            new = rng.choice([0, 1, 2])
+        elif k == "type_vocab_size" and v > 0:
+            new = rng.randint(1, 4)
+        elif SMALL.match(k) and v > 1:
+            new = 8 * rng.randint(1, 6)
+        elif k in ("out_hidden_size", "text_hidden_size", "text_embed_dim", "text_dim"):
+            new = width
+        elif k == "num_position_embeddings":
+            new = rng.choice([4, 5, 6]) ** 2
+        elif k == "patch_size" and is_int(d.get("image_size")) and "window_size" not in d and not staged:
+            new = rng.choice([4, 8, 14, 16])
+            over["image_size"] = new * rng.choice([2, 3, 4, 7])
+        elif k == "pad_token_id":
+            new = rng.randint(0, 3)
+        elif k == "num_conv_pos_embedding_groups":
+            new = rng.choice([2, 4])
+        elif k == "num_buckets" and v > 64:
+            new = 64
+        if new is not None and new != v and (must or rng.random() < .93 * keep):
+            over[k] = new
+    return over
+
+
+def vary_list(k, v, rng):
+    """Another list like `v`, or None to leave it."""
+    if not v or not all(is_int(x) for x in v):
+        return None
+    if "depths" in k or k in ("num_blocks", "layers"):
+        return [rng.randint(1, 2) for _ in v]
+    if SIZES.search(k) and min(v) >= 8 and all(x % 8 == 0 for x in v) and not re.search("kernel|stride|patch|window|image|crop|pool", k):
+        f = 8 if all(x % 64 == 0 for x in v) else 4 if all(x % 32 == 0 for x in v) else 1
+        return [x // f for x in v]
+    return None
+
+
+def settle(model_type, over, base, rng):
+    """What single model types ask of their configs, and what a composition copies from its parts."""
+    if model_type == "gpt_neo":
+        n = rng.randint(1, 2)
+        over.update(num_layers=2 * n, attention_types=[[["global", "local"], n]])
+    elif model_type == "esm":
+        over.update(vocab_size=rng.randint(34, 60), pad_token_id=1, mask_token_id=32)
+    elif model_type in ("autoformer", "informer", "time_series_transformer"):
+        over.update(prediction_length=rng.randint(3, 9))
+    elif model_type in ("chameleon", "emu3"):
+        over["vocabulary_map"] = {"<image>": 5, **{f"IMGIMG{c}Z": 6 + j for j, c in enumerate("ABCDEFGH")}}
+    elif model_type in ("wav2vec2-bert", "wav2vec2-conformer"):
+        over.setdefault("vocab_size", rng.randint(20, 60))
+    elif model_type == "mllama" and isinstance(over.get("text_config"), dict):
+        settle_mllama(over["text_config"], rng)
+    elif model_type == "mllama_text_model":
+        settle_mllama(over, rng)
+    elif model_type in ("beit", "data2vec-vision"):
+        n = rng.randint(4, 5)
+        over.update(num_hidden_layers=n, out_indices=sorted(rng.sample(range(1, n + 1), 4)))
+    elif model_type == "hubert" or model_type.startswith(("wav2vec2", "wavlm", "unispeech", "data2vec-audio", "sew")):
+        over.pop("conv_dim", None)
+    settle_stages(model_type, over, base, rng)
+    text = over.get("text_config")
+    width = text.get("hidden_size") if isinstance(text, dict) else None
+    if width:
+        for name, sub in subconfigs(base).items():
+            if name != "text_config" and isinstance(over.get(name), dict):
+                for k in ("out_hidden_size", "text_hidden_size") + (("projection_dim",) if model_type == "paligemma" else ()):
+                    if is_int(getattr(sub, k, None)):
+                        over[name][k] = width
+        if model_type == "paligemma":
+            over.update(projection_dim=width, hidden_size=width)
+
+
+def settle_mllama(text, rng):
+    n = rng.randint(2, 5)
+    text.update(num_hidden_layers=n, cross_attention_layers=sorted(rng.sample(range(n), rng.randint(1, 2))), pad_token_id=rng.randint(0, 3))
+    if transformers.__version__.startswith("4"):
+        text["rope_scaling"] = {"rope_type": "default"}
+
+
+def settle_stages(model_type, over, base, rng):
+    """A backbone's `out_indices` must exist in a model of fewer layers."""
+    out = getattr(base, "out_indices", None) or getattr(base, "_out_indices", None)
+    names = getattr(base, "stage_names", None)
+    n = over.get("num_hidden_layers")
+    if model_type in ("beit", "data2vec-vision") or not out or not names or not is_int(n) or len(names) != getattr(base, "num_hidden_layers", 0) + 1:
+        return
+    n = over["num_hidden_layers"] = max(n, len(out))
+    pick = sorted(rng.sample(range(1, n + 1), len(out)))
+    over.update(out_indices=pick, out_features=[f"stage{j}" for j in pick])
+
+
+# ---- perturbations -------------------------------------------------------------------------------------------
+
+def candidates(flat, words):
+    """Keys of a flat config that are worth changing."""
+    return [k for k in sorted(flat) if not NOISE.search(k.split(".")[-1]) and alternatives(k, flat[k], words)
+            and not FIXED_FLAG.search(k.split(".")[-1]) and ".rope_" not in "." + k]
+
+
+def alternatives(key, v, words):
+    """Other values for a key, the most telling first. `words`: {key: strings the model's source compares it with}."""
+    leaf = key.split(".")[-1]
+    said = [w for w in words.get(leaf, []) if w != v]
+    if isinstance(v, bool):
+        return [not v]
+    if is_int(v):
+        if leaf == "num_labels":
+            return [v + 1, v + 3, 1]
+        return [v * 2, v + 1, v * 3, 0 if not (WIDTH.match(leaf) or HEADS.match(leaf)) else v + 2, v + 8, v // 2, 1] if v > 0 else [1, 2, 8, 3, 0]
+    if isinstance(v, float):
+        return [v * 2, v / 2, v + .5] if RATIO.search(leaf) else []
+    if isinstance(v, str):
+        return said[:6]
+    if v is None:
+        if said:
+            return said[:4]
+        return [8, 16, 1, 2, 24, True] if OPTIONAL.search(leaf) else [True, 8] if FLAG.search(leaf) else []
+    if isinstance(v, list):
+        return list_alternatives(leaf, v, said)
+    return []
+
+
+def list_alternatives(leaf, v, said):
+    if not v:
+        return [[0], [1]]
+    if all(is_int(x) for x in v):
+        bumped = [[x + (j == q) for j, x in enumerate(v)] for q in range(min(4, len(v)))]
+        doubled = [[x * (2 if j == q else 1) for j, x in enumerate(v)] for q in range(min(4, len(v)))]
+        return [[x * 2 for x in v], *doubled, [x + 1 + j for j, x in enumerate(v)], [v[0]] * len(v), v[:-1], v + [v[-1]], *bumped, v[::-1]]
+    if all(isinstance(x, str) for x in v):
+        out = []
+        values = sorted(set(v) | set(said))[:6]
+        if len(values) > 1 and not re.search("features|stage_names|architectures", leaf):
+            for shift in range(len(values)):
+                out.append([values[(j + shift) % len(values)] for j in range(len(v))])
+            out += [[x] * len(v) for x in values[:3]]
+        return [x for x in out if x != v] + ([v[1:], v[:-1]] if len(v) > 1 else [])
+    if all(isinstance(x, (list, tuple)) for x in v) and all(is_int(y) for x in v for y in x):
+        return [[[y * 2 for y in x] for x in v], [[y + 1 for y in x] for x in v], v[:-1]] + [[[y * (2 if j == q else 1) for y in x] for j, x in enumerate(v)] for q in range(min(3, len(v)))]
+    if all(isinstance(x, bool) for x in v):
+        return [[not x for x in v], [not v[0], *v[1:]], [*v[:-1], not v[-1]], [j % 2 == 0 for j in range(len(v))]]
+    return [v[:-1]] if len(v) > 1 else []
+
+
+def same_length_lists(flat):
+    """Groups of lists of one config that have the same length, as stages have: they can only grow or shrink together."""
+    groups = {}
+    for k, v in sorted(flat.items()):
+        if isinstance(v, list) and len(v) > 1 and not NOISE.search(k.split(".")[-1]):
+            groups.setdefault((k.rpartition(".")[0], len(v)), []).append(k)
+    return [ks for ks in groups.values() if len(ks) > 1]
+
+
+def compared_words(*sources):
+    """{key: [strings]} that a source text compares config keys with, as in `config.feat_extract_norm == "group"`."""
+    out = {}
+    strings = r"[\[({]?\s*((?:[\"'][\w.\-]+[\"']\s*,?\s*)+)"
+    for source in sources:
+        for m in re.finditer(r"(\w+)(?:\[[^\]\n]*\])?\s*(?:==|!=|not in|in)\s*" + strings, source):
+            add_words(out, m[1], m[2])
+        for m in re.finditer(r"(\w+)\s*:\s*(?:list\[)?Literal\[((?:\s*[\"'][\w.\-]+[\"']\s*,?)+)", source):
+            add_words(out, m[1], m[2])
+    for k in list(out):                                         # a list of layer types, compared one by one
+        out.setdefault(k + "s", out[k])
+        if k in ("layer_type", "attention_type"):
+            out.setdefault("layer_types", out[k])
+            out.setdefault("layers_block_type", out[k])
+    return out
+
+
+def add_words(out, key, text):
+    for w in re.findall(r"[\"']([\w.\-]+)[\"']", text):
+        if w not in out.setdefault(key, []):
+            out[key].append(w)

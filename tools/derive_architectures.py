@@ -1,0 +1,52 @@
+#!/usr/bin/env python3
+"""Derive what transformers' model classes expect (rules/architectures) from transformers itself. For maintainers.
+
+    python tools/derive_architectures.py sample --cache DIR     # build every class on `meta` many times: samples on disk
+    python tools/derive_architectures.py fit --cache DIR        # samples -> one template file per class
+
+Each runs under one transformers version at a time (that of the Python it is started with) and writes below
+`DIR/<version>/`. Both resume: what is there already is not made again. See tools/derive/README.md.
+"""
+import argparse
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+
+def add_sample(commands):
+    p = commands.add_parser("sample", help="instantiate classes on many configs and write down their tensors")
+    p.add_argument("--only", help="regular expression on class name or model_type")
+    p.add_argument("--again", action="store_true", help="sample again what has been sampled")
+    p.add_argument("--restart-every", type=int, default=60, help="families built before the worker is replaced (memory)")
+    p.set_defaults(run="derive.sample")
+
+
+def add_fit(commands):
+    p = commands.add_parser("fit", help="find the expressions that explain the samples")
+    p.add_argument("--only", help="regular expression on class name or model_type")
+    p.add_argument("--version", help="transformers version whose samples to fit (default: every one in the cache)")
+    p.add_argument("--again", action="store_true", help="fit again what has been fitted")
+    p.add_argument("--check", action="store_true", help="evaluate each result on the fresh configs and say what differs")
+    p.set_defaults(run="derive.fit")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
+    commands = parser.add_subparsers(required=True)
+    for add in (add_sample, add_fit):
+        add(commands)
+    for sub in set(commands.choices.values()):                # --cache may stand before or after the subcommand
+        sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.cache is None:
+        parser.error("say where samples and results are kept: --cache DIR, or the environment variable DERIVE_CACHE")
+    args.cache = Path(args.cache)
+    __import__(args.run)
+    return sys.modules[args.run].main(args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
