@@ -9,7 +9,7 @@
 
 mod data;
 
-use ckpt_doctor::knowledge::{Evidence, Expected, Library};
+use ckpt_doctor::knowledge::{Evidence, Expected, Library, Loader};
 use serde_json::{Value, json};
 
 use data::{Map, config, map, records};
@@ -17,7 +17,8 @@ use data::{Map, config, map, records};
 fn expect(config: &Value, stored: &Map) -> Expected {
     let library = Library::embedded();
     let evidence: Evidence = stored.iter().map(|(name, shape)| (name.clone(), Some(shape.clone()))).collect();
-    let architecture = library.find(config, stored.keys().map(String::as_str)).expect("a known architecture");
+    let architecture =
+        library.find(config, stored.keys().map(String::as_str), Loader::V4_47_0).expect("a known architecture");
     architecture.expect_given(config, &evidence).unwrap_or_else(|e| panic!("{e:?}"))
 }
 
@@ -127,7 +128,7 @@ fn hostile_configs_are_refused_in_a_sentence() {
     let llama = |patch: Value| {
         let mut config = json!({ "architectures": ["LlamaForCausalLM"], "model_type": "llama" });
         config.as_object_mut().expect("object").extend(patch.as_object().expect("object").clone());
-        Library::embedded().find(&config, []).expect("llama").expect(&config)
+        Library::embedded().find(&config, [], Loader::V4_47_0).expect("llama").expect(&config)
     };
     for (patch, says) in [
         (json!({ "num_hidden_layers": 2_147_483_648_u64 }), "more than 200000 tensors"),
@@ -152,8 +153,9 @@ fn hostile_configs_are_refused_in_a_sentence() {
 #[test]
 fn compositions_name_the_part_that_cannot_be_built() {
     let library = Library::embedded();
-    let refuse =
-        |config: Value| library.find(&config, []).expect("known").expect(&config).expect_err("refused").join("; ");
+    let refuse = |config: Value| {
+        library.find(&config, [], Loader::V4_47_0).expect("known").expect(&config).expect_err("refused").join("; ")
+    };
     let said = refuse(json!({ "model_type": "paligemma", "text_config": { "model_type": "mamba" } }));
     assert_eq!(said, "`text_config.model_type` is \"mamba\"; known here: gemma, gemma2, llama");
     let said = refuse(json!({ "model_type": "spatialvla", "vision_zoe_config": null }));
@@ -170,7 +172,7 @@ fn compositions_name_the_part_that_cannot_be_built() {
 #[test]
 fn the_class_decides_and_model_type_where_it_cannot() {
     let library = Library::embedded();
-    let found = |config: Value| library.find(&config, []).map(|a| a.name().to_owned());
+    let found = |config: Value| library.find(&config, [], Loader::V4_47_0).map(|a| a.name().to_owned());
     let some = |name: &str| Some(name.to_owned());
     assert_eq!(found(json!({ "architectures": ["Gemma2ForCausalLM"], "model_type": "llama" })), some("gemma2"));
     assert_eq!(found(json!({ "model_type": "clip_vision_model" })), some("clip_vision_model"));
@@ -181,7 +183,7 @@ fn the_class_decides_and_model_type_where_it_cannot() {
         ),
         some("spatialvla")
     );
-    assert_eq!(found(json!({ "model_type": "beit" })), None);
+    assert_eq!(found(json!({ "model_type": "unheard-of" })), None);
     assert_eq!(found(json!({})), None);
     assert_eq!(found(json!("config")), None);
 }
@@ -205,15 +207,121 @@ fn every_file_in_the_folder_parses_and_says_its_own_name() {
 #[test]
 fn a_user_adds_an_architecture_or_replaces_one() {
     let mut library = Library::embedded();
-    let text = r#"{ architecture: "mlp", summary: "", classes: ["Mlp"], sources: [], tensors: { "l.{i}": { repeat: { i: "c.n" }, weight: ["2", "3"], bias: "i > 0" } } }"#;
+    let text = r#"{ architecture: "mlp", summary: "", sources: [], loaders: ["4.47.0"],
+        classes: [{ class: "Mlp", tensors: { "l.{i}": { repeat: { i: "c.n" }, weight: ["2", "3"], bias: "i > 0" } } }] }"#;
     library.add(text).expect("parses");
     let config = json!({ "architectures": ["Mlp"], "n": 2 });
-    let expected = library.find(&config, []).expect("added").expect(&config).expect("built");
+    let expected = library.find(&config, [], Loader::V4_47_0).expect("added").expect(&config).expect("built");
     assert_eq!(expected.tensors.keys().collect::<Vec<_>>(), ["l.0.weight", "l.1.weight", "l.1.bias"]);
-    let endless = r#"{ architecture: "m", summary: "", classes: ["M"], sources: [], tensors: { "": { part: { by_model_type: { m: "m" }, untyped: "m" } } } }"#;
+    let endless = r#"{ architecture: "m", summary: "", sources: [], loaders: ["4.47.0"],
+        classes: [{ class: "M", tensors: { "": { part: { class: "M" } } } }] }"#;
     library.add(endless).expect("parses");
     let refused = library.architecture("m").expect("added").expect(&json!({})).expect_err("a part of itself");
     assert_eq!(refused, ["parts are nested more than 8 deep"]);
     let error = library.add(&text.replace("bias", "bais")).expect_err("misspelt");
     assert!(error.contains("bais"), "{error}");
+}
+
+/// Two files in the way derived ones are written: a composition whose parts differ by loader.
+fn small_library() -> Library {
+    let mut library = Library::embedded();
+    library
+        .add(
+            r#"{
+  architecture: "tower", summary: "", sources: [], model_types: ["tower"], loaders: ["4.47.0", "5.23.0"], derived: {},
+  auto: { model: "TowerModel" },
+  defaults: { width: 2, depth: 1 },
+  by_loader: { "5.23.0": { defaults: { depth: 2 }, auto: { model: "TowerForAll" } } },
+  conversions: { tower: [{ kind: "WeightRenaming", from: ["old"], to: ["new"] }], TowerForAll: "tower" },
+  let: { w: "c.width", unused: "c.only_some_have_it" },
+  classes: [
+    {
+      class: "TowerModel", base_model_prefix: "tower", ignore_missing: ["position_ids"],
+      tensors: {
+        "layers.{i}.": { repeat: { i: "c.depth" }, tensors: { "fc": { when: "i != 1 || major == 5", weight: ["w", "w"], bias: "major == 5" } } },
+        "pooler": { weight: ["w"] },
+        "ids": { buffer: true },
+      },
+    },
+    { class: "TowerForAll", loaders: ["5.23.0"], tensors: { "body.": { part: { class: "TowerModel", set: { width: "=w + 1" }, without: ["pooler."] } } } },
+  ],
+}"#,
+        )
+        .expect("parses");
+    library
+        .add(
+            r#"{
+  architecture: "house", summary: "", sources: [], model_types: ["house"], loaders: ["4.47.0", "5.23.0"], derived: {},
+  configs: { inner: { absent: {}, defaults: { name: "x" } , computed: { rooms: "7" } }, tower_config: { type: "tower", absent: { width: "=c.n" } } },
+  conversions: { HouseModel: [{ kind: "PrefixChange", from: ["^a"], to: ["b"], prefix_to_remove: "a" }] },
+  classes: [
+    {
+      class: "HouseModel", base_model_prefix: "model", ignore_unexpected: ["junk"],
+      tensors: {
+        "tower.": { part: { auto: "model", config: "tower_config" } },
+        "side.": { model: "TowerModel", model_type: "tower", tensors: {
+          "w": { shape: ["c.inner.rooms"] },
+          "deep.": { model: "TowerBlock", model_type: "tower", tensors: { "b": { buffer: true } } },
+        } },
+        "head.w": { shape: ["1"], tied_to: "side.w" },
+      },
+    },
+    { class: "HouseForSale", base_model_prefix: "model", base_module: true, tensors: { "model.": { part: { class: "HouseModel" } } } },
+  ],
+}"#,
+        )
+        .expect("parses");
+    library
+}
+
+#[test]
+fn a_composition_takes_its_parts_as_each_loader_builds_them() {
+    let library = small_library();
+    let config = json!({ "architectures": ["HouseForSale"], "n": 3, "tower_config": { "depth": null } });
+    let built = |config: &Value, loader| library.find(config, [], loader).expect("known").expect(config);
+    let refused = built(&config, Loader::V5_23_0).expect_err("depth is null, and null is no number");
+    assert!(refused[0].contains("c.depth"), "{refused:?}");
+    let config = json!({ "architectures": ["HouseForSale"], "n": 3 });
+
+    let old = built(&config, Loader::V4_47_0).expect("built");
+    let names: Vec<(&str, &[u64])> = old.tensors.iter().map(|(n, t)| (n.as_str(), t.shape.as_slice())).collect();
+    assert_eq!(
+        names,
+        [
+            ("model.tower.layers.0.fc.weight", [3, 3].as_slice()),
+            ("model.tower.pooler.weight", &[3]),
+            ("model.side.w", &[7]),
+            ("model.head.w", &[1]),
+        ]
+    );
+    assert_eq!(old.tensors["model.head.w"].tied_to.as_deref(), Some("model.side.w"));
+    assert_eq!((old.has_head, old.class.as_str(), old.model_type.as_str()), (true, "HouseForSale", "house"));
+    assert!(old.conversions.is_empty() && old.ignore_unexpected.is_empty(), "of the class alone");
+
+    let new = built(&config, Loader::V5_23_0).expect("built");
+    let names: Vec<&String> = new.tensors.keys().collect();
+    assert_eq!(
+        names,
+        [
+            "model.tower.body.layers.0.fc.weight",
+            "model.tower.body.layers.0.fc.bias",
+            "model.tower.body.layers.1.fc.weight",
+            "model.tower.body.layers.1.fc.bias",
+            "model.side.w",
+            "model.head.w",
+        ]
+    );
+    assert_eq!(new.tensors["model.tower.body.layers.0.fc.bias"].shape, [4]);
+    assert_eq!((new.ignore_missing, new.ignore_unexpected), (vec!["position_ids".to_owned()], vec!["junk".to_owned()]));
+    let steps: Vec<(&str, Option<&str>)> =
+        new.conversions.iter().map(|c| (c.from[0].as_str(), c.scope.as_deref())).collect();
+    // By class; by a class that shares another's rows; its part by model type, since that was not how the part's
+    // surroundings were found; a group by model type, and nothing for what is inside it.
+    assert_eq!(
+        steps[..4],
+        [("^a", Some("")), ("old", Some("tower")), ("old", Some("tower.body")), ("old", Some("side"))],
+        "and then those for every model"
+    );
+    assert_eq!((steps.len(), steps[4]), (9, ("LayerNorm.gamma", None)));
+    assert_eq!(new.conversions[0].extra["prefix_to_remove"], "a");
 }

@@ -247,6 +247,7 @@ const FAMILIES: &[(&str, &str)] = &[
 const KEYS: &[(&str, &str)] = &[
     ("Keys of a rule", "rule.rs"),
     ("Keys of an architecture", "architecture/blueprint.rs"),
+    ("Keys of an entry of `tensors`", "architecture/member.rs"),
     ("Keys of a processor", "processor.rs"),
     ("Keys of a recipe and of a merge file", "recipe.rs"),
 ];

@@ -11,7 +11,7 @@ mod data;
 
 use ckpt_doctor::check::finding::LoadReport;
 use ckpt_doctor::check::load::{Stored, predict};
-use ckpt_doctor::knowledge::Library;
+use ckpt_doctor::knowledge::{Library, Loader};
 
 use data::{Load, Map, Record, records};
 
@@ -20,7 +20,7 @@ fn difference(record: &Record, stored: Map, load: &Load) -> Option<String> {
     let library = Library::embedded();
     let stored = Stored::from_shapes(stored);
     let evidence = stored.evidence();
-    let architecture = library.find(&record.config, stored.names()).expect("a known class");
+    let architecture = library.find(&record.config, stored.names(), Loader::V4_47_0).expect("a known class");
     let expected = architecture.expect_given(&record.config, &evidence).unwrap_or_else(|e| panic!("{e:?}"));
     let report: LoadReport = predict(&expected, &stored);
     if load.error.is_some() || report.raises.is_some() {

@@ -11,7 +11,7 @@ use super::{facts, index, modules, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
-use crate::knowledge::{Expected, Library, Scope};
+use crate::knowledge::{Expected, Library, Loader, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
 const CAP: usize = 100;
@@ -61,7 +61,12 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     let stored = Stored::of(checkpoint);
     let evidence = stored.evidence();
     let config = checkpoint.config();
-    let architecture = config.and_then(|c| knowledge.library.find(c, stored.names()));
+    let architecture = config.and_then(|c| {
+        // A class that the config's own version does not know may be known to another one.
+        let mut loaders = Loader::ALL;
+        loaders.sort_by_key(|l| *l != Loader::of_config(c));
+        loaders.into_iter().find_map(|loader| knowledge.library.find(c, stored.names(), loader))
+    });
     let mut outcome = Outcome { architecture: architecture.map(|a| a.name().to_owned()), ..Outcome::default() };
     let mut expected: Option<Expected> = None;
     match (config, architecture) {

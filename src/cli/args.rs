@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use ckpt_doctor::check::Severity;
+use ckpt_doctor::knowledge::Loader;
 use ckpt_doctor::report::Format;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -13,6 +14,10 @@ pub struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
+    /// A folder laid out as the program's own rules: what it has in architectures/*.json5 is known too, or replaces what
+    /// has the same name
+    #[arg(long, value_name = "DIR", global = true)]
+    pub rules: Option<PathBuf>,
 }
 
 /// The subcommands.
@@ -22,10 +27,40 @@ pub enum Command {
     Check(CheckArgs),
     /// Build one checkpoint from parts of two
     BuildMerged(BuildMergedArgs),
+    /// Print the tensors that a model class has, by its config alone
+    Expect(ExpectArgs),
     /// Say all there is to say of one rule
     Explain(ExplainArgs),
     /// List the rules
     Rules,
+}
+
+/// Arguments of `expect`.
+#[derive(Debug, Args)]
+#[command(after_help = "Exit codes: 0 all were built, 1 one could not be, 2 a file could not be read.")]
+pub struct ExpectArgs {
+    /// A config.json, a directory that has one, or @FILE: lines of JSON with the config under \"config\" (and the class,
+    /// if it is not the config's, under \"class\")
+    #[arg(value_name = "CONFIG|DIR|@FILE", required = true)]
+    pub configs: Vec<String>,
+    /// The version that builds it, as transformers==4.47.0; the nearest known one stands for it, and without this the
+    /// one nearest to what the config names
+    #[arg(long = "for", value_name = "LOADER", value_parser = parse_loader)]
+    pub loader: Option<Loader>,
+    /// text: a tensor a line; json: a list; jsonl: an object a line for each config, and those that fail say why
+    #[arg(long, value_name = "FMT", default_value = "text")]
+    pub output_format: ExpectFormat,
+}
+
+/// Formats of `expect`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ExpectFormat {
+    /// A tensor a line.
+    Text,
+    /// A list of objects.
+    Json,
+    /// An object a line.
+    Jsonl,
 }
 
 /// Arguments of `explain`.
@@ -141,6 +176,13 @@ pub enum Color {
     Always,
     /// Never.
     Never,
+}
+
+fn parse_loader(text: &str) -> Result<Loader, String> {
+    match text.strip_prefix("transformers==") {
+        Some(version) if version.starts_with(|c: char| c.is_ascii_digit()) => Ok(Loader::nearest(version)),
+        _ => Err("write it as transformers==VERSION".to_owned()),
+    }
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {

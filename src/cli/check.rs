@@ -1,6 +1,7 @@
 //! `check`.
 
 use std::collections::BTreeSet;
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
@@ -10,11 +11,11 @@ use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::CheckpointReport;
 
 use super::args::CheckArgs;
-use super::output;
+use super::{library, output};
 
 /// Runs `check`.
-pub fn run(args: &CheckArgs) -> anyhow::Result<u8> {
-    let mut knowledge = Knowledge::embedded()?;
+pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+    let mut knowledge = Knowledge { library: library::with(rules)?, ..Knowledge::embedded()? };
     knowledge.rules.choose(&args.select, &args.ignore)?;
     let mut seen = BTreeSet::new();
     let mut reports = Vec::new();

@@ -3,6 +3,8 @@
 mod args;
 mod build_merged;
 mod check;
+mod expect;
+mod library;
 mod output;
 mod rules;
 
@@ -19,9 +21,10 @@ const FAILED: u8 = 2;
 
 /// Runs the program.
 pub fn main() -> ExitCode {
-    let command = args::Cli::parse().command;
+    let args::Cli { command, rules } = args::Cli::parse();
     let result = match &command {
-        args::Command::Check(args) => check::run(args),
+        args::Command::Check(args) => check::run(args, rules.as_deref()),
+        args::Command::Expect(args) => expect::run(args, rules.as_deref()),
         args::Command::BuildMerged(args) => build_merged::run(args),
         args::Command::Explain(args) => rules::explain(args),
         args::Command::Rules => rules::list(),

@@ -2,96 +2,66 @@
 
 mod blueprint;
 mod build;
+mod conversions;
+mod member;
+mod ordered;
+mod resolve;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::collections::BTreeSet;
 
 use indexmap::IndexMap;
 use serde_json::Value;
 
-pub(crate) use blueprint::Blueprint;
+pub(crate) use blueprint::{Blueprint, Class};
+pub use conversions::Conversion;
 
-use super::Library;
+use super::{Evidence, Library, Loader};
 
 /// Tensors an architecture may have; a config that asks for more is refused.
 pub const TENSOR_CAP: usize = 200_000;
 
-/// Tensors found in a checkpoint, by name, with their shape where it is known.
-///
-/// A few facts are in no config (the size of LLaVA-3D's CLIP tower): those are read off the tensors.
-#[derive(Debug, Clone, Default)]
-pub struct Evidence {
-    shapes: Arc<BTreeMap<String, Option<Vec<u64>>>>,
-}
-
-impl Evidence {
-    /// Shape of the tensor of this name, when there is one and its shape is known.
-    #[must_use]
-    pub fn shape(&self, name: &str) -> Option<&[u64]> {
-        self.shapes.get(name)?.as_deref()
-    }
-
-    /// Whether there is a tensor of this name.
-    #[must_use]
-    pub fn contains(&self, name: &str) -> bool {
-        self.shapes.contains_key(name)
-    }
-
-    /// One more than the largest number that follows `prefix` in a tensor's name; 0 when none does.
-    #[must_use]
-    pub fn count(&self, prefix: &str) -> u64 {
-        let index = |name: &str| -> Option<u64> {
-            let rest = name.strip_prefix(prefix)?;
-            rest.split_once('.').map_or(rest, |(index, _)| index).parse().ok()
-        };
-        let names = self.shapes.range(prefix.to_owned()..).map(|(name, _)| name.as_str());
-        names.take_while(|name| name.starts_with(prefix)).filter_map(index).max().map_or(0, |n| n.saturating_add(1))
-    }
-}
-
-impl FromIterator<(String, Option<Vec<u64>>)> for Evidence {
-    fn from_iter<I: IntoIterator<Item = (String, Option<Vec<u64>>)>>(tensors: I) -> Self {
-        Self { shapes: Arc::new(tensors.into_iter().collect()) }
-    }
-}
-
-/// Names alone.
-impl<'n> FromIterator<&'n str> for Evidence {
-    fn from_iter<I: IntoIterator<Item = &'n str>>(names: I) -> Self {
-        names.into_iter().map(|name| (name.to_owned(), None)).collect()
-    }
-}
-
-/// A model class of the library.
+/// A model class of the library, as one loader builds it.
 #[derive(Clone, Copy)]
 pub struct Architecture<'l> {
     library: &'l Library,
-    blueprint: &'l Blueprint,
-    /// Only the base module of the class, such as `LlamaModel`.
-    base: bool,
+    file: &'l Blueprint,
+    class: &'l Class,
+    loader: Loader,
 }
 
 impl<'l> Architecture<'l> {
-    pub(crate) const fn new(library: &'l Library, blueprint: &'l Blueprint, base: bool) -> Self {
-        Self { library, blueprint, base }
+    pub(crate) const fn new(library: &'l Library, file: &'l Blueprint, class: &'l Class, loader: Loader) -> Self {
+        Self { library, file, class, loader }
     }
 
-    /// Its name: the stem of its file.
+    /// Its name: the stem of its file, in most cases the `model_type`.
     #[must_use]
     pub fn name(&self) -> &'l str {
-        &self.blueprint.architecture
+        &self.file.architecture
+    }
+
+    /// The class, as in `architectures` of config.json.
+    #[must_use]
+    pub fn class(&self) -> &'l str {
+        &self.class.name
+    }
+
+    /// The loader that builds it.
+    #[must_use]
+    pub const fn loader(&self) -> Loader {
+        self.loader
     }
 
     /// One line on what it is.
     #[must_use]
     pub fn summary(&self) -> &'l str {
-        &self.blueprint.summary
+        &self.file.summary
     }
 
     /// Where its facts come from.
     #[must_use]
     pub fn sources(&self) -> &'l [String] {
-        &self.blueprint.sources
+        &self.file.sources
     }
 
     /// The tensors the class builds from `config`, the content of config.json.
@@ -107,25 +77,27 @@ impl<'l> Architecture<'l> {
     /// # Errors
     /// As [`Self::expect`].
     pub fn expect_given(&self, config: &Value, evidence: &Evidence) -> Result<Expected, Vec<String>> {
-        let mut expected = build::build(self.library, self.blueprint, config, evidence)?;
-        if self.base {
-            expected.keep_base();
-        }
-        Ok(expected)
+        build::build(*self, config, evidence)
     }
 }
 
 impl std::fmt::Debug for Architecture<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.name())
+        write!(f, "{} ({}, transformers {})", self.class(), self.name(), self.loader)
     }
 }
 
 /// The state dict a model class has for one config, and what its loader knows besides.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Expected {
     /// Name of the architecture.
     pub architecture: String,
+    /// The loader that builds it so.
+    pub loader: Loader,
+    /// The class.
+    pub class: String,
+    /// The `model_type` of its config; empty when it has none.
+    pub model_type: String,
     /// The config with the class's defaults filled in, sub-configs included.
     pub config: Value,
     /// Tensors in the order of the class's state dict.
@@ -136,6 +108,32 @@ pub struct Expected {
     pub base_model_prefix: String,
     /// Whether the class holds its base model in an attribute of that name, that is, has a head.
     pub has_head: bool,
+    /// Regular expressions (searched for, not matched) of names whose absence the loader does not report: of the class
+    /// and, for transformers 5, of its parts.
+    pub ignore_missing: Vec<String>,
+    /// As `ignore_missing`, of names whose presence is not reported.
+    pub ignore_unexpected: Vec<String>,
+    /// What transformers 5 renames and converts, in the order of application; empty for transformers 4.
+    pub conversions: Vec<Conversion>,
+}
+
+impl Default for Expected {
+    fn default() -> Self {
+        Self {
+            architecture: String::new(),
+            loader: Loader::V4_47_0,
+            class: String::new(),
+            model_type: String::new(),
+            config: Value::Null,
+            tensors: IndexMap::new(),
+            buffers: BTreeSet::new(),
+            base_model_prefix: String::new(),
+            has_head: false,
+            ignore_missing: Vec::new(),
+            ignore_unexpected: Vec::new(),
+            conversions: Vec::new(),
+        }
+    }
 }
 
 /// A tensor of an [`Expected`] state dict.
@@ -164,20 +162,5 @@ impl Expected {
         let found: BTreeSet<String> =
             self.tensors.iter().filter(|(name, _)| present(name)).filter_map(|(_, t)| t.optional.clone()).collect();
         self.tensors.retain(|_, tensor| tensor.optional.as_ref().is_none_or(|group| found.contains(group)));
-    }
-
-    /// Reduces a class with a head to its base module.
-    fn keep_base(&mut self) {
-        let prefix = format!("{}.", self.base_model_prefix);
-        let strip = |name: &str| name.strip_prefix(&prefix).map(str::to_owned);
-        self.tensors = std::mem::take(&mut self.tensors)
-            .into_iter()
-            .filter_map(|(name, tensor)| {
-                let tied_to = tensor.tied_to.as_deref().and_then(strip);
-                Some((strip(&name)?, ExpectedTensor { tied_to, ..tensor }))
-            })
-            .collect();
-        self.buffers = self.buffers.iter().filter_map(|name| strip(name)).collect();
-        self.has_head = false;
     }
 }

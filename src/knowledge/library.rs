@@ -6,9 +6,13 @@ use std::sync::OnceLock;
 use include_dir::{Dir, include_dir};
 use serde_json::Value;
 
-use super::architecture::{Architecture, Blueprint};
+use super::Loader;
+use super::architecture::{Architecture, Blueprint, Class};
 
 static ARCHITECTURES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules/architectures");
+
+/// What `AutoModel…` mappings are asked for when a config names a model type and no class, in this order.
+const AUTO: [&str; 5] = ["causal_lm", "image_text_to_text", "vision_2_seq", "seq_to_seq_causal_lm", "model"];
 
 /// All known architectures. A file is parsed when it is first needed.
 #[derive(Default)]
@@ -37,7 +41,7 @@ impl Library {
         Self { files }
     }
 
-    /// Adds an architecture, or replaces the one of the same name.
+    /// Adds an architecture file, or replaces the one of the same name.
     ///
     /// # Errors
     /// Says what is wrong with `text`, and where.
@@ -54,52 +58,92 @@ impl Library {
         self.files.iter().map(|file| file.stem.as_str())
     }
 
-    /// The architecture of this name.
+    /// The architecture of this name: the first class of its file, under the first loader it is known for.
     #[must_use]
     pub fn architecture(&self, name: &str) -> Option<Architecture<'_>> {
-        self.blueprint(name).map(|blueprint| Architecture::new(self, blueprint, false))
+        let file = self.files.iter().find(|file| file.stem == name)?.blueprint();
+        Loader::ALL
+            .into_iter()
+            .find_map(|loader| Some(Architecture::new(self, file, file.classes(loader).next()?, loader)))
     }
 
-    /// The architecture of the checkpoint with this config.json and these tensors.
+    /// The class of this name, as `loader` builds it.
+    #[must_use]
+    pub fn class(&self, name: &str, loader: Loader) -> Option<Architecture<'_>> {
+        self.entry(name, loader).map(|(file, class)| Architecture::new(self, file, class, loader))
+    }
+
+    /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
     /// The class in `architectures` decides; where it is absent, or custom code may stand behind an unknown
-    /// name (`auto_map`), `model_type` does. Where several files describe one class, the tensors choose.
+    /// name (`auto_map`), `model_type` does. Where several entries describe one class, the tensors choose.
     #[must_use]
-    pub fn find<'n>(&self, config: &Value, names: impl IntoIterator<Item = &'n str>) -> Option<Architecture<'_>> {
+    pub fn find<'n>(
+        &self,
+        config: &Value,
+        names: impl IntoIterator<Item = &'n str>,
+        loader: Loader,
+    ) -> Option<Architecture<'_>> {
         let mut names = names.into_iter();
         let class = config.get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
-        if let Some(class) = class {
-            let base = |blueprint: &Blueprint| blueprint.base_class.as_deref() == Some(class);
-            let of_class = |blueprint: &Blueprint| base(blueprint) || blueprint.classes.iter().any(|c| c == class);
-            if let Some(blueprint) = self.choose(class, of_class, &mut names) {
-                return Some(Architecture::new(self, blueprint, base(blueprint)));
+        let candidates = class.map(|class| self.entries(class, loader)).unwrap_or_default();
+        let (file, class) = match choose(candidates, &mut names) {
+            Some(found) => found,
+            None if class.is_some() && config.get("auto_map").is_none() => return None,
+            None => {
+                let model_type = config.get("model_type").and_then(Value::as_str)?;
+                let files = self.mentioning(model_type).filter(|f| f.model_types.iter().any(|t| t == model_type));
+                choose(files.filter_map(|file| Some((file, main_class(file, loader)?))).collect(), &mut names)?
             }
-            config.get("auto_map")?;
-        }
-        let model_type = config.get("model_type").and_then(Value::as_str)?;
-        let fits = |blueprint: &Blueprint| blueprint.model_types.iter().any(|t| t == model_type);
-        self.choose(model_type, fits, &mut names).map(|blueprint| Architecture::new(self, blueprint, false))
+        };
+        Some(Architecture::new(self, file, class, loader))
     }
 
-    pub(super) fn blueprint(&self, name: &str) -> Option<&Blueprint> {
-        self.files.iter().find(|file| file.stem == name).map(File::blueprint)
+    /// The entry of a class, when the tensors need not choose.
+    pub(super) fn entry(&self, class: &str, loader: Loader) -> Option<(&Blueprint, &Class)> {
+        choose(self.entries(class, loader), &mut std::iter::empty())
     }
 
-    fn choose<'n>(
-        &self,
-        word: &str,
-        fits: impl Fn(&Blueprint) -> bool,
-        names: &mut impl Iterator<Item = &'n str>,
-    ) -> Option<&Blueprint> {
-        let quoted = format!("{word:?}");
-        // A file that does not contain the word need not be parsed.
-        let candidates: Vec<&Blueprint> =
-            self.files.iter().filter(|f| f.text.contains(&quoted)).map(File::blueprint).filter(|b| fits(b)).collect();
-        let (chosen, plain): (Vec<_>, Vec<_>) = candidates.into_iter().partition(|b| !b.chosen_by.is_empty());
-        let speaks_for = |b: &Blueprint, name: &str| b.chosen_by.iter().any(|prefix| name.starts_with(prefix));
-        let mut voted = names.filter_map(|name| chosen.iter().find(|b| speaks_for(b, name)));
-        if chosen.is_empty() { None } else { voted.next().copied() }.or_else(|| plain.first().copied())
+    fn entries(&self, class: &str, loader: Loader) -> Vec<(&Blueprint, &Class)> {
+        let of_file = |file| Blueprint::classes(file, loader).filter(|c| c.name == class).map(move |c| (file, c));
+        self.mentioning(class).flat_map(of_file).collect()
     }
+
+    /// The file of the config class of this model type.
+    pub(super) fn of_model_type(&self, model_type: &str) -> Option<&Blueprint> {
+        let files = || self.mentioning(model_type).filter(|f| f.model_types.iter().any(|t| t == model_type));
+        files().find(|f| f.classes.iter().all(|c| c.chosen_by.is_empty())).or_else(|| files().next())
+    }
+
+    /// The file with the conversions of this class or model type.
+    pub(super) fn with_conversions(&self, identifier: &str) -> Option<&Blueprint> {
+        self.mentioning(identifier).find(|f| f.conversions.contains_key(identifier))
+    }
+
+    /// Files in which this word stands: the others need not be parsed.
+    fn mentioning(&self, word: &str) -> impl Iterator<Item = &Blueprint> {
+        let finder = memchr::memmem::Finder::new(word).into_owned();
+        self.files.iter().filter(move |f| finder.find(f.text.as_bytes()).is_some()).map(File::blueprint)
+    }
+}
+
+/// The class that a config of this file means when it names none.
+fn main_class(file: &Blueprint, loader: Loader) -> Option<&Class> {
+    let mapped = AUTO.iter().find_map(|mapping| {
+        let class = file.auto(mapping, loader)?;
+        file.classes(loader).find(|c| c.name == class)
+    });
+    mapped.or_else(|| file.classes(loader).next())
+}
+
+fn choose<'f, 'n>(
+    candidates: Vec<(&'f Blueprint, &'f Class)>,
+    names: &mut impl Iterator<Item = &'n str>,
+) -> Option<(&'f Blueprint, &'f Class)> {
+    let (chosen, plain): (Vec<_>, Vec<_>) = candidates.into_iter().partition(|(_, c)| !c.chosen_by.is_empty());
+    let speaks_for = |class: &Class, name: &str| class.chosen_by.iter().any(|prefix| name.starts_with(prefix));
+    let mut voted = names.filter_map(|name| chosen.iter().find(|(_, c)| speaks_for(c, name)));
+    if chosen.is_empty() { None } else { voted.next().copied() }.or_else(|| plain.first().copied())
 }
 
 impl std::fmt::Debug for Library {

@@ -1,14 +1,18 @@
 //! What should be: rules, architectures and recipes read from `rules/`, and their expressions.
 
 pub mod architecture;
+pub mod evidence;
 pub mod expression;
 pub mod library;
+pub mod loader;
 pub mod processor;
 pub mod recipe;
 pub mod rule;
 pub mod selection;
 pub mod source;
 
-pub use architecture::{Architecture, Evidence, Expected, ExpectedTensor};
+pub use architecture::{Architecture, Conversion, Expected, ExpectedTensor};
+pub use evidence::Evidence;
 pub use expression::{EvalError, Expression, Scope, Template};
 pub use library::Library;
+pub use loader::Loader;

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use ckpt_doctor::check::Knowledge;
+use ckpt_doctor::knowledge::Loader;
 use ckpt_doctor::surgery::merge::pipeline::{self, Request};
 use serde_json::Value;
 
@@ -63,7 +64,7 @@ fn documents(name: &str, dir: &Path, shards: usize, knowledge: &Knowledge) {
     copy(&project().join("fixtures/bases").join(name), dir);
     let config: Value =
         serde_json::from_str(&fs::read_to_string(dir.join("config.json")).expect("text")).expect("JSON");
-    let architecture = knowledge.library.find(&config, []).expect("a known class");
+    let architecture = knowledge.library.find(&config, [], Loader::of_config(&config)).expect("a known class");
     let expected = architecture.expect(&config).unwrap_or_else(|e| panic!("{name}: {e:?}"));
     let tensors: Vec<_> = expected.tensors.iter().filter(|(_, t)| t.tied_to.is_none()).collect();
     let mut weights = Weights::default();

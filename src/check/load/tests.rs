@@ -4,14 +4,14 @@ use serde_json::json;
 
 use super::*;
 use crate::checkpoint::{Dtype, Shard, Tensor};
-use crate::knowledge::{ExpectedTensor, Library};
+use crate::knowledge::{ExpectedTensor, Library, Loader};
 
 type Shapes = BTreeMap<String, Vec<u64>>;
 
 fn llama(tie: bool) -> Expected {
     let config = json!({ "architectures": ["LlamaForCausalLM"], "hidden_size": 4, "intermediate_size": 8, "num_attention_heads": 2,
         "num_hidden_layers": 1, "vocab_size": 10, "tie_word_embeddings": tie });
-    Library::embedded().find(&config, []).expect("llama").expect(&config).expect("built")
+    Library::embedded().find(&config, [], Loader::V4_47_0).expect("llama").expect(&config).expect("built")
 }
 
 fn all(expected: &Expected) -> Shapes {
@@ -69,7 +69,7 @@ fn a_full_checkpoint_loads_into_the_base_class() {
     let whole = llama(false);
     let config = json!({ "architectures": ["LlamaModel"], "hidden_size": 4, "intermediate_size": 8, "num_attention_heads": 2,
         "num_hidden_layers": 1, "vocab_size": 10 });
-    let base = Library::embedded().find(&config, []).expect("llama").expect(&config).expect("built");
+    let base = Library::embedded().find(&config, [], Loader::V4_47_0).expect("llama").expect(&config).expect("built");
     let mut stored = all(&whole);
     stored.insert("model.norm.weight".to_owned(), vec![5]);
     let report = predict(&base, &Stored::from_shapes(stored));

@@ -1,18 +1,20 @@
-//! The form of `rules/architectures/*.json5`: an architecture as it is written down.
+//! The form of `rules/architectures/*.json5`: a config class, and the model classes that are built from it.
 
-use std::fmt;
-use std::marker::PhantomData;
+use std::collections::BTreeMap;
 
-use serde::de::{Error as _, MapAccess, Visitor};
-use serde::{Deserialize, Deserializer};
+use serde::Deserialize;
+use serde::de::IgnoredAny;
 use serde_json::{Map, Value};
 
-use crate::knowledge::{Expression, Template};
+use super::conversions::Rows;
+use super::member::Member;
+use super::ordered::ordered;
+use crate::knowledge::{Expression, Loader, Template};
 
 /// One architecture file.
 ///
-/// Expressions see the config, defaults filled in, as `c`, the names of `let`, and the indices of
-/// the repeats around them.
+/// Expressions see the config, defaults filled in, as `c`, the loader's major version as `major`, the names of
+/// `let`, and the indices of the repeats around them.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Blueprint {
@@ -20,40 +22,84 @@ pub(crate) struct Blueprint {
     pub architecture: String,
     /// One line on what it is.
     pub summary: String,
-    /// Model classes it describes, as in `architectures` of config.json.
-    pub classes: Vec<String>,
-    /// The class that is this one's base module alone, such as `LlamaModel`.
-    #[serde(default)]
-    pub base_class: Option<String>,
-    /// `model_type` values that mean this class when config.json names no class.
+    /// `model_type` values of the config class.
     #[serde(default)]
     pub model_types: Vec<String>,
     /// Where the facts come from.
     pub sources: Vec<String>,
-    /// The class's `base_model_prefix`.
+    /// Loaders the file speaks for.
+    pub loaders: Vec<Loader>,
+    /// By version: how many samples it was derived from, and on how many unseen configs each class was verified.
+    /// Absent in files written by hand.
     #[serde(default)]
-    pub base_model_prefix: String,
-    /// Whether the class holds its base model in an attribute of that name.
+    pub derived: Option<IgnoredAny>,
+    /// Classes that `AutoModel…` builds for this config class: `model`, `causal_lm` and so on.
     #[serde(default)]
-    pub base_module: bool,
-    /// Tensor-name prefixes that speak for this file over another one of the same class.
-    #[serde(default)]
-    pub chosen_by: Vec<String>,
+    auto: BTreeMap<String, String>,
     /// Values of config keys that are absent.
     #[serde(default)]
-    pub defaults: Map<String, Value>,
+    defaults: Map<String, Value>,
     /// Values of config keys that are absent or null, computed from the others, in order.
     #[serde(default, deserialize_with = "ordered")]
-    pub computed: Vec<(String, Expression)>,
-    /// What must hold for the class to be built at all; checked before `computed`.
+    computed: Vec<(String, Expression)>,
+    /// Sub-configs: how each is resolved.
+    #[serde(default, deserialize_with = "ordered")]
+    configs: Vec<(String, SubConfig)>,
+    /// By version, what that loader has different of the four above: merged over them key by key.
+    #[serde(default)]
+    by_loader: BTreeMap<Loader, ConfigClass>,
+    /// What must hold for the classes to be built at all; checked before `computed`.
     #[serde(default)]
     pub require: Vec<Requirement>,
-    /// Names for what the shapes below say often, in order.
+    /// Names for what the shapes of all classes say often, in order.
     #[serde(default, rename = "let", deserialize_with = "ordered")]
     pub lets: Vec<(String, Expression)>,
-    /// The tensors, in the order of the class's state dict.
-    #[serde(deserialize_with = "ordered")]
-    pub tensors: Vec<(Template, Member)>,
+    /// Renamings and merges that transformers 5 does at load, by the class or `model_type` it looks them up by: a list
+    /// of rows (`kind`, `from`, `to`, `ops`), or the identifier whose rows they share.
+    #[serde(default)]
+    pub conversions: BTreeMap<String, Rows>,
+    /// The model classes.
+    pub classes: Vec<Class>,
+}
+
+/// What a config class fills in under one loader, and what it means.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ConfigClass {
+    /// As in the file.
+    #[serde(default)]
+    pub auto: BTreeMap<String, String>,
+    /// As in the file.
+    #[serde(default)]
+    pub defaults: Map<String, Value>,
+    /// As in the file.
+    #[serde(default, deserialize_with = "ordered")]
+    pub computed: Vec<(String, Expression)>,
+    /// As in the file; each field that an entry gives replaces that field.
+    #[serde(default, deserialize_with = "ordered")]
+    pub configs: Vec<(String, SubConfig)>,
+}
+
+/// How the config inside a config gets its values. In `absent` and `set` a string that starts with `=` is an
+/// expression over the outer `c`.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct SubConfig {
+    /// The `model_type` of one that names none; the file of that model type fills in the rest.
+    #[serde(default, rename = "type")]
+    pub model_type: Option<String>,
+    /// The sub-config when there is none, before that; without it, none is none.
+    #[serde(default)]
+    pub absent: Option<Map<String, Value>>,
+    /// Values that are written over the given ones.
+    #[serde(default)]
+    pub set: Map<String, Value>,
+    /// Values of keys that are absent, for one without a model type.
+    #[serde(default)]
+    pub defaults: Map<String, Value>,
+    /// As in the file, over the sub-config.
+    #[serde(default, deserialize_with = "ordered")]
+    pub computed: Vec<(String, Expression)>,
 }
 
 /// A condition on the config, and what to say when it does not hold.
@@ -66,158 +112,96 @@ pub(crate) struct Requirement {
     pub message: Template,
 }
 
-/// An entry of `tensors`: its name is a template, and says one of `shape`, `weight`, `buffer`, `tensors`, `part`.
-#[derive(Debug, Clone, Deserialize)]
-#[serde(deny_unknown_fields, try_from = "RawMember")]
-pub(crate) struct Member {
-    pub when: Option<Expression>,
-    pub repeat: Vec<(String, Expression)>,
-    pub lets: Vec<(String, Expression)>,
-    pub optional: Option<String>,
-    pub kind: Kind,
-}
-
-/// What an entry stands for.
-#[derive(Debug, Clone)]
-pub(crate) enum Kind {
-    /// One tensor of this name and shape.
-    Tensor { shape: Vec<Expression>, tied: Option<Tied> },
-    /// `NAME.weight` of this shape and, on the condition, `NAME.bias` of its first dimension.
-    Layer { weight: Vec<Expression>, bias: Option<Expression>, tied: Option<Tied> },
-    /// A buffer that is in the model and not in its state dict.
-    Buffer,
-    /// Entries whose names start with this one.
-    Group(Vec<(Template, Member)>),
-    /// Another architecture under this prefix.
-    Part(Part),
-}
-
-/// Sharing of storage with another tensor.
-#[derive(Debug, Clone)]
-pub(crate) struct Tied {
-    pub to: Template,
-    pub when: Option<Expression>,
-}
-
-/// Another architecture as part of this one.
+/// A model class.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Part {
-    /// Key of the sub-config that governs it; without one, only `set` does.
+pub(crate) struct Class {
+    /// Its name, as in `architectures` of config.json.
+    #[serde(rename = "class")]
+    pub name: String,
+    /// Loaders this entry speaks for; those of the file when absent.
     #[serde(default)]
-    pub config: Option<String>,
-    /// Architecture by the sub-config's `model_type`.
-    pub by_model_type: Map<String, Value>,
-    /// The `model_type` of a sub-config that names none.
-    pub untyped: String,
-    /// The sub-config when there is none. A string that starts with `=` is an expression over this `c`.
+    pub loaders: Option<Vec<Loader>>,
+    /// The class's `base_model_prefix`.
     #[serde(default)]
-    pub absent: Option<Map<String, Value>>,
-    /// Values that override the sub-config's, written as in `absent`.
+    pub base_model_prefix: String,
+    /// Whether the class holds its base model in an attribute of that name.
     #[serde(default)]
-    pub set: Map<String, Value>,
-}
-
-/// An entry of `tensors` as it is written: its name is a template, and it says one of `shape`, `weight`, `buffer`,
-/// `tensors`, `part`.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct RawMember {
-    /// The entry counts only then.
+    pub base_module: bool,
+    /// Regular expressions of names whose absence the loader does not report; the class's own.
     #[serde(default)]
-    when: Option<Expression>,
-    /// Names that run from 0 to below their counts, in the entry's name as `{i}`.
-    #[serde(default, deserialize_with = "ordered")]
-    repeat: Vec<(String, Expression)>,
-    /// Names for what is said often, in order.
+    pub ignore_missing: Vec<String>,
+    /// Regular expressions of names whose presence the loader does not report; the class's own.
+    #[serde(default)]
+    pub ignore_unexpected: Vec<String>,
+    /// Tensor-name prefixes that speak for this entry over another one of the same name.
+    #[serde(default)]
+    pub chosen_by: Vec<String>,
+    /// Names for what the shapes below say often, in order.
     #[serde(default, rename = "let", deserialize_with = "ordered")]
-    lets: Vec<(String, Expression)>,
-    /// Name of a group that a checkpoint has whole or not at all.
-    #[serde(default)]
-    optional: Option<String>,
-    /// One tensor of this name: its dimensions, outermost first.
-    #[serde(default)]
-    shape: Option<Vec<Expression>>,
-    /// `NAME.weight` of these dimensions.
-    #[serde(default)]
-    weight: Option<Vec<Expression>>,
-    /// Beside `weight`: when there is a `NAME.bias` of the first dimension.
-    #[serde(default)]
-    bias: Option<Expression>,
-    /// Tensor whose storage it shares.
-    #[serde(default)]
-    tied_to: Option<Template>,
-    /// It does so only then.
-    #[serde(default)]
-    tied_when: Option<Expression>,
-    /// A buffer that is in the model and not in its state dict.
-    #[serde(default)]
-    buffer: bool,
-    /// Entries whose names start with this one's.
-    #[serde(default, deserialize_with = "ordered_option")]
-    tensors: Option<Vec<(Template, Member)>>,
-    /// Another architecture under this prefix.
-    #[serde(default)]
-    part: Option<Part>,
+    pub lets: Vec<(String, Expression)>,
+    /// The tensors, in the order of the class's state dict.
+    #[serde(deserialize_with = "ordered")]
+    pub tensors: Vec<(Template, Member)>,
 }
 
-impl TryFrom<RawMember> for Member {
-    type Error = String;
+impl Blueprint {
+    /// The entries that a loader knows.
+    pub fn classes(&self, loader: Loader) -> impl Iterator<Item = &Class> {
+        self.classes.iter().filter(move |c| c.loaders.as_ref().unwrap_or(&self.loaders).contains(&loader))
+    }
 
-    fn try_from(raw: RawMember) -> Result<Self, String> {
-        let tied = match (raw.tied_to, raw.tied_when) {
-            (Some(to), when) => Some(Tied { to, when }),
-            (None, None) => None,
-            (None, Some(_)) => return Err("`tied_when` needs `tied_to`".to_owned()),
+    /// What the config class fills in under one loader.
+    pub fn config(&self, loader: Loader) -> ConfigClass {
+        let mut config = ConfigClass {
+            auto: self.auto.clone(),
+            defaults: self.defaults.clone(),
+            computed: self.computed.clone(),
+            configs: self.configs.clone(),
         };
-        let bare = raw.bias.is_none() && tied.is_none();
-        let kind = match (raw.shape, raw.weight, raw.buffer, raw.tensors, raw.part) {
-            (Some(shape), None, false, None, None) if raw.bias.is_none() => Kind::Tensor { shape, tied },
-            (None, Some(weight), false, None, None) => Kind::Layer { weight, bias: raw.bias, tied },
-            (None, None, true, None, None) if bare => Kind::Buffer,
-            (None, None, false, Some(tensors), None) if bare => Kind::Group(tensors),
-            (None, None, false, None, Some(part)) if bare && raw.repeat.is_empty() => Kind::Part(part),
-            _ => return Err("an entry says exactly one of `shape`, `weight`, `buffer`, `tensors`, `part`".to_owned()),
-        };
-        Ok(Self { when: raw.when, repeat: raw.repeat, lets: raw.lets, optional: raw.optional, kind })
+        if let Some(other) = self.by_loader.get(&loader) {
+            config.auto.extend(other.auto.clone());
+            config.defaults.extend(other.defaults.clone());
+            overlay(&mut config.computed, &other.computed, |old, new| *old = new.clone());
+            overlay(&mut config.configs, &other.configs, SubConfig::overlay);
+        }
+        config
+    }
+
+    /// The class that `AutoModel…` builds under one loader.
+    pub fn auto(&self, mapping: &str, loader: Loader) -> Option<&str> {
+        let own = self.by_loader.get(&loader).and_then(|other| other.auto.get(mapping));
+        own.or_else(|| self.auto.get(mapping)).map(String::as_str)
+    }
+
+    /// Whether its classes are code that came with a checkpoint, which transformers 5 loads without conversions.
+    pub fn is_custom_code(&self) -> bool {
+        self.derived.is_none() && self.conversions.is_empty()
     }
 }
 
-/// A map in the order it was written; a key given twice is an error.
-fn ordered<'de, D, K, V>(deserializer: D) -> Result<Vec<(K, V)>, D::Error>
-where
-    D: Deserializer<'de>,
-    K: Deserialize<'de> + fmt::Display,
-    V: Deserialize<'de>,
-{
-    struct Ordered<K, V>(PhantomData<(K, V)>);
-    impl<'de, K: Deserialize<'de> + fmt::Display, V: Deserialize<'de>> Visitor<'de> for Ordered<K, V> {
-        type Value = Vec<(K, V)>;
-
-        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            f.write_str("a map")
+impl SubConfig {
+    /// Each field that `other` gives replaces this one's; defaults and computed values key by key.
+    fn overlay(&mut self, other: &Self) {
+        if other.model_type.is_some() {
+            self.model_type.clone_from(&other.model_type);
         }
-
-        fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
-            let mut seen = std::collections::HashSet::new();
-            let mut entries = Vec::new();
-            while let Some((key, value)) = map.next_entry::<K, V>()? {
-                if !seen.insert(key.to_string()) {
-                    return Err(A::Error::custom(format!("`{key}` is given twice")));
-                }
-                entries.push((key, value));
-            }
-            Ok(entries)
+        if other.absent.is_some() {
+            self.absent.clone_from(&other.absent);
         }
+        if !other.set.is_empty() {
+            self.set.clone_from(&other.set);
+        }
+        self.defaults.extend(other.defaults.clone());
+        overlay(&mut self.computed, &other.computed, |old, new| *old = new.clone());
     }
-    deserializer.deserialize_map(Ordered(PhantomData))
 }
 
-fn ordered_option<'de, D, K, V>(deserializer: D) -> Result<Option<Vec<(K, V)>>, D::Error>
-where
-    D: Deserializer<'de>,
-    K: Deserialize<'de> + fmt::Display,
-    V: Deserialize<'de>,
-{
-    ordered(deserializer).map(Some)
+fn overlay<T: Clone>(base: &mut Vec<(String, T)>, other: &[(String, T)], merge: impl Fn(&mut T, &T)) {
+    for (key, new) in other {
+        match base.iter_mut().find(|(k, _)| k == key) {
+            Some((_, old)) => merge(old, new),
+            None => base.push((key.clone(), new.clone())),
+        }
+    }
 }

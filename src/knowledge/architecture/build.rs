@@ -1,20 +1,21 @@
-//! From a blueprint and a config to the tensors a class has.
+//! From a class and a config to the tensors it has.
 
 use serde_json::{Map, Value};
 
-use super::blueprint::{Blueprint, Kind, Member, Part, Tied};
-use super::{Evidence, Expected, ExpectedTensor, TENSOR_CAP};
-use crate::knowledge::{EvalError, Expression, Library, Scope, Template};
+use super::blueprint::{Blueprint, Class};
+use super::conversions::{self, Module};
+use super::member::{Kind, Member, Part, Tied};
+use super::resolve::{DEPTH_CAP, Resolver, at_path, evaluated, model_type};
+use super::{Architecture, Evidence, Expected, ExpectedTensor, TENSOR_CAP};
+use crate::knowledge::{EvalError, Expression, Scope, Template};
 
 /// Entries visited before a config is refused: repeats whose conditions are all false cost time too.
 const STEP_CAP: usize = 2_000_000;
 /// Longest tensor name that is made; parts of names may come from the config.
 const NAME_CAP: usize = 1_000;
-/// Depth of parts within parts.
-const DEPTH_CAP: usize = 8;
 
 /// One sentence on why a class cannot be built.
-struct Refusal(String);
+pub(super) struct Refusal(pub String);
 
 impl From<EvalError> for Refusal {
     fn from(e: EvalError) -> Self {
@@ -22,132 +23,155 @@ impl From<EvalError> for Refusal {
     }
 }
 
-type Outcome<T> = Result<T, Refusal>;
+pub(super) type Outcome<T> = Result<T, Refusal>;
 
 pub(super) fn build(
-    library: &Library,
-    blueprint: &Blueprint,
+    architecture: Architecture<'_>,
     config: &Value,
     evidence: &Evidence,
 ) -> Result<Expected, Vec<String>> {
     let Value::Object(config) = config else { return Err(vec!["the config is not an object".to_owned()]) };
-    let mut builder = Builder { library, evidence, expected: Expected::default(), steps: 0 };
-    let outcome = builder.resolve(blueprint, config.clone(), 0).and_then(|config| {
-        builder.emit(blueprint, &config, Place::default())?;
+    let Architecture { library, file, class, loader } = architecture;
+    let resolver = Resolver { library, loader, evidence };
+    let mut builder = Builder { resolver, expected: Expected::default(), modules: Vec::new(), steps: 0 };
+    let outcome = resolver.resolve(file, config.clone(), 0).and_then(|config| {
+        let scope = resolver.scope(&config);
+        builder.class(file, class, Config { map: &config, scope: &scope }, Place::default())?;
         Ok(config)
     });
     match outcome {
-        Ok(config) => Ok(Expected {
-            architecture: blueprint.architecture.clone(),
-            config: Value::Object(config),
-            base_model_prefix: blueprint.base_model_prefix.clone(),
-            has_head: blueprint.base_module,
-            ..builder.expected
-        }),
+        Ok(config) => {
+            let mut expected = builder.expected;
+            if loader.major() >= 5 {
+                expected.conversions = conversions::collect(library, &builder.modules, &class.base_model_prefix);
+            }
+            Ok(Expected {
+                architecture: file.architecture.clone(),
+                loader,
+                class: class.name.clone(),
+                model_type: model_type(&config, file).unwrap_or_default(),
+                config: Value::Object(config),
+                base_model_prefix: class.base_model_prefix.clone(),
+                has_head: class.base_module,
+                ..expected
+            })
+        }
         Err(Refusal(reason)) => Err(reason.split('\n').map(str::to_owned).collect()),
     }
 }
 
-struct Builder<'a> {
-    library: &'a Library,
-    evidence: &'a Evidence,
+struct Builder<'l> {
+    resolver: Resolver<'l>,
     expected: Expected,
+    /// The models visited so far, outermost first.
+    modules: Vec<Module<'l>>,
     steps: usize,
 }
 
-/// Where an entry stands: what its name starts with, and the optional group it is in.
+/// A resolved config, and the scope that has it as `c`.
+#[derive(Clone, Copy)]
+struct Config<'a> {
+    map: &'a Map<String, Value>,
+    scope: &'a Scope<'a>,
+}
+
+/// Where an entry stands.
 #[derive(Clone, Copy, Default)]
 struct Place<'a> {
+    /// What its name starts with.
     prefix: &'a str,
+    /// What the names of its class start with.
+    root: &'a str,
+    /// The optional group it is in.
     optional: Option<&'a str>,
+    /// Names that are not built, by their starts; those of the parts around it stand behind.
+    without: Option<&'a Without<'a>>,
     /// How many parts it is inside.
     depth: usize,
 }
 
-impl<'a> Builder<'a> {
-    /// Fills in defaults: static ones, then sub-configs, then computed ones.
-    fn resolve(
-        &self,
-        blueprint: &Blueprint,
-        mut config: Map<String, Value>,
-        depth: usize,
-    ) -> Outcome<Map<String, Value>> {
-        if depth > DEPTH_CAP {
-            return Err(Refusal(format!("parts are nested more than {DEPTH_CAP} deep")));
+struct Without<'a> {
+    root: &'a str,
+    starts: &'a [String],
+    outer: Option<&'a Without<'a>>,
+}
+
+impl Without<'_> {
+    fn covers(&self, name: &str) -> bool {
+        let inner = name.strip_prefix(self.root);
+        inner.is_some_and(|n| self.starts.iter().any(|s| n.starts_with(s.as_str())))
+            || self.outer.is_some_and(|outer| outer.covers(name))
+    }
+}
+
+impl Place<'_> {
+    fn leaves_out(&self, name: &str) -> bool {
+        self.without.is_some_and(|without| without.covers(name))
+    }
+}
+
+/// What the entries of one class have in common.
+#[derive(Clone, Copy)]
+struct Around<'a, 'l> {
+    file: &'l Blueprint,
+    config: Config<'a>,
+}
+
+impl<'l> Builder<'l> {
+    /// The entries of a class.
+    fn class(&mut self, file: &'l Blueprint, class: &'l Class, config: Config<'_>, place: Place<'_>) -> Outcome<()> {
+        let model_type = model_type(config.map, file);
+        // Without a name of its own it is the module around it: a class that only calls itself otherwise.
+        if place.prefix.is_empty() == self.modules.is_empty() {
+            self.module(place.prefix, &class.name, model_type, file);
         }
-        for (key, value) in &blueprint.defaults {
-            if !config.contains_key(key) {
-                config.insert(key.clone(), value.clone());
+        let own = self.modules.len() <= 1 || self.resolver.loader.major() >= 5;
+        if own {
+            self.expected.ignore(&class.ignore_missing, &class.ignore_unexpected);
+        }
+        let mut scope = config.scope.child();
+        // Classes of one file share these, and not every class has a use, or the config keys, for each.
+        let mut failed = Vec::new();
+        for (name, expression) in &file.lets {
+            match expression.eval(&scope) {
+                Ok(value) => scope.bind(name, &value),
+                Err(e) => failed.push((format!("'{name}'"), e)),
             }
         }
-        let mut scope = self.scope(&config);
-        for (_, member) in &blueprint.tensors {
-            if let Kind::Part(part @ Part { config: Some(key), .. }) = &member.kind
-                && holds(member.when.as_ref(), &scope)?
-            {
-                let sub = sub_config(part, config.get(key), &scope, key)?;
-                let blueprint = self.part_blueprint(part, &sub, key)?;
-                let sub = self
-                    .resolve(blueprint, sub, depth.saturating_add(1))
-                    .map_err(|Refusal(e)| Refusal(format!("{key}: {e}")))?;
-                config.insert(key.clone(), Value::Object(sub));
-            }
-        }
-        bind(&mut scope, &config);
-        let unmet: Vec<String> = blueprint
-            .require
-            .iter()
-            .filter_map(|r| match r.that.eval_bool(&scope) {
-                Ok(true) => None,
-                Ok(false) => Some(r.message.render(&scope)),
-                Err(e) => Some(e.to_string()),
-            })
-            .collect();
-        if !unmet.is_empty() {
-            return Err(Refusal(unmet.join("\n")));
-        }
-        for (key, expression) in &blueprint.computed {
-            if config.get(key).is_none_or(Value::is_null) {
-                config.insert(key.clone(), expression.eval(&scope)?);
-                bind(&mut scope, &config);
-            }
-        }
-        Ok(config)
+        let outcome = bind_all(&class.lets, &mut scope)
+            .and_then(|()| self.members(&class.tensors, Around { file, config }, &scope, place));
+        outcome.map_err(|refusal| match failed.into_iter().find(|(name, _)| refusal.0.contains(name.as_str())) {
+            Some((_, cause)) => cause.into(),
+            None => refusal,
+        })
     }
 
-    fn part_blueprint(&self, part: &Part, sub: &Map<String, Value>, key: &str) -> Outcome<&'a Blueprint> {
-        let model_type = sub.get("model_type").and_then(Value::as_str).unwrap_or_default();
-        let name = part.by_model_type.get(model_type).and_then(Value::as_str).ok_or_else(|| {
-            let known: Vec<_> = part.by_model_type.keys().map(String::as_str).collect();
-            let shown: String = model_type.chars().take(80).collect();
-            Refusal(format!("`{key}.model_type` is {shown:?}; known here: {}", known.join(", ")))
-        })?;
-        self.library.blueprint(name).ok_or_else(|| Refusal(format!("no architecture is called {name}")))
+    fn module(&mut self, prefix: &str, class: &str, model_type: Option<String>, file: &'l Blueprint) {
+        let path = prefix.trim_end_matches('.').to_owned();
+        self.modules.push(Module { path, class: class.to_owned(), model_type, file });
     }
 
-    fn emit(&mut self, blueprint: &Blueprint, config: &Map<String, Value>, place: Place<'_>) -> Outcome<()> {
-        let mut scope = self.scope(config);
-        for (name, expression) in &blueprint.lets {
-            let value = expression.eval(&scope)?;
-            scope.bind(name, &value);
-        }
-        blueprint
-            .tensors
-            .iter()
-            .try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, &scope, config, place))
+    fn members(
+        &mut self,
+        members: &'l [(Template, Member)],
+        around: Around<'_, 'l>,
+        scope: &Scope<'_>,
+        place: Place<'_>,
+    ) -> Outcome<()> {
+        members.iter().try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, around, scope, place))
     }
 
     fn repeat(
         &mut self,
-        name: &Template,
-        member: &Member,
+        name: &'l Template,
+        member: &'l Member,
         repeats: &[(String, Expression)],
+        around: Around<'_, 'l>,
         scope: &Scope<'_>,
-        config: &Map<String, Value>,
         place: Place<'_>,
     ) -> Outcome<()> {
         let Some(((index, count), inner)) = repeats.split_first() else {
-            return self.member(name, member, scope, config, place);
+            return self.member(name, member, around, scope, place);
         };
         let count_of = count.eval_u64(scope)?;
         if count_of > TENSOR_CAP as u64 {
@@ -156,17 +180,17 @@ impl<'a> Builder<'a> {
         for i in 0..count_of {
             let mut scope = scope.child();
             scope.bind_int(index, i);
-            self.repeat(name, member, inner, &scope, config, place)?;
+            self.repeat(name, member, inner, around, &scope, place)?;
         }
         Ok(())
     }
 
     fn member(
         &mut self,
-        name: &Template,
-        member: &Member,
+        name: &'l Template,
+        member: &'l Member,
+        around: Around<'_, 'l>,
         scope: &Scope<'_>,
-        config: &Map<String, Value>,
         place: Place<'_>,
     ) -> Outcome<()> {
         self.steps = self.steps.saturating_add(1);
@@ -177,10 +201,7 @@ impl<'a> Builder<'a> {
             return Ok(());
         }
         let mut scope = scope.child();
-        for (name, expression) in &member.lets {
-            let value = expression.eval(&scope)?;
-            scope.bind(name, &value);
-        }
+        bind_all(&member.lets, &mut scope)?;
         let name = format!("{}{}", place.prefix, name.try_render(&scope)?);
         if name.len() > NAME_CAP {
             return Err(Refusal(format!("the config makes a tensor name of {} bytes", name.len())));
@@ -201,29 +222,86 @@ impl<'a> Builder<'a> {
                 Ok(())
             }
             Kind::Buffer => {
-                self.expected.buffers.insert(name);
+                if !place.leaves_out(&name) {
+                    self.expected.buffers.insert(name);
+                }
                 Ok(())
             }
-            Kind::Group(members) => {
-                let place = Place { prefix: &name, ..place };
-                members
-                    .iter()
-                    .try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, &scope, config, place))
+            Kind::Group { members, model } => {
+                if let Some(model) = model
+                    && !place.leaves_out(&name)
+                {
+                    let model_type = model.model_type.clone().or_else(|| model_type(around.config.map, around.file));
+                    self.module(&name, &model.class, model_type, around.file);
+                }
+                self.members(members, around, &scope, Place { prefix: &name, ..place })
             }
-            Kind::Part(part) => {
-                let key = part.config.as_deref().unwrap_or(&name);
-                let resolved = part.config.as_ref().and_then(|key| config.get(key)).and_then(Value::as_object);
-                let depth = place.depth.saturating_add(1);
-                let sub = if let Some(sub) = resolved {
-                    sub.clone()
-                } else {
-                    let sub = sub_config(part, Some(&Value::Object(Map::new())), &scope, key)?;
-                    self.resolve(self.part_blueprint(part, &sub, key)?, sub, depth)?
-                };
-                let place = Place { prefix: &name, depth, ..place };
-                self.emit(self.part_blueprint(part, &sub, key)?, &sub, place)
-            }
+            Kind::Part(_) if place.leaves_out(&name) => Ok(()),
+            Kind::Part(part) => self.part(part, &name, around, &scope, place),
         }
+    }
+
+    fn part(
+        &mut self,
+        part: &'l Part,
+        name: &str,
+        around: Around<'_, 'l>,
+        scope: &Scope<'_>,
+        place: Place<'_>,
+    ) -> Outcome<()> {
+        let depth = place.depth.saturating_add(1);
+        if depth > DEPTH_CAP {
+            return Err(Refusal(format!("parts are nested more than {DEPTH_CAP} deep")));
+        }
+        let outer = place.without;
+        let without = Without { root: name, starts: &part.without, outer };
+        let place = Place { prefix: name, root: name, depth, without: Some(&without), ..place };
+        let given = match &part.config {
+            Some(path) => at_path(around.config.map, path)?,
+            None => around.config.map,
+        };
+        let (file, class) = self.part_class(part, given, around.file)?;
+        if part.config.is_none() && part.set.is_empty() {
+            return self.class(file, class, around.config, place);
+        }
+        let mut map = given.clone();
+        map.extend(evaluated(&part.set, scope)?);
+        let scope = self.resolver.scope(&map);
+        self.class(file, class, Config { map: &map, scope: &scope }, place)
+    }
+
+    /// The class of a part, by the config that governs it.
+    fn part_class(
+        &self,
+        part: &Part,
+        config: &Map<String, Value>,
+        around: &Blueprint,
+    ) -> Outcome<(&'l Blueprint, &'l Class)> {
+        let Resolver { library, loader, .. } = self.resolver;
+        let key = part.config.as_ref().map_or_else(|| "model_type".to_owned(), |path| format!("{path}.model_type"));
+        let model_type = || {
+            let named = if part.config.is_some() { None } else { around.model_types.first().map(String::as_str) };
+            config.get("model_type").and_then(Value::as_str).or(named)
+        };
+        let class = if let Some(class) = &part.class {
+            class.as_str()
+        } else {
+            let model_type = model_type().ok_or_else(|| Refusal(format!("`{key}` is absent")))?;
+            let listed = part.by_model_type.get(model_type).and_then(Value::as_str);
+            let auto = || library.of_model_type(model_type)?.auto(part.auto.as_deref()?, loader);
+            listed.or_else(auto).ok_or_else(|| {
+                let known: Vec<&str> = part.by_model_type.keys().map(String::as_str).collect();
+                let known =
+                    if part.auto.is_some() { String::new() } else { format!("; known here: {}", known.join(", ")) };
+                Refusal(format!(
+                    "`{key}` is {model_type:?}{}",
+                    if known.is_empty() { ", which is not known here" } else { &known }
+                ))
+            })?
+        };
+        library.entry(class, loader).ok_or_else(|| {
+            Refusal(format!("the class {class}, which it has as a part, is not known for transformers {loader}"))
+        })
     }
 
     fn tensor(
@@ -234,35 +312,34 @@ impl<'a> Builder<'a> {
         scope: &Scope<'_>,
         place: Place<'_>,
     ) -> Outcome<()> {
+        if place.leaves_out(&name) {
+            return Ok(());
+        }
         let tied_to = match tied {
             Some(tied) if holds(tied.when.as_ref(), scope)? => {
-                Some(format!("{}{}", place.prefix, tied.to.try_render(scope)?))
+                Some(format!("{}{}", place.root, tied.to.try_render(scope)?))
             }
             _ => None,
         };
         let tensor = ExpectedTensor { shape, tied_to, optional: place.optional.map(str::to_owned) };
-        match self.expected.tensors.insert(name, tensor) {
-            None => Ok(()),
-            Some(_) => Err(Refusal("the config makes two tensors of one name".to_owned())),
+        match self.expected.tensors.entry(name) {
+            indexmap::map::Entry::Vacant(free) => {
+                free.insert(tensor);
+                Ok(())
+            }
+            indexmap::map::Entry::Occupied(taken) => {
+                Err(Refusal(format!("the config makes two tensors of the name {}", taken.key())))
+            }
         }
-    }
-
-    /// A root scope with `c` and the functions that look at stored tensors.
-    fn scope(&self, config: &Map<String, Value>) -> Scope<'static> {
-        let mut scope = Scope::new();
-        let evidence = self.evidence.clone();
-        scope.function1("stored", move |name| evidence.shape(name).map_or(Value::Null, Value::from));
-        let evidence = self.evidence.clone();
-        scope.function1("has_tensor", move |name| evidence.contains(name).into());
-        let evidence = self.evidence.clone();
-        scope.function1("stored_count", move |prefix| evidence.count(prefix).into());
-        bind(&mut scope, config);
-        scope
     }
 }
 
-fn bind(scope: &mut Scope<'_>, config: &Map<String, Value>) {
-    scope.bind("c", &Value::Object(config.clone()));
+fn bind_all(lets: &[(String, Expression)], scope: &mut Scope<'_>) -> Outcome<()> {
+    for (name, expression) in lets {
+        let value = expression.eval(scope)?;
+        scope.bind(name, &value);
+    }
+    Ok(())
 }
 
 fn holds(condition: Option<&Expression>, scope: &Scope<'_>) -> Outcome<bool> {
@@ -271,31 +348,4 @@ fn holds(condition: Option<&Expression>, scope: &Scope<'_>) -> Outcome<bool> {
 
 fn dimensions(shape: &[Expression], scope: &Scope<'_>) -> Outcome<Vec<u64>> {
     shape.iter().map(|d| Ok(d.eval_u64(scope)?)).collect()
-}
-
-/// A map of values, of which strings that start with `=` are expressions.
-fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> Outcome<Map<String, Value>> {
-    let value = |value: &Value| match value.as_str().and_then(|s| s.strip_prefix('=')) {
-        Some(source) => match Expression::parse(source) {
-            Ok(expression) => Ok(expression.eval(scope)?),
-            Err(e) => Err(Refusal(e.to_string())),
-        },
-        None => Ok(value.clone()),
-    };
-    map.iter().map(|(k, v)| Ok((k.clone(), value(v)?))).collect()
-}
-
-/// The sub-config of a part: as given, or what the composition builds without one.
-fn sub_config(part: &Part, given: Option<&Value>, scope: &Scope<'_>, key: &str) -> Outcome<Map<String, Value>> {
-    let mut sub = match (given, &part.absent) {
-        (Some(Value::Object(map)), _) => map.clone(),
-        (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
-        (None | Some(Value::Null), None) => return Err(Refusal(format!("`{key}` is absent"))),
-        (Some(_), _) => return Err(Refusal(format!("`{key}` is not an object"))),
-    };
-    if !sub.contains_key("model_type") {
-        sub.insert("model_type".to_owned(), part.untyped.clone().into());
-    }
-    sub.extend(evaluated(&part.set, scope)?);
-    Ok(sub)
 }

@@ -10,7 +10,7 @@ use super::record::{ChangedTensor, Dropped, Seam, ShapedName};
 use super::{Context, Donor, Draft, MergeError};
 use crate::checkpoint::{Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
-use crate::knowledge::{Evidence, Library};
+use crate::knowledge::{Evidence, Library, Loader};
 use crate::surgery::plan::{PlannedTensor, Source, TensorRef, into_shards};
 use crate::surgery::transform::can_compute;
 
@@ -140,7 +140,8 @@ fn expected_shapes<'n>(
     evidence: &Evidence,
 ) -> HashMap<String, (usize, Vec<u64>)> {
     let Some(config) = config else { return HashMap::new() };
-    let found = library.find(config, names).and_then(|a| a.expect_given(config, evidence).ok());
+    let found =
+        library.find(config, names, Loader::of_config(config)).and_then(|a| a.expect_given(config, evidence).ok());
     found.map_or_else(HashMap::new, |e| {
         e.tensors.iter().enumerate().map(|(i, (name, t))| (name.clone(), (i, t.shape.clone()))).collect()
     })

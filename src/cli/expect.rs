@@ -1,0 +1,214 @@
+//! `expect`: what a model class has, by its config alone.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use ckpt_doctor::checkpoint::open::{JSON_CAP, open_regular, read_capped};
+use ckpt_doctor::checkpoint::{Document, escape};
+use ckpt_doctor::knowledge::{Expected, Library, Loader};
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+
+use super::args::{ExpectArgs, ExpectFormat};
+use super::{CLEAN, FINDINGS, library, output};
+
+/// A line of `@FILE`; what else it has is ignored.
+#[derive(Deserialize)]
+struct Record {
+    config: Value,
+    #[serde(default)]
+    class: Option<String>,
+}
+
+/// A config, and how to speak of it.
+struct Asked {
+    source: String,
+    record: Result<Record, String>,
+}
+
+/// What came of it.
+struct Answer {
+    source: String,
+    loader: Loader,
+    built: Result<Expected, String>,
+}
+
+/// Runs `expect`.
+pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+    let library = library::with(rules)?;
+    let mut failed = false;
+    let mut list = Vec::new();
+    let mut answer = |asked: Asked| -> anyhow::Result<()> {
+        let answer = build(&library, asked, args.loader);
+        failed |= answer.built.is_err();
+        match args.output_format {
+            ExpectFormat::Text => output::print(&text(&answer)),
+            ExpectFormat::Jsonl => output::print(&format!("{}\n", object(&answer))),
+            ExpectFormat::Json => {
+                list.push(object(&answer));
+                Ok(())
+            }
+        }
+    };
+    for config in &args.configs {
+        match config.strip_prefix('@') {
+            Some(file) => each_line(Path::new(file), &mut answer)?,
+            None => answer(one(Path::new(config))?)?,
+        }
+    }
+    if args.output_format == ExpectFormat::Json {
+        output::print(&format!("{:#}\n", Value::Array(list)))?;
+    }
+    Ok(if failed { FINDINGS } else { CLEAN })
+}
+
+/// A config.json, or a directory's.
+fn one(path: &Path) -> anyhow::Result<Asked> {
+    let file = if path.is_dir() { path.join("config.json") } else { path.to_owned() };
+    let record = parse(&read_capped(&file, JSON_CAP)?).map(|config| Record { config, class: None });
+    Ok(Asked { source: path.display().to_string(), record })
+}
+
+/// The configs of a file of records, one after the other: such a file may be larger than memory.
+fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) -> anyhow::Result<()> {
+    let mut lines = BufReader::new(open_regular(path, u64::MAX)?.file);
+    for number in 1_usize.. {
+        let mut line = Vec::new();
+        let read = lines.by_ref().take(JSON_CAP).read_until(b'\n', &mut line);
+        let source = format!("{}:{number}", path.display());
+        match read.with_context(|| path.display().to_string())? {
+            0 => break,
+            _ if !line.ends_with(b"\n") && u64::try_from(line.len()).is_ok_and(|n| n >= JSON_CAP) => {
+                bail!("{source}: a line of more than {JSON_CAP} bytes")
+            }
+            _ if line.trim_ascii().is_empty() => {}
+            _ => {
+                // Python writes infinities that are not JSON: those take the longer way.
+                let record = serde_json::from_slice(&line).or_else(|strict| {
+                    serde_json::from_value(parse(&line)?).map_err(|_| format!("no object with a \"config\": {strict}"))
+                });
+                answer(Asked { source, record })?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// JSON as checkpoints have it.
+fn parse(bytes: &[u8]) -> Result<Value, String> {
+    let document = Document::parse("config.json", bytes);
+    document.value.ok_or_else(|| {
+        let kind = document.faults.first().map_or("not JSON", |f| f.kind);
+        format!("the config cannot be read: {kind}")
+    })
+}
+
+fn build(library: &Library, asked: Asked, loader: Option<Loader>) -> Answer {
+    let Asked { source, record } = asked;
+    let config = record.as_ref().map_or(&Value::Null, |r| &r.config);
+    let loader = loader.unwrap_or_else(|| Loader::of_config(config));
+    let built = record.and_then(|Record { config, class }| {
+        let found = match &class {
+            Some(class) => library.class(class, loader),
+            None => library.find(&config, [], loader),
+        };
+        let unknown = || {
+            let class = class.as_deref().or_else(|| config.pointer("/architectures/0")?.as_str());
+            let model_type = config.get("model_type").and_then(Value::as_str);
+            format!(
+                "no architecture is known for class {} and model type {} under transformers {loader}",
+                class.unwrap_or("none"),
+                model_type.unwrap_or("none")
+            )
+        };
+        let architecture = found.ok_or_else(unknown)?;
+        architecture.expect(&config).map_err(|reasons| format!("{}: {}", architecture.class(), reasons.join("; ")))
+    });
+    Answer { source, loader, built }
+}
+
+/// Longest text of a checkpoint in a line of output.
+const CAP: usize = 1000;
+
+fn text(answer: &Answer) -> String {
+    let mut out = String::new();
+    let source = escape(&answer.source, CAP);
+    match &answer.built {
+        Err(reason) => {
+            let _ok = writeln!(out, "{source}: error: {}", escape(reason, CAP));
+        }
+        Ok(e) => {
+            let counts = format!("{} tensors, {} non-persistent buffers", e.tensors.len(), e.buffers.len());
+            let _ok = writeln!(out, "{source}: {} ({}), transformers {}: {counts}", e.class, e.architecture, e.loader);
+            for (name, tensor) in &e.tensors {
+                let _ok = write!(out, "  {} {:?}", escape(name, CAP), tensor.shape);
+                if let Some(to) = &tensor.tied_to {
+                    let _ok = write!(out, " = {}", escape(to, CAP));
+                }
+                if let Some(group) = &tensor.optional {
+                    let _ok = write!(out, " (optional: {group})");
+                }
+                out.push('\n');
+            }
+            for name in &e.buffers {
+                let _ok = writeln!(out, "  {} buffer", escape(name, CAP));
+            }
+        }
+    }
+    out
+}
+
+fn object(answer: &Answer) -> Value {
+    match &answer.built {
+        Err(reason) => json!({ "source": answer.source, "loader": answer.loader.version(), "error": reason }),
+        Ok(e) => json!({
+            "source": answer.source,
+            "loader": answer.loader.version(),
+            "architecture": e.architecture,
+            "class": e.class,
+            "model_type": e.model_type,
+            "base_model_prefix": e.base_model_prefix,
+            "has_base": e.has_head,
+            "tensors": e.tensors.iter().map(|(name, t)| (name.clone(), json!(t.shape))).collect::<Map<_, _>>(),
+            "tied": tied(e),
+            "buffers": e.buffers,
+            "ignore_missing": e.ignore_missing,
+            "ignore_unexpected": e.ignore_unexpected,
+            "conversions": e.conversions,
+        }),
+    }
+}
+
+/// Names that share a storage, each group in the order of the state dict.
+fn tied(expected: &Expected) -> Vec<Vec<&str>> {
+    let mut groups: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for (name, tensor) in &expected.tensors {
+        if let Some(to) = &tensor.tied_to {
+            groups.entry(source_of(expected, to)).or_default().push(name);
+        }
+    }
+    let place = |name: &&str| expected.tensors.get_index_of(*name);
+    let whole = groups.into_iter().map(|(to, mut names)| {
+        names.push(to);
+        names.sort_by_key(place);
+        names
+    });
+    let mut whole: Vec<Vec<&str>> = whole.collect();
+    whole.sort_by_key(|names| names.first().and_then(place));
+    whole
+}
+
+/// The end of a chain of ties.
+fn source_of<'e>(expected: &'e Expected, name: &'e str) -> &'e str {
+    let mut at = name;
+    for _ in 0..8 {
+        match expected.tensors.get(at).and_then(|t| t.tied_to.as_deref()) {
+            Some(next) => at = next,
+            None => break,
+        }
+    }
+    at
+}

@@ -1,0 +1,176 @@
+//! From a config as it is written to one with every value its config class fills in.
+
+use serde_json::{Map, Value};
+
+use super::blueprint::{Blueprint, SubConfig};
+use super::build::{Outcome, Refusal};
+use super::{Evidence, Expected};
+use crate::knowledge::{Expression, Library, Loader, Scope};
+
+/// Depth of configs within configs, and of parts within parts.
+pub(super) const DEPTH_CAP: usize = 8;
+
+/// What configs are resolved with.
+#[derive(Clone, Copy)]
+pub(super) struct Resolver<'a> {
+    pub library: &'a Library,
+    pub loader: Loader,
+    pub evidence: &'a Evidence,
+}
+
+impl Resolver<'_> {
+    /// Fills in defaults: static ones, then sub-configs, then computed ones.
+    pub fn resolve(
+        &self,
+        file: &Blueprint,
+        mut config: Map<String, Value>,
+        depth: usize,
+    ) -> Outcome<Map<String, Value>> {
+        if depth > DEPTH_CAP {
+            return Err(Refusal(format!("configs are nested more than {DEPTH_CAP} deep")));
+        }
+        let class = file.config(self.loader);
+        fill(&mut config, &class.defaults);
+        let mut scope = self.scope(&config);
+        for (key, spec) in &class.configs {
+            if let Some(sub) = self.sub_config(spec, config.get(key), &scope, key, depth)? {
+                config.insert(key.clone(), Value::Object(sub));
+            }
+        }
+        if !class.configs.is_empty() {
+            bind(&mut scope, &config);
+        }
+        let unmet: Vec<String> = file
+            .require
+            .iter()
+            .filter_map(|r| match r.that.eval_bool(&scope) {
+                Ok(true) => None,
+                Ok(false) => Some(r.message.render(&scope)),
+                Err(e) => Some(e.to_string()),
+            })
+            .collect();
+        if !unmet.is_empty() {
+            return Err(Refusal(unmet.join("\n")));
+        }
+        compute(&mut config, &class.computed, &mut scope)?;
+        Ok(config)
+    }
+
+    /// A sub-config as given, or as the composition builds one, resolved by the file of its model type.
+    fn sub_config(
+        &self,
+        spec: &SubConfig,
+        given: Option<&Value>,
+        scope: &Scope<'_>,
+        key: &str,
+        depth: usize,
+    ) -> Outcome<Option<Map<String, Value>>> {
+        let mut sub = match (given, &spec.absent) {
+            (Some(Value::Object(map)), _) => map.clone(),
+            (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
+            (None | Some(Value::Null), None) => return Ok(None),
+            (Some(_), _) => return Err(Refusal(format!("`{key}` is not an object"))),
+        };
+        if let Some(model_type) = &spec.model_type
+            && sub.get("model_type").is_none_or(Value::is_null)
+        {
+            sub.insert("model_type".to_owned(), model_type.clone().into());
+        }
+        sub.extend(evaluated(&spec.set, scope)?);
+        fill(&mut sub, &spec.defaults);
+        let file = sub.get("model_type").and_then(Value::as_str).and_then(|t| self.library.of_model_type(t));
+        let inside = |Refusal(e): Refusal| Refusal(format!("{key}: {e}"));
+        if let Some(file) = file {
+            sub = self.resolve(file, sub, depth.saturating_add(1)).map_err(inside)?;
+        }
+        if !spec.computed.is_empty() {
+            let mut scope = self.scope(&sub);
+            compute(&mut sub, &spec.computed, &mut scope).map_err(inside)?;
+        }
+        Ok(Some(sub))
+    }
+
+    /// A root scope: `c`, `major`, and the functions that look at stored tensors.
+    pub fn scope(&self, config: &Map<String, Value>) -> Scope<'static> {
+        let mut scope = Scope::new();
+        let evidence = self.evidence.clone();
+        scope.function1("stored", move |name| evidence.shape(name).map_or(Value::Null, Value::from));
+        let evidence = self.evidence.clone();
+        scope.function1("has_tensor", move |name| evidence.contains(name).into());
+        let evidence = self.evidence.clone();
+        scope.function1("stored_count", move |prefix| evidence.count(prefix).into());
+        scope.bind_int("major", self.loader.major());
+        bind(&mut scope, config);
+        scope
+    }
+}
+
+fn fill(config: &mut Map<String, Value>, defaults: &Map<String, Value>) {
+    for (key, value) in defaults {
+        if !config.contains_key(key) {
+            config.insert(key.clone(), value.clone());
+        }
+    }
+}
+
+fn compute(config: &mut Map<String, Value>, computed: &[(String, Expression)], scope: &mut Scope<'_>) -> Outcome<()> {
+    for (key, expression) in computed {
+        if config.get(key).is_none_or(Value::is_null) {
+            config.insert(key.clone(), expression.eval(scope)?);
+            bind(scope, config);
+        }
+    }
+    Ok(())
+}
+
+fn bind(scope: &mut Scope<'_>, config: &Map<String, Value>) {
+    scope.bind("c", &Value::Object(config.clone()));
+}
+
+/// A map of values, of which strings that start with `=` are expressions.
+pub(super) fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> Outcome<Map<String, Value>> {
+    map.iter().map(|(k, v)| Ok((k.clone(), value(v, scope)?))).collect()
+}
+
+fn value(written: &Value, scope: &Scope<'_>) -> Outcome<Value> {
+    Ok(match written {
+        Value::String(s) => match s.strip_prefix('=') {
+            Some(source) => Expression::parse(source).map_err(|e| Refusal(e.to_string()))?.eval(scope)?,
+            None => written.clone(),
+        },
+        Value::Object(map) => Value::Object(evaluated(map, scope)?),
+        other => other.clone(),
+    })
+}
+
+/// The sub-config at a dotted path.
+pub(super) fn at_path<'c>(config: &'c Map<String, Value>, path: &str) -> Outcome<&'c Map<String, Value>> {
+    let mut at = config;
+    for key in path.split('.') {
+        at = match at.get(key) {
+            Some(Value::Object(map)) => map,
+            None | Some(Value::Null) => return Err(Refusal(format!("`{path}` is absent"))),
+            Some(_) => return Err(Refusal(format!("`{path}` is not an object"))),
+        };
+    }
+    Ok(at)
+}
+
+/// The `model_type` of a config; that of the file it was resolved with when it names none.
+pub(super) fn model_type(config: &Map<String, Value>, file: &Blueprint) -> Option<String> {
+    let named = config.get("model_type").and_then(Value::as_str);
+    named.or_else(|| file.model_types.first().map(String::as_str)).map(str::to_owned)
+}
+
+impl Expected {
+    /// Adds patterns that are not there yet.
+    pub(super) fn ignore(&mut self, missing: &[String], unexpected: &[String]) {
+        for (all, new) in [(&mut self.ignore_missing, missing), (&mut self.ignore_unexpected, unexpected)] {
+            for pattern in new {
+                if !all.contains(pattern) {
+                    all.push(pattern.clone());
+                }
+            }
+        }
+    }
+}

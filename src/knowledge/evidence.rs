@@ -1,0 +1,50 @@
+//! What is known of a checkpoint's tensors when an architecture is built.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Tensors found in a checkpoint, by name, with their shape where it is known.
+///
+/// A few facts are in no config (the size of LLaVA-3D's CLIP tower): those are read off the tensors.
+#[derive(Debug, Clone, Default)]
+pub struct Evidence {
+    shapes: Arc<BTreeMap<String, Option<Vec<u64>>>>,
+}
+
+impl Evidence {
+    /// Shape of the tensor of this name, when there is one and its shape is known.
+    #[must_use]
+    pub fn shape(&self, name: &str) -> Option<&[u64]> {
+        self.shapes.get(name)?.as_deref()
+    }
+
+    /// Whether there is a tensor of this name.
+    #[must_use]
+    pub fn contains(&self, name: &str) -> bool {
+        self.shapes.contains_key(name)
+    }
+
+    /// One more than the largest number that follows `prefix` in a tensor's name; 0 when none does.
+    #[must_use]
+    pub fn count(&self, prefix: &str) -> u64 {
+        let index = |name: &str| -> Option<u64> {
+            let rest = name.strip_prefix(prefix)?;
+            rest.split_once('.').map_or(rest, |(index, _)| index).parse().ok()
+        };
+        let names = self.shapes.range(prefix.to_owned()..).map(|(name, _)| name.as_str());
+        names.take_while(|name| name.starts_with(prefix)).filter_map(index).max().map_or(0, |n| n.saturating_add(1))
+    }
+}
+
+impl FromIterator<(String, Option<Vec<u64>>)> for Evidence {
+    fn from_iter<I: IntoIterator<Item = (String, Option<Vec<u64>>)>>(tensors: I) -> Self {
+        Self { shapes: Arc::new(tensors.into_iter().collect()) }
+    }
+}
+
+/// Names alone.
+impl<'n> FromIterator<&'n str> for Evidence {
+    fn from_iter<I: IntoIterator<Item = &'n str>>(names: I) -> Self {
+        names.into_iter().map(|name| (name.to_owned(), None)).collect()
+    }
+}

@@ -1,0 +1,101 @@
+//! The loaders whose behaviour is known: versions of transformers that were read and run.
+
+use std::fmt;
+
+use serde::{Deserialize, Deserializer};
+use serde_json::Value;
+
+/// A version of transformers that architectures and load reports speak for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Loader {
+    /// transformers 4.47.0, for all of 4.x.
+    V4_47_0,
+    /// transformers 5.23.0, for all of 5.x.
+    V5_23_0,
+}
+
+impl Loader {
+    /// All of them, oldest first.
+    pub const ALL: [Self; 2] = [Self::V4_47_0, Self::V5_23_0];
+
+    /// The newest one.
+    pub const NEWEST: Self = Self::V5_23_0;
+
+    /// Its version number.
+    #[must_use]
+    pub const fn version(self) -> &'static str {
+        match self {
+            Self::V4_47_0 => "4.47.0",
+            Self::V5_23_0 => "5.23.0",
+        }
+    }
+
+    /// The first number of its version.
+    #[must_use]
+    pub const fn major(self) -> u64 {
+        match self {
+            Self::V4_47_0 => 4,
+            Self::V5_23_0 => 5,
+        }
+    }
+
+    /// The known loader nearest to a version: of the same major version; the oldest or newest for what lies outside.
+    /// A text that does not start with a number names no version, and means the newest.
+    #[must_use]
+    pub fn nearest(version: &str) -> Self {
+        let digits = version.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default();
+        match digits.parse::<u64>() {
+            Ok(major) if major <= 4 => Self::V4_47_0,
+            _ => Self::V5_23_0,
+        }
+    }
+
+    /// The known loader nearest to the version that wrote this config.json; the newest when it does not say.
+    #[must_use]
+    pub fn of_config(config: &Value) -> Self {
+        config.get("transformers_version").and_then(Value::as_str).map_or(Self::NEWEST, Self::nearest)
+    }
+}
+
+impl fmt::Display for Loader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.version())
+    }
+}
+
+/// A data file may name the version that its author read; the nearest known one stands for it.
+impl<'de> Deserialize<'de> for Loader {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let version = String::deserialize(deserializer)?;
+        if version.starts_with(|c: char| c.is_ascii_digit()) {
+            Ok(Self::nearest(&version))
+        } else {
+            Err(serde::de::Error::custom(format!("`{version}` is no version of transformers")))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn the_nearest_loader_has_the_same_major_version() {
+        for (version, nearest) in [
+            ("4.51.3", Loader::V4_47_0),
+            ("3.0", Loader::V4_47_0),
+            ("4.48.0.dev0", Loader::V4_47_0),
+            ("5.0.0rc1", Loader::V5_23_0),
+            ("6.1.0", Loader::V5_23_0),
+            ("main", Loader::V5_23_0),
+        ] {
+            assert_eq!(Loader::nearest(version), nearest, "{version}");
+        }
+        assert_eq!(Loader::of_config(&json!({ "transformers_version": "4.40.1" })), Loader::V4_47_0);
+        assert_eq!(Loader::of_config(&json!({})), Loader::NEWEST);
+        assert_eq!(Loader::V4_47_0.to_string(), "4.47.0");
+        assert_eq!(Loader::ALL.last(), Some(&Loader::NEWEST));
+    }
+}
