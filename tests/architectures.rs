@@ -209,17 +209,17 @@ fn a_user_adds_an_architecture_or_replaces_one() {
     let mut library = Library::embedded();
     let text = r#"{ architecture: "mlp", summary: "", sources: [], loaders: ["4.47.0"],
         classes: [{ class: "Mlp", tensors: { "l.{i}": { repeat: { i: "c.n" }, weight: ["2", "3"], bias: "i > 0" } } }] }"#;
-    library.add(text).expect("parses");
+    library.add("mlp.json5", text).expect("parses");
     let config = json!({ "architectures": ["Mlp"], "n": 2 });
     let expected = library.find(&config, [], Loader::V4_47_0).expect("added").expect(&config).expect("built");
     assert_eq!(expected.tensors.keys().collect::<Vec<_>>(), ["l.0.weight", "l.1.weight", "l.1.bias"]);
     let endless = r#"{ architecture: "m", summary: "", sources: [], loaders: ["4.47.0"],
         classes: [{ class: "M", tensors: { "": { part: { class: "M" } } } }] }"#;
-    library.add(endless).expect("parses");
+    library.add("m.json5", endless).expect("parses");
     let refused = library.architecture("m").expect("added").expect(&json!({})).expect_err("a part of itself");
     assert_eq!(refused, ["parts are nested more than 8 deep"]);
-    let error = library.add(&text.replace("bias", "bais")).expect_err("misspelt");
-    assert!(error.contains("bais"), "{error}");
+    let error = library.add("mlp.json5", &text.replace("bias", "bais")).expect_err("misspelt");
+    assert!(error.to_string().contains("bais"), "{error}");
 }
 
 /// Two files in the way derived ones are written: a composition whose parts differ by loader.
@@ -227,6 +227,7 @@ fn small_library() -> Library {
     let mut library = Library::embedded();
     library
         .add(
+            "tower.json5",
             r#"{
   architecture: "tower", summary: "", sources: [], model_types: ["tower"], loaders: ["4.47.0", "5.23.0"], derived: {},
   auto: { model: "TowerModel" },
@@ -250,6 +251,7 @@ fn small_library() -> Library {
         .expect("parses");
     library
         .add(
+            "house.json5",
             r#"{
   architecture: "house", summary: "", sources: [], model_types: ["house"], loaders: ["4.47.0", "5.23.0"], derived: {},
   configs: { inner: { absent: {}, defaults: { name: "x" } , computed: { rooms: "7" } }, tower_config: { type: "tower", absent: { width: "=c.n" } } },

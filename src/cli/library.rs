@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, bail};
 use ckpt_doctor::checkpoint::open::{MODULE_CAP, read_capped};
 use ckpt_doctor::knowledge::Library;
 
@@ -22,7 +22,7 @@ pub fn with(rules: Option<&Path>) -> anyhow::Result<Library> {
     for file in files {
         let text = String::from_utf8(read_capped(&file, MODULE_CAP)?);
         let text = text.with_context(|| format!("{}: not UTF-8", file.display()))?;
-        library.add(&text).map_err(|e| anyhow!("{}: {e}", file.display()))?;
+        library.add(&file.display().to_string(), &text)?;
     }
     Ok(library)
 }

@@ -1,15 +1,16 @@
 //! The architectures that ship with the program, and those a user adds.
 
+mod index;
+
 use std::borrow::Cow;
 use std::sync::OnceLock;
 
-use include_dir::{Dir, include_dir};
 use serde_json::Value;
 
 use super::Loader;
 use super::architecture::{Architecture, Blueprint, Class};
-
-static ARCHITECTURES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules/architectures");
+use super::source::{self, DataError};
+use index::Index;
 
 /// What `AutoModel…` mappings are asked for when a config names a model type and no class, in this order.
 const AUTO: [&str; 5] = ["causal_lm", "image_text_to_text", "vision_2_seq", "seq_to_seq_causal_lm", "model"];
@@ -18,6 +19,7 @@ const AUTO: [&str; 5] = ["causal_lm", "image_text_to_text", "vision_2_seq", "seq
 #[derive(Default)]
 pub struct Library {
     files: Vec<File>,
+    index: OnceLock<Index>,
 }
 
 struct File {
@@ -30,26 +32,26 @@ impl Library {
     /// The architectures in the program, by name.
     #[must_use]
     pub fn embedded() -> Self {
-        let mut files: Vec<File> = ARCHITECTURES
-            .files()
-            .filter_map(|f| {
-                let stem = f.path().file_stem()?.to_str()?.to_owned();
-                Some(File { stem, text: Cow::Borrowed(f.contents_utf8()?), parsed: OnceLock::new() })
-            })
-            .collect();
+        let file = |(path, text): (String, &'static str)| {
+            let name = path.rsplit('/').next().unwrap_or_default();
+            let stem = name.strip_suffix(".json5").unwrap_or(name).to_owned();
+            File { stem, text: Cow::Borrowed(text), parsed: OnceLock::new() }
+        };
+        let mut files: Vec<File> = source::embedded("architectures").into_iter().map(file).collect();
         files.sort_by(|a, b| a.stem.cmp(&b.stem));
-        Self { files }
+        Self { files, index: OnceLock::new() }
     }
 
     /// Adds an architecture file, or replaces the one of the same name.
     ///
     /// # Errors
-    /// Says what is wrong with `text`, and where.
-    pub fn add(&mut self, text: &str) -> Result<(), String> {
-        let blueprint = parse(text)?;
+    /// Says what is wrong with `text`, and where; `path` is for the message.
+    pub fn add(&mut self, path: &str, text: &str) -> Result<(), DataError> {
+        let blueprint: Blueprint = source::parse(path, text)?;
         let stem = blueprint.architecture.clone();
         self.files.retain(|file| file.stem != stem);
         self.files.insert(0, File { stem, text: Cow::Owned(text.to_owned()), parsed: OnceLock::from(blueprint) });
+        self.index = OnceLock::new();
         Ok(())
     }
 
@@ -86,13 +88,14 @@ impl Library {
     ) -> Option<Architecture<'_>> {
         let mut names = names.into_iter();
         let class = config.get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
-        let candidates = class.map(|class| self.entries(class, loader)).unwrap_or_default();
+        let model_type = config.get("model_type").and_then(Value::as_str);
+        let mut candidates = class.map(|class| self.entries(class, loader)).unwrap_or_default();
+        candidates.sort_by_key(|(file, _)| !model_type.is_some_and(|t| file.model_types.iter().any(|m| m == t)));
         let (file, class) = match choose(candidates, &mut names) {
             Some(found) => found,
             None if class.is_some() && config.get("auto_map").is_none() => return None,
             None => {
-                let model_type = config.get("model_type").and_then(Value::as_str)?;
-                let files = self.mentioning(model_type).filter(|f| f.model_types.iter().any(|t| t == model_type));
+                let files = self.all_of_model_type(model_type?);
                 choose(files.filter_map(|file| Some((file, main_class(file, loader)?))).collect(), &mut names)?
             }
         };
@@ -106,24 +109,36 @@ impl Library {
 
     fn entries(&self, class: &str, loader: Loader) -> Vec<(&Blueprint, &Class)> {
         let of_file = |file| Blueprint::classes(file, loader).filter(|c| c.name == class).map(move |c| (file, c));
-        self.mentioning(class).flat_map(of_file).collect()
+        self.files_at(self.index().with_class(class)).flat_map(of_file).collect()
     }
 
     /// The file of the config class of this model type.
     pub(super) fn of_model_type(&self, model_type: &str) -> Option<&Blueprint> {
-        let files = || self.mentioning(model_type).filter(|f| f.model_types.iter().any(|t| t == model_type));
+        let files = || self.all_of_model_type(model_type);
         files().find(|f| f.classes.iter().all(|c| c.chosen_by.is_empty())).or_else(|| files().next())
     }
 
-    /// The file with the conversions of this class or model type.
-    pub(super) fn with_conversions(&self, identifier: &str) -> Option<&Blueprint> {
-        self.mentioning(identifier).find(|f| f.conversions.contains_key(identifier))
+    fn all_of_model_type(&self, model_type: &str) -> impl Iterator<Item = &Blueprint> {
+        let files = self.files_at(self.index().with_model_type(model_type));
+        files.filter(move |f| f.model_types.iter().any(|t| t == model_type))
     }
 
-    /// Files in which this word stands: the others need not be parsed.
-    fn mentioning(&self, word: &str) -> impl Iterator<Item = &Blueprint> {
-        let finder = memchr::memmem::Finder::new(word).into_owned();
-        self.files.iter().filter(move |f| finder.find(f.text.as_bytes()).is_some()).map(File::blueprint)
+    /// The file with the conversions of this class or model type: where it is described, or any other.
+    pub(super) fn with_conversions(&self, identifier: &str) -> Option<&Blueprint> {
+        let index = self.index();
+        let described = index.with_class(identifier).iter().chain(index.with_model_type(identifier));
+        let word = memchr::memmem::Finder::new(identifier);
+        let mentioned = self.files.iter().filter(|f| word.find(f.text.as_bytes()).is_some()).map(File::blueprint);
+        let files = described.filter_map(|at| self.files.get(*at)).map(File::blueprint).chain(mentioned);
+        files.into_iter().find(|f| f.conversions.contains_key(identifier))
+    }
+
+    fn index(&self) -> &Index {
+        self.index.get_or_init(|| Index::of(self.files.iter().map(|f| (f.text.as_ref(), f.parsed.get()))))
+    }
+
+    fn files_at<'l>(&'l self, places: &'l [usize]) -> impl Iterator<Item = &'l Blueprint> {
+        places.iter().filter_map(|at| self.files.get(*at)).map(File::blueprint)
     }
 }
 
@@ -157,11 +172,8 @@ impl File {
     /// When a file in the program does not parse; a test reads them all.
     fn blueprint(&self) -> &Blueprint {
         self.parsed.get_or_init(|| {
-            parse(&self.text).unwrap_or_else(|e| panic!("rules/architectures/{}.json5: {e}", self.stem))
+            let path = format!("rules/architectures/{}.json5", self.stem);
+            source::parse_embedded(&path, &self.text).unwrap_or_else(|e| panic!("{e}"))
         })
     }
-}
-
-fn parse(text: &str) -> Result<Blueprint, String> {
-    json5::from_str(text).map_err(|e| e.to_string())
 }

@@ -57,6 +57,6 @@ impl Processor {
     /// # Errors
     /// [`DataError`]; the house tests see to it that there is none.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
-        source::embedded("processors").iter().map(|(path, text)| source::parse(path, text)).collect()
+        source::embedded("processors").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 }

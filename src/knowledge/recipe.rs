@@ -344,7 +344,7 @@ impl Recipe {
     /// # Errors
     /// [`DataError`]; the house tests see to it that there is none.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
-        source::embedded("recipes").iter().map(|(path, text)| Self::parse(path, text)).collect()
+        source::embedded("recipes").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 }
 

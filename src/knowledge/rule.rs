@@ -169,7 +169,8 @@ impl RuleSet {
     /// # Errors
     /// [`DataError`] naming the file and the place; the house tests see to it that there is none.
     pub fn embedded() -> Result<Self, DataError> {
-        Self::from_files(source::embedded("checks"))
+        let parse = |(path, text): (String, &str)| Ok((source::parse_embedded(&path, text)?, path));
+        Self::collect(source::embedded("checks").into_iter().map(parse))
     }
 
     /// Rules from named texts.
@@ -177,9 +178,13 @@ impl RuleSet {
     /// # Errors
     /// [`DataError`] for a text that is no rule, a code given twice, or an unknown kind of fault.
     pub fn from_files<'a>(files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
+        Self::collect(files.into_iter().map(|(path, text)| Ok((source::parse(&path, text)?, path))))
+    }
+
+    fn collect(files: impl Iterator<Item = Result<(Rule, String), DataError>>) -> Result<Self, DataError> {
         let mut rules: Vec<Rule> = Vec::new();
-        for (path, text) in files {
-            let rule: Rule = source::parse(&path, text)?;
+        for file in files {
+            let (rule, path) = file?;
             if let Check::Fault(f) = &rule.check
                 && let Some(kind) = f.kinds.iter().find(|k| !is_known_kind(k))
             {

@@ -3,6 +3,8 @@
 use include_dir::{Dir, include_dir};
 use serde::de::DeserializeOwned;
 
+use super::expression::{compiled_at_once, compiled_when_needed};
+
 static RULES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules");
 
 /// A data file that is not what it should be.
@@ -24,11 +26,23 @@ impl DataError {
 /// Nesting that a data file may have. The json5 crate recurses without a limit of its own.
 const MAX_DEPTH: usize = 64;
 
-/// Parses one of our own JSON5 files, or a user's recipe or merge file.
+/// Parses a JSON5 file of ours or of a user's, its expressions included.
 ///
 /// # Errors
 /// [`DataError`] with the parser's line and column.
 pub fn parse<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
+    compiled_at_once(|| read(path, text))
+}
+
+/// Parses a file that is in the program: its expressions are known to be right, and compiled when they are needed.
+///
+/// # Errors
+/// As [`parse`], expressions aside.
+pub fn parse_embedded<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
+    compiled_when_needed(|| read(path, text))
+}
+
+fn read<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
     let deepest = text
         .bytes()
         .scan(0_usize, |depth, b| {

@@ -25,7 +25,10 @@ pub fn tables(source: &str) -> String {
         } else if line == "}" {
             inside = false;
         } else {
-            if inside && let Some(key) = key(text, &serde) {
+            if inside
+                && !serde.contains("(skip)")
+                && let Some(key) = key(text, &serde)
+            {
                 let optional = if serde.contains("default") || text.contains(": Option<") { "optional" } else { "" };
                 let _ = writeln!(out, "| `{key}` | {optional} | {} |", cell(&docs));
             }

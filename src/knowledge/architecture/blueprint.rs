@@ -1,6 +1,7 @@
 //! The form of `rules/architectures/*.json5`: a config class, and the model classes that are built from it.
 
 use std::collections::BTreeMap;
+use std::sync::OnceLock;
 
 use serde::Deserialize;
 use serde::de::IgnoredAny;
@@ -60,6 +61,9 @@ pub(crate) struct Blueprint {
     pub conversions: BTreeMap<String, Rows>,
     /// The model classes.
     pub classes: Vec<Class>,
+    /// By loader, in the order of [`Loader::ALL`]: what [`Self::config`] merged.
+    #[serde(skip)]
+    merged: [OnceLock<ConfigClass>; Loader::ALL.len()],
 }
 
 /// What a config class fills in under one loader, and what it means.
@@ -152,7 +156,13 @@ impl Blueprint {
     }
 
     /// What the config class fills in under one loader.
-    pub fn config(&self, loader: Loader) -> ConfigClass {
+    pub fn config(&self, loader: Loader) -> &ConfigClass {
+        let place = Loader::ALL.iter().zip(&self.merged).find(|(l, _)| **l == loader);
+        let [oldest, ..] = &self.merged;
+        place.map_or(oldest, |(_, merged)| merged).get_or_init(|| self.merge(loader))
+    }
+
+    fn merge(&self, loader: Loader) -> ConfigClass {
         let mut config = ConfigClass {
             auto: self.auto.clone(),
             defaults: self.defaults.clone(),

@@ -133,9 +133,8 @@ impl<'l> Builder<'l> {
         // Classes of one file share these, and not every class has a use, or the config keys, for each.
         let mut failed = Vec::new();
         for (name, expression) in &file.lets {
-            match expression.eval(&scope) {
-                Ok(value) => scope.bind(name, &value),
-                Err(e) => failed.push((format!("'{name}'"), e)),
+            if let Err(e) = expression.bind(name, &mut scope) {
+                failed.push((format!("'{name}'"), e));
             }
         }
         let outcome = bind_all(&class.lets, &mut scope)
@@ -335,11 +334,7 @@ impl<'l> Builder<'l> {
 }
 
 fn bind_all(lets: &[(String, Expression)], scope: &mut Scope<'_>) -> Outcome<()> {
-    for (name, expression) in lets {
-        let value = expression.eval(scope)?;
-        scope.bind(name, &value);
-    }
-    Ok(())
+    lets.iter().try_for_each(|(name, expression)| Ok(expression.bind(name, scope)?))
 }
 
 fn holds(condition: Option<&Expression>, scope: &Scope<'_>) -> Outcome<bool> {

@@ -124,7 +124,7 @@ fn compute(config: &mut Map<String, Value>, computed: &[(String, Expression)], s
 }
 
 fn bind(scope: &mut Scope<'_>, config: &Map<String, Value>) {
-    scope.bind("c", &Value::Object(config.clone()));
+    scope.bind_map("c", config);
 }
 
 /// A map of values, of which strings that start with `=` are expressions.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use cel::common::types::{CelBool, CelDouble, CelInt, CelList, CelMap, CelMapKey, CelNull, CelString};
 use cel::common::value::Val;
 use cel::{Context, ExecutionError, FunctionContext, Value as Cel};
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::functions;
 
@@ -100,12 +100,24 @@ impl Scope<'_> {
     ///
     /// The value is converted here, once; expressions then borrow it.
     pub fn bind(&mut self, name: &str, value: &Value) {
-        self.context.add_variable_as_val(name, to_val(value));
+        self.bind_val(name, to_val(value));
     }
 
     /// Binds an integer, such as a loop index. Beyond `i64` it becomes a `double`.
     pub fn bind_int(&mut self, name: &str, value: u64) {
-        self.bind(name, &Value::from(value));
+        match i64::try_from(value) {
+            Ok(value) => self.bind_val(name, Box::new(CelInt::from(value))),
+            Err(_) => self.bind(name, &Value::from(value)),
+        }
+    }
+
+    /// Binds an object without the detour of a [`Value`].
+    pub(crate) fn bind_map(&mut self, name: &str, map: &Map<String, Value>) {
+        self.bind_val(name, map_to_val(map));
+    }
+
+    pub(super) fn bind_val(&mut self, name: &str, value: Box<dyn Val>) {
+        self.context.add_variable_as_val(name, value);
     }
 
     /// A scope inside this one: sees everything of it, binds names of its own.
@@ -129,12 +141,14 @@ fn to_val(value: &Value) -> Box<dyn Val> {
         },
         Value::String(s) => Box::new(CelString::from(s.clone())),
         Value::Array(items) => Box::new(CelList::from(items.iter().map(to_val).collect::<Vec<_>>())),
-        Value::Object(map) => {
-            let map: HashMap<CelMapKey<'static>, Box<dyn Val>> =
-                map.iter().map(|(k, v)| (CelMapKey::from(k.clone()), to_val(v))).collect();
-            Box::new(CelMap::from(map))
-        }
+        Value::Object(map) => map_to_val(map),
     }
+}
+
+fn map_to_val(map: &Map<String, Value>) -> Box<dyn Val> {
+    let map: HashMap<CelMapKey<'static>, Box<dyn Val>> =
+        map.iter().map(|(k, v)| (CelMapKey::from(k.clone()), to_val(v))).collect();
+    Box::new(CelMap::from(map))
 }
 
 /// The CEL value of a JSON value, for what functions return.

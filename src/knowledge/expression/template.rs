@@ -1,5 +1,6 @@
 //! Messages with `{expression}` placeholders.
 
+use std::borrow::Cow;
 use std::fmt;
 
 use serde::{Deserialize, Deserializer};
@@ -26,6 +27,10 @@ impl Template {
     /// # Errors
     /// When a brace has no partner, or a placeholder is not an expression.
     pub fn parse(source: &str) -> Result<Self, ParseError> {
+        super::compiled_at_once(|| Self::written(source))
+    }
+
+    fn written(source: &str) -> Result<Self, ParseError> {
         let mut pieces = Vec::new();
         let mut text = String::new();
         let mut rest = source;
@@ -48,7 +53,7 @@ impl Template {
                     pieces.push(Piece::Text(std::mem::take(&mut text)));
                 }
                 let (expression, after) = body.split_at(end);
-                pieces.push(Piece::Value(Expression::parse(expression)?));
+                pieces.push(Piece::Value(Expression::written(expression)?));
                 rest = after.strip_prefix('}').unwrap_or(after);
             } else {
                 return Err(unpaired('}'));
@@ -147,7 +152,7 @@ impl fmt::Debug for Template {
 
 impl<'de> Deserialize<'de> for Template {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let source = String::deserialize(deserializer)?;
-        Self::parse(&source).map_err(serde::de::Error::custom)
+        let source = Cow::<str>::deserialize(deserializer)?;
+        Self::written(&source).map_err(serde::de::Error::custom)
     }
 }

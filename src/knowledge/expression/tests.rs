@@ -116,9 +116,45 @@ fn a_text_that_is_no_expression_is_a_serde_error_with_its_place() {
     #[derive(serde::Deserialize, Debug)]
     #[serde(deny_unknown_fields)]
     struct File {
-        #[expect(dead_code, reason = "only its parsing is tested")]
         when: Expression,
     }
-    let error = json5::from_str::<File>("{\n  when: \"c.hidden +\",\n}").expect_err("no operand");
+    let text = "{\n  when: \"c.hidden +\",\n}";
+    let error = compiled_at_once(|| json5::from_str::<File>(text)).expect_err("no operand");
     assert!(error.to_string().contains("`c.hidden +` is not an expression"), "{error}");
+    // Otherwise it fails where it is used.
+    let lazy = json5::from_str::<File>(text).expect("not looked at yet");
+    let error = lazy.when.eval(&Scope::new()).expect_err("no operand");
+    assert!(error.to_string().starts_with("`c.hidden +`: column"), "{error}");
+}
+
+#[test]
+fn simple_expressions_mean_what_they_mean_in_cel() {
+    let mut scope = Scope::new();
+    scope.bind("c", &json!({ "n": 7, "sub": { "x": [1, 2], "y": null }, "text": "abc" }));
+    scope.bind_int("i", 3);
+    for simple in [
+        "7",
+        "true",
+        "false",
+        "i",
+        "c.n",
+        "c.sub.x",
+        "c.sub.y",
+        "c.sub",
+        "c.absent",
+        "d",
+        "c.n.x",
+        "c.text.x",
+        "c.sub.y.z",
+        "null",
+    ] {
+        let general = Expression::parse(&format!("({simple})")).expect("CEL").eval(&scope);
+        let direct = Expression::parse(simple).expect("CEL").eval(&scope);
+        assert_eq!(direct.ok(), general.ok(), "{simple}");
+    }
+    for (absent, cause) in [("c.sub.z", "No such key: z"), ("d", "Undeclared reference to 'd'")] {
+        let error = Expression::parse(absent).expect("CEL").eval(&scope).expect_err(absent);
+        assert_eq!(error.cause, cause);
+    }
+    Expression::parse("99999999999999999999").expect_err("more than 64 bits");
 }

@@ -1,0 +1,92 @@
+//! What an expression is compiled to.
+
+use cel::common::types::CelString;
+use cel::common::value::Val;
+use cel::{Context, ExecutionError, Value as Cel};
+
+use super::ENV;
+
+/// Most expressions of the data files are a number, a flag, or a path such as `c.hidden_size`: those need neither CEL's
+/// parser, which is slow, nor its interpreter.
+pub(super) enum Program {
+    /// An integer, `true` or `false`.
+    Constant(Cel),
+    /// A variable, and the keys that are followed from it.
+    Path { variable: String, keys: Vec<CelString<'static>> },
+    /// Anything else.
+    General(cel::Program),
+}
+
+/// Words that are no variables.
+const RESERVED: [&str; 4] = ["true", "false", "null", "in"];
+
+impl Program {
+    /// The cause is CEL's message, with its place in the text.
+    pub fn compile(source: &str) -> Result<Self, String> {
+        if let Some(simple) = Self::constant(source).or_else(|| Self::path(source)) {
+            return Ok(simple);
+        }
+        ENV.compile(source).map(Self::General).map_err(|errors| {
+            let errors = errors.errors.iter().map(|e| format!("column {}: {}", e.pos.1, e.msg));
+            errors.collect::<Vec<_>>().join("; ")
+        })
+    }
+
+    fn constant(source: &str) -> Option<Self> {
+        let digits = source.bytes().all(|b| b.is_ascii_digit());
+        Some(Self::Constant(match source {
+            "true" => Cel::Bool(true),
+            "false" => Cel::Bool(false),
+            _ if digits => Cel::Int(source.parse().ok()?),
+            _ => return None,
+        }))
+    }
+
+    fn path(source: &str) -> Option<Self> {
+        let word = |text: &str| {
+            let mut bytes = text.bytes();
+            let first = bytes.next().is_some_and(|b| b.is_ascii_alphabetic() || b == b'_');
+            first && bytes.all(|b| b.is_ascii_alphanumeric() || b == b'_') && !RESERVED.contains(&text)
+        };
+        if !source.split('.').all(word) {
+            return None;
+        }
+        let mut words = source.split('.').map(str::to_owned);
+        let variable = words.next()?;
+        Some(Self::Path { variable, keys: words.map(CelString::from).collect() })
+    }
+
+    pub fn run(&self, context: &Context<'_, 'static>) -> Result<Cel, ExecutionError> {
+        match self {
+            Self::Constant(value) => Ok(value.clone()),
+            Self::Path { variable, keys } => {
+                let undeclared = || ExecutionError::UndeclaredReference(variable.clone().into());
+                let root = context.get_variable(variable).ok_or_else(undeclared)?;
+                follow(root.as_ref(), keys)
+            }
+            Self::General(program) => program.execute(context),
+        }
+    }
+
+    /// Variables it mentions, sorted.
+    pub fn variables(&self) -> Vec<String> {
+        match self {
+            Self::Constant(_) => Vec::new(),
+            Self::Path { variable, .. } => vec![variable.clone()],
+            Self::General(program) => {
+                let references = program.references();
+                let mut names: Vec<String> = references.variables().into_iter().map(str::to_owned).collect();
+                names.sort();
+                names
+            }
+        }
+    }
+}
+
+fn follow(value: &dyn Val, keys: &[CelString<'static>]) -> Result<Cel, ExecutionError> {
+    let Some((key, deeper)) = keys.split_first() else { return value.try_into() };
+    match value.as_indexer() {
+        Some(map) => follow(map.get(key)?.as_ref(), deeper),
+        None => Err(ExecutionError::NoSuchKey(key.inner().to_owned().into())),
+    }
+}
