@@ -149,7 +149,7 @@ proptest! {
             .map(|(start, len)| Location { file: Some("config.json".to_owned()), span: Some(*start..start + len), ..Location::default() })
             .collect();
         let mismatched = names.iter().map(|n| Mismatch { name: n.clone(), stored: vec![u64::MAX; 3], expected: vec![] }).collect();
-        checkpoint.load = Some(LoadReport { missing: names.clone(), unexpected: names, mismatched, silent: vec![], raises: None });
+        checkpoint.load = Some(LoadReport { missing: names.clone(), unexpected: names, mismatched, ..LoadReport::default() });
         for format in Format::ALL {
             for color in [false, true] {
                 let shown = render(&report, format, Style { color, width: Some(width), cap });

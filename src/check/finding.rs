@@ -53,9 +53,14 @@ pub struct Finding {
     pub fix: Option<FixHint>,
 }
 
-/// Lists of what the loader would say of the state dict; names are state-dict names.
+/// Lists of what a loader would say of the state dict; names are spelled as it spells them.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct LoadReport {
+    /// Version of transformers that was read for this prediction: `4.47.0`.
+    pub loader: String,
+    /// The version that was asked for, or that config.json names, when this one stands for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stands_for: Option<String>,
     /// Expected by the model class, not provided: newly initialised.
     pub missing: Vec<String>,
     /// Provided, not part of the model: ignored.

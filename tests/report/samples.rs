@@ -190,6 +190,7 @@ fn load() -> LoadReport {
             Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned() },
         ],
         raises: Some("ValueError: The state dictionary is corrupted.".to_owned()),
+        ..LoadReport::default()
     }
 }
 
@@ -255,7 +256,7 @@ pub fn hostile() -> Report {
         unexpected: vec![HOSTILE.to_owned()],
         mismatched: vec![Mismatch { name: HOSTILE.to_owned(), stored: vec![1; 10_000], expected: vec![u64::MAX] }],
         silent: vec![Silent { name: HOSTILE.to_owned(), reason: HOSTILE.to_owned() }],
-        raises: None,
+        ..LoadReport::default()
     });
     Report::new(vec![checkpoint], None)
 }

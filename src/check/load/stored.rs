@@ -80,6 +80,17 @@ impl Stored {
         self.keys.iter().chain(self.shapes.keys()).map(|name| (name.clone(), self.shapes.get(name).cloned())).collect()
     }
 
+    /// Names in the files the loader opens; those of the index stand in for files that are not there.
+    pub(super) fn file_names(&self) -> impl Iterator<Item = &str> {
+        let unread = self.keys.iter().filter(|key| !self.shapes.contains_key(*key) && !self.absent.contains(*key));
+        self.shapes.keys().chain(unread).map(String::as_str)
+    }
+
+    /// Shape of a tensor, when its file was read.
+    pub(super) fn shape(&self, name: &str) -> Option<&[u64]> {
+        self.shapes.get(name).map(Vec::as_slice)
+    }
+
     /// Tensors in the files the loader opens, by name.
     pub(super) fn shapes(&self) -> impl Iterator<Item = (&str, &[u64])> {
         self.shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_slice()))

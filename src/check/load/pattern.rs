@@ -1,0 +1,41 @@
+//! Regular expressions of the loader, searched for as Python's `re.search` does.
+//!
+//! The patterns are the library's own, the names are a stranger's: backtracking is bounded, and a search that
+//! reaches the bound counts as no match.
+
+use fancy_regex::{Captures, Regex, RegexBuilder};
+
+/// Steps of backtracking for one name; the longest pattern of transformers 5.23.0 takes some hundred.
+const BACKTRACKS: usize = 100_000;
+
+/// A compiled pattern.
+#[derive(Debug, Clone)]
+pub(super) struct Pattern(Regex);
+
+impl Pattern {
+    /// Python's syntax is fancy-regex's in all that these patterns use.
+    pub(super) fn new(text: &str) -> Option<Self> {
+        RegexBuilder::new(text).backtrack_limit(BACKTRACKS).build().ok().map(Self)
+    }
+
+    pub(super) fn found_in(&self, name: &str) -> bool {
+        self.0.is_match(name).unwrap_or(false)
+    }
+
+    pub(super) fn captures<'n>(&self, name: &'n str) -> Option<Captures<'n, str>> {
+        self.0.captures(name).ok().flatten()
+    }
+
+    /// Number of the group of this name.
+    pub(super) fn group(&self, name: &str) -> Option<usize> {
+        self.0.capture_names().position(|group| group == Some(name))
+    }
+}
+
+/// Drops the names that one of the patterns is found in.
+pub(super) fn ignore(names: &mut Vec<String>, patterns: &[String]) {
+    let patterns: Vec<Pattern> = patterns.iter().filter_map(|text| Pattern::new(text)).collect();
+    if !patterns.is_empty() {
+        names.retain(|name| !patterns.iter().any(|p| p.found_in(name)));
+    }
+}

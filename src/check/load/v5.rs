@@ -1,0 +1,249 @@
+//! transformers 5.23.0: `convert_and_load_state_dict_in_model` and `_finalize_model_loading`, on names and shapes.
+//!
+//! Each key of the files is renamed, and may go with others into a converter; what comes out is compared with the
+//! model. All lists are in the model's names.
+
+use std::cmp::Ordering;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use indexmap::IndexMap;
+
+use super::convert::{Shape, Tensors, convert};
+use super::pattern;
+use super::rename::Transform;
+use super::{Stored, absent_groups};
+use crate::check::finding::{LoadReport, Mismatch};
+use crate::knowledge::{Expected, ExpectedTensor};
+
+const CONVERSION: &str = "RuntimeError: We encountered some issues during automatic conversion of the weights";
+
+/// What will be made into one tensor of the model, or into those of one converter.
+enum Mapping {
+    /// The tensor as it is; the first of that name wins.
+    Plain(Shape),
+    /// A converter, by its place, and what was collected for it.
+    Converter(usize, Tensors),
+}
+
+pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
+    let mut loading = Loading::new(expected);
+    let mut names: Vec<&str> = stored.file_names().collect();
+    names.sort_by(|a, b| natural(a, b));
+    for name in names {
+        loading.collect(name, stored.shape(name).map_or(Shape::Unknown, |dims| Shape::Known(dims.to_vec())));
+    }
+    let raises = loading.convert();
+    let absent = absent_groups(expected, |name| !loading.missing.contains(name));
+    loading.missing.retain(|name| {
+        let group = expected.tensors.get(name).and_then(|t| t.optional.as_ref());
+        group.is_none_or(|group| !absent.contains(group.as_str()))
+    });
+    loading.tie();
+    let mut report = LoadReport {
+        missing: loading.missing.into_iter().collect(),
+        unexpected: loading.unexpected.into_iter().collect(),
+        mismatched: loading.mismatched.into_values().collect(),
+        raises,
+        ..LoadReport::default()
+    };
+    pattern::ignore(&mut report.missing, &expected.ignore_missing);
+    pattern::ignore(&mut report.unexpected, &expected.ignore_unexpected);
+    pattern::ignore(&mut report.unexpected, &old_buffers(expected));
+    report
+}
+
+/// Buffers that older versions saved, as patterns: silent in a file when the model has one of that name anywhere.
+fn old_buffers(expected: &Expected) -> Vec<String> {
+    [("rotary_emb.inv_freq", r"rotary_emb\.inv_freq"), ("position_ids", r"(^|\.)position_ids$")]
+        .into_iter()
+        .filter(|(end, _)| expected.buffers.iter().chain(expected.tensors.keys()).any(|name| name.ends_with(end)))
+        .map(|(_, pattern)| pattern.to_owned())
+        .collect()
+}
+
+struct Loading<'e> {
+    expected: &'e Expected,
+    renamings: Vec<Transform<'e>>,
+    converters: Vec<Transform<'e>>,
+    /// The last converter that has this source pattern: the loader takes that one, whichever matched.
+    by_pattern: HashMap<&'e str, usize>,
+    mappings: IndexMap<String, Mapping>,
+    missing: BTreeSet<String>,
+    unexpected: BTreeSet<String>,
+    mismatched: BTreeMap<String, Mismatch>,
+}
+
+impl<'e> Loading<'e> {
+    fn new(expected: &'e Expected) -> Self {
+        let transforms = expected.conversions.iter().filter_map(|row| Transform::new(row, &expected.base_model_prefix));
+        let (converters, renamings): (Vec<_>, Vec<_>) = transforms.partition(Transform::is_converter);
+        let patterns =
+            converters.iter().enumerate().flat_map(|(i, c)| c.row().from.iter().map(move |p| (p.as_str(), i)));
+        Self {
+            expected,
+            by_pattern: patterns.collect(),
+            renamings,
+            converters,
+            mappings: IndexMap::new(),
+            missing: expected.tensors.keys().cloned().collect(),
+            unexpected: BTreeSet::new(),
+            mismatched: BTreeMap::new(),
+        }
+    }
+
+    fn in_model(&self, name: &str) -> bool {
+        self.expected.tensors.contains_key(name)
+    }
+
+    /// Renames a key of the files and puts its tensor where it belongs.
+    fn collect(&mut self, key: &str, shape: Shape) {
+        let mut name = key.to_owned();
+        for renaming in &mut self.renamings {
+            if let Some((renamed, _)) = renaming.apply(&name) {
+                name = renamed;
+            }
+        }
+        let converted = self.converters.iter_mut().find_map(|converter| converter.apply(&name));
+        let (name, mut source) = converted.map_or((name, None), |(renamed, source)| (renamed, Some(source)));
+        let mut name = self.prefixed(name);
+        if !self.in_model(&name) && self.in_model(key) {
+            // The renaming leads nowhere, and the name was right as it was.
+            name = self.prefixed(key.to_owned());
+            source = None;
+        }
+        let converter = source.and_then(|source| Some((source, *self.by_pattern.get(source)?)));
+        match converter {
+            _ if self.in_model(&name) => {
+                let (as_mapping, source) = match converter {
+                    Some((source, at)) => (Mapping::Converter(at, Tensors::new()), source),
+                    None => (Mapping::Plain(shape.clone()), key),
+                };
+                if let Mapping::Converter(_, tensors) = self.mappings.entry(name).or_insert(as_mapping) {
+                    tensors.entry(source.to_owned()).or_default().push(shape);
+                }
+            }
+            Some((_, at)) => {
+                let to = self.converters.get(at).map(|c| c.row().to.as_slice()).unwrap_or_default();
+                let first = to.first().map_or("", String::as_str);
+                self.unexpected.extend(to.iter().map(|to| name.replace(first, to)));
+            }
+            None => {
+                self.unexpected.insert(name);
+            }
+        }
+    }
+
+    /// Takes the base model's prefix off a name, or puts it on, when that makes it one of the model's.
+    fn prefixed(&self, name: String) -> String {
+        let prefix = &self.expected.base_model_prefix;
+        if let Some(rest) = name.strip_prefix(prefix.as_str()) {
+            // As the loader does: any character may stand for the dot.
+            let mut rest = rest.chars();
+            rest.next();
+            if self.in_model(rest.as_str()) {
+                return rest.as_str().to_owned();
+            }
+        }
+        let longer = format!("{prefix}.{name}");
+        if self.in_model(&longer) { longer } else { name }
+    }
+
+    /// Runs the converters and compares every tensor with the model's. Says why the load raises, if it does.
+    fn convert(&mut self) -> Option<String> {
+        let mut raises = None;
+        for (target, mapping) in std::mem::take(&mut self.mappings) {
+            let made = match mapping {
+                Mapping::Plain(shape) => Ok(vec![(target.clone(), shape)]),
+                Mapping::Converter(at, tensors) => match self.converters.get(at) {
+                    Some(converter) => convert(converter.row(), &target, tensors, self.expected),
+                    None => continue,
+                },
+            };
+            match made {
+                Ok(made) => made.into_iter().for_each(|(name, shape)| self.set(name, &shape)),
+                Err(failure) if raises.is_none() => raises = Some(format!("{CONVERSION} ({target}: {failure})")),
+                Err(_) => {}
+            }
+        }
+        raises
+    }
+
+    fn set(&mut self, name: String, shape: &Shape) {
+        let Some(ExpectedTensor { shape: wanted, .. }) = self.expected.tensors.get(&name) else {
+            // Usually a bias that the module has switched off.
+            self.unexpected.insert(name);
+            return;
+        };
+        self.missing.remove(&name);
+        let stored = match (shape, wanted.split_first()) {
+            (Shape::Known(dims), _) => dims.clone(),
+            (Shape::Stack(count), Some((_, rest))) => std::iter::once(*count).chain(rest.iter().copied()).collect(),
+            _ => return,
+        };
+        if stored != *wanted {
+            self.mismatched.insert(name.clone(), Mismatch { name, stored, expected: wanted.clone() });
+        }
+    }
+
+    /// `tie_weights`: a tensor stands for those that are tied to it, and for the one that it is tied to.
+    fn tie(&mut self) {
+        let pairs: Vec<(&String, &String)> =
+            self.expected.tensors.iter().filter_map(|(name, t)| Some((name, t.tied_to.as_ref()?))).collect();
+        for (i, (target, source)) in pairs.iter().enumerate() {
+            match (self.missing.contains(*source), self.missing.contains(*target)) {
+                (false, true) => self.missing.remove(*target),
+                (true, false) => self.missing.remove(*source),
+                (true, true) => {
+                    let later = pairs.iter().skip(i.saturating_add(1));
+                    let other = later.filter(|(_, s)| s == source).any(|(t, _)| !self.missing.contains(*t));
+                    other && self.missing.remove(*target)
+                }
+                (false, false) => false,
+            };
+        }
+    }
+}
+
+/// The loader's order of names: part by part between dots, numbers by value and before words, and the number at the
+/// end of a word by value.
+fn natural(a: &str, b: &str) -> Ordering {
+    let compare = |(a_word, a): &(bool, &str), (b_word, b): &(bool, &str)| {
+        a_word.cmp(b_word).then_with(|| {
+            let (a_text, a_digits) = trailing_digits(a);
+            let (b_text, b_digits) = trailing_digits(b);
+            a_text.cmp(b_text).then_with(|| number(a_digits).cmp(&number(b_digits)))
+        })
+    };
+    let (a, b) = (parts(a), parts(b));
+    let differing = a.iter().zip(&b).map(|(a, b)| compare(a, b)).find(|o| o.is_ne());
+    differing.unwrap_or_else(|| a.len().cmp(&b.len()))
+}
+
+/// The parts of a name, each with whether it is a word.
+fn parts(name: &str) -> Vec<(bool, &str)> {
+    let is_number = |part: &str| !part.is_empty() && part.bytes().all(|b| b.is_ascii_digit());
+    name.split('.').map(|part| (!is_number(part), part)).collect()
+}
+
+fn trailing_digits(part: &str) -> (&str, &str) {
+    let text = part.trim_end_matches(|c: char| c.is_ascii_digit());
+    part.split_at(text.len())
+}
+
+/// A number of any length as something that compares by value; none is before all.
+fn number(digits: &str) -> Option<(usize, &str)> {
+    let value = digits.trim_start_matches('0');
+    (!digits.is_empty()).then_some((value.len(), value))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::natural;
+
+    #[test]
+    fn names_sort_as_the_loader_sorts_them() {
+        let mut names = ["b.10.w", "b.9.w", "b.x.w", "b.shard_11", "b.shard_2", "b.shard_", "b.9", "a.1"];
+        names.sort_by(|a, b| natural(a, b));
+        assert_eq!(names, ["a.1", "b.9", "b.9.w", "b.10.w", "b.shard_", "b.shard_2", "b.shard_11", "b.x.w"]);
+    }
+}
