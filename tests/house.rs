@@ -12,6 +12,7 @@ mod support;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::fs;
+use std::path::Path;
 
 use ckpt_doctor::checkpoint::fault::FAULT_KINDS;
 use ckpt_doctor::knowledge::processor::Processor;
@@ -170,14 +171,14 @@ fn other_data_files_parse() {
     assert_eq!(names.len(), texts("rules/architectures").len());
     let mut read = Library::default();
     for (path, text) in texts("rules/architectures") {
+        let stem = Path::new(&path).file_stem().map(|s| s.to_string_lossy().into_owned());
+        assert!(names.contains(&stem.unwrap_or_default().as_str()), "{path}");
         read.add(&path, &text).unwrap_or_else(|e| panic!("{e}"));
     }
+    assert_eq!(read.names().count(), names.len(), "an architecture has the name of its file");
     for name in names {
-        let architecture = library.architecture(name).unwrap_or_else(|| panic!("{name}"));
-        assert!(
-            !architecture.summary().is_empty() && !architecture.sources().is_empty(),
-            "{name} says what it is and who says so"
-        );
+        let (summary, sources) = library.about(name).unwrap_or_else(|| panic!("{name}"));
+        assert!(!summary.is_empty() && !sources.is_empty(), "{name} says what it is and who says so");
     }
 }
 

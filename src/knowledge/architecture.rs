@@ -52,18 +52,6 @@ impl<'l> Architecture<'l> {
         self.loader
     }
 
-    /// One line on what it is.
-    #[must_use]
-    pub fn summary(&self) -> &'l str {
-        &self.file.summary
-    }
-
-    /// Where its facts come from.
-    #[must_use]
-    pub fn sources(&self) -> &'l [String] {
-        &self.file.sources
-    }
-
     /// The tensors the class builds from `config`, the content of config.json.
     ///
     /// # Errors
