@@ -184,3 +184,25 @@ impl File {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn only_the_file_at_hand_is_parsed() {
+        let library = Library::embedded();
+        let parsed = || library.files.iter().filter(|f| f.parsed.get().is_some()).map(|f| f.stem.as_str());
+        assert_eq!(parsed().count(), 0);
+        let config = json!({ "architectures": ["LlamaForCausalLM"], "model_type": "llama" });
+        for loader in Loader::ALL {
+            let llama = library.find(&config, [], loader).expect("known");
+            llama.expect(&config).expect("built");
+        }
+        assert_eq!(parsed().collect::<Vec<_>>(), ["llama"]);
+        assert!(library.find(&json!({ "architectures": ["Nobody"] }), [], Loader::NEWEST).is_none());
+        assert_eq!(parsed().count(), 1);
+    }
+}
