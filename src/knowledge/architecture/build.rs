@@ -1,5 +1,7 @@
 //! From a class and a config to the tensors it has.
 
+use std::borrow::Cow;
+
 use serde_json::{Map, Value};
 
 use super::blueprint::{Blueprint, Class};
@@ -13,6 +15,9 @@ use crate::knowledge::{EvalError, Expression, Scope, Template};
 const STEP_CAP: usize = 2_000_000;
 /// Longest tensor name that is made; parts of names may come from the config.
 const NAME_CAP: usize = 1_000;
+
+/// Models within a model that conversions are looked up for; real ones have a few.
+const MODULE_CAP: usize = 1_000;
 
 /// One sentence on why a class cannot be built.
 pub(super) struct Refusal(pub String);
@@ -146,8 +151,10 @@ impl<'l> Builder<'l> {
     }
 
     fn module(&mut self, prefix: &str, class: &str, model_type: Option<String>, file: &'l Blueprint) {
-        let path = prefix.trim_end_matches('.').to_owned();
-        self.modules.push(Module { path, class: class.to_owned(), model_type, file });
+        if self.modules.len() < MODULE_CAP {
+            let path = prefix.trim_end_matches('.').to_owned();
+            self.modules.push(Module { path, class: class.to_owned(), model_type, file });
+        }
     }
 
     fn members(
@@ -263,8 +270,12 @@ impl<'l> Builder<'l> {
         if part.config.is_none() && part.set.is_empty() {
             return self.class(file, class, around.config, place);
         }
-        let mut map = given.clone();
-        map.extend(evaluated(&part.set, scope)?);
+        // Another config costs time by its size, as often as a repeat asks for it.
+        self.steps = self.steps.saturating_add(given.len());
+        let mut map = Cow::Borrowed(given);
+        if !part.set.is_empty() {
+            map.to_mut().extend(evaluated(&part.set, scope)?);
+        }
         let scope = self.resolver.scope(&map);
         self.class(file, class, Config { map: &map, scope: &scope }, place)
     }

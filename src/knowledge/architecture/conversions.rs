@@ -73,9 +73,6 @@ pub(super) struct Module<'l> {
     pub file: &'l Blueprint,
 }
 
-/// Modules a conversion table is asked for; a model with more is no model.
-const MODULE_CAP: usize = 10_000;
-
 /// The conversions for a model, in the order of application.
 ///
 /// Follows `get_model_conversion_mapping` of transformers 5.23.0: modules in order, each by its class name, else by its
@@ -87,7 +84,7 @@ pub(super) fn collect(library: &Library, modules: &[Module<'_>], base_model_pref
         seen.get(identifier).is_some_and(|paths| paths.iter().any(|above| is_below(path, above)))
     };
     let mut found = Vec::new();
-    for module in modules.iter().take(MODULE_CAP) {
+    for module in modules {
         let model_type = module.model_type.as_deref();
         if module.file.is_custom_code() || claimed(&seen, &module.class, &module.path) {
             continue;
