@@ -85,7 +85,8 @@ impl Library {
     /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
     /// The class in `architectures` decides; where it is absent, or custom code may stand behind an unknown
-    /// name (`auto_map`), `model_type` does. Where several entries describe one class, the tensors choose.
+    /// name (`auto_map`), `model_type` does. Where several entries describe one class, the config (`when` of the file)
+    /// and the tensors (`chosen_by` of the class) choose.
     #[must_use]
     pub fn find<'n>(
         &self,
@@ -97,12 +98,13 @@ impl Library {
         let class = config.get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
         let model_type = config.get("model_type").and_then(Value::as_str);
         let mut candidates = class.map(|class| self.entries(class, loader)).unwrap_or_default();
+        candidates.retain(|(file, _)| file.speaks_for(config));
         candidates.sort_by_key(|(file, _)| !model_type.is_some_and(|t| file.model_types.iter().any(|m| m == t)));
         let (file, class) = match choose(candidates, &mut names) {
             Some(found) => found,
             None if class.is_some() && config.get("auto_map").is_none() => return None,
             None => {
-                let files = self.all_of_model_type(model_type?);
+                let files = self.all_of_model_type(model_type?).filter(|file| file.speaks_for(config));
                 choose(files.filter_map(|file| Some((file, main_class(file, loader)?))).collect(), &mut names)?
             }
         };
@@ -119,10 +121,10 @@ impl Library {
         self.files_at(self.index().with_class(class)).flat_map(of_file).collect()
     }
 
-    /// The file of the config class of this model type.
-    pub(super) fn of_model_type(&self, model_type: &str) -> Option<&Blueprint> {
-        let files = || self.all_of_model_type(model_type);
-        files().find(|f| f.classes.iter().all(|c| c.chosen_by.is_empty())).or_else(|| files().next())
+    /// The file of the config class of this model type: one that the loader knows, if any.
+    pub(super) fn of_model_type(&self, model_type: &str, loader: Loader) -> Option<&Blueprint> {
+        let chosen = |f: &Blueprint| f.classes.iter().any(|c| !c.chosen_by.is_empty());
+        self.all_of_model_type(model_type).min_by_key(|file| (!file.loaders.contains(&loader), chosen(file)))
     }
 
     fn all_of_model_type(&self, model_type: &str) -> impl Iterator<Item = &Blueprint> {

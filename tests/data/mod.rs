@@ -39,10 +39,10 @@ fn expand(name: &str) -> Vec<String> {
     let (range, after) = rest.split_once('}').expect("closing brace");
     let (from, to) = range.split_once("..").expect("range");
     let (from, to): (u64, u64) = (from.parse().expect("number"), to.parse().expect("number"));
-    (from..=to).map(|i| format!("{before}{i}{after}")).collect()
+    (from..=to).flat_map(|i| expand(&format!("{before}{i}{after}"))).collect()
 }
 
-/// One small model: what transformers builds from a config, and says of mutated copies of its file.
+/// One model: what transformers builds from a config, and says of mutated copies of its file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Record {

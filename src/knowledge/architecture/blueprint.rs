@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use super::conversions::Rows;
 use super::member::Member;
 use super::ordered::ordered;
-use crate::knowledge::{Expression, Loader, Template};
+use crate::knowledge::{Expression, Loader, Scope, Template};
 
 /// One architecture file.
 ///
@@ -34,6 +34,9 @@ pub(crate) struct Blueprint {
     /// Absent in files written by hand.
     #[serde(default)]
     pub derived: Option<IgnoredAny>,
+    /// Which configs the file speaks for, seen as they are written, as `c`: other code may stand behind the same names.
+    #[serde(default)]
+    when: Option<Expression>,
     /// Classes that `AutoModel…` builds for this config class: `model`, `causal_lm` and so on.
     #[serde(default)]
     auto: BTreeMap<String, String>,
@@ -150,6 +153,15 @@ pub(crate) struct Class {
 }
 
 impl Blueprint {
+    /// Whether the file is about this config.json.
+    pub fn speaks_for(&self, config: &Value) -> bool {
+        self.when.as_ref().is_none_or(|when| {
+            let mut scope = Scope::new();
+            scope.bind("c", config);
+            when.eval_bool(&scope).unwrap_or(false)
+        })
+    }
+
     /// The entries that a loader knows.
     pub fn classes(&self, loader: Loader) -> impl Iterator<Item = &Class> {
         self.classes.iter().filter(move |c| c.loaders.as_ref().unwrap_or(&self.loaders).contains(&loader))

@@ -285,7 +285,7 @@ impl<'l> Builder<'l> {
         &self,
         part: &Part,
         config: &Map<String, Value>,
-        around: &Blueprint,
+        around: &'l Blueprint,
     ) -> Outcome<(&'l Blueprint, &'l Class)> {
         let Resolver { library, loader, .. } = self.resolver;
         let key = part.config.as_ref().map_or_else(|| "model_type".to_owned(), |path| format!("{path}.model_type"));
@@ -298,7 +298,7 @@ impl<'l> Builder<'l> {
         } else {
             let model_type = model_type().ok_or_else(|| Refusal(format!("`{key}` is absent")))?;
             let listed = part.by_model_type.get(model_type).and_then(Value::as_str);
-            let auto = || library.of_model_type(model_type)?.auto(part.auto.as_deref()?, loader);
+            let auto = || library.of_model_type(model_type, loader)?.auto(part.auto.as_deref()?, loader);
             listed.or_else(auto).ok_or_else(|| {
                 let known: Vec<&str> = part.by_model_type.keys().map(String::as_str).collect();
                 let known =
@@ -309,7 +309,9 @@ impl<'l> Builder<'l> {
                 ))
             })?
         };
-        library.entry(class, loader).ok_or_else(|| {
+        // Two files may have a class of one name: a part is first looked for in its own.
+        let own = around.classes(loader).find(|c| c.name == class).map(|c| (around, c));
+        own.or_else(|| library.entry(class, loader)).ok_or_else(|| {
             Refusal(format!("the class {class}, which it has as a part, is not known for transformers {loader}"))
         })
     }

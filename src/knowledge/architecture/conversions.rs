@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::blueprint::Blueprint;
-use crate::knowledge::Library;
+use crate::knowledge::{Library, Loader};
 
 /// One step of transformers 5's conversion of file names to model names, or of file tensors to model tensors.
 ///
@@ -116,8 +116,9 @@ fn is_below(path: &str, above: &str) -> bool {
 }
 
 fn by_model_type<'l>(library: &'l Library, file: &'l Blueprint, model_type: &str) -> Option<&'l [Conversion]> {
-    rows(library, file, model_type, 0)
-        .or_else(|| library.of_model_type(model_type).and_then(|file| rows(library, file, model_type, 0)))
+    rows(library, file, model_type, 0).or_else(|| {
+        library.of_model_type(model_type, Loader::V5_23_0).and_then(|file| rows(library, file, model_type, 0))
+    })
 }
 
 /// What a file says under an identifier, references followed.

@@ -78,7 +78,8 @@ impl Resolver<'_> {
         }
         sub.extend(evaluated(&spec.set, scope)?);
         fill(&mut sub, &spec.defaults);
-        let file = sub.get("model_type").and_then(Value::as_str).and_then(|t| self.library.of_model_type(t));
+        let file =
+            sub.get("model_type").and_then(Value::as_str).and_then(|t| self.library.of_model_type(t, self.loader));
         let inside = |Refusal(e): Refusal| Refusal(format!("{key}: {e}"));
         if let Some(file) = file {
             sub = self.resolve(file, sub, depth.saturating_add(1)).map_err(inside)?;
