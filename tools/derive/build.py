@@ -37,8 +37,14 @@ def without_initialisation():
     torch.linspace = lambda *a, **k: linspace(*a, **{**k, "device": "cpu"})
     torch.Tensor.item = lambda t: 0.0 if t.device.type == "meta" else item(t)
     torch.Tensor.tolist = lambda t: [0.0] * t.numel() if t.device.type == "meta" else tolist(t)
+    nn = torch.nn
+    for kind in (nn.Linear, nn.Embedding, nn.LayerNorm, nn.modules.conv._ConvNd, nn.GroupNorm):
+        kind.reset_parameters = lambda self: None
     # Not transformers' own switch for this: it would leave out tying weights as well.
     PreTrainedModel._initialize_weights = lambda *a, **k: None
+    if transformers.__version__.startswith("4"):
+        PreTrainedModel.init_weights = lambda self: self.tie_weights()
+    PreTrainedModel.can_generate = classmethod(lambda cls: False)      # no generation config is made
     torch.set_num_threads(1)
 
 

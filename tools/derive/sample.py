@@ -25,16 +25,19 @@ from .catalogue import VERSION  # noqa: E402
 from .configs import alternatives, candidates, changed, copied, flatten, is_int, random_raw  # noqa: E402
 
 MEMORY = 5 << 30
-BASES, FRESH, OMITTED, MIXED, EQUAL = 9, 9, 5, 22, 12
+HEAD_KEY = "label|tie|classif|pool|proj|head|summary|vocab|decoder|bias|^num_|use_"
+BASES, FRESH, OMITTED, MIXED, EQUAL = 6, 8, 4, 12, 6
 # A budget in modules built, not in seconds, so that the same version gives the same samples. A module costs about 60 µs.
-FIRST_BUDGET, OTHER_BUDGET, LEAST = 36000, 14000, 80
+FIRST_BUDGET, OTHER_BUDGET, LEAST = 7000, 1800, 30
 CLASS_SECONDS = 45                                            # a stop for what the budget does not see
 
 
 class Sampler:
     """All samples of one class."""
 
-    def __init__(self, cls, config_class, model_type, raws, words, known, budget):
+    def __init__(self, cls, config_class, model_type, raws, words, known, budget, hints):
+        # `hints`: for classes around one already sampled, the keys that had an effect there; others only if named by this class.
+        self.hints, self.text = hints, class_source(cls)
         self.cls, self.config_class, self.model_type, self.words = cls, config_class, model_type, words
         self.budget, self.spent, self.count, self.started = budget, 0, 0, time.time()
         self.samples, self.seen, self.errors, self.device = [], {}, {}, "meta"
@@ -62,7 +65,7 @@ class Sampler:
         self.spent += b.modules
         self.count += 1
         s = {"raw": raw, "parent": parent, "key": key, "flat": b.flat, "tensors": b.tensors, "tied": b.tied, "buffers": b.buffers,
-             "persistent": b.persistent, "models": nested_models(b, config)}
+             "persistent": b.persistent, "models": self.models(b, config)}
         if self.facts is None:
             self.facts = facts(b, self.cls)
         if parent is None or {(m[0], m[1]) for m in s["models"]} - set(self.parts):
@@ -70,6 +73,13 @@ class Sampler:
         self.seen[mark] = len(self.samples)
         self.samples.append(s)
         return len(self.samples) - 1
+
+    def models(self, b, config):
+        """`nested_models`, worked out again only for models not seen before: comparing configs is slow."""
+        key = tuple((prefix, type(m).__name__, id(type(m.config))) for prefix, m in b.models)
+        if key not in self.values:
+            self.values[key] = nested_models(b, config)
+        return self.values[key]
 
     def note_parts(self, b, s):
         """How each model inside differs from the same class built by itself from the same config."""
@@ -120,9 +130,9 @@ class Sampler:
         if rich is not None:
             self.scan(rich, skip=[k for k, e in self.effective.items() if e])
         strong = sorted(k for k, e in self.effective.items() if e == 2)
-        order = [b for b in [rich, first, *bases[1:4]] if b is not None]
+        order = [b for b in [rich, first, *bases[1:3]] if b is not None][:3]
         for depth, base in enumerate(order):
-            self.deepen(base, strong, 3 if depth < 2 else 2)
+            self.deepen(base, strong, 3 if depth < 1 else 1)
         self.joint(order[:2])
         self.equalise(order[:2], strong)
         self.mix(bases + ([rich] * 3 if rich is not None else []), strong)
@@ -131,11 +141,11 @@ class Sampler:
         """Every key once."""
         flat, raw = self.samples[base]["flat"], self.samples[base]["raw"]
         for k in candidates(flat, self.words):
-            if k in skip:
+            if k in skip or self.hints is not None and k not in self.hints and not re.search(HEAD_KEY, k) and k.split(".")[-1] not in self.text:
                 continue
             if not self.left():
                 break
-            for v in alternatives(k, flat[k], self.words)[:4]:
+            for v in alternatives(k, flat[k], self.words)[:2]:
                 i = self.change(base, raw, k, v)
                 if i is not None:
                     e = self.effect(i)
@@ -177,7 +187,7 @@ class Sampler:
             if k not in flat:
                 continue
             done = 0
-            many = 8 if isinstance(flat[k], list) and base == self.samples[base].get("base", base) else values
+            many = 8 if isinstance(flat[k], list) and values > 1 else values
             for v in alternatives(k, flat[k], self.words):
                 done += self.change(base, raw, k, v) is not None
                 if done >= many:
@@ -356,6 +366,27 @@ def config_record(model_type, config_class, raws):
     return out
 
 
+def write_config(root, model_type, config_class, raws=None):
+    """The record of a config class, and of those inside it that have none yet."""
+    if raws is None:
+        raws = base_raws(model_type, config_class, lambda raw: config_class(**copied(raw)), BASES + FRESH, "config")
+    write_json(root / "config-samples" / f"{model_type}.json.gz", config_record(model_type, config_class, raws))
+    for sub in configs.subconfigs(config_class()).values():
+        mt = sub.model_type
+        if mt and type(sub) is not config_class and not (root / "config-samples" / f"{mt}.json.gz").exists():
+            write_config(root, mt, type(sub))
+
+
+def remaining_configs(root):
+    """Records of config classes no model was sampled for."""
+    for mt in sorted(catalogue.CONFIG_MAPPING_NAMES):
+        if not (root / "config-samples" / f"{mt}.json.gz").exists():
+            try:
+                write_config(root, mt, catalogue.config_class(mt))
+            except Exception as e:
+                failed(root, mt, f"config: {type(e).__name__}: {e}")
+
+
 def thinned_raw(raw, rng, share):
     out = {}
     for k, v in sorted(raw.items()):
@@ -393,6 +424,13 @@ def base_raws(model_type, config_class, works, wanted, seed):
     return out
 
 
+def class_source(cls):
+    try:
+        return inspect.getsource(cls)
+    except (OSError, TypeError):
+        return ""
+
+
 def sources(cls, config_class):
     for c in (cls, config_class):
         try:
@@ -406,7 +444,7 @@ def sample_family(root, model_type, names, again, log):
     config_class = catalogue.config_class(model_type)
     if config_class is None:
         raise RuntimeError("its config class cannot be imported")
-    shared, known = {}, set()
+    shared, known, hints = {}, set(), {}
     for order, name in enumerate(names):
         target = root / "samples" / f"{name}.json.gz"
         (root / "current").write_text(name)
@@ -416,15 +454,18 @@ def sample_family(root, model_type, names, again, log):
         started = time.time()
         try:
             cls = catalogue.find_class(name)
-            cc = cls.config_class if getattr(cls, "config_class", None) is not None and cls.config_class.model_type == model_type else config_class
+            own = getattr(cls, "config_class", None) or config_class
+            cc = config_class if issubclass(config_class, own) else own
+            model_type = cc.model_type
             if cc not in shared:
                 shared[cc] = family_raws(model_type, cc, cls)
-                write_json(root / "config-samples" / f"{model_type}.json.gz", config_record(model_type, cc, shared[cc][0] + shared[cc][1]))
+                write_config(root, model_type, cc, shared[cc][0] + shared[cc][1])
             raws, fresh = shared[cc]
             raws, fresh = labelled(name, raws), labelled(name, fresh)
             words = configs.compared_words(*sources(cls, cc))
-            s = Sampler(cls, cc, model_type, raws, words, known, OTHER_BUDGET if known else FIRST_BUDGET)
+            s = Sampler(cls, cc, model_type, raws, words, known, OTHER_BUDGET if known else FIRST_BUDGET, hints.get(cc))
             s.run()
+            hints.setdefault(cc, {k for k, e in s.effective.items() if e})
             write_json(root / "samples" / f"{name}.json.gz", packed(s, {"model_type": model_type, "config_class": cc.__name__, "version": VERSION}))
             rows = s.fresh(fresh)
             (root / "fresh").mkdir(exist_ok=True)
@@ -500,6 +541,7 @@ def main(args):
         done = {p.name.removesuffix(".json.gz") for p in (root / "samples").glob("*.gz")} | bad if not args.again else set()
         todo = [(mt, [n for n in names if n not in bad or args.again]) for mt, names in families if set(names) - done]
         if not todo:
+            remaining_configs(root)
             return 0
         pid = os.fork()
         if pid == 0:

@@ -1,0 +1,532 @@
+"""From samples to templates: `fit/<Class>.json`, a template per tensor with expressions that explain every sample."""
+import collections
+import functools
+import json
+import re
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from . import conditions, defaults, evaluate, parts, store
+from .conditions import Literal, quoted
+from .keys import LAYERS, NOISE
+from .vectors import Column
+
+LETTERS = "ijkl"
+NUMBER = re.compile(r"^(.*?)(\d+)$")
+STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|offset|start|end|last|moe|layer|num_")
+
+
+class Unexplained(Exception):
+    """No expression was found; says what for and shows the values."""
+
+
+# ---- names ---------------------------------------------------------------------------------------------------
+
+@functools.lru_cache(maxsize=200000)
+def skeleton(name):
+    """("layers.{}.weight", (3,)) for "layers.3.weight": every number at the end of a component is a possible index."""
+    out, indices = [], []
+    for component in name.split("."):
+        m = NUMBER.match(component)
+        if m:
+            indices.append(int(m[2]))
+            component = m[1] + "{}"
+        out.append(component)
+    return ".".join(out), tuple(indices)
+
+
+def put(pattern, position, text):
+    """`pattern` with its placeholder number `position` replaced."""
+    pieces = pattern.split("{}")
+    return "{}".join(pieces[:position + 1]) + text + "{}".join(pieces[position + 1:])
+
+
+def groups(samples, names_of):
+    """{template with {} for what varies: {sample number: {indices: value}}}. A number that is the same in every sample
+    is part of the name."""
+    found = {}
+    for s in samples:
+        for name, v in names_of(s).items():
+            pattern, indices = skeleton(name)
+            found.setdefault(pattern, {}).setdefault(s.number, {})[indices] = v
+    out = {}
+    for pattern, per in found.items():
+        settle(pattern, per, 0, out)
+    return out
+
+
+def settle(pattern, per, position, out):
+    """Decide for each index position, left to right, whether it is an index or part of the name."""
+    if position == pattern.count("{}"):
+        out[pattern] = per
+        return
+    sets = {frozenset(ix[position] for ix in d) for d in per.values()}
+    if len(sets) == 1:
+        spell_out(pattern, per, position, out)
+    else:
+        settle(pattern, per, position + 1, out)
+
+
+def spell_out(pattern, per, position, out):
+    """One template for each value of an index."""
+    for n in sorted({ix[position] for d in per.values() for ix in d}):
+        sub = {}
+        for s, d in per.items():
+            some = {ix[:position] + ix[position + 1:]: v for ix, v in d.items() if ix[position] == n}
+            if some:
+                sub[s] = some
+        settle(put(pattern, position, str(n)), sub, position, out)
+
+
+# ---- what a class's expressions may use ----------------------------------------------------------------------
+
+class Fitter:
+    """Fits everything about one class, remembering what has been fitted: many tensors share their dimensions."""
+
+    def __init__(self, samples):
+        self.samples, self.by_number = samples, {s.number: s for s in samples}
+        self.memo, self.counts, self.bad = {}, {}, []
+
+    def remembered(self, kind, signature, f):
+        key = (kind, signature)
+        if key not in self.memo:
+            try:
+                self.memo[key] = f()
+            except Unexplained as e:
+                self.memo[key] = e
+        if isinstance(self.memo[key], Unexplained):
+            raise self.memo[key]
+        return self.memo[key]
+
+    def influence(self, values):
+        """Keys whose change changed a value (values: {sample number: value}), those changed on purpose first."""
+        direct, implied = collections.Counter(), collections.Counter()
+        for s in self.samples:
+            p = s.parent
+            if p is None or s.number not in values or p.number not in values or values[s.number] == values[p.number]:
+                continue
+            if s.key in s.changed:
+                direct[s.key] += 3 if len(s.changed) == 1 else 2
+            for k in s.changed:
+                if k != s.key:
+                    implied[k] += 1
+        keys = [k for k, _ in sorted(direct.items(), key=lambda kv: (-kv[1], kv[0]))][:9]
+        keys += [k for k, _ in sorted(implied.items(), key=lambda kv: (-kv[1], kv[0])) if k not in keys and not NOISE.search(k.split(".")[-1])][:max(3, 8 - len(keys))]
+        if keys:
+            return keys
+        live = [self.by_number[n] for n in values]
+        varied = [k for k in live[0].flat if len({repr(s.flat.get(k)) for s in live}) > 1 and not NOISE.search(k.split(".")[-1])]
+        return sorted(varied, key=lambda k: not LAYERS.match(k.split(".")[-1]))[:14]
+
+    def columns(self, rows, keys, indexed=0):
+        """Columns for keys over rows of (sample number, indices), and what their lists give at an index."""
+        out = []
+        flats = [self.by_number[n].flat for n, _ in rows]
+        for rank, k in enumerate(keys):
+            values = [f.get(k) for f in flats]
+            cost = 1 + .04 * rank
+            out.append(Column(f"c.{k}", values, cost))
+            if any(isinstance(v, list) for v in values):
+                out.extend(of_list(f"c.{k}", values, rows, indexed, cost))
+        for p in range(indexed):
+            out.append(Column(LETTERS[p], [ix[p] for _, ix in rows], 1.05))
+        return out
+
+    def all_lists(self):
+        """Keys that hold lists in every sample."""
+        first = self.samples[0].flat
+        return [k for k, v in first.items() if isinstance(v, list) and not NOISE.search(k.split(".")[-1]) and all(isinstance(s.flat.get(k), list) for s in self.samples)]
+
+    # -- numbers
+
+    def number(self, what, rows, targets, values, indexed=0):
+        """An expression for `targets` over `rows`. `values`: {sample: anything that changes when the targets do}."""
+        def find():
+            keys = self.influence(values)
+            columns = self.columns(rows, keys, indexed)
+            extra = self.index_literals(rows, columns, keys, indexed) if indexed else ()
+            found = conditions.number(targets, columns, extra)
+            if found is None:
+                lists = [k for k in self.all_lists() if k not in keys]
+                columns = self.columns(rows, keys[:5] + lists[:8], indexed)
+                found = conditions.number(targets, columns, extra, 1 + (indexed > 0))
+            if found is None:
+                raise Unexplained(f"{what}: {sorted(set(targets))[:6]} by {keys[:6]}")
+            return found[1]
+        return self.remembered("number", (tuple(rows), tuple(targets)), find)
+
+    def truth(self, what, rows, targets, values, indexed=0):
+        def find():
+            keys = self.influence(values)
+            columns = self.columns(rows, keys, indexed)
+            extra = self.index_literals(rows, columns, keys, indexed) if indexed else ()
+            found = conditions.condition(targets, columns, extra)
+            if found is None and indexed:
+                more = keys + [k for k in self.all_lists() if k not in keys][:6]
+                columns = self.columns(rows, more, indexed)
+                found = conditions.condition(targets, columns, self.index_literals(rows, columns, more, indexed))
+            if found is None:
+                raise Unexplained(f"{what}: {sum(targets)} of {len(targets)} by {keys[:6]}")
+            return found
+        return self.remembered("truth", (tuple(rows), tuple(targets)), find)
+
+    def index_literals(self, rows, columns, keys, indexed):
+        """Conditions on the last index: where it begins, every how many, in which list, of which kind."""
+        p = indexed - 1
+        letter = LETTERS[p]
+        i = np.array([ix[p] for _, ix in rows])
+        out = [Literal(1, f"{letter} == 0", f"{letter} > 0", i == 0)]
+
+        def add(cost, text, opposite, truth):
+            out.append(Literal(cost, text, opposite, np.array(truth, dtype=bool)))
+        for m in (2, 3, 4):
+            for r in range(m):
+                add(1.6 + .2 * m, f"{letter} % {m} == {r}", f"{letter} % {m} != {r}", i % m == r)
+        ints = [c for c in columns if c.kind() == "int" and c.text not in LETTERS]
+        ints += [c for c in self.columns(rows, [k for k, v in self.samples[0].flat.items() if isinstance(v, int) and not isinstance(v, bool) and k not in keys
+                                                and STEP.search(k) and not NOISE.search(k.split(".")[-1])][:10]) if c.kind() == "int"]
+        for c in ints:
+            v = np.array(c.values)
+            add(c.cost + .5, f"{letter} >= {c.text}", f"{letter} < {c.text}", i >= v)
+            add(c.cost + .8, f"{letter} == {c.text} - 1", f"{letter} != {c.text} - 1", i == v - 1)
+            add(c.cost + 1.2, f"{letter} == {c.text}", f"{letter} != {c.text}", i == v)
+            add(c.cost + 1.4, f"{letter} >= {c.text} - 1", f"{letter} < {c.text} - 1", i >= v - 1)
+            add(c.cost + 1.5, f"{letter} > {c.text}", f"{letter} <= {c.text}", i > v)
+            half = v // 2
+            add(c.cost + 1.6, f"{letter} >= {c.text} / 2", f"{letter} < {c.text} / 2", i >= half)
+            add(c.cost + 1.7, f"{letter} > {c.text} / 2", f"{letter} <= {c.text} / 2", i > half)
+            if (v > 0).all() and v.max() < 64:
+                add(c.cost + .7, f"{letter} % {c.text} == 0", f"{letter} % {c.text} != 0", i % v == 0)
+                add(c.cost + .8, f"({letter} + 1) % {c.text} == 0", f"({letter} + 1) % {c.text} != 0", (i + 1) % v == 0)
+                add(c.cost + 1.1, f"{letter} % {c.text} == 1", f"{letter} % {c.text} != 1", i % v == 1)
+                for d in ints:
+                    w = np.array(d.values)
+                    if d is not c and re.search("offset|start|first|index|begin", d.text):
+                        add(c.cost + d.cost + .8, f"{letter} % {c.text} == {d.text}", f"{letter} % {c.text} != {d.text}", i % v == w)
+                        add(c.cost + d.cost + 1, f"({letter} - {d.text}) % {c.text} == 0", f"({letter} - {d.text}) % {c.text} != 0", (i - w) % v == 0)
+            for d in ints:
+                if d is not c and LAYERS.match(c.text.split(".")[-1]):
+                    w = np.array(d.values)
+                    add(c.cost + d.cost + .9, f"{letter} >= {c.text} - {d.text}", f"{letter} < {c.text} - {d.text}", i >= v - w)
+        for k in dict.fromkeys([*keys, *self.all_lists()[:12]]):
+            values = [self.by_number[n].flat.get(k) for n, _ in rows]
+            if not any(isinstance(v, list) for v in values):
+                continue
+            guard = f"c.{k} != null && " if any(v is None for v in values) else ""
+            lists = [v if isinstance(v, list) else [] for v in values]
+            def both(cost, text, truth):
+                add(cost, guard + text, f"!({guard}{text})", truth)
+            if all(isinstance(x, int) and not isinstance(x, bool) for v in lists for x in v):
+                both(1.5, f"{letter} in c.{k}", [n in v for n, v in zip(i.tolist(), lists)])
+                full = all(n < len(v) for n, v in zip(i.tolist(), lists))
+                if full:
+                    for x in (0, 1):
+                        both(1.6, f"c.{k}[{letter}] > {x}", [v[n] > x for n, v in zip(i.tolist(), lists)])
+            words = sorted({x for v in lists for x in v if isinstance(x, str)})[:8]
+            at = [v[n] if n < len(v) else None for n, v in zip(i.tolist(), lists)]
+            inside = all(n < len(v) for n, v in zip(i.tolist(), lists))
+            for w in words:
+                if inside:
+                    both(1.4, f"c.{k}[{letter}] == {quoted(w)}", [x == w for x in at])
+                elif all(lists):
+                    both(2, f"c.{k}[{letter} % size(c.{k})] == {quoted(w)}", [v[n % len(v)] == w for n, v in zip(i.tolist(), lists)])
+            if inside and any(isinstance(x, bool) for x in at):
+                both(1.4, f"c.{k}[{letter}] == true", [x is True for x in at])
+        for c in columns:                                     # that index against a count: the last layer
+            if c.kind() == "int" and c.text.startswith("size("):
+                add(2, f"{letter} == {c.text} - 1", f"{letter} != {c.text} - 1", i == np.array(c.values) - 1)
+        return out
+
+    # -- one template
+
+    def template(self, pattern, per, shapes=True):
+        """{"repeat", "when", "shape"} for a group of tensors, or raises Unexplained."""
+        entry, whens = {}, []
+        places = pattern.count("{}")
+        prefixes = pattern.split("{}")
+        present = {s.number: s.number in per for s in self.samples}
+        everywhere = all(present.values())
+        rows = [(n, ()) for n in sorted(per)]
+        repeat = []
+        for p in range(places):
+            sets = {(n, ix): {full[p] for full in per[n] if full[:p] == ix} for n, ix in rows}
+            here = "{}".join(prefixes[:p + 1])
+            count, when = self.index_range(pattern, here, p, rows, sets)
+            repeat.append([LETTERS[p], count])
+            if when:
+                whens.append(when)
+            rows = [(n, (*ix, x)) for n, ix in rows for x in sorted(sets[n, ix])]
+        if not everywhere and not (repeat and self.vanishes(repeat[0][1], present)):
+            rows0 = [(s.number, ()) for s in self.samples if s.number in per or not repeat or self.may_exist(repeat[0][1], s)]
+            whens.insert(0, self.truth("condition", rows0, tuple(present[n] for n, _ in rows0), present))
+        if repeat:
+            entry["repeat"] = repeat
+        whens = [w for w in dict.fromkeys(whens) if w != "true"]
+        if whens:
+            entry["when"] = " && ".join(conditions.guarded(w, " && ") for w in whens)
+        if shapes:
+            entry["shape"] = self.shape(per, places)
+        return entry
+
+    @staticmethod
+    def may_exist(count, s):
+        """Whether a count leaves room for the tensor: where there are no layers, no flag tells anything."""
+        try:
+            return evaluate.value(count, s.flat) != 0
+        except Exception:
+            return True
+
+    def vanishes(self, count, present):
+        """Whether a count is 0 exactly where the tensor is absent."""
+        for s in self.samples:
+            try:
+                n = evaluate.value(count, s.flat)
+            except Exception:
+                return False
+            if not isinstance(n, int) or (n > 0) != present[s.number]:
+                return False
+        return True
+
+    def index_range(self, pattern, here, p, rows, sets):
+        """(count, condition or None) of one index, over the rows of those before it."""
+        sizes = {r: max(v) + 1 if v else 0 for r, v in sets.items()}
+        by_sample = collections.defaultdict(list)
+        for (n, ix), v in sets.items():
+            by_sample[n].append((ix, tuple(sorted(v))))
+        values = {n: tuple(v) for n, v in by_sample.items()}
+        if all(len(v) == sizes[r] for r, v in sets.items()):
+            count = self.number(f"count of {LETTERS[p]}", rows, tuple(sizes[r] for r in rows), values, p)
+            self.counts.setdefault(here, {})[count] = {r: sizes[r] for r in rows}
+            return count, None
+        for count in self.bounds(here, p, rows, sizes):
+            flat_rows, truth = [], []
+            ok = True
+            for n, ix in rows:
+                try:
+                    limit = evaluate.value(count, self.by_number[n].flat, ix)
+                except Exception:
+                    ok = False
+                    break
+                if not isinstance(limit, int) or limit < sizes[n, ix] or limit > 300:
+                    ok = False
+                    break
+                for x in range(limit):
+                    flat_rows.append((n, (*ix, x)))
+                    truth.append(x in sets[n, ix])
+            if not ok or not flat_rows:
+                continue
+            try:
+                return count, self.truth(f"which {LETTERS[p]}", flat_rows, tuple(truth), values, p + 1)
+            except Unexplained:
+                continue
+        raise Unexplained(f"indices {LETTERS[p]}: {[sorted(v) for v in list(sets.values())[:3]]}")
+
+    def bounds(self, here, p, rows, sizes):
+        """Counts an index with holes may run to: those of its neighbours, those of layers."""
+        out = list(self.counts.get(here, {}))
+        if not out:
+            out = [c for h, cs in self.counts.items() if h.rpartition("{}")[0] == here.rpartition("{}")[0] and h.count("{}") == here.count("{}") for c in cs][:3]
+        flat = self.by_number[rows[0][0]].flat
+        out += [f"c.{k}" for k, v in flat.items() if isinstance(v, int) and not isinstance(v, bool) and LAYERS.match(k.split(".")[-1])]
+        out += [f"size(c.{k})" for k in self.all_lists()]
+        return list(dict.fromkeys(out))[:9]
+
+    def shape(self, per, places):
+        ranks = {len(v) for d in per.values() for v in d.values()}
+        if len(ranks) != 1:
+            raise Unexplained(f"number of dimensions varies: {sorted(ranks)}")
+        return [self.dimension(per, k, places) for k in range(ranks.pop())]
+
+    def dimension(self, per, k, places):
+        values = {n: tuple(sorted((ix, v[k]) for ix, v in d.items())) for n, d in per.items()}
+        if all(len({v[k] for v in d.values()}) == 1 for d in per.values()):
+            rows = [(n, ()) for n in sorted(per)]
+            one = {n: next(iter(d.values()))[k] for n, d in per.items()}
+            try:
+                return self.number(f"dim {k}", rows, tuple(one[n] for n, _ in rows), one)
+            except Unexplained:
+                if not places:
+                    raise
+        rows = [(n, ix) for n in sorted(per) for ix in sorted(per[n])]
+        return self.number(f"dim {k}", rows, tuple(per[n][ix][k] for n, ix in rows), values, places)
+
+
+def of_list(text, values, rows, indexed, cost):
+    """Columns from a list: its length, ends, sum, and what stands at an index."""
+    def safe(f):
+        out = []
+        for v, row in zip(values, rows):
+            try:
+                x = f(v, row)
+            except (IndexError, TypeError):
+                x = None
+            out.append(x if x is None or isinstance(x, (bool, int, float, str)) else None)
+        return out
+
+    def at(v, n):
+        if n < 0:
+            raise IndexError
+        return v[n]
+    yield Column(f"size({text})", safe(lambda v, _: len(v)), cost + .3)
+    numeric = all(isinstance(x, (int, float)) and not isinstance(x, bool) for v in values if isinstance(v, list) for x in v)
+    nested = any(isinstance(x, list) for v in values if isinstance(v, list) for x in v)
+    shortest = min((len(v) for v in values if isinstance(v, list)), default=0)
+    if not nested:
+        for n in range(min(shortest, 8)):
+            yield Column(f"{text}[{n}]", safe(lambda v, _, n=n: at(v, n)), cost + .3 + .01 * n)
+        yield Column(f"{text}[size({text}) - 1]", safe(lambda v, _: v[-1]), cost + .4)
+        yield Column(f"{text}[size({text}) - 2]", safe(lambda v, _: v[-2]), cost + .9)
+    else:
+        for n in range(min(shortest, 6)):
+            for m in range(3):
+                yield Column(f"{text}[{n}][{m}]", safe(lambda v, _, n=n, m=m: at(at(v, n), m)), cost + .5)
+    if numeric:
+        yield Column(f"sum({text})", safe(lambda v, _: sum(v)), cost + .5)
+    for p in range(indexed):
+        letter = LETTERS[p]
+        tails = [""] if not nested else [f"[{m}]" for m in range(3)]
+        for tail in tails:
+            pick = (lambda x: x) if not tail else (lambda x, m=int(tail[1]): x[m])
+            yield Column(f"{text}[{letter}]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, r[1][p]))), cost + .15)
+            yield Column(f"{text}[{letter} - 1]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, r[1][p] - 1))), cost + .35)
+            yield Column(f"{text}[{letter} + 1]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, r[1][p] + 1))), cost + .35)
+            yield Column(f"{text}[size({text}) - 1 - {letter}]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, len(v) - 1 - r[1][p]))), cost + .6)
+            yield Column(f"{text}[size({text}) - 2 - {letter}]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, len(v) - 2 - r[1][p]))), cost + .9)
+
+
+# ---- all templates of a class --------------------------------------------------------------------------------
+
+def lettered(pattern):
+    for letter in LETTERS[:pattern.count("{}")]:
+        pattern = pattern.replace("{}", "{" + letter + "}", 1)
+    return pattern
+
+
+def fit_names(fitter, samples, names_of, order, shapes=True):
+    """[[template, entry]] in state-dict order, and what was not explained."""
+    todo = groups(samples, names_of)
+    first = {pattern: min(order.get(name, 1 << 30) for name in some_names(pattern, per)) for pattern, per in todo.items()}
+    # Gapless ones first: their counts bound the others.
+    queue = sorted(todo, key=lambda g: (not gapless(todo[g]), first[g], g))
+    done, bad = [], []
+    while queue:
+        pattern = queue.pop(0)
+        per = todo[pattern]
+        try:
+            if pattern.count("{}") > len(LETTERS):
+                raise Unexplained("too many indices")
+            done.append((first[pattern], lettered(pattern), fitter.template(pattern, per, shapes), per))
+        except Unexplained as e:
+            smaller = split(pattern, per)
+            if not smaller:
+                bad.append([lettered(pattern), *str(e).partition(": ")[::2]])
+                continue
+            for q, sub in smaller.items():                    # each number by itself
+                todo[q], first[q] = sub, first[pattern]
+                queue.append(q)
+    done.sort(key=lambda d: (d[0], d[1]))
+    return done, bad
+
+
+def some_names(pattern, per):
+    d = max(per.values(), key=len)
+    for ix in list(d)[:1] + list(d)[-1:]:
+        name = pattern
+        for n in ix:
+            name = name.replace("{}", str(n), 1)
+        yield name
+
+
+def gapless(per):
+    return all({ix[0] for ix in d} == set(range(len({ix[0] for ix in d}))) for d in per.values() if d and next(iter(d)))
+
+
+def split(pattern, per):
+    """The same group with one index spelled out, where it has few values."""
+    for p in range(pattern.count("{}")):
+        numbers = {ix[p] for d in per.values() for ix in d}
+        if len(numbers) <= 8:
+            out = {}
+            for n in sorted(numbers):
+                sub = {s: {ix[:p] + ix[p + 1:]: v for ix, v in d.items() if ix[p] == n} for s, d in per.items()}
+                out[put(pattern, p, str(n))] = {s: d for s, d in sub.items() if d}
+            return out
+    return None
+
+
+def fit_class(root, name, known):
+    """The result for one class, as the writing side reads it."""
+    data = store.load(root, name)
+    about = data.about
+    found = parts.find(data.samples, name, known, root)
+    samples = [s for s in data.samples if s.number not in found.unusable]
+    inside = tuple(found.prefixes)
+    fitter = Fitter(samples)
+
+    def own_tensors(s):
+        return {n: v for n, v in s.tensors.items() if not n.startswith(inside)} if inside else s.tensors
+    done, bad = fit_names(fitter, samples, own_tensors, data.order)
+    templates = []
+    persistent = {n for s in samples for n in s.persistent}
+    for _, pattern, entry, per in done:
+        if any(n in persistent for n in some_names(re.sub(r"\{\w\}", "{}", pattern), per)):
+            entry["persistent_buffer"] = True
+        templates.append([pattern, entry])
+    bad += parts.fit_ties(fitter, samples, done, inside, about)
+    buffers, bad_buffers = fit_names(fitter, samples, lambda s: {n: () for n in s.buffers if not n.startswith(inside)} if inside else {n: () for n in s.buffers}, data.order, False)
+    result = {"class": name, "model_type": about["model_type"], "version": about["version"], "config_class": about["config_class"], "module": about["module"],
+              "samples": len(samples), "base_model_prefix": about["base_model_prefix"], "has_base": about["has_base"],
+              "ignore_missing": about["ignore_missing"], "ignore_unexpected": about["ignore_unexpected"],
+              "models": [[p.rstrip("."), c, mt] for p, c, mt, _ in max(samples, key=lambda s: len(s.tensors)).models],
+              "parts": found.entries(fitter, samples, bad), "tensors": templates, "buffers": [[p, e] for _, p, e, _ in buffers],
+              "unexplained": bad, "unexplained_buffers": bad_buffers}
+    result.update(defaults.for_class(root, result))
+    return result
+
+
+# ---- the command ---------------------------------------------------------------------------------------------
+
+def main(args):
+    versions = [args.version] if args.version else sorted(p.name for p in args.cache.iterdir() if (p / "samples").is_dir())
+    for version in versions:
+        fit_version(args.cache / version, args)
+    return 0
+
+
+def fit_version(root, args):
+    names = sorted(p.name.removesuffix(".json.gz") for p in (root / "samples").glob("*.json.gz"))
+    known = set(names)
+    (root / "fit").mkdir(exist_ok=True)
+    started, causes, exact, fitted = time.time(), collections.Counter(), [], 0
+    for name in names:
+        target = root / "fit" / f"{name}.json"
+        if not args.only and target.exists() and not args.again:
+            continue
+        try:
+            about = store.read(root / "samples" / f"{name}.json.gz")
+            if args.only and not re.search(args.only, name) and not re.search(args.only, about["model_type"]):
+                continue
+            t = time.time()
+            result = fit_class(root, name, known)
+            fitted += 1
+            Path(str(target) + ".part").write_text(json.dumps(result, indent=1) + "\n")
+            Path(str(target) + ".part").replace(target)
+            line = f"{name}: {len(result['tensors'])} templates, {len(result['unexplained'])} unexplained, {time.time() - t:.1f} s"
+        except Exception as e:
+            causes[type(e).__name__] += 1
+            with open(root / "failed.jsonl", "a") as f:
+                f.write(json.dumps({"class": name, "stage": "fit", "reason": f"{type(e).__name__}: {e}"[:300]}) + "\n")
+            line = f"{name}: {type(e).__name__}: {e}"
+            if args.only:
+                raise
+        if args.only or args.check:
+            print(line, flush=True)
+            for b in (result["unexplained"][:4] if args.only else ()):
+                print("   ", b)
+    print(f"{root.name}: {fitted} fitted in {time.time() - started:.0f} s {dict(causes)}", file=sys.stderr)
+    if args.check:
+        from . import check
+        check.report(root, [n for n in names if (root / "fit" / f"{n}.json").exists()], args.only)
