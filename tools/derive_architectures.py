@@ -26,7 +26,7 @@ def add_sample(commands):
 def add_fit(commands):
     p = commands.add_parser("fit", help="find the expressions that explain the samples")
     p.add_argument("--only", help="regular expression on class name or model_type")
-    p.add_argument("--version", help="transformers version whose samples to fit (default: every one in the cache)")
+    p.add_argument("--version", help="transformers version whose samples to fit (default: the one at hand)")
     p.add_argument("--again", action="store_true", help="fit again what has been fitted")
     p.add_argument("--check", action="store_true", help="evaluate each result on the fresh configs and say what differs")
     p.set_defaults(run="derive.fit")

@@ -1,6 +1,7 @@
 """From samples to templates: `fit/<Class>.json`, a template per tensor with expressions that explain every sample."""
 import collections
 import functools
+import importlib.metadata
 import json
 import re
 import sys
@@ -461,6 +462,7 @@ def fit_class(root, name, known):
     """The result for one class, as the writing side reads it."""
     data = store.load(root, name)
     about = data.about
+    parts.MODULES[name] = about["module"]
     found = parts.find(data.samples, name, known, root)
     samples = [s for s in data.samples if s.number not in found.unusable]
     inside = tuple(found.prefixes)
@@ -490,9 +492,7 @@ def fit_class(root, name, known):
 # ---- the command ---------------------------------------------------------------------------------------------
 
 def main(args):
-    versions = [args.version] if args.version else sorted(p.name for p in args.cache.iterdir() if (p / "samples").is_dir())
-    for version in versions:
-        fit_version(args.cache / version, args)
+    fit_version(args.cache / (args.version or importlib.metadata.version("transformers")), args)
     return 0
 
 

@@ -1,5 +1,6 @@
 """Models inside models: which can be referred to instead of repeated; and which tensors share their storage."""
 import functools
+import importlib.metadata
 import importlib.util
 import json
 import re
@@ -90,12 +91,9 @@ def auto_table(root):
 
 @functools.lru_cache(maxsize=64)
 def source(root, module):
-    """The source of a modeling module, from a copy kept in the cache or the transformers at hand."""
-    kept = root / "source" / f"{module}.py"
-    if kept.exists():
-        return kept.read_text()
+    """The source of a modeling module, where the transformers at hand is the version that was sampled."""
     spec = importlib.util.find_spec("transformers")
-    if spec is None or not spec.origin:
+    if spec is None or not spec.origin or importlib.metadata.version("transformers") != root.name:
         return ""
     path = Path(spec.origin).parent.parent / (module.replace(".", "/") + ".py")
     return path.read_text() if path.exists() else ""
