@@ -245,6 +245,7 @@ const FAMILIES: &[(&str, &str)] = &[
     ("IDX", "The index, against the shards"),
     ("JSN", "JSON documents"),
     ("ARC", "Tensors, against the model class"),
+    ("QNT", "Quantised weights"),
     ("CFG", "config.json"),
     ("GEN", "Generation"),
     ("TOK", "Tokenizer"),
@@ -258,6 +259,7 @@ const KEYS: &[(&str, &str)] = &[
     ("Keys of a rule", "rule.rs"),
     ("Keys of an architecture", "architecture/blueprint.rs"),
     ("Keys of an entry of `tensors`", "architecture/member.rs"),
+    ("Keys of a quantisation scheme", "quantization.rs"),
     ("Keys of a processor", "processor.rs"),
     ("Keys of a recipe and of a merge file", "recipe.rs"),
 ];

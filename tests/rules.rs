@@ -11,7 +11,7 @@ mod support;
 use std::fmt::Write as _;
 
 use ckpt_doctor::check::check;
-use ckpt_doctor::check::finding::{Finding, Severity};
+use ckpt_doctor::check::finding::{Finding, LoadReport, Severity};
 use ckpt_doctor::checkpoint::Checkpoint;
 use support::{Expect, Tried, tried};
 
@@ -76,6 +76,21 @@ fn sound_checkpoints_trip_nothing_above_info() {
         (t.case.code.is_none() && !loud.is_empty()).then(|| shown(&loud))
     });
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Their tensors stand for those of the class, and the report says so.
+#[test]
+fn quantised_checkpoints_load_clean() {
+    let quantised = |t: &&Tried| t.case.name.starts_with("sound/quantized-");
+    let dirty: Vec<String> = tried()
+        .iter()
+        .filter(quantised)
+        .filter(|t| t.outcome.load.as_ref().is_some_and(|load| *load != LoadReport::default()))
+        .map(|t| format!("{}: {:?}", t.case.name, t.outcome.load))
+        .collect();
+    assert!(dirty.is_empty(), "{}", dirty.join("\n"));
+    let loaded = tried().iter().filter(quantised).filter(|t| t.outcome.load.is_some()).count();
+    assert!(loaded >= 10, "{loaded} quantised cases have a load report");
 }
 
 #[test]

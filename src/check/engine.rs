@@ -1,5 +1,6 @@
 //! Runs rules over a checkpoint.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -7,9 +8,11 @@ use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, FixHint, LoadReport, Location};
 use super::load::{self, Stored};
+use super::quantization::{self, Quantised};
 use super::{facts, index, modules, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
 use crate::knowledge::processor::Processor;
+use crate::knowledge::quantization::{Said, said};
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
 use crate::knowledge::{Expected, Library, Loader, Scope};
 
@@ -85,20 +88,40 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
         (Some(config), None) => faults.push(unknown_architecture(config)),
         _ => {}
     }
+    let said = config.map_or(Said::Plain, said);
+    let quantised = match &said {
+        Said::Known(applied) => Some(Quantised::new(applied, expected.as_ref(), checkpoint, &stored)),
+        _ => None,
+    };
+    faults.extend(quantization::faults(checkpoint, &said, quantised.as_ref()));
     if let Some(expected) = &expected {
         outcome.config = expected.config.clone();
-        if !stored.is_empty() {
-            let mut report = load::predict(expected, &stored);
+        let plain = quantised.as_ref().map_or_else(|| Cow::Borrowed(&stored), |q| Cow::Owned(q.plain(&stored)));
+        // How a scheme that is not known stores what cannot be guessed.
+        let known = !matches!(said, Said::Unknown(_));
+        let report = (known && !stored.is_empty()).then(|| load::predict(expected, &plain));
+        let report = match &quantised {
+            Some(quantised) => report.and_then(|report| quantised.spelled(report)),
+            None => report,
+        };
+        if let Some(mut report) = report {
             // A tensor whose header entry could not be read is there.
             let unreadable: BTreeSet<&str> =
                 checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
             report.missing.retain(|name| !unreadable.contains(name.as_str()));
             faults.extend(load::faults(&report));
+            if let Some(quantised) = &quantised {
+                quantised.complete(&mut report);
+            }
             // Rules about the index name the shard; the lists alone would read as if all were well.
             let absent = index::first_absent_shard(checkpoint);
             report.raises = report.raises.or_else(|| absent.map(|name| format!("FileNotFoundError: {name}")));
             outcome.load = Some(report);
         }
+    }
+    let explained = outcome.load.as_ref().is_some_and(|report| report.unexpected.is_empty());
+    if matches!(said, Said::Plain) && !explained {
+        faults.extend(quantization::undeclared(stored.names()));
     }
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint);

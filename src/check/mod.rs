@@ -6,6 +6,7 @@ pub mod finding;
 pub mod index;
 pub mod load;
 pub mod modules;
+pub mod quantization;
 pub mod tokens;
 
 pub use engine::{Knowledge, Outcome, check};

@@ -19,6 +19,7 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use program::Program;
+pub(crate) use functions::glob;
 pub use scope::Scope;
 pub use template::Template;
 

@@ -6,6 +6,7 @@ pub mod expression;
 pub mod library;
 pub mod loader;
 pub mod processor;
+pub mod quantization;
 pub mod recipe;
 pub mod rule;
 pub mod selection;

@@ -224,7 +224,16 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "mismatched-tensor",
     "no-weights",
     "pickle-weights",
+    "plain-though-quantized",
     "prefix-hijack",
+    "quantize-config-disagrees",
+    "quantized-config-plain-tensors",
+    "quantized-dtype-wrong",
+    "quantized-for-another-loader",
+    "quantized-module-incomplete",
+    "quantized-shape-wrong",
+    "quantized-though-skipped",
+    "quantized-undeclared",
     "relative-import-missing",
     "shard-missing",
     "shard-name-differs-in-case",
@@ -239,6 +248,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "total-size-wrong",
     "unexpected-tensors",
     "unknown-architecture",
+    "unknown-quantization",
 ];
 
 /// Whether some stage produces faults of this kind.

@@ -9,15 +9,17 @@ use ckpt_doctor::knowledge::Loader;
 use ckpt_doctor::surgery::merge::pipeline::{self, Request};
 use serde_json::Value;
 
-use super::project;
+use super::change::apply_all;
+use super::{cases, project};
 use super::weights::{Shard, Weights};
 
 /// Names of all bases.
 ///
 /// `llama` and `paligemma` are documents in `fixtures/bases` with weights made for them; `spatialvla` is the donor
-/// without the data set whose statistics have three `Infinity`; the merged ones are built from the donors.
+/// without the data set whose statistics have three `Infinity`; the merged ones are built from the donors; `llama-gptq`
+/// is the sound case of that name.
 pub const BASES: &[&str] =
-    &["llama", "llama-sharded", "paligemma", "spatialvla", "llava3d", "merged", "merged-baked", "merged-wrapped"];
+    &["llama", "llama-sharded", "llama-gptq", "paligemma", "spatialvla", "llava3d", "merged", "merged-baked", "merged-wrapped"];
 
 /// Makes every base below `root`.
 pub fn make_all(root: &Path, knowledge: &Knowledge) -> BTreeMap<&'static str, PathBuf> {
@@ -28,6 +30,11 @@ pub fn make_all(root: &Path, knowledge: &Knowledge) -> BTreeMap<&'static str, Pa
             match *name {
                 "llama" => documents("llama", &dir, 1, knowledge),
                 "llama-sharded" => documents("llama", &dir, 2, knowledge),
+                "llama-gptq" => {
+                    documents("llama", &dir, 1, knowledge);
+                    let case = cases().into_iter().find(|c| c.name == "sound/quantized-gptq").expect("the case");
+                    apply_all(&case.name, &case.changes, &dir);
+                }
                 "paligemma" => documents("paligemma", &dir, 1, knowledge),
                 "spatialvla" => {
                     copy(&project().join("fixtures/donors/spatialvla-tiny"), &dir);

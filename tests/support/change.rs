@@ -3,12 +3,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ckpt_doctor::knowledge::{Expression, Scope};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use serde::Deserialize;
 use serde_json::Value;
 
 use super::base;
-use super::weights::{Shard, Weights, join, split};
+use super::weights::{Shard, Tensor, Weights, join, split};
 
 /// One change. Those of tensors keep shards and index sound; those of headers and bytes do not.
 #[derive(Debug, Clone, Deserialize)]
@@ -66,6 +67,9 @@ pub enum Change {
     Reshape { name: String, shape: Vec<u64> },
     /// Gives every tensor another dtype's name and width.
     Retype { name: String, dtype: String },
+    /// Stores others in place of each tensor whose name ends so: ending, dtype and dimensions. These are expressions
+    /// over the `rows` and `cols` of the tensor that goes.
+    Pack { ending: String, into: Vec<(String, String, Vec<String>)> },
     /// Writes a shard of these tensors, of no index.
     Shard { file: String, tensors: Vec<(String, Vec<u64>)> },
 
@@ -130,10 +134,15 @@ pub fn make(case: &str, base: &Path, changes: &[Change], room: &Path) -> PathBuf
     let named = changes.iter().find_map(|c| if let Change::Directory(name) = c { Some(name.as_str()) } else { None });
     let dir = room.join(named.unwrap_or("checkpoint"));
     base::copy(base, &dir);
-    for change in changes {
-        apply(change, &dir).unwrap_or_else(|e| panic!("{case}: {change:?}: {e}"));
-    }
+    apply_all(case, changes, &dir);
     dir
+}
+
+/// Makes these changes, one after the other.
+pub fn apply_all(case: &str, changes: &[Change], dir: &Path) {
+    for change in changes {
+        apply(change, dir).unwrap_or_else(|e| panic!("{case}: {change:?}: {e}"));
+    }
 }
 
 fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
@@ -184,11 +193,20 @@ fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
         | Change::RenameTensors { .. }
         | Change::Reshape { .. }
         | Change::Retype { .. }
+        | Change::Pack { .. }
         | Change::Shard { .. } => {
             tensors(change, dir);
             Ok(())
         }
     }
+}
+
+fn dimensions(shape: &[String], plain: &[u64]) -> Vec<u64> {
+    let mut scope = Scope::new();
+    scope.bind_int("rows", plain[0]);
+    scope.bind_int("cols", plain[1]);
+    let dimension = |source: &String| Expression::parse(source).expect("CEL").eval_u64(&scope).expect("a dimension");
+    shape.iter().map(dimension).collect()
 }
 
 fn tensors(change: &Change, dir: &Path) {
@@ -201,6 +219,23 @@ fn tensors(change: &Change, dir: &Path) {
     }
     let mut weights = Weights::read(dir);
     match change {
+        Change::Pack { ending, into } => {
+            let mut packed = 0;
+            for shard in &mut weights.shards {
+                let (gone, kept) = std::mem::take(&mut shard.tensors)
+                    .into_iter()
+                    .partition(|t: &Tensor| t.shape.len() > 1 && t.name.ends_with(ending.as_str()));
+                shard.tensors = kept;
+                packed += gone.len();
+                for tensor in gone {
+                    let module = tensor.name.strip_suffix(".weight").unwrap_or(&tensor.name);
+                    for (ending, dtype, shape) in into {
+                        shard.add(&format!("{module}{ending}"), dtype, &dimensions(shape, &tensor.shape));
+                    }
+                }
+            }
+            assert!(packed > 0, "no tensor ends in {ending}");
+        }
         Change::AddTensor { name, shape, dtype, file } => {
             let wanted = |s: &Shard| file.as_ref().is_none_or(|f| *f == s.file);
             let shard = weights.shards.iter_mut().rfind(|s| wanted(s)).expect("a shard of that name");

@@ -63,6 +63,20 @@ impl Stored {
         Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new() }
     }
 
+    /// The same with some tensors taken out and others put in; of those the shape may be unknown.
+    #[must_use]
+    pub fn replacing(&self, taken: &BTreeSet<String>, added: BTreeMap<String, Option<Vec<u64>>>) -> Self {
+        let mut replaced = self.clone();
+        replaced.keys.retain(|name| !taken.contains(name));
+        replaced.absent.retain(|name| !taken.contains(name));
+        replaced.shapes.retain(|name, _| !taken.contains(name));
+        for (name, shape) in added {
+            replaced.shapes.extend(shape.map(|shape| (name.clone(), shape)));
+            replaced.keys.insert(name);
+        }
+        replaced
+    }
+
     /// What the loader reads as keys.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.keys.iter().map(String::as_str)

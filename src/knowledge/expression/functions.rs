@@ -137,7 +137,7 @@ fn get(context: &FunctionContext) -> Result<Cel, ExecutionError> {
 ///
 /// Linear in memory, and in time at most the product of the two lengths.
 #[must_use]
-pub(super) fn glob(name: &str, pattern: &str) -> bool {
+pub(crate) fn glob(name: &str, pattern: &str) -> bool {
     let (name, pattern): (Vec<char>, Vec<char>) = (name.chars().collect(), pattern.chars().collect());
     let (mut n, mut p) = (0, 0);
     let mut retry: Option<(usize, usize)> = None;

@@ -1,0 +1,65 @@
+//! What config.json says of quantisation, against the other documents and against plain sight.
+
+use std::collections::BTreeSet;
+
+use serde_json::Value;
+
+use super::module;
+use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::knowledge::quantization::block;
+
+/// What AutoGPTQ and AutoAWQ write beside config.json.
+const BESIDE: [&str; 2] = ["quantize_config.json", "quant_config.json"];
+
+/// Parameters that decide shapes or the meaning of values, and how else they are spelled.
+const PARAMETERS: [(&str, &str); 6] = [
+    ("bits", "w_bit"),
+    ("group_size", "q_group_size"),
+    ("desc_act", "desc_act"),
+    ("sym", "sym"),
+    ("zero_point", "zero_point"),
+    ("quant_method", "quant_method"),
+];
+
+/// A config whose scheme is not known here.
+pub(super) fn unknown(method: &str, config: &Value) -> Fault {
+    let pointer = block(config).map_or("", |(pointer, _)| pointer);
+    Fault::new("unknown-quantization").at(Place::file("config.json").pointer(pointer)).with("method", method)
+}
+
+/// Parameters that a separate file states otherwise than config.json does.
+pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let Some((pointer, block)) = checkpoint.config().and_then(block) else { return Vec::new() };
+    let mut faults = Vec::new();
+    for name in BESIDE {
+        let Some(Value::Object(beside)) = checkpoint.document(name).and_then(|d| d.value.as_ref()) else { continue };
+        for (key, alias) in PARAMETERS {
+            let spelled = |map: &Value| [key, alias].into_iter().find(|k| map.get(*k).is_some_and(|v| !v.is_null()));
+            let other = Value::Object(beside.clone());
+            let (Some(here), Some(there)) = (spelled(block), spelled(&other)) else { continue };
+            let (said, otherwise) = (block.get(here), other.get(there));
+            if said != otherwise {
+                let fault = Fault::new("quantize-config-disagrees")
+                    .at(Place::file(name).pointer(format!("/{there}")))
+                    .at(Place::file("config.json").pointer(format!("{pointer}/{here}")));
+                faults.push(
+                    fault
+                        .with("parameter", key)
+                        .with("said", said.cloned().unwrap_or_default())
+                        .with("otherwise", otherwise.cloned().unwrap_or_default()),
+                );
+            }
+        }
+    }
+    faults
+}
+
+/// Names that nothing explains and that are a scheme's, under a config that says of none.
+#[must_use]
+pub fn undeclared<'n>(names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
+    let names: BTreeSet<&str> = names.into_iter().collect();
+    let (scheme, module) = module::signature(&names)?;
+    let carrier = scheme.endings().next().unwrap_or_default();
+    let at = Place::tensor(format!("{module}{carrier}"));
+    Some(Fault::new("quantized-undeclared").at(at).with("scheme", scheme.summary.as_str()).with("module", module))
+}

@@ -1,0 +1,119 @@
+//! Which stored tensors make up one quantised module.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::skipped::Skipped;
+use crate::check::load::Stored;
+use crate::checkpoint::{Checkpoint, Dtype};
+use crate::knowledge::quantization::{Part, Scheme, Shapes};
+
+/// What is known of a stored tensor; an index alone tells neither.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Held<'c> {
+    pub(super) shape: Option<&'c [u64]>,
+    pub(super) dtype: Option<Dtype>,
+}
+
+/// The tensors that a loader finds, by name.
+pub(super) struct Tensors<'c>(BTreeMap<&'c str, Held<'c>>);
+
+impl<'c> Tensors<'c> {
+    pub(super) fn of(checkpoint: &'c Checkpoint, stored: &'c Stored) -> Self {
+        let mut tensors: BTreeMap<&str, Held<'_>> = stored.names().map(|name| (name, Held::default())).collect();
+        for (_, tensor) in checkpoint.tensors() {
+            if let Some(held) = tensors.get_mut(tensor.name.as_str()) {
+                *held = Held { shape: Some(&tensor.shape), dtype: Some(tensor.dtype) };
+            }
+        }
+        Self(tensors)
+    }
+
+    pub(super) fn names(&self) -> impl Iterator<Item = &'c str> {
+        self.0.keys().copied()
+    }
+}
+
+/// A module whose values are stored by a scheme, and which of the scheme's tensors are there, by its order.
+#[derive(Debug)]
+pub(super) struct Module<'c> {
+    /// Its name: that of the plain tensor without the scheme's ending.
+    pub(super) name: &'c str,
+    pub(super) held: Vec<Option<Held<'c>>>,
+}
+
+impl Module<'_> {
+    /// Endings of the tensors that are there.
+    pub(super) fn endings<'s>(&self, scheme: &'s Scheme) -> Vec<&'s str> {
+        scheme.endings().zip(&self.held).filter_map(|(ending, held)| held.is_some().then_some(ending)).collect()
+    }
+
+    /// Shapes of the tensors that are there, as far as they are known.
+    pub(super) fn shapes(&self) -> Shapes {
+        self.held.iter().map(|held| Some(held.as_ref()?.shape?.to_vec())).collect()
+    }
+}
+
+/// The modules of a scheme among these tensors, by name.
+///
+/// A module is one whose first tensor, which holds the values, is stored; where that keeps its plain name another one
+/// has to be there too. `plain` says whether a class has a tensor of that name: such a one is nobody's scale.
+pub(super) fn group<'c>(scheme: &Scheme, tensors: &Tensors<'c>, plain: impl Fn(&str) -> bool) -> Vec<Module<'c>> {
+    let mut endings: Vec<(usize, &str)> = scheme.endings().enumerate().collect();
+    // `_scale_inv` before `_scale`; the plain ending is not told from any other tensor's here.
+    endings.sort_by_key(|(_, ending)| std::cmp::Reverse(ending.len()));
+    endings.retain(|(_, ending)| *ending != scheme.plain);
+    let mut names: BTreeSet<&str> = BTreeSet::new();
+    for name in tensors.names() {
+        if let Some(module) = endings.iter().find_map(|(_, ending)| name.strip_suffix(ending))
+            && !plain(name)
+        {
+            names.insert(module);
+        }
+    }
+    let held = |module: &str, ending: &str| tensors.0.get(format!("{module}{ending}").as_str()).copied();
+    let module = |name| Module { name, held: scheme.endings().map(|ending| held(name, ending)).collect() };
+    names.into_iter().map(module).filter(|m| m.held.first().is_some_and(Option::is_some)).collect()
+}
+
+/// Modules that are stored plainly although others of their kind are quantised and the config does not leave them out.
+pub(super) fn left_plain<'c>(
+    scheme: &Scheme,
+    tensors: &Tensors<'c>,
+    kinds: &BTreeSet<String>,
+    quantised: &BTreeSet<&str>,
+    skipped: &Skipped<'_>,
+) -> Vec<Module<'c>> {
+    let held = |name: &'c str| {
+        scheme.endings().map(|ending| if ending == scheme.plain { tensors.0.get(name).copied() } else { None }).collect()
+    };
+    tensors
+        .names()
+        .filter_map(|name| Some((name, name.strip_suffix(scheme.plain.as_str())?)))
+        .filter(|(_, module)| !quantised.contains(module) && kinds.contains(&kind(module)))
+        .filter(|(_, module)| !skipped.may_cover(module))
+        .map(|(name, module)| Module { name: module, held: held(name) })
+        .collect()
+}
+
+/// A module's name with the numbers taken out: the same for one place in every layer.
+pub(super) fn kind(name: &str) -> String {
+    let segment = |s: &str| if s.bytes().all(|b| b.is_ascii_digit()) { "#".to_owned() } else { s.to_owned() };
+    name.split('.').map(segment).collect::<Vec<_>>().join(".")
+}
+
+/// The scheme whose tensors these are, and a module of it; for names that nothing explains.
+///
+/// Only a module that has all that its scheme requires is taken for one.
+#[must_use]
+pub(super) fn signature<'n>(names: &BTreeSet<&'n str>) -> Option<(&'static Scheme, &'n str)> {
+    let has = |module: &str, part: &Part| names.contains(&*format!("{module}{}", part.name));
+    let whole =
+        |scheme: &Scheme, module: &str| scheme.tensors.iter().all(|p| p.required.is_some() || has(module, p));
+    let found = Scheme::all().iter().filter_map(|scheme| {
+        let sign = scheme.sign.as_deref()?;
+        let module = names.iter().find_map(|name| name.strip_suffix(sign).filter(|module| whole(scheme, module)))?;
+        Some((scheme, module))
+    });
+    // AWQ's names are GPTQ's without `g_idx`: the scheme that explains most is meant.
+    found.max_by_key(|(scheme, module)| scheme.tensors.iter().filter(|part| has(module, part)).count())
+}

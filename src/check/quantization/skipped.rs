@@ -1,0 +1,85 @@
+//! What a config leaves plain.
+//!
+//! Loaders match such lists in ways of their own: 4.47 takes a pattern that ends a segment anywhere in the name, 5.23 a
+//! regular expression at the start or a literal end, compressed-tensors whole names or `re:…`. So there are two
+//! questions here: what is left plain by all of them, and what may be by any.
+
+use regex::Regex;
+
+use crate::knowledge::expression::glob;
+use crate::knowledge::quantization::Applied;
+
+/// Longest regular expression of a config that is compiled.
+const PATTERN_CAP: usize = 1_000;
+
+/// The patterns of one config.
+pub(super) struct Skipped<'a> {
+    patterns: Vec<Pattern<'a>>,
+    /// Names of modules, not of branches.
+    modules: bool,
+}
+
+enum Pattern<'a> {
+    Text(&'a str),
+    /// `re:…`, matched at the start as Python's `re.match` does; `None` when it cannot be compiled here.
+    Regex(Option<Regex>),
+}
+
+impl<'a> Skipped<'a> {
+    pub(super) fn of(applied: &'a Applied) -> Self {
+        let pattern = |text: &'a str| match text.strip_prefix("re:") {
+            Some(regex) if regex.len() > PATTERN_CAP => Pattern::Regex(None),
+            Some(regex) => Pattern::Regex(Regex::new(&format!("^(?:{regex})")).ok()),
+            None => Pattern::Text(text),
+        };
+        let patterns = applied.skipped().into_iter().map(pattern).collect();
+        Self { patterns, modules: applied.scheme().skipped_are_modules }
+    }
+
+    /// The pattern by which every loader leaves this module plain.
+    pub(super) fn covers(&self, module: &str) -> Option<&'a str> {
+        self.patterns.iter().find_map(|pattern| match pattern {
+            Pattern::Text(text) => {
+                let branch = || glob(module, &format!("{text}.*")) || glob(module, &format!("*.{text}"));
+                (module == *text || (!self.modules && (glob(module, text) || branch()))).then_some(*text)
+            }
+            Pattern::Regex(_) => None,
+        })
+    }
+
+    /// Whether some loader may leave this module plain.
+    pub(super) fn may_cover(&self, module: &str) -> bool {
+        self.patterns.iter().any(|pattern| match pattern {
+            Pattern::Text(text) => module.contains(tail(text)) || glob(module, &format!("*{text}*")),
+            Pattern::Regex(regex) => regex.as_ref().is_none_or(|r| r.is_match(module)),
+        })
+    }
+}
+
+/// A pattern from the last word before its first number on: what stands before changes from version to version.
+fn tail(pattern: &str) -> &str {
+    let mut start = 0;
+    let mut at = 0_usize;
+    for segment in pattern.split('.') {
+        if !segment.is_empty() && segment.bytes().all(|b| b.is_ascii_digit()) {
+            return pattern.get(start..).unwrap_or(pattern);
+        }
+        start = at;
+        at = at.saturating_add(segment.len()).saturating_add(1);
+    }
+    pattern
+}
+
+#[cfg(test)]
+mod tests {
+    use super::tail;
+
+    #[test]
+    fn a_pattern_is_known_by_its_numbered_tail() {
+        assert_eq!(tail("model.language_model.layers.4.mlp"), "layers.4.mlp");
+        assert_eq!(tail("layers.4"), "layers.4");
+        assert_eq!(tail("4.mlp"), "4.mlp");
+        assert_eq!(tail("lm_head"), "lm_head");
+        assert_eq!(tail("model.visual"), "model.visual");
+    }
+}
