@@ -14,8 +14,10 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
+use ckpt_doctor::checkpoint::Dtype;
 use ckpt_doctor::checkpoint::fault::FAULT_KINDS;
 use ckpt_doctor::knowledge::processor::Processor;
+use ckpt_doctor::knowledge::quantization::Scheme;
 use ckpt_doctor::knowledge::recipe::Recipe;
 use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, Rule, RuleSet, Severity};
 use ckpt_doctor::knowledge::{Library, source};
@@ -165,6 +167,18 @@ fn other_data_files_parse() {
         Recipe::parse(&path, &text).unwrap_or_else(|e| panic!("{e}"));
     }
     assert_eq!(Recipe::embedded().unwrap_or_else(|e| panic!("{e}")).len(), texts("rules/recipes").len());
+    let mut schemes = 0;
+    for (path, text) in texts("rules/quantization") {
+        let scheme = source::parse::<Scheme>(&path, &text).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(path, format!("rules/quantization/{}.json5", scheme.scheme), "a scheme has the name of its file");
+        assert!(!scheme.summary.is_empty() && !scheme.sources.is_empty(), "{path} says what it is and who says so");
+        for part in &scheme.tensors {
+            let known = part.dtypes.iter().all(|dtype| Dtype::from_name(dtype).is_some());
+            assert!(known && !part.dtypes.is_empty(), "{path}: types of {:?}", part.name);
+        }
+        schemes += 1;
+    }
+    assert_eq!(Scheme::all().len(), schemes);
     // An architecture parses when it is first asked for.
     let library = Library::embedded();
     let names: Vec<&str> = library.names().collect();
@@ -246,6 +260,7 @@ const FAMILIES: &[(&str, &str)] = &[
     ("JSN", "JSON documents"),
     ("ARC", "Tensors, against the model class"),
     ("QNT", "Quantised weights"),
+    ("ADP", "PEFT adapters"),
     ("CFG", "config.json"),
     ("GEN", "Generation"),
     ("TOK", "Tokenizer"),

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 use super::finding::{Finding, FixHint, LoadReport, Location};
 use super::load::{self, Stored};
 use super::quantization::{self, Quantised};
-use super::{facts, index, modules, tokens};
+use super::{adapter, facts, index, modules, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::quantization::{Said, said};
@@ -61,6 +61,7 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
     faults.extend(index::compare(checkpoint));
     faults.extend(modules::compare(checkpoint));
+    faults.extend(adapter::compare(checkpoint));
     let stored = Stored::of(checkpoint);
     let evidence = stored.evidence();
     let config = checkpoint.config();

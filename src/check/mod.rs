@@ -1,5 +1,6 @@
 //! Compares what is there with what should be; pure functions from a checkpoint to findings.
 
+pub mod adapter;
 pub mod engine;
 pub mod facts;
 pub mod finding;

@@ -199,10 +199,7 @@ impl<'a> Quantised<'a> {
 }
 
 /// Tensors of a module whose element type is none of those the scheme writes: ending, type, those allowed.
-fn mistyped<'s>(
-    scheme: &'s Scheme,
-    judged: &'s Judged<'_>,
-) -> impl Iterator<Item = (&'s str, &'static str, String)> {
+fn mistyped<'s>(scheme: &'s Scheme, judged: &'s Judged<'_>) -> impl Iterator<Item = (&'s str, &'static str, String)> {
     scheme.tensors.iter().zip(&judged.module.held).filter_map(|(part, held)| {
         let dtype = held.as_ref()?.dtype?.name();
         let allowed = part.dtypes.iter().any(|d| d == dtype);

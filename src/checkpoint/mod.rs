@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
+pub mod adapter;
 mod discover;
 pub mod document;
 pub mod fault;

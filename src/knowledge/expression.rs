@@ -18,8 +18,8 @@ use cel::{Env, Value as Cel};
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-use program::Program;
 pub(crate) use functions::glob;
+use program::Program;
 pub use scope::Scope;
 pub use template::Template;
 

@@ -49,12 +49,10 @@ pub struct Scheme {
     pub lets: Vec<Let>,
     /// How the plain tensor's name ends; `tensors` put other endings in its place.
     pub plain: String,
-    /// The plain shape, read off the stored shapes in `s`; absent where these do not say.
+    /// The plain shape, read off the stored shapes in `s`; of one dimension where these say only how many values there
+    /// are; absent where they do not say that either.
     #[serde(default)]
     pub plain_shape: Option<Expression>,
-    /// `plain_shape` says how many values there are, not how they are arranged.
-    #[serde(default)]
-    pub flattened: bool,
     /// Keys of `q` that list what is left plain.
     #[serde(default)]
     pub skipped: Vec<String>,

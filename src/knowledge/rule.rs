@@ -205,6 +205,20 @@ impl RuleSet {
 
 /// Kinds of fault that the comparisons in `check` produce, beside those of the reader ([`FAULT_KINDS`]).
 pub const COMPARISON_KINDS: &[&str] = &[
+    "adapter-base-is-a-path",
+    "adapter-dora-disagrees",
+    "adapter-key-unread",
+    "adapter-magnitude-misshapen",
+    "adapter-module-not-saved",
+    "adapter-module-untargeted",
+    "adapter-of-a-model",
+    "adapter-pair-incomplete",
+    "adapter-rank-disagrees",
+    "adapter-rank-unusable",
+    "adapter-type-missing",
+    "adapter-type-unchecked",
+    "adapter-weights-missing",
+    "adapter-without-matrices",
     "added-tokens-disagree",
     "all-shards-absent",
     "alias-misses-import",

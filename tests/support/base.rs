@@ -10,16 +10,26 @@ use ckpt_doctor::surgery::merge::pipeline::{self, Request};
 use serde_json::Value;
 
 use super::change::apply_all;
-use super::{cases, project};
 use super::weights::{Shard, Weights};
+use super::{cases, project};
 
 /// Names of all bases.
 ///
 /// `llama` and `paligemma` are documents in `fixtures/bases` with weights made for them; `spatialvla` is the donor
 /// without the data set whose statistics have three `Infinity`; the merged ones are built from the donors; `llama-gptq`
-/// is the sound case of that name.
-pub const BASES: &[&str] =
-    &["llama", "llama-sharded", "llama-gptq", "paligemma", "spatialvla", "llava3d", "merged", "merged-baked", "merged-wrapped"];
+/// is the sound case of that name; `lora` is an adapter of the llama.
+pub const BASES: &[&str] = &[
+    "llama",
+    "llama-sharded",
+    "llama-gptq",
+    "lora",
+    "paligemma",
+    "spatialvla",
+    "llava3d",
+    "merged",
+    "merged-baked",
+    "merged-wrapped",
+];
 
 /// Makes every base below `root`.
 pub fn make_all(root: &Path, knowledge: &Knowledge) -> BTreeMap<&'static str, PathBuf> {
@@ -35,6 +45,7 @@ pub fn make_all(root: &Path, knowledge: &Knowledge) -> BTreeMap<&'static str, Pa
                     let case = cases().into_iter().find(|c| c.name == "sound/quantized-gptq").expect("the case");
                     apply_all(&case.name, &case.changes, &dir);
                 }
+                "lora" => lora(&dir),
                 "paligemma" => documents("paligemma", &dir, 1, knowledge),
                 "spatialvla" => {
                     copy(&project().join("fixtures/donors/spatialvla-tiny"), &dir);
@@ -91,6 +102,20 @@ fn documents(name: &str, dir: &Path, shards: usize, knowledge: &Knowledge) {
     if shards > 1 {
         weights.write_index(dir);
     }
+}
+
+/// Two matrices of rank four for two modules of each layer.
+fn lora(dir: &Path) {
+    copy(&project().join("fixtures/bases/lora"), dir);
+    let mut shard = Shard::new("adapter_model.safetensors");
+    for layer in 0..2 {
+        for (module, out) in [("q_proj", 16), ("v_proj", 8)] {
+            let name = format!("base_model.model.model.layers.{layer}.self_attn.{module}");
+            shard.add(&format!("{name}.lora_A.weight"), "F32", &[4, 16]);
+            shard.add(&format!("{name}.lora_B.weight"), "F32", &[out, 4]);
+        }
+    }
+    Weights { shards: vec![shard] }.write(dir);
 }
 
 fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {

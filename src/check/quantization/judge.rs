@@ -65,6 +65,9 @@ pub(super) struct Judge<'j> {
     pub(super) skipped: &'j Skipped<'j>,
 }
 
+/// Plain shape of a module, the shapes it asks for, and how many stored ones differ.
+type Fit = (Option<Vec<u64>>, Shapes, usize);
+
 /// What one choice of parameters makes of all modules.
 struct Attempt {
     /// Plain shape, and the shapes it asks for; by the order of the modules.
@@ -125,13 +128,11 @@ impl Judge<'_> {
         let mut attempt = Attempt { shapes: Vec::with_capacity(found.len()), wrong: 0 };
         let says = self.applied.says_shapes();
         // Layers repeat: a few shapes stand for thousands of modules.
-        let mut seen: BTreeMap<(Option<&[u64]>, Shapes), (Option<Vec<u64>>, Shapes, usize)> = BTreeMap::new();
+        let mut seen: BTreeMap<(Option<&[u64]>, Shapes), Fit> = BTreeMap::new();
         for (module, class) in found.iter().zip(classes) {
             let stored = module.shapes();
-            let look = || match says {
-                true => self.fit(values, *class, &stored),
-                false => (class.map(<[u64]>::to_vec), vec![None; stored.len()], 0),
-            };
+            let unsaid = || (class.map(<[u64]>::to_vec), vec![None; stored.len()], 0);
+            let look = || if says { self.fit(values, *class, &stored) } else { unsaid() };
             let (plain, shapes, wrong) = match self.applied.overridden(module.name) {
                 Some(own) => self.fit(&own, *class, &stored),
                 None => seen.entry((*class, stored.clone())).or_insert_with(look).clone(),
@@ -143,23 +144,24 @@ impl Judge<'_> {
     }
 
     /// Plain shape, the shapes it asks for, and how many stored ones differ.
-    fn fit(&self, values: &[Value], class: Option<&[u64]>, stored: &Shapes) -> (Option<Vec<u64>>, Shapes, usize) {
+    fn fit(&self, values: &[Value], class: Option<&[u64]>, stored: &Shapes) -> Fit {
         let wrong = |shapes: &Shapes| {
             let pairs = shapes.iter().zip(stored).filter_map(|(e, s)| Some((e.as_deref()?, s.as_deref()?)));
             pairs.filter(|(expected, stored)| !same(expected, stored)).count()
         };
         let Some(class) = class else {
-            let flattened = self.applied.scheme().flattened;
-            let Some(plain) = self.applied.plain_shape(values, stored) else { return (None, vec![None; stored.len()], 0) };
-            let shapes = self.applied.shapes(values, &plain, flattened);
+            let Some(plain) = self.applied.plain_shape(values, stored) else {
+                return (None, vec![None; stored.len()], 0);
+            };
+            let shapes = self.applied.shapes(values, &plain);
             let wrong = wrong(&shapes);
-            return ((!flattened).then_some(plain), shapes, wrong);
+            return ((plain.len() > 1).then_some(plain), shapes, wrong);
         };
-        let shapes = self.applied.shapes(values, class, false);
+        let shapes = self.applied.shapes(values, class);
         let count = wrong(&shapes);
         // GPT-2's `Conv1D` has the input first; packed it is a linear layer like any other.
         if let ([first, second], true) = (class, count > 0) {
-            let turned = self.applied.shapes(values, &[*second, *first], false);
+            let turned = self.applied.shapes(values, &[*second, *first]);
             if wrong(&turned) == 0 {
                 return (Some(class.to_vec()), turned, 0);
             }

@@ -84,7 +84,10 @@ pub(super) fn left_plain<'c>(
     skipped: &Skipped<'_>,
 ) -> Vec<Module<'c>> {
     let held = |name: &'c str| {
-        scheme.endings().map(|ending| if ending == scheme.plain { tensors.0.get(name).copied() } else { None }).collect()
+        scheme
+            .endings()
+            .map(|ending| if ending == scheme.plain { tensors.0.get(name).copied() } else { None })
+            .collect()
     };
     tensors
         .names()
@@ -107,8 +110,7 @@ pub(super) fn kind(name: &str) -> String {
 #[must_use]
 pub(super) fn signature<'n>(names: &BTreeSet<&'n str>) -> Option<(&'static Scheme, &'n str)> {
     let has = |module: &str, part: &Part| names.contains(&*format!("{module}{}", part.name));
-    let whole =
-        |scheme: &Scheme, module: &str| scheme.tensors.iter().all(|p| p.required.is_some() || has(module, p));
+    let whole = |scheme: &Scheme, module: &str| scheme.tensors.iter().all(|p| p.required.is_some() || has(module, p));
     let found = Scheme::all().iter().filter_map(|scheme| {
         let sign = scheme.sign.as_deref()?;
         let module = names.iter().find_map(|name| name.strip_suffix(sign).filter(|module| whole(scheme, module)))?;

@@ -92,12 +92,12 @@ impl Applied {
 
     /// Shapes of a module's tensors by its plain shape, or by what [`Self::plain_shape`] could tell of it.
     #[must_use]
-    pub fn shapes(&self, values: &[Value], plain: &[u64], flattened: bool) -> Shapes {
+    pub fn shapes(&self, values: &[Value], plain: &[u64]) -> Shapes {
         let mut scope = self.inner(values);
         if let Some(count) = plain.iter().try_fold(1_u64, |n, d| n.checked_mul(*d)) {
             scope.bind_int("count", count);
         }
-        if let ([lead @ .., rows, cols], false) = (plain, flattened) {
+        if let [lead @ .., rows, cols] = plain {
             scope.bind("lead", &lead.to_vec().into());
             scope.bind_int("rows", *rows);
             scope.bind_int("cols", *cols);
@@ -122,7 +122,7 @@ impl Applied {
         self.scheme.tensors.iter().map(required).collect()
     }
 
-    /// The plain shape behind stored shapes, when they say it; of a flattened one only the number of values.
+    /// The plain shape behind stored shapes, when they say it; of one dimension when they say only how many values there are.
     #[must_use]
     pub fn plain_shape(&self, values: &[Value], stored: &Shapes) -> Option<Vec<u64>> {
         let mut scope = self.inner(values);

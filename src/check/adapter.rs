@@ -1,0 +1,144 @@
+//! PEFT adapters: keys and shapes of a LoRA against its `adapter_config.json`.
+//!
+//! Source: peft 5d602fd, `utils/save_and_load.py` (`get_peft_model_state_dict`, `set_peft_model_state_dict`),
+//! `tuners/tuners_utils.py` (`check_target_module_exists`) and `tuners/lora`. PEFT loads with `strict=False`: a name that
+//! fits nothing is dropped with a warning at best, a tensor of another shape raises.
+
+mod keys;
+mod targets;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::Value;
+
+use crate::checkpoint::adapter::{Adapter, CONFIG};
+use crate::checkpoint::{Checkpoint, Fault, Place, Tensor};
+use keys::{Key, Role};
+use targets::Targets;
+
+/// The tensors of one module.
+type Module<'c> = BTreeMap<Role, &'c Tensor>;
+
+/// Faults of the adapter in this directory; none when there is none.
+#[must_use]
+pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let Some(adapter) = Adapter::of(checkpoint) else { return Vec::new() };
+    let mut faults = Vec::new();
+    match adapter.file() {
+        None => faults.push(Fault::new("adapter-weights-missing").at(Place::file(CONFIG))),
+        Some(file) if !file.ends_with(".safetensors") => {
+            faults.push(Fault::new("pickle-weights").at(Place::file(file)));
+        }
+        Some(_) => {}
+    }
+    // What is wrong with a config that is no object the document says itself.
+    let Some(config) = adapter.config() else { return faults };
+    let text = |key: &str| config.get(key).and_then(Value::as_str);
+    let base = text("base_model_name_or_path").unwrap_or_default();
+    if is_path(base) {
+        let at = Place::file(CONFIG).pointer("/base_model_name_or_path");
+        faults.push(Fault::new("adapter-base-is-a-path").at(at).with("base", base));
+    }
+    let kind = text("peft_type").unwrap_or_default();
+    if kind != "LORA" {
+        let at = Place::file(CONFIG).pointer("/peft_type");
+        let fault = Fault::new(if kind.is_empty() { "adapter-type-missing" } else { "adapter-type-unchecked" });
+        faults.push(fault.at(at).with("peft_type", kind));
+        return faults;
+    }
+    let base = if base.is_empty() { "a base model it does not name" } else { base };
+    let about = Fault::new("adapter-of-a-model").at(Place::file(CONFIG).pointer("/base_model_name_or_path"));
+    faults.push(about.with("base", base).with("rank", config.get("r").cloned().unwrap_or_default()));
+    let rank = config.get("r");
+    if rank.is_some_and(|r| r.as_u64().is_none_or(|r| r == 0)) {
+        let at = Place::file(CONFIG).pointer("/r");
+        faults.push(Fault::new("adapter-rank-unusable").at(at).with("rank", rank.cloned().unwrap_or_default()));
+    }
+    if let Some(tensors) = adapter.tensors() {
+        lora(config, tensors, &mut faults);
+    }
+    faults
+}
+
+/// Whether a base model is named by a path of the machine that trained: a Hub id has at most one slash, inside.
+fn is_path(base: &str) -> bool {
+    let drive = base.get(1..3).is_some_and(|s| s == ":\\" || s == ":/");
+    drive || base.starts_with(['/', '.', '~']) || base.contains('\\') || base.matches('/').count() > 1
+}
+
+fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
+    let mut modules: BTreeMap<&str, Module<'_>> = BTreeMap::new();
+    let mut whole: BTreeSet<&str> = BTreeSet::new();
+    for tensor in tensors {
+        match Key::parse(&tensor.name) {
+            Key::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
+            Key::Whole(name) => drop(whole.insert(name)),
+            Key::Foreign(reason) => {
+                let fault = Fault::new("adapter-key-unread").at(Place::tensor(&*tensor.name));
+                faults.push(fault.with("tensor", tensor.name.as_str()).with("reason", reason));
+            }
+        }
+    }
+    let targets = Targets::of(config);
+    for (name, module) in &modules {
+        pairs(name, module, &targets, faults);
+        if !targets.may_cover(name) {
+            let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
+            faults.push(Fault::new("adapter-module-untargeted").at(at).with("module", *name));
+        }
+        let magnitude = module.get(&Role::Magnitude);
+        if magnitude.is_some() != targets.dora {
+            let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
+            let fault = Fault::new("adapter-dora-disagrees").at(at).with("module", *name);
+            faults.push(fault.with("stored", magnitude.is_some()));
+        }
+    }
+    if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == "adapter-key-unread") {
+        faults.push(Fault::new("adapter-without-matrices").at(Place::file(CONFIG)));
+    }
+    for (at, saved) in targets.saved.iter().enumerate() {
+        // PEFT takes the last segments of a module's name.
+        let there = whole.iter().any(|name| format!(".{name}").contains(&format!(".{saved}.")));
+        if !there && !tensors.is_empty() {
+            let at = Place::file(CONFIG).pointer(format!("/modules_to_save/{at}"));
+            faults.push(Fault::new("adapter-module-not-saved").at(at).with("module", *saved));
+        }
+    }
+}
+
+/// `lora_A [r, in]` and `lora_B [out, r]` of one module, of one rank, and that of the config.
+fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, faults: &mut Vec<Fault>) {
+    for (down, up) in [(Role::A, Role::B), (Role::EmbeddingA, Role::EmbeddingB)] {
+        let (a, b) = match (module.get(&down), module.get(&up)) {
+            (None, None) => continue,
+            (Some(a), Some(b)) => (a, b),
+            (one, other) => {
+                let at = Place::tensor(one.or(other).map_or("", |t| t.name.as_str()));
+                let lacks = if one.is_none() { down } else { up };
+                let fault = Fault::new("adapter-pair-incomplete").at(at).with("module", name);
+                faults.push(fault.with("lacks", lacks.word()));
+                continue;
+            }
+        };
+        let (Some(&rank), Some(&other)) = (a.shape.first(), b.shape.get(1)) else {
+            let fault = Fault::new("adapter-rank-disagrees").at(Place::tensor(&*a.name)).with("module", name);
+            faults.push(fault.with("a", a.shape.clone()).with("b", b.shape.clone()).with("rank", Value::Null));
+            continue;
+        };
+        let expected = targets.rank(name);
+        if rank != other || expected.is_some_and(|expected| expected != rank) {
+            let fault = Fault::new("adapter-rank-disagrees").at(Place::tensor(&*a.name)).with("module", name);
+            let fault = fault.with("a", a.shape.clone()).with("b", b.shape.clone());
+            faults.push(fault.with("rank", expected.map_or(Value::Null, Value::from)));
+        }
+        if down == Role::A
+            && let Some(magnitude) = module.get(&Role::Magnitude)
+            && let (Some(out), Some(values)) =
+                (b.shape.first(), magnitude.shape.iter().copied().reduce(u64::saturating_mul))
+            && *out != values
+        {
+            let fault = Fault::new("adapter-magnitude-misshapen").at(Place::tensor(&*magnitude.name));
+            faults.push(fault.with("module", name).with("stored", magnitude.shape.clone()).with("expected", *out));
+        }
+    }
+}

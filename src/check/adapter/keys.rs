@@ -1,0 +1,91 @@
+//! Names in an adapter's file.
+
+use crate::checkpoint::adapter::PREFIX;
+
+/// What a tensor is to its module.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Role {
+    A,
+    B,
+    /// `lora_B.bias`, with `lora_bias`.
+    Bias,
+    EmbeddingA,
+    EmbeddingB,
+    /// The vector of lengths that DoRA adds.
+    Magnitude,
+}
+
+impl Role {
+    /// How names spell it.
+    pub(super) const fn word(self) -> &'static str {
+        match self {
+            Self::A => "lora_A",
+            Self::B => "lora_B",
+            Self::Bias => "lora_B.bias",
+            Self::EmbeddingA => "lora_embedding_A",
+            Self::EmbeddingB => "lora_embedding_B",
+            Self::Magnitude => "lora_magnitude_vector",
+        }
+    }
+}
+
+/// A tensor's name, taken apart.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Key<'n> {
+    /// A tensor of a LoRA, and the base model's module it belongs to.
+    Lora { module: &'n str, role: Role },
+    /// A tensor of the base model, stored whole: an embedding, a trained bias, one of `modules_to_save`.
+    Whole(&'n str),
+    /// PEFT finds no place for it, for this reason.
+    Foreign(&'static str),
+}
+
+/// Endings of the saved form, which has no adapter's name in it.
+const ENDINGS: [(&str, Role); 7] = [
+    (".lora_A.weight", Role::A),
+    (".lora_B.weight", Role::B),
+    (".lora_B.bias", Role::Bias),
+    (".lora_embedding_A", Role::EmbeddingA),
+    (".lora_embedding_B", Role::EmbeddingB),
+    (".lora_magnitude_vector", Role::Magnitude),
+    (".lora_magnitude_vector.weight", Role::Magnitude),
+];
+
+impl<'n> Key<'n> {
+    pub(super) fn parse(name: &'n str) -> Self {
+        let Some(bare) = name.strip_prefix(PREFIX) else {
+            return Self::Foreign("it does not start with base_model.model.");
+        };
+        if let Some((module, role)) = ENDINGS.iter().find_map(|(end, role)| Some((bare.strip_suffix(end)?, *role))) {
+            return Self::Lora { module, role };
+        }
+        // Variants of LoRA (`lora_ga`, `lora_sparse…`) have tensors of their own; only what is plainly misspelled counts.
+        let named = ["lora_A", "lora_B", "lora_embedding_A", "lora_embedding_B"].into_iter().any(|word| {
+            bare.split_once(&format!(".{word}."))
+                .is_some_and(|(_, rest)| word.contains("embedding") || rest.contains('.'))
+        });
+        if named { Self::Foreign("the name of an adapter is in it") } else { Self::Whole(bare) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_say_module_and_role() {
+        let lora = |module, role| Key::Lora { module, role };
+        for (name, key) in [
+            ("base_model.model.h.0.c_attn.lora_A.weight", lora("h.0.c_attn", Role::A)),
+            ("base_model.model.h.0.c_attn.lora_B.bias", lora("h.0.c_attn", Role::Bias)),
+            ("base_model.model.wte.lora_embedding_B", lora("wte", Role::EmbeddingB)),
+            ("base_model.model.q.lora_magnitude_vector", lora("q", Role::Magnitude)),
+            ("base_model.model.lm_head.weight", Key::Whole("lm_head.weight")),
+            ("base_model.model.q.lora_A.default.weight", Key::Foreign("the name of an adapter is in it")),
+            ("base_model.model.wte.lora_embedding_A.default", Key::Foreign("the name of an adapter is in it")),
+            ("h.0.c_attn.lora_A.weight", Key::Foreign("it does not start with base_model.model.")),
+        ] {
+            assert_eq!(Key::parse(name), key, "{name}");
+        }
+    }
+}
