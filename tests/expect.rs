@@ -48,6 +48,13 @@ fn a_config_is_printed_as_the_tensors_of_its_class() {
 }
 
 #[test]
+fn its_help_says_what_can_be_given() {
+    let (help, code) = expect(Path::new("."), &["--help"]);
+    assert_eq!(code, Some(0));
+    insta::assert_snapshot!("expect-help", help);
+}
+
+#[test]
 fn a_line_that_fails_does_not_stop_the_others() {
     let work = TempDir::new().unwrap();
     let mut broken = llama();

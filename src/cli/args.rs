@@ -39,8 +39,8 @@ pub enum Command {
 #[derive(Debug, Args)]
 #[command(after_help = "Exit codes: 0 all were built, 1 one could not be, 2 a file could not be read.")]
 pub struct ExpectArgs {
-    /// A config.json, a directory that has one, or @FILE: lines of JSON with the config under \"config\" (and the class,
-    /// if it is not the config's, under \"class\")
+    /// A config.json, a directory that has one, or @FILE: a JSON object a line, with the config in its `config` (and the
+    /// class, where it is not the config's own, in its `class`)
     #[arg(value_name = "CONFIG|DIR|@FILE", required = true)]
     pub configs: Vec<String>,
     /// The version that builds it, as transformers==4.47.0; the nearest known one stands for it, and without this the
