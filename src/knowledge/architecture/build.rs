@@ -277,7 +277,11 @@ impl<'l> Builder<'l> {
             map.to_mut().extend(evaluated(&part.set, scope)?);
         }
         let scope = self.resolver.scope(&map);
-        self.class(file, class, Config { map: &map, scope: &scope }, place)
+        let built = self.class(file, class, Config { map: &map, scope: &scope }, place);
+        built.map_err(|refusal| match &part.config {
+            Some(path) => Refusal(format!("{path}: {}", refusal.0)),
+            None => refusal,
+        })
     }
 
     /// The class of a part, by the config that governs it.
