@@ -17,6 +17,9 @@ from .vectors import Column
 
 LETTERS = "ijkl"
 NUMBER = re.compile(r"^(.*?)(\d+)$")
+MANY = 160                                                    # rows an expression is searched on; it must hold on all
+SEARCHES = 220                                                # for one class
+ENOUGH = 6                                                    # unexplained templates after which a class is given up
 STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|offset|start|end|last|moe|layer|num_")
 
 
@@ -145,34 +148,55 @@ class Fitter:
 
     def number(self, what, rows, targets, values, indexed=0):
         """An expression for `targets` over `rows`. `values`: {sample: anything that changes when the targets do}."""
-        def find():
-            keys = self.influence(values)
-            columns = self.columns(rows, keys, indexed)
-            extra = self.index_literals(rows, columns, keys, indexed) if indexed else ()
-            found = conditions.number(targets, columns, extra)
+        keys = self.influence(values)
+
+        def solve(some, wanted):
+            columns = self.columns(some, keys, indexed)
+            extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
+            found = conditions.number(wanted, columns, extra)
             if found is None:
                 lists = [k for k in self.all_lists() if k not in keys]
-                columns = self.columns(rows, keys[:5] + lists[:8], indexed)
-                found = conditions.number(targets, columns, extra, 1 + (indexed > 0))
-            if found is None:
-                raise Unexplained(f"{what}: {sorted(set(targets))[:6]} by {keys[:6]}")
-            return found[1]
-        return self.remembered("number", (tuple(rows), tuple(targets)), find)
+                if lists:
+                    found = conditions.number(wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, 1 + (indexed > 0))
+            return found and found[1]
+        return self.remembered("number", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
 
     def truth(self, what, rows, targets, values, indexed=0):
-        def find():
-            keys = self.influence(values)
-            columns = self.columns(rows, keys, indexed)
-            extra = self.index_literals(rows, columns, keys, indexed) if indexed else ()
-            found = conditions.condition(targets, columns, extra)
+        keys = self.influence(values)
+
+        def solve(some, wanted):
+            columns = self.columns(some, keys, indexed)
+            extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
+            found = conditions.condition(wanted, columns, extra)
             if found is None and indexed:
                 more = keys + [k for k in self.all_lists() if k not in keys][:6]
-                columns = self.columns(rows, more, indexed)
-                found = conditions.condition(targets, columns, self.index_literals(rows, columns, more, indexed))
-            if found is None:
-                raise Unexplained(f"{what}: {sum(targets)} of {len(targets)} by {keys[:6]}")
+                columns = self.columns(some, more, indexed)
+                found = conditions.condition(wanted, columns, self.index_literals(some, columns, more, indexed))
             return found
-        return self.remembered("truth", (tuple(rows), tuple(targets)), find)
+        return self.remembered("truth", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
+
+    def hold(self, what, keys, rows, targets, solve):
+        """What `solve` finds on some of the rows and holds on all: rows it is wrong on are added until it does."""
+        chosen = range(len(rows))
+        if len(rows) > MANY:
+            chosen = sorted({*range(0, len(rows), len(rows) // MANY + 1), *list({t: n for n, t in enumerate(targets)}.values())[:40]})
+        for _ in range(8):
+            text = solve([rows[n] for n in chosen], [targets[n] for n in chosen])
+            if text is None:
+                break
+            if len(chosen) == len(rows):
+                return text
+            wrong = [n for n, (r, t) in enumerate(zip(rows, targets)) if not self.says(text, r, t)]
+            if not wrong:
+                return text
+            chosen = sorted({*chosen, *wrong[::len(wrong) // 40 + 1]})
+        raise Unexplained(f"{what}: {len(set(targets))} values over {len(rows)} rows by {keys[:6]}")
+
+    def says(self, text, row, target):
+        try:
+            return evaluate.value(text, self.by_number[row[0]].flat, row[1]) == target
+        except Exception:
+            return False
 
     def index_literals(self, rows, columns, keys, indexed):
         """Conditions on the last index: where it begins, every how many, in which list, of which kind."""
@@ -416,6 +440,9 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
     while queue:
         pattern = queue.pop(0)
         per = todo[pattern]
+        if len(bad) >= ENOUGH:                                # it cannot be shipped; what fails is what takes time
+            bad.append([lettered(pattern), "not tried", ""])
+            continue
         try:
             if pattern.count("{}") > len(LETTERS):
                 raise Unexplained("too many indices")
@@ -467,6 +494,7 @@ def fit_class(root, name, known):
     samples = [s for s in data.samples if s.number not in found.unusable]
     inside = tuple(found.prefixes)
     fitter = Fitter(samples)
+    conditions.Work.left = SEARCHES
 
     def own_tensors(s):
         return {n: v for n, v in s.tensors.items() if not n.startswith(inside)} if inside else s.tensors
