@@ -201,10 +201,11 @@ def number(t, columns, extra=(), depth=2, thorough=True):
         (ty, cy, ly), (tn, cn, ln) = (part(t, v, columns, extra) for v in (x.truth, ~x.truth))
         yes, no = vectors.quick(ty, cy), vectors.quick(tn, cn)
         if yes is None and no is None:
-            if rank > 7 or depth < 2:
+            if rank > 9:
                 continue
             yes = vectors.fit(ty, cy, False)
-            if yes is None:
+            no = vectors.fit(tn, cn, False) if yes is None or depth < 2 else None
+            if yes is None and no is None:
                 continue
         yes = yes or number(ty, cy, ly, depth - 1, False)
         no = no or number(tn, cn, ln, depth - 1, False)

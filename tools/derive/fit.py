@@ -119,6 +119,9 @@ class Fitter:
                     implied[k] += 1
         keys = [k for k, _ in sorted(direct.items(), key=lambda kv: (-kv[1], kv[0]))][:9]
         keys += [k for k, _ in sorted(implied.items(), key=lambda kv: (-kv[1], kv[0])) if k not in keys and not NOISE.search(k.split(".")[-1])][:max(3, 8 - len(keys))]
+        for k in list(keys):                                  # a width under another name, where parts are of several kinds
+            if k.endswith("hidden_size") and any(k not in self.by_number[n].flat for n in values):
+                keys += [a for a in (k[:-len("hidden_size")] + x for x in ("d_model", "n_embd", "dim")) if any(a in self.by_number[n].flat for n in values) and a not in keys]
         if keys:
             return keys
         live = [self.by_number[n] for n in values]
@@ -223,6 +226,10 @@ class Fitter:
             half = v // 2
             add(c.cost + 1.6, f"{letter} >= {c.text} / 2", f"{letter} < {c.text} / 2", i >= half)
             add(c.cost + 1.7, f"{letter} > {c.text} / 2", f"{letter} <= {c.text} / 2", i > half)
+            if (v >= 0).all() and not v.all() and v.max() < 64:
+                safe = np.maximum(v, 1)
+                add(c.cost + .9, f"{c.text} > 0 && {letter} % {c.text} == 0", f"!({c.text} > 0 && {letter} % {c.text} == 0)", (v > 0) & (i % safe == 0))
+                add(c.cost + 1, f"{c.text} > 0 && ({letter} + 1) % {c.text} == 0", f"!({c.text} > 0 && ({letter} + 1) % {c.text} == 0)", (v > 0) & ((i + 1) % safe == 0))
             if (v > 0).all() and v.max() < 64:
                 add(c.cost + .7, f"{letter} % {c.text} == 0", f"{letter} % {c.text} != 0", i % v == 0)
                 add(c.cost + .8, f"({letter} + 1) % {c.text} == 0", f"({letter} + 1) % {c.text} != 0", (i + 1) % v == 0)
@@ -269,15 +276,23 @@ class Fitter:
 
     def template(self, pattern, per, shapes=True):
         """{"repeat", "when", "shape"} for a group of tensors, or raises Unexplained."""
+        try:
+            return self.template_over(pattern, per, shapes, [(n, ()) for n in sorted(per)])
+        except Unexplained:
+            if "{}" not in pattern or len(per) == len(self.samples):
+                raise
+        # A condition on the index may be what leaves some samples without the tensor altogether.
+        return self.template_over(pattern, per, shapes, [(s.number, ()) for s in self.samples])
+
+    def template_over(self, pattern, per, shapes, rows):
         entry, whens = {}, []
         places = pattern.count("{}")
         prefixes = pattern.split("{}")
         present = {s.number: s.number in per for s in self.samples}
-        everywhere = all(present.values())
-        rows = [(n, ()) for n in sorted(per)]
+        everywhere = len(rows) == len(self.samples)
         repeat = []
         for p in range(places):
-            sets = {(n, ix): {full[p] for full in per[n] if full[:p] == ix} for n, ix in rows}
+            sets = {(n, ix): {full[p] for full in per.get(n, ()) if full[:p] == ix} for n, ix in rows}
             here = "{}".join(prefixes[:p + 1])
             count, when = self.index_range(pattern, here, p, rows, sets)
             repeat.append([LETTERS[p], count])
