@@ -126,7 +126,7 @@ fn reports_can_be_written_beside_the_terminal() {
     ]);
     assert_eq!(run.status.code(), Some(0));
     let value: Value = serde_json::from_slice(&fs::read(json).unwrap()).unwrap();
-    assert_eq!((value["schema"].as_u64(), value["summary"]["verdict"].as_str()), (Some(1), Some("clean")));
+    assert_eq!((value["schema"].as_u64(), value["summary"]["verdict"].as_str()), (Some(2), Some("clean")));
     assert!(fs::read_to_string(markdown).unwrap().contains("llava3d-tiny"));
 }
 
@@ -170,4 +170,45 @@ fn rules_can_be_chosen_listed_and_explained() {
     assert_eq!(one.status.code(), Some(0));
     insta::assert_snapshot!("explain", String::from_utf8(one.stdout).unwrap());
     assert_eq!(doctor(&["explain", "IDX999"]).status.code(), Some(2));
+}
+
+#[test]
+fn the_load_is_predicted_for_the_versions_asked_for() {
+    let work = TempDir::new().unwrap();
+    let dir = work.path().join("llama");
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/bases/llama"), &dir);
+    // A file of one tensor: what matters is who speaks, not what is missing.
+    let header = br#"{"model.norm.weight":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}"#;
+    let bytes = [&(header.len() as u64).to_le_bytes()[..], header, &[0; 4]].concat();
+    fs::write(dir.join("model.safetensors"), bytes).unwrap();
+    let loaders = |more: &[&str]| {
+        let (_, report) = report(&[&["check", dir.to_str().unwrap(), "--output-format", "json"], more].concat());
+        let loads = report["checkpoints"][0]["loads"].as_array().unwrap().clone();
+        loads.iter().map(|l| json!([l["loader"], l["stands_for"]])).collect::<Vec<_>>()
+    };
+    // fixtures/bases/llama was written by 4.47.0.
+    assert_eq!(loaders(&[]), [json!(["4.47.0", null]), json!(["5.23.0", null])]);
+    assert_eq!(loaders(&["--for", "transformers==5.23.0"]), [json!(["5.23.0", null])]);
+    assert_eq!(loaders(&["--for", "transformers==4.51.3"]), [json!(["4.47.0", "4.51.3"])]);
+    let both = ["--for", "transformers==5.1.0", "--for", "transformers==4.47.0"];
+    assert_eq!(loaders(&both), [json!(["5.23.0", "5.1.0"]), json!(["4.47.0", null])]);
+
+    let shown = doctor(&[&["check", dir.to_str().unwrap()], &both[..]].concat());
+    let shown = String::from_utf8(shown.stdout).unwrap();
+    assert!(shown.contains("predicted load by transformers 5.1.0 (judged as 5.23.0) and 4.47.0:"), "{shown}");
+
+    for wrong in ["5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
+        let output = doctor(&["check", dir.to_str().unwrap(), "--for", wrong]);
+        assert_eq!(output.status.code(), Some(2), "{wrong}");
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(said.contains("known are 4.47.0, 5.23.0"), "{said}");
+    }
+    // A class of custom code that was read for one version only.
+    let spatialvla = donor("spatialvla-tiny");
+    let (_, report) =
+        report(&["check", spatialvla.to_str().unwrap(), "--for", "transformers==5.23.0", "--output-format", "json"]);
+    assert_eq!(report["checkpoints"][0]["loads"], json!([]));
+    let findings = report["checkpoints"][0]["findings"].as_array().unwrap();
+    let unknown = findings.iter().find(|f| f["code"] == "ARC001").unwrap();
+    assert!(unknown["message"].as_str().unwrap().contains("not known here for transformers 5.23.0"));
 }

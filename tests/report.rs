@@ -50,7 +50,7 @@ fn long_lists_are_capped_but_in_json() {
     }
     let json: serde_json::Value = serde_json::from_str(&show(&report, Format::Json)).unwrap();
     assert_eq!(json["checkpoints"][0]["findings"].as_array().unwrap().len(), 42);
-    assert_eq!(json["checkpoints"][0]["load"]["missing"].as_array().unwrap().len(), 30);
+    assert_eq!(json["checkpoints"][0]["loads"][0]["missing"].as_array().unwrap().len(), 30);
 }
 
 #[test]
@@ -149,7 +149,7 @@ proptest! {
             .map(|(start, len)| Location { file: Some("config.json".to_owned()), span: Some(*start..start + len), ..Location::default() })
             .collect();
         let mismatched = names.iter().map(|n| Mismatch { name: n.clone(), stored: vec![u64::MAX; 3], expected: vec![] }).collect();
-        checkpoint.load = Some(LoadReport { missing: names.clone(), unexpected: names, mismatched, ..LoadReport::default() });
+        checkpoint.loads = vec![LoadReport { missing: names.clone(), unexpected: names, mismatched, ..LoadReport::default() }];
         for format in Format::ALL {
             for color in [false, true] {
                 let shown = render(&report, format, Style { color, width: Some(width), cap });

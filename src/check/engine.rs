@@ -1,20 +1,17 @@
 //! Runs rules over a checkpoint.
 
-use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, FixHint, LoadReport, Location};
-use super::load::{self, Stored};
-use super::quantization::{self, Quantised};
-use super::{adapter, facts, index, modules, tokens};
+use super::load::Stored;
+use super::{adapter, facts, index, judge, modules, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
 use crate::knowledge::processor::Processor;
-use crate::knowledge::quantization::{Said, said};
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
-use crate::knowledge::{Expected, Library, Loader, Scope};
+use crate::knowledge::{Library, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
 const CAP: usize = 100;
@@ -25,12 +22,12 @@ const PLACES: usize = 20;
 /// What checking a checkpoint gave.
 #[derive(Debug, Clone, Default)]
 pub struct Outcome {
-    /// Architecture the load report was predicted with.
+    /// Architecture the load reports were predicted with.
     pub architecture: Option<String>,
     /// Sorted by file, place and code.
     pub findings: Vec<Finding>,
-    /// Absent when the architecture is unknown or there are no weights to speak of.
-    pub load: Option<LoadReport>,
+    /// One for each loader that was asked; none when the architecture is unknown or there are no weights to speak of.
+    pub loads: Vec<LoadReport>,
     /// The config with the class's defaults filled in; null when the architecture is unknown.
     pub config: Value,
 }
@@ -55,75 +52,24 @@ impl Knowledge {
     }
 }
 
-/// Runs every rule over a checkpoint.
+/// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
 #[must_use]
 pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
+    check_for(checkpoint, knowledge, &[])
+}
+
+/// Runs every rule over a checkpoint, for these versions of transformers; for those of [`check`] when there are none.
+#[must_use]
+pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
     faults.extend(index::compare(checkpoint));
     faults.extend(modules::compare(checkpoint));
     faults.extend(adapter::compare(checkpoint));
-    let stored = Stored::of(checkpoint);
-    let evidence = stored.evidence();
+    let judged = judge::judge(checkpoint, &knowledge.library, versions, &Stored::of(checkpoint));
+    faults.extend(judged.faults);
     let config = checkpoint.config();
-    let architecture = config.and_then(|c| {
-        // A class that the config's own version does not know may be known to another one.
-        let mut loaders = Loader::ALL;
-        loaders.sort_by_key(|l| *l != Loader::of_config(c));
-        loaders.into_iter().find_map(|loader| knowledge.library.find(c, stored.names(), loader))
-    });
-    let mut outcome = Outcome { architecture: architecture.map(|a| a.name().to_owned()), ..Outcome::default() };
-    let mut expected: Option<Expected> = None;
-    match (config, architecture) {
-        (Some(config), Some(architecture)) => match architecture.expect_given(config, &evidence) {
-            Ok(e) => expected = Some(e),
-            Err(problems) => {
-                let reason = problems.first().map_or("", String::as_str);
-                faults.push(
-                    Fault::new("config-incomputable")
-                        .at(Place::file("config.json"))
-                        .with("architecture", architecture.name())
-                        .with("reason", reason),
-                );
-            }
-        },
-        (Some(config), None) => faults.push(unknown_architecture(config)),
-        _ => {}
-    }
-    let said = config.map_or(Said::Plain, said);
-    let quantised = match &said {
-        Said::Known(applied) => Some(Quantised::new(applied, expected.as_ref(), checkpoint, &stored)),
-        _ => None,
-    };
-    faults.extend(quantization::faults(checkpoint, &said, quantised.as_ref()));
-    if let Some(expected) = &expected {
-        outcome.config = expected.config.clone();
-        let plain = quantised.as_ref().map_or_else(|| Cow::Borrowed(&stored), |q| Cow::Owned(q.plain(&stored)));
-        // How a scheme that is not known stores what cannot be guessed.
-        let known = !matches!(said, Said::Unknown(_));
-        let report = (known && !stored.is_empty()).then(|| load::predict(expected, &plain));
-        let report = match &quantised {
-            Some(quantised) => report.and_then(|report| quantised.spelled(report)),
-            None => report,
-        };
-        if let Some(mut report) = report {
-            // A tensor whose header entry could not be read is there.
-            let unreadable: BTreeSet<&str> =
-                checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
-            report.missing.retain(|name| !unreadable.contains(name.as_str()));
-            faults.extend(load::faults(&report));
-            if let Some(quantised) = &quantised {
-                quantised.complete(&mut report);
-            }
-            // Rules about the index name the shard; the lists alone would read as if all were well.
-            let absent = index::first_absent_shard(checkpoint);
-            report.raises = report.raises.or_else(|| absent.map(|name| format!("FileNotFoundError: {name}")));
-            outcome.load = Some(report);
-        }
-    }
-    let explained = outcome.load.as_ref().is_some_and(|report| report.unexpected.is_empty());
-    if matches!(said, Said::Plain) && !explained {
-        faults.extend(quantization::undeclared(stored.names()));
-    }
+    let mut outcome =
+        Outcome { architecture: judged.architecture, findings: Vec::new(), loads: judged.loads, config: judged.config };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint);
     faults.extend(tokens::compare(checkpoint, rows));
@@ -152,15 +98,6 @@ fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
         place.and_then(|l| l.tensor.as_deref()),
         &f.message,
     )
-}
-
-fn unknown_architecture(config: &Value) -> Fault {
-    let text = |key: &str| config.get(key).and_then(Value::as_str).unwrap_or("none").to_owned();
-    let class = config.pointer("/architectures/0").and_then(Value::as_str).unwrap_or("none");
-    Fault::new("unknown-architecture")
-        .at(Place::file("config.json").pointer("/model_type"))
-        .with("model_type", text("model_type"))
-        .with("class", class)
 }
 
 /// Rows of the token embedding: what every token id has to stay below.

@@ -74,6 +74,28 @@ pub struct LoadReport {
     pub raises: Option<String>,
 }
 
+impl LoadReport {
+    /// Whether every tensor of the class comes from the checkpoint.
+    #[must_use]
+    pub fn is_whole(&self) -> bool {
+        self.missing.is_empty() && self.mismatched.is_empty() && self.raises.is_none()
+    }
+
+    /// Whether two loaders say the same.
+    #[must_use]
+    pub fn agrees(&self, other: &Self) -> bool {
+        let said = |r: &Self| Self { loader: String::new(), stands_for: None, ..r.clone() };
+        said(self) == said(other)
+    }
+
+    /// The version it is for: `5.23.0`, or `4.51.3 (judged as 4.47.0)`.
+    #[must_use]
+    pub fn version(&self) -> String {
+        let version = |asked: &String| format!("{asked} (judged as {})", self.loader);
+        self.stands_for.as_ref().map_or_else(|| self.loader.clone(), version)
+    }
+}
+
 /// A tensor whose stored shape is not the expected one.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Mismatch {

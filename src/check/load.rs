@@ -3,10 +3,12 @@
 //! One prediction for each loader that is known, on names and shapes alone.
 
 mod convert;
+mod difference;
 mod keys;
 mod pattern;
 mod rename;
 mod stored;
+mod target;
 mod v4;
 mod v5;
 
@@ -16,7 +18,9 @@ use super::finding::LoadReport;
 use crate::checkpoint::{Fault, Place};
 use crate::knowledge::{Expected, Loader};
 
+pub use difference::{Judged, difference};
 pub use stored::Stored;
+pub use target::{Target, targets};
 
 /// Names in the message of one fault.
 const NAMES_SHOWN: usize = 5;
@@ -41,8 +45,9 @@ fn absent_groups(expected: &Expected, there: impl Fn(&str) -> bool) -> BTreeSet<
 /// Faults for the rules to judge: one for each cause, not one for each tensor.
 ///
 /// `indexed-but-absent` is not among them: comparing the index with the shards finds it without a class.
+/// `under` names the loader where several say different things.
 #[must_use]
-pub fn faults(report: &LoadReport) -> Vec<Fault> {
+pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     let mut faults = Vec::new();
     for kind in ["prefix-hijack", "tied-over"] {
         let silent = report.silent.iter().filter(|s| s.reason == kind);
@@ -65,7 +70,11 @@ pub fn faults(report: &LoadReport) -> Vec<Fault> {
             fault.with("stored", m.stored.clone()).with("expected", m.expected.clone())
         }));
     }
-    faults
+    let named = |fault: Fault| match under {
+        Some(loader) => fault.with("under", loader),
+        None => fault,
+    };
+    faults.into_iter().map(named).collect()
 }
 
 fn listed(names: &[String]) -> String {

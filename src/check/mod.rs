@@ -5,10 +5,11 @@ pub mod engine;
 pub mod facts;
 pub mod finding;
 pub mod index;
+pub mod judge;
 pub mod load;
 pub mod modules;
 pub mod quantization;
 pub mod tokens;
 
-pub use engine::{Knowledge, Outcome, check};
+pub use engine::{Knowledge, Outcome, check, check_for};
 pub use finding::{Finding, FixHint, Location, Severity};

@@ -97,6 +97,9 @@ pub struct CheckArgs {
     /// Checkpoint directories, directories that hold some, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
+    /// Versions to predict the load for; default: the one that wrote config.json, and the newest known
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_for)]
+    pub versions: Vec<String>,
     /// Only these rules: codes, starts of codes (JSN), or names; comma-separated
     #[arg(long, value_name = "RULE", value_delimiter = ',')]
     pub select: Vec<String>,
@@ -178,11 +181,9 @@ pub enum Color {
     Never,
 }
 
+/// The loader that stands for the version.
 fn parse_loader(text: &str) -> Result<Loader, String> {
-    match text.strip_prefix("transformers==") {
-        Some(version) if version.starts_with(|c: char| c.is_ascii_digit()) => Ok(Loader::nearest(version)),
-        _ => Err("write it as transformers==VERSION".to_owned()),
-    }
+    parse_for(text).map(|version| Loader::nearest(&version))
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {
@@ -194,6 +195,17 @@ fn parse_pair(text: &str) -> Result<(String, String), String> {
         Some((name, value)) if !name.is_empty() && !value.is_empty() => Ok((name.to_owned(), value.to_owned())),
         _ => Err("write it as NAME=VALUE".to_owned()),
     }
+}
+
+/// `transformers==4.51.3`: a version as Python packages have it. Which loader stands for it is the checker's business.
+fn parse_for(text: &str) -> Result<String, String> {
+    let version = text.strip_prefix("transformers==").unwrap_or_default();
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
+    if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
+        return Ok(version.to_owned());
+    }
+    let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
+    Err(format!("write it as transformers==VERSION; known are {}, others are judged as the nearest", known.join(", ")))
 }
 
 fn parse_report(text: &str) -> Result<(Format, PathBuf), String> {

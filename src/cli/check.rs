@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::{Knowledge, check};
+use ckpt_doctor::check::{Knowledge, check_for};
 use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::CheckpointReport;
@@ -36,7 +36,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
                 continue;
             }
             let checkpoint = Arc::new(Checkpoint::open(&dir).with_context(|| dir.display().to_string())?);
-            let outcome = check(&checkpoint, &knowledge);
+            let outcome = check_for(&checkpoint, &knowledge, &args.versions);
             reports.push(CheckpointReport::new(dir.display().to_string(), None, &checkpoint, &outcome));
         }
     }

@@ -233,6 +233,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "index-missing",
     "index-names-other-shard",
     "load-raises",
+    "loads-differ",
     "missing-tensors",
     "module-needs-package",
     "mismatched-tensor",

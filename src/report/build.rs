@@ -27,7 +27,7 @@ impl CheckpointReport {
             verdict: counts.verdict().to_owned(),
             counts,
             findings: outcome.findings.clone(),
-            load: outcome.load.clone(),
+            loads: outcome.loads.clone(),
             sources,
             tensors: (checkpoint.tensors().count(), bytes),
         }

@@ -41,8 +41,8 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", text_name(code));
     }
-    if let Some(load) = &checkpoint.load {
-        render_load(out, load, cap);
+    for loaders in words::agreeing(&checkpoint.loads) {
+        render_load(out, &loaders, cap);
     }
 }
 
@@ -93,12 +93,14 @@ fn place(location: &Location) -> Option<String> {
     (!parts.is_empty()).then(|| parts.join(" "))
 }
 
-fn render_load(out: &mut String, load: &LoadReport, cap: usize) {
+fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
+    let Some(load) = loaders.first() else { return };
+    let versions = text(&words::versions(loaders));
     let (missing, unexpected) = (load.missing.len(), load.unexpected.len());
     let (mismatched, silent) = (load.mismatched.len(), load.silent.len());
     let _ok = writeln!(
         out,
-        "\nPredicted load: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"
+        "\nPredicted load by {versions}: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"
     );
     if let Some(exception) = &load.raises {
         let _ok = writeln!(out, "\nBefore any of these is reported, the loader raises: {}", text(&sentence(exception)));

@@ -9,7 +9,7 @@ use crate::check::finding::LoadReport;
 use crate::check::{Finding, Severity};
 pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 
-/// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 1).
+/// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 2).
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     /// Version of this contract.
@@ -33,7 +33,7 @@ impl Report {
         let verdict = if seams { Severity::Error.name() } else { counts.verdict() };
         let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts };
         let tool = Tool { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") };
-        Self { schema: 1, tool, checkpoints, merge, summary }
+        Self { schema: 2, tool, checkpoints, merge, summary }
     }
 }
 
@@ -54,7 +54,7 @@ pub struct CheckpointReport {
     /// What it is in this run, for a merge: `donor vision`, `planned`, `written`; absent for `check`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub role: Option<String>,
-    /// Architecture the load report was predicted with.
+    /// Architecture the load reports were predicted with.
     pub architecture: Option<String>,
     /// `clean`, or the worst severity.
     pub verdict: String,
@@ -62,8 +62,8 @@ pub struct CheckpointReport {
     pub counts: Counts,
     /// Findings sorted by file, place and code.
     pub findings: Vec<Finding>,
-    /// Predicted load report; absent when the architecture is unknown or there are no tensors.
-    pub load: Option<LoadReport>,
+    /// Predicted load reports, one for each loader; none when the architecture is unknown or there are no tensors.
+    pub loads: Vec<LoadReport>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
     #[serde(skip)]
     pub sources: BTreeMap<String, Arc<str>>,

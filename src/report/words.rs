@@ -233,6 +233,24 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     together
 }
 
+/// Load reports of which the loaders say the same, together.
+pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
+    let mut together: Vec<Vec<&LoadReport>> = Vec::new();
+    for load in loads {
+        match together.iter_mut().find(|group| group.first().is_some_and(|first| first.agrees(load))) {
+            Some(group) => group.push(load),
+            None => together.push(vec![load]),
+        }
+    }
+    together
+}
+
+/// `transformers 4.51.3 (judged as 4.47.0) and 5.23.0`.
+pub fn versions(loaders: &[&LoadReport]) -> String {
+    let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
+    format!("transformers {}", versions.join(" and "))
+}
+
 /// `and 3 more`, when a list of `total` is cut at `cap`.
 pub fn more(total: usize, cap: usize) -> Option<String> {
     total.checked_sub(cap).filter(|n| *n > 0).map(|n| format!("and {n} more"))

@@ -21,7 +21,7 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
         verdict: counts.verdict().to_owned(),
         counts,
         findings,
-        load: None,
+        loads: vec![],
         sources: sources.iter().map(|(file, text)| ((*file).to_owned(), Arc::from(*text))).collect(),
         tensors: (690, 1_234_567),
     }
@@ -63,7 +63,8 @@ pub fn fix(safety: &str, title: &str) -> Option<FixHint> {
 
 pub fn clean() -> Report {
     let mut one = checkpoint("models/tiny", vec![], &[]);
-    one.load = Some(LoadReport::default());
+    let load = |loader: &str| LoadReport { loader: loader.to_owned(), ..LoadReport::default() };
+    one.loads = vec![load("4.47.0"), load("5.23.0")];
     let mut other = checkpoint("models/unknown", vec![], &[]);
     other.architecture = None;
     Report::new(vec![one, other], None)
@@ -165,7 +166,9 @@ pub fn findings() -> Report {
     let all = vec![twin("a.json"), twin("b.json"), no_span, ids, unmapped, module, infinity, nowhere];
     let mut checkpoint =
         checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
-    checkpoint.load = Some(load());
+    // A newer loader that reads all but one of these the same way.
+    let newer = LoadReport { loader: "5.23.0".to_owned(), stands_for: None, raises: None, silent: vec![], ..load() };
+    checkpoint.loads = vec![load(), newer];
     Report::new(vec![checkpoint], None)
 }
 
@@ -177,6 +180,8 @@ fn load() -> LoadReport {
         expected: expected.to_vec(),
     };
     LoadReport {
+        loader: "4.47.0".to_owned(),
+        stands_for: Some("4.51.3".to_owned()),
         missing: [layers("mlp.up_proj.weight"), vec!["language_model.lm_head.weight".to_owned()]].concat(),
         unexpected: layers("self_attn.rotary_emb.inv_freq"),
         mismatched: vec![
@@ -220,8 +225,12 @@ pub fn long_lists() -> Report {
     findings.push(places);
     let mut checkpoint = checkpoint("models/long", findings, &[]);
     let odd = |what: &str| (0..30).map(|n| format!("{what}_{n}")).collect::<Vec<_>>();
-    checkpoint.load =
-        Some(LoadReport { missing: odd("missing"), unexpected: odd("unexpected"), ..LoadReport::default() });
+    checkpoint.loads = vec![LoadReport {
+        loader: "5.23.0".to_owned(),
+        missing: odd("missing"),
+        unexpected: odd("unexpected"),
+        ..LoadReport::default()
+    }];
     Report::new(vec![checkpoint], None)
 }
 
@@ -251,13 +260,15 @@ pub fn hostile() -> Report {
     one.fix = fix(HOSTILE, HOSTILE);
     let mut checkpoint = checkpoint(HOSTILE, vec![one], &[("config.json", &source)]);
     checkpoint.architecture = Some(HOSTILE.to_owned());
-    checkpoint.load = Some(LoadReport {
+    checkpoint.loads = vec![LoadReport {
+        loader: HOSTILE.to_owned(),
+        stands_for: Some(HOSTILE.to_owned()),
         missing: vec![HOSTILE.to_owned()],
         unexpected: vec![HOSTILE.to_owned()],
         mismatched: vec![Mismatch { name: HOSTILE.to_owned(), stored: vec![1; 10_000], expected: vec![u64::MAX] }],
         silent: vec![Silent { name: HOSTILE.to_owned(), reason: HOSTILE.to_owned() }],
         ..LoadReport::default()
-    });
+    }];
     Report::new(vec![checkpoint], None)
 }
 
@@ -325,7 +336,7 @@ pub fn merge_ok() -> Report {
         let mut part =
             if donor { checkpoint("donors/x", vec![], &[]) } else { checkpoint("out/merged", vec![note()], &[]) };
         part.role = Some(role.to_owned());
-        part.load = Some(LoadReport::default());
+        part.loads = vec![LoadReport { loader: "4.47.0".to_owned(), ..LoadReport::default() }];
         part
     });
     Report::new(parts.into(), Some(merge()))

@@ -44,7 +44,7 @@ fn a_whole_checkpoint_loads_clean() {
     let expected = llama(false);
     let report = predict(&expected, &Stored::from_shapes(all(&expected)));
     assert_eq!(report, clean());
-    assert!(faults(&report).is_empty());
+    assert!(faults(&report, None).is_empty());
 }
 
 #[test]
@@ -67,7 +67,7 @@ fn base_model_keys_load_into_a_class_with_a_head() {
     stored.insert("lm_head.weight".to_owned(), vec![10, 4]);
     let report = predict(&expected, &Stored::from_shapes(stored));
     assert!(report.raises.as_deref().is_some_and(|r| r.starts_with("ValueError: The state dictionary")));
-    assert_eq!(faults(&report).iter().map(|f| f.kind).collect::<Vec<_>>(), ["load-raises"]);
+    assert_eq!(faults(&report, None).iter().map(|f| f.kind).collect::<Vec<_>>(), ["load-raises"]);
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn one_stray_key_with_the_prefix_hijacks_the_whole_model() {
     assert_eq!(report.missing, ["model.language_model.model.w", "model.vision_tower.w"]);
     assert_eq!(report.unexpected, ["language_model.model.w", "modelx.weight", "vision_tower.w"]);
     assert_eq!(reasons(&report), [("modelx.weight", "prefix-hijack")]);
-    let faults = faults(&report);
+    let faults = faults(&report, None);
     assert_eq!(faults.iter().map(|f| f.kind).collect::<Vec<_>>(), ["prefix-hijack"]);
     assert_eq!(faults[0].detail["tensor"], json!("modelx.weight"));
 }
@@ -175,7 +175,7 @@ fn an_optional_group_is_whole_or_absent() {
 #[test]
 fn faults_name_a_few_tensors_and_count_the_rest() {
     let report = LoadReport { missing: (0..7).map(|i| format!("t{i}")).collect(), ..LoadReport::default() };
-    let faults = faults(&report);
+    let faults = faults(&report, None);
     assert_eq!(faults[0].detail["names"], json!("t0, t1, t2, t3, t4 and 2 more"));
     assert_eq!((faults[0].kind, &faults[0].detail["count"], faults[0].places.len()), ("missing-tensors", &json!(7), 5));
 }

@@ -6,14 +6,23 @@ use comfy_table::{ContentArrangement, Table, presets};
 
 use super::super::Style;
 use super::super::collapse::{Group, collapse};
-use super::super::words::{mismatched, more, name, sentence, silent};
+use super::super::words::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
 use crate::check::finding::LoadReport;
 
-pub fn render(out: &mut String, load: &LoadReport, style: Style) {
+/// What these loaders say alike.
+pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
+    let Some(load) = loaders.first() else { return };
     let paint = Paint(style.color);
     let n = [load.missing.len(), load.unexpected.len(), load.mismatched.len(), load.silent.len()];
-    let line = format!("predicted load: {} missing, {} unexpected, {} mismatched, {} silent", n[0], n[1], n[2], n[3]);
+    let line = format!(
+        "predicted load by {}: {} missing, {} unexpected, {} mismatched, {} silent",
+        versions(loaders),
+        n[0],
+        n[1],
+        n[2],
+        n[3]
+    );
     if n == [0; 4] && load.raises.is_none() {
         let _ok = writeln!(out, "  {}", paint.quiet(&line));
         return;

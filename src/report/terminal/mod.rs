@@ -10,7 +10,7 @@ use std::fmt::Write as _;
 use self::paint::Paint;
 use super::Style;
 use super::model::{CheckpointReport, Report};
-use super::words::{alike, bytes, capped, counts, name, plural, summary};
+use super::words::{agreeing, alike, bytes, capped, counts, name, plural, summary};
 
 pub fn render(report: &Report, style: Style) -> String {
     let paint = Paint(style.color);
@@ -22,8 +22,8 @@ pub fn render(report: &Report, style: Style) -> String {
             let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
         } else {
             findings(&mut out, checkpoint, style);
-            if let Some(load) = &checkpoint.load {
-                load::render(&mut out, load, style);
+            for loaders in agreeing(&checkpoint.loads) {
+                load::render(&mut out, &loaders, style);
             }
         }
         out.push('\n');
@@ -40,7 +40,7 @@ pub fn render(report: &Report, style: Style) -> String {
 /// Whether a checkpoint has the findings of the one above it: what was planned is usually what was written.
 fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
     !checkpoint.findings.is_empty()
-        && (&above.path, &above.findings, &above.load) == (&checkpoint.path, &checkpoint.findings, &checkpoint.load)
+        && (&above.path, &above.findings, &above.loads) == (&checkpoint.path, &checkpoint.findings, &checkpoint.loads)
 }
 
 /// `fixtures/vision (donor vision): spatialvla, 690 tensors, 1.23 MB, clean`

@@ -1,0 +1,168 @@
+//! What each loader that is asked makes of a checkpoint, and which faults follow.
+
+use std::borrow::Cow;
+use std::collections::BTreeSet;
+
+use serde_json::Value;
+
+use super::finding::LoadReport;
+use super::index;
+use super::load::{self, Judged, Stored, Target};
+use super::quantization::{self, Quantised};
+use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::knowledge::quantization::{Said, said};
+use crate::knowledge::{Architecture, Expected, Library, Loader};
+
+/// The outcome for all loaders.
+#[derive(Debug, Default)]
+pub struct Judgement {
+    /// Architecture the reports were predicted with.
+    pub architecture: Option<String>,
+    /// The config with the class's defaults filled in, as the first loader has them; null for an unknown class.
+    pub config: Value,
+    /// A report for each loader.
+    pub loads: Vec<LoadReport>,
+    /// What follows for the rules.
+    pub faults: Vec<Fault>,
+}
+
+/// One loader's class, and what is stored as it stands for the plain tensors of that class.
+struct Candidate<'a> {
+    target: Target,
+    expected: Expected,
+    quantised: Option<Quantised<'a>>,
+    /// What the checkpoint can be compared by.
+    report: Option<LoadReport>,
+}
+
+/// Asks the loaders for these versions; without any, that of the version that wrote config.json and the newest.
+#[must_use]
+pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], stored: &Stored) -> Judgement {
+    let Some(config) = checkpoint.config() else { return Judgement::default() };
+    let names: Vec<&str> = stored.names().collect();
+    let targets = load::targets(library, config, &names, versions);
+    let mut faults: Vec<Fault> = unknown(config, &targets, versions).collect();
+    let architecture = targets.first().map(|(_, architecture)| architecture.name().to_owned());
+    let said = said(config);
+    let quantise = |expected: Option<&Expected>| match &said {
+        Said::Known(applied) => Some(Quantised::new(applied, expected, checkpoint, stored)),
+        _ => None,
+    };
+    let evidence = stored.evidence();
+    let mut candidates: Vec<Candidate<'_>> = Vec::new();
+    for (target, architecture) in targets {
+        // How a version unpacks weights that another one packed is not known.
+        if !target.leads && !matches!(said, Said::Plain) {
+            continue;
+        }
+        match architecture.expect_given(config, &evidence) {
+            Ok(expected) => {
+                let quantised = quantise(Some(&expected));
+                // How a scheme that is not known stores what cannot be guessed.
+                let comparable = !matches!(said, Said::Unknown(_)) && !stored.is_empty();
+                let report = comparable.then(|| predicted(checkpoint, &target, &expected, quantised.as_ref(), stored));
+                candidates.push(Candidate { target, expected, quantised, report: report.flatten() });
+            }
+            Err(problems) if target.leads => faults.push(
+                Fault::new("config-incomputable")
+                    .at(Place::file("config.json"))
+                    .with("architecture", architecture.name())
+                    .with("reason", problems.first().map_or("", String::as_str)),
+            ),
+            // Nobody asked what a version makes of it that cannot build the class.
+            Err(_) => {}
+        }
+    }
+    match candidates.first() {
+        Some(first) => faults.extend(quantization::faults(checkpoint, &said, first.quantised.as_ref())),
+        None => faults.extend(quantization::faults(checkpoint, &said, quantise(None).as_ref())),
+    }
+    faults.extend(load_faults(&candidates, stored));
+    let resolved = candidates.first().map_or(Value::Null, |c| c.expected.config.clone());
+    let loads: Vec<LoadReport> = candidates.into_iter().filter_map(|c| completed(c, checkpoint)).collect();
+    let explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
+    if matches!(said, Said::Plain) && !explained {
+        faults.extend(quantization::undeclared(stored.names()));
+    }
+    Judgement { architecture, config: resolved, loads, faults }
+}
+
+fn predicted(
+    checkpoint: &Checkpoint,
+    target: &Target,
+    expected: &Expected,
+    quantised: Option<&Quantised<'_>>,
+    stored: &Stored,
+) -> Option<LoadReport> {
+    let plain = quantised.map_or_else(|| Cow::Borrowed(stored), |q| Cow::Owned(q.plain(stored)));
+    let report = load::predict(expected, &plain);
+    let mut report = match quantised {
+        Some(quantised) => quantised.spelled(report)?,
+        None => report,
+    };
+    // A tensor whose header entry could not be read is there.
+    let unreadable: BTreeSet<&str> =
+        checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
+    report.missing.retain(|name| !unreadable.contains(name.as_str()));
+    report.stands_for.clone_from(&target.stands_for);
+    Some(report)
+}
+
+/// The report with what rules of other families find, without which its lists would read as if all were well.
+fn completed(candidate: Candidate<'_>, checkpoint: &Checkpoint) -> Option<LoadReport> {
+    let mut report = candidate.report?;
+    if let Some(quantised) = &candidate.quantised {
+        quantised.complete(&mut report);
+    }
+    let absent = index::first_absent_shard(checkpoint);
+    report.raises = report.raises.or_else(|| absent.map(|name| format!("FileNotFoundError: {name}")));
+    Some(report)
+}
+
+/// What each loader finds at fault: where the checkpoint has to load, all of it; elsewhere, that it does not load.
+fn load_faults(candidates: &[Candidate<'_>], stored: &Stored) -> Vec<Fault> {
+    let judged = |leads: bool| {
+        let asked = candidates.iter().filter(move |c| c.target.leads == leads);
+        asked.filter_map(|c| Some(Judged { report: c.report.as_ref()?, expected: &c.expected }))
+    };
+    let mut told: Vec<&LoadReport> = Vec::new();
+    for Judged { report, .. } in judged(true) {
+        if !told.iter().any(|t| t.agrees(report)) {
+            told.push(report);
+        }
+    }
+    let under = |report: &LoadReport| match told.len() {
+        0 | 1 => None,
+        _ => Some(format!("transformers {}", report.version())),
+    };
+    let mut faults: Vec<Fault> =
+        told.iter().flat_map(|report| load::faults(report, under(report).as_deref())).collect();
+    if let Some(loads) = judged(true).next() {
+        faults.extend(judged(false).filter_map(|other| load::difference(loads, other, stored)));
+    }
+    faults
+}
+
+/// For a class that no loader, or none of those asked for, is known to build.
+fn unknown(
+    config: &Value,
+    known: &[(Target, Architecture<'_>)],
+    versions: &[String],
+) -> impl Iterator<Item = Fault> + use<> {
+    let text = |key: &str| config.get(key).and_then(Value::as_str).unwrap_or("none").to_owned();
+    let class = config.pointer("/architectures/0").and_then(Value::as_str).unwrap_or("none").to_owned();
+    let unknown: Vec<Option<String>> = if versions.is_empty() {
+        known.is_empty().then_some(None).into_iter().collect()
+    } else {
+        let is_known = |version: &str| known.iter().any(|(target, _)| target.loader == Loader::nearest(version));
+        versions.iter().filter(|v| !is_known(v)).map(|v| Some(format!("transformers {v}"))).collect()
+    };
+    let model_type = text("model_type");
+    unknown.into_iter().map(move |version| {
+        let fault = Fault::new("unknown-architecture")
+            .at(Place::file("config.json").pointer("/model_type"))
+            .with("model_type", model_type.as_str())
+            .with("class", class.as_str());
+        version.into_iter().fold(fault, |fault, version| fault.with("under", version))
+    })
+}
