@@ -195,7 +195,6 @@ fn load() -> LoadReport {
             Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned() },
         ],
         raises: Some("ValueError: The state dictionary is corrupted.".to_owned()),
-        ..LoadReport::default()
     }
 }
 

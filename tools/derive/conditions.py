@@ -6,6 +6,11 @@ import numpy as np
 from . import vectors
 
 
+class Work:
+    """How many searches one class may still cost; counted, not timed, so that results do not depend on the machine."""
+    left = 0
+
+
 class Literal:
     """A simple condition: its text, the text of its opposite, its truth in every row."""
     __slots__ = ("cost", "text", "opposite", "truth")
@@ -84,25 +89,48 @@ def condition(truth, columns, extra=()):
     for _, text, v in both:
         if (v == truth).all():
             return text
+    if not both:
+        return None
+    both, truth = distinct_rows(both, truth)
+    if both is None:
+        return None                                           # two rows alike in everything, and one is in
     # A conjunction is made of what holds wherever the target holds, a disjunction of what holds nowhere else.
     wide = [x for x in both if (x[2] | ~truth).all()]
     narrow = [x for x in both if (~x[2] | truth).all()]
     for n in (2, 3):
-        found = combine(wide[:120 if n == 2 else 36], n, truth, np.logical_and, " && ") or combine(narrow[:120 if n == 2 else 36], n, truth, np.logical_or, " || ")
+        found = combine(wide[:150 if n == 2 else 50], n, ~truth, False, " && ") or combine(narrow[:150 if n == 2 else 50], n, truth, True, " || ")
         if found:
             return found
-    return of_both(wide, both, truth) or tree(truth, both, 3)
+    return of_both(wide, both, truth) or tree(truth, both[:200], 3)
 
 
-def combine(choices, n, truth, join, sign):
+def distinct_rows(both, truth):
+    """The same literals over rows that differ in at least one; (None, None) where the target differs and nothing else does."""
+    matrix = np.stack([v for *_, v in both])
+    _, keep = np.unique(np.packbits(matrix, axis=0).T, axis=0, return_index=True)
+    _, again = np.unique(np.packbits(np.vstack([matrix, truth]), axis=0).T, axis=0, return_index=True)
+    if len(again) > len(keep):
+        return None, None
+    keep.sort()
+    return [(c, text, v[keep]) for c, text, v in both], truth[keep]
+
+
+def combine(choices, n, rows, inverted, sign):
+    """The cheapest n of `choices` that together leave out every one of `rows` (inverted: that together cover them)."""
+    if len(choices) < n:
+        return None
+    m = np.stack([(~v if inverted else v)[rows] for *_, v in choices]).astype(np.int32)
+    costs = [c for c, *_ in choices]
     best = None
-    for combo in itertools.combinations(choices, n):
-        cost = sum(x[0] for x in combo)
-        if best is not None and cost >= best[0]:
-            continue
-        if (join.reduce([x[2] for x in combo]) == truth).all():
-            best = (cost, sign.join(guarded(x[1], sign) for x in combo))
-    return best and best[1]
+    for start in (itertools.combinations(range(len(choices)), n - 2) if n > 2 else [()]):
+        left = m if not start else m[:, m[start[0]] > 0]
+        hits = np.argwhere(np.triu(left @ left.T == 0, 1))
+        for a, b in hits[:400]:
+            combo = (*start, int(a), int(b))
+            cost = sum(costs[i] for i in combo)
+            if len(set(combo)) == n and (best is None or cost < best[0]):
+                best = (cost, combo)
+    return best and sign.join(guarded(choices[i][1], sign) for i in sorted(best[1]))
 
 
 def guarded(text, sign):
@@ -114,17 +142,11 @@ def guarded(text, sign):
 def of_both(wide, both, truth):
     """a && (b || c)"""
     for _, a, va in wide[:30]:
-        rest = [x for x in both if (~(x[2] & va) | truth).all()]
-        found = first_or(rest[:60], va, truth)
+        inside = [(c, text, v[va]) for c, text, v in both]
+        narrow = [x for x in inside if (~x[2] | truth[va]).all() and x[2].any()]
+        found = combine(narrow[:80], 2, truth[va], True, " || ")
         if found:
             return f"{guarded(a, ' && ')} && ({found})"
-    return None
-
-
-def first_or(rest, inside, truth):
-    for (_, a, va), (_, b, vb) in itertools.combinations(rest, 2):
-        if (((va | vb) & inside) == truth).all():
-            return f"{guarded(a, ' || ')} || {guarded(b, ' || ')}"
     return None
 
 
@@ -163,11 +185,15 @@ def tree(truth, both, depth):
 def number(t, columns, extra=(), depth=2, thorough=True):
     """An expression for a column of integers, with cases where one formula does not do. None where nothing fits."""
     t = np.array(t, dtype=np.int64)
+    Work.left -= 1
+    if Work.left < 0:
+        return None
     plain = vectors.fit(t, columns, thorough)
     if plain is not None and plain[0] < 6.5 or depth == 0:
         return plain
     best = plain
     cases = sorted([*literals(columns), *[x for x in extra if x.truth.any() and not x.truth.all()]], key=lambda x: x.cost)
+    extra = sorted(extra, key=lambda x: x.cost)[:40]
     for rank, x in enumerate(cases[:26]):
         if best is not None and x.cost + 2 >= best[0]:
             break
@@ -175,10 +201,11 @@ def number(t, columns, extra=(), depth=2, thorough=True):
         (ty, cy, ly), (tn, cn, ln) = (part(t, v, columns, extra) for v in (x.truth, ~x.truth))
         yes, no = vectors.quick(ty, cy), vectors.quick(tn, cn)
         if yes is None and no is None:
-            if rank > 7 or depth < 2:
+            if rank > 9:
                 continue
             yes = vectors.fit(ty, cy, False)
-            if yes is None:
+            no = vectors.fit(tn, cn, False) if yes is None or depth < 2 else None
+            if yes is None and no is None:
                 continue
         yes = yes or number(ty, cy, ly, depth - 1, False)
         no = no or number(tn, cn, ln, depth - 1, False)

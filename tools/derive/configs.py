@@ -40,7 +40,7 @@ def flatten(config, prefix="", out=None):
         elif k.startswith("_") or not isinstance(k, str):
             continue
         elif isinstance(v, dict):
-            if len(v) < 80 and not k.startswith("task_specific"):
+            if (len(v) < 80 or "model_type" in v) and not k.startswith("task_specific"):
                 flatten(v, f"{prefix}{k}.", out)
         elif v is None or isinstance(v, (bool, int, float, str)):
             out[prefix + k] = v

@@ -44,7 +44,9 @@ def of_config(root, model_type):
     path = root / "config-samples" / f"{model_type}.json.gz"
     if not path.exists():
         return None
+    left, conditions.Work.left = conditions.Work.left, 400
     result = derive(root, store.read(path))
+    conditions.Work.left = left
     kept.parent.mkdir(exist_ok=True)
     kept.write_text(json.dumps(result, indent=1) + "\n")
     return result

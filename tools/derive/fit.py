@@ -17,6 +17,9 @@ from .vectors import Column
 
 LETTERS = "ijkl"
 NUMBER = re.compile(r"^(.*?)(\d+)$")
+MANY = 160                                                    # rows an expression is searched on; it must hold on all
+SEARCHES = 220                                                # for one class
+ENOUGH = 6                                                    # unexplained templates after which a class is given up
 STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|offset|start|end|last|moe|layer|num_")
 
 
@@ -116,6 +119,9 @@ class Fitter:
                     implied[k] += 1
         keys = [k for k, _ in sorted(direct.items(), key=lambda kv: (-kv[1], kv[0]))][:9]
         keys += [k for k, _ in sorted(implied.items(), key=lambda kv: (-kv[1], kv[0])) if k not in keys and not NOISE.search(k.split(".")[-1])][:max(3, 8 - len(keys))]
+        for k in list(keys):                                  # a width under another name, where parts are of several kinds
+            if k.endswith("hidden_size") and any(k not in self.by_number[n].flat for n in values):
+                keys += [a for a in (k[:-len("hidden_size")] + x for x in ("d_model", "n_embd", "dim")) if any(a in self.by_number[n].flat for n in values) and a not in keys]
         if keys:
             return keys
         live = [self.by_number[n] for n in values]
@@ -145,34 +151,55 @@ class Fitter:
 
     def number(self, what, rows, targets, values, indexed=0):
         """An expression for `targets` over `rows`. `values`: {sample: anything that changes when the targets do}."""
-        def find():
-            keys = self.influence(values)
-            columns = self.columns(rows, keys, indexed)
-            extra = self.index_literals(rows, columns, keys, indexed) if indexed else ()
-            found = conditions.number(targets, columns, extra)
+        keys = self.influence(values)
+
+        def solve(some, wanted):
+            columns = self.columns(some, keys, indexed)
+            extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
+            found = conditions.number(wanted, columns, extra)
             if found is None:
                 lists = [k for k in self.all_lists() if k not in keys]
-                columns = self.columns(rows, keys[:5] + lists[:8], indexed)
-                found = conditions.number(targets, columns, extra, 1 + (indexed > 0))
-            if found is None:
-                raise Unexplained(f"{what}: {sorted(set(targets))[:6]} by {keys[:6]}")
-            return found[1]
-        return self.remembered("number", (tuple(rows), tuple(targets)), find)
+                if lists:
+                    found = conditions.number(wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, 1 + (indexed > 0))
+            return found and found[1]
+        return self.remembered("number", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
 
     def truth(self, what, rows, targets, values, indexed=0):
-        def find():
-            keys = self.influence(values)
-            columns = self.columns(rows, keys, indexed)
-            extra = self.index_literals(rows, columns, keys, indexed) if indexed else ()
-            found = conditions.condition(targets, columns, extra)
+        keys = self.influence(values)
+
+        def solve(some, wanted):
+            columns = self.columns(some, keys, indexed)
+            extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
+            found = conditions.condition(wanted, columns, extra)
             if found is None and indexed:
                 more = keys + [k for k in self.all_lists() if k not in keys][:6]
-                columns = self.columns(rows, more, indexed)
-                found = conditions.condition(targets, columns, self.index_literals(rows, columns, more, indexed))
-            if found is None:
-                raise Unexplained(f"{what}: {sum(targets)} of {len(targets)} by {keys[:6]}")
+                columns = self.columns(some, more, indexed)
+                found = conditions.condition(wanted, columns, self.index_literals(some, columns, more, indexed))
             return found
-        return self.remembered("truth", (tuple(rows), tuple(targets)), find)
+        return self.remembered("truth", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
+
+    def hold(self, what, keys, rows, targets, solve):
+        """What `solve` finds on some of the rows and holds on all: rows it is wrong on are added until it does."""
+        chosen = range(len(rows))
+        if len(rows) > MANY:
+            chosen = sorted({*range(0, len(rows), len(rows) // MANY + 1), *list({t: n for n, t in enumerate(targets)}.values())[:40]})
+        for _ in range(8):
+            text = solve([rows[n] for n in chosen], [targets[n] for n in chosen])
+            if text is None:
+                break
+            if len(chosen) == len(rows):
+                return text
+            wrong = [n for n, (r, t) in enumerate(zip(rows, targets)) if not self.says(text, r, t)]
+            if not wrong:
+                return text
+            chosen = sorted({*chosen, *wrong[::len(wrong) // 40 + 1]})
+        raise Unexplained(f"{what}: {len(set(targets))} values over {len(rows)} rows by {keys[:6]}")
+
+    def says(self, text, row, target):
+        try:
+            return evaluate.value(text, self.by_number[row[0]].flat, row[1]) == target
+        except Exception:
+            return False
 
     def index_literals(self, rows, columns, keys, indexed):
         """Conditions on the last index: where it begins, every how many, in which list, of which kind."""
@@ -199,6 +226,10 @@ class Fitter:
             half = v // 2
             add(c.cost + 1.6, f"{letter} >= {c.text} / 2", f"{letter} < {c.text} / 2", i >= half)
             add(c.cost + 1.7, f"{letter} > {c.text} / 2", f"{letter} <= {c.text} / 2", i > half)
+            if (v >= 0).all() and not v.all() and v.max() < 64:
+                safe = np.maximum(v, 1)
+                add(c.cost + .9, f"{c.text} > 0 && {letter} % {c.text} == 0", f"!({c.text} > 0 && {letter} % {c.text} == 0)", (v > 0) & (i % safe == 0))
+                add(c.cost + 1, f"{c.text} > 0 && ({letter} + 1) % {c.text} == 0", f"!({c.text} > 0 && ({letter} + 1) % {c.text} == 0)", (v > 0) & ((i + 1) % safe == 0))
             if (v > 0).all() and v.max() < 64:
                 add(c.cost + .7, f"{letter} % {c.text} == 0", f"{letter} % {c.text} != 0", i % v == 0)
                 add(c.cost + .8, f"({letter} + 1) % {c.text} == 0", f"({letter} + 1) % {c.text} != 0", (i + 1) % v == 0)
@@ -245,15 +276,23 @@ class Fitter:
 
     def template(self, pattern, per, shapes=True):
         """{"repeat", "when", "shape"} for a group of tensors, or raises Unexplained."""
+        try:
+            return self.template_over(pattern, per, shapes, [(n, ()) for n in sorted(per)])
+        except Unexplained:
+            if "{}" not in pattern or len(per) == len(self.samples):
+                raise
+        # A condition on the index may be what leaves some samples without the tensor altogether.
+        return self.template_over(pattern, per, shapes, [(s.number, ()) for s in self.samples])
+
+    def template_over(self, pattern, per, shapes, rows):
         entry, whens = {}, []
         places = pattern.count("{}")
         prefixes = pattern.split("{}")
         present = {s.number: s.number in per for s in self.samples}
-        everywhere = all(present.values())
-        rows = [(n, ()) for n in sorted(per)]
+        everywhere = len(rows) == len(self.samples)
         repeat = []
         for p in range(places):
-            sets = {(n, ix): {full[p] for full in per[n] if full[:p] == ix} for n, ix in rows}
+            sets = {(n, ix): {full[p] for full in per.get(n, ()) if full[:p] == ix} for n, ix in rows}
             here = "{}".join(prefixes[:p + 1])
             count, when = self.index_range(pattern, here, p, rows, sets)
             repeat.append([LETTERS[p], count])
@@ -416,6 +455,9 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
     while queue:
         pattern = queue.pop(0)
         per = todo[pattern]
+        if len(bad) >= ENOUGH:                                # it cannot be shipped; what fails is what takes time
+            bad.append([lettered(pattern), "not tried", ""])
+            continue
         try:
             if pattern.count("{}") > len(LETTERS):
                 raise Unexplained("too many indices")
@@ -467,6 +509,7 @@ def fit_class(root, name, known):
     samples = [s for s in data.samples if s.number not in found.unusable]
     inside = tuple(found.prefixes)
     fitter = Fitter(samples)
+    conditions.Work.left = SEARCHES
 
     def own_tensors(s):
         return {n: v for n, v in s.tensors.items() if not n.startswith(inside)} if inside else s.tensors

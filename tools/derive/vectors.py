@@ -122,6 +122,7 @@ class Atoms:
         every = self.ints[:14]
         for (n, v, c), (m, w, d) in itertools.combinations(every, 2):
             yield c + d + .2, f"{n} * {m}", v * w
+            yield c + d + 3.6, f"({n} * {m} * 2 / 3 + 7) / 8 * 8", (v * w * 2 // 3 + 7) // 8 * 8        # gated units of about the same size
             yield c + d + 2, f"max({n}, {m})", np.maximum(v, w)
             yield c + d + 2, f"min({n}, {m})", np.minimum(v, w)
         fixed = self.fixed[:6]
