@@ -24,6 +24,11 @@ type Module<'c> = BTreeMap<Role, &'c Tensor>;
 pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
     let Some(adapter) = Adapter::of(checkpoint) else { return Vec::new() };
     let mut faults = Vec::new();
+    // AdapterHub's library gives its own, other files the same name.
+    if adapter.config().is_some_and(|config| config.get("peft_type").is_none() && config.get("model_class").is_some()) {
+        let at = Place::file(CONFIG).pointer("/model_class");
+        return vec![Fault::new("adapter-type-unchecked").at(at).with("peft_type", "AdapterHub")];
+    }
     match adapter.file() {
         None => faults.push(Fault::new("adapter-weights-missing").at(Place::file(CONFIG))),
         Some(file) if !file.ends_with(".safetensors") => {
@@ -96,13 +101,12 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
     if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == "adapter-key-unread") {
         faults.push(Fault::new("adapter-without-matrices").at(Place::file(CONFIG)));
     }
-    for (at, saved) in targets.saved.iter().enumerate() {
-        // PEFT takes the last segments of a module's name.
-        let there = whole.iter().any(|name| format!(".{name}").contains(&format!(".{saved}.")));
-        if !there && !tensors.is_empty() {
-            let at = Place::file(CONFIG).pointer(format!("/modules_to_save/{at}"));
-            faults.push(Fault::new("adapter-module-not-saved").at(at).with("module", *saved));
-        }
+    // PEFT lists `classifier` and `score` for every sequence classification, and a model has one of them: only a file
+    // with none of the list has lost something. It matches the last segments of a module's name.
+    let is_saved = |module: &&str| whole.iter().any(|name| format!(".{name}").contains(&format!(".{module}.")));
+    if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
+        let at = Place::file(CONFIG).pointer("/modules_to_save");
+        faults.push(Fault::new("adapter-module-not-saved").at(at).with("modules", targets.saved.join(", ")));
     }
 }
 

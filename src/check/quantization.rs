@@ -40,6 +40,7 @@ pub struct Quantised<'a> {
     modules: Vec<Judged<'a>>,
     /// Kinds of module (names with their numbers taken out) of which at least one is quantised.
     kinds: BTreeSet<String>,
+    skipped: Skipped<'a>,
     /// Parameters that would explain the shapes where those of the config do not: `bits 8`.
     fits: Option<String>,
     has_weights: bool,
@@ -66,7 +67,7 @@ impl<'a> Quantised<'a> {
             let plain = module::left_plain(scheme, &tensors, &kinds, &quantised, &skipped);
             modules.extend(plain.into_iter().map(|module| judge.left_plain(module)));
         }
-        Self { applied, modules, kinds, fits, has_weights: !stored.is_empty() }
+        Self { applied, modules, kinds, skipped, fits, has_weights: !stored.is_empty() }
     }
 
     /// The stored tensors as if they had never been quantised.
@@ -76,9 +77,16 @@ impl<'a> Quantised<'a> {
         let mut taken: BTreeSet<String> =
             stored.names().filter(|n| scheme.ignored.iter().any(|g| glob(n, g))).map(str::to_owned).collect();
         let mut added: BTreeMap<String, Option<Vec<u64>>> = BTreeMap::new();
-        for judged in self.modules.iter().filter(|m| m.state == State::Quantised) {
+        for judged in self.modules.iter().filter(|m| m.state != State::Plain) {
             let name = judged.module.name;
-            taken.extend(judged.module.endings(scheme).into_iter().map(|ending| format!("{name}{ending}")));
+            let held = judged.module.endings(scheme).into_iter().map(|ending| format!("{name}{ending}"));
+            // The loader takes what is packed in a plain module's place for what it is named.
+            if judged.state == State::Skipped {
+                let held: BTreeSet<String> = held.collect();
+                taken.retain(|name| !held.contains(name));
+                continue;
+            }
+            taken.extend(held);
             added.insert(format!("{name}{}", scheme.plain), judged.plain.clone());
         }
         stored.replacing(&taken, added)
@@ -99,10 +107,11 @@ impl<'a> Quantised<'a> {
             module.is_some_and(|module| self.kinds.contains(&kind(module)))
         };
         report.unexpected.retain(|name| !is_extra(name));
+        let wrapped = |module: &&str| self.kinds.contains(&kind(module)) && self.skipped.covers(module).is_none();
         let required = self.applied.required(&[]);
         let mut missing: BTreeSet<String> = BTreeSet::new();
         for name in std::mem::take(&mut report.missing) {
-            match name.strip_suffix(scheme.plain.as_str()).filter(|module| self.kinds.contains(&kind(module))) {
+            match name.strip_suffix(scheme.plain.as_str()).filter(wrapped) {
                 Some(module) => {
                     let parts = scheme.endings().zip(&required).filter(|(_, required)| **required);
                     missing.extend(parts.map(|(ending, _)| format!("{module}{ending}")));

@@ -40,7 +40,9 @@ impl<'a> Skipped<'a> {
     pub(super) fn covers(&self, module: &str) -> Option<&'a str> {
         self.patterns.iter().find_map(|pattern| match pattern {
             Pattern::Text(text) => {
-                let branch = || glob(module, &format!("{text}.*")) || glob(module, &format!("*.{text}"));
+                // A last segment alone is matched by all; several at the end only by 5.23.
+                let last = || !text.contains('.') && glob(module, &format!("*.{text}"));
+                let branch = || glob(module, &format!("{text}.*")) || last();
                 (module == *text || (!self.modules && (glob(module, text) || branch()))).then_some(*text)
             }
             Pattern::Regex(_) => None,

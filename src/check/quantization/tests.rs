@@ -92,6 +92,22 @@ fn what_is_missing_is_spelled_as_the_loader_looks_for_it() {
 }
 
 #[test]
+fn a_module_that_the_config_leaves_plain_is_looked_for_plainly() {
+    let expected = class(&[("h.0.q.weight", &[32, 32]), ("h.1.q.weight", &[32, 32])]);
+    let packed = |n: u64| {
+        [("qweight", Dtype::I32, [32, 4]), ("qzeros", Dtype::I32, [1, 4]), ("scales", Dtype::F16, [1, 32])]
+            .map(|(ending, dtype, shape)| (format!("h.{n}.q.{ending}"), dtype, shape))
+    };
+    let tensors = [packed(0), packed(1)].concat();
+    let tensors: Vec<(&str, Dtype, &[u64])> = tensors.iter().map(|(n, d, s)| (n.as_str(), *d, s.as_slice())).collect();
+    let block = json!({ "quant_method": "awq", "group_size": -1, "modules_to_not_convert": ["h.1"] });
+    let (faults, report) = look(&block, &expected, &checkpoint(&tensors));
+    assert_eq!(faults, ["quantized-though-skipped"]);
+    assert_eq!(report.missing, ["h.1.q.weight"]);
+    assert_eq!(report.unexpected, ["h.1.q.qweight", "h.1.q.qzeros", "h.1.q.scales"]);
+}
+
+#[test]
 fn an_incomplete_module_of_bitsandbytes_raises() {
     let expected = class(&[("h.0.q.weight", &[32, 32])]);
     let stored = checkpoint(&[("h.0.q.weight", Dtype::U8, &[512, 1]), ("h.0.q.weight.absmax", Dtype::F32, &[16])]);
