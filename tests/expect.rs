@@ -101,6 +101,10 @@ fn rules_of_a_folder_are_known_too() {
     let (text, code) = expect(dir, &["config.json", "--rules", "mine"]);
     assert_eq!(code, Some(0));
     assert_eq!(text, "config.json: Mine (mine), transformers 5.23.0: 1 tensors, 0 non-persistent buffers\n  w [2]\n");
+    let mut check = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    let report =
+        String::from_utf8(check.args(["check", "--rules", "mine"]).current_dir(dir).output().unwrap().stdout).unwrap();
+    assert!(report.contains("mine, 0 tensors"), "{report}");
     file(r#"tensors: { "w": { shape: ["c.n +"] } }"#);
     let (wrong, code) = expect(dir, &["config.json", "--rules", "mine"]);
     assert_eq!(code, Some(2));

@@ -16,15 +16,15 @@ use ckpt_doctor::surgery::apply::{ApplyError, INTERRUPTED};
 use ckpt_doctor::surgery::merge::pipeline::{self, PipelineError, Request, Run};
 
 use super::args::BuildMergedArgs;
-use super::{FINDINGS, output};
+use super::{FINDINGS, library, output};
 
 /// What a shell expects of a program that Ctrl-C ended.
 const INTERRUPTED_CODE: u8 = 130;
 
 /// Runs `build-merged`.
-pub fn run(args: &BuildMergedArgs) -> anyhow::Result<u8> {
+pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let request = request(args)?;
-    let knowledge = Knowledge::embedded()?;
+    let knowledge = Knowledge { library: library::with(rules)?, ..Knowledge::embedded()? };
     ctrlc::set_handler(|| INTERRUPTED.store(true, Ordering::Relaxed)).context("setting up Ctrl-C")?;
     let terminal = std::io::stderr().is_terminal();
     let mut last = 0;

@@ -25,7 +25,7 @@ pub fn main() -> ExitCode {
     let result = match &command {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(args, rules.as_deref()),
-        args::Command::BuildMerged(args) => build_merged::run(args),
+        args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
         args::Command::Explain(args) => rules::explain(args),
         args::Command::Rules => rules::list(),
     };
