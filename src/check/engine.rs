@@ -7,6 +7,7 @@ use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, FixHint, LoadReport, Location};
 use super::load::Stored;
+use super::votes::Vote;
 use super::{adapter, facts, index, judge, modules, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
 use crate::knowledge::processor::Processor;
@@ -30,6 +31,8 @@ pub struct Outcome {
     pub loads: Vec<LoadReport>,
     /// The config with the class's defaults filled in; null when the architecture is unknown.
     pub config: Value,
+    /// Values of config.json that stored tensors contradict.
+    pub votes: Vec<Vote>,
 }
 
 /// What a checker knows: rules, architectures, processors.
@@ -68,8 +71,13 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let judged = judge::judge(checkpoint, &knowledge.library, versions, &Stored::of(checkpoint));
     faults.extend(judged.faults);
     let config = checkpoint.config();
-    let mut outcome =
-        Outcome { architecture: judged.architecture, findings: Vec::new(), loads: judged.loads, config: judged.config };
+    let mut outcome = Outcome {
+        architecture: judged.architecture,
+        findings: Vec::new(),
+        loads: judged.loads,
+        config: judged.config,
+        votes: judged.votes,
+    };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint);
     faults.extend(tokens::compare(checkpoint, rows));

@@ -9,6 +9,7 @@ use super::finding::LoadReport;
 use super::index;
 use super::load::{self, Judged, Stored, Target};
 use super::quantization::{self, Quantised};
+use super::votes::{self, Explanation, Vote};
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::quantization::{Said, said};
 use crate::knowledge::{Architecture, Expected, Library, Loader};
@@ -24,6 +25,8 @@ pub struct Judgement {
     pub loads: Vec<LoadReport>,
     /// What follows for the rules.
     pub faults: Vec<Fault>,
+    /// Values of config.json that stored tensors contradict.
+    pub votes: Vec<Vote>,
 }
 
 /// One loader's class, and what is stored as it stands for the plain tensors of that class.
@@ -33,6 +36,15 @@ struct Candidate<'a> {
     quantised: Option<Quantised<'a>>,
     /// What the checkpoint can be compared by.
     report: Option<LoadReport>,
+    /// The values of the config that explain the report, and what they leave.
+    explained: Option<Explanation>,
+}
+
+impl Candidate<'_> {
+    /// What no value of the config explains.
+    fn unexplained(&self) -> Option<&LoadReport> {
+        self.explained.as_ref().map(|explained| &explained.rest).or(self.report.as_ref())
+    }
 }
 
 /// Asks the loaders for these versions; without any, that of the version that wrote config.json and the newest.
@@ -61,7 +73,16 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                 // How a scheme that is not known stores what cannot be guessed.
                 let comparable = !matches!(said, Said::Unknown(_)) && !stored.is_empty();
                 let report = comparable.then(|| predicted(checkpoint, &target, &expected, quantised.as_ref(), stored));
-                candidates.push(Candidate { target, expected, quantised, report: report.flatten() });
+                let report = report.flatten();
+                // A quantised tensor has the shape that its scheme packs it into, and does not vote.
+                let voting = report.as_ref().filter(|_| target.leads && matches!(said, Said::Plain));
+                let explained =
+                    voting.and_then(|report| votes::explain(architecture, config, &expected, stored, report));
+                let explained = explained.map(|Explanation { votes, rest }| Explanation {
+                    votes,
+                    rest: finished(checkpoint, &target, rest),
+                });
+                candidates.push(Candidate { target, expected, quantised, report, explained });
             }
             Err(problems) if target.leads => faults.push(
                 Fault::new("config-incomputable")
@@ -78,13 +99,20 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
         None => faults.extend(quantization::faults(checkpoint, &said, quantise(None).as_ref())),
     }
     faults.extend(load_faults(&candidates, stored));
+    let mut votes: Vec<Vote> = Vec::new();
+    for vote in candidates.iter().filter_map(|c| c.explained.as_ref()).flat_map(|e| &e.votes) {
+        if votes.iter().all(|v| v.pointer != vote.pointer) {
+            votes.push(vote.clone());
+        }
+    }
+    faults.extend(votes.iter().map(votes::fault));
     let resolved = candidates.first().map_or(Value::Null, |c| c.expected.config.clone());
     let loads: Vec<LoadReport> = candidates.into_iter().filter_map(|c| completed(c, checkpoint)).collect();
     let explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
     if matches!(said, Said::Plain) && !explained {
         faults.extend(quantization::undeclared(stored.names()));
     }
-    Judgement { architecture, config: resolved, loads, faults }
+    Judgement { architecture, config: resolved, loads, faults, votes }
 }
 
 fn predicted(
@@ -96,16 +124,20 @@ fn predicted(
 ) -> Option<LoadReport> {
     let plain = quantised.map_or_else(|| Cow::Borrowed(stored), |q| Cow::Owned(q.plain(stored)));
     let report = load::predict(expected, &plain);
-    let mut report = match quantised {
+    let report = match quantised {
         Some(quantised) => quantised.spelled(report)?,
         None => report,
     };
+    Some(finished(checkpoint, target, report))
+}
+
+fn finished(checkpoint: &Checkpoint, target: &Target, mut report: LoadReport) -> LoadReport {
     // A tensor whose header entry could not be read is there.
     let unreadable: BTreeSet<&str> =
         checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
     report.missing.retain(|name| !unreadable.contains(name.as_str()));
     report.stands_for.clone_from(&target.stands_for);
-    Some(report)
+    report
 }
 
 /// The report with what rules of other families find, without which its lists would read as if all were well.
@@ -126,7 +158,9 @@ fn load_faults(candidates: &[Candidate<'_>], stored: &Stored) -> Vec<Fault> {
         asked.filter_map(|c| Some(Judged { report: c.report.as_ref()?, expected: &c.expected }))
     };
     let mut told: Vec<&LoadReport> = Vec::new();
-    for Judged { report, .. } in judged(true) {
+    // One finding on the value that is wrong says more than one on each tensor that follows from it.
+    let asked = candidates.iter().filter(|c| c.target.leads);
+    for report in asked.filter_map(Candidate::unexplained) {
         if !told.iter().any(|t| t.agrees(report)) {
             told.push(report);
         }

@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 
 use super::finding::LoadReport;
 use crate::checkpoint::{Fault, Place};
-use crate::knowledge::{Expected, Loader};
+use crate::knowledge::{Evidence, Expected, Loader};
 
 pub use difference::{Judged, difference};
 pub use stored::Stored;
@@ -33,6 +33,16 @@ pub fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         Loader::V5_23_0 => v5::predict(expected, stored),
     };
     LoadReport { loader: expected.loader.version().to_owned(), ..report }
+}
+
+/// The stored tensors under the names that the loader has for them in the model, renamed and converted. A shape is
+/// left out where it depends on more than is known.
+#[must_use]
+pub fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
+    match expected.loader {
+        Loader::V4_47_0 => v4::in_model(expected, stored),
+        Loader::V5_23_0 => v5::in_model(expected, stored),
+    }
 }
 
 /// Optional groups of which nothing is there.

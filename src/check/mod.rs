@@ -5,11 +5,13 @@ pub mod engine;
 pub mod facts;
 pub mod finding;
 pub mod index;
+pub mod inspect;
 pub mod judge;
 pub mod load;
 pub mod modules;
 pub mod quantization;
 pub mod tokens;
+pub mod votes;
 
 pub use engine::{Knowledge, Outcome, check, check_for};
 pub use finding::{Finding, FixHint, Location, Severity};

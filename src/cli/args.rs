@@ -27,6 +27,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Build one checkpoint from parts of two
     BuildMerged(BuildMergedArgs),
+    /// Say what a checkpoint is: tensors, class, and the config values that the tensors show
+    Inspect(InspectArgs),
     /// Print the tensors that a model class has, by its config alone
     Expect(ExpectArgs),
     /// Say all there is to say of one rule
@@ -50,6 +52,29 @@ pub struct ExpectArgs {
     /// text: a tensor a line; json: a list; jsonl: an object a line for each config, and those that fail say why
     #[arg(long, value_name = "FMT", default_value = "text")]
     pub output_format: ExpectFormat,
+}
+
+/// Arguments of `inspect`.
+#[derive(Debug, Args)]
+pub struct InspectArgs {
+    /// A checkpoint directory, with a config.json or without, or a .safetensors file
+    #[arg(value_name = "PATH", default_value = ".")]
+    pub path: PathBuf,
+    /// full: for a terminal; json: complete
+    #[arg(long, value_name = "FMT", default_value = "full")]
+    pub output_format: InspectFormat,
+    /// When to use colours
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    pub color: Color,
+}
+
+/// Formats of `inspect`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum InspectFormat {
+    /// For a terminal.
+    Full,
+    /// An object.
+    Json,
 }
 
 /// Formats of `expect`.

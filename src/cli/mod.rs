@@ -4,6 +4,7 @@ mod args;
 mod build_merged;
 mod check;
 mod expect;
+mod inspect;
 mod library;
 mod output;
 mod rules;
@@ -24,6 +25,7 @@ pub fn main() -> ExitCode {
     let args::Cli { command, rules } = args::Cli::parse();
     let result = match &command {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
+        args::Command::Inspect(args) => inspect::run(args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(args, rules.as_deref()),
         args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
         args::Command::Explain(args) => rules::explain(args),

@@ -18,15 +18,7 @@ pub fn note(line: &str) {
 
 /// Prints the report and writes those asked for; returns the exit code by severity.
 pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
-    let terminal = std::io::stdout().is_terminal();
-    let color = match args.color {
-        Color::Always => true,
-        Color::Never => false,
-        // https://no-color.org
-        Color::Auto => terminal && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()),
-    };
-    let width = terminal.then(columns).flatten();
-    let text = render(report, args.output_format, Style { color, width, ..Style::default() });
+    let text = render(report, args.output_format, style(args.color));
     for (format, file) in &args.report {
         let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };
         write(file, render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
@@ -35,6 +27,18 @@ pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
     let worst = report.checkpoints.iter().filter_map(|c| c.counts.worst()).max();
     let fails = !args.exit_zero && worst.is_some_and(|s| s >= args.fail_on.severity());
     Ok(if fails { FINDINGS } else { CLEAN })
+}
+
+/// The style for standard output.
+pub fn style(color: Color) -> Style {
+    let terminal = std::io::stdout().is_terminal();
+    let color = match color {
+        Color::Always => true,
+        Color::Never => false,
+        // https://no-color.org
+        Color::Auto => terminal && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()),
+    };
+    Style { color, width: terminal.then(columns).flatten(), ..Style::default() }
 }
 
 /// Prints to standard output.

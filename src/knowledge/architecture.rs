@@ -3,7 +3,7 @@
 mod blueprint;
 mod build;
 mod conversions;
-mod member;
+pub(crate) mod member;
 mod ordered;
 mod resolve;
 
@@ -44,6 +44,24 @@ impl<'l> Architecture<'l> {
     #[must_use]
     pub fn class(&self) -> &'l str {
         &self.class.name
+    }
+
+    /// The `model_type` of its config; `None` where it has none of its own.
+    #[must_use]
+    pub fn model_type(&self) -> Option<&'l str> {
+        self.file.model_types.first().map(String::as_str)
+    }
+
+    /// Whether a key of a config is a word of its file.
+    #[must_use]
+    pub fn speaks_of(&self, key: &str) -> bool {
+        self.library.text(self.name()).is_some_and(|text| text.contains(key))
+    }
+
+    /// The config that a search for one begins with when there is none.
+    #[must_use]
+    pub fn start(&self) -> Value {
+        Value::Object(self.file.start.clone())
     }
 
     /// The loader that builds it.

@@ -24,6 +24,17 @@ impl Evidence {
         self.shapes.contains_key(name)
     }
 
+    /// The tensor of this name, as it is held here.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<(&str, Option<&[u64]>)> {
+        self.shapes.get_key_value(name).map(|(name, shape)| (name.as_str(), shape.as_deref()))
+    }
+
+    /// Every tensor by name, with its shape where that is known.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, Option<&[u64]>)> {
+        self.shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_deref()))
+    }
+
     /// One more than the largest number that follows `prefix` in a tensor's name; 0 when none does.
     #[must_use]
     pub fn count(&self, prefix: &str) -> u64 {

@@ -111,6 +111,21 @@ impl Library {
         Some(Architecture::new(self, file, class, loader))
     }
 
+    /// Stem and text of every file, unparsed.
+    pub(super) fn texts(&self) -> impl Iterator<Item = (&str, &[u8])> {
+        self.files.iter().map(|file| (file.stem.as_str(), file.text.as_bytes()))
+    }
+
+    /// Text of the file of this stem.
+    pub(super) fn text(&self, stem: &str) -> Option<&str> {
+        self.files.iter().find(|file| file.stem == stem).map(|file| file.text.as_ref())
+    }
+
+    /// The file of this stem.
+    pub(super) fn file(&self, stem: &str) -> Option<&Blueprint> {
+        self.files.iter().find(|file| file.stem == stem).map(File::blueprint)
+    }
+
     /// The entry of a class, when the tensors need not choose.
     pub(super) fn entry(&self, class: &str, loader: Loader) -> Option<(&Blueprint, &Class)> {
         choose(self.entries(class, loader), &mut std::iter::empty())

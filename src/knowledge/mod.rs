@@ -8,6 +8,7 @@ pub mod loader;
 pub mod processor;
 pub mod quantization;
 pub mod recipe;
+pub mod resemblance;
 pub mod rule;
 pub mod selection;
 pub mod source;

@@ -229,6 +229,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "auto-map-remote",
     "auto-map-unsafe-path",
     "config-incomputable",
+    "config-outvoted",
     "index-key-nowhere",
     "index-missing",
     "index-names-other-shard",

@@ -7,6 +7,7 @@ mod ci;
 mod collapse;
 mod concise;
 mod excerpt;
+pub mod inspect;
 mod json;
 mod markdown;
 pub mod model;

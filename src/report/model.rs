@@ -32,8 +32,7 @@ impl Report {
         let seams = merge.as_ref().is_some_and(|m| !m.seams.is_empty());
         let verdict = if seams { Severity::Error.name() } else { counts.verdict() };
         let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts };
-        let tool = Tool { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") };
-        Self { schema: 2, tool, checkpoints, merge, summary }
+        Self { schema: 2, tool: Tool::this(), checkpoints, merge, summary }
     }
 }
 
@@ -44,6 +43,14 @@ pub struct Tool {
     pub name: &'static str,
     /// Its version.
     pub version: &'static str,
+}
+
+impl Tool {
+    /// This program.
+    #[must_use]
+    pub const fn this() -> Self {
+        Self { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") }
+    }
 }
 
 /// The verdict over one checkpoint.

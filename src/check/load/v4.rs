@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::keys::{self, Spelling};
 use super::{Stored, absent_groups, pattern};
 use crate::check::finding::{LoadReport, Mismatch, Silent};
-use crate::knowledge::Expected;
+use crate::knowledge::{Evidence, Expected};
 
 /// What it says when a class with a head is given base-model keys without prefix, and the head.
 const CORRUPTED: &str = "ValueError: The state dictionary of the model you are trying to load is corrupted. Are you sure it was properly saved?";
@@ -63,6 +63,16 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         .collect();
     let raises = spelling.is_corrupted(expected, &file).then(|| CORRUPTED.to_owned());
     LoadReport { missing, unexpected, mismatched, silent, raises, ..LoadReport::default() }
+}
+
+/// The stored tensors under the class's names.
+pub(super) fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
+    let file: BTreeSet<String> = stored.names().map(keys::renamed).collect();
+    let spelling = Spelling::of(expected, &file);
+    let shapes: BTreeMap<&str, &[u64]> = stored.shapes().collect();
+    let names: BTreeSet<&str> = stored.names().chain(shapes.keys().copied()).collect();
+    let named = |name: &str| (spelling.in_model(&keys::renamed(name)), shapes.get(name).map(|s| s.to_vec()));
+    names.into_iter().map(named).collect()
 }
 
 /// Names that share one storage, the one they are tied to first.

@@ -13,7 +13,7 @@ use super::pattern;
 use super::rename::Transform;
 use super::{Stored, absent_groups};
 use crate::check::finding::{LoadReport, Mismatch};
-use crate::knowledge::{Expected, ExpectedTensor};
+use crate::knowledge::{Evidence, Expected, ExpectedTensor};
 
 const CONVERSION: &str = "RuntimeError: We encountered some issues during automatic conversion of the weights";
 
@@ -26,12 +26,7 @@ enum Mapping {
 }
 
 pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
-    let mut loading = Loading::new(expected);
-    let mut names: Vec<&str> = stored.file_names().collect();
-    names.sort_by(|a, b| natural(a, b));
-    for name in names {
-        loading.collect(name, stored.shape(name).map_or(Shape::Unknown, |dims| Shape::Known(dims.to_vec())));
-    }
+    let mut loading = Loading::of(expected, stored);
     let raises = loading.convert();
     let absent = absent_groups(expected, |name| !loading.missing.contains(name));
     loading.missing.retain(|name| {
@@ -50,6 +45,34 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     pattern::ignore(&mut report.unexpected, &expected.ignore_unexpected);
     pattern::ignore(&mut report.unexpected, &old_buffers(expected));
     report
+}
+
+/// The stored tensors under the model's names: those made by converters, and those that are not the model's too.
+pub(super) fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
+    let mut loading = Loading::of(expected, stored);
+    let mut tensors: BTreeMap<String, Option<Vec<u64>>> = BTreeMap::new();
+    let known = |shape: &Shape| if let Shape::Known(dims) = shape { Some(dims.clone()) } else { None };
+    for (target, mapping) in std::mem::take(&mut loading.mappings) {
+        match mapping {
+            Mapping::Plain(shape) => {
+                tensors.insert(target, known(&shape));
+            }
+            Mapping::Converter(at, sources) => {
+                let Some(converter) = loading.converters.get(at) else { continue };
+                match convert(converter.row(), &target, sources, expected) {
+                    Ok(made) => tensors.extend(made.iter().map(|(name, shape)| (name.clone(), known(shape)))),
+                    Err(_) => {
+                        tensors.insert(target, None);
+                    }
+                }
+            }
+        }
+    }
+    for name in std::mem::take(&mut loading.unexpected) {
+        let shape = stored.shape(&name).map(<[u64]>::to_vec);
+        tensors.insert(name, shape);
+    }
+    tensors.into_iter().collect()
 }
 
 /// Buffers that older versions saved, as patterns: silent in a file when the model has one of that name anywhere.
@@ -89,6 +112,17 @@ impl<'e> Loading<'e> {
             unexpected: BTreeSet::new(),
             mismatched: BTreeMap::new(),
         }
+    }
+
+    /// With everything collected that is stored.
+    fn of(expected: &'e Expected, stored: &Stored) -> Self {
+        let mut loading = Self::new(expected);
+        let mut names: Vec<&str> = stored.file_names().collect();
+        names.sort_by(|a, b| natural(a, b));
+        for name in names {
+            loading.collect(name, stored.shape(name).map_or(Shape::Unknown, |dims| Shape::Known(dims.to_vec())));
+        }
+        loading
     }
 
     fn in_model(&self, name: &str) -> bool {

@@ -52,6 +52,10 @@ pub(crate) struct Blueprint {
     /// By version, what that loader has different of the four above: merged over them key by key.
     #[serde(default)]
     by_loader: BTreeMap<Loader, ConfigClass>,
+    /// What a search for a config begins with when there is none: values without which nothing can be built, or that no
+    /// tensor can vote for.
+    #[serde(default)]
+    pub start: Map<String, Value>,
     /// What must hold for the classes to be built at all; checked before `computed`.
     #[serde(default)]
     pub require: Vec<Requirement>,
@@ -194,6 +198,16 @@ impl Blueprint {
     pub fn auto(&self, mapping: &str, loader: Loader) -> Option<&str> {
         let own = self.by_loader.get(&loader).and_then(|other| other.auto.get(mapping));
         own.or_else(|| self.auto.get(mapping)).map(String::as_str)
+    }
+
+    /// The `model_type` of a sub-config that names none, under one loader.
+    pub fn sub_config_type(&self, key: &str, loader: Loader) -> Option<String> {
+        let of = |configs: &[(String, SubConfig)]| {
+            let (_, sub) = configs.iter().find(|(k, _)| k == key)?;
+            let absent = sub.absent.as_ref().and_then(|a| a.get("model_type")).and_then(Value::as_str);
+            sub.model_type.as_deref().or(absent).map(str::to_owned)
+        };
+        self.by_loader.get(&loader).and_then(|other| of(&other.configs)).or_else(|| of(&self.configs))
     }
 
     /// Whether its classes are code that came with a checkpoint, which transformers 5 loads without conversions.

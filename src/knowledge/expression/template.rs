@@ -22,6 +22,12 @@ enum Piece {
 }
 
 impl Template {
+    /// The text with `0` for every placeholder: the outline of a name.
+    #[must_use]
+    pub fn outline(&self) -> String {
+        self.pieces.iter().map(|piece| if let Piece::Text(text) = piece { text } else { "0" }).collect()
+    }
+
     /// Parses `source`.
     ///
     /// # Errors

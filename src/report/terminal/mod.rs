@@ -1,9 +1,9 @@
 //! The report for people at a terminal: source excerpts, tables, one verdict line at the end.
 
 mod finding;
-mod load;
+pub(super) mod load;
 mod merge;
-mod paint;
+pub(super) mod paint;
 
 use std::fmt::Write as _;
 

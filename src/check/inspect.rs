@@ -1,0 +1,328 @@
+//! What a checkpoint is: counted, and with the class and the config that its tensors ask for.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use super::load::{self, Stored};
+use super::votes::{self, Fit, Votes, vote};
+use crate::checkpoint::{Checkpoint, Tensor};
+use crate::knowledge::resemblance::Resemblance;
+use crate::knowledge::{Architecture, Library, Loader};
+
+/// Classes that are named beside the best.
+const CANDIDATES: usize = 8;
+/// Classes with equally good names that are built to tell them apart by their defaults.
+const BUILT: usize = 40;
+/// Model types that are tried for a part.
+const PARTS: usize = 6;
+/// Share of the parameters beyond which a module is shown by its parts.
+const LARGE: (u64, u64) = (9, 10);
+
+/// All there is to say of a checkpoint at a glance.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Inspection {
+    /// Files of the directory, by name.
+    pub files: Vec<InspectedFile>,
+    /// All tensors together.
+    pub tensors: Amount,
+    /// By element type, most bytes first.
+    pub dtypes: BTreeMap<String, Amount>,
+    /// By the outer parts of their names, in the order of names.
+    pub modules: BTreeMap<String, Amount>,
+    /// What config.json says of itself; absent without one.
+    pub config: Option<Said>,
+    /// Classes that the names fit, best first; the class of the config stands first where it is known.
+    pub classes: Vec<Candidate>,
+    /// What the tensors say of the values of the config, for the first of `classes`.
+    pub votes: Option<Votes>,
+    /// A config.json that says what the tensors show, and nothing else; null when no class fits.
+    pub proven: Value,
+    /// Why something is left out.
+    pub notes: Vec<String>,
+}
+
+/// Tensors, their elements and their bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Amount {
+    /// Tensors.
+    pub tensors: usize,
+    /// Elements as stored; a quantised tensor may hold several parameters in one.
+    pub parameters: u64,
+    /// Bytes.
+    pub bytes: u64,
+}
+
+impl Amount {
+    fn add(&mut self, tensor: &Tensor) {
+        self.tensors = self.tensors.saturating_add(1);
+        let elements = tensor.shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
+        self.parameters = self.parameters.saturating_add(elements);
+        self.bytes = self.bytes.saturating_add(tensor.len());
+    }
+}
+
+/// A file of the directory.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct InspectedFile {
+    /// Its name.
+    pub name: String,
+    /// Its bytes.
+    pub bytes: u64,
+    /// Tensors in it, for a shard.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tensors: Option<usize>,
+}
+
+/// What config.json says of itself.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct Said {
+    /// The first of `architectures`.
+    pub class: Option<String>,
+    /// `model_type`.
+    pub model_type: Option<String>,
+    /// `transformers_version`.
+    pub transformers_version: Option<String>,
+    /// `quantization_config.quant_method`.
+    pub quantization: Option<String>,
+}
+
+/// A class that may have written these tensors.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Candidate {
+    /// Its name.
+    pub class: String,
+    /// The file in `rules/architectures/` that knows it.
+    pub architecture: String,
+    /// The loaders that are known to build it.
+    pub loaders: Vec<String>,
+    /// Share of names that both sides agree on, from 0 to 1.
+    pub names: f64,
+    /// Share of names and shapes they agree on once the values are voted for; only of those that were tried.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<f64>,
+}
+
+/// Looks at a checkpoint; reads nothing beside what [`Checkpoint::open`] has read.
+#[must_use]
+pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
+    let mut tensors = Amount::default();
+    let mut dtypes: BTreeMap<String, Amount> = BTreeMap::new();
+    for (_, tensor) in checkpoint.tensors() {
+        tensors.add(tensor);
+        dtypes.entry(tensor.dtype.to_string()).or_default().add(tensor);
+    }
+    let files = checkpoint.entries.iter().map(|(name, entry)| InspectedFile {
+        name: name.clone(),
+        bytes: entry.size,
+        tensors: checkpoint.shards.get(name).map(|shard| shard.tensors.len()),
+    });
+    let mut inspection = Inspection {
+        files: files.collect(),
+        tensors,
+        dtypes,
+        modules: modules(checkpoint, tensors),
+        config: checkpoint.config().map(said),
+        classes: Vec::new(),
+        votes: None,
+        proven: Value::Null,
+        notes: Vec::new(),
+    };
+    let mut stored = Stored::of(checkpoint);
+    if stored.is_empty() {
+        let shapes = checkpoint.tensors().map(|(_, t)| (t.name.clone(), t.shape.clone()));
+        stored = Stored::from_shapes(shapes.collect());
+    }
+    if stored.is_empty() {
+        inspection.notes.push("no tensors: nothing votes on the config".to_owned());
+        return inspection;
+    }
+    judge(&mut inspection, checkpoint.config(), &stored, library);
+    inspection
+}
+
+fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, library: &Library) {
+    let named = config.and_then(|config| by_config(library, config, stored));
+    let mut alike = library.resembling(stored.names());
+    if let Some(class) = named {
+        alike.sort_by_key(|r| r.architecture.class() != class.class());
+    } else {
+        nearest_first(&mut alike, stored);
+    }
+    let best = named.or_else(|| alike.first().map(|r| r.architecture));
+    let Some(best) = best else {
+        inspection.notes.push("no class that is known here has names like these".to_owned());
+        return;
+    };
+    let mut classes: Vec<Candidate> = Vec::new();
+    for r in &alike {
+        if classes.len() < CANDIDATES && classes.iter().all(|c| c.class != r.architecture.class()) {
+            classes.push(candidate(library, r.architecture, Some(r)));
+        }
+    }
+    if named.is_some() && classes.first().is_none_or(|c| c.class != best.class()) {
+        classes.insert(0, candidate(library, best, None));
+    }
+    let quantised = config.is_some_and(|c| c.get("quantization_config").is_some_and(Value::is_object));
+    if quantised {
+        inspection.notes.push("quantised: shapes are those of packed tensors and do not vote".to_owned());
+        inspection.classes = classes;
+        return;
+    }
+    let start = match (named, config) {
+        (Some(_), Some(config)) => config.clone(),
+        _ => parts(best.start(), best, alike.first(), stored, library),
+    };
+    match vote(best, &start, stored) {
+        Some(votes) => {
+            if let Some(first) = classes.first_mut() {
+                first.fit = Some(votes.after.score());
+            }
+            if votes.exhausted {
+                inspection.notes.push("the model is large: the search for values stopped early".to_owned());
+            }
+            inspection.proven = proven(best, &votes, named.is_some());
+            inspection.votes = Some(votes);
+        }
+        None => inspection.notes.push(format!(
+            "{} cannot be built {}: its values were not voted on",
+            best.class(),
+            if named.is_some() { "from config.json" } else { "without a config" }
+        )),
+    }
+    inspection.classes = classes;
+}
+
+/// The class that config.json names, under the loader it names or else another.
+fn by_config<'l>(library: &'l Library, config: &Value, stored: &Stored) -> Option<Architecture<'l>> {
+    let mut loaders = Loader::ALL;
+    loaders.sort_by_key(|l| *l != Loader::of_config(config));
+    loaders.into_iter().find_map(|loader| library.find(config, stored.names(), loader))
+}
+
+/// Puts first, of the classes whose names fit equally well, the one whose defaults are nearest to the tensors.
+fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
+    let Some(best) = alike.first().map(Resemblance::score) else { return };
+    let evidence = stored.evidence();
+    let tied = alike.iter().take(BUILT).take_while(|r| r.score() >= best).count();
+    let Some(tied) = alike.get_mut(..tied) else { return };
+    tied.sort_by_cached_key(|r| {
+        let expected = r.architecture.expect_given(&r.architecture.start(), &evidence);
+        let fit = expected.map(|e| Fit::of(&e, &load::in_model(&e, stored)));
+        fit.map_or(usize::MAX, |fit| {
+            fit.expected.saturating_add(fit.stored).saturating_sub(fit.found).saturating_add(fit.mismatched)
+        })
+    });
+}
+
+fn candidate(library: &Library, architecture: Architecture<'_>, alike: Option<&Resemblance<'_>>) -> Candidate {
+    let class = architecture.class();
+    let known = Loader::ALL.into_iter().filter(|loader| library.class(class, *loader).is_some());
+    Candidate {
+        class: class.to_owned(),
+        architecture: architecture.name().to_owned(),
+        loaders: known.map(|loader| loader.to_string()).collect(),
+        names: alike.map_or(0.0, Resemblance::score),
+        fit: None,
+    }
+}
+
+/// Chooses the class of each part that may be any, by the names under it: writes its `model_type` into the config.
+fn parts(
+    mut start: Value,
+    whole: Architecture<'_>,
+    alike: Option<&Resemblance<'_>>,
+    stored: &Stored,
+    library: &Library,
+) -> Value {
+    let evidence = stored.evidence();
+    let distance = |config: &Value| {
+        let expected = whole.expect_given(config, &evidence).ok()?;
+        let fit = Fit::of(&expected, &load::in_model(&expected, stored));
+        Some(fit.expected.saturating_add(fit.stored).saturating_sub(fit.found.saturating_mul(2)))
+    };
+    for (prefix, config) in alike.into_iter().flat_map(|r| &r.parts) {
+        let inside = evidence.iter().filter_map(|(name, shape)| Some((name.strip_prefix(prefix)?, shape)));
+        let inside = inside.map(|(name, shape)| (name.to_owned(), shape.unwrap_or_default().to_vec()));
+        let inside = Stored::from_shapes(inside.collect());
+        let mut alike = library.resembling(inside.names());
+        nearest_first(&mut alike, &inside);
+        let mut tried: BTreeSet<&str> = BTreeSet::new();
+        let pointer = format!("/{}/model_type", config.replace('.', "/"));
+        let types = alike.iter().filter_map(|r| r.architecture.model_type()).filter(|t| tried.insert(*t));
+        let choices = types.take(PARTS).map(|model_type| {
+            let mut config = start.clone();
+            votes::put(&mut config, &pointer, model_type.into());
+            config
+        });
+        // The one that the composition takes when nothing is said comes first among equals.
+        let choices = std::iter::once(start.clone()).chain(choices);
+        let best = choices.filter_map(|config| Some((distance(&config)?, config))).min_by_key(|(d, _)| *d);
+        start = best.map_or(start, |(_, config)| config);
+    }
+    start
+}
+
+/// `architectures`, `model_type` and every value that the tensors decide.
+///
+/// Beside given values, one of a product that tensors show is decided; without any, none is.
+fn proven(architecture: Architecture<'_>, votes: &Votes, given: bool) -> Value {
+    let mut config = Map::new();
+    config.insert("architectures".to_owned(), Value::Array(vec![architecture.class().into()]));
+    if let Some(model_type) = architecture.model_type() {
+        config.insert("model_type".to_owned(), model_type.into());
+    }
+    let mut config = Value::Object(config);
+    for (pointer, model_type) in votes::model_types(&votes.config) {
+        votes::put(&mut config, &pointer, model_type);
+    }
+    let open: BTreeSet<&String> = votes.undecided.iter().flat_map(|u| &u.pointers).filter(|_| !given).collect();
+    for vote in votes.votes.iter().filter(|v| v.votes_for >= v.votes_against && !open.contains(&v.pointer)) {
+        votes.put(&mut config, vote);
+    }
+    config
+}
+
+fn said(config: &Value) -> Said {
+    let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).map(str::to_owned);
+    Said {
+        class: text("/architectures/0"),
+        model_type: text("/model_type"),
+        transformers_version: text("/transformers_version"),
+        quantization: text("/quantization_config/quant_method"),
+    }
+}
+
+/// Tensors by the first part of their names; a part that holds nearly everything is shown by its own parts.
+fn modules(checkpoint: &Checkpoint, all: Amount) -> BTreeMap<String, Amount> {
+    let mut large: BTreeSet<String> = BTreeSet::new();
+    loop {
+        let mut modules: BTreeMap<String, Amount> = BTreeMap::new();
+        for (_, tensor) in checkpoint.tensors() {
+            modules.entry(module(&tensor.name, &large)).or_default().add(tensor);
+        }
+        let is_large = |amount: &Amount| {
+            u128::from(amount.parameters).saturating_mul(LARGE.1.into())
+                > u128::from(all.parameters).saturating_mul(LARGE.0.into())
+        };
+        let split =
+            modules.iter().find(|(name, amount)| is_large(amount) && amount.tensors > 1 && !large.contains(*name));
+        match split {
+            Some((name, _)) if large.len() < 4 => large.insert(name.clone()),
+            _ => return modules,
+        };
+    }
+}
+
+fn module(name: &str, large: &BTreeSet<String>) -> String {
+    let mut end = 0;
+    for part in name.split('.') {
+        let is_number = part.bytes().all(|b| b.is_ascii_digit());
+        if end > 0 && (is_number || !name.get(..end).is_some_and(|outer| large.contains(outer))) {
+            break;
+        }
+        end = if end == 0 { part.len() } else { end.saturating_add(1).saturating_add(part.len()) };
+    }
+    name.get(..end).unwrap_or(name).to_owned()
+}

@@ -1,0 +1,279 @@
+//! The space that votes search: configs of one class, and how far what each builds is from what is stored.
+
+use std::cell::Cell;
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::{Map, Value};
+
+use crate::check::load::{self, Stored};
+use crate::knowledge::{Architecture, Evidence, Expected};
+
+/// Tensors that may be built in one search: it tries a few hundred configs, and a mixture of experts has tens of
+/// thousands of tensors.
+const BUDGET: usize = 3_000_000;
+/// What a build costs beside its tensors, in tensors.
+const OVERHEAD: usize = 40;
+/// Most values of a config that are looked at; a label map may have thousands.
+const LEAVES: usize = 600;
+/// Longest list whose elements are looked at one by one.
+const LIST: usize = 64;
+
+/// One class and one set of stored tensors.
+pub(super) struct Space<'a> {
+    architecture: Architecture<'a>,
+    files: &'a Stored,
+    /// Stored tensors, as the file spells them.
+    evidence: Evidence,
+    /// Stored tensors, as the class spells them.
+    pub stored: Evidence,
+    /// The numbers in their names.
+    pub numbered: Numbered,
+    /// Keys that the files of the class have defaults for, without the numbers of list elements; empty when unknown.
+    known: BTreeSet<String>,
+    spent: Cell<usize>,
+}
+
+impl<'a> Space<'a> {
+    /// The names are those of the file until [`Self::rename`] is told what the class has.
+    pub fn new(architecture: Architecture<'a>, files: &'a Stored) -> Self {
+        let evidence = files.evidence();
+        let numbered = Numbered::of(evidence.iter().map(|(name, _)| name));
+        let stored = evidence.clone();
+        Self { architecture, files, evidence, stored, numbered, known: BTreeSet::new(), spent: Cell::new(0) }
+    }
+
+    /// Spells the stored names as the loader would for this class; whether that changed any.
+    pub fn rename(&mut self, expected: &Expected) -> bool {
+        let stored = load::in_model(expected, self.files);
+        let changed = !stored.iter().eq(self.stored.iter());
+        if changed {
+            self.numbered = Numbered::of(stored.iter().map(|(name, _)| name));
+            self.stored = stored;
+        }
+        changed
+    }
+
+    /// Learns from a config which of its keys the class knows: those that are filled in when all are left out.
+    pub fn learn(&mut self, config: &Value) {
+        let mut bare = Value::Object(Map::new());
+        for pointer in leaves(config).iter().filter(|p| p.ends_with("model_type")) {
+            put(&mut bare, &Value::Null, pointer, config.pointer(pointer).cloned().unwrap_or_default());
+        }
+        if let Some(built) = self.build(&bare) {
+            self.known = leaves(&built.config).iter().map(|pointer| unnumbered(pointer)).collect();
+        }
+    }
+
+    /// Pointers to the values of a config that may shape the class.
+    pub fn shaping(&self, config: &Value) -> Vec<String> {
+        let mut pointers = leaves(config);
+        if !self.known.is_empty() {
+            pointers.retain(|pointer| {
+                let key = unnumbered(pointer);
+                self.known.contains(&key) || self.architecture.speaks_of(key.rsplit('/').next().unwrap_or_default())
+            });
+        }
+        pointers
+    }
+
+    /// What the class builds from `config`; `None` when it refuses, or when enough was tried.
+    pub fn build(&self, config: &Value) -> Option<Expected> {
+        if self.exhausted() {
+            return None;
+        }
+        let expected = self.architecture.expect_given(config, &self.evidence).ok();
+        let cost = expected.as_ref().map_or(0, |e| e.tensors.len()).saturating_add(OVERHEAD);
+        self.spent.set(self.spent.get().saturating_add(cost));
+        let mut expected = expected?;
+        expected.drop_absent_groups(|name| self.stored.contains(name));
+        Some(expected)
+    }
+
+    /// Whether the search had to stop early.
+    pub fn exhausted(&self) -> bool {
+        self.spent.get() >= BUDGET
+    }
+
+    /// How far `expected` is from the store: 0 where every name and dimension agrees.
+    ///
+    /// A dimension that differs counts 2, a name on one side only a little more than all its dimensions, so that
+    /// nothing is gained by making a tensor vanish because its shape is wrong.
+    pub fn distance(&self, expected: &Expected) -> u64 {
+        let mut there = BTreeSet::new();
+        for (name, tensor) in &expected.tensors {
+            if let Some(to) = &tensor.tied_to
+                && (self.stored.contains(name) || self.stored.contains(to))
+            {
+                there.extend([name.as_str(), to.as_str()]);
+            }
+        }
+        let mut distance: u64 = 0;
+        let mut found: u64 = 0;
+        for (name, tensor) in &expected.tensors {
+            let here = match self.stored.shape(name) {
+                Some(shape) => {
+                    found = found.saturating_add(weight(shape));
+                    differing(&tensor.shape, shape).saturating_mul(2)
+                }
+                None if self.stored.contains(name) => {
+                    found = found.saturating_add(weight(&[]));
+                    0
+                }
+                None if there.contains(name.as_str()) => 0,
+                None => weight(&tensor.shape),
+            };
+            // A file of tied tensors has one of them; two say, a little, that they are not tied.
+            let twice = u64::from(
+                tensor.tied_to.as_ref().is_some_and(|to| self.stored.contains(name) && self.stored.contains(to)),
+            );
+            distance = distance.saturating_add(here).saturating_add(twice);
+        }
+        let buffers = expected.buffers.iter().filter(|b| self.stored.contains(b) && !expected.tensors.contains_key(*b));
+        found = buffers.fold(found, |sum, b| sum.saturating_add(weight(self.stored.shape(b).unwrap_or_default())));
+        distance.saturating_add(self.total().saturating_sub(found))
+    }
+
+    /// The distance of a class without any tensor.
+    fn total(&self) -> u64 {
+        self.stored.iter().fold(0, |sum, (_, shape)| sum.saturating_add(weight(shape.unwrap_or_default())))
+    }
+}
+
+/// A pointer without the numbers of list elements.
+fn unnumbered(pointer: &str) -> String {
+    let is_number = |step: &&str| !step.is_empty() && step.bytes().all(|b| b.is_ascii_digit());
+    pointer.split('/').filter(|step| !is_number(step)).collect::<Vec<_>>().join("/")
+}
+
+fn weight(shape: &[u64]) -> u64 {
+    u64::try_from(shape.len()).unwrap_or(u64::MAX).saturating_add(1).saturating_mul(2)
+}
+
+fn differing(a: &[u64], b: &[u64]) -> u64 {
+    let n = if a.len() == b.len() { a.iter().zip(b).filter(|(a, b)| a != b).count() } else { a.len().max(b.len()) };
+    u64::try_from(n).unwrap_or(u64::MAX)
+}
+
+/// Pointers to the values of a config that could shape a model: numbers, flags, nulls and words, those in short
+/// lists too.
+pub(super) fn leaves(config: &Value) -> Vec<String> {
+    let mut found = Vec::new();
+    collect(config, &mut String::new(), &mut found);
+    found
+}
+
+fn collect(value: &Value, pointer: &mut String, found: &mut Vec<String>) {
+    /// Keys whose values are names or settings of tokens and generation, never of tensors.
+    const APART: [&str; 5] = ["id2label", "label2id", "auto_map", "task_specific_params", "quantization_config"];
+    let mut step = |key: &str, value: &Value, found: &mut Vec<String>| {
+        let before = pointer.len();
+        pointer.push('/');
+        pointer.push_str(&key.replace('~', "~0").replace('/', "~1"));
+        collect(value, pointer, found);
+        pointer.truncate(before);
+    };
+    match value {
+        Value::Object(map) => {
+            for (key, value) in map.iter().filter(|(key, _)| !APART.contains(&key.as_str())) {
+                step(key, value, found);
+            }
+        }
+        Value::Array(items) if items.len() <= LIST => {
+            for (i, item) in items.iter().enumerate() {
+                step(&i.to_string(), item, found);
+            }
+        }
+        Value::Array(_) => {}
+        _ if found.len() < LEAVES => found.push(pointer.clone()),
+        _ => {}
+    }
+}
+
+/// `config` with the value at `pointer` replaced. What is not there on the way is taken from `resolved`, the same
+/// config with all defaults filled in.
+pub(super) fn with(config: &Value, resolved: &Value, pointer: &str, value: Value) -> Value {
+    let mut config = config.clone();
+    put(&mut config, resolved, pointer, value);
+    config
+}
+
+pub(super) fn put(config: &mut Value, resolved: &Value, pointer: &str, value: Value) {
+    let steps: Vec<String> =
+        pointer.split('/').skip(1).map(|step| step.replace("~1", "/").replace("~0", "~")).collect();
+    let Some((last, way)) = steps.split_last() else { return };
+    let (mut here, mut filled) = (config, resolved);
+    for step in way {
+        filled = child(filled, step).unwrap_or(&Value::Null);
+        here = match here {
+            Value::Object(map) => {
+                let next = map.entry(step.clone()).or_insert(Value::Null);
+                if next.is_null() {
+                    *next = if filled.is_null() { Value::Object(Map::new()) } else { filled.clone() };
+                }
+                next
+            }
+            Value::Array(items) => match step.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
+                Some(next) => next,
+                None => return,
+            },
+            _ => return,
+        };
+    }
+    match here {
+        Value::Object(map) => {
+            map.insert(last.clone(), value);
+        }
+        Value::Array(items) => {
+            if let Some(slot) = last.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
+                *slot = value;
+            }
+        }
+        _ => {}
+    }
+}
+
+fn child<'v>(value: &'v Value, step: &str) -> Option<&'v Value> {
+    match value {
+        Value::Object(map) => map.get(step),
+        Value::Array(items) => items.get(step.parse::<usize>().ok()?),
+        _ => None,
+    }
+}
+
+/// The stored names by what is left of them without one of their numbers, and the largest such number.
+///
+/// `layers.3.experts.7.w` counts once as `layers.*.experts.7.w` with 3 and once as `layers.3.experts.*.w` with 7.
+pub(super) struct Numbered(BTreeMap<String, u64>);
+
+impl Numbered {
+    pub fn of<'n>(names: impl Iterator<Item = &'n str>) -> Self {
+        let mut largest: BTreeMap<String, u64> = BTreeMap::new();
+        for name in names {
+            for (pattern, number) in patterns(name) {
+                let slot = largest.entry(pattern).or_default();
+                *slot = number.max(*slot);
+            }
+        }
+        Self(largest)
+    }
+
+    pub fn largest(&self, pattern: &str) -> Option<u64> {
+        self.0.get(pattern).copied()
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = (&str, u64)> {
+        self.0.iter().map(|(pattern, number)| (pattern.as_str(), *number))
+    }
+}
+
+/// A name with each of its numbers in turn replaced by `*`, and that number.
+fn patterns(name: &str) -> Vec<(String, u64)> {
+    let parts: Vec<&str> = name.split('.').collect();
+    let numbered = parts.iter().enumerate().filter_map(|(at, part)| {
+        let number: u64 = part.parse().ok()?;
+        let starred: Vec<&str> = parts.iter().enumerate().map(|(i, p)| if i == at { "*" } else { *p }).collect();
+        Some((starred.join("."), number))
+    });
+    // Deep names have few numbers; hostile ones must not cost more.
+    numbered.take(4).collect()
+}

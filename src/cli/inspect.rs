@@ -1,0 +1,49 @@
+//! `inspect`.
+
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use ckpt_doctor::check::inspect::inspect;
+use ckpt_doctor::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
+use ckpt_doctor::report::inspect as report;
+
+use super::args::{InspectArgs, InspectFormat};
+use super::{CLEAN, library, output};
+
+/// Runs `inspect`.
+pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+    let path = &args.path;
+    if !path.exists() {
+        bail!("{}: no such file or directory", path.display());
+    }
+    let checkpoint = if let Some(shard) = alone(path) {
+        shard
+    } else {
+        let found = find_checkpoints(path);
+        let [dir] = found.as_slice() else {
+            bail!("{}: {} checkpoints there; name one, or a .safetensors file", path.display(), found.len());
+        };
+        Checkpoint::open(dir).with_context(|| dir.display().to_string())?
+    };
+    let inspection = inspect(&checkpoint, &library::with(rules)?);
+    let shown = path.display().to_string();
+    output::print(&match args.output_format {
+        InspectFormat::Full => report::full(&shown, &inspection, output::style(args.color)),
+        InspectFormat::Json => report::json(&shown, &inspection),
+    })?;
+    Ok(CLEAN)
+}
+
+/// A shard with neither a config nor an index beside it is looked at by itself.
+fn alone(path: &Path) -> Option<Checkpoint> {
+    if !path.is_file() || path.extension().is_none_or(|e| e != "safetensors") {
+        return None;
+    }
+    let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    let name = path.file_name()?.to_str()?;
+    if ["config.json", "model.safetensors.index.json"].iter().any(|beside| parent.join(beside).exists()) {
+        return None;
+    }
+    let shards = vec![Shard::read(parent, name)];
+    Some(Checkpoint::planned(parent, Parts { shards, ..Parts::default() }))
+}

@@ -1,0 +1,244 @@
+//! Which classes have names like these: the search for an architecture when no config names one.
+//!
+//! Names are compared as patterns, with `#` for every number, and classes as they are written, with no config at all:
+//! nothing is built, so that hundreds of files are searched in a fraction of a second.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use memchr::memmem::Finder;
+
+use super::architecture::member::{Kind, Member, Part};
+use super::architecture::{Architecture, Blueprint, Class};
+use super::{Library, Loader, Template};
+
+/// Files that are parsed: those that say most of the words of the names.
+const FILES: usize = 80;
+/// Words of stored names that are looked for.
+const WORDS: usize = 400;
+/// Depth of parts within parts.
+const DEPTH: usize = 6;
+/// Patterns of one class.
+const PATTERNS: usize = 20_000;
+
+/// A class, and how its names agree with some stored names; counted in patterns.
+#[derive(Debug, Clone)]
+pub struct Resemblance<'l> {
+    /// The class, as the first of `loaders` builds it.
+    pub architecture: Architecture<'l>,
+    /// Names on both sides.
+    pub common: usize,
+    /// Names that the class has under any config, and that are not stored.
+    pub missing: usize,
+    /// Stored names that the class does not have.
+    pub unexpected: usize,
+    /// Stored names in a part that may be any class.
+    pub open: usize,
+    /// Such parts: what their names start with (with `#` for numbers), and where their config is.
+    pub parts: Vec<(String, String)>,
+}
+
+impl Resemblance<'_> {
+    /// Share of the names on either side that are on both, from 0 to 1.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "counts of names are far below 2^52")]
+    pub fn score(&self) -> f64 {
+        // A part that may be anything explains its names only half.
+        let explained = self.common as f64 + self.open as f64 / 2.0;
+        let all = self.common.saturating_add(self.missing).saturating_add(self.unexpected).saturating_add(self.open);
+        if all == 0 { 0.0 } else { explained / all as f64 }
+    }
+}
+
+impl Library {
+    /// The classes that have names like these, the most alike first; classes without a common name are left out.
+    ///
+    /// A class that several loaders know stands for the first of them.
+    #[must_use]
+    pub fn resembling<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Vec<Resemblance<'_>> {
+        let stored: BTreeSet<String> = names.into_iter().map(pattern).take(PATTERNS).collect();
+        let mut found: Vec<Resemblance<'_>> = Vec::new();
+        let mut seen = BTreeSet::new();
+        for file in self.files_saying(&words(&stored)) {
+            for loader in Loader::ALL {
+                for class in file.classes(loader) {
+                    if seen.insert((&file.architecture, std::ptr::from_ref(class))) {
+                        let architecture = Architecture::new(self, file, class, loader);
+                        found.extend(self.compare(architecture, file, class, loader, &stored));
+                    }
+                }
+            }
+        }
+        let key = |r: &Resemblance<'_>| (r.architecture.class().len(), r.architecture.class().to_owned());
+        found.sort_by(|a, b| b.score().total_cmp(&a.score()).then_with(|| key(a).cmp(&key(b))));
+        found
+    }
+
+    /// Files in which the words of the names stand; a word that few files have counts more.
+    fn files_saying(&self, words: &BTreeSet<&str>) -> Vec<&Blueprint> {
+        let texts: Vec<(&str, &[u8])> = self.texts().collect();
+        let mut scores = vec![0_u64; texts.len()];
+        for word in words.iter().take(WORDS) {
+            let finder = Finder::new(*word);
+            let having: Vec<bool> = texts.iter().map(|(_, text)| finder.find(text).is_some()).collect();
+            let count = having.iter().filter(|has| **has).count();
+            let rarity = u64::from(texts.len().checked_div(count).map_or(0, usize::ilog2)).saturating_add(1);
+            for (score, _) in scores.iter_mut().zip(&having).filter(|(_, has)| **has) {
+                *score = score.saturating_add(rarity);
+            }
+        }
+        let mut ranked: Vec<(u64, &str)> = scores.into_iter().zip(texts.iter().map(|(stem, _)| *stem)).collect();
+        ranked.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(b.1)));
+        let best = ranked.into_iter().filter(|(score, _)| *score > 0).take(FILES);
+        best.filter_map(|(_, stem)| self.file(stem)).collect()
+    }
+
+    fn compare<'l>(
+        &'l self,
+        architecture: Architecture<'l>,
+        file: &'l Blueprint,
+        class: &'l Class,
+        loader: Loader,
+        stored: &BTreeSet<String>,
+    ) -> Option<Resemblance<'l>> {
+        let mut names =
+            Names { library: self, loader, patterns: BTreeMap::new(), open: Vec::new(), buffers: BTreeSet::new() };
+        names.members(file, &class.tensors, "", true, 0);
+        let common = names.patterns.keys().filter(|name| stored.contains(*name)).count();
+        let inside = |name: &str| names.open.iter().any(|(prefix, _)| name.starts_with(prefix));
+        let missing =
+            names.patterns.iter().filter(|(name, sure)| **sure && !stored.contains(*name) && !inside(name)).count();
+        let (open, unexpected): (Vec<&String>, Vec<&String>) = stored
+            .iter()
+            .filter(|name| !names.patterns.contains_key(*name) && !names.buffers.contains(*name))
+            .partition(|name| inside(name));
+        let (open, unexpected) = (open.len(), unexpected.len());
+        let parts = names.open;
+        (common > 0).then_some(Resemblance { architecture, common, missing, unexpected, open, parts })
+    }
+}
+
+/// Words that tell one class from another: the dotted parts of names without those that are all number.
+fn words(patterns: &BTreeSet<String>) -> BTreeSet<&str> {
+    let plain = |word: &&str| word.len() > 2 && *word != "weight" && *word != "bias";
+    patterns.iter().flat_map(|name| name.split('.')).flat_map(|part| part.split('#')).filter(plain).collect()
+}
+
+/// A name with `#` for every number.
+fn pattern(name: &str) -> String {
+    let mut out = String::with_capacity(name.len());
+    for c in name.chars() {
+        match c {
+            '0'..='9' if out.ends_with('#') => {}
+            '0'..='9' => out.push('#'),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// All names a class may have.
+struct Names<'l> {
+    library: &'l Library,
+    loader: Loader,
+    /// With whether the class has it under any config.
+    patterns: BTreeMap<String, bool>,
+    buffers: BTreeSet<String>,
+    /// Parts whose class a config decides: the start of their names, and where that config is.
+    open: Vec<(String, String)>,
+}
+
+impl<'l> Names<'l> {
+    fn members(
+        &mut self,
+        file: &'l Blueprint,
+        members: &'l [(Template, Member)],
+        prefix: &str,
+        sure: bool,
+        depth: usize,
+    ) {
+        for (name, member) in members {
+            if self.patterns.len() > PATTERNS {
+                return;
+            }
+            let name = format!("{prefix}{}", pattern(&name.outline()));
+            let sure = sure && member.when.is_none() && member.optional.is_none();
+            match &member.kind {
+                Kind::Tensor { tied, .. } => self.add(name, sure && tied.is_none()),
+                Kind::Layer { bias, tied, .. } => {
+                    if let Some(bias) = bias {
+                        self.add(format!("{name}.bias"), sure && bias.source() == "true");
+                    }
+                    self.add(format!("{name}.weight"), sure && tied.is_none());
+                }
+                Kind::Buffer => {
+                    self.buffers.insert(name);
+                }
+                Kind::Group { members, .. } => self.members(file, members, &name, sure, depth),
+                Kind::Part(part) => self.part(file, part, &name, sure, depth),
+            }
+        }
+    }
+
+    fn add(&mut self, name: String, sure: bool) {
+        let slot = self.patterns.entry(name).or_insert(false);
+        *slot |= sure;
+    }
+
+    fn part(&mut self, file: &'l Blueprint, part: &'l Part, prefix: &str, sure: bool, depth: usize) {
+        if depth >= DEPTH {
+            return;
+        }
+        let class = if let Some(class) = &part.class {
+            Some(class.as_str())
+        } else {
+            self.open.push((prefix.to_owned(), part.config.clone().unwrap_or_default()));
+            // What the composition takes when nothing is said is the likeliest.
+            let model_type = part.config.as_deref().and_then(|key| file.sub_config_type(key, self.loader));
+            let mapped = model_type.as_deref().and_then(|t| part.by_model_type.get(t)).and_then(|class| class.as_str());
+            mapped.or_else(|| {
+                self.library.of_model_type(&model_type?, self.loader)?.auto(part.auto.as_deref()?, self.loader)
+            })
+        };
+        if let Some((file, class)) = class.and_then(|class| self.library.entry(class, self.loader)) {
+            let mut inner = Names {
+                library: self.library,
+                loader: self.loader,
+                patterns: BTreeMap::new(),
+                open: Vec::new(),
+                buffers: BTreeSet::new(),
+            };
+            inner.members(file, &class.tensors, "", sure, depth.saturating_add(1));
+            let built = |name: &str| !part.without.iter().any(|start| name.starts_with(start.as_str()));
+            for (name, sure) in inner.patterns.into_iter().filter(|(name, _)| built(name)) {
+                self.add(format!("{prefix}{name}"), sure);
+            }
+            self.buffers.extend(inner.buffers.into_iter().map(|name| format!("{prefix}{name}")));
+            let outer = part.config.as_deref().map(|config| format!("{config}.")).unwrap_or_default();
+            let open = inner.open.into_iter();
+            self.open.extend(open.map(|(inner, config)| (format!("{prefix}{inner}"), format!("{outer}{config}"))));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_do_not_count() {
+        assert_eq!(pattern("layers.12.conv1.w"), "layers.#.conv#.w");
+    }
+
+    #[test]
+    fn names_lead_to_the_class() {
+        let library = Library::embedded();
+        let names = [
+            "model.embed_tokens.weight",
+            "model.layers.0.self_attn.q_proj.weight",
+            "model.layers.0.pre_feedforward_layernorm.weight",
+        ];
+        let found = library.resembling(names);
+        assert_eq!(found.first().map(|r| r.architecture.class()), Some("Gemma2ForCausalLM"));
+        assert!(library.resembling(["nothing.like.it"]).is_empty());
+    }
+}

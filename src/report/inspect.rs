@@ -1,0 +1,213 @@
+//! What `inspect` says: for people, or as JSON.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::Style;
+use super::json::pretty;
+use super::model::Tool;
+use super::terminal::load::table;
+use super::terminal::paint::Paint;
+use super::words::{bytes, more, name, plural, sentence};
+use crate::check::inspect::{Amount, Candidate, Inspection};
+use crate::check::votes::{Vote, Votes};
+
+#[derive(Serialize)]
+struct Document<'a> {
+    schema: u32,
+    tool: Tool,
+    path: &'a str,
+    #[serde(flatten)]
+    inspection: &'a Inspection,
+}
+
+/// The whole of an inspection as JSON (`schema` 1).
+#[must_use]
+pub fn json(path: &str, inspection: &Inspection) -> String {
+    pretty(&Document { schema: 1, tool: Tool::this(), path, inspection })
+}
+
+/// An inspection for a terminal.
+#[must_use]
+pub fn full(path: &str, inspection: &Inspection, style: Style) -> String {
+    let paint = Paint(style.color);
+    let mut out = String::new();
+    let all = inspection.tensors;
+    let _ok = writeln!(
+        out,
+        "{}: {}, {}, {} parameters, {}",
+        paint.strong(&name(path)),
+        plural(inspection.files.len(), "file"),
+        plural(all.tensors, "tensor"),
+        count(all.parameters),
+        bytes(all.bytes)
+    );
+    amounts(&mut out, "dtypes", &inspection.dtypes, style);
+    amounts(&mut out, "modules", &inspection.modules, style);
+    files(&mut out, inspection, style);
+    class(&mut out, inspection, style);
+    if let Some(votes) = &inspection.votes {
+        values(&mut out, votes, inspection.config.is_some(), style);
+    }
+    if !inspection.proven.is_null() && (inspection.config.is_none() || outvoted(inspection)) {
+        let _ok = writeln!(out, "\n  {}", paint.strong("what the tensors show, as a start of a config.json"));
+        indented(&mut out, &pretty(&inspection.proven));
+    }
+    for note in &inspection.notes {
+        let _ok = writeln!(out, "\n  note: {}", sentence(note));
+    }
+    out
+}
+
+fn outvoted(inspection: &Inspection) -> bool {
+    inspection.votes.as_ref().is_some_and(|v| v.outvoted().next().is_some())
+}
+
+fn amounts<'a>(
+    out: &mut String,
+    title: &str,
+    amounts: impl IntoIterator<Item = (&'a String, &'a Amount)>,
+    style: Style,
+) {
+    let rows: Vec<[String; 4]> = amounts
+        .into_iter()
+        .map(|(key, a)| [name(key), a.tensors.to_string(), count(a.parameters), bytes(a.bytes)])
+        .collect();
+    if !rows.is_empty() {
+        let _ok = writeln!(out, "\n  {title}");
+        table(out, ["", "tensors", "parameters", "bytes"], &rows, style);
+    }
+}
+
+fn files(out: &mut String, inspection: &Inspection, style: Style) {
+    let rows: Vec<[String; 3]> = inspection
+        .files
+        .iter()
+        .map(|f| [name(&f.name), bytes(f.bytes), f.tensors.map(|n| n.to_string()).unwrap_or_default()])
+        .collect();
+    let _ok = writeln!(out, "\n  files");
+    table(out, ["", "bytes", "tensors"], &rows, style);
+}
+
+fn class(out: &mut String, inspection: &Inspection, style: Style) {
+    let paint = Paint(style.color);
+    let _ok = match &inspection.config {
+        None => writeln!(out, "\n  class: no config.json"),
+        Some(said) => {
+            let or = |text: &Option<String>, none: &str| text.as_deref().map_or_else(|| none.to_owned(), name);
+            let _ok = write!(
+                out,
+                "\n  class by config: {} (model_type {})",
+                paint.strong(&or(&said.class, "not named")),
+                or(&said.model_type, "not named")
+            );
+            if let Some(version) = &said.transformers_version {
+                let _ok = write!(out, ", written by transformers {}", name(version));
+            }
+            if let Some(method) = &said.quantization {
+                let _ok = write!(out, ", quantised with {}", name(method));
+            }
+            writeln!(out)
+        }
+    };
+    let Some(best) = inspection.classes.first() else { return };
+    let fit = best.fit.map(|fit| format!("; with the values below it has {} of names and shapes", percent(fit)));
+    let _ok = writeln!(
+        out,
+        "  class by tensors: {} ({}), {} of names{}; known for transformers {}",
+        paint.strong(&name(&best.class)),
+        name(&best.architecture),
+        percent(best.names),
+        fit.unwrap_or_default(),
+        best.loaders.join(" and ")
+    );
+    let others: Vec<&Candidate> = inspection.classes.iter().skip(1).collect();
+    if !others.is_empty() {
+        let mut shown: Vec<String> =
+            others.iter().take(style.cap).map(|c| format!("{} {}", name(&c.class), percent(c.names))).collect();
+        shown.extend(more(others.len(), style.cap));
+        let _ok = writeln!(out, "    then {}", shown.join(", "));
+    }
+}
+
+fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
+    let (outvoted, agreed): (Vec<&Vote>, Vec<&Vote>) = votes.votes.iter().partition(|v| v.outvotes());
+    let rows: Vec<[String; 5]> = outvoted
+        .into_iter()
+        .chain(agreed)
+        .map(|v| {
+            [
+                name(v.pointer.trim_start_matches('/')).replace('/', "."),
+                said(v),
+                name(&v.voted_value.to_string()),
+                tally(v),
+                v.evidence.first().map(|w| name(&w.to_string())).unwrap_or_default(),
+            ]
+        })
+        .collect();
+    let _ok = writeln!(out, "\n  config values by the votes of the tensors");
+    let first = if has_config { "config" } else { "default" };
+    table(out, ["", first, "tensors say", "votes", "for example"], &rows, style);
+    let (before, after) = (votes.before, votes.after);
+    let fits = |f: crate::check::votes::Fit| {
+        format!("{} of {} stored, {} of another shape", f.found, f.expected, f.mismatched)
+    };
+    let _ok = match votes.outvoted().count() {
+        0 => writeln!(out, "  no value is outvoted; tensors of the class: {}", fits(after)),
+        n => writeln!(
+            out,
+            "  {} outvoted; tensors of the class: {}; with the voted values: {}",
+            plural(n, "value"),
+            fits(before),
+            fits(after)
+        ),
+    };
+    for open in &votes.undecided {
+        let _ok = writeln!(out, "  not decided, only: {}", name(&open.constraint));
+    }
+}
+
+/// What the config says, marked where the tensors say otherwise or it says nothing.
+fn said(vote: &Vote) -> String {
+    let value = name(&vote.config_value.to_string());
+    let value = if vote.given { value } else { format!("({value})") };
+    if vote.outvotes() { format!("{value} ✗") } else { value }
+}
+
+fn tally(vote: &Vote) -> String {
+    let all = vote.votes_for.saturating_add(vote.votes_against);
+    if all == 0 { "by absence".to_owned() } else { format!("{} of {all}", vote.votes_for) }
+}
+
+fn indented(out: &mut String, text: &str) {
+    for line in text.lines() {
+        let _ok = writeln!(out, "    {line}");
+    }
+}
+
+fn percent(share: f64) -> String {
+    // 99.96 % is not all.
+    let tenths = (share * 1000.0).floor() / 10.0;
+    if tenths >= 100.0 { "100 %".to_owned() } else { format!("{tenths:.1} %") }
+}
+
+/// `7.08 billion`.
+fn count(n: u64) -> String {
+    const UNITS: [(&str, u64); 3] = [("billion", 1_000_000_000), ("million", 1_000_000), ("thousand", 1_000)];
+    let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else { return n.to_string() };
+    let hundredths = u128::from(n).saturating_mul(100).checked_div(u128::from(size)).unwrap_or_default();
+    let (whole, rest) = (hundredths / 100, hundredths % 100);
+    format!("{whole}.{rest:02} {unit}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nearly_all_is_not_all() {
+        assert_eq!([percent(1.0), percent(0.9999), percent(0.5)], ["100 %", "99.9 %", "50.0 %"]);
+        assert_eq!([count(999), count(7_085_000_000)], ["999", "7.08 billion"]);
+    }
+}
