@@ -12,13 +12,13 @@ import numpy as np
 
 from . import conditions, defaults, evaluate, parts, store
 from .conditions import Literal, quoted
-from .keys import LAYERS, NOISE
+from .keys import HEADS, LAYERS, NOISE, WIDTH
 from .vectors import Column
 
 LETTERS = "ijkl"
 NUMBER = re.compile(r"^(.*?)(\d+)$")
 MANY = 160                                                    # rows an expression is searched on; it must hold on all
-SEARCHES = 220                                                # for one class
+SEARCHES, ONE_SEARCH = 300, 40                                # for one class, for one expression
 ENOUGH = 6                                                    # unexplained templates after which a class is given up
 STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|offset|start|end|last|moe|layer|num_")
 
@@ -156,13 +156,21 @@ class Fitter:
         def solve(some, wanted):
             columns = self.columns(some, keys, indexed)
             extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
-            found = conditions.number(wanted, columns, extra)
+            found = conditions.number(wanted, columns, extra, 0 if self.heads_of(keys) else 2)
+            if found is None and (more := self.heads_of(keys)):
+                found = conditions.number(wanted, self.columns(some, keys[:4] + more, indexed), extra, 0) or conditions.number(wanted, columns, extra)
             if found is None:
                 lists = [k for k in self.all_lists() if k not in keys]
                 if lists:
                     found = conditions.number(wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, 1 + (indexed > 0))
             return found and found[1]
         return self.remembered("number", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
+
+    def heads_of(self, keys):
+        """Numbers of heads beside widths: a width they do not divide is rounded down, which few samples show."""
+        flat = self.samples[0].flat
+        beside = {k.rpartition(".")[0] for k in keys if WIDTH.match(k.split(".")[-1])}
+        return [k for k, v in flat.items() if k not in keys[:4] and isinstance(v, int) and HEADS.match(k.split(".")[-1]) and k.rpartition(".")[0] in beside][:3]
 
     def truth(self, what, rows, targets, values, indexed=0):
         keys = self.influence(values)
@@ -184,7 +192,10 @@ class Fitter:
         if len(rows) > MANY:
             chosen = sorted({*range(0, len(rows), len(rows) // MANY + 1), *list({t: n for n, t in enumerate(targets)}.values())[:40]})
         for _ in range(8):
+            whole, conditions.Work.left = conditions.Work.left, min(conditions.Work.left, ONE_SEARCH)
+            granted = conditions.Work.left
             text = solve([rows[n] for n in chosen], [targets[n] for n in chosen])
+            conditions.Work.left = whole - (granted - max(conditions.Work.left, 0))
             if text is None:
                 break
             if len(chosen) == len(rows):
@@ -338,9 +349,13 @@ class Fitter:
             by_sample[n].append((ix, tuple(sorted(v))))
         values = {n: tuple(v) for n, v in by_sample.items()}
         if all(len(v) == sizes[r] for r, v in sets.items()):
-            count = self.number(f"count of {LETTERS[p]}", rows, tuple(sizes[r] for r in rows), values, p)
-            self.counts.setdefault(here, {})[count] = {r: sizes[r] for r in rows}
-            return count, None
+            try:
+                count = self.number(f"count of {LETTERS[p]}", rows, tuple(sizes[r] for r in rows), values, p)
+                self.counts.setdefault(here, {})[count] = {r: sizes[r] for r in rows}
+                return count, None
+            except Unexplained:                               # perhaps a condition on the index ends it early
+                if p > 1:
+                    raise
         for count in self.bounds(here, p, rows, sizes):
             flat_rows, truth = [], []
             ok = True
