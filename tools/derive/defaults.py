@@ -202,7 +202,8 @@ def of_sub(root, document, key, sub):
     prefix = key + "."
     static = {k[len(prefix):]: v for k, v in document["static"].items() if k.startswith(prefix)}
     own = sub["own"] or {}
-    out = {"type": sub["model_type"] or None, "absent": {}, "set": {}}
+    mt = sub["model_type"] if sub["model_type"] != document["model_type"] else None       # some carry the name of the outer one
+    out = {"type": mt or None, "absent": {}, "set": {}}
     samples = document["samples"]
     missing = [s for s in samples if not isinstance(s["raw"].get(key), dict)]
     top = [k for k in document["static"] if "." not in k and not NOISE.search(k)]
@@ -216,7 +217,7 @@ def of_sub(root, document, key, sub):
                 text = copied(k, seen, prefix, top)
             out["absent"][k] = f"={text}" if text else v
     out["set"] = written_over(document, key, prefix, top)
-    if not sub["model_type"] or not (root / "config-samples" / f"{sub['model_type']}.json.gz").exists():
+    if not mt or not (root / "config-samples" / f"{mt}.json.gz").exists():
         out["defaults"] = {k: v for k, v in own.items() if not NOISE.search(k.split(".")[-1])}
     return out
 
@@ -295,7 +296,7 @@ def for_class(root, result):
 
 def resolve(root, model_type, config, fallback=None):
     """The flat config that a config.json stands for, by what was derived."""
-    document = of_config(root, model_type) or {"defaults": fallback or {}, "computed": [], "configs": {}}
+    document = (of_config(root, model_type) if model_type and fallback is None else None) or {"defaults": fallback or {}, "computed": [], "configs": {}}
     flat = dict(document["defaults"])
     subs = document["configs"]
     for k, v in config.items():
@@ -321,7 +322,7 @@ def resolve(root, model_type, config, fallback=None):
                 inner_config = {k: solved(v, flat) for k, v in sub["absent"].items()}
             for k, v in sub["set"].items():
                 inner_config[k] = solved(v, flat)
-            inner = resolve(root, mt, nest(inner_config), sub.get("defaults"))
+            inner = resolve(root, mt, nest(inner_config), sub.get("defaults") if mt in (None, sub["type"], model_type) else None)
             inner["model_type"] = mt
             for k in [k for k in flat if k.startswith(key + ".")]:
                 del flat[k]

@@ -149,22 +149,22 @@ class Fitter:
 
     # -- numbers
 
-    def number(self, what, rows, targets, values, indexed=0):
+    def number(self, what, rows, targets, values, indexed=0, depth=2):
         """An expression for `targets` over `rows`. `values`: {sample: anything that changes when the targets do}."""
         keys = self.influence(values)
 
         def solve(some, wanted):
             columns = self.columns(some, keys, indexed)
             extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
-            found = conditions.number(wanted, columns, extra, 0 if self.heads_of(keys) else 2)
+            found = conditions.number(wanted, columns, extra, 0 if self.heads_of(keys) else depth)
             if found is None and (more := self.heads_of(keys)):
                 found = conditions.number(wanted, self.columns(some, keys[:4] + more, indexed), extra, 0) or conditions.number(wanted, columns, extra)
             if found is None:
                 lists = [k for k in self.all_lists() if k not in keys]
                 if lists:
-                    found = conditions.number(wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, 1 + (indexed > 0))
+                    found = conditions.number(wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, min(depth, 1 + (indexed > 0)))
             return found and found[1]
-        return self.remembered("number", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
+        return self.remembered(f"number {depth}", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
 
     def heads_of(self, keys):
         """Numbers of heads beside widths: a width they do not divide is rounded down, which few samples show."""
@@ -350,12 +350,9 @@ class Fitter:
         values = {n: tuple(v) for n, v in by_sample.items()}
         if all(len(v) == sizes[r] for r, v in sets.items()):
             try:
-                count = self.number(f"count of {LETTERS[p]}", rows, tuple(sizes[r] for r in rows), values, p)
-                self.counts.setdefault(here, {})[count] = {r: sizes[r] for r in rows}
-                return count, None
+                return self.count(here, p, rows, sizes, values, 0), None
             except Unexplained:                               # perhaps a condition on the index ends it early
-                if p > 1:
-                    raise
+                pass
         for count in self.bounds(here, p, rows, sizes):
             flat_rows, truth = [], []
             ok = True
@@ -377,7 +374,14 @@ class Fitter:
                 return count, self.truth(f"which {LETTERS[p]}", flat_rows, tuple(truth), values, p + 1)
             except Unexplained:
                 continue
+        if all(len(v) == sizes[r] for r, v in sets.items()):
+            return self.count(here, p, rows, sizes, values, 2), None
         raise Unexplained(f"indices {LETTERS[p]}: {[sorted(v) for v in list(sets.values())[:3]]}")
+
+    def count(self, here, p, rows, sizes, values, depth):
+        text = self.number(f"count of {LETTERS[p]}", rows, tuple(sizes[r] for r in rows), values, p, depth)
+        self.counts.setdefault(here, {})[text] = True
+        return text
 
     def bounds(self, here, p, rows, sizes):
         """Counts an index with holes may run to: those of its neighbours, those of layers."""

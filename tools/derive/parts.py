@@ -52,6 +52,12 @@ def find(samples, name, known, root):
         if any(prefix.startswith(p) for p in out.prefixes):
             continue
         good = {mt: rows for mt, rows in kinds.items() if all(not r[2] and r[0] in known and r[0] != name for r in rows) and len({r[0] for r in rows}) == 1}
+        if good and path:                                     # a copy with small changes is not recognised; the class still tells
+            for s in samples:
+                mt = s.flat.get(path + ".model_type")
+                for p, cls, inner, where in s.models:
+                    if p == prefix and where is None and inner == mt and mt not in kinds and cls in known:
+                        good.setdefault(mt, [(cls, [], [], s)])
         without = left_out(prefix, [r for rows in good.values() for r in rows])
         if not good or without is None:
             continue

@@ -134,6 +134,10 @@ class Sampler:
         for depth, base in enumerate(order):
             self.deepen(base, strong, 3 if depth < 1 else 1)
         self.joint(order[:2])
+        for base in order[:2]:                                # neither does anything without the other
+            raw = self.samples[base]["raw"]
+            if {"is_decoder", "add_cross_attention"} <= set(self.samples[base]["flat"]):
+                self.make(changed(changed(raw, "is_decoder", True), "add_cross_attention", True), base, "add_cross_attention")
         self.equalise(order[:2], strong)
         self.mix(bases + ([rich] * 3 if rich is not None else []), strong)
 
