@@ -158,7 +158,7 @@ class Fitter:
             extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
             found = conditions.number(wanted, columns, extra, 0 if self.heads_of(keys) else depth)
             if found is None and (more := self.heads_of(keys)):
-                found = conditions.number(wanted, self.columns(some, keys[:4] + more, indexed), extra, 0) or conditions.number(wanted, columns, extra)
+                found = conditions.number(wanted, self.columns(some, keys[:4] + more, indexed), extra, 0) or conditions.number(wanted, columns, extra, depth)
             if found is None:
                 lists = [k for k in self.all_lists() if k not in keys]
                 if lists:
