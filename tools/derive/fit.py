@@ -1,6 +1,5 @@
 """From samples to templates: `fit/<Class>.json`, a template per tensor with expressions that explain every sample."""
 import collections
-import functools
 import importlib.metadata
 import json
 import re
@@ -13,10 +12,10 @@ import numpy as np
 from . import conditions, defaults, evaluate, parts, store
 from .conditions import Literal, quoted
 from .keys import HEADS, LAYERS, NOISE, WIDTH
+from .lists import of_list
+from .names import LETTERS, gapless, groups, lettered, some_names, split
 from .vectors import Column
 
-LETTERS = "ijkl"
-NUMBER = re.compile(r"^(.*?)(\d+)$")
 MANY = 160                                                    # rows an expression is searched on; it must hold on all
 SEARCHES, ONE_SEARCH = 300, 40                                # for one class, for one expression
 ENOUGH = 6                                                    # unexplained templates after which a class is given up
@@ -25,64 +24,6 @@ STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|o
 
 class Unexplained(Exception):
     """No expression was found; says what for and shows the values."""
-
-
-# ---- names ---------------------------------------------------------------------------------------------------
-
-@functools.lru_cache(maxsize=200000)
-def skeleton(name):
-    """("layers.{}.weight", (3,)) for "layers.3.weight": every number at the end of a component is a possible index."""
-    out, indices = [], []
-    for component in name.split("."):
-        m = NUMBER.match(component)
-        if m:
-            indices.append(int(m[2]))
-            component = m[1] + "{}"
-        out.append(component)
-    return ".".join(out), tuple(indices)
-
-
-def put(pattern, position, text):
-    """`pattern` with its placeholder number `position` replaced."""
-    pieces = pattern.split("{}")
-    return "{}".join(pieces[:position + 1]) + text + "{}".join(pieces[position + 1:])
-
-
-def groups(samples, names_of):
-    """{template with {} for what varies: {sample number: {indices: value}}}. A number that is the same in every sample
-    is part of the name."""
-    found = {}
-    for s in samples:
-        for name, v in names_of(s).items():
-            pattern, indices = skeleton(name)
-            found.setdefault(pattern, {}).setdefault(s.number, {})[indices] = v
-    out = {}
-    for pattern, per in found.items():
-        settle(pattern, per, 0, out)
-    return out
-
-
-def settle(pattern, per, position, out):
-    """Decide for each index position, left to right, whether it is an index or part of the name."""
-    if position == pattern.count("{}"):
-        out[pattern] = per
-        return
-    sets = {frozenset(ix[position] for ix in d) for d in per.values()}
-    if len(sets) == 1:
-        spell_out(pattern, per, position, out)
-    else:
-        settle(pattern, per, position + 1, out)
-
-
-def spell_out(pattern, per, position, out):
-    """One template for each value of an index."""
-    for n in sorted({ix[position] for d in per.values() for ix in d}):
-        sub = {}
-        for s, d in per.items():
-            some = {ix[:position] + ix[position + 1:]: v for ix, v in d.items() if ix[position] == n}
-            if some:
-                sub[s] = some
-        settle(put(pattern, position, str(n)), sub, position, out)
 
 
 # ---- what a class's expressions may use ----------------------------------------------------------------------
@@ -413,56 +354,7 @@ class Fitter:
         return self.number(f"dim {k}", rows, tuple(per[n][ix][k] for n, ix in rows), values, places)
 
 
-def of_list(text, values, rows, indexed, cost):
-    """Columns from a list: its length, ends, sum, and what stands at an index."""
-    def safe(f):
-        out = []
-        for v, row in zip(values, rows):
-            try:
-                x = f(v, row)
-            except (IndexError, TypeError):
-                x = None
-            out.append(x if x is None or isinstance(x, (bool, int, float, str)) else None)
-        return out
-
-    def at(v, n):
-        if n < 0:
-            raise IndexError
-        return v[n]
-    yield Column(f"size({text})", safe(lambda v, _: len(v)), cost + .3)
-    numeric = all(isinstance(x, (int, float)) and not isinstance(x, bool) for v in values if isinstance(v, list) for x in v)
-    nested = any(isinstance(x, list) for v in values if isinstance(v, list) for x in v)
-    shortest = min((len(v) for v in values if isinstance(v, list)), default=0)
-    if not nested:
-        for n in range(min(shortest, 8)):
-            yield Column(f"{text}[{n}]", safe(lambda v, _, n=n: at(v, n)), cost + .3 + .01 * n)
-        yield Column(f"{text}[size({text}) - 1]", safe(lambda v, _: v[-1]), cost + .4)
-        yield Column(f"{text}[size({text}) - 2]", safe(lambda v, _: v[-2]), cost + .9)
-    else:
-        for n in range(min(shortest, 6)):
-            for m in range(3):
-                yield Column(f"{text}[{n}][{m}]", safe(lambda v, _, n=n, m=m: at(at(v, n), m)), cost + .5)
-    if numeric:
-        yield Column(f"sum({text})", safe(lambda v, _: sum(v)), cost + .5)
-    for p in range(indexed):
-        letter = LETTERS[p]
-        tails = [""] if not nested else [f"[{m}]" for m in range(3)]
-        for tail in tails:
-            pick = (lambda x: x) if not tail else (lambda x, m=int(tail[1]): x[m])
-            yield Column(f"{text}[{letter}]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, r[1][p]))), cost + .15)
-            yield Column(f"{text}[{letter} - 1]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, r[1][p] - 1))), cost + .35)
-            yield Column(f"{text}[{letter} + 1]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, r[1][p] + 1))), cost + .35)
-            yield Column(f"{text}[size({text}) - 1 - {letter}]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, len(v) - 1 - r[1][p]))), cost + .6)
-            yield Column(f"{text}[size({text}) - 2 - {letter}]{tail}", safe(lambda v, r, p=p, pick=pick: pick(at(v, len(v) - 2 - r[1][p]))), cost + .9)
-
-
 # ---- all templates of a class --------------------------------------------------------------------------------
-
-def lettered(pattern):
-    for letter in LETTERS[:pattern.count("{}")]:
-        pattern = pattern.replace("{}", "{" + letter + "}", 1)
-    return pattern
-
 
 def fit_names(fitter, samples, names_of, order, shapes=True):
     """[[template, entry]] in state-dict order, and what was not explained."""
@@ -491,32 +383,6 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
                 queue.append(q)
     done.sort(key=lambda d: (d[0], d[1]))
     return done, bad
-
-
-def some_names(pattern, per):
-    d = max(per.values(), key=len)
-    for ix in list(d)[:1] + list(d)[-1:]:
-        name = pattern
-        for n in ix:
-            name = name.replace("{}", str(n), 1)
-        yield name
-
-
-def gapless(per):
-    return all({ix[0] for ix in d} == set(range(len({ix[0] for ix in d}))) for d in per.values() if d and next(iter(d)))
-
-
-def split(pattern, per):
-    """The same group with one index spelled out, where it has few values."""
-    for p in range(pattern.count("{}")):
-        numbers = {ix[p] for d in per.values() for ix in d}
-        if len(numbers) <= 8:
-            out = {}
-            for n in sorted(numbers):
-                sub = {s: {ix[:p] + ix[p + 1:]: v for ix, v in d.items() if ix[p] == n} for s, d in per.items()}
-                out[put(pattern, p, str(n))] = {s: d for s, d in sub.items() if d}
-            return out
-    return None
 
 
 def fit_class(root, name, known):
