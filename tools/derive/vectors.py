@@ -10,6 +10,7 @@ from fractions import Fraction
 import numpy as np
 
 ATOM = re.compile(r"c\.[\w.]+|\w+|c\.[\w.]+\[[^\[\]]*\]|\w+\([^()]*\)|\(.*\)")
+QUOTIENT = re.compile(r"c\.[\w.]+ / c\.[\w.]+")
 LIMIT = 1 << 40
 
 
@@ -89,7 +90,7 @@ class Atoms:
                 self.list.append((cost, text, v))
 
     def generate(self, floats):
-        ks = self.ints[:5 if self.plain else 9]
+        ks = self.ints[:7 if self.plain else 9]
         for n, v, c in self.ints:
             yield c, n, v
             yield c + 2.2, f"{n} * {n}", v * v
@@ -281,7 +282,8 @@ def fit(t, columns, thorough=True):
     best = min((b for b in (best, two) if b), default=None, key=lambda b: b[0])
     if best:
         return best
-    for n, v, c in atoms.ints:                                # a common factor: (heads + 2 * groups) * head_dim
+    quotients = [(f"({text})", v, cost) for cost, text, v in atoms.list if QUOTIENT.fullmatch(text)]
+    for n, v, c in atoms.ints + quotients[:12]:               # a common factor: (heads + 2 * groups) * head_dim
         if (v > 0).all() and (t % v == 0).all():
             rest = t // v
             if (rest == rest[0]).all():
