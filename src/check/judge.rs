@@ -6,10 +6,10 @@ use std::collections::BTreeSet;
 use serde_json::Value;
 
 use super::finding::LoadReport;
-use super::index;
 use super::load::{self, Judged, Stored, Target};
 use super::quantization::{self, Quantised};
 use super::votes::{self, Explanation, Vote};
+use super::{index, layers};
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::quantization::{Said, said};
 use crate::knowledge::{Architecture, Expected, Library, Loader};
@@ -54,6 +54,10 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
     let names: Vec<&str> = stored.names().collect();
     let targets = load::targets(library, config, &names, versions);
     let mut faults: Vec<Fault> = unknown(config, &targets, versions).collect();
+    if targets.is_empty() {
+        // A known class says more of its layers than they do of one another.
+        faults.extend(layers::compare(stored.names()));
+    }
     let architecture = targets.first().map(|(_, architecture)| architecture.name().to_owned());
     let said = said(config);
     let quantise = |expected: Option<&Expected>| match &said {

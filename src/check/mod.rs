@@ -7,6 +7,7 @@ pub mod finding;
 pub mod index;
 pub mod inspect;
 pub mod judge;
+pub mod layers;
 pub mod load;
 pub mod modules;
 pub mod quantization;

@@ -233,6 +233,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "index-key-nowhere",
     "index-missing",
     "index-names-other-shard",
+    "layer-lacks-tensor",
     "load-raises",
     "loads-differ",
     "missing-tensors",
