@@ -32,18 +32,43 @@ def add_fit(commands):
     p.set_defaults(run="derive.fit")
 
 
+def add_conversions(commands):
+    p = commands.add_parser("conversions", help="read off transformers 5 what it renames and merges at load")
+    p.add_argument("--instances", action="store_true", help="also for a model of each fitted class, to verify against")
+    p.set_defaults(run="derive.conversions")
+
+
+def add_write(commands):
+    p = commands.add_parser("write", help="write candidates for architecture files, not verified")
+    p.add_argument("--out", type=Path, required=True, help="folder to write them to")
+    p.set_defaults(run="derive.write")
+
+
+def add_verify(commands):
+    p = commands.add_parser("verify", help="ask ckpt-doctor about unseen configs; write what is right to rules/architectures")
+    p.add_argument("--binary", help="ckpt-doctor (default: the environment variable CKPT_DOCTOR, else the one on the path)")
+    p.add_argument("--out", type=Path, help="another folder to write to")
+    p.set_defaults(run="derive.verify")
+
+
+def add_table(commands):
+    p = commands.add_parser("table", help="write docs/architectures.md from what is in the repository")
+    p.add_argument("--check", action="store_true", help="only say whether it is as it should be")
+    p.set_defaults(run="derive.table")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
     commands = parser.add_subparsers(required=True)
-    for add in (add_sample, add_fit):
+    for add in (add_sample, add_fit, add_conversions, add_write, add_verify, add_table):
         add(commands)
     for sub in set(commands.choices.values()):                # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.cache is None:
+    if args.cache is None and args.run != "derive.table":
         parser.error("say where samples and results are kept: --cache DIR, or the environment variable DERIVE_CACHE")
-    args.cache = Path(args.cache)
+    args.cache = Path(args.cache) if args.cache else None
     __import__(args.run)
     return sys.modules[args.run].main(args)
 

@@ -33,7 +33,7 @@ impl Resolver<'_> {
         fill(&mut config, &class.defaults);
         let mut scope = self.scope(&config);
         for (key, spec) in &class.configs {
-            if let Some(sub) = self.sub_config(spec, config.get(key), &scope, key, depth)? {
+            if let Some(sub) = self.sub_config(file, spec, config.get(key), &scope, key, depth)? {
                 config.insert(key.clone(), Value::Object(sub));
             }
         }
@@ -59,6 +59,7 @@ impl Resolver<'_> {
     /// A sub-config as given, or as the composition builds one, resolved by the file of its model type.
     fn sub_config(
         &self,
+        owner: &Blueprint,
         spec: &SubConfig,
         given: Option<&Value>,
         scope: &Scope<'_>,
@@ -81,7 +82,10 @@ impl Resolver<'_> {
         let file =
             sub.get("model_type").and_then(Value::as_str).and_then(|t| self.library.of_model_type(t, self.loader));
         let inside = |Refusal(e): Refusal| Refusal(format!("{key}: {e}"));
-        if let Some(file) = file {
+        // Qwen2-VL's vision config bears the model type of the whole (4.47.0): then `spec` alone speaks of it.
+        if let Some(file) = file
+            && !std::ptr::eq(file, owner)
+        {
             sub = self.resolve(file, sub, depth.saturating_add(1)).map_err(inside)?;
         }
         if !spec.computed.is_empty() {

@@ -1,0 +1,369 @@
+"""From fitted classes to the files of rules/architectures."""
+import re
+from pathlib import Path
+
+from . import json5
+from .family import Version, first, load, used_keys
+from .merge import Apart, merged, share
+from .naming import name_all
+from .tree import Clash, layout, nest
+
+MARK = re.compile(r"^  derived: ", re.MULTILINE)
+
+
+class Writer:
+    """Writes what `ships` says: {version: classes}; `prefer`: {class: "4" or "5"} where one version's expressions hold for both."""
+
+    def __init__(self, versions, conversions):
+        self.versions = versions                             # oldest first
+        self.conversions = conversions
+        self.prefer = {}
+        self.ships = {}
+        self.verified = {}                                   # version -> {class: configs}
+        self.apart = {}
+
+    def start(self):
+        self.ships = {v.version: set(v.fits) for v in self.versions}
+        self.drop_dependent()
+
+    def drop_dependent(self):
+        """Takes out classes of which a part is not shipped, until there is none."""
+        for v in self.versions:
+            ships, again = self.ships[v.version], True
+            while again:
+                again = False
+                for name in sorted(ships):
+                    lacking = missing_part(v.fits[name], ships)
+                    if lacking:
+                        ships.discard(name)
+                        v.reasons[name] = f"a part is not shipped: {lacking}"
+                        again = True
+
+    def files(self):
+        """{stem: text} of all families."""
+        used = [used_keys(v, self.ships[v.version]) for v in self.versions]
+        # A version that knows a config class knows all its keys: entries may be shared between versions.
+        self.used = {v.version: {t: set().union(*(u.get(t, ()) for u in used)) for t in mine} for v, mine in zip(self.versions, used)}
+        model_types = {t for used in self.used.values() for t in used}
+        model_types |= {v.model_type(n) for v in self.versions for n in self.ships[v.version]}
+        self.places = {}
+        for v in self.versions:
+            for name in self.ships[v.version]:
+                self.places.setdefault(name, v.model_type(name))
+                self.places.setdefault(v.model_type(name), v.model_type(name))
+        return {t: json5.document(self.file(t)) for t in sorted(model_types) if t and any(known(v, t) for v in self.versions)}
+
+    def file(self, model_type):
+        present = [v for v in self.versions if self.used[v.version].get(model_type) or self.family(v, model_type)]
+        common, by_loader = self.config_class(model_type, present)
+        entries = self.classes(model_type, present)
+        lets, trees = name_all([e["tensors"] for e in entries])
+        for entry, tensors in zip(entries, trees):
+            entry["tensors"] = layout(tensors)
+        derived = {v.version: self.provenance(v, model_type) for v in present if self.family(v, model_type)}
+        names = sorted({e["class"] for e in entries})
+        modules = sorted({f.raw["module"].split(".")[-2] for v in present for f in self.family(v, model_type)}) or [model_type]
+        config_class = next((f.raw.get("config_class") for v in reversed(present) for f in self.family(v, model_type)), None)
+        out = {
+            "architecture": model_type,
+            "summary": f"{config_class or model_type}: {counted(len(names))}" if names else f"{model_type}: what the config of a part fills in",
+            "model_types": [model_type],
+            "sources": [f"transformers {' and '.join(v.version for v in present)}, models/{' and models/'.join(modules)}"],
+            "loaders": [v.version for v in present],
+            "derived": json5.Lines(derived),
+            **common,
+        }
+        require = divisors([*common.get("computed", {}).values(), *(t for told in by_loader.values() for t in told.get("computed", {}).values())])
+        if require:
+            out["require"] = [{"that": f"c.{key} > 0", "message": f"{key} is {{c.{key}}}"} for key in require]
+        if by_loader:
+            out["by_loader"] = json5.Lines(by_loader)
+        if lets:
+            out["let"] = lets
+        rows = self.conversion_rows(model_type, names)
+        if rows:
+            out["conversions"] = json5.Lines(rows)
+        out["classes"] = entries
+        for key in ("defaults", "let"):
+            if key in out:
+                out[key] = json5.Filled(out[key])
+        return out
+
+    def family(self, v, model_type):
+        return [v.fits[n] for n in sorted(self.ships[v.version]) if v.model_type(n) == model_type]
+
+    def provenance(self, v, model_type):
+        family = self.family(v, model_type)
+        verified = self.verified.get(v.version, {})
+        return json5.Filled(samples=sum(f.raw["samples"] for f in family), verified=json5.Filled({f.name: verified.get(f.name, 0) for f in family}))
+
+    # ---- the config class ------------------------------------------------------------------------------------
+
+    def config_class(self, model_type, present):
+        common, by_loader = {}, {v.version: {} for v in present}
+        sides = [self.config_side(v, model_type) for v in present]
+        for field in ("auto", "defaults", "computed", "configs"):
+            values = [side[field] for side in sides]
+            for key in dict.fromkeys(k for value in values for k in value):
+                have = [(v, value[key]) for v, value in zip(present, values) if key in value]
+                same = all(value == have[0][1] for _, value in have)
+                if same and (len(have) == len(present) or field in ("auto", "defaults")):
+                    common.setdefault(field, {})[key] = have[0][1]
+                elif len(have) == len(present) and field in ("auto", "defaults"):
+                    common.setdefault(field, {})[key] = have[0][1]
+                    for v, value in have[1:]:
+                        by_loader[v.version].setdefault(field, {})[key] = value
+                else:
+                    for v, value in have:
+                        by_loader[v.version].setdefault(field, {})[key] = value
+        order = [f for f in ("auto", "defaults", "computed", "configs") if f in common]
+        shown = {f: common[f] for f in order}
+        if "defaults" in shown:
+            shown["defaults"] = dict(sorted(shown["defaults"].items()))
+        return shown, {version: json5.Lines({k: json5.Filled(v) if k == "defaults" else v for k, v in told.items()}) for version, told in by_loader.items() if told}
+
+    def config_side(self, v, model_type):
+        used = self.used[v.version].get(model_type, set())
+        static, computed, configs = v.static(model_type), v.computed(model_type), v.sub_configs(model_type)
+        auto = {}
+        for mapping, table in sorted(v.auto.items()):
+            name = first(table.get(model_type))
+            if name in self.ships[v.version]:
+                auto[mapping.lower()] = name
+        side = {
+            "auto": auto,
+            "defaults": {k: static.get(k) for k in sorted(used) if k not in configs and k != "model_type" and (k in static or k not in computed and known(v, model_type))},
+            "computed": {k: text for k, text in computed.items() if k in used},
+            "configs": {k: self.sub_config(v, model_type, k, spec) for k, spec in sorted(configs.items()) if k in used},
+        }
+        return side
+
+    def sub_config(self, v, model_type, key, spec):
+        out = {}
+        types = v.types(model_type, key)
+        if spec.get("type"):
+            out["type"] = spec["type"]
+        used = set().union(*(self.used[v.version].get(t, set()) for t in types)) if types else None
+        if "absent" in spec and spec["absent"] is not None:
+            sub = spec["absent"].get("model_type", spec.get("type"))
+            static = v.static(sub) if sub else {}
+            out["absent"] = {
+                k: value for k, value in spec["absent"].items()
+                if k == "model_type" or (used is None or k in used) and not (k in static and static[k] == value)
+            }
+        if spec.get("set"):
+            kept = {k: value for k, value in spec["set"].items() if used is None or k in used}
+            if kept:
+                out["set"] = kept
+        for field in ("defaults", "computed"):
+            kept = {k: value for k, value in dict(spec.get(field) or {}).items() if used is None or k in used}
+            if kept:
+                out[field] = json5.Filled(kept)
+        return out
+
+    # ---- the classes -----------------------------------------------------------------------------------------
+
+    def classes(self, model_type, present):
+        sides = [{f.name: f for f in self.family(v, model_type)} for v in present]
+        entries = []
+        for name in order_of({**(sides[0] if sides else {}), **(sides[-1] if sides else {})}):
+            have = [(v, side[name]) for v, side in zip(present, sides) if name in side]
+            loaders = None if len(have) == len(present) else [v.version for v, _ in have]
+            entry = self.shared_entry(name, have) if len(have) > 1 else None
+            if entry is None:
+                for v, fit in have:
+                    told = self.entry(v, fit, fit.items)
+                    entries.append(with_loaders(told, [v.version] if len(present) > 1 else None))
+            else:
+                entries.append(with_loaders(entry, loaders))
+        return entries
+
+    def shared_entry(self, name, have):
+        (v4, old), (v5, new) = have
+        if (self.head(v4, old), self.ignored(v4, old)) != (self.head(v5, new), self.ignored(v5, new)):
+            self.apart[name] = "other prefix or patterns"
+            return None
+        ours, theirs = self.kept(v4, old), self.kept(v5, new)
+        prefer = self.prefer.get(name)
+        if share(ours, theirs, prefer) < 0.5:
+            self.apart[name] = "more than half differs"
+            return None
+        try:
+            items = merged(ours, theirs, prefer)
+            entry = self.entry(v5, new, items)
+        except (Apart, Clash) as e:
+            self.apart[name] = str(e)
+            return None
+        return entry
+
+    def differs(self, name):
+        """Whether the versions say different things of a class."""
+        old, new = (v.fits[name] for v in self.versions)
+        return {i.name: i for i in old.items} != {i.name: i for i in new.items}
+
+    def head(self, v, fit):
+        out = {"class": fit.name}
+        if fit.raw.get("base_model_prefix"):
+            out["base_model_prefix"] = fit.raw["base_model_prefix"]
+        if fit.raw.get("has_base"):
+            out["base_module"] = True
+        return out
+
+    def ignored(self, v, fit):
+        out = {}
+        for key in ("ignore_missing", "ignore_unexpected"):
+            told = list(fit.raw.get(key) or [])
+            if v.version.startswith("5"):                     # the loader asks the models inside too; parts bring their own
+                for _, name, _ in self.written_out(fit):
+                    told += [p for p in self.conversions.get("patterns", {}).get(name, {}).get(key, []) if p not in told]
+            out[key] = effective(told)
+        return out
+
+    @staticmethod
+    def written_out(fit):
+        """Models inside a class that are no part: their tensors stand in place."""
+        prefixes = [p["prefix"] for p in fit.raw["parts"]]
+        return [m for m in fit.raw["models"] if m[0] and not any((m[0] + ".").startswith(p) for p in prefixes)]
+
+    def entry(self, v, fit, items):
+        out = self.head(v, fit)
+        out.update({k: told for k, told in self.ignored(v, fit).items() if told})
+        out["tensors"] = nest(self.shippable(v, items), self.marks(v, fit))
+        return out
+
+    def kept(self, v, fit):
+        return self.shippable(v, fit.items)
+
+    def shippable(self, v, items):
+        """The items; of a part that the config chooses, only classes that are there."""
+        out = []
+        known_classes = set().union(*self.ships.values())
+        for item in items:
+            table = (item.part or {}).get("by_model_type")
+            if table:
+                item.part = {**item.part, "by_model_type": {t: c for t, c in table.items() if c in known_classes}}
+            out.append(item)
+        return out
+
+    def marks(self, v, fit):
+        """Models written in place for which transformers 5 looks up conversions."""
+        if not v.version.startswith("5"):
+            return []
+        table = self.conversions.get("identifiers", {})
+        own, by_class = fit.raw["model_type"], fit.name in table
+        out = []
+        for path, name, model_type in self.written_out(fit):
+            if name in table or model_type in table and (by_class or model_type != own):
+                if not re.search(r"(^|\.)\d+(\.|$)", path):
+                    out.append((path, name, model_type if model_type != own else None))
+        return out
+
+    # ---- conversions -----------------------------------------------------------------------------------------
+
+    def conversion_rows(self, model_type, names):
+        """Rows of the table for this model type, its classes, and models written in place in them."""
+        table, same_as = self.conversions.get("identifiers", {}), self.conversions.get("same_as", {})
+        v5 = self.versions[-1]
+        family = self.family(v5, model_type) if v5.version.startswith("5") else []
+        if not family and not self.used[v5.version].get(model_type):
+            return {}
+        wanted = {model_type} | {f.name for f in family}
+        for fit in family:
+            for _, name, inner in self.marks(v5, fit):
+                wanted.add(name if name in table else inner)
+        out = {}
+        for identifier in sorted(wanted & set(table)):
+            other = same_as.get(identifier)
+            home = self.places.get(other)
+            if other and (home == model_type and other in wanted or home not in (None, model_type)):
+                out[identifier] = other
+            else:
+                out[identifier] = [{k: row[k] for k in ("kind", "from", "to", "ops", *sorted(row)) if k in row} for row in table[identifier]]
+        return out
+
+
+def effective(patterns):
+    """Patterns as the loader uses them. A class that gives a text instead of a list has each letter tried: `.` is all names."""
+    return ["."] if "." in patterns else patterns
+
+
+def divisors(texts):
+    """Keys that computed defaults divide by: a config where one is 0 is refused in words."""
+    return sorted({key for text in texts for key in re.findall(r"/ c\.(\w+)(?![\w.])", text)})
+
+
+def known(v, model_type):
+    return model_type in v.configs or any(f.raw["model_type"] == model_type for f in v.fits.values())
+
+
+def missing_part(fit, ships):
+    """A class that the fit needs and that is not there; of a choice by model type one is enough."""
+    for p in fit.raw["parts"]:
+        names = set(p["classes"].values())
+        fit.parts                                             # decides on `auto`
+        if not p.get("auto") and not names & ships:
+            return ", ".join(sorted(names))
+    return None
+
+
+def order_of(fits):
+    """Classes in an order to be read in: what others are made of first."""
+    def depth(name, seen=()):
+        inner = [c for p in fits[name].raw["parts"] if not p.get("config") for c in p["classes"].values() if c in fits and c not in seen and c != name]
+        return 1 + max((depth(c, (*seen, name)) for c in inner), default=0)
+    return sorted(fits, key=lambda n: (depth(n), n))
+
+
+def counted(n):
+    return f"{n} class" if n == 1 else f"{n} classes"
+
+
+def with_loaders(entry, loaders):
+    if loaders is None:
+        return json5.Lines(entry)
+    return json5.Lines({"class": entry["class"], "loaders": loaders, **{k: v for k, v in entry.items() if k != "class"}})
+
+
+def derived_files(folder):
+    """Architecture files that this tool wrote, as opposed to those written by hand."""
+    return [p for p in sorted(Path(folder).glob("*.json5")) if MARK.search(p.read_text())]
+
+
+def put(files, folder):
+    """Makes `files` the derived files of the folder; files written by hand stay, and win."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    mine = set(derived_files(folder))
+    by_hand = {p.stem for p in folder.glob("*.json5")} - {p.stem for p in mine}
+    for path in mine:
+        if path.stem not in files:
+            path.unlink()
+    for stem, text in files.items():
+        path = folder / f"{stem}.json5"
+        if stem not in by_hand and (not path.exists() or path.read_text() != text):
+            path.write_text(text)
+    return sorted(by_hand & set(files))
+
+
+def read_versions(cache):
+    names = sorted((p.name for p in Path(cache).iterdir() if (p / "fit").is_dir()), key=lambda n: [int(x) for x in n.split(".")])
+    return [Version.read(cache, n) for n in names]
+
+
+def read_conversions(cache, versions):
+    newest = versions[-1].version
+    path = Path(cache) / newest / "conversions.json"
+    if newest.startswith("5") and not path.exists():
+        raise SystemExit(f"{path} is not there: run `conversions` under transformers {newest} first")
+    return load(path, {})
+
+
+def main(args):
+    """Candidates only, not verified; to look at."""
+    versions = read_versions(args.cache)
+    writer = Writer(versions, read_conversions(args.cache, versions))
+    writer.start()
+    by_hand = put(writer.files(), args.out)
+    for v in versions:
+        print(f"{v.version}: {len(writer.ships[v.version])} classes of {len(v.fits)} fitted, {len(v.reasons)} not")
+    print(f"left to files written by hand: {by_hand}; written apart: {len(writer.apart)}")
