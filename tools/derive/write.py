@@ -46,11 +46,11 @@ class Writer:
         self.used = {v.version: {t: set().union(*(u.get(t, ()) for u in used)) for t in mine} for v, mine in zip(self.versions, used)}
         model_types = {t for used in self.used.values() for t in used}
         model_types |= {v.model_type(n) for v in self.versions for n in self.ships[v.version]}
+        # Where a row of the conversion table stands: rows are written for the classes of transformers 5 alone.
         self.places = {}
-        for v in self.versions:
-            for name in self.ships[v.version]:
-                self.places.setdefault(name, v.model_type(name))
-                self.places.setdefault(v.model_type(name), v.model_type(name))
+        v5 = self.versions[-1]
+        for name in self.ships[v5.version]:
+            self.places[name] = self.places[v5.model_type(name)] = v5.model_type(name)
         return {t: json5.document(self.file(t)) for t in sorted(model_types) if t and any(known(v, t) for v in self.versions)}
 
     def file(self, model_type):
