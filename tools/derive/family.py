@@ -15,12 +15,19 @@ from .tree import Item
 def tidied(value):
     """The same with tidy expressions, 'words' in single quotes so that they need no escapes inside a string."""
     if isinstance(value, str):
-        return tidy(re.sub(r'"([\w. +-]*)"', r"'\1'", value))
+        return tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value)))
     if isinstance(value, list):
         return [tidied(v) for v in value]
     if isinstance(value, dict):
         return {k: tidied(v) for k, v in value.items()}
     return value
+
+
+def within(text):
+    """An element beyond a list's end is null to the fitter and an error to CEL: the same said by the index."""
+    text = re.sub(r"(c(?:\.\w+)+)\[i( \+ 1)?\] == null", r"i\2 >= size(\1)", text)
+    text = re.sub(r"(c(?:\.\w+)+)\[i( \+ 1)?\] != null", r"i\2 < size(\1)", text)
+    return re.sub(r"c(?:\.\w+)+\[i - 1\] ([!=])= null", lambda m: "i == 0" if m[1] == "=" else "i > 0", text)
 
 
 def load(path, otherwise=None):
@@ -33,6 +40,11 @@ UNDECLARED = {
     # modeling_siglip.py: `True if not hasattr(config, "vision_use_head") else config.vision_use_head`
     "siglip_vision_model": ("vision_use_head", True, re.compile(r"(vision_model\.)?head\."), "c.vision_use_head == true"),
 }
+
+
+# What a config class computes from a list's length, which no sample varies: {model_type: {key: how}}.
+SWIN = {"hidden_size": "c.embed_dim * pow(2, size(c.depths) - 1)"}  # configuration_swin.py: `int(embed_dim * 2 ** (len(depths) - 1))`
+COMPUTED = {"swin": SWIN, "swinv2": SWIN, "maskformer-swin": SWIN, "donut-swin": SWIN}
 
 
 @dataclass
@@ -232,6 +244,7 @@ class Version:
         for fit in self.family(model_type):
             for key, text in fit.raw["computed"]:
                 out.setdefault(key, text)
+        out.update(COMPUTED.get(model_type, {}))
         return {k: v for k, v in out.items() if "." not in k}
 
 
