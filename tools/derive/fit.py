@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import conditions, defaults, evaluate, parts, store
+from . import conditions, defaults, evaluate, parts, store, told
 from .conditions import Literal, quoted
 from .keys import HEADS, LAYERS, NOISE, WIDTH
 from .lists import of_list
@@ -31,7 +31,8 @@ class Unexplained(Exception):
 class Fitter:
     """Fits everything about one class, remembering what has been fitted: many tensors share their dimensions."""
 
-    def __init__(self, samples):
+    def __init__(self, samples, model_type=None):
+        self.model_type = model_type
         self.samples, self.by_number = samples, {s.number: s for s in samples}
         self.memo, self.counts, self.bad = {}, {}, []
 
@@ -129,6 +130,9 @@ class Fitter:
 
     def hold(self, what, keys, rows, targets, solve):
         """What `solve` finds on some of the rows and holds on all: rows it is wrong on are added until it does."""
+        for text in told.expressions(self.model_type, targets):
+            if all(self.says(text, r, t) for r, t in zip(rows, targets)):
+                return text
         chosen = range(len(rows))
         if len(rows) > MANY:
             chosen = sorted({*range(0, len(rows), len(rows) // MANY + 1), *list({t: n for n, t in enumerate(targets)}.values())[:40]})
@@ -393,7 +397,7 @@ def fit_class(root, name, known):
     found = parts.find(data.samples, name, known, root)
     samples = [s for s in data.samples if s.number not in found.unusable]
     inside = tuple(found.prefixes)
-    fitter = Fitter(samples)
+    fitter = Fitter(samples, about["model_type"])
     conditions.Work.left = SEARCHES
 
     def own_tensors(s):
