@@ -223,7 +223,7 @@ fn remote_configs_are_refused_in_a_sentence() {
     let refuse = |config: Value| {
         let library = Library::embedded();
         let architecture = library.find(&config, [], Loader::V4_47_0).expect("known");
-        architecture.expect(&config).expect_err("refused").join("; ")
+        architecture.expect(&config).expect_err("refused").to_string()
     };
     let openvla = |id: &str| json!({ "architectures": ["OpenVLAForActionPrediction"], "vision_backbone_id": id });
     assert_eq!(refuse(openvla("vit")), "vision_backbone_id is vit, which the class does not know");

@@ -212,3 +212,31 @@ fn the_load_is_predicted_for_the_versions_asked_for() {
     let unknown = findings.iter().find(|f| f["code"] == "ARC001").unwrap();
     assert!(unknown["message"].as_str().unwrap().contains("not known here for transformers 5.23.0"));
 }
+
+/// Gemma 3 text inside PaliGemma: transformers 4.47.0 has no such model type, 5.23.0 has.
+#[test]
+fn a_part_that_only_another_loader_knows_is_judged_as_that_one_builds_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = json!({
+        "architectures": ["PaliGemmaForConditionalGeneration"], "model_type": "paligemma", "transformers_version": "4.57.0",
+        "text_config": { "model_type": "gemma3_text", "num_hidden_layers": 1 }, "vision_config": { "num_hidden_layers": 1 },
+    });
+    fs::write(dir.path().join("config.json"), config.to_string()).unwrap();
+    let index = json!({ "metadata": {}, "weight_map": { "a.weight": "model-00001-of-00001.safetensors" } });
+    fs::write(dir.path().join("model.safetensors.index.json"), index.to_string()).unwrap();
+    let path = dir.path().to_str().unwrap();
+    let loads = |more: &[&str]| {
+        let (_, report) = report(&[&["check", path, "--output-format", "json"], more].concat());
+        let found = report["checkpoints"][0].clone();
+        let codes = found["findings"].as_array().unwrap().iter().map(|f| f["code"].as_str().unwrap().to_owned());
+        (
+            found["loads"].as_array().unwrap().iter().map(|l| l["loader"].clone()).collect::<Vec<_>>(),
+            codes.collect::<Vec<_>>(),
+        )
+    };
+    let (loaders, codes) = loads(&[]);
+    assert_eq!(loaders, ["5.23.0"]);
+    assert!(!codes.iter().any(|c| c == "ARC001" || c == "ARC002"), "{codes:?}");
+    let (loaders, codes) = loads(&["--for", "transformers==4.47.0"]);
+    assert!(loaders.is_empty() && codes.iter().filter(|c| *c == "ARC001").count() == 1, "{codes:?}");
+}

@@ -12,7 +12,7 @@ use super::votes::{self, Explanation, Vote};
 use super::{index, layers};
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::quantization::{Said, said};
-use crate::knowledge::{Architecture, Expected, Library, Loader};
+use crate::knowledge::{Architecture, Expected, Library, Loader, Refusal, UnknownPart};
 
 /// The outcome for all loaders.
 #[derive(Debug, Default)]
@@ -28,6 +28,9 @@ pub struct Judgement {
     /// Values of config.json that stored tensors contradict.
     pub votes: Vec<Vote>,
 }
+
+/// A loader, its class, and what the config makes of it.
+type Built<'l> = (Target, Architecture<'l>, Result<Expected, Refusal>);
 
 /// One loader's class, and what is stored as it stands for the plain tensors of that class.
 struct Candidate<'a> {
@@ -53,11 +56,6 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
     let Some(config) = checkpoint.config() else { return Judgement::default() };
     let names: Vec<&str> = stored.names().collect();
     let targets = load::targets(library, config, &names, versions);
-    let mut faults: Vec<Fault> = unknown(config, &targets, versions).collect();
-    if targets.is_empty() {
-        // A known class says more of its layers than they do of one another.
-        faults.extend(layers::compare(stored.names()));
-    }
     let architecture = targets.first().map(|(_, architecture)| architecture.name().to_owned());
     let said = said(config);
     let quantise = |expected: Option<&Expected>| match &said {
@@ -65,13 +63,18 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
         _ => None,
     };
     let evidence = stored.evidence();
+    // How a version unpacks weights that another one packed is not known.
+    let asked = targets.into_iter().filter(|(target, _)| target.leads || matches!(said, Said::Plain));
+    let built = asked.map(|(target, class)| (target, class, class.expect_given(config, &evidence))).collect();
+    let built = leading(built, config, versions);
+    let mut faults: Vec<Fault> = unknown(config, &built, versions);
+    if in_doubt(&built) {
+        // A known class says more of its layers than they do of one another.
+        faults.extend(layers::compare(stored.names()));
+    }
     let mut candidates: Vec<Candidate<'_>> = Vec::new();
-    for (target, architecture) in targets {
-        // How a version unpacks weights that another one packed is not known.
-        if !target.leads && !matches!(said, Said::Plain) {
-            continue;
-        }
-        match architecture.expect_given(config, &evidence) {
+    for (target, architecture, expected) in built {
+        match expected {
             Ok(expected) => {
                 let quantised = quantise(Some(&expected));
                 // How a scheme that is not known stores what cannot be guessed.
@@ -88,13 +91,13 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                 });
                 candidates.push(Candidate { target, expected, quantised, report, explained });
             }
-            Err(problems) if target.leads => faults.push(
+            Err(Refusal::Impossible(reasons)) if target.leads => faults.push(
                 Fault::new("config-incomputable")
                     .at(Place::file("config.json"))
                     .with("architecture", architecture.name())
-                    .with("reason", problems.first().map_or("", String::as_str)),
+                    .with("reason", reasons.first().map_or("", String::as_str)),
             ),
-            // Nobody asked what a version makes of it that cannot build the class.
+            // Nobody asked what a version makes of it that cannot build the class; what is not known is told already.
             Err(_) => {}
         }
     }
@@ -181,26 +184,52 @@ fn load_faults(candidates: &[Candidate<'_>], stored: &Stored) -> Vec<Fault> {
     faults
 }
 
-/// For a class that no loader, or none of those asked for, is known to build.
-fn unknown(
-    config: &Value,
-    known: &[(Target, Architecture<'_>)],
-    versions: &[String],
-) -> impl Iterator<Item = Fault> + use<> {
+/// Whether no loader that counts says what the model is: not even that it cannot be.
+fn in_doubt(built: &[Built<'_>]) -> bool {
+    built.iter().all(|(target, _, expected)| !target.leads || matches!(expected, Err(Refusal::UnknownPart(_))))
+}
+
+/// Lets another loader lead where the one that should does not know a part, unless somebody asked for it.
+fn leading<'l>(mut built: Vec<Built<'l>>, config: &Value, versions: &[String]) -> Vec<Built<'l>> {
+    if versions.is_empty() && in_doubt(&built) {
+        let version = config.get("transformers_version").and_then(Value::as_str);
+        let known = built.iter_mut().find(|(_, _, expected)| expected.is_ok());
+        if let Some((target, ..)) = known {
+            target.lead(version);
+        }
+    }
+    built
+}
+
+/// For a class, or a part of one, that no loader, or none of those asked for, is known to build.
+fn unknown(config: &Value, built: &[Built<'_>], versions: &[String]) -> Vec<Fault> {
     let text = |key: &str| config.get(key).and_then(Value::as_str).unwrap_or("none").to_owned();
     let class = config.pointer("/architectures/0").and_then(Value::as_str).unwrap_or("none").to_owned();
-    let unknown: Vec<Option<String>> = if versions.is_empty() {
-        known.is_empty().then_some(None).into_iter().collect()
-    } else {
-        let is_known = |version: &str| known.iter().any(|(target, _)| target.loader == Loader::nearest(version));
-        versions.iter().filter(|v| !is_known(v)).map(|v| Some(format!("transformers {v}"))).collect()
-    };
-    let model_type = text("model_type");
-    unknown.into_iter().map(move |version| {
+    let fault = |part: Option<&UnknownPart>| {
+        let pointer = match part {
+            Some(part) if !part.config.is_empty() => format!("/{}/model_type", part.config.replace('.', "/")),
+            _ => "/model_type".to_owned(),
+        };
         let fault = Fault::new("unknown-architecture")
-            .at(Place::file("config.json").pointer("/model_type"))
-            .with("model_type", model_type.as_str())
+            .at(Place::file("config.json").pointer(pointer))
+            .with("model_type", text("model_type"))
             .with("class", class.as_str());
-        version.into_iter().fold(fault, |fault, version| fault.with("under", version))
-    })
+        part.into_iter().fold(fault, |fault, part| fault.with("part", part.to_string()))
+    };
+    let part = |built: &Built<'_>| match &built.2 {
+        Err(Refusal::UnknownPart(part)) => Some(part.clone()),
+        _ => None,
+    };
+    if versions.is_empty() {
+        return in_doubt(built).then(|| fault(built.iter().find_map(part).as_ref())).into_iter().collect();
+    }
+    let of_version = |version: &String| {
+        let found = built.iter().find(|(target, ..)| target.loader == Loader::nearest(version));
+        let fault = match found {
+            Some(found) => fault(Some(&part(found)?)),
+            None => fault(None),
+        };
+        Some(fault.with("under", format!("transformers {version}")))
+    };
+    versions.iter().filter_map(of_version).collect()
 }

@@ -125,7 +125,7 @@ fn build(library: &Library, asked: Asked, loader: Option<Loader>) -> Answer {
             )
         };
         let architecture = found.ok_or_else(unknown)?;
-        architecture.expect(&config).map_err(|reasons| format!("{}: {}", architecture.class(), reasons.join("; ")))
+        architecture.expect(&config).map_err(|refusal| format!("{}: {refusal}", architecture.class()))
     });
     Answer { source, loader, built }
 }

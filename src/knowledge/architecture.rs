@@ -5,6 +5,7 @@ mod build;
 mod conversions;
 pub(crate) mod member;
 mod ordered;
+mod refusal;
 mod resolve;
 
 use std::collections::BTreeSet;
@@ -14,6 +15,7 @@ use serde_json::Value;
 
 pub(crate) use blueprint::{Blueprint, Class};
 pub use conversions::Conversion;
+pub use refusal::{Refusal, UnknownPart};
 
 use super::{Evidence, Library, Loader};
 
@@ -73,8 +75,8 @@ impl<'l> Architecture<'l> {
     /// The tensors the class builds from `config`, the content of config.json.
     ///
     /// # Errors
-    /// Says, in a sentence each, why the class cannot be built from this config.
-    pub fn expect(&self, config: &Value) -> Result<Expected, Vec<String>> {
+    /// Says why the class cannot be built from this config.
+    pub fn expect(&self, config: &Value) -> Result<Expected, Refusal> {
         self.expect_given(config, &Evidence::default())
     }
 
@@ -82,7 +84,7 @@ impl<'l> Architecture<'l> {
     ///
     /// # Errors
     /// As [`Self::expect`].
-    pub fn expect_given(&self, config: &Value, evidence: &Evidence) -> Result<Expected, Vec<String>> {
+    pub fn expect_given(&self, config: &Value, evidence: &Evidence) -> Result<Expected, Refusal> {
         build::build(*self, config, evidence)
     }
 }

@@ -13,7 +13,7 @@ pub mod rule;
 pub mod selection;
 pub mod source;
 
-pub use architecture::{Architecture, Conversion, Expected, ExpectedTensor};
+pub use architecture::{Architecture, Conversion, Expected, ExpectedTensor, Refusal, UnknownPart};
 pub use evidence::Evidence;
 pub use expression::{EvalError, Expression, Scope, Template};
 pub use library::Library;

@@ -20,6 +20,12 @@ impl Target {
         let loader = Loader::nearest(version);
         Self { loader, stands_for: (version != loader.version()).then(|| version.to_owned()), leads }
     }
+
+    /// Makes it the one that counts, in place of the loader of `version`, which does not know the class.
+    pub(in crate::check) fn lead(&mut self, version: Option<&str>) {
+        self.leads = true;
+        self.stands_for = version.filter(|v| *v != self.loader.version()).map(str::to_owned);
+    }
 }
 
 /// The loaders to ask, each with the class it builds for this config.
@@ -54,8 +60,7 @@ pub fn targets<'l>(
             known.extend(others.find_map(built));
         }
         if let Some((target, _)) = known.first_mut() {
-            target.leads = true;
-            target.stands_for = version.filter(|v| *v != target.loader.version()).map(str::to_owned);
+            target.lead(version);
         }
     }
     known

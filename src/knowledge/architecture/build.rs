@@ -7,9 +7,10 @@ use serde_json::{Map, Value};
 use super::blueprint::{Blueprint, Class};
 use super::conversions::{self, Module};
 use super::member::{Kind, Member, Part, Tied};
+use super::refusal::{Refusal, UnknownPart};
 use super::resolve::{DEPTH_CAP, Resolver, at_path, evaluated, model_type};
 use super::{Architecture, Evidence, Expected, ExpectedTensor, TENSOR_CAP};
-use crate::knowledge::{EvalError, Expression, Scope, Template};
+use crate::knowledge::{Expression, Scope, Template};
 
 /// Entries visited before a config is refused: repeats whose conditions are all false cost time too.
 const STEP_CAP: usize = 2_000_000;
@@ -19,23 +20,10 @@ const NAME_CAP: usize = 1_000;
 /// Models within a model that conversions are looked up for; real ones have a few.
 const MODULE_CAP: usize = 1_000;
 
-/// One sentence on why a class cannot be built.
-pub(super) struct Refusal(pub String);
-
-impl From<EvalError> for Refusal {
-    fn from(e: EvalError) -> Self {
-        Self(e.to_string())
-    }
-}
-
 pub(super) type Outcome<T> = Result<T, Refusal>;
 
-pub(super) fn build(
-    architecture: Architecture<'_>,
-    config: &Value,
-    evidence: &Evidence,
-) -> Result<Expected, Vec<String>> {
-    let Value::Object(config) = config else { return Err(vec!["the config is not an object".to_owned()]) };
+pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &Evidence) -> Outcome<Expected> {
+    let Value::Object(config) = config else { return Err(Refusal::impossible("the config is not an object")) };
     let Architecture { library, file, class, loader } = architecture;
     let resolver = Resolver { library, loader, evidence };
     let mut builder = Builder { resolver, expected: Expected::default(), modules: Vec::new(), steps: 0 };
@@ -61,7 +49,12 @@ pub(super) fn build(
                 ..expected
             })
         }
-        Err(Refusal(reason)) => Err(reason.split('\n').map(str::to_owned).collect()),
+        // A default that looks into a sub-config nobody knows fails before the part is reached.
+        Err(Refusal::Impossible(reasons)) => Err(match resolver.unknown_sub_config(file, config) {
+            Some(part) => Refusal::UnknownPart(part),
+            None => Refusal::Impossible(reasons),
+        }),
+        Err(unknown) => Err(unknown),
     }
 }
 
@@ -144,7 +137,7 @@ impl<'l> Builder<'l> {
         }
         let outcome = bind_all(&class.lets, &mut scope)
             .and_then(|()| self.members(&class.tensors, Around { file, config }, &scope, place));
-        outcome.map_err(|refusal| match failed.into_iter().find(|(name, _)| refusal.0.contains(name.as_str())) {
+        outcome.map_err(|refusal| match failed.into_iter().find(|(name, _)| refusal.mentions(name)) {
             Some((_, cause)) => cause.into(),
             None => refusal,
         })
@@ -181,7 +174,7 @@ impl<'l> Builder<'l> {
         };
         let count_of = count.eval_u64(scope)?;
         if count_of > TENSOR_CAP as u64 {
-            return Err(Refusal(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
+            return Err(Refusal::impossible(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
         }
         for i in 0..count_of {
             let mut scope = scope.child();
@@ -201,7 +194,7 @@ impl<'l> Builder<'l> {
     ) -> Outcome<()> {
         self.steps = self.steps.saturating_add(1);
         if self.steps > STEP_CAP || self.expected.tensors.len() > TENSOR_CAP {
-            return Err(Refusal(format!("the config asks for more than {TENSOR_CAP} tensors")));
+            return Err(Refusal::impossible(format!("the config asks for more than {TENSOR_CAP} tensors")));
         }
         if !holds(member.when.as_ref(), scope)? {
             return Ok(());
@@ -210,7 +203,7 @@ impl<'l> Builder<'l> {
         bind_all(&member.lets, &mut scope)?;
         let name = format!("{}{}", place.prefix, name.try_render(&scope)?);
         if name.len() > NAME_CAP {
-            return Err(Refusal(format!("the config makes a tensor name of {} bytes", name.len())));
+            return Err(Refusal::impossible(format!("the config makes a tensor name of {} bytes", name.len())));
         }
         let place = Place { optional: member.optional.as_deref().or(place.optional), ..place };
         match &member.kind {
@@ -257,7 +250,7 @@ impl<'l> Builder<'l> {
     ) -> Outcome<()> {
         let depth = place.depth.saturating_add(1);
         if depth > DEPTH_CAP {
-            return Err(Refusal(format!("parts are nested more than {DEPTH_CAP} deep")));
+            return Err(Refusal::impossible(format!("parts are nested more than {DEPTH_CAP} deep")));
         }
         let outer = place.without;
         let without = Without { root: name, starts: &part.without, outer };
@@ -279,7 +272,7 @@ impl<'l> Builder<'l> {
         let scope = self.resolver.scope(&map);
         let built = self.class(file, class, Config { map: &map, scope: &scope }, place);
         built.map_err(|refusal| match &part.config {
-            Some(path) => Refusal(format!("{path}: {}", refusal.0)),
+            Some(path) => refusal.inside(path),
             None => refusal,
         })
     }
@@ -297,26 +290,23 @@ impl<'l> Builder<'l> {
             let named = if part.config.is_some() { None } else { around.model_types.first().map(String::as_str) };
             config.get("model_type").and_then(Value::as_str).or(named)
         };
+        let sub_config = || part.config.clone().unwrap_or_default();
         let class = if let Some(class) = &part.class {
             class.as_str()
         } else {
-            let model_type = model_type().ok_or_else(|| Refusal(format!("`{key}` is absent")))?;
+            let model_type = model_type().ok_or_else(|| Refusal::impossible(format!("`{key}` is absent")))?;
             let listed = part.by_model_type.get(model_type).and_then(Value::as_str);
             let auto = || library.of_model_type(model_type, loader)?.auto(part.auto.as_deref()?, loader);
             listed.or_else(auto).ok_or_else(|| {
-                let known: Vec<&str> = part.by_model_type.keys().map(String::as_str).collect();
-                let known =
-                    if part.auto.is_some() { String::new() } else { format!("; known here: {}", known.join(", ")) };
-                Refusal(format!(
-                    "`{key}` is {model_type:?}{}",
-                    if known.is_empty() { ", which is not known here" } else { &known }
-                ))
+                let model_type = Some(model_type.to_owned());
+                Refusal::UnknownPart(UnknownPart { config: sub_config(), model_type, class: None })
             })?
         };
         // Two files may have a class of one name: a part is first looked for in its own.
         let own = around.classes(loader).find(|c| c.name == class).map(|c| (around, c));
         own.or_else(|| library.entry(class, loader)).ok_or_else(|| {
-            Refusal(format!("the class {class}, which it has as a part, is not known for transformers {loader}"))
+            let class = Some(class.to_owned());
+            Refusal::UnknownPart(UnknownPart { config: sub_config(), model_type: None, class })
         })
     }
 
@@ -344,7 +334,7 @@ impl<'l> Builder<'l> {
                 Ok(())
             }
             indexmap::map::Entry::Occupied(taken) => {
-                Err(Refusal(format!("the config makes two tensors of the name {}", taken.key())))
+                Err(Refusal::impossible(format!("the config makes two tensors of the name {}", taken.key())))
             }
         }
     }

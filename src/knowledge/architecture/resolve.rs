@@ -3,7 +3,8 @@
 use serde_json::{Map, Value};
 
 use super::blueprint::{Blueprint, SubConfig};
-use super::build::{Outcome, Refusal};
+use super::build::Outcome;
+use super::refusal::{Refusal, UnknownPart};
 use super::{Evidence, Expected};
 use crate::knowledge::{Expression, Library, Loader, Scope};
 
@@ -27,7 +28,7 @@ impl Resolver<'_> {
         depth: usize,
     ) -> Outcome<Map<String, Value>> {
         if depth > DEPTH_CAP {
-            return Err(Refusal(format!("configs are nested more than {DEPTH_CAP} deep")));
+            return Err(Refusal::impossible(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
         let class = file.config(self.loader);
         fill(&mut config, &class.defaults);
@@ -50,7 +51,7 @@ impl Resolver<'_> {
             })
             .collect();
         if !unmet.is_empty() {
-            return Err(Refusal(unmet.join("\n")));
+            return Err(Refusal::Impossible(unmet));
         }
         compute(&mut config, &class.computed, &mut scope)?;
         Ok(config)
@@ -70,7 +71,7 @@ impl Resolver<'_> {
             (Some(Value::Object(map)), _) => map.clone(),
             (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
             (None | Some(Value::Null), None) => return Ok(None),
-            (Some(_), _) => return Err(Refusal(format!("`{key}` is not an object"))),
+            (Some(_), _) => return Err(Refusal::impossible(format!("`{key}` is not an object"))),
         };
         if let Some(model_type) = &spec.model_type
             && sub.get("model_type").is_none_or(Value::is_null)
@@ -81,7 +82,7 @@ impl Resolver<'_> {
         fill(&mut sub, &spec.defaults);
         let file =
             sub.get("model_type").and_then(Value::as_str).and_then(|t| self.library.of_model_type(t, self.loader));
-        let inside = |Refusal(e): Refusal| Refusal(format!("{key}: {e}"));
+        let inside = |refusal: Refusal| refusal.inside(key);
         // Qwen2-VL's vision config bears the model type of the whole (4.47.0): then `spec` alone speaks of it.
         if let Some(file) = file
             && !std::ptr::eq(file, owner)
@@ -93,6 +94,18 @@ impl Resolver<'_> {
             compute(&mut sub, &spec.computed, &mut scope).map_err(inside)?;
         }
         Ok(Some(sub))
+    }
+
+    /// A sub-config of a model type that no file knows, for a class that looked into it and failed.
+    pub fn unknown_sub_config(&self, file: &Blueprint, config: &Map<String, Value>) -> Option<UnknownPart> {
+        file.config(self.loader).configs.iter().find_map(|(key, spec)| {
+            let sub = config.get(key)?.as_object()?;
+            let model_type = sub.get("model_type").and_then(Value::as_str).or(spec.model_type.as_deref())?;
+            let is_known = spec.model_type.as_deref() == Some(model_type)
+                || self.library.of_model_type(model_type, self.loader).is_some();
+            let part = || UnknownPart { config: key.clone(), model_type: Some(model_type.to_owned()), class: None };
+            (!is_known).then(part)
+        })
     }
 
     /// A root scope: `c`, `major`, and the functions that look at stored tensors.
@@ -140,7 +153,7 @@ pub(super) fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> Outcome<
 fn value(written: &Value, scope: &Scope<'_>) -> Outcome<Value> {
     Ok(match written {
         Value::String(s) => match s.strip_prefix('=') {
-            Some(source) => Expression::parse(source).map_err(|e| Refusal(e.to_string()))?.eval(scope)?,
+            Some(source) => Expression::parse(source).map_err(|e| Refusal::impossible(e.to_string()))?.eval(scope)?,
             None => written.clone(),
         },
         Value::Object(map) => Value::Object(evaluated(map, scope)?),
@@ -154,8 +167,8 @@ pub(super) fn at_path<'c>(config: &'c Map<String, Value>, path: &str) -> Outcome
     for key in path.split('.') {
         at = match at.get(key) {
             Some(Value::Object(map)) => map,
-            None | Some(Value::Null) => return Err(Refusal(format!("`{path}` is absent"))),
-            Some(_) => return Err(Refusal(format!("`{path}` is not an object"))),
+            None | Some(Value::Null) => return Err(Refusal::impossible(format!("`{path}` is absent"))),
+            Some(_) => return Err(Refusal::impossible(format!("`{path}` is not an object"))),
         };
     }
     Ok(at)
