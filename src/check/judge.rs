@@ -9,7 +9,7 @@ use super::finding::LoadReport;
 use super::load::{self, Judged, Stored, Target};
 use super::quantization::{self, Quantised};
 use super::votes::{self, Explanation, Vote};
-use super::{index, layers};
+use super::{index, layers, size};
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::quantization::{Said, said};
 use crate::knowledge::{Architecture, Expected, Library, Loader, Refusal, UnknownPart};
@@ -73,6 +73,7 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
         faults.extend(layers::compare(stored.names()));
     }
     let mut candidates: Vec<Candidate<'_>> = Vec::new();
+    let (is_plain, mut sized) = (matches!(said, Said::Plain), None);
     for (target, architecture, expected) in built {
         match expected {
             Ok(expected) => {
@@ -89,6 +90,9 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                     votes,
                     rest: finished(checkpoint, &target, rest),
                 });
+                if let Some(report) = report.as_ref().filter(|_| sized.is_none() && target.leads && is_plain) {
+                    sized = size::compare(checkpoint, architecture, config, &expected, stored, report);
+                }
                 candidates.push(Candidate { target, expected, quantised, report, explained });
             }
             Err(Refusal::Impossible(reasons)) if target.leads => faults.push(
@@ -105,6 +109,7 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
         Some(first) => faults.extend(quantization::faults(checkpoint, &said, first.quantised.as_ref())),
         None => faults.extend(quantization::faults(checkpoint, &said, quantise(None).as_ref())),
     }
+    faults.extend(sized);
     faults.extend(load_faults(&candidates, stored));
     let mut votes: Vec<Vote> = Vec::new();
     for vote in candidates.iter().filter_map(|c| c.explained.as_ref()).flat_map(|e| &e.votes) {

@@ -11,6 +11,7 @@ pub mod layers;
 pub mod load;
 pub mod modules;
 pub mod quantization;
+pub mod size;
 pub mod tokens;
 pub mod votes;
 

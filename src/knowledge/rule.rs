@@ -262,6 +262,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "token-above-rows",
     "token-hole",
     "token-id-twice",
+    "total-size-not-of-class",
     "total-size-wrong",
     "unexpected-tensors",
     "unknown-architecture",

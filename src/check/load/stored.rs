@@ -106,7 +106,7 @@ impl Stored {
     }
 
     /// Tensors in the files the loader opens, by name.
-    pub(super) fn shapes(&self) -> impl Iterator<Item = (&str, &[u64])> {
+    pub(in crate::check) fn shapes(&self) -> impl Iterator<Item = (&str, &[u64])> {
         self.shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_slice()))
     }
 

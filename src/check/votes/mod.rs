@@ -20,6 +20,7 @@ use serde_json::Value;
 pub use self::explain::{Explanation, explain, fault};
 use self::solve::State;
 use self::space::Space;
+pub(super) use self::space::{leaves, with};
 use super::load::Stored;
 use crate::knowledge::{Architecture, Evidence, Expected};
 
@@ -178,7 +179,7 @@ pub fn put(config: &mut Value, pointer: &str, value: Value) {
 #[must_use]
 pub fn model_types(config: &Value) -> Vec<(String, Value)> {
     let inner = |pointer: &String| pointer.ends_with("/model_type") && pointer != "/model_type";
-    let pointers = space::leaves(config).into_iter().filter(inner);
+    let pointers = leaves(config).into_iter().filter(inner);
     pointers.filter_map(|p| Some((p.clone(), config.pointer(&p)?.clone()))).collect()
 }
 

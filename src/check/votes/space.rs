@@ -156,7 +156,7 @@ fn differing(a: &[u64], b: &[u64]) -> u64 {
 
 /// Pointers to the values of a config that could shape a model: numbers, flags, nulls and words, those in short
 /// lists too.
-pub(super) fn leaves(config: &Value) -> Vec<String> {
+pub(in crate::check) fn leaves(config: &Value) -> Vec<String> {
     let mut found = Vec::new();
     collect(config, &mut String::new(), &mut found);
     found
@@ -191,7 +191,7 @@ fn collect(value: &Value, pointer: &mut String, found: &mut Vec<String>) {
 
 /// `config` with the value at `pointer` replaced. What is not there on the way is taken from `resolved`, the same
 /// config with all defaults filled in.
-pub(super) fn with(config: &Value, resolved: &Value, pointer: &str, value: Value) -> Value {
+pub(in crate::check) fn with(config: &Value, resolved: &Value, pointer: &str, value: Value) -> Value {
     let mut config = config.clone();
     put(&mut config, resolved, pointer, value);
     config

@@ -1,0 +1,279 @@
+//! The bytes that an index states against those of the class: a check of shapes that needs no weights.
+//!
+//! `metadata.total_size` is the only thing that tells of shapes when no shard is there. A config value that changes no
+//! name (the key-value heads, the vocabulary) shows in it and nowhere else.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::Value;
+
+use super::finding::LoadReport;
+use super::load::{self, Stored};
+use super::votes::{leaves, with};
+use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::knowledge::{Architecture, Evidence, Expected};
+
+/// Tensors that may be built while values are tried.
+const BUDGET: usize = 400_000;
+/// Explanations that are named.
+const SHOWN: usize = 6;
+/// What is kept as 64-bit integers, whatever the type of the rest.
+const INTEGERS: [&str; 3] = ["num_batches_tracked", "position_ids", "relative_position_index"];
+/// Bytes of the narrowest and the widest float that weights are kept in without a quantisation scheme.
+const FLOATS: (u64, u64) = (2, 4);
+
+/// Compares the size in the index with that of the class, where no shard tells and every name is as it should be.
+#[must_use]
+pub fn compare(
+    checkpoint: &Checkpoint,
+    architecture: Architecture<'_>,
+    config: &Value,
+    expected: &Expected,
+    stored: &Stored,
+    report: &LoadReport,
+) -> Option<Fault> {
+    let index = checkpoint.index.as_ref()?;
+    let stated = index.total_bytes()?;
+    let clean = report.missing.is_empty() && report.unexpected.is_empty() && report.raises.is_none();
+    if !clean || stored.shapes().next().is_some() {
+        return None;
+    }
+    let width = width(config)?;
+    let here = load::in_model(expected, stored);
+    let weighed = Weighed::of(expected, &here)?;
+    let sizes = weighed.sizes(width)?;
+    let foreign = here.iter().any(|(name, _)| !expected.tensors.contains_key(name));
+    // Buffers that some versions save and others do not have are of any size.
+    let legitimate = sizes.contains(&stated)
+        || weighed.mixed(stated, width)
+        || (foreign && sizes.first().is_some_and(|least| stated > *least));
+    if legitimate {
+        return None;
+    }
+    let values = explain(architecture, config, expected, stored, stated, width);
+    let least = weighed.elements()?.checked_mul(FLOATS.0)?;
+    let most = weighed.sizes(FLOATS.1)?.into_iter().max()?;
+    // Tensors of several types may take anything in between.
+    if values.is_empty() && (least..=most).contains(&stated) {
+        return None;
+    }
+    let mut fault = Fault::new("total-size-not-of-class")
+        .at(Place::file(&index.document).pointer("/metadata/total_size"))
+        .with("stated", stated)
+        .with("computed", *sizes.first()?)
+        .with("class", expected.class.as_str());
+    let said = |(pointer, value): &(String, Value)| {
+        let key = pointer.trim_start_matches('/').replace('/', ".");
+        let now = expected.config.pointer(pointer).cloned().unwrap_or_default();
+        format!("{key} {value} instead of {now}")
+    };
+    let named: Vec<String> = values.iter().map(said).collect();
+    fault.places.extend(values.iter().map(|(pointer, _)| Place::file("config.json").pointer(pointer)));
+    if !named.is_empty() {
+        fault = fault.with("values", named.join(", or "));
+    }
+    Some(fault)
+}
+
+/// Bytes of a value of the type that config.json names; `None` for any but the usual floats, and for more than one.
+fn width(config: &Value) -> Option<u64> {
+    let mut types: BTreeSet<&str> = BTreeSet::new();
+    let configs = std::iter::once(config).chain(config.as_object()?.values().filter(|v| v.is_object()));
+    for config in configs {
+        types.extend(["torch_dtype", "dtype"].iter().filter_map(|key| config.get(key)?.as_str()));
+    }
+    let widths: Option<BTreeSet<u64>> = types
+        .into_iter()
+        .map(|name| match name.strip_prefix("torch.").unwrap_or(name) {
+            "bfloat16" | "float16" => Some(2),
+            "float32" => Some(4),
+            _ => None,
+        })
+        .collect();
+    let widths = widths?;
+    widths.first().copied().filter(|_| widths.len() == 1)
+}
+
+/// Elements of what is stored of a class.
+struct Weighed<'e> {
+    /// Floats, each storage once.
+    floats: Vec<(&'e str, u64)>,
+    /// Integers.
+    integers: u64,
+    /// Floats in names beyond the first of each storage: those that are stored, and those that are not.
+    copies: (u64, u64),
+}
+
+impl<'e> Weighed<'e> {
+    fn of(expected: &'e Expected, here: &Evidence) -> Option<Self> {
+        let mut weighed = Self { floats: Vec::new(), integers: 0, copies: (0, 0) };
+        let aliases = || expected.tensors.iter().filter_map(|(name, t)| Some((name, t, t.tied_to.as_deref()?)));
+        let shared: BTreeSet<&str> = aliases().filter(|(name, ..)| here.contains(name)).map(|(_, _, to)| to).collect();
+        for (name, tensor) in &expected.tensors {
+            let elements = tensor.shape.iter().try_fold(1_u64, |n, d| n.checked_mul(*d))?;
+            let is_here = here.contains(name);
+            if let Some(to) = &tensor.tied_to {
+                let both = is_here && here.contains(to);
+                let copies = if both { &mut weighed.copies.0 } else { &mut weighed.copies.1 };
+                *copies = copies.checked_add(elements)?;
+            } else if INTEGERS.iter().any(|end| name.ends_with(end)) {
+                weighed.integers = weighed.integers.checked_add(if is_here { elements } else { 0 })?;
+            } else if is_here || shared.contains(name.as_str()) {
+                weighed.floats.push((name, elements));
+            }
+        }
+        Some(weighed)
+    }
+
+    fn elements(&self) -> Option<u64> {
+        self.floats.iter().try_fold(0_u64, |sum, (_, elements)| sum.checked_add(*elements))
+    }
+
+    /// What programs may state, the least first: shared storages once, as often as they are stored, as often as they
+    /// are named.
+    fn sizes(&self, width: u64) -> Option<Vec<u64>> {
+        let mut sizes = BTreeSet::new();
+        let floats = self.elements()?;
+        for copies in [0, self.copies.0, self.copies.0.checked_add(self.copies.1)?] {
+            let bytes = floats.checked_add(copies)?.checked_mul(width)?;
+            for integer in [width, 8] {
+                sizes.insert(bytes.checked_add(self.integers.checked_mul(integer)?)?);
+            }
+        }
+        Some(sizes.into_iter().collect())
+    }
+
+    /// Whether the tensors of one kind, one module or one rank kept in the other float type make the difference; or all.
+    fn mixed(&self, stated: u64, width: u64) -> bool {
+        let other = if width == FLOATS.0 { FLOATS.1 } else { FLOATS.0 };
+        if self.sizes(other).is_some_and(|sizes| sizes.contains(&stated)) {
+            return true;
+        }
+        let mut groups: BTreeMap<String, u64> = BTreeMap::new();
+        for (name, elements) in &self.floats {
+            let parts: Vec<&str> = name.split('.').collect();
+            let unnumbered: Vec<&str> = parts.iter().map(|p| if p.parse::<u64>().is_ok() { "*" } else { p }).collect();
+            let starts = (1..=parts.len()).filter_map(|n| Some(format!("{}.", parts.get(..n)?.join("."))));
+            let kind = unnumbered.join(".");
+            let word = unnumbered.iter().rev().nth(1).map(|module| format!("*.{module}.*"));
+            for group in starts.chain([kind]).chain(word) {
+                let sum = groups.entry(group).or_default();
+                *sum = sum.saturating_add(*elements);
+            }
+        }
+        let sizes = self.sizes(width).unwrap_or_default();
+        let delta = |sum: u64| sum.saturating_mul(width.abs_diff(other));
+        groups.into_values().map(delta).any(|delta| {
+            let moved = |size: &u64| if other > width { size.checked_add(delta) } else { size.checked_sub(delta) };
+            sizes.iter().filter_map(moved).any(|size| size == stated)
+        })
+    }
+}
+
+/// Values of the config with which the class has the same names and the stated size; at most one for each key.
+fn explain(
+    architecture: Architecture<'_>,
+    config: &Value,
+    expected: &Expected,
+    stored: &Stored,
+    stated: u64,
+    width: u64,
+) -> Vec<(String, Value)> {
+    let evidence = stored.evidence();
+    let mut spent = 0_usize;
+    let mut sizes = |pointer: &str, value: u64| -> Option<Vec<u64>> {
+        if spent > BUDGET {
+            return None;
+        }
+        spent = spent.saturating_add(expected.tensors.len());
+        let config = with(config, &expected.config, pointer, value.into());
+        let built = architecture.expect_given(&config, &evidence).ok()?;
+        let same = built.tensors.len() == expected.tensors.len()
+            && built.tensors.keys().all(|name| expected.tensors.contains_key(name));
+        Weighed::of(&built, &load::in_model(&built, stored)).filter(|_| same)?.sizes(width)
+    };
+    let Some(now) = Weighed::of(expected, &load::in_model(expected, stored)).and_then(|w| w.sizes(width)) else {
+        return Vec::new();
+    };
+    let mut found = Vec::new();
+    for pointer in leaves(&expected.config) {
+        if found.len() >= SHOWN {
+            break;
+        }
+        let key = pointer.rsplit('/').next().unwrap_or_default();
+        let Some(value) = expected.config.pointer(&pointer).and_then(Value::as_u64).filter(|v| *v > 0) else {
+            continue;
+        };
+        if !architecture.speaks_of(key) {
+            continue;
+        }
+        let Some(doubled) = value.checked_mul(2) else { continue };
+        let probe = sizes(&pointer, doubled);
+        // Sizes that do not follow this value, and those that are not possible twice as large, tell nothing.
+        if probe.as_ref() == Some(&now) {
+            continue;
+        }
+        let mut candidates: BTreeSet<u64> = (1..=5_u32)
+            .flat_map(|n| [value.checked_shl(n), value.checked_shr(n).filter(|v| v.checked_shl(n) == Some(value))])
+            .flatten()
+            .filter(|v| *v > 0)
+            .collect();
+        // Most sizes are linear in most values.
+        for (at, twice) in now.iter().zip(probe.iter().flatten()) {
+            let step = i128::from(*twice).saturating_sub(i128::from(*at));
+            let missing = i128::from(stated).saturating_sub(i128::from(*at)).saturating_mul(i128::from(value));
+            let whole = missing.checked_rem(step) == Some(0);
+            let moved = missing.checked_div(step).filter(|_| whole).map(|n| n.saturating_add(i128::from(value)));
+            candidates.extend(moved.and_then(|v| u64::try_from(v).ok()).filter(|v| *v > 0));
+        }
+        let fits = candidates.into_iter().find(|v| sizes(&pointer, *v).is_some_and(|sizes| sizes.contains(&stated)));
+        if let Some(value) = fits {
+            found.push((pointer, value.into()));
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::knowledge::{Library, Loader};
+
+    /// A llama of 1000 rows and one layer: its embedding has 8000 elements, the rest 856.
+    fn llama(tied: bool) -> Expected {
+        let config = json!({
+            "architectures": ["LlamaForCausalLM"], "model_type": "llama", "hidden_size": 8, "intermediate_size": 24,
+            "num_hidden_layers": 1, "num_attention_heads": 2, "vocab_size": 1000, "tie_word_embeddings": tied,
+        });
+        Library::embedded().find(&config, [], Loader::V4_47_0).expect("llama").expect(&config).expect("built")
+    }
+
+    fn names(expected: &Expected) -> Evidence {
+        expected.tensors.keys().map(|name| (name.clone(), None)).collect()
+    }
+
+    #[test]
+    fn a_shared_storage_may_be_counted_once_or_as_often_as_it_is_named() {
+        let (rest, rows) = (4 * 8 * 8 + 3 * 8 * 24 + 3 * 8, 8000);
+        let tied = llama(true);
+        let sizes = Weighed::of(&tied, &names(&tied)).and_then(|w| w.sizes(2)).expect("sizes");
+        assert_eq!(sizes, [2 * (rest + rows), 2 * (rest + 2 * rows)]);
+        let apart = llama(false);
+        let sizes = Weighed::of(&apart, &names(&apart)).and_then(|w| w.sizes(2)).expect("sizes");
+        assert_eq!(sizes, [2 * (rest + 2 * rows)]);
+    }
+
+    #[test]
+    fn one_kind_or_module_in_the_other_type_is_legitimate_and_some_other_difference_is_not() {
+        let llama = llama(false);
+        let weighed = Weighed::of(&llama, &names(&llama)).expect("sizes");
+        let plain = *weighed.sizes(2).expect("sizes").first().expect("a size");
+        for more in [8000, 8, 4 * 8 * 8] {
+            assert!(weighed.mixed(plain + 2 * more, 2), "{more}");
+        }
+        assert!(weighed.mixed(2 * plain, 2), "all in float32");
+        assert!(!weighed.mixed(plain + 2 * 4000, 2) && !weighed.mixed(plain - 2 * 8, 2));
+    }
+}
