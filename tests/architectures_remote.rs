@@ -117,7 +117,9 @@ fn every_class_builds_what_its_own_code_builds() {
         assert!(differ.is_empty() && lacking.is_empty(), "{}: differ {differ:#?}, lacking {lacking:#?}", record.config);
         let ties = expected.tensors.iter().filter_map(|(n, t)| Some(vec![n.clone(), t.tied_to.clone()?]));
         assert_eq!(ties.collect::<Vec<_>>(), record.tied, "{}", record.config);
-        if let Some(buffers) = record.buffers {
+        // InternVL brings a copy of Phi-3 whose rotary buffers are none; the class of transformers that stands for it has them.
+        let copied = record.config.pointer("/llm_config/model_type") == Some(&"phi3".into());
+        if let Some(buffers) = record.buffers.filter(|_| !copied) {
             assert_eq!(expected.buffers.into_iter().collect::<Vec<_>>(), buffers, "{}", record.config);
         }
         architectures.insert(expected.architecture);

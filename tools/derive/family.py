@@ -46,6 +46,9 @@ UNDECLARED = {
 SWIN = {"hidden_size": "c.embed_dim * pow(2, size(c.depths) - 1)"}  # configuration_swin.py: `int(embed_dim * 2 ** (len(depths) - 1))`
 COMPUTED = {"swin": SWIN, "swinv2": SWIN, "maskformer-swin": SWIN, "donut-swin": SWIN}
 
+# Sub-configs that take the outer config's own values when there is none: `Qwen2VLConfig.__post_init__` of transformers 5.
+FLAT = {"qwen2_vl": "text_config", "qwen2_5_vl": "text_config"}
+
 
 @dataclass
 class Fit:
@@ -217,6 +220,8 @@ class Version:
                     else:
                         mine.setdefault(part, value)
         for key, spec in out.items():
+            if FLAT.get(model_type) == key and self.version.startswith("5"):
+                spec["flat"] = True
             if spec.get("type") == model_type:                # a config inside that bears the name of the one around it
                 spec["defaults"] = self.inside(model_type, key)
         return out

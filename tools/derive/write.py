@@ -139,7 +139,7 @@ class Writer:
         return side
 
     def sub_config(self, v, model_type, key, spec):
-        out = {}
+        out = {"flat": True} if spec.get("flat") else {}
         types = v.types(model_type, key)
         if spec.get("type"):
             out["type"] = spec["type"]

@@ -102,6 +102,10 @@ pub(crate) struct SubConfig {
     /// The sub-config when there is none, before that; without it, none is none.
     #[serde(default)]
     pub absent: Option<Map<String, Value>>,
+    /// Without a sub-config, the outer config's own values go into it: files of before there was one
+    /// (`Qwen2VLConfig.__post_init__` of transformers 5).
+    #[serde(default)]
+    pub flat: bool,
     /// Values that are written over the given ones.
     #[serde(default)]
     pub set: Map<String, Value>,
@@ -225,6 +229,7 @@ impl SubConfig {
         if other.absent.is_some() {
             self.absent.clone_from(&other.absent);
         }
+        self.flat |= other.flat;
         if !other.set.is_empty() {
             self.set.clone_from(&other.set);
         }
