@@ -31,11 +31,15 @@ impl Resolver<'_> {
             return Err(Refusal::impossible(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
         let class = file.config(self.loader);
-        let given = class.configs.iter().any(|(_, spec)| spec.flat).then(|| config.clone());
+        for (key, _) in class.configs.iter().filter(|(_, spec)| spec.flat) {
+            if config.get(key).is_none_or(Value::is_null) {
+                config.insert(key.clone(), Value::Object(values_of(&config)));
+            }
+        }
         fill(&mut config, &class.defaults);
         let mut scope = self.scope(&config);
         for (key, spec) in &class.configs {
-            if let Some(sub) = self.sub_config(file, spec, config.get(key), given.as_ref(), &scope, key, depth)? {
+            if let Some(sub) = self.sub_config(file, spec, config.get(key), &scope, key, depth)? {
                 config.insert(key.clone(), Value::Object(sub));
             }
         }
@@ -64,20 +68,13 @@ impl Resolver<'_> {
         owner: &Blueprint,
         spec: &SubConfig,
         given: Option<&Value>,
-        around: Option<&Map<String, Value>>,
         scope: &Scope<'_>,
         key: &str,
         depth: usize,
     ) -> Outcome<Option<Map<String, Value>>> {
         let mut sub = match (given, &spec.absent) {
             (Some(Value::Object(map)), _) => map.clone(),
-            (None | Some(Value::Null), Some(absent)) => {
-                let mut sub = evaluated(absent, scope)?;
-                let flat = around.filter(|_| spec.flat).into_iter().flatten();
-                let own = flat.filter(|(key, value)| *key != "model_type" && !value.is_object());
-                sub.extend(own.map(|(key, value)| (key.clone(), value.clone())));
-                sub
-            }
+            (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
             (None | Some(Value::Null), None) => return Ok(None),
             (Some(_), _) => return Err(Refusal::impossible(format!("`{key}` is not an object"))),
         };
@@ -199,4 +196,10 @@ impl Expected {
             }
         }
     }
+}
+
+/// What a config says of itself, without the configs inside it and its model type.
+fn values_of(config: &Map<String, Value>) -> Map<String, Value> {
+    let own = config.iter().filter(|(key, value)| *key != "model_type" && !value.is_object());
+    own.map(|(key, value)| (key.clone(), value.clone())).collect()
 }
