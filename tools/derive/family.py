@@ -42,12 +42,20 @@ UNDECLARED = {
 }
 
 
-# What a config class computes from a list's length, which no sample varies: {model_type: {key: how}}.
+# What a config class computes whatever is given, from a list's length that no sample varies: {model_type: {key: how}}.
 SWIN = {"hidden_size": "c.embed_dim * pow(2, size(c.depths) - 1)"}  # configuration_swin.py: `int(embed_dim * 2 ** (len(depths) - 1))`
 COMPUTED = {"swin": SWIN, "swinv2": SWIN, "maskformer-swin": SWIN, "donut-swin": SWIN}
 
 # Sub-configs that take the outer config's own values when there is none: `Qwen2VLConfig.__post_init__` of transformers 5.
 FLAT = {"qwen2_vl": "text_config", "qwen2_5_vl": "text_config"}
+
+
+def always(model_type, value):
+    """The same with the keys that a config class computes by itself written out."""
+    text = json.dumps(value)
+    for key, how in COMPUTED.get(model_type, {}).items():
+        text = re.sub(rf"\bc\.{key}\b", f"({how})", text)
+    return json.loads(text)
 
 
 @dataclass
@@ -170,7 +178,7 @@ class Version:
         for path in sorted((folder / "fit").glob("*.json")):
             raw = load(path)
             for key in ("tensors", "buffers", "parts", "computed"):
-                raw[key] = tidied(raw.get(key) or [])
+                raw[key] = always(raw["model_type"], tidied(raw.get(key) or []))
             fresh = folder / "fresh" / f"{raw['class']}.jsonl"
             if not fresh.exists():
                 out.reasons[raw["class"]] = "no unseen configs to verify on"
