@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::modules;
 use super::tokens::OpenedTokenizer;
+use super::{index, modules};
 use crate::checkpoint::{Checkpoint, Vocabulary};
 use crate::knowledge::Scope;
 
@@ -59,6 +59,7 @@ pub fn scope(
     scope.bind("directory", &json!(name.unwrap_or_default()));
     let has_weights = checkpoint.tensors().next().is_some();
     scope.bind("has_weights", &json!(has_weights));
+    scope.bind("all_read", &json!(has_weights && index::all_read(checkpoint)));
     let here = Arc::clone(checkpoint);
     scope.function1("shape", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.shape)));
     let here = Arc::clone(checkpoint);

@@ -114,4 +114,7 @@ pub struct Silent {
     pub name: String,
     /// Why: one of `indexed-but-absent`, `prefix-hijack`, `tied-over`.
     pub reason: String,
+    /// The tensor whose values it gets instead, when it is tied to one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
 }

@@ -27,6 +27,13 @@ fn readable(shard: &Shard) -> bool {
     !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind) || f.kind == "not-a-regular-file")
 }
 
+/// Whether every shard is there and its header could be read, so that a tensor that is not seen is not there.
+#[must_use]
+pub fn all_read(checkpoint: &Checkpoint) -> bool {
+    let named = checkpoint.index.iter().flat_map(|index| index.weight_map.values());
+    checkpoint.shards.values().all(readable) && named.into_iter().all(|name| checkpoint.shards.contains_key(name))
+}
+
 /// Which shard holds a tensor of that name; the first when there are several.
 fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
     let mut map: BTreeMap<&str, Vec<&str>> = BTreeMap::new();

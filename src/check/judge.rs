@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use serde_json::Value;
 
 use super::finding::LoadReport;
-use super::load::{self, Judged, Stored, Target};
+use super::load::{self, Judged, Moved, Stored, Target};
 use super::quantization::{self, Quantised};
 use super::votes::{self, Explanation, Vote};
 use super::{index, layers, size};
@@ -84,8 +84,19 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                 let report = report.flatten();
                 // A quantised tensor has the shape that its scheme packs it into, and does not vote.
                 let voting = report.as_ref().filter(|_| target.leads && matches!(said, Said::Plain));
-                let explained =
-                    voting.and_then(|report| votes::explain(architecture, config, &expected, stored, report));
+                // Under another prefix they are of no use to any loader, and still say what the config should.
+                let moved = voting.and_then(|report| load::moved(&expected, stored, report));
+                let explained = voting.and_then(|report| {
+                    let (stored, report) = moved.as_ref().map_or((stored, report), |m| (&m.stored, &m.report));
+                    votes::explain(architecture, config, &expected, stored, report)
+                });
+                let explained = match (explained, moved) {
+                    (explained, None) => explained,
+                    (explained, Some(Moved { report, faults: prefixes, .. })) => {
+                        faults.extend(prefixes);
+                        Some(explained.unwrap_or(Explanation { votes: Vec::new(), rest: report }))
+                    }
+                };
                 let explained = explained.map(|Explanation { votes, rest }| Explanation {
                     votes,
                     rest: finished(checkpoint, &target, rest),
@@ -110,7 +121,16 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
         None => faults.extend(quantization::faults(checkpoint, &said, quantise(None).as_ref())),
     }
     faults.extend(sized);
-    faults.extend(load_faults(&candidates, stored));
+    faults.extend(load_faults(&candidates, stored).into_iter().map(|fault| {
+        let names = (fault.detail.get("tensor"), fault.detail.get("by"));
+        let (Some(tensor), Some(by)) = (names.0.and_then(Value::as_str), names.1.and_then(Value::as_str)) else {
+            return fault;
+        };
+        match same_bytes(checkpoint, tensor, by) {
+            Some(false) => Fault { kind: "tied-over-another", ..fault },
+            _ => fault,
+        }
+    }));
     let mut votes: Vec<Vote> = Vec::new();
     for vote in candidates.iter().filter_map(|c| c.explained.as_ref()).flat_map(|e| &e.votes) {
         if votes.iter().all(|v| v.pointer != vote.pointer) {
@@ -148,8 +168,25 @@ fn finished(checkpoint: &Checkpoint, target: &Target, mut report: LoadReport) ->
     let unreadable: BTreeSet<&str> =
         checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
     report.missing.retain(|name| !unreadable.contains(name.as_str()));
+    // A shape that no bytes can have is the container's fault to report.
+    let impossible = |f: &&Fault| matches!(f.kind, "shape-overflow" | "sub-byte-misaligned");
+    let faults = checkpoint.shards.values().flat_map(|s| &s.faults).filter(impossible);
+    let impossible: BTreeSet<&str> = faults.flat_map(|f| &f.places).filter_map(|p| p.tensor.as_deref()).collect();
+    report.mismatched.retain(|m| !impossible.contains(m.name.as_str()));
+    // A copy that is overwritten by itself loses nothing.
+    report.silent.retain(|s| s.by.as_deref().and_then(|by| same_bytes(checkpoint, &s.name, by)) != Some(true));
     report.stands_for.clone_from(&target.stands_for);
     report
+}
+
+/// Whether two tensors hold the same; `None` when their bytes were not read.
+fn same_bytes(checkpoint: &Checkpoint, one: &str, other: &str) -> Option<bool> {
+    let contents = checkpoint.contents.as_ref()?;
+    let held = |name: &str| {
+        let (shard, tensor) = checkpoint.tensor(name)?;
+        Some((tensor.dtype, &tensor.shape, contents.digest(&shard.name, name)?))
+    };
+    Some(held(one)? == held(other)?)
 }
 
 /// The report with what rules of other families find, without which its lists would read as if all were well.

@@ -5,6 +5,7 @@
 mod convert;
 mod difference;
 mod keys;
+mod moved;
 mod pattern;
 mod rename;
 mod stored;
@@ -14,11 +15,12 @@ mod v5;
 
 use std::collections::BTreeSet;
 
-use super::finding::LoadReport;
+use super::finding::{LoadReport, Mismatch};
 use crate::checkpoint::{Fault, Place};
 use crate::knowledge::{Evidence, Expected, Loader};
 
 pub use difference::{Judged, difference};
+pub use moved::{Moved, moved};
 pub use stored::Stored;
 pub use target::{Target, targets};
 
@@ -61,7 +63,10 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     let mut faults = Vec::new();
     for kind in ["prefix-hijack", "tied-over"] {
         let silent = report.silent.iter().filter(|s| s.reason == kind);
-        faults.extend(silent.map(|s| Fault::new(kind).at(Place::tensor(&*s.name)).with("tensor", s.name.as_str())));
+        faults.extend(silent.map(|s| {
+            let fault = Fault::new(kind).at(Place::tensor(&*s.name)).with("tensor", s.name.as_str());
+            s.by.iter().fold(fault, |fault, by| fault.at(Place::tensor(by)).with("by", by.as_str()))
+        }));
     }
     if let Some(reason) = &report.raises {
         faults.push(Fault::new("load-raises").with("reason", reason.as_str()));
@@ -75,7 +80,16 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
                 faults.push(fault);
             }
         }
-        faults.extend(report.mismatched.iter().map(|m| {
+        // A shape of no elements is no other shape: nothing was stored.
+        let is_empty = |m: &&Mismatch| m.stored.contains(&0) && !m.expected.contains(&0);
+        let (empty, others): (Vec<&Mismatch>, Vec<&Mismatch>) = report.mismatched.iter().partition(is_empty);
+        if !empty.is_empty() {
+            let names: Vec<String> = empty.iter().map(|m| m.name.clone()).collect();
+            let mut fault = Fault::new("empty-tensors").with("count", names.len()).with("names", listed(&names));
+            fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
+            faults.push(fault);
+        }
+        faults.extend(others.into_iter().map(|m| {
             let fault = Fault::new("mismatched-tensor").at(Place::tensor(&*m.name)).with("tensor", m.name.as_str());
             fault.with("stored", m.stored.clone()).with("expected", m.expected.clone())
         }));

@@ -94,6 +94,8 @@ pub const FAULT_KINDS: &[&str] = &[
     "appended-section",
     "byte-order-mark",
     "comment-in-json",
+    "content-hash-differs",
+    "contents-unread",
     "dangling-symlink",
     "data-hole",
     "duplicate-header-key",
@@ -126,6 +128,7 @@ pub const FAULT_KINDS: &[&str] = &[
     "missing-comma",
     "no-format-metadata",
     "non-finite-number",
+    "non-finite-weights",
     "not-a-regular-file",
     "not-an-object",
     "not-safetensors",
@@ -153,6 +156,7 @@ pub const FAULT_KINDS: &[&str] = &[
     "weight-map-malformed",
     "weight-map-missing",
     "wrong-encoding",
+    "zero-tail",
 ];
 
 /// How many faults of one kind one file may have before the rest are only counted.

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use serde_json::Value;
 
 pub mod adapter;
+mod contents;
 mod discover;
 pub mod document;
 pub mod fault;
@@ -24,6 +25,7 @@ mod sniff;
 pub mod text;
 pub mod tokenizer;
 
+pub use contents::Contents;
 pub use discover::find_checkpoints;
 pub use document::Document;
 pub use fault::{FAULT_KINDS, Fault, Place};
@@ -84,6 +86,8 @@ pub struct Checkpoint {
     pub modules: BTreeMap<String, Module>,
     /// The tokenizer.
     pub tokenizer: Tokenizer,
+    /// What the tensors' bytes hold; `None` when they were not read.
+    pub contents: Option<Contents>,
     /// Faults of the directory itself; [`Checkpoint::all_faults`] has those of its parts too.
     pub faults: Vec<Fault>,
 }

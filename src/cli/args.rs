@@ -125,6 +125,9 @@ pub struct CheckArgs {
     /// Versions to predict the load for; default: the one that wrote config.json, and the newest known
     #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_for)]
     pub versions: Vec<String>,
+    /// Also read the bytes of every tensor: NaN and infinity, ends of zeros, tied matrices that differ, hub checksums
+    #[arg(long)]
+    pub deep: bool,
     /// Only these rules: codes, starts of codes (JSN), or names; comma-separated
     #[arg(long, value_name = "RULE", value_delimiter = ',')]
     pub select: Vec<String>,

@@ -35,7 +35,11 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
             if !seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone())) {
                 continue;
             }
-            let checkpoint = Arc::new(Checkpoint::open(&dir).with_context(|| dir.display().to_string())?);
+            let mut checkpoint = Checkpoint::open(&dir).with_context(|| dir.display().to_string())?;
+            if args.deep {
+                checkpoint.read_contents();
+            }
+            let checkpoint = Arc::new(checkpoint);
             let outcome = check_for(&checkpoint, &knowledge, &args.versions);
             reports.push(CheckpointReport::new(dir.display().to_string(), None, &checkpoint, &outcome));
         }

@@ -94,9 +94,9 @@ pub struct FaultCheck {
 /// class's defaults filled in), `text` (its language part), `arch`, `rows` (of the token embedding),
 /// `tokenizer` (`length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`),
 /// `tokens` (what the processor makes of it, by the names in `rules/processors/`, with `length` and
-/// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, and the functions `shape(tensor)`,
-/// `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`. A condition that cannot be evaluated because
-/// a value is not there is not a finding.
+/// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, `all_read` (every shard is there and
+/// its header was read), and the functions `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`,
+/// `id_of(token)`. A condition that cannot be evaluated because a value is not there is not a finding.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Assert {
@@ -230,6 +230,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "auto-map-unsafe-path",
     "config-incomputable",
     "config-outvoted",
+    "empty-tensors",
     "index-key-nowhere",
     "index-missing",
     "index-names-other-shard",
@@ -239,6 +240,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "missing-tensors",
     "module-needs-package",
     "mismatched-tensor",
+    "names-moved",
     "no-weights",
     "pickle-weights",
     "plain-though-quantized",
@@ -259,6 +261,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "stray-shard",
     "tensor-in-two-shards",
     "tied-over",
+    "tied-over-another",
     "token-above-rows",
     "token-hole",
     "token-id-twice",

@@ -16,6 +16,7 @@ use std::collections::BTreeSet;
 
 use ckpt_doctor::checkpoint::{FAULT_KINDS, Fault};
 
+mod contents;
 mod directories;
 mod documents;
 mod modules;
@@ -52,7 +53,8 @@ fn hold(cases: &[Case]) {
 #[test]
 fn every_kind_is_listed_once_in_order_and_produced_by_some_case() {
     assert!(FAULT_KINDS.is_sorted_by(|a, b| a < b));
-    let tables = [&documents::CASES, &shards::CASES, &modules::CASES, &tokenizers::CASES, &directories::CASES];
+    let tables =
+        [&documents::CASES, &shards::CASES, &contents::CASES, &modules::CASES, &tokenizers::CASES, &directories::CASES];
     let produced: BTreeSet<_> = tables.iter().flat_map(|t| t.iter()).flat_map(|c| &c.faults).map(|f| f.kind).collect();
     let listed: BTreeSet<_> = FAULT_KINDS.iter().copied().collect();
     assert_eq!(produced, listed);

@@ -191,8 +191,12 @@ fn load() -> LoadReport {
             mismatch("language_model.model.layers.1.mlp.down_proj.weight", &[64, 48], &[48, 64]),
         ],
         silent: vec![
-            Silent { name: "spatial_embed_tokens.weight".to_owned(), reason: "indexed-but-absent".to_owned() },
-            Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned() },
+            Silent {
+                name: "spatial_embed_tokens.weight".to_owned(),
+                reason: "indexed-but-absent".to_owned(),
+                by: None,
+            },
+            Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned(), by: None },
         ],
         raises: Some("ValueError: The state dictionary is corrupted.".to_owned()),
     }
@@ -265,7 +269,7 @@ pub fn hostile() -> Report {
         missing: vec![HOSTILE.to_owned()],
         unexpected: vec![HOSTILE.to_owned()],
         mismatched: vec![Mismatch { name: HOSTILE.to_owned(), stored: vec![1; 10_000], expected: vec![u64::MAX] }],
-        silent: vec![Silent { name: HOSTILE.to_owned(), reason: HOSTILE.to_owned() }],
+        silent: vec![Silent { name: HOSTILE.to_owned(), reason: HOSTILE.to_owned(), by: None }],
         ..LoadReport::default()
     }];
     Report::new(vec![checkpoint], None)

@@ -31,9 +31,9 @@ pub const BASES: &[&str] = &[
     "merged-wrapped",
 ];
 
-/// Makes every base below `root`.
-pub fn make_all(root: &Path, knowledge: &Knowledge) -> BTreeMap<&'static str, PathBuf> {
-    BASES
+/// Makes these bases below `root`.
+pub fn make_all(root: &Path, names: &[&'static str], knowledge: &Knowledge) -> BTreeMap<&'static str, PathBuf> {
+    names
         .iter()
         .map(|name| {
             let dir = root.join(name);

@@ -67,6 +67,8 @@ pub enum Change {
     Reshape { name: String, shape: Vec<u64> },
     /// Gives every tensor another dtype's name and width.
     Retype { name: String, dtype: String },
+    /// Writes bytes into a tensor's own, from byte `at` on.
+    Poke { tensor: String, at: usize, bytes: Bytes },
     /// Stores others in place of each tensor whose name ends so: ending, dtype and dimensions. These are expressions
     /// over the `rows` and `cols` of the tensor that goes.
     Pack { ending: String, into: Vec<(String, String, Vec<String>)> },
@@ -193,6 +195,7 @@ fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
         | Change::RenameTensors { .. }
         | Change::Reshape { .. }
         | Change::Retype { .. }
+        | Change::Poke { .. }
         | Change::Pack { .. }
         | Change::Shard { .. } => {
             tensors(change, dir);
@@ -264,6 +267,12 @@ fn tensors(change: &Change, dir: &Path) {
             let place = shard.tensors.iter().position(|t| t.name == *name).expect("held");
             let old = shard.tensors.remove(place);
             shard.add(name, dtype, &old.shape);
+        }
+        Change::Poke { tensor: name, at, bytes } => {
+            let shard = weights.holder(name);
+            let tensor = shard.tensors.iter_mut().find(|t| t.name == *name).expect("held");
+            let bytes = bytes.get();
+            tensor.bytes[*at..*at + bytes.len()].copy_from_slice(&bytes);
         }
         other => panic!("{other:?} is no change of tensors"),
     }

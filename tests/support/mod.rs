@@ -50,6 +50,9 @@ pub struct Case {
     /// Applied in order.
     #[serde(default)]
     changes: Vec<Change>,
+    /// Whether the tensors' bytes are read, as `check --deep` does. Those of sound cases always are.
+    #[serde(default)]
+    deep: bool,
     /// What has to be said; absent for a sound case.
     #[serde(default)]
     pub expect: Option<Expect>,
@@ -162,7 +165,7 @@ pub fn cases() -> Vec<Case> {
         cases.push(case);
     }
     for file in texts("fixtures/sound") {
-        let case = parse(file, "fixtures/");
+        let case = Case { deep: true, ..parse(file, "fixtures/") };
         assert!(case.expect.is_none(), "{} is sound and expects a finding", case.name);
         cases.push(case);
     }
@@ -171,6 +174,7 @@ pub fn cases() -> Vec<Case> {
         code: None,
         base: (*base).to_owned(),
         changes: Vec::new(),
+        deep: true,
         expect: None,
     });
     cases.extend(plain);
@@ -183,12 +187,96 @@ pub fn tried() -> &'static [Tried] {
     TRIED.get_or_init(try_all)
 }
 
+/// Opens and checks a directory.
+fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
+    let mut checkpoint = Checkpoint::open(dir).expect("a directory");
+    if deep {
+        checkpoint.read_contents();
+    }
+    check(&Arc::new(checkpoint), knowledge)
+}
+
+/// A defect in one of the two models.
+pub struct Seeded {
+    pub defect: String,
+    pub model: &'static str,
+    pub code: String,
+    pub says: String,
+    /// Rules that truly follow from the defect too.
+    pub also: Vec<String>,
+    pub count: usize,
+}
+
+/// All of them, with what was found.
+pub struct AllSeeded {
+    pub defects: usize,
+    pub tried: Vec<(Seeded, Outcome)>,
+    /// The models without a defect.
+    pub sound: Vec<(&'static str, Outcome)>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SeededFile {
+    defects: Vec<Planted>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Planted {
+    defect: String,
+    llama: Option<SeededCase>,
+    spatialvla: Option<SeededCase>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SeededCase {
+    changes: Vec<Change>,
+    #[serde(default)]
+    deep: bool,
+    code: String,
+    says: String,
+    #[serde(default)]
+    also: Vec<String>,
+    #[serde(default)]
+    count: Option<usize>,
+}
+
+/// Makes and checks every defect of `fixtures/seeded.json5`, once.
+pub fn seeded() -> &'static AllSeeded {
+    static SEEDED: OnceLock<AllSeeded> = OnceLock::new();
+    SEEDED.get_or_init(|| {
+        let path = "fixtures/seeded.json5";
+        let text = fs::read_to_string(project().join(path)).expect("text");
+        let file: SeededFile = source::parse(path, &text).unwrap_or_else(|e| panic!("{e}"));
+        let knowledge = knowledge();
+        let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
+        let bases = base::make_all(&temporary.path().join("bases"), &["llama-sharded", "spatialvla"], &knowledge);
+        let sound = bases.iter().map(|(name, dir)| (*name, look(dir, true, &knowledge))).collect();
+        let mut all = AllSeeded { defects: file.defects.len(), tried: Vec::new(), sound };
+        for Planted { defect, llama, spatialvla } in file.defects {
+            for (model, case) in [("llama-sharded", llama), ("spatialvla", spatialvla)] {
+                let Some(case) = case else { continue };
+                let room = temporary.path().join("room");
+                let made = change::make(&defect, &bases[model], &case.changes, &room);
+                let outcome = look(&made, case.deep, &knowledge);
+                fs::remove_dir_all(&room).expect("removing a fixture");
+                let SeededCase { code, says, also, count, .. } = case;
+                let seeded = Seeded { defect: defect.clone(), model, code, says, also, count: count.unwrap_or(1) };
+                all.tried.push((seeded, outcome));
+            }
+        }
+        all
+    })
+}
+
 fn try_all() -> Vec<Tried> {
     let knowledge = knowledge();
     let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
-    let bases = base::make_all(&temporary.path().join("bases"), &knowledge);
-    let look = |dir: &Path| check(&Arc::new(Checkpoint::open(dir).expect("a directory")), &knowledge);
-    let before: BTreeMap<&str, Outcome> = bases.iter().map(|(name, dir)| (*name, look(dir))).collect();
+    let bases = base::make_all(&temporary.path().join("bases"), BASES, &knowledge);
+    let before: BTreeMap<&str, Outcome> =
+        bases.iter().map(|(name, dir)| (*name, look(dir, true, &knowledge))).collect();
 
     let cases = cases();
     let pending = Mutex::new(cases.into_iter().enumerate());
@@ -199,7 +287,7 @@ fn try_all() -> Vec<Tried> {
             let base = bases.get(case.base.as_str()).unwrap_or_else(|| panic!("{}: no base {}", case.name, case.base));
             let room = temporary.path().join(number.to_string());
             let made = change::make(&case.name, base, &case.changes, &room);
-            let outcome = look(&made);
+            let outcome = look(&made, case.deep, &knowledge);
             let before = before[case.base.as_str()].findings.iter().map(|f| f.code.clone()).collect();
             fs::remove_dir_all(&room).expect("removing a fixture");
             done.lock().expect("no panic").insert(number, Tried { case, outcome, before });

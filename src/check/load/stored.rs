@@ -77,6 +77,21 @@ impl Stored {
         replaced
     }
 
+    /// The same with these names starting with `to` instead of `from`.
+    #[must_use]
+    pub fn under(&self, names: &[String], from: &str, to: &str) -> Self {
+        let names: BTreeSet<&String> = names.iter().collect();
+        let renamed = |name: &String| match name.strip_prefix(from).filter(|_| names.contains(name)) {
+            Some(rest) => format!("{to}{rest}"),
+            None => name.clone(),
+        };
+        Self {
+            keys: self.keys.iter().map(renamed).collect(),
+            shapes: self.shapes.iter().map(|(name, shape)| (renamed(name), shape.clone())).collect(),
+            absent: self.absent.iter().map(renamed).collect(),
+        }
+    }
+
     /// What the loader reads as keys.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.keys.iter().map(String::as_str)

@@ -40,16 +40,17 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
             missing.retain(|name| !group.contains(name));
         }
         let kept: Vec<&String> = group.iter().filter(|name| file.contains(*name) && !stored.is_absent(name)).collect();
-        silent
-            .extend(kept.into_iter().skip(1).map(|name| Silent { name: name.clone(), reason: "tied-over".to_owned() }));
+        let by = kept.first().map(|name| (*name).clone());
+        let over = |name: &String| Silent { name: name.clone(), reason: "tied-over".to_owned(), by: by.clone() };
+        silent.extend(kept.into_iter().skip(1).map(over));
     }
     pattern::ignore(&mut missing, &expected.ignore_missing);
     pattern::ignore(&mut unexpected, &expected.ignore_unexpected);
     for name in stored.absent().filter(|name| model.contains_key(&keys::renamed(name))) {
-        silent.push(Silent { name: name.to_owned(), reason: "indexed-but-absent".to_owned() });
+        silent.push(Silent { name: name.to_owned(), reason: "indexed-but-absent".to_owned(), by: None });
     }
     for name in keys::hijackers(expected, &file) {
-        silent.push(Silent { name: name.to_owned(), reason: "prefix-hijack".to_owned() });
+        silent.push(Silent { name: name.to_owned(), reason: "prefix-hijack".to_owned(), by: None });
     }
     silent.sort_by(|a, b| (&a.reason, &a.name).cmp(&(&b.reason, &b.name)));
 

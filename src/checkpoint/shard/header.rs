@@ -303,7 +303,7 @@ impl<'t> Reader<'_, 't> {
     }
 }
 
-fn hex(bytes: &[u8]) -> String {
+pub(in crate::checkpoint) fn hex(bytes: &[u8]) -> String {
     use std::fmt::Write as _;
     bytes.iter().fold(String::new(), |mut out, byte| {
         // Writing to a String cannot fail.

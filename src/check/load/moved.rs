@@ -1,0 +1,126 @@
+//! Tensors that are all there under other names: a wrapper's prefix, or a level too many or too few.
+//!
+//! `torch.compile` puts `_orig_mod.` before every name, `DataParallel` and `DeepSpeed` `module.`, a class that holds the
+//! model in an attribute that attribute's name. A loader reports every tensor twice then, as missing and as unexpected.
+//! Which prefix stands for which is read off the names themselves; nothing here knows any of them.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{Stored, predict};
+use crate::check::finding::LoadReport;
+use crate::checkpoint::{Fault, Place};
+use crate::knowledge::Expected;
+
+/// Stored names from which prefixes are guessed.
+const SAMPLES: usize = 48;
+/// Leading parts of a stored name that may be a prefix.
+const DEPTH: usize = 4;
+/// Prefixes that are told, one after the other.
+const ROUNDS: usize = 3;
+
+/// A checkpoint with its tensors under the names of the class.
+#[derive(Debug, Clone)]
+pub struct Moved {
+    /// The tensors, renamed.
+    pub stored: Stored,
+    /// What the loader would say of them.
+    pub report: LoadReport,
+    /// One for each prefix.
+    pub faults: Vec<Fault>,
+}
+
+/// Finds prefixes under which tensors of the class lie; `None` when there are none, or renaming does not help.
+#[must_use]
+pub fn moved(expected: &Expected, stored: &Stored, report: &LoadReport) -> Option<Moved> {
+    let mut found = Moved { stored: stored.clone(), report: report.clone(), faults: Vec::new() };
+    for _ in 0..ROUNDS {
+        if found.report.missing.is_empty() || found.report.unexpected.is_empty() {
+            break;
+        }
+        let Some(step) = best(expected, &found.stored) else { break };
+        let renamed = found.stored.under(&step.names, &step.from, &step.to);
+        let report = predict(expected, &renamed);
+        let cleared = size(&found.report).saturating_sub(size(&report));
+        // Each tensor was reported as missing and as unexpected, or was at least one of them.
+        if cleared < step.names.len() {
+            break;
+        }
+        found.faults.push(step.fault());
+        found.stored = renamed;
+        found.report = report;
+    }
+    (!found.faults.is_empty()).then_some(found)
+}
+
+fn size(report: &LoadReport) -> usize {
+    report.missing.len().saturating_add(report.unexpected.len()).saturating_add(usize::from(report.raises.is_some()))
+}
+
+/// A prefix, what the class has in its place, and the stored names that start so and would fit.
+struct Step {
+    from: String,
+    to: String,
+    names: Vec<String>,
+}
+
+impl Step {
+    fn fault(&self) -> Fault {
+        let mut fault = Fault::new("names-moved")
+            .with("from", self.from.as_str())
+            .with("to", self.to.as_str())
+            .with("count", self.names.len())
+            .with("names", super::listed(&self.names));
+        fault.places = self.names.iter().take(super::NAMES_SHOWN).map(Place::tensor).collect();
+        fault
+    }
+}
+
+/// The pair of prefixes that brings most tensors to their place.
+fn best(expected: &Expected, stored: &Stored) -> Option<Step> {
+    let here: BTreeSet<&str> = stored.names().collect();
+    let wanted: BTreeSet<&str> = expected.tensors.keys().map(String::as_str).filter(|n| !here.contains(n)).collect();
+    let strays: Vec<&str> = here.iter().copied().filter(|n| !expected.tensors.contains_key(*n)).collect();
+    let mut pairs: BTreeMap<(&str, &str), usize> = BTreeMap::new();
+    let step = strays.len().div_ceil(SAMPLES).max(1);
+    for stray in strays.iter().step_by(step) {
+        for (from, rest) in splits(stray) {
+            let fits = wanted.iter().filter_map(|name| Some((from, prefix(name, rest)?)));
+            // The shortest detour is the likeliest.
+            if let Some(pair) = fits.min_by_key(|(_, to)| to.len()) {
+                pairs.entry(pair).or_default();
+            }
+        }
+    }
+    for ((from, to), count) in &mut pairs {
+        let arrives = |n: &&&str| n.strip_prefix(*from).is_some_and(|rest| wanted.contains(&*format!("{to}{rest}")));
+        *count = strays.iter().filter(arrives).count();
+    }
+    let ((from, to), count) =
+        pairs.into_iter().max_by_key(|((from, to), count)| (*count, Reverse(from.len().saturating_add(to.len()))))?;
+    // One tensor under another name may be another tensor.
+    if count < 2 {
+        return None;
+    }
+    let arrives = |n: &&str| n.strip_prefix(from).is_some_and(|rest| wanted.contains(&*format!("{to}{rest}")));
+    let names = strays.into_iter().filter(arrives).map(str::to_owned).collect();
+    Some(Step { from: from.to_owned(), to: to.to_owned(), names })
+}
+
+/// A name taken apart after each of its first dots, and before the first; never behind a number, which is a place in a
+/// list and no prefix.
+fn splits(name: &str) -> impl Iterator<Item = (&str, &str)> {
+    let ends = name.match_indices('.').map(|(at, _)| at.saturating_add(1));
+    let cuts = std::iter::once(0).chain(ends.take(DEPTH));
+    cuts.filter_map(|at| name.split_at_checked(at)).filter(|(from, _)| !numbered(from))
+}
+
+/// What stands before `rest` in a name of the class.
+fn prefix<'n>(name: &'n str, rest: &str) -> Option<&'n str> {
+    let to = name.strip_suffix(rest)?;
+    ((to.is_empty() || to.ends_with('.')) && !numbered(to)).then_some(to)
+}
+
+fn numbered(prefix: &str) -> bool {
+    prefix.split('.').any(|part| part.parse::<u64>().is_ok())
+}

@@ -1,0 +1,179 @@
+//! What the bytes of the tensors hold; read only when somebody asks for it (`check --deep`).
+//!
+//! Every byte of every shard passes once through one buffer, whatever the size of the weights. Positioned reads, no
+//! memory map: a file that shrinks meanwhile is a message and not a signal.
+
+use std::collections::BTreeMap;
+use std::os::unix::fs::FileExt as _;
+use std::path::Path;
+
+use sha2::{Digest as _, Sha256};
+
+use super::open::{Opened, open_regular};
+use super::shard::hex;
+use super::{Checkpoint, Entry, Fault, Shard, Tensor};
+
+mod numbers;
+
+use numbers::Numbers;
+
+/// Bytes read at a time: a multiple of every element's width, so that none lies across two reads.
+const CHUNK: usize = 1 << 20;
+
+/// What reading the tensors' bytes gave.
+#[derive(Debug, Clone, Default)]
+pub struct Contents {
+    digests: BTreeMap<String, BTreeMap<String, [u8; 32]>>,
+}
+
+impl Contents {
+    /// SHA-256 of a tensor's bytes; `None` where they could not be read.
+    #[must_use]
+    pub fn digest(&self, shard: &str, tensor: &str) -> Option<&[u8; 32]> {
+        self.digests.get(shard)?.get(tensor)
+    }
+}
+
+impl Checkpoint {
+    /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
+    /// their bytes show. Never fails: what cannot be read is a fault too.
+    pub fn read_contents(&mut self) {
+        let mut contents = Contents::default();
+        for shard in self.shards.values_mut() {
+            let mut reading = Reading { shard, digests: BTreeMap::new(), faults: Vec::new() };
+            reading.run(&self.root, self.entries.get(&shard.name));
+            let Reading { digests, faults, .. } = reading;
+            contents.digests.insert(shard.name.clone(), digests);
+            if faults.iter().any(|f| f.kind == "zero-tail") {
+                // The reader of headers saw a part of it already, where the file system told.
+                shard.faults.retain(|f| f.kind != "zero-tail");
+            }
+            shard.faults.extend(faults);
+        }
+        self.contents = Some(contents);
+    }
+}
+
+/// One shard while it is read.
+struct Reading<'s> {
+    shard: &'s Shard,
+    digests: BTreeMap<String, [u8; 32]>,
+    faults: Vec<Fault>,
+}
+
+impl Reading<'_> {
+    fn run(&mut self, root: &Path, entry: Option<&Entry>) {
+        // A header that is not to be trusted says nothing of what the bytes behind it are; it has its own faults.
+        if self.shard.unread || self.shard.tensors.is_empty() {
+            return;
+        }
+        let opened = match open_regular(&root.join(&self.shard.name), u64::MAX) {
+            Ok(opened) => opened,
+            Err(error) => return self.unread(&error.to_string()),
+        };
+        if opened.identity.size != self.shard.file_len {
+            return self.unread("it changed while it was read");
+        }
+        if let Err(error) = self.tensors(&opened, entry) {
+            let ended = error.kind() == std::io::ErrorKind::UnexpectedEof;
+            self.unread(&if ended { "it became shorter while it was read".to_owned() } else { error.to_string() });
+        }
+    }
+
+    fn unread(&mut self, reason: &str) {
+        self.faults.push(Fault::new("contents-unread").at(self.shard.place()).with("reason", reason));
+    }
+
+    fn tensors(&mut self, opened: &Opened, entry: Option<&Entry>) -> std::io::Result<()> {
+        let mut buffer = vec![0_u8; CHUNK];
+        let region = self.shard.file_len.saturating_sub(self.shard.data_start);
+        let mut tensors: Vec<&Tensor> = self.shard.tensors.iter().filter(|t| t.begin <= t.end).collect();
+        tensors.sort_by_key(|t| (t.begin, t.end, t.name.as_str()));
+        // Only a shard that is covered by its tensors is a file read to its end.
+        let stated = entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == "zero-tail"));
+        let mut whole = stated.as_ref().map(|_| Sha256::new());
+        if let Some(whole) = &mut whole {
+            each_chunk(opened, 0, self.shard.data_start, &mut buffer, |bytes| whole.update(bytes))?;
+        }
+        // Where the last byte ends that is not zero, and the number of tensors before each that are all zero.
+        let mut last_value = 0_u64;
+        for tensor in &tensors {
+            // Of a shard that is cut short the rest can still be read.
+            if tensor.end > region {
+                continue;
+            }
+            let mut digest = Sha256::new();
+            let mut numbers = Numbers::of(tensor.dtype);
+            let mut at = tensor.begin;
+            let start = self.shard.data_start.saturating_add(tensor.begin);
+            each_chunk(opened, start, tensor.len(), &mut buffer, |bytes| {
+                digest.update(bytes);
+                if let Some(whole) = &mut whole {
+                    whole.update(bytes);
+                }
+                numbers.add(bytes);
+                if let Some(place) = bytes.iter().rposition(|byte| *byte != 0) {
+                    last_value = at.saturating_add(as_u64(place)).saturating_add(1);
+                }
+                at = at.saturating_add(as_u64(bytes.len()));
+            })?;
+            self.digests.insert(tensor.name.clone(), digest.finalize().into());
+            self.faults.extend(numbers.fault(self.shard, tensor));
+        }
+        if last_value < region {
+            let tail = tail(self.shard, &tensors, last_value);
+            self.faults.extend(tail);
+        }
+        if let (Some(whole), Some(stated)) = (whole, stated) {
+            let found = hex(&whole.finalize());
+            if found != stated {
+                let fault = Fault::new("content-hash-differs").at(self.shard.place());
+                self.faults.push(fault.with("stated", stated).with("found", found));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The SHA-256 that a file's name in the hub cache gives; smaller files have names of another kind.
+fn stated_digest(entry: &Entry) -> Option<String> {
+    let name = entry.link.as_deref()?.rsplit('/').next()?;
+    let is_digest = name.len() == 64 && name.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
+    is_digest.then(|| name.to_owned())
+}
+
+/// The fault of a shard whose last bytes from `from` on, counted in its data, are zero: when at least one whole matrix
+/// lies there. A bias may be zero, and so may be the second factor of a LoRA that was not trained.
+pub(super) fn tail(shard: &Shard, tensors: &[&Tensor], from: u64) -> Option<Fault> {
+    let zero = |t: &&&Tensor| t.begin >= from && !t.is_empty();
+    let matrix = |t: &&Tensor| t.shape.len() > 1 && !t.name.contains("lora_B") && !t.name.contains("lora_embedding_B");
+    let all: Vec<&Tensor> = tensors.iter().filter(zero).copied().collect();
+    let first = all.iter().find(|t| matrix(t))?;
+    let fault = Fault::new("zero-tail").at(shard.place().in_tensor(first.name.clone()));
+    let region = shard.file_len.saturating_sub(shard.data_start);
+    Some(fault.with("tensors", all.len()).with("bytes", region.saturating_sub(from)))
+}
+
+/// Hands `len` bytes from `start` on to `each`, in pieces.
+fn each_chunk(
+    opened: &Opened,
+    start: u64,
+    len: u64,
+    buffer: &mut [u8],
+    mut each: impl FnMut(&[u8]),
+) -> std::io::Result<()> {
+    let (mut at, mut left) = (start, len);
+    while left > 0 {
+        let size = usize::try_from(left).unwrap_or(usize::MAX).min(buffer.len());
+        let Some(piece) = buffer.get_mut(..size) else { return Ok(()) };
+        opened.file.read_exact_at(piece, at)?;
+        each(piece);
+        at = at.saturating_add(as_u64(size));
+        left = left.saturating_sub(as_u64(size));
+    }
+    Ok(())
+}
+
+fn as_u64(n: usize) -> u64 {
+    u64::try_from(n).unwrap_or(u64::MAX)
+}
