@@ -396,7 +396,7 @@ fn a_run_under_way_is_respected() {
     let staging = work.path().join(".out.partial");
     fs::create_dir(&staging).unwrap();
     fs::write(staging.join("ckpt-doctor-owner"), "process 4711").unwrap();
-    let lock = fs::File::open(&staging).unwrap();
+    let lock = fs::File::open(staging.join("ckpt-doctor-owner")).unwrap();
     lock.lock().unwrap();
     let run = tiny(&work.path().join("out"), &[]);
     assert_eq!(run.status.code(), Some(2));

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
 use anyhow::{Context, bail};
 use ckpt_doctor::check::Knowledge;
@@ -12,20 +11,17 @@ use ckpt_doctor::knowledge::recipe::{MergeFile, Recipe};
 use ckpt_doctor::knowledge::source;
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{Format, Report, Style, render};
-use ckpt_doctor::surgery::apply::{ApplyError, INTERRUPTED};
+use ckpt_doctor::surgery::apply::ApplyError;
 use ckpt_doctor::surgery::merge::pipeline::{self, PipelineError, Request, Run};
 
 use super::args::BuildMergedArgs;
-use super::{FINDINGS, library, output};
-
-/// What a shell expects of a program that Ctrl-C ended.
-const INTERRUPTED_CODE: u8 = 130;
+use super::{FINDINGS, library, output, signals};
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let request = request(args)?;
     let knowledge = Knowledge { library: library::with(rules)?, ..Knowledge::embedded()? };
-    ctrlc::set_handler(|| INTERRUPTED.store(true, Ordering::Relaxed)).context("setting up Ctrl-C")?;
+    signals::install()?;
     let terminal = std::io::stderr().is_terminal();
     let mut last = 0;
     let mut progress = |done: u64, total: u64| {
@@ -40,11 +36,14 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         Ok(run) => run,
         Err(PipelineError::Apply(ApplyError::Interrupted)) => {
             output::note("interrupted; nothing was written");
-            return Ok(INTERRUPTED_CODE);
+            return Ok(signals::exit_code());
         }
         Err(error) => return Err(error.into()),
     };
-    let by_severity = output::finish(&report(&run, false), &args.report)?;
+    let by_severity = output::finish(&report(&run, false), &args.report).with_context(|| match &*run.record.stage {
+        "written" => format!("{} is written; its report is not", run.record.out),
+        _ => "the report".to_owned(),
+    })?;
     // What matters is the result; findings on a donor that the merge repaired are told, not counted.
     Ok(match run.record.stage.as_str() {
         "written" | "dry-run" if args.report.exit_zero || !result_fails(&run, args) => super::CLEAN,

@@ -8,6 +8,7 @@ mod inspect;
 mod library;
 mod output;
 mod rules;
+mod signals;
 
 use std::process::ExitCode;
 

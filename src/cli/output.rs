@@ -10,10 +10,10 @@ use ckpt_doctor::report::{Format, Report, Style, render};
 use super::args::{Color, ReportArgs};
 use super::{CLEAN, FINDINGS};
 
-/// A line on standard error.
-#[expect(clippy::print_stderr, reason = "this is where the program talks")]
+/// A line on standard error. Where that cannot be written to (a full disk, a closed pipe) nobody listens, and
+/// `eprintln` would panic.
 pub fn note(line: &str) {
-    eprintln!("{line}");
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// Prints the report and writes those asked for; returns the exit code by severity.
@@ -64,7 +64,7 @@ fn columns() -> Option<usize> {
 }
 
 /// Progress on a terminal, on one line.
-#[expect(clippy::print_stderr, reason = "this is where the program talks")]
 pub fn progress(percent: u64) {
-    eprint!("\rwriting {percent:3} %{}", if percent >= 100 { "\r             \r" } else { "" });
+    let end = if percent >= 100 { "\r             \r" } else { "" };
+    let _ = write!(std::io::stderr(), "\rwriting {percent:3} %{end}");
 }

@@ -3,260 +3,103 @@
 //! Everything is written into a [`Staging`] directory beside the target and synced before the rename, so
 //! nothing under the final name ever exists half-done.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
-use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, LazyLock};
 
-use rustix::fs::OFlags;
-
+use super::donor::{AtRest, DonorFile};
 use super::plan::{Plan, PlannedShard, PlannedTensor, Source, TensorRef};
 use super::staging::Staging;
+use super::system::{ask_for_room, copy_in_kernel, create, explain};
 use super::transform;
 use super::verify::accepted_by_safetensors;
-use crate::checkpoint::open::{Opened, open_regular};
+use crate::checkpoint::open::open_regular;
 
-/// Set by the program's signal handler; a run under way then cleans up and stops.
-pub static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+pub use super::error::ApplyError;
+pub(super) use super::error::io_at;
+pub use super::target::check_target;
 
-/// Why nothing was written.
-#[derive(Debug, thiserror::Error)]
-pub enum ApplyError {
-    /// The target is in the way.
-    #[error("{path}: {reason}; choose an --out that does not exist yet or is an empty directory", path = path.display())]
-    Target {
-        /// The target.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The target and a donor overlap.
-    #[error("{path}: {reason}; donors are never written to, choose an --out elsewhere", path = path.display())]
-    Donor {
-        /// The target.
-        path: PathBuf,
-        /// How they overlap.
-        reason: String,
-    },
-    /// Another run holds the staging directory.
-    #[error("{path}: another run is writing there ({holder}); wait for it or choose another --out", path = path.display())]
-    Busy {
-        /// The target.
-        path: PathBuf,
-        /// Who holds it.
-        holder: String,
-    },
-    /// Not enough room.
-    #[error("{path}: no space: need {need} bytes, have {have}; free some or choose an --out on another disk", path = path.display())]
-    Space {
-        /// The directory that would hold the target.
-        path: PathBuf,
-        /// Bytes the plan takes.
-        need: u64,
-        /// Bytes free.
-        have: u64,
-    },
-    /// A donor changed while it was read.
-    #[error("{path}: {reason} while it was being read; nothing was written, run again when it is at rest", path = path.display())]
-    Changed {
-        /// The donor's file.
-        path: PathBuf,
-        /// What changed.
-        reason: String,
-    },
-    /// Ctrl-C.
-    #[error("interrupted; nothing was written")]
-    Interrupted,
-    /// Anything the system says.
-    #[error("{path}: {doing}: {error}", path = path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What was being done.
-        doing: &'static str,
-        /// What the system said.
-        error: io::Error,
-    },
-}
+/// The signal that asked the program to stop, set by its signal handler; 0 while there was none. A run under
+/// way then cleans up and stops.
+pub static INTERRUPTED: LazyLock<Arc<AtomicUsize>> = LazyLock::new(Arc::default);
 
-pub(super) fn io_at(path: &Path, doing: &'static str) -> impl FnOnce(io::Error) -> ApplyError {
-    move |error| ApplyError::Io { path: path.to_owned(), doing, error }
-}
-
-/// Checks that `out` may become a new directory: absent or empty, and apart from every donor.
-///
-/// Returns its parent and the path it will have, both resolved.
-///
-/// # Errors
-/// [`ApplyError::Target`] and [`ApplyError::Donor`]; [`ApplyError::Io`] when a path cannot be looked at.
-pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError> {
-    let target = |reason: &str| ApplyError::Target { path: out.to_owned(), reason: reason.to_owned() };
-    let name = match out.components().next_back() {
-        Some(std::path::Component::Normal(name)) => name.to_owned(),
-        // `.` and `..` name directories that exist; resolve them to find out which.
-        _ => fs::canonicalize(out)
-            .map_err(io_at(out, "resolving"))?
-            .file_name()
-            .ok_or_else(|| target("is the root directory"))?
-            .to_owned(),
-    };
-    match fs::symlink_metadata(out) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => {}
-        Err(e) => return Err(io_at(out, "looking at")(e)),
-        Ok(m) if m.is_symlink() => {
-            // A link to a donor deserves the clearer message.
-            if let Ok(real) = fs::canonicalize(out) {
-                apart(out, &real, donors)?;
-            }
-            return Err(target("is a symbolic link"));
-        }
-        Ok(m) if !m.is_dir() => return Err(target("is a file")),
-        Ok(_) => {
-            let real = fs::canonicalize(out).map_err(io_at(out, "resolving"))?;
-            apart(out, &real, donors)?;
-            if fs::read_dir(out).map_err(io_at(out, "listing"))?.next().is_some() {
-                return Err(target("is a directory with files in it"));
-            }
-        }
-    }
-    let parent = match out.parent() {
-        Some(p) if !p.as_os_str().is_empty() => p,
-        _ => Path::new("."),
-    };
-    let real_parent = fs::canonicalize(parent).map_err(|e| match e.kind() {
-        io::ErrorKind::NotFound => target(&format!("its parent {} does not exist", parent.display())),
-        _ => io_at(parent, "resolving")(e),
-    })?;
-    if !real_parent.is_dir() {
-        return Err(target("its parent is not a directory"));
-    }
-    let real = if name == "." { real_parent.clone() } else { real_parent.join(name) };
-    apart(out, &real, donors)?;
-    Ok(real)
-}
-
-fn apart(out: &Path, real: &Path, donors: &[&Path]) -> Result<(), ApplyError> {
-    let identity = fs::metadata(real).ok().map(|m| (m.dev(), m.ino()));
-    for donor in donors {
-        let Ok(donor_real) = fs::canonicalize(donor) else { continue };
-        let same = identity.is_some() && identity == fs::metadata(&donor_real).ok().map(|m| (m.dev(), m.ino()));
-        let reason = if same || donor_real == real {
-            "is the donor"
-        } else if real.starts_with(&donor_real) {
-            "lies inside the donor"
-        } else if donor_real.starts_with(real) {
-            "contains the donor"
-        } else {
-            continue;
-        };
-        return Err(ApplyError::Donor { path: out.to_owned(), reason: format!("{reason} {}", donor.display()) });
-    }
-    Ok(())
-}
-
-fn interrupted() -> Result<(), ApplyError> {
-    if INTERRUPTED.load(Ordering::Relaxed) { Err(ApplyError::Interrupted) } else { Ok(()) }
+pub(super) fn interrupted() -> Result<(), ApplyError> {
+    if INTERRUPTED.load(Ordering::Relaxed) == 0 { Ok(()) } else { Err(ApplyError::Interrupted) }
 }
 
 /// Writes `plan` as the directory `out` (a path from [`check_target`]); `progress` hears of bytes written.
 ///
+/// The `donors` must still be as they were seen, or nothing is published.
+///
 /// # Errors
-/// An [`ApplyError`]; then the target is as it was and the staging directory is gone.
-pub fn apply(plan: &Plan, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+/// An [`ApplyError`]; then the target is as it was and the staging directory is gone, unless the error says
+/// otherwise.
+pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
-    let space = rustix::fs::statvfs(parent).map_err(|e| io_at(parent, "asking for free space")(e.into()))?;
-    let have = space.f_bavail.saturating_mul(space.f_frsize);
-    if have < plan.len() {
-        return Err(ApplyError::Space { path: parent.to_owned(), need: plan.len(), have });
+    // The staging directory takes a few blocks of its own: two directories and a marker.
+    let files = plan.files.iter().map(|f| f.bytes.len() as u64).chain([1; 3]);
+    ask_for_room(parent, files.chain(plan.shards.iter().map(PlannedShard::file_len)))?;
+    let explained = |error| explain(error, parent, plan.len(), largest(plan));
+    let staging = Staging::new(out).map_err(explained)?;
+    let written = write(plan, staging.content(), progress)
+        .and_then(|()| donors.iter().try_for_each(AtRest::unchanged))
+        .and_then(|()| interrupted())
+        .and_then(|()| staging.publish(out));
+    match (written, staging.discard()) {
+        (Ok(()), _) => Ok(()), // what may be left is a marker that the next run removes
+        (Err(error), Ok(())) => Err(explained(error)),
+        (Err(error), Err((path, why))) => Err(ApplyError::Left { error: Box::new(explained(error)), path, why }),
     }
-    let staging = Staging::new(out)?;
+}
+
+fn largest(plan: &Plan) -> u64 {
+    plan.shards.iter().map(PlannedShard::file_len).max().unwrap_or_default()
+}
+
+fn write(plan: &Plan, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
     for shard in &plan.shards {
-        write_shard(&staging.content().join(&shard.name), shard, progress)?;
+        write_shard(&dir.join(&shard.name), shard, progress)?;
     }
     for file in &plan.files {
         interrupted()?;
-        let path = staging.content().join(&file.name);
+        let path = dir.join(&file.name);
         let mut f = create(&path)?;
-        f.write_all(&file.bytes).and_then(|()| f.sync_all()).map_err(io_at(&path, "writing"))?;
+        f.write_all(&file.bytes).map_err(io_at(&path, "writing"))?;
+        f.sync_all().map_err(io_at(&path, "syncing"))?;
         progress(file.bytes.len() as u64);
     }
-    interrupted()?;
-    staging.publish(out)
+    Ok(())
 }
 
-fn create(path: &Path) -> Result<File, ApplyError> {
-    let flags = i32::try_from(OFlags::NOFOLLOW.bits()).unwrap_or_default();
-    OpenOptions::new().write(true).create_new(true).custom_flags(flags).open(path).map_err(io_at(path, "creating"))
-}
-
-fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
     let mut out = create(path)?;
     let header = shard.header();
     out.write_all(&header).map_err(io_at(path, "writing"))?;
     progress(header.len() as u64);
-    let mut donor: Option<Donor> = None;
+    let mut donor: Option<DonorFile> = None;
     for tensor in &shard.tensors {
         interrupted()?;
         let from = tensor.source.donor();
         // Neighbouring tensors mostly share a donor file: keep it open.
         if donor.as_ref().is_none_or(|d| d.path != from.path) {
-            if let Some(done) = donor.take() {
-                done.unchanged()?;
-            }
-            donor = Some(Donor::open(&from.path)?);
+            donor = Some(DonorFile::open(&from.path)?);
         }
-        if let Some(d) = &mut donor {
+        if let Some(d) = &donor {
             write_tensor(&mut out, path, d, tensor, progress)?;
         }
     }
-    if let Some(done) = donor {
-        done.unchanged()?;
-    }
-    let want = (header.len() as u64).saturating_add(shard.data_len());
+    let want = shard.file_len();
     let is = out.metadata().map_err(io_at(path, "looking at"))?.len();
     if is != want {
         let error = io::Error::other(format!("wrote {is} bytes where the header says {want}"));
         return Err(io_at(path, "writing")(error));
     }
     out.sync_all().map_err(io_at(path, "syncing"))?;
-    // mmap needs a readable handle; `out` is write-only so that nothing is read back by accident.
+    // `out` is write-only so that nothing is read back by accident.
     let written = open_regular(path, u64::MAX).map_err(|e| io_at(path, "opening")(io::Error::other(e)))?;
     accepted_by_safetensors(&written.file).map_err(io_at(path, "verifying"))
-}
-
-/// A donor's file, with what it looked like when it was opened.
-struct Donor {
-    path: PathBuf,
-    opened: Opened,
-}
-
-impl Donor {
-    fn open(path: &Path) -> Result<Self, ApplyError> {
-        let opened = open_regular(path, u64::MAX)
-            .map_err(|e| ApplyError::Changed { path: path.to_owned(), reason: format!("became unreadable ({e})") })?;
-        Ok(Self { path: path.to_owned(), opened })
-    }
-
-    fn unchanged(&self) -> Result<(), ApplyError> {
-        let now = self.opened.file.metadata().map_err(io_at(&self.path, "looking at"))?;
-        let was = &self.opened.identity;
-        let same = now.len() == was.size && (now.mtime(), now.mtime_nsec()) == was.mtime;
-        if same { Ok(()) } else { Err(self.changed("changed")) }
-    }
-
-    fn changed(&self, reason: &str) -> ApplyError {
-        ApplyError::Changed { path: self.path.clone(), reason: reason.to_owned() }
-    }
-
-    /// An error of a read: a short one means that the donor was cut off under us.
-    fn read_error(&self, error: io::Error) -> ApplyError {
-        if error.kind() == io::ErrorKind::UnexpectedEof {
-            self.changed("was cut short")
-        } else {
-            io_at(&self.path, "reading")(error)
-        }
-    }
 }
 
 /// Bytes moved between two looks at [`INTERRUPTED`].
@@ -265,7 +108,7 @@ const SLICE: u64 = 64 * 1024 * 1024;
 fn write_tensor(
     out: &mut File,
     path: &Path,
-    donor: &mut Donor,
+    donor: &DonorFile,
     tensor: &PlannedTensor,
     progress: &mut dyn FnMut(u64),
 ) -> Result<(), ApplyError> {
@@ -277,12 +120,11 @@ fn write_tensor(
             let mut failed_read = None;
             let result = {
                 let mut writer = BufWriter::with_capacity(256 * 1024, &mut *out);
-                let file = &donor.opened.file;
                 let mut read = |at: u64, buf: &mut [u8]| {
-                    if INTERRUPTED.load(Ordering::Relaxed) {
+                    if interrupted().is_err() {
                         return Err(io::Error::from(io::ErrorKind::Other));
                     }
-                    file.read_exact_at(buf, from.offset.saturating_add(at)).map_err(|e| {
+                    donor.read_at(buf, from.offset.saturating_add(at)).map_err(|e| {
                         let kind = e.kind();
                         failed_read = Some(e);
                         io::Error::from(kind)
@@ -313,25 +155,38 @@ fn write_tensor(
     }
 }
 
-/// Moves a byte range inside the kernel where it can (`std::io::copy` uses `copy_file_range`).
+/// Copies a byte range: inside the kernel where it can, else through a buffer.
 fn copy_range(
     out: &mut File,
     path: &Path,
-    donor: &mut Donor,
+    donor: &DonorFile,
     from: &TensorRef,
     progress: &mut dyn FnMut(u64),
 ) -> Result<(), ApplyError> {
-    donor.opened.file.seek(SeekFrom::Start(from.offset)).map_err(io_at(&donor.path, "reading"))?;
+    let mut at = from.offset;
     let mut left = from.len;
+    let mut buffer = Vec::new();
     while left > 0 {
         interrupted()?;
-        let slice = left.min(SLICE);
-        let copied = io::copy(&mut (&donor.opened.file).take(slice), out).map_err(io_at(path, "writing"))?;
-        if copied < slice {
-            return Err(donor.changed("was cut short"));
-        }
+        let in_kernel = if buffer.is_empty() {
+            copy_in_kernel(donor.file(), at, out, left.min(SLICE)).map_err(io_at(path, "copying from a donor to it"))?
+        } else {
+            None
+        };
+        let copied = if let Some(n) = in_kernel {
+            n
+        } else {
+            buffer.resize(usize::try_from(left.min(BUFFER)).unwrap_or_default(), 0);
+            donor.read_at(&mut buffer, at).map_err(|e| donor.read_error(e))?;
+            out.write_all(&buffer).map_err(io_at(path, "writing"))?;
+            buffer.len() as u64
+        };
         progress(copied);
+        at = at.saturating_add(copied);
         left = left.saturating_sub(copied);
     }
     Ok(())
 }
+
+/// Bytes moved at a time where the kernel cannot copy by itself.
+const BUFFER: u64 = 1024 * 1024;

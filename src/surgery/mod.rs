@@ -1,8 +1,12 @@
 //! Findings or a recipe become a plan; only this module writes checkpoints.
 
 pub mod apply;
+pub mod donor;
+mod error;
 pub mod merge;
 pub mod plan;
 mod staging;
+mod system;
+mod target;
 pub mod transform;
 pub mod verify;

@@ -131,6 +131,12 @@ impl PlannedShard {
         self.tensors.iter().fold(0, |n, t| n.saturating_add(t.len()))
     }
 
+    /// Bytes of the file, header and data.
+    #[must_use]
+    pub fn file_len(&self) -> u64 {
+        (self.header().len() as u64).saturating_add(self.data_len())
+    }
+
     /// The header: length prefix and JSON, padded with spaces so that the data starts on a multiple of eight.
     ///
     /// Key order is `__metadata__`, then the tensors in file order: the same plan gives the same bytes.
@@ -195,7 +201,7 @@ impl Plan {
     #[must_use]
     pub fn len(&self) -> u64 {
         let files = self.files.iter().fold(0_u64, |n, f| n.saturating_add(f.bytes.len() as u64));
-        self.shards.iter().fold(files, |n, s| n.saturating_add(s.data_len()).saturating_add(s.header().len() as u64))
+        self.shards.iter().fold(files, |n, s| n.saturating_add(s.file_len()))
     }
 
     /// Whether there is nothing to write.

@@ -1,29 +1,43 @@
 //! The staging directory: where a checkpoint is written before it gets its name.
 //!
 //! `.NAME.partial` beside the target holds a marker that says who works on it, and `content`, which becomes
-//! the target by one rename. The directory is locked while a run works on it, so a second run sees the lock
-//! (the kernel frees it, whatever ends the first), and a run after a crash clears what the marker shows to
-//! be ours. A directory of that name without the marker is somebody's data and is left alone.
+//! the target by one rename. The marker is locked while a run works there, so a second run sees the lock (the
+//! kernel frees it, whatever ends the first), and a run after a crash clears what the marker shows to be ours.
+//! A directory of that name without the marker is somebody's data and is left alone.
+//!
+//! The lock is on the marker and not on the directory, because NFS locks only what is open for writing.
 #![expect(clippy::disallowed_methods, reason = "this module and apply.rs are where checkpoints are written")]
 
 use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io;
+use std::io::{self, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 
-use super::apply::{ApplyError, io_at};
+use super::error::{ApplyError, io_at};
+pub(super) use super::system::sync_dir;
+use super::system::{custom, remove_dir, remove_dir_all, remove_file, retry};
 use crate::checkpoint::open::read_capped;
 
 const MARKER: &str = "ckpt-doctor-owner";
 const CONTENT: &str = "content";
 
-/// A locked staging directory; dropped without [`Staging::publish`] it is removed.
+/// Where the staging directory of `out` is.
+pub(super) fn staging_path(out: &Path) -> PathBuf {
+    let mut name = std::ffi::OsString::from(".");
+    name.push(out.file_name().unwrap_or_default());
+    name.push(".partial");
+    out.with_file_name(name)
+}
+
+/// A locked staging directory; dropped without [`Staging::discard`] it is removed all the same.
 pub(super) struct Staging {
     path: PathBuf,
     content: PathBuf,
-    _lock: File,
+    lock: File,
+    /// The marker is gone, and with it the right to touch what is there.
+    over: bool,
 }
 
 impl Staging {
@@ -32,41 +46,80 @@ impl Staging {
     /// # Errors
     /// [`ApplyError::Busy`] when another run has it, [`ApplyError::Target`] when it is not ours to clear.
     pub(super) fn new(out: &Path) -> Result<Self, ApplyError> {
-        let name = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let path = out.with_file_name(format!(".{name}.partial"));
-        // Two rounds: a run that ended between our open and our lock took the directory with it.
-        for _ in 0..2 {
-            match fs::create_dir(&path) {
-                Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&path, "creating")(e)),
-                _ => {}
-            }
-            let flags = i32::try_from((OFlags::DIRECTORY | OFlags::NOFOLLOW).bits()).unwrap_or_default();
-            let lock = match OpenOptions::new().read(true).custom_flags(flags).open(&path) {
-                Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
-                other => other.map_err(io_at(&path, "opening"))?,
+        let path = staging_path(out);
+        // Three rounds: a run that ends between our steps takes the directory or the marker with it.
+        for _ in 0..3 {
+            let made = match retry(|| fs::create_dir(&path)) {
+                Ok(()) => true,
+                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => false,
+                Err(e) => return Err(io_at(&path, "creating")(e)),
             };
-            match lock.try_lock() {
-                Ok(()) => {}
-                Err(TryLockError::WouldBlock) => {
-                    let holder = read_capped(&path.join(MARKER), 64).unwrap_or_default();
-                    let holder = String::from_utf8(holder).unwrap_or_default();
-                    let holder = if holder.is_empty() { "just started".to_owned() } else { holder };
-                    return Err(ApplyError::Busy { path: out.to_owned(), holder });
+            match Self::lock(out, &path, made) {
+                Ok(Some(staging)) => return Ok(staging),
+                Ok(None) => {}
+                Err(error) => {
+                    if made {
+                        // It stays when another run is quicker and works there: then it is not empty.
+                        let _ = remove_dir(&path);
+                    }
+                    return Err(error);
                 }
-                Err(TryLockError::Error(e)) => return Err(io_at(&path, "locking")(e)),
-            }
-            let held = lock.metadata().map_err(io_at(&path, "looking at"))?;
-            let same = fs::symlink_metadata(&path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
-            if same {
-                clear(&path)?;
-                let staging = Self { content: path.join(CONTENT), path, _lock: lock };
-                let marker = staging.path.join(MARKER);
-                fs::write(&marker, format!("process {}", std::process::id())).map_err(io_at(&marker, "writing"))?;
-                fs::create_dir(&staging.content).map_err(io_at(&staging.content, "creating"))?;
-                return Ok(staging);
             }
         }
         Err(ApplyError::Busy { path: out.to_owned(), holder: "it ended just now".to_owned() })
+    }
+
+    /// Locks the marker in `path`; `None` when the directory went away meanwhile.
+    fn lock(out: &Path, path: &Path, made: bool) -> Result<Option<Self>, ApplyError> {
+        if !made && !is_ours(path)? {
+            return Ok(None);
+        }
+        let marker = path.join(MARKER);
+        let mut options = OpenOptions::new();
+        let options = options.read(true).write(true).create(true).truncate(false);
+        let lock = match options.custom_flags(custom(OFlags::NOFOLLOW | OFlags::NONBLOCK)).open(&marker) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+            other => other.map_err(io_at(&marker, "opening"))?,
+        };
+        loop {
+            match lock.try_lock() {
+                Ok(()) => break,
+                Err(TryLockError::WouldBlock) => return Err(busy(out, &marker)),
+                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Interrupted => {}
+                // Lustre, for one, may be mounted without locks. Who made the directory has it to itself then.
+                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported && made => break,
+                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
+                    let reason = "is there, and without locks on this file system nobody can tell whether a run is \
+                                  still writing; remove it if none is";
+                    return Err(ApplyError::Target { path: path.to_owned(), reason: reason.to_owned() });
+                }
+                Err(TryLockError::Error(e)) => {
+                    if made {
+                        let _ = remove_file(&marker);
+                    }
+                    return Err(io_at(&marker, "locking")(e));
+                }
+            }
+        }
+        let held = lock.metadata().map_err(io_at(&marker, "looking at"))?;
+        if !fs::symlink_metadata(&marker).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino())) {
+            return Ok(None);
+        }
+        let content = path.join(CONTENT);
+        // From here on whatever fails removes the directory: it is ours.
+        let mut staging = Self { path: path.to_owned(), content, lock, over: false };
+        remove_dir_all(&staging.content).map_err(io_at(&staging.content, "removing"))?;
+        staging.sign().map_err(io_at(&marker, "writing"))?;
+        retry(|| fs::create_dir(&staging.content)).map_err(io_at(&staging.content, "creating"))?;
+        Ok(Some(staging))
+    }
+
+    /// Writes into the marker who works here.
+    fn sign(&mut self) -> io::Result<()> {
+        let host = rustix::system::uname();
+        let signature = format!("process {} on {}", std::process::id(), host.nodename().to_string_lossy());
+        retry(|| self.lock.set_len(0))?;
+        self.lock.write_all(signature.as_bytes())
     }
 
     /// Where files are written.
@@ -77,46 +130,83 @@ impl Staging {
     /// Makes the content durable and gives it its name.
     ///
     /// # Errors
-    /// [`ApplyError::Io`]; a failed sync is a failure, never retried.
-    pub(super) fn publish(self, out: &Path) -> Result<(), ApplyError> {
+    /// [`ApplyError::Io`]; a failed sync is a failure, never retried, and the name is taken back.
+    pub(super) fn publish(&self, out: &Path) -> Result<(), ApplyError> {
         sync_dir(&self.content)?;
         // rename(2) replaces an empty directory and refuses any other: exactly the rule for the target.
-        fs::rename(&self.content, out).map_err(io_at(out, "publishing"))?;
-        out.parent().map_or(Ok(()), sync_dir)
-    }
-}
-
-/// Removes what a crashed run left in a staging directory of ours.
-fn clear(path: &Path) -> Result<(), ApplyError> {
-    let names: Vec<_> = fs::read_dir(path)
-        .and_then(|entries| entries.map(|e| e.map(|e| e.file_name())).collect::<io::Result<_>>())
-        .map_err(io_at(path, "listing"))?;
-    let ours = names.is_empty() || names.iter().any(|n| n == MARKER);
-    if !ours || names.iter().any(|n| n != MARKER && n != CONTENT) {
-        let reason = "has this name and was not made by ckpt-doctor, which works there; move it away".to_owned();
-        return Err(ApplyError::Target { path: path.to_owned(), reason });
-    }
-    for (name, is_dir) in [(CONTENT, true), (MARKER, false)] {
-        let inner = path.join(name);
-        let removed = if is_dir { fs::remove_dir_all(&inner) } else { fs::remove_file(&inner) };
-        match removed {
-            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(io_at(&inner, "removing")(e)),
-            _ => {}
+        retry(|| fs::rename(&self.content, out)).map_err(io_at(out, "publishing"))?;
+        let synced = out.parent().map_or(Ok(()), sync_dir);
+        match synced {
+            Err(ApplyError::Io { error, .. }) if retry(|| fs::rename(out, &self.content)).is_err() => {
+                Err(ApplyError::Unsynced { path: out.to_owned(), error })
+            }
+            other => other,
         }
     }
-    Ok(())
+
+    /// Removes the staging directory with all that is in it.
+    ///
+    /// # Errors
+    /// Its path, and what the system said.
+    pub(super) fn discard(mut self) -> Result<(), (PathBuf, io::Error)> {
+        self.remove().map_err(|why| (self.path.clone(), why))
+    }
+
+    /// The marker goes last, so that what is left is still known to be ours.
+    fn remove(&mut self) -> io::Result<()> {
+        if self.over {
+            return Ok(());
+        }
+        remove_dir_all(&self.content)?;
+        // Without its marker the directory is anybody's: the next run may begin in it before we remove it.
+        self.over = true;
+        remove_file(&self.path.join(MARKER))?;
+        match remove_dir(&self.path) {
+            Err(e) if e.kind() == io::ErrorKind::DirectoryNotEmpty => Ok(()),
+            other => other,
+        }
+    }
 }
 
 impl Drop for Staging {
     fn drop(&mut self) {
-        // Best effort: when something failed, that error is the one to report; the next run clears the rest.
-        // The marker goes last, so that what is left is still known to be ours.
-        let _ = fs::remove_dir_all(&self.content);
-        let _ = fs::remove_file(self.path.join(MARKER));
-        let _ = fs::remove_dir(&self.path);
+        // For panics and early errors; after `discard` there is nothing left to do.
+        let _ = self.remove();
     }
 }
 
-fn sync_dir(path: &Path) -> Result<(), ApplyError> {
-    File::open(path).and_then(|d| d.sync_all()).map_err(io_at(path, "syncing"))
+/// Whether the directory is one that a run of ours left behind or works in; `false` when it is gone.
+fn is_ours(path: &Path) -> Result<bool, ApplyError> {
+    let not_ours = |reason: &str| ApplyError::Target {
+        path: path.to_owned(),
+        reason: format!("{reason}, and ckpt-doctor works under this name; move it away"),
+    };
+    let metadata = match fs::symlink_metadata(path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(false),
+        other => other.map_err(io_at(path, "looking at"))?,
+    };
+    if !metadata.is_dir() {
+        return Err(not_ours("is not a directory"));
+    }
+    // Who owns a directory can swap what is in it while we write.
+    if metadata.uid() != rustix::process::geteuid().as_raw() {
+        return Err(not_ours("belongs to another user"));
+    }
+    let names: io::Result<Vec<_>> =
+        fs::read_dir(path).and_then(|entries| entries.map(|e| e.map(|e| e.file_name())).collect());
+    let names = match names {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(false),
+        other => other.map_err(io_at(path, "listing"))?,
+    };
+    if !(names.is_empty() || names.iter().any(|n| n == MARKER)) || names.iter().any(|n| n != MARKER && n != CONTENT) {
+        return Err(not_ours("was not made by ckpt-doctor"));
+    }
+    Ok(true)
+}
+
+fn busy(out: &Path, marker: &Path) -> ApplyError {
+    let holder = read_capped(marker, 400).unwrap_or_default();
+    let holder = String::from_utf8(holder).unwrap_or_default();
+    let holder = if holder.is_empty() { "just started".to_owned() } else { holder };
+    ApplyError::Busy { path: out.to_owned(), holder }
 }

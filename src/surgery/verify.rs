@@ -5,19 +5,62 @@
 
 use std::fs::File;
 use std::io;
+use std::os::unix::fs::FileExt;
 
 use memmap2::Mmap;
 use safetensors::SafeTensors;
+use safetensors::tensor::Metadata;
 
 /// Reads a written shard with the safetensors crate, whose checks are the format's definition.
 ///
-/// Nothing but the header is touched, whatever the size of the file.
+/// Nothing but the header is touched, whatever the size of the file. Where a file cannot be mapped (some
+/// network file systems, a limit on memory) the crate gets the header alone.
 ///
 /// # Errors
-/// When the file cannot be mapped, or the crate refuses it.
+/// When the file cannot be read, or the crate refuses it.
 #[expect(unsafe_code, reason = "mapping a file is unsafe because others may change it; nobody else has this one")]
 pub fn accepted_by_safetensors(file: &File) -> io::Result<()> {
     // SAFETY: the caller has just written this file into a directory it has locked; it is not changed while mapped.
-    let map = unsafe { Mmap::map(file)? };
-    SafeTensors::deserialize(&map).map(drop).map_err(io::Error::other)
+    let map = unsafe { Mmap::map(file) };
+    match map {
+        Ok(map) => SafeTensors::deserialize(&map).map(drop).map_err(io::Error::other),
+        Err(_) => header_accepted(file),
+    }
+}
+
+/// The same checks on the header alone, and the length of the file against it.
+fn header_accepted(file: &File) -> io::Result<()> {
+    let mut prefix = [0; 8];
+    file.read_exact_at(&mut prefix, 0)?;
+    let stated = u64::from_le_bytes(prefix);
+    let mut header = vec![0; usize::try_from(stated).map_err(io::Error::other)?];
+    file.read_exact_at(&mut header, 8)?;
+    let metadata: Metadata = serde_json::from_slice(&header)?;
+    let end = (metadata.data_len() as u64).saturating_add(stated).saturating_add(8);
+    if end == file.metadata()?.len() { Ok(()) } else { Err(io::Error::other("the header and the length disagree")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_a_map_the_verdict_is_the_same() {
+        let header = br#"{"a":{"dtype":"U8","shape":[2],"data_offsets":[0,2]}}"#;
+        let wrong = br#"{"a":{"dtype":"U8","shape":[3],"data_offsets":[0,2]}}"#;
+        let mut whole = (header.len() as u64).to_le_bytes().to_vec();
+        whole.extend_from_slice(header);
+        let mut misfit = (wrong.len() as u64).to_le_bytes().to_vec();
+        misfit.extend_from_slice(wrong);
+        for bytes in [&mut whole, &mut misfit] {
+            bytes.extend_from_slice(&[1, 2]);
+        }
+        let cases = [(&whole[..], true), (&whole[..whole.len() - 1], false), (&misfit, false), (&whole[..20], false)];
+        for (bytes, sound) in cases {
+            let file = tempfile::tempfile().unwrap();
+            file.write_all_at(bytes, 0).unwrap();
+            assert_eq!(accepted_by_safetensors(&file).is_ok(), sound, "{bytes:?}");
+            assert_eq!(header_accepted(&file).is_ok(), sound, "{bytes:?}");
+        }
+    }
 }

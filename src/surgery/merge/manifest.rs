@@ -1,7 +1,7 @@
 //! `merge-manifest.json`: what went into a merged checkpoint, so that it can be made again and compared.
 
 use std::fmt::Write;
-use std::io::{self, Read};
+use std::io::Read;
 use std::path::Path;
 
 use serde_json::{Map, Value, json};
@@ -10,6 +10,9 @@ use sha2::{Digest, Sha256};
 use super::{Donor, Draft, Options};
 use crate::checkpoint::open::open_regular;
 use crate::knowledge::recipe::Recipe;
+use crate::surgery::apply::{ApplyError, interrupted};
+use crate::surgery::error::io_at;
+use crate::surgery::system::retry;
 
 /// File name in the merged directory.
 pub const NAME: &str = "merge-manifest.json";
@@ -20,14 +23,14 @@ pub const NAME: &str = "merge-manifest.json";
 /// same manifest. With `all_bytes` whole shards are hashed, otherwise their headers.
 ///
 /// # Errors
-/// When a donor's file cannot be read.
+/// When a donor's file cannot be read, or a signal asked to stop.
 pub fn manifest(
     recipe: &Recipe,
     options: &Options,
     donors: &[Donor],
     draft: &Draft,
     all_bytes: bool,
-) -> io::Result<Value> {
+) -> Result<Value, ApplyError> {
     let mut hashed = Map::new();
     for donor in donors {
         let mut documents = Map::new();
@@ -69,12 +72,14 @@ pub fn manifest(
 }
 
 /// SHA-256 of a file, in hexadecimal.
-fn hash(path: &Path) -> io::Result<String> {
-    let mut opened = open_regular(path, u64::MAX).map_err(io::Error::other)?;
+fn hash(path: &Path) -> Result<String, ApplyError> {
+    let mut opened = open_regular(path, u64::MAX)
+        .map_err(|e| ApplyError::Changed { path: path.to_owned(), reason: format!("became unreadable ({e})") })?;
     let mut hasher = Sha256::new();
     let mut block = vec![0_u8; 1 << 20];
     loop {
-        let n = opened.file.read(&mut block)?;
+        interrupted()?;
+        let n = retry(|| opened.file.read(&mut block)).map_err(io_at(path, "reading"))?;
         if n == 0 {
             break;
         }

@@ -13,7 +13,8 @@ use crate::check::{Knowledge, Outcome, Severity, check};
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
 use crate::checkpoint::{Checkpoint, Document, Entry, Module, OpenError, Parts, Vocabulary};
 use crate::knowledge::recipe::Recipe;
-use crate::surgery::apply::{ApplyError, apply, check_target};
+use crate::surgery::apply::{ApplyError, apply, check_target, interrupted};
+use crate::surgery::donor::AtRest;
 use crate::surgery::plan::PlannedFile;
 
 /// What a merge is asked to do.
@@ -75,9 +76,6 @@ pub enum PipelineError {
     /// A data file inside the program or given by the user is not right.
     #[error(transparent)]
     Data(#[from] crate::knowledge::source::DataError),
-    /// A donor could not be read for the manifest.
-    #[error("reading the donors for the manifest: {0}")]
-    Manifest(std::io::Error),
 }
 
 /// Runs a merge as far as it goes.
@@ -101,8 +99,12 @@ pub fn run(
     let out = check_target(&request.out, &dirs)?;
 
     let mut donors = Vec::new();
+    let mut at_rest = Vec::new();
     for (role, dir) in &request.donors {
+        interrupted()?;
+        let seen = AtRest::see(dir);
         let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Open { role: role.clone(), error })?;
+        at_rest.push(seen?);
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);
         donors.push(Donor { role: role.clone(), checkpoint: Arc::clone(&checkpoint), config: outcome.config.clone() });
@@ -151,7 +153,7 @@ pub fn run(
     accompany(&mut drafted, &mut run, &recipe, &options, &donors, request, report)?;
     let total = drafted.plan.len();
     let mut done = 0_u64;
-    apply(&drafted.plan, &out, &mut |bytes| {
+    apply(&drafted.plan, &at_rest, &out, &mut |bytes| {
         done = done.saturating_add(bytes);
         progress(done, total);
     })?;
@@ -342,7 +344,7 @@ fn accompany(
     request: &Request,
     report: &dyn Fn(&Run) -> String,
 ) -> Result<(), PipelineError> {
-    let value = manifest::manifest(recipe, options, donors, drafted, request.hash).map_err(PipelineError::Manifest)?;
+    let value = manifest::manifest(recipe, options, donors, drafted, request.hash)?;
     let mut text = serde_json::to_string_pretty(&value).unwrap_or_default();
     text.push('\n');
     let origin = "made by the merge";

@@ -1,0 +1,98 @@
+//! What can go wrong while a checkpoint is written, in words that say what to do next.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Why nothing was written.
+#[derive(Debug, thiserror::Error)]
+pub enum ApplyError {
+    /// The target is in the way.
+    #[error("{path}: {reason}; choose an --out that does not exist yet or is an empty directory", path = path.display())]
+    Target {
+        /// The target.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The target and a donor overlap.
+    #[error("{path}: {reason}; donors are never written to, choose an --out elsewhere", path = path.display())]
+    Donor {
+        /// The target.
+        path: PathBuf,
+        /// How they overlap.
+        reason: String,
+    },
+    /// Another run holds the staging directory.
+    #[error("{path}: another run is writing there ({holder}); wait for it or choose another --out", path = path.display())]
+    Busy {
+        /// The target.
+        path: PathBuf,
+        /// Who holds it.
+        holder: String,
+    },
+    /// Not enough room: by the estimate, or found while writing.
+    #[error("{path}: {cause}: need {need} bytes, have {have}; free some or choose an --out on another disk", path = path.display())]
+    Space {
+        /// What was being written, or the directory that would hold the target.
+        path: PathBuf,
+        /// `no space`, or what the system said.
+        cause: String,
+        /// Bytes still to be written.
+        need: u64,
+        /// Bytes free.
+        have: u64,
+    },
+    /// One file is larger than may be.
+    #[error("{path}: the file would be too large: need {need} bytes, {limit}; choose smaller shards", path = path.display())]
+    FileSize {
+        /// The file.
+        path: PathBuf,
+        /// Its size when it is whole.
+        need: u64,
+        /// Whose limit it is.
+        limit: String,
+    },
+    /// A donor changed while it was read.
+    #[error("{path}: {reason} while it was being read; nothing was written, run again when it is at rest", path = path.display())]
+    Changed {
+        /// The donor's file.
+        path: PathBuf,
+        /// What changed.
+        reason: String,
+    },
+    /// A signal, such as that of Ctrl-C.
+    #[error("interrupted; nothing was written")]
+    Interrupted,
+    /// Anything the system says.
+    #[error("{path}: {doing}: {error}; nothing was written", path = path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What was being done.
+        doing: &'static str,
+        /// What the system said.
+        error: io::Error,
+    },
+    /// Writing failed, and so did removing what was written until then.
+    #[error("{error}; {path} could not be removed ({why}), the next run with the same --out will try again", path = path.display())]
+    Left {
+        /// What went wrong first.
+        error: Box<Self>,
+        /// The staging directory.
+        path: PathBuf,
+        /// What the system said to its removal.
+        why: io::Error,
+    },
+    /// The target has its name, and can neither be made durable nor be taken back.
+    #[error("{path}: is whole, but may not outlive a power failure, because the system failed to sync its name: {error}", path = path.display())]
+    Unsynced {
+        /// The target.
+        path: PathBuf,
+        /// What the system said.
+        error: io::Error,
+    },
+}
+
+pub(super) fn io_at(path: &Path, doing: &'static str) -> impl FnOnce(io::Error) -> ApplyError {
+    move |error| ApplyError::Io { path: path.to_owned(), doing, error }
+}

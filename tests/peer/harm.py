@@ -1,0 +1,322 @@
+"""What crash.py does harm with: a place with donors and a target, the program under strace, and the promises.
+
+Linux only. strace makes the N-th call of a kind fail, or sends a signal there, without a change to the program.
+"""
+
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+from peer import DONORS
+
+PROGRAM = os.environ.get("CKPT_DOCTOR", "ckpt-doctor")
+LINE = re.compile(r"(\d+) +(\w+)\((.*)")
+# What the kernel logs of a call that another thread cut in two.
+RESUMED = re.compile(r"(\d+) +<\.\.\. (\w+) resumed>")
+RESULT = re.compile(r"\) += (-?\d+)[^=]*$")
+# Opens that the dynamic linker and the runtime do are no business of ours: everything before this call.
+CHANGES = {
+    "mkdir", "mkdirat", "rename", "renameat", "renameat2", "link", "linkat", "symlink", "symlinkat", "unlink", "unlinkat",
+    "rmdir", "write", "pwrite64", "writev", "copy_file_range", "sendfile", "splice", "ftruncate", "fallocate", "fsync",
+    "fdatasync", "chmod", "fchmod", "fchmodat", "chown", "fchown", "fchownat", "flock", "utimensat",
+}  # fmt: skip
+
+
+class Broken(Exception):
+    """A promise that was not kept."""
+
+
+class Call:
+    """The N-th call of its name in a run."""
+
+    def __init__(self, name, nth, text):
+        self.name, self.nth, self.text = name, nth, text
+        found = RESULT.search(text)
+        self.result = int(found[1]) if found else None
+
+    @property
+    def creates(self):
+        return self.name == "openat" and "O_CREAT" in self.text
+
+    @property
+    def kind(self):
+        """Its name, or what it does where that matters more."""
+        if self.creates:
+            return "creating"
+        return "mapping" if self.name == "mmap" and "safetensors" in self.text else self.name
+
+    @property
+    def changes(self):
+        return self.name in CHANGES or self.creates
+
+    @property
+    def paths(self):
+        """Paths in the arguments: given ones, and those that strace shows for descriptors."""
+        return re.findall(r'(?:"|\d<)(/[^">]*)', self.text)
+
+    @property
+    def printed(self):
+        return self.name == "write" and re.match(r"[12]<", self.text)
+
+    def __str__(self):
+        return f"{self.name} #{self.nth} ({self.text[:150]})"
+
+
+def tree(directory):
+    """What a directory holds, to the byte: name to mode and content."""
+    found = {}
+    for path in sorted(Path(directory).rglob("*")):
+        name = str(path.relative_to(directory))
+        if path.is_symlink():
+            found[name] = ("link", os.readlink(path))
+        elif path.is_dir():
+            found[name] = ("directory", path.stat().st_mode)
+        else:
+            found[name] = (path.stat().st_mode, hashlib.sha256(path.read_bytes()).hexdigest())
+    return found
+
+
+def identity(directory):
+    """Which files there are and which they are. A write would show in the change time, which nobody can set."""
+    found = {}
+    for path in sorted([directory, *Path(directory).rglob("*")]):
+        s = path.lstat()
+        found[str(path)] = (s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_mode, s.st_nlink, s.st_uid, s.st_gid)
+    return found
+
+
+class Outcome:
+    def __init__(self, code, said, log=""):
+        self.code, self.said, self.log = code, said, log
+
+
+class Job:
+    """One kind of run, in a place of its own."""
+
+    name = ""
+
+    def __init__(self, place):
+        self.place = Path(place)
+        self.work = self.place / "work"  # where it writes; a small disk is mounted here
+        self.work.mkdir(parents=True)
+        self.command = ""
+        self.twins = []
+        self.lay()
+        self.reset()
+        first = self.run()
+        if first.code != 0 or self.left_over():
+            raise Broken(f"{self.name} undisturbed: exit {first.code}, left {self.left_over()}\n{first.said}")
+        self.complete = self.target()
+        self.sizes = self.written()
+        self.reset()
+
+    def places(self, count):
+        """This one, and more of its kind beside it."""
+        while len(self.twins) + 1 < count:
+            self.twins.append(type(self)(f"{self.place}-{len(self.twins) + 2}"))
+        return [self, *self.twins][:count]
+
+    # The kinds say what follows.
+
+    def lay(self):
+        """Puts what the run starts from."""
+
+    def reset(self):
+        """Makes the target what it was before a run."""
+
+    def argv(self):
+        raise NotImplementedError
+
+    def target(self):
+        """The target as it is, in a form to compare."""
+        raise NotImplementedError
+
+    def left_over(self):
+        """Names that are neither input nor target."""
+        raise NotImplementedError
+
+    def inputs(self):
+        """What no run may touch."""
+        raise NotImplementedError
+
+    def written(self):
+        """Sizes of the files that a run wrote."""
+        raise NotImplementedError
+
+    def held(self, changes):
+        """Those of the calls at which the lock is held and says by whom."""
+        raise NotImplementedError
+
+    def again(self):
+        """Makes way for a run after one that came to its end."""
+        self.reset()
+
+    # The rest is common.
+
+    def state(self):
+        """`old` or `complete`; what is neither is half."""
+        now = self.target()
+        if now == self.complete:
+            return "complete"
+        if now == self.old:
+            return "old"
+        raise Broken(f"the target is half: {describe(now, self.complete)}")
+
+    def run(self, **options):
+        done = subprocess.run(self.argv(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
+        return Outcome(done.returncode, done.stdout)
+
+    def strace(self, *options, argv=None, **more):
+        """Runs under strace; the log is what the options asked for."""
+        log = self.place / "strace.log"
+        command = ["strace", "-f", "-qq", "-o", str(log), *options, "--", *(argv or self.argv())]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **more)
+        self.command = " ".join(command)
+        outcome = Outcome(done.returncode, done.stdout, log.read_text(errors="replace"))
+        log.unlink()
+        return outcome
+
+    def inject(self, call, what):
+        """One run in which `what` happens at `call`; says whether it did."""
+        outcome = self.strace("-e", f"trace={call.name}", "-e", f"inject={call.name}:{what}:when={call.nth}")
+        if "signal=" not in what and "(INJECTED)" not in outcome.log:
+            raise Broken(f"strace injected nothing at {call}: the program does not do the same twice")
+        return outcome
+
+    def calls(self):
+        """All calls of an undisturbed run, and where those that write begin and end."""
+        outcome = self.strace("-y", "-s", "8")
+        if outcome.code != 0:
+            raise Broken(f"{self.name} under strace: exit {outcome.code}\n{outcome.said}")
+        self.reset()
+        seen, calls, processes = {}, [], set()
+        for line in outcome.log.splitlines():
+            found = LINE.match(line)
+            if found and not RESUMED.match(line):
+                processes.add(found[1])
+                seen[found[2]] = seen.get(found[2], 0) + 1
+                calls.append(Call(found[2], seen[found[2]], found[3]))
+        if len(processes) != 1:
+            raise Broken("the program has threads, and strace counts calls by thread: teach this script which one writes")
+        ours = [i for i, call in enumerate(calls) if call.changes and not call.printed]
+        return calls, ours[0], ours[-1]
+
+    @contextlib.contextmanager
+    def disk(self, options):
+        """A disk of its own for what it writes."""
+        subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", str(self.work)], check=True)
+        try:
+            self.reset()
+            yield
+        finally:
+            subprocess.run(["umount", "--lazy", str(self.work)], check=True)
+
+    def promises(self, outcome, before, done_is_fine=True, left_is_fine=False):
+        """What holds after any run that came to an end by itself."""
+        if self.inputs() != before:
+            raise Broken("an input was touched")
+        state = self.state()
+        if outcome.code == 0 and state != "complete":
+            raise Broken("exit 0, and the target is not complete")
+        if outcome.code < 0 or outcome.code in (101, 134, 139):
+            raise Broken(f"ended by a signal or a panic: {outcome.code}\n{outcome.said}")
+        if outcome.code != 0 and state != "old" and not done_is_fine:
+            raise Broken(f"exit {outcome.code}, and yet the target is there\n{outcome.said}")
+        if self.left_over() and not left_is_fine:
+            raise Broken(f"left behind: {self.left_over()}\n{outcome.said}")
+        return state
+
+    def recovers(self):
+        """The next run does all its work, whatever the last one left."""
+        before = self.inputs()
+        if self.state() == "complete":
+            self.again()
+        outcome = self.run()
+        if outcome.code != 0 or self.state() != "complete" or self.left_over():
+            raise Broken(f"the next run: exit {outcome.code}, {self.state()}, left {self.left_over()}\n{outcome.said}")
+        if self.inputs() != before:
+            raise Broken("the next run touched an input")
+        self.reset()
+
+
+class Build(Job):
+    """`build-merged` of the two tiny donors."""
+
+    name = "build"
+    old = None
+    race_codes = ([0, 2],)
+
+    def lay(self):
+        self.donors = self.place / "donors"
+        shutil.copytree(DONORS, self.donors, dirs_exist_ok=True)
+        self.out = self.work / "merged"
+
+    def reset(self):
+        shutil.rmtree(self.out, ignore_errors=True)
+
+    def argv(self):
+        return [PROGRAM, "build-merged", "--vision", str(self.donors / "spatialvla-tiny"),
+                "--language", str(self.donors / "llava3d-tiny"), "--out", str(self.out),
+                "--set", "shard-size=300KB", "--output-format", "concise"]  # fmt: skip
+
+    def target(self):
+        return tree(self.out) if self.out.exists() else None
+
+    def left_over(self):
+        return sorted(p.name for p in self.work.iterdir() if p != self.out)
+
+    def inputs(self):
+        return identity(self.donors)
+
+    def held(self, changes):
+        signed = next(i for i, call in enumerate(changes) if call.name == "mkdir" and call.nth == 2)
+        named = next(i for i, call in enumerate(changes) if call.name == "rename")
+        return changes[signed:named]
+
+    def written(self):
+        return [path.stat().st_size for path in self.out.iterdir()]
+
+
+JOBS = [Build]
+
+
+
+def describe(now, complete):
+    if now is None or complete is None:
+        return "there where it should not be" if now else "not there"
+    missing = sorted(complete.keys() - now.keys())
+    extra = sorted(now.keys() - complete.keys())
+    other = sorted(n for n in now.keys() & complete.keys() if now[n] != complete[n])
+    return f"missing {missing[:5]}, extra {extra[:5]}, different {other[:5]}"
+
+
+def stopped_at(job, call, argv=None):
+    """Starts a run that stops itself at a call, and waits until it has. Returns the process of strace and the run's id.
+
+    Nothing here depends on speed: the program sleeps until it is sent SIGCONT.
+    """
+    log = job.place / "stop.log"
+    log.unlink(missing_ok=True)
+    command = ["strace", "-f", "-qq", "-o", str(log), "-e", f"trace={call.name}",
+               "-e", f"inject={call.name}:signal=STOP:when={call.nth}", "--", *(argv or job.argv())]  # fmt: skip
+    job.command = " ".join(command)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    while process.poll() is None:
+        found = re.search(r"^(\d+) +--- stopped by SIGSTOP", log.read_text() if log.exists() else "", re.MULTILINE)
+        if found:
+            return process, int(found[1])
+    raise Broken(f"it did not stop at {call}\n{process.communicate()[0]}")
+
+
+def go_on(process, pid, with_signal=None):
+    """Lets it run to its end."""
+    if with_signal:
+        os.kill(pid, with_signal)
+    os.kill(pid, signal.SIGCONT)
+    said = process.communicate()[0]
+    return Outcome(process.returncode, said)
