@@ -40,8 +40,9 @@ pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMu
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     // The staging directory takes a few blocks of its own: two directories and a marker.
     let files = plan.files.iter().map(|f| f.bytes.len() as u64).chain([1; 3]);
-    ask_for_room(parent, files.chain(plan.shards.iter().map(PlannedShard::file_len)))?;
-    let explained = |error| explain(error, parent, plan.len(), largest(plan));
+    let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
+    ask_for_room(parent, &sizes)?;
+    let explained = |error| explain(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
     let written = write(plan, staging.content(), progress)
         .and_then(|()| donors.iter().try_for_each(AtRest::unchanged))
@@ -52,10 +53,6 @@ pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMu
         (Err(error), Ok(())) => Err(explained(error)),
         (Err(error), Err((path, why))) => Err(ApplyError::Left { error: Box::new(explained(error)), path, why }),
     }
-}
-
-fn largest(plan: &Plan) -> u64 {
-    plan.shards.iter().map(PlannedShard::file_len).max().unwrap_or_default()
 }
 
 fn write(plan: &Plan, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {

@@ -42,6 +42,20 @@ pub enum ApplyError {
         /// Bytes free.
         have: u64,
     },
+    /// No more files can be made, however small they are.
+    #[error("{path}: {doing}: {error}: need {need} files, have {have} (inodes); choose an --out on another disk", path = path.display())]
+    Files {
+        /// What was being made.
+        path: PathBuf,
+        /// What was being done.
+        doing: &'static str,
+        /// What the system said.
+        error: io::Error,
+        /// Files to be made.
+        need: u64,
+        /// Files that can be made.
+        have: u64,
+    },
     /// One file is larger than may be.
     #[error("{path}: the file would be too large: need {need} bytes, {limit}; choose smaller shards", path = path.display())]
     FileSize {

@@ -69,8 +69,8 @@ struct Room {
     bytes: u64,
     /// Size of a block.
     block: u64,
-    /// Whether no further file can be made, whatever its size.
-    no_more_files: bool,
+    /// Files that can still be made; `None` where there is no limit to them.
+    files: Option<u64>,
 }
 
 /// The room on the file system of `dir`; `None` where it does not say, as some network ones do not.
@@ -78,21 +78,18 @@ fn room(dir: &Path) -> Result<Option<Room>, ApplyError> {
     let says = rustix::io::retry_on_intr(|| rustix::fs::statvfs(dir))
         .map_err(|e| io_at(dir, "asking for free space")(e.into()))?;
     let block = says.f_frsize.max(1);
-    let room = Room {
-        bytes: says.f_bavail.saturating_mul(block),
-        block,
-        no_more_files: says.f_files > 0 && says.f_ffree == 0,
-    };
+    let room =
+        Room { bytes: says.f_bavail.saturating_mul(block), block, files: (says.f_files > 0).then_some(says.f_ffree) };
     Ok((says.f_blocks > 0).then_some(room))
 }
 
-/// Refuses files that will not fit into `dir`, before the first byte of them is written.
+/// Refuses files of these sizes that will not fit into `dir`, before the first byte of them is written.
 ///
 /// Each file takes whole blocks. What else a file system needs is its own affair, so this can be a little too
 /// hopeful: [`explain`] has the word when writing fails.
-pub(super) fn ask_for_room(dir: &Path, sizes: impl Iterator<Item = u64>) -> Result<(), ApplyError> {
+pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> {
     let Some(room) = room(dir)? else { return Ok(()) };
-    let blocks = sizes.fold(0_u64, |n, size| n.saturating_add(size.div_ceil(room.block)));
+    let blocks = sizes.iter().fold(0_u64, |n, size| n.saturating_add(size.div_ceil(room.block)));
     let need = blocks.saturating_mul(room.block);
     if room.bytes < need {
         return Err(ApplyError::Space { path: dir.to_owned(), cause: "no space".to_owned(), need, have: room.bytes });
@@ -100,16 +97,18 @@ pub(super) fn ask_for_room(dir: &Path, sizes: impl Iterator<Item = u64>) -> Resu
     Ok(())
 }
 
-/// Gives an error of the system its figures: how much was to be written into `dir`, and how much room there is.
-///
-/// `need` is the whole, `file_len` the largest file of it. To be asked when what was written is removed again.
-pub(super) fn explain(error: ApplyError, dir: &Path, need: u64, file_len: u64) -> ApplyError {
+/// Gives an error of the system its figures: files of these sizes were to be written into `dir`, and this is the room
+/// there is. To be asked when what was written is removed again.
+pub(super) fn explain(error: ApplyError, dir: &Path, sizes: &[u64]) -> ApplyError {
     let ApplyError::Io { path, doing, error } = error else { return error };
     match Errno::from_io_error(&error) {
         Some(Errno::NOSPC | Errno::DQUOT) => match room(dir) {
+            Ok(Some(Room { files: Some(have), .. })) if have < sizes.len() as u64 => {
+                ApplyError::Files { path, doing, error, need: sizes.len() as u64, have }
+            }
             Ok(Some(room)) => {
-                let files = if room.no_more_files { " for more files" } else { "" };
-                ApplyError::Space { path, cause: format!("{doing}: {error}{files}"), need, have: room.bytes }
+                let need = sizes.iter().fold(0_u64, |n, size| n.saturating_add(*size));
+                ApplyError::Space { path, cause: format!("{doing}: {error}"), need, have: room.bytes }
             }
             _ => ApplyError::Io { path, doing, error },
         },
@@ -118,7 +117,7 @@ pub(super) fn explain(error: ApplyError, dir: &Path, need: u64, file_len: u64) -
                 Some(limit) => format!("this process may write {limit} (ulimit -f)"),
                 None => "the file system takes no file of that size".to_owned(),
             };
-            ApplyError::FileSize { path, need: file_len, limit }
+            ApplyError::FileSize { path, need: sizes.iter().copied().max().unwrap_or_default(), limit }
         }
         _ => ApplyError::Io { path, doing, error },
     }
