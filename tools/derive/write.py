@@ -329,11 +329,59 @@ def derived_files(folder):
     return [p for p in sorted(Path(folder).glob("*.json5")) if MARK.search(p.read_text())]
 
 
+# Derived once and then mended by hand, from the source: what no sample shows. {stem: what}
+MENDED = {
+    "blip-2": "cross attention by its frequency, distances in every layer",
+    "canary": "subsampling by its factor, the decoder's vocabulary",
+    "canary_decoder": "the vocabulary's default",
+    "chinese_clip": "distances in every layer",
+    "convnext": "norms by out_features",
+    "convnextv2": "norms by out_features",
+    "cosmos3_edge_vision": "channels times patch area",
+    "donut-swin": "stages in one repeat",
+    "ernie4_5_vl_moe": "the text model's head width, the temporal resampler",
+    "ernie4_5_vl_moe_text": "keys the above reads",
+    "focalnet": "stages in one repeat",
+    "glpn": "stages in one repeat",
+    "gradium_phonon_tts": "the backbone's width, the latent's, the loss weighting",
+    "hiera": "stages in one repeat, norms by out_features",
+    "hy_v3": "no shared experts",
+    "inkling_text": "heads and widths of layers that do not slide",
+    "laguna": "the gate for each channel",
+    "lilt": "distances in every layer",
+    "llama4_text": "dense layers, and which layers have experts",
+    "markuplm": "distances in every layer",
+    "maskformer-swin": "stages in one repeat",
+    "minicpm_ocr": "the text model is a part; the merger's last projection",
+    "minimax_m3_vl_text": "the indexer's own heads",
+    "mllama_text_model": "which layers cross-attend; MllamaForCausalLM is built from it",
+    "molmo2_text": "norms over all heads",
+    "moshi": "no audio vocabulary is computed from other keys",
+    "ovis2": "the visual head takes a square of strides in",
+    "pocket_tts": "the backbone's width, the latent's, the loss weighting",
+    "qwen2_moe": "dense layers",
+    "qwen3_5": "the text model is a part",
+    "qwen3_5_text": "layer types alone decide",
+    "qwen3_asr": "frequency bins after three halvings",
+    "sam3_tracker": "the decoder's deep MLPs, the neck by scale factors",
+    "sam3_vision_model": "the neck by scale factors",
+    "squeezebert": "widths are hidden_size, divided by groups; 4.47.0 too",
+    "swin": "stages in one repeat, norms by out_features",
+    "swinv2": "stages in one repeat",
+    "videomae": "what the decoder predicts",
+    "vitdet": "residual blocks of any layer, windowed relative positions",
+    "vitmatte": "the backbone is a part",
+    "voxtral_realtime_encoder": "no head width given",
+    "wav2vec2-bert": "relative and rotary positions of both versions, the kernel's width",
+    "wav2vec2-conformer": "rotary positions, the kernel's width, layer weights",
+}
+
+
 def put(files, folder):
-    """Makes `files` the derived files of the folder; files written by hand stay, and win."""
+    """Makes `files` the derived files of the folder; files written or mended by hand stay, and win."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    mine = set(derived_files(folder))
+    mine = {path for path in derived_files(folder) if path.stem not in MENDED}
     by_hand = {p.stem for p in folder.glob("*.json5")} - {p.stem for p in mine}
     for path in mine:
         if path.stem not in files:
@@ -342,7 +390,7 @@ def put(files, folder):
         path = folder / f"{stem}.json5"
         if stem not in by_hand and (not path.exists() or path.read_text() != text):
             path.write_text(text)
-    return sorted(by_hand & set(files))
+    return sorted((by_hand - set(MENDED)) & set(files))
 
 
 def read_versions(cache):
