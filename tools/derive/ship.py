@@ -3,7 +3,8 @@ import json
 import re
 from pathlib import Path
 
-from .write import MENDED, put
+from .mended import MENDED
+from .write import put
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "rules" / "architectures"

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from . import json5
 from .family import Version, first, load, used_keys
+from .mended import MENDED
 from .merge import Apart, merged, share
 from .naming import name_all
 from .tree import Clash, layout, nest
@@ -327,92 +328,6 @@ def with_loaders(entry, loaders):
 def derived_files(folder):
     """Architecture files that this tool wrote, as opposed to those written by hand."""
     return [p for p in sorted(Path(folder).glob("*.json5")) if MARK.search(p.read_text())]
-
-
-# Derived once and then mended by hand, from the source: what no sample shows. {stem: what}
-MENDED = {
-    "blip-2": "cross attention by its frequency, distances in every layer",
-    "blip_2_qformer": "cross attention by its frequency",
-    "canary": "subsampling by its factor, the decoder's vocabulary",
-    "canary_decoder": "the vocabulary's default",
-    "chinese_clip": "distances in every layer",
-    "convnext": "norms by out_features",
-    "convnextv2": "norms by out_features",
-    "cosmos3_edge_vision": "channels times patch area",
-    "dac": "the decoder's widths",
-    "deepseek_vl_hybrid": "the neck's channels",
-    "dinov3_convnext": "stages in one repeat",
-    "donut-swin": "stages in one repeat",
-    "ernie4_5_vl_moe": "the text model's head width, the temporal resampler",
-    "ernie4_5_vl_moe_text": "keys the above reads",
-    "esmc": "biases of all heads",
-    "focalnet": "stages in one repeat",
-    "gemma3n_text": "layers that share keys and values; frequencies by layer type",
-    "gemma4_audio": "what the projection gives out",
-    "glpn": "stages in one repeat",
-    "got_ocr2": "the neck's channels",
-    "got_ocr2_vision": "a key the above reads",
-    "gradium_phonon_tts": "the backbone's width, the latent's, the loss weighting",
-    "granite_docling_text": "head widths rounded down",
-    "granite_speech5_ctc": "the vocabulary",
-    "granitemoe_swa": "head widths rounded down",
-    "groupvit": "stages in one repeat",
-    "groupvit_vision_model": "keys the above reads",
-    "gte": "heads other than four",
-    "hiera": "stages in one repeat, norms by out_features",
-    "hunyuan_vl_vision": "heads other than four",
-    "hy_v3": "no shared experts",
-    "inkling_text": "heads and widths of layers that do not slide",
-    "jina_embeddings_v3": "heads other than four",
-    "kimi_linear": "full attention's own heads",
-    "laguna": "the gate for each channel",
-    "lilt": "distances in every layer",
-    "llama4_text": "dense layers, and which layers have experts",
-    "llama4_vision_model": "heads other than four",
-    "markuplm": "distances in every layer",
-    "maskformer-swin": "stages in one repeat",
-    "minicpm_ocr": "the text model is a part; the merger's last projection",
-    "minimax_m3_vl_text": "the indexer's own heads",
-    "mllama_text_model": "which layers cross-attend; MllamaForCausalLM is built from it",
-    "mobilevit": "stages in one repeat, widths rounded to eighths",
-    "mobilevitv2": "stages in one repeat, widths by the multiplier",
-    "molmo2_text": "norms over all heads",
-    "moshi": "no audio vocabulary is computed from other keys",
-    "nemotron3_diarization": "widths of the head and the audio model",
-    "ovis2": "the visual head takes a square of strides in",
-    "pocket_tts": "the backbone's width, the latent's, the loss weighting",
-    "pp_formulanet": "the neck's channels, positions of global layers",
-    "pp_formulanet_vision": "a key the above reads",
-    "qwen2_moe": "dense layers",
-    "qwen3_5": "the text model is a part",
-    "qwen3_5_text": "layer types alone decide",
-    "qwen3_asr": "frequency bins after three halvings",
-    "qwen3_moe": "sparse layers",
-    "qwen3_next": "dense layers",
-    "qwen3_vl_moe_text": "dense and sparse layers",
-    "roformer": "cross attention in every layer",
-    "sam": "the neck's channels",
-    "sam3_tracker": "the decoder's deep MLPs, the neck by scale factors",
-    "sam3_vision_model": "the neck by scale factors",
-    "sam_hq_vision_model": "the neck's channels",
-    "sam_vision_model": "the neck's channels",
-    "slanext": "the neck's channels, positions of global layers",
-    "slanext_vision": "a key the above reads",
-    "squeezebert": "widths are hidden_size, divided by groups; 4.47.0 too",
-    "swin": "stages in one repeat, norms by out_features",
-    "swin2sr": "all upsamplers, deep residual connections; 4.47.0 too",
-    "swinv2": "stages in one repeat",
-    "tapas": "cross attention in every layer, token types by their list",
-    "uvdoc": "one bridge for each stage",
-    "uvdoc_backbone": "channels and layers by their lists",
-    "videomae": "what the decoder predicts",
-    "vit": "heads other than four",
-    "vitdet": "residual blocks of any layer, windowed relative positions",
-    "vitmatte": "the backbone is a part",
-    "voxtral_realtime_encoder": "no head width given",
-    "wav2vec2-bert": "relative and rotary positions of both versions, the kernel's width",
-    "wav2vec2-conformer": "rotary positions, the kernel's width, layer weights",
-}
 
 
 def put(files, folder):
