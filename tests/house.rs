@@ -267,6 +267,7 @@ const FAMILIES: &[(&str, &str)] = &[
     ("PRC", "Processor"),
     ("AUT", "auto_map and its modules"),
     ("SEC", "Code that runs unasked"),
+    ("SUP", "Suppressions"),
 ];
 
 /// The forms of data files, and the sources that read them.
@@ -277,6 +278,7 @@ const KEYS: &[(&str, &str)] = &[
     ("Keys of a quantisation scheme", "quantization.rs"),
     ("Keys of a processor", "processor.rs"),
     ("Keys of a recipe and of a merge file", "recipe.rs"),
+    ("Keys of a settings file", "settings.rs"),
 ];
 
 fn page() -> String {

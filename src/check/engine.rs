@@ -5,17 +5,22 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, FixHint, LoadReport, Location};
+use super::finding::{Finding, FixHint, LoadReport, Location, Skipped, Suppressed};
 use super::load::Stored;
 use super::votes::Vote;
-use super::{adapter, facts, index, judge, modules, tokens};
+use super::{adapter, facts, index, judge, modules, policy, tokens};
 use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
+use crate::knowledge::expression::within;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
-use crate::knowledge::{Library, Scope};
+use crate::knowledge::settings::Policy;
+use crate::knowledge::{EvalError, Expression, Library, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
 const CAP: usize = 100;
+
+/// Steps that a user's own rule may take over one checkpoint: elements its loops go over, and values they gather.
+const STEPS: u64 = 2_000_000;
 
 /// Places of one finding that are kept.
 const PLACES: usize = 20;
@@ -33,9 +38,16 @@ pub struct Outcome {
     pub config: Value,
     /// Values of config.json that stored tensors contradict.
     pub votes: Vec<Vote>,
+    /// Findings that settings accept, in the order of the others.
+    pub suppressed: Vec<Suppressed>,
+    /// Rules that did not apply, or were not chosen.
+    pub skipped: Vec<Skipped>,
+    /// Rules of the user's own that cannot be used, and why: they take more steps than a rule may, or name what there is
+    /// not.
+    pub unusable: Vec<Skipped>,
 }
 
-/// What a checker knows: rules, architectures, processors.
+/// What a checker knows: rules, architectures, processors; and what becomes of its findings.
 pub struct Knowledge {
     /// Rules.
     pub rules: RuleSet,
@@ -43,6 +55,8 @@ pub struct Knowledge {
     pub library: Library,
     /// Processors.
     pub processors: Vec<Processor>,
+    /// What settings say of single findings.
+    pub policy: Policy,
 }
 
 impl Knowledge {
@@ -51,7 +65,12 @@ impl Knowledge {
     /// # Errors
     /// A data file that is not right; the house tests see to it that there is none.
     pub fn embedded() -> Result<Self, crate::knowledge::source::DataError> {
-        Ok(Self { rules: RuleSet::embedded()?, library: Library::embedded(), processors: Processor::embedded()? })
+        Ok(Self {
+            rules: RuleSet::embedded()?,
+            library: Library::embedded(),
+            processors: Processor::embedded()?,
+            policy: Policy::default(),
+        })
     }
 }
 
@@ -77,6 +96,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         loads: judged.loads,
         config: judged.config,
         votes: judged.votes,
+        ..Outcome::default()
     };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint);
@@ -89,12 +109,38 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     });
     let scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     for rule in &knowledge.rules.rules {
-        if applies(rule, outcome.architecture.as_deref(), &scope) {
-            outcome.findings.extend(run(rule, checkpoint, &faults, &scope));
+        // Rules of the program are known to end; of a user's rule that is found out.
+        let (found, stopped) = match rule.origin {
+            Some(_) => within(STEPS, || ask(rule, checkpoint, &faults, &scope, &outcome)),
+            None => (ask(rule, checkpoint, &faults, &scope, &outcome), false),
+        };
+        if stopped {
+            let why = "takes too many steps; let its loops go over less".to_owned();
+            outcome.unusable.push(Skipped { code: rule.code.clone(), why });
+        }
+        match found {
+            Ok(findings) => outcome.findings.extend(findings),
+            Err(why) => {
+                let skipped = Skipped { code: rule.code.clone(), why };
+                if rule.origin.is_some() && skipped.why.contains("Undeclared reference") {
+                    outcome.unusable.push(skipped.clone());
+                }
+                outcome.skipped.push(skipped);
+            }
         }
     }
+    let unselected = knowledge.rules.unselected.iter();
+    outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not chosen".to_owned() }));
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    policy::apply(&knowledge.policy, checkpoint, &mut outcome);
     outcome
+}
+
+/// What the rules that name these faults make of them, outside the checks of a checkpoint.
+pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
+    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if f.kinds.iter().any(|k| faults.iter().any(|f| f.kind == k)));
+    let rules = knowledge.rules.rules.iter().filter(asked);
+    rules.flat_map(|rule| run(rule, checkpoint, faults, &Scope::new()).unwrap_or_default()).collect()
 }
 
 fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
@@ -124,15 +170,45 @@ fn embedding_rows(checkpoint: &Checkpoint) -> Option<u64> {
         .max()
 }
 
-fn applies(rule: &Rule, architecture: Option<&str>, scope: &Scope<'_>) -> bool {
-    let named = rule.applies.is_empty() || architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a));
-    named && rule.when.as_ref().is_none_or(|w| w.eval_bool(scope).unwrap_or(false))
+/// A rule's findings, or why it was not asked.
+fn ask(
+    rule: &Rule,
+    checkpoint: &Checkpoint,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+    outcome: &Outcome,
+) -> Result<Vec<Finding>, String> {
+    let architecture = outcome.architecture.as_deref();
+    if !rule.applies.is_empty() && !architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a)) {
+        let is = architecture.unwrap_or("unknown");
+        return Err(format!("about {}; the architecture is {is}", rule.applies.join(", ")));
+    }
+    let cannot = |expression: &Expression, error: &EvalError| match facts::absent(checkpoint, expression) {
+        Some(file) => format!("{file} is not there"),
+        None => format!("cannot be asked: {}", error.cause),
+    };
+    if let Some(when) = &rule.when {
+        match when.eval_bool(scope) {
+            Ok(true) => {}
+            Ok(false) => return Err(format!("when is false: {when}")),
+            Err(error) => return Err(cannot(when, &error)),
+        }
+    }
+    run(rule, checkpoint, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
-fn run(rule: &Rule, checkpoint: &Checkpoint, faults: &[Fault], scope: &Scope<'_>) -> Vec<Finding> {
+/// An expression that could not be evaluated, and why.
+type Unasked<'r> = (&'r Expression, EvalError);
+
+fn run<'r>(
+    rule: &'r Rule,
+    checkpoint: &Checkpoint,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+) -> Result<Vec<Finding>, Unasked<'r>> {
     let mut findings = match &rule.check {
         Check::Fault(check) => from_faults(rule, check, checkpoint, faults, scope),
-        Check::Assert(check) => from_assert(rule, check, checkpoint, scope),
+        Check::Assert(check) => from_assert(rule, check, checkpoint, scope)?,
     };
     let more = findings.len().saturating_sub(CAP);
     if more > 0 {
@@ -142,7 +218,7 @@ fn run(rule: &Rule, checkpoint: &Checkpoint, faults: &[Fault], scope: &Scope<'_>
             last.evidence.insert("more".to_owned(), json!(more));
         }
     }
-    findings
+    Ok(findings)
 }
 
 fn from_faults(
@@ -202,27 +278,41 @@ fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'
     inner
 }
 
-fn from_assert(rule: &Rule, check: &Assert, checkpoint: &Checkpoint, scope: &Scope<'_>) -> Vec<Finding> {
+fn from_assert<'r>(
+    rule: &'r Rule,
+    check: &'r Assert,
+    checkpoint: &Checkpoint,
+    scope: &Scope<'_>,
+) -> Result<Vec<Finding>, Unasked<'r>> {
     let Some(each) = &check.each else {
-        return one_assert(rule, check, checkpoint, scope).into_iter().collect();
+        let found = one_assert(rule, check, checkpoint, scope).map_err(|error| (&check.that, error))?;
+        return Ok(found.into_iter().collect());
     };
-    let Ok(Value::Array(items)) = each.eval(scope) else { return Vec::new() };
+    let items = match each.eval(scope).map_err(|error| (each, error))? {
+        Value::Array(items) => items,
+        _ => Vec::new(),
+    };
     let mut out = Vec::new();
     for item in items {
         let mut inner = scope.child();
         inner.bind("it", &item);
-        out.extend(one_assert(rule, check, checkpoint, &inner));
+        // A value that is not there cannot be wrong: whether it has to be there is another rule's question.
+        out.extend(one_assert(rule, check, checkpoint, &inner).unwrap_or(None));
     }
-    out
+    Ok(out)
 }
 
-fn one_assert(rule: &Rule, check: &Assert, checkpoint: &Checkpoint, scope: &Scope<'_>) -> Option<Finding> {
-    // A value that is not there cannot be wrong: whether it has to be there is another rule's question.
-    if check.that.eval_bool(scope).unwrap_or(true) {
-        return None;
+fn one_assert(
+    rule: &Rule,
+    check: &Assert,
+    checkpoint: &Checkpoint,
+    scope: &Scope<'_>,
+) -> Result<Option<Finding>, EvalError> {
+    if check.that.eval_bool(scope)? {
+        return Ok(None);
     }
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
-    Some(finding(rule, scope, locate(checkpoint, &places), Map::new()))
+    Ok(Some(finding(rule, scope, locate(checkpoint, &places), Map::new())))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use super::tokens::OpenedTokenizer;
 use super::{index, modules};
 use crate::checkpoint::{Checkpoint, Vocabulary};
-use crate::knowledge::Scope;
+use crate::knowledge::{Expression, Scope};
 
 /// Keys of `tokenizer_config.json` that hold thousands of entries; rules reach them through `tokenizer` and `id_of`.
 const BULKY: [&str; 2] = ["added_tokens_decoder", "additional_special_tokens"];
@@ -21,6 +21,15 @@ const DOCUMENTS: [(&str, &str); 6] = [
     ("tokenizer_config", "tokenizer_config.json"),
     ("special_tokens", "special_tokens_map.json"),
 ];
+
+/// The first document that an expression asks about and that is not there, or has no value.
+#[must_use]
+pub fn absent(checkpoint: &Checkpoint, expression: &Expression) -> Option<&'static str> {
+    let asked = expression.variables();
+    let is_absent = |file| checkpoint.document(file).is_none_or(|d| d.value.is_none());
+    let mut documents = DOCUMENTS.into_iter().filter(|(name, _)| asked.iter().any(|a| a == name));
+    documents.find(|(_, file)| is_absent(file)).map(|(_, file)| file)
+}
 
 /// The variables and functions named in [`crate::knowledge::rule::Assert`].
 #[must_use]

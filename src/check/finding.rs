@@ -53,6 +53,35 @@ pub struct Finding {
     pub fix: Option<FixHint>,
 }
 
+/// A finding that is accepted, and not counted.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Suppressed {
+    /// What was found.
+    #[serde(flatten)]
+    pub finding: Finding,
+    /// Why it is accepted.
+    pub accepted: Accepted,
+}
+
+/// Why a finding is not counted.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Accepted {
+    /// Where that is written: `ckpt-doctor.json5: suppress[0]`, or the name of a baseline.
+    pub by: String,
+    /// The reason given there; none in a baseline.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+}
+
+/// A rule that was not asked of a checkpoint, or could not be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Skipped {
+    /// Rule code.
+    pub code: String,
+    /// Why.
+    pub why: String,
+}
+
 /// Lists of what a loader would say of the state dict; names are spelled as it spells them.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct LoadReport {

@@ -10,6 +10,7 @@ pub mod judge;
 pub mod layers;
 pub mod load;
 pub mod modules;
+pub mod policy;
 pub mod quantization;
 pub mod size;
 pub mod tokens;

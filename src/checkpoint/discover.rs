@@ -49,6 +49,14 @@ fn search(dir: &Path, depth: usize, found: &mut Vec<PathBuf>) {
     }
 }
 
+/// Whether a directory is a checkpoint itself.
+#[must_use]
+pub fn is_checkpoint(dir: &Path) -> bool {
+    let is_file = |entry: &fs::DirEntry| !entry.file_type().is_ok_and(|t| t.is_dir());
+    let marks = |entry: fs::DirEntry| is_file(&entry) && marks_checkpoint(&entry.file_name().to_string_lossy());
+    fs::read_dir(dir).is_ok_and(|entries| entries.flatten().any(marks))
+}
+
 /// Whether a file of this name makes its directory a checkpoint.
 fn marks_checkpoint(name: &str) -> bool {
     !name.starts_with('.')

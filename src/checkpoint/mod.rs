@@ -26,7 +26,7 @@ pub mod text;
 pub mod tokenizer;
 
 pub use contents::Contents;
-pub use discover::find_checkpoints;
+pub use discover::{find_checkpoints, is_checkpoint};
 pub use document::Document;
 pub use fault::{FAULT_KINDS, Fault, Place};
 pub use index::{INDEX_NAME, Index};

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use ckpt_doctor::check::Severity;
 use ckpt_doctor::knowledge::Loader;
+use ckpt_doctor::knowledge::loader::asked;
 use ckpt_doctor::report::Format;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -14,8 +15,8 @@ pub struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
-    /// A folder laid out as the program's own rules: what it has in architectures/*.json5 is known too, or replaces what
-    /// has the same name
+    /// A folder laid out as the program's own rules: checks/**/*.json5 are asked too; architectures/*.json5 are known too,
+    /// or replace what has the same name
     #[arg(long, value_name = "DIR", global = true)]
     pub rules: Option<PathBuf>,
 }
@@ -34,7 +35,31 @@ pub enum Command {
     /// Say all there is to say of one rule
     Explain(ExplainArgs),
     /// List the rules
-    Rules,
+    Rules(SettingsArgs),
+    /// Write a ckpt-doctor.json5 with every key explained
+    Init(InitArgs),
+}
+
+/// Which settings to go by.
+#[derive(Debug, Args)]
+pub struct SettingsArgs {
+    /// This settings file, instead of the nearest ckpt-doctor.json5 in the folders above each checkpoint
+    #[arg(long, value_name = "FILE", conflicts_with = "isolated")]
+    pub config: Option<PathBuf>,
+    /// No settings file
+    #[arg(long)]
+    pub isolated: bool,
+}
+
+/// Arguments of `init`.
+#[derive(Debug, Args)]
+pub struct InitArgs {
+    /// Where to write it
+    #[arg(value_name = "DIR", default_value = ".")]
+    pub dir: PathBuf,
+    /// Write a .pre-commit-config.yaml as well
+    #[arg(long)]
+    pub pre_commit: bool,
 }
 
 /// Arguments of `expect`.
@@ -94,6 +119,9 @@ pub struct ExplainArgs {
     /// Code or name: IDX005, shard-missing
     #[arg(value_name = "RULE")]
     pub rule: String,
+    /// Which settings to go by.
+    #[command(flatten)]
+    pub settings: SettingsArgs,
 }
 
 /// How and where to report, and what counts as a failure.
@@ -105,15 +133,26 @@ pub struct ReportArgs {
     /// Also write the report to a file; may be given several times
     #[arg(long, value_name = "FMT=FILE", value_parser = parse_report)]
     pub report: Vec<(Format, PathBuf)>,
-    /// Least severity that makes the exit code 1
-    #[arg(long, value_name = "SEVERITY", default_value = "error")]
-    pub fail_on: FailOn,
+    /// Least severity that makes the exit code 1; default: error
+    #[arg(long, value_name = "SEVERITY")]
+    pub fail_on: Option<FailOn>,
     /// Exit with 0 whatever is found
     #[arg(long)]
     pub exit_zero: bool,
     /// When to use colours
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
+}
+
+/// Findings that were there before.
+#[derive(Debug, Args)]
+pub struct BaselineArgs {
+    /// Do not count the findings in this file, and say which of them are gone
+    #[arg(long, value_name = "FILE")]
+    pub baseline: Option<PathBuf>,
+    /// Write what is found to the baseline, instead of comparing with it
+    #[arg(long)]
+    pub write_baseline: bool,
 }
 
 /// Arguments of `check`.
@@ -123,7 +162,7 @@ pub struct CheckArgs {
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
     /// Versions to predict the load for; default: the one that wrote config.json, and the newest known
-    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_for)]
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = asked)]
     pub versions: Vec<String>,
     /// Also read the bytes of every tensor: NaN and infinity, ends of zeros, tied matrices that differ, hub checksums
     #[arg(long)]
@@ -131,9 +170,24 @@ pub struct CheckArgs {
     /// Only these rules: codes, starts of codes (JSN), or names; comma-separated
     #[arg(long, value_name = "RULE", value_delimiter = ',')]
     pub select: Vec<String>,
+    /// These rules as well as those that the settings select
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    pub extend_select: Vec<String>,
     /// All but these rules; where both name one, the longer word wins
     #[arg(long, value_name = "RULE", value_delimiter = ',')]
     pub ignore: Vec<String>,
+    /// What was there before.
+    #[command(flatten)]
+    pub baseline: BaselineArgs,
+    /// Count findings by rule instead of showing them (full, concise and json)
+    #[arg(long)]
+    pub statistics: bool,
+    /// Say of each rule that was not asked why
+    #[arg(short, long)]
+    pub verbose: bool,
+    /// Which settings to go by.
+    #[command(flatten)]
+    pub settings: SettingsArgs,
     /// How to report.
     #[command(flatten)]
     pub report: ReportArgs,
@@ -211,7 +265,7 @@ pub enum Color {
 
 /// The loader that stands for the version.
 fn parse_loader(text: &str) -> Result<Loader, String> {
-    parse_for(text).map(|version| Loader::nearest(&version))
+    asked(text).map(|version| Loader::nearest(&version))
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {
@@ -223,17 +277,6 @@ fn parse_pair(text: &str) -> Result<(String, String), String> {
         Some((name, value)) if !name.is_empty() && !value.is_empty() => Ok((name.to_owned(), value.to_owned())),
         _ => Err("write it as NAME=VALUE".to_owned()),
     }
-}
-
-/// `transformers==4.51.3`: a version as Python packages have it. Which loader stands for it is the checker's business.
-fn parse_for(text: &str) -> Result<String, String> {
-    let version = text.strip_prefix("transformers==").unwrap_or_default();
-    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
-    if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
-        return Ok(version.to_owned());
-    }
-    let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
-    Err(format!("write it as transformers==VERSION; known are {}, others are judged as the nearest", known.join(", ")))
 }
 
 fn parse_report(text: &str) -> Result<(Format, PathBuf), String> {

@@ -5,7 +5,7 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::Knowledge;
+use ckpt_doctor::check::{Knowledge, Severity};
 use ckpt_doctor::checkpoint::open::{JSON_CAP, read_capped};
 use ckpt_doctor::knowledge::recipe::{MergeFile, Recipe};
 use ckpt_doctor::knowledge::source;
@@ -14,7 +14,7 @@ use ckpt_doctor::report::{Format, Report, Style, render};
 use ckpt_doctor::surgery::apply::ApplyError;
 use ckpt_doctor::surgery::merge::pipeline::{self, PipelineError, Request, Run};
 
-use super::args::BuildMergedArgs;
+use super::args::{BuildMergedArgs, FailOn};
 use super::{FINDINGS, library, output, signals};
 
 /// Runs `build-merged`.
@@ -40,21 +40,21 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         }
         Err(error) => return Err(error.into()),
     };
-    let by_severity = output::finish(&report(&run, false), &args.report).with_context(|| match &*run.record.stage {
+    output::finish(&report(&run, false), &args.report, false).with_context(|| match &*run.record.stage {
         "written" => format!("{} is written; its report is not", run.record.out),
         _ => "the report".to_owned(),
     })?;
     // What matters is the result; findings on a donor that the merge repaired are told, not counted.
     Ok(match run.record.stage.as_str() {
         "written" | "dry-run" if args.report.exit_zero || !result_fails(&run, args) => super::CLEAN,
-        "written" | "dry-run" => by_severity.max(FINDINGS),
         _ => FINDINGS,
     })
 }
 
 fn result_fails(run: &Run, args: &BuildMergedArgs) -> bool {
+    let least = args.report.fail_on.map_or(Severity::Error, FailOn::severity);
     let result = run.looked.iter().rfind(|l| !l.role.starts_with("donor"));
-    result.is_some_and(|l| l.outcome.findings.iter().any(|f| f.severity >= args.report.fail_on.severity()))
+    result.is_some_and(|l| l.outcome.findings.iter().any(|f| f.severity >= least))
 }
 
 /// The report of a run; `portable` names directories by their last component, for a file that travels.

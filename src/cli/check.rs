@@ -1,24 +1,33 @@
 //! `check`.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::{Knowledge, check_for};
+use ckpt_doctor::check::{Outcome, check_for, policy};
 use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::CheckpointReport;
 
 use super::args::CheckArgs;
-use super::{library, output};
+use super::settings::{Resolved, Resolver, Typed};
+use super::{CLEAN, FINDINGS, baseline, output, unasked};
+
+/// A checkpoint that was looked at.
+struct Looked {
+    dir: PathBuf,
+    checkpoint: Arc<Checkpoint>,
+    outcome: Outcome,
+    by: Rc<Resolved>,
+}
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let mut knowledge = Knowledge { library: library::with(rules)?, ..Knowledge::embedded()? };
-    knowledge.rules.choose(&args.select, &args.ignore)?;
+    let mut settings = Resolver::new(Typed::check(args, rules));
     let mut seen = BTreeSet::new();
-    let mut reports = Vec::new();
+    let mut looked = Vec::new();
     for path in &args.paths {
         if !path.exists() {
             bail!("{}: no such file or directory", path.display());
@@ -35,14 +44,57 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
             if !seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone())) {
                 continue;
             }
-            let mut checkpoint = Checkpoint::open(&dir).with_context(|| dir.display().to_string())?;
-            if args.deep {
-                checkpoint.read_contents();
-            }
-            let checkpoint = Arc::new(checkpoint);
-            let outcome = check_for(&checkpoint, &knowledge, &args.versions);
-            reports.push(CheckpointReport::new(dir.display().to_string(), None, &checkpoint, &outcome));
+            looked.push(look(dir, args.deep, &mut settings)?);
         }
     }
-    output::finish(&Report::new(reports, None), &args.report)
+    suppressions_without_use(&mut looked, &settings, &args.paths);
+    let reports = looked.iter().map(|l| {
+        let mut report = CheckpointReport::new(l.dir.display().to_string(), None, &l.checkpoint, &l.outcome);
+        report.settings = l.by.file.as_ref().map(|file| file.display().to_string());
+        report
+    });
+    let mut reports: Vec<CheckpointReport> = reports.collect();
+    let by: Vec<Rc<Resolved>> = looked.iter().map(|l| Rc::clone(&l.by)).collect();
+    baseline::apply(&mut reports, &by, args.baseline.write_baseline)?;
+    let fails =
+        |(report, by): (&CheckpointReport, &Rc<Resolved>)| report.counts.worst().is_some_and(|w| w >= by.fail_on);
+    let failed = reports.iter().zip(&by).any(fails);
+    output::finish(&Report::new(reports, None), &args.report, args.statistics)?;
+    if args.verbose {
+        for l in &looked {
+            unasked::say(&l.dir, &l.outcome, &l.by.knowledge.rules);
+        }
+    }
+    Ok(if failed && !args.report.exit_zero { FINDINGS } else { CLEAN })
+}
+
+fn look(dir: PathBuf, deep: bool, settings: &mut Resolver) -> anyhow::Result<Looked> {
+    let by = settings.of(&dir)?;
+    let mut checkpoint = Checkpoint::open(&dir).with_context(|| dir.display().to_string())?;
+    if deep {
+        checkpoint.read_contents();
+    }
+    let checkpoint = Arc::new(checkpoint);
+    let outcome = check_for(&checkpoint, &by.knowledge, &by.versions);
+    if let Some(rule) = outcome.unusable.first() {
+        let origin = by.knowledge.rules.find(&rule.code)?.origin.as_deref().unwrap_or_default();
+        bail!("{origin}: {} on {}: {}", rule.code, dir.display(), rule.why);
+    }
+    Ok(Looked { dir, checkpoint, outcome, by })
+}
+
+/// Adds a finding for each suppression that had nothing to suppress.
+fn suppressions_without_use(looked: &mut [Looked], settings: &Resolver, searched: &[PathBuf]) {
+    for resolved in settings.all() {
+        let here: Vec<usize> =
+            looked.iter().enumerate().filter(|(_, l)| Rc::ptr_eq(&l.by, resolved)).map(|(at, _)| at).collect();
+        let outcomes: Vec<_> =
+            here.iter().filter_map(|at| looked.get(*at)).map(|l| (Arc::clone(&l.checkpoint), &l.outcome)).collect();
+        let unused = policy::unused(&resolved.knowledge, &outcomes, searched);
+        for (at, finding) in unused {
+            if let Some(looked) = here.get(at).and_then(|at| looked.get_mut(*at)) {
+                looked.outcome.findings.push(finding);
+            }
+        }
+    }
 }

@@ -1,4 +1,4 @@
-//! The architectures of the program, and those of `--rules`.
+//! The rules and architectures of the program, and those of `--rules`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,23 +6,62 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use ckpt_doctor::checkpoint::open::{MODULE_CAP, read_capped};
 use ckpt_doctor::knowledge::Library;
+use ckpt_doctor::knowledge::rule::RuleSet;
 
-/// The library inside the program with the files of `rules/architectures` over it.
+/// How many folders deep a user's rules are looked for.
+const MAX_DEPTH: usize = 8;
+
+/// The library inside the program, with the files of `rules/architectures` over it.
 pub fn with(rules: Option<&Path>) -> anyhow::Result<Library> {
     let mut library = Library::embedded();
-    let Some(rules) = rules else { return Ok(library) };
-    let folder = rules.join("architectures");
-    let entries = fs::read_dir(&folder).with_context(|| format!("{} cannot be listed", folder.display()))?;
-    let mut files: Vec<PathBuf> = entries.collect::<Result<Vec<_>, _>>()?.into_iter().map(|e| e.path()).collect();
-    files.retain(|f| f.extension().is_some_and(|e| e == "json5"));
-    if files.is_empty() {
-        bail!("{} has no *.json5", folder.display());
-    }
-    files.sort();
-    for file in files {
-        let text = String::from_utf8(read_capped(&file, MODULE_CAP)?);
-        let text = text.with_context(|| format!("{}: not UTF-8", file.display()))?;
-        library.add(&file.display().to_string(), &text)?;
+    for (name, text) in texts(rules, "architectures")? {
+        library.add(&name, &text)?;
     }
     Ok(library)
+}
+
+/// The rules inside the program, and those in the files of `rules/checks`.
+pub fn rules(rules: Option<&Path>) -> anyhow::Result<RuleSet> {
+    let texts = texts(rules, "checks")?;
+    Ok(RuleSet::embedded()?.and_files(texts.iter().map(|(name, text)| (name.clone(), text.as_str())))?)
+}
+
+/// Name and text of the `.json5` files in a folder of the user's rules.
+fn texts(rules: Option<&Path>, folder: &str) -> anyhow::Result<Vec<(String, String)>> {
+    let Some(rules) = rules else { return Ok(Vec::new()) };
+    let mut files = Vec::new();
+    for part in ["architectures", "checks"] {
+        let below = rules.join(part);
+        if below.is_dir() {
+            find(&below, MAX_DEPTH, &mut files)?;
+        }
+    }
+    if files.is_empty() {
+        bail!("{} has neither architectures/*.json5 nor checks/**/*.json5", rules.display());
+    }
+    files.retain(|file| file.starts_with(rules.join(folder)));
+    files.sort();
+    let read = |file: PathBuf| {
+        let text = String::from_utf8(read_capped(&file, MODULE_CAP)?);
+        let name = file.display().to_string();
+        Ok((name.clone(), text.with_context(|| format!("{name}: not UTF-8"))?))
+    };
+    files.into_iter().map(read).collect()
+}
+
+fn find(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> anyhow::Result<()> {
+    let entries = fs::read_dir(folder).with_context(|| format!("{} cannot be listed", folder.display()))?;
+    for entry in entries {
+        let entry = entry?;
+        let path = entry.path();
+        // A link to a folder may lead back.
+        if entry.file_type()?.is_dir() {
+            if let Some(depth) = depth.checked_sub(1) {
+                find(&path, depth, files)?;
+            }
+        } else if path.extension().is_some_and(|e| e == "json5") {
+            files.push(path);
+        }
+    }
+    Ok(())
 }

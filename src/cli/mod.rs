@@ -1,14 +1,18 @@
 //! The command line: what was typed, what that means, what is printed, which code the program ends with.
 
 mod args;
+mod baseline;
 mod build_merged;
 mod check;
 mod expect;
+mod init;
 mod inspect;
 mod library;
 mod output;
 mod rules;
+mod settings;
 mod signals;
+mod unasked;
 
 use std::process::ExitCode;
 
@@ -29,8 +33,9 @@ pub fn main() -> ExitCode {
         args::Command::Inspect(args) => inspect::run(args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(args, rules.as_deref()),
         args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
-        args::Command::Explain(args) => rules::explain(args),
-        args::Command::Rules => rules::list(),
+        args::Command::Explain(args) => rules::explain(args, rules.as_deref()),
+        args::Command::Rules(args) => rules::list(args, rules.as_deref()),
+        args::Command::Init(args) => init::run(args),
     };
     match result {
         Ok(code) => ExitCode::from(code),

@@ -5,10 +5,9 @@ use std::io::{IsTerminal, Write};
 use std::path::Path;
 
 use anyhow::Context;
-use ckpt_doctor::report::{Format, Report, Style, render};
+use ckpt_doctor::report::{Format, Report, Style, render, statistics};
 
 use super::args::{Color, ReportArgs};
-use super::{CLEAN, FINDINGS};
 
 /// A line on standard error. Where that cannot be written to (a full disk, a closed pipe) nobody listens, and
 /// `eprintln` would panic.
@@ -16,17 +15,19 @@ pub fn note(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// Prints the report and writes those asked for; returns the exit code by severity.
-pub fn finish(report: &Report, args: &ReportArgs) -> anyhow::Result<u8> {
-    let text = render(report, args.output_format, style(args.color));
+/// Prints the report, or statistics of it, and writes those asked for.
+pub fn finish(report: &Report, args: &ReportArgs, counted: bool) -> anyhow::Result<()> {
+    let text = if counted {
+        let format = args.output_format;
+        statistics(report, format).with_context(|| format!("--statistics has no form as {format}"))?
+    } else {
+        render(report, args.output_format, style(args.color))
+    };
     for (format, file) in &args.report {
         let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };
-        write(file, render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
+        write(file, &render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
     }
-    print(&text)?;
-    let worst = report.checkpoints.iter().filter_map(|c| c.counts.worst()).max();
-    let fails = !args.exit_zero && worst.is_some_and(|s| s >= args.fail_on.severity());
-    Ok(if fails { FINDINGS } else { CLEAN })
+    print(&text)
 }
 
 /// The style for standard output.
@@ -53,8 +54,18 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 
 /// Writes a report where the user asked for it.
 #[expect(clippy::disallowed_methods, reason = "a report, not a checkpoint")]
-fn write(file: &Path, text: String) -> std::io::Result<()> {
+pub fn write(file: &Path, text: &str) -> std::io::Result<()> {
     fs::write(file, text)
+}
+
+/// A line that may quote a checkpoint, safe to show.
+pub fn safe(line: &str) -> String {
+    ckpt_doctor::checkpoint::escape(line, 4000)
+}
+
+/// Writes a file that must not be there yet.
+pub fn create(file: &Path, text: &str) -> std::io::Result<()> {
+    fs::OpenOptions::new().write(true).create_new(true).open(file)?.write_all(text.as_bytes())
 }
 
 /// Columns of the terminal.

@@ -2,17 +2,21 @@
 
 use std::fmt::Write;
 
-use ckpt_doctor::knowledge::rule::{Rule, RuleSet};
+use std::path::Path;
+
+use ckpt_doctor::knowledge::rule::Rule;
 use comfy_table::{Table, presets};
 
-use super::args::ExplainArgs;
+use super::args::{ExplainArgs, SettingsArgs};
+use super::settings::{Resolver, Typed};
 use super::{CLEAN, output};
 
-/// Runs `rules`: a line for each.
-pub fn list() -> anyhow::Result<u8> {
+/// Runs `rules`: a line for each that is asked here.
+pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+    let here = Resolver::new(Typed::new(args, rules)).of(Path::new("."))?;
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
-    for rule in &RuleSet::embedded()?.rules {
+    for rule in &here.knowledge.rules.rules {
         table.add_row([rule.code.as_str(), rule.severity.name(), rule.name.as_str()]);
     }
     let lines: Vec<String> = table.lines().map(|line| line.trim().to_owned()).collect();
@@ -21,9 +25,9 @@ pub fn list() -> anyhow::Result<u8> {
 }
 
 /// Runs `explain`: all there is to say of one rule.
-pub fn explain(args: &ExplainArgs) -> anyhow::Result<u8> {
-    let rules = RuleSet::embedded()?;
-    output::print(&page(rules.find(&args.rule)?)?)?;
+pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+    let here = Resolver::new(Typed::new(&args.settings, rules)).of(Path::new("."))?;
+    output::print(&page(here.knowledge.rules.find(&args.rule)?)?)?;
     Ok(CLEAN)
 }
 
@@ -38,6 +42,9 @@ fn page(rule: &Rule) -> Result<String, std::fmt::Error> {
     writeln!(out, "\nMessage\n  {}", rule.message.source())?;
     if let Some(fix) = &rule.fix {
         writeln!(out, "\nFix ({})\n  {}", fix.safety.name(), fix.help.source())?;
+    }
+    if let Some(origin) = &rule.origin {
+        writeln!(out, "\nFrom\n  {origin}")?;
     }
     if !rule.references.is_empty() {
         writeln!(out, "\nReferences\n  {}", rule.references.join("\n  "))?;

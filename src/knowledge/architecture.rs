@@ -4,7 +4,6 @@ mod blueprint;
 mod build;
 mod conversions;
 pub(crate) mod member;
-mod ordered;
 mod refusal;
 mod resolve;
 

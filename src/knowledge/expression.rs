@@ -6,6 +6,7 @@
 mod functions;
 mod program;
 mod scope;
+mod steps;
 mod template;
 
 use std::borrow::Cow;
@@ -21,6 +22,7 @@ use serde_json::Value;
 pub(crate) use functions::glob;
 use program::Program;
 pub use scope::Scope;
+pub(crate) use steps::within;
 pub use template::Template;
 
 /// Characters of an evaluation error that are kept: the crate prints whole operands.
@@ -58,6 +60,8 @@ pub struct Expression(Arc<Inner>);
 
 struct Inner {
     source: Box<str>,
+    /// Whether it comes from a user's file, and its steps are counted.
+    counted: bool,
     program: OnceLock<Result<Program, String>>,
 }
 
@@ -102,7 +106,7 @@ impl Expression {
     /// # Errors
     /// When it is not CEL.
     pub fn parse(source: &str) -> Result<Self, ParseError> {
-        let expression = Self(Arc::new(Inner { source: source.into(), program: OnceLock::new() }));
+        let expression = Self(Arc::new(Inner { source: source.into(), counted: true, program: OnceLock::new() }));
         match expression.program() {
             Ok(_) => Ok(expression),
             Err(cause) => Err(ParseError { source_text: source.to_owned(), cause: cause.to_owned() }),
@@ -119,14 +123,14 @@ impl Expression {
         let expression = if at_once {
             Self::parse(source)?
         } else {
-            Self(Arc::new(Inner { source: source.into(), program: OnceLock::new() }))
+            Self(Arc::new(Inner { source: source.into(), counted: false, program: OnceLock::new() }))
         };
         READING.with_borrow_mut(|r| Some(r.seen.as_mut()?.insert(source.into(), expression.clone())));
         Ok(expression)
     }
 
     fn program(&self) -> Result<&Program, &str> {
-        let program = self.0.program.get_or_init(|| Program::compile(&self.0.source));
+        let program = self.0.program.get_or_init(|| Program::compile(&self.0.source, self.0.counted));
         program.as_ref().map_err(String::as_str)
     }
 
@@ -162,6 +166,7 @@ impl Expression {
     }
 
     fn value(&self, scope: &Scope<'_>) -> Result<Cel, EvalError> {
+        steps::spend(1).map_err(|cause| self.error(&cause))?;
         self.program().map_err(|cause| self.error(&cause))?.run(scope.context()).map_err(|e| self.error(&e))
     }
 

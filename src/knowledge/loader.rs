@@ -75,6 +75,20 @@ impl<'de> Deserialize<'de> for Loader {
     }
 }
 
+/// `transformers==4.51.3`: the version, as Python packages have it. Which loader stands for it is the checker's business.
+///
+/// # Errors
+/// Says how a version is written.
+pub fn asked(text: &str) -> Result<String, String> {
+    let version = text.strip_prefix("transformers==").unwrap_or_default();
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
+    if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
+        return Ok(version.to_owned());
+    }
+    let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
+    Err(format!("write it as transformers==VERSION; known are {}, others are judged as the nearest", known.join(", ")))
+}
+
 #[cfg(test)]
 mod tests {
     use serde_json::json;

@@ -5,12 +5,14 @@ pub mod evidence;
 pub mod expression;
 pub mod library;
 pub mod loader;
+mod ordered;
 pub mod processor;
 pub mod quantization;
 pub mod recipe;
 pub mod resemblance;
 pub mod rule;
 pub mod selection;
+pub mod settings;
 pub mod source;
 
 pub use architecture::{Architecture, Conversion, Expected, ExpectedTensor, Refusal, UnknownPart};

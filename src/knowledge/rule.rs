@@ -60,6 +60,9 @@ pub struct Rule {
     /// Where the facts come from.
     #[serde(default)]
     pub references: Vec<String>,
+    /// The file it was read from, for a user's own rule.
+    #[serde(skip)]
+    pub origin: Option<String>,
 }
 
 /// The kinds of check. Adding a rule rarely needs another.
@@ -156,11 +159,13 @@ pub struct Fix {
     pub help: Template,
 }
 
-/// All rules, by code.
+/// Rules, by code.
 #[derive(Debug, Clone, Default)]
 pub struct RuleSet {
-    /// Sorted by code.
+    /// Those that are asked, sorted by code.
     pub rules: Vec<Rule>,
+    /// Those that were not chosen.
+    pub unselected: Vec<Rule>,
 }
 
 impl RuleSet {
@@ -170,7 +175,7 @@ impl RuleSet {
     /// [`DataError`] naming the file and the place; the house tests see to it that there is none.
     pub fn embedded() -> Result<Self, DataError> {
         let parse = |(path, text): (String, &str)| Ok((source::parse_embedded(&path, text)?, path));
-        Self::collect(source::embedded("checks").into_iter().map(parse))
+        Self::default().with(source::embedded("checks").into_iter().map(parse))
     }
 
     /// Rules from named texts.
@@ -178,29 +183,53 @@ impl RuleSet {
     /// # Errors
     /// [`DataError`] for a text that is no rule, a code given twice, or an unknown kind of fault.
     pub fn from_files<'a>(files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
-        Self::collect(files.into_iter().map(|(path, text)| Ok((source::parse(&path, text)?, path))))
+        Self::default().and_files(files)
     }
 
-    fn collect(files: impl Iterator<Item = Result<(Rule, String), DataError>>) -> Result<Self, DataError> {
-        let mut rules: Vec<Rule> = Vec::new();
+    /// These rules and others from named texts.
+    ///
+    /// # Errors
+    /// As [`Self::from_files`]; a code or a name that these rules have is taken.
+    pub fn and_files<'a>(self, files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
+        self.with(files.into_iter().map(|(path, text)| {
+            let rule: Rule = source::parse(&path, text)?;
+            Ok((Rule { origin: Some(path.clone()), ..rule }, path))
+        }))
+    }
+
+    /// Every rule, chosen or not.
+    pub fn all(&self) -> impl Iterator<Item = &Rule> {
+        self.rules.iter().chain(&self.unselected)
+    }
+
+    fn with(mut self, files: impl Iterator<Item = Result<(Rule, String), DataError>>) -> Result<Self, DataError> {
         for file in files {
             let (rule, path) = file?;
+            let wrong = |reason: String| Err(DataError::new(&path, reason));
+            if !is_code(&rule.code) {
+                return wrong(format!("`{}` is no code: capitals for the family, then digits, as IDX005", rule.code));
+            }
             if let Check::Fault(f) = &rule.check
                 && let Some(kind) = f.kinds.iter().find(|k| !is_known_kind(k))
             {
-                return Err(DataError::new(&path, format!("no such kind of fault: {kind}")));
+                return wrong(format!("no such kind of fault: {kind}"));
             }
-            if let Some(twin) = rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
-                return Err(DataError::new(
-                    &path,
-                    format!("{} {} is already taken by {}", rule.code, rule.name, twin.code),
-                ));
+            if let Some(twin) = self.rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
+                return wrong(format!("{} {} is already taken by {} {}", rule.code, rule.name, twin.code, twin.name));
             }
-            rules.push(rule);
+            self.rules.push(rule);
         }
-        rules.sort_by(|a, b| a.code.cmp(&b.code));
-        Ok(Self { rules })
+        self.rules.sort_by(|a, b| a.code.cmp(&b.code));
+        Ok(self)
     }
+}
+
+/// Whether a rule can be chosen by this code, and by the start of it.
+fn is_code(code: &str) -> bool {
+    let family = code.trim_end_matches(|c: char| c.is_ascii_digit());
+    (2..=8).contains(&family.len())
+        && family.bytes().all(|b| b.is_ascii_uppercase())
+        && (1..=8).contains(&code.len().saturating_sub(family.len()))
 }
 
 /// Kinds of fault that the comparisons in `check` produce, beside those of the reader ([`FAULT_KINDS`]).
@@ -259,6 +288,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "shard-tensor-not-in-index",
     "single-file-beside-index",
     "stray-shard",
+    "suppression-unused",
     "tensor-in-two-shards",
     "tied-over",
     "tied-over-another",

@@ -1,6 +1,7 @@
 //! Choosing rules by code, by the start of a code, or by name.
 
-use super::rule::{Rule, RuleSet};
+use super::rule::{Rule, RuleSet, Severity};
+use super::source::nearest;
 
 /// A word that chooses no rule.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -11,9 +12,6 @@ pub struct UnknownRule {
     /// The code or name nearest to it, when one is near.
     pub similar: Option<String>,
 }
-
-/// Likeness, from 0 to 1, from which a name is offered instead of a misspelt one.
-const NEAR: f64 = 0.75;
 
 /// How exactly `word` names the rule: the length of the code it gives; a name gives all of it.
 fn specificity(word: &str, rule: &Rule) -> Option<usize> {
@@ -31,35 +29,85 @@ impl RuleSet {
     /// [`UnknownRule`], with the nearest one there is.
     pub fn find(&self, word: &str) -> Result<&Rule, UnknownRule> {
         let whole = |r: &&Rule| word == r.name || word.eq_ignore_ascii_case(&r.code);
-        self.rules.iter().find(whole).ok_or_else(|| self.unknown(word))
+        self.all().find(whole).ok_or_else(|| self.unknown(word))
     }
 
-    /// Keeps the rules that `select` names (all when it is empty) and `ignore` does not.
+    /// Keeps the rules that these choices, from the weakest to the last word, leave on. Without any, all are on.
     ///
-    /// A word is a code, the start of one (`JSN`), or a name. Where both name a rule the longer word wins, and
-    /// `ignore` when they are equal, as in ruff.
+    /// A choice that selects starts anew; one that does not changes what those before it left. Within a choice the
+    /// longer word wins where two name a rule, and `ignore` when they are equal, as in ruff.
     ///
     /// # Errors
     /// [`UnknownRule`] for a word that names no rule.
-    pub fn choose(&mut self, select: &[String], ignore: &[String]) -> Result<(), UnknownRule> {
-        for word in select.iter().chain(ignore) {
-            if !self.rules.iter().any(|r| specificity(word, r).is_some()) {
-                return Err(self.unknown(word));
-            }
+    pub fn choose(&mut self, choices: &[Choice]) -> Result<(), UnknownRule> {
+        for word in choices.iter().flat_map(Choice::words) {
+            self.codes(word)?;
         }
-        let longest = |words: &[String], rule: &Rule| words.iter().filter_map(|w| specificity(w, rule)).max();
-        self.rules.retain(|rule| {
-            let wanted = if select.is_empty() { Some(0) } else { longest(select, rule) };
-            wanted.is_some_and(|w| longest(ignore, rule).is_none_or(|unwanted| w > unwanted))
-        });
+        let on = |rule: &Rule| choices.iter().fold(true, |on, choice| choice.says(rule).unwrap_or(on));
+        let (chosen, others) = std::mem::take(&mut self.rules).into_iter().partition(on);
+        self.rules = chosen;
+        self.unselected.extend(others);
         Ok(())
     }
 
+    /// Gives rules other severities; of two words that name a rule the longer one wins, of equal ones the later.
+    ///
+    /// # Errors
+    /// [`UnknownRule`] for a word that names no rule.
+    pub fn regrade(&mut self, words: &[(&str, Severity)]) -> Result<(), UnknownRule> {
+        for (word, _) in words {
+            self.codes(word)?;
+        }
+        for rule in &mut self.rules {
+            let graded = words.iter().filter_map(|(word, to)| Some((specificity(word, rule)?, *to)));
+            if let Some((_, severity)) = graded.max_by_key(|(exactness, _)| *exactness) {
+                rule.severity = severity;
+            }
+        }
+        Ok(())
+    }
+
+    /// The codes of the rules that a word names, chosen or not.
+    ///
+    /// # Errors
+    /// [`UnknownRule`] when there is none.
+    pub fn codes(&self, word: &str) -> Result<Vec<String>, UnknownRule> {
+        let named = self.all().filter(|r| specificity(word, r).is_some());
+        let codes: Vec<String> = named.map(|r| r.code.clone()).collect();
+        if codes.is_empty() { Err(self.unknown(word)) } else { Ok(codes) }
+    }
+
     fn unknown(&self, word: &str) -> UnknownRule {
-        let words = self.rules.iter().flat_map(|r| [&r.code, &r.name]);
-        let likeness = |other: &str| strsim::jaro_winkler(&word.to_ascii_lowercase(), &other.to_ascii_lowercase());
-        let near = words.map(|w| (likeness(w), w)).max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(l, _)| *l > NEAR);
-        UnknownRule { word: word.to_owned(), similar: near.map(|(_, w)| w.clone()) }
+        let words = self.all().flat_map(|r| [r.code.as_str(), r.name.as_str()]);
+        UnknownRule { word: word.to_owned(), similar: nearest(word, words).map(str::to_owned) }
+    }
+}
+
+/// Which rules one place, a settings file or the command line, turns on and off.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Choice {
+    /// Only these, when it is given.
+    pub select: Option<Vec<String>>,
+    /// These as well.
+    pub extend_select: Vec<String>,
+    /// Not these.
+    pub ignore: Vec<String>,
+}
+
+impl Choice {
+    fn words(&self) -> impl Iterator<Item = &String> {
+        self.select.iter().flatten().chain(&self.extend_select).chain(&self.ignore)
+    }
+
+    /// Whether the rule is on, when this choice says so.
+    fn says(&self, rule: &Rule) -> Option<bool> {
+        let wanted = self.select.iter().flatten().chain(&self.extend_select);
+        let wanted = wanted.filter_map(|w| specificity(w, rule)).max();
+        let unwanted = self.ignore.iter().filter_map(|w| specificity(w, rule)).max();
+        match (wanted, unwanted) {
+            (None, None) => self.select.as_ref().map(|_| false),
+            (wanted, unwanted) => Some(wanted > unwanted),
+        }
     }
 }
 
@@ -67,29 +115,57 @@ impl RuleSet {
 mod tests {
     use super::*;
 
-    fn codes(select: &[&str], ignore: &[&str]) -> Vec<String> {
+    fn choice(select: Option<&[&str]>, extend: &[&str], ignore: &[&str]) -> Choice {
         let owned = |words: &[&str]| words.iter().map(|w| (*w).to_owned()).collect::<Vec<_>>();
+        Choice { select: select.map(owned), extend_select: owned(extend), ignore: owned(ignore) }
+    }
+
+    fn codes(choices: &[Choice]) -> Vec<String> {
         let mut rules = RuleSet::embedded().unwrap();
-        rules.choose(&owned(select), &owned(ignore)).unwrap();
+        rules.choose(choices).unwrap();
         rules.rules.into_iter().map(|r| r.code).collect()
     }
 
     #[test]
     fn the_longer_word_wins() {
-        assert_eq!(codes(&["JSN001"], &[]), ["JSN001"]);
-        assert_eq!(codes(&["non-finite-number"], &["JSN"]), ["JSN001"]);
-        assert_eq!(codes(&["JSN001"], &["JSN001"]), Vec::<String>::new());
-        assert!(codes(&["JSN"], &["JSN001"]).contains(&"JSN002".to_owned()));
-        assert!(!codes(&[], &["jsn"]).iter().any(|c| c.starts_with("JSN")));
-        assert_eq!(codes(&[], &[]).len(), RuleSet::embedded().unwrap().rules.len());
+        let one = |select: &[&str], ignore: &[&str]| codes(&[choice(Some(select), &[], ignore)]);
+        assert_eq!(one(&["JSN001"], &[]), ["JSN001"]);
+        assert_eq!(one(&["non-finite-number"], &["JSN"]), ["JSN001"]);
+        assert_eq!(one(&["JSN001"], &["JSN001"]), Vec::<String>::new());
+        assert!(one(&["JSN"], &["JSN001"]).contains(&"JSN002".to_owned()));
+        assert!(!codes(&[choice(None, &[], &["jsn"])]).iter().any(|c| c.starts_with("JSN")));
+        assert_eq!(codes(&[]).len(), RuleSet::embedded().unwrap().rules.len());
+    }
+
+    #[test]
+    fn a_later_choice_has_the_last_word() {
+        let file = choice(Some(&["JSN001", "LFS"]), &[], &["LFS002"]);
+        assert_eq!(codes(std::slice::from_ref(&file)), ["JSN001", "LFS001"]);
+        assert_eq!(codes(&[file.clone(), choice(None, &["LFS002"], &["JSN"])]), ["LFS001", "LFS002"]);
+        assert_eq!(codes(&[file, choice(Some(&["JSN002"]), &[], &[])]), ["JSN002"]);
+    }
+
+    #[test]
+    fn severities_follow_the_longer_word() {
+        let mut rules = RuleSet::embedded().unwrap();
+        rules.regrade(&[("JSN001", Severity::Info), ("JSN", Severity::Error)]).unwrap();
+        let of = |code: &str| rules.find(code).unwrap().severity;
+        assert_eq!((of("JSN001"), of("JSN003")), (Severity::Info, Severity::Error));
+        assert_eq!(
+            rules.clone().regrade(&[("JSN0O1", Severity::Info)]).unwrap_err().similar.as_deref(),
+            Some("JSN001")
+        );
     }
 
     #[test]
     fn a_misspelt_word_is_answered_with_the_nearest() {
-        let rules = RuleSet::embedded().unwrap();
+        let mut rules = RuleSet::embedded().unwrap();
         assert_eq!(rules.find("shard-mising").unwrap_err().similar.as_deref(), Some("shard-missing"));
         assert_eq!(rules.find("qqqq").unwrap_err().similar, None);
         assert_eq!(rules.find("idx005").unwrap().name, "shard-missing");
         assert!(rules.find("IDX").is_err());
+        // Also one that is not chosen is known.
+        rules.choose(&[choice(Some(&["JSN"]), &[], &[])]).unwrap();
+        assert!(rules.find("IDX005").is_ok() && rules.codes("IDX").is_ok());
     }
 }

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use super::model::{CheckpointReport, Counts};
-use crate::check::Outcome;
+use crate::check::finding::{Accepted, Suppressed};
+use crate::check::{Finding, Outcome};
 use crate::checkpoint::Checkpoint;
 
 impl CheckpointReport {
@@ -26,10 +27,24 @@ impl CheckpointReport {
             architecture: outcome.architecture.clone(),
             verdict: counts.verdict().to_owned(),
             counts,
+            settings: None,
             findings: outcome.findings.clone(),
+            suppressed: outcome.suppressed.clone(),
             loads: outcome.loads.clone(),
             sources,
             tensors: (checkpoint.tensors().count(), bytes),
         }
+    }
+
+    /// Sets findings aside that are accepted; they are no longer counted.
+    pub fn accept(&mut self, accepted: impl Fn(usize, &Finding) -> Option<Accepted>) {
+        for (number, finding) in std::mem::take(&mut self.findings).into_iter().enumerate() {
+            match accepted(number, &finding) {
+                Some(accepted) => self.suppressed.push(Suppressed { finding, accepted }),
+                None => self.findings.push(finding),
+            }
+        }
+        self.counts = Counts::of(&self.findings);
+        self.counts.verdict().clone_into(&mut self.verdict);
     }
 }

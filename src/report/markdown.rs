@@ -34,6 +34,9 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     let verdict = text(&checkpoint.verdict);
     let _ok =
         writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
+    if !checkpoint.suppressed.is_empty() {
+        let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
+    }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
     for finding in words::alike(shown) {
         render_finding(out, &finding);

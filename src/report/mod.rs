@@ -2,6 +2,7 @@
 //!
 //! [`render`] turns a [`Report`] into text; where that text goes is the caller's business.
 
+pub mod baseline;
 mod build;
 mod ci;
 mod collapse;
@@ -11,6 +12,7 @@ pub mod inspect;
 mod json;
 mod markdown;
 pub mod model;
+mod statistics;
 mod terminal;
 mod words;
 
@@ -18,6 +20,7 @@ use std::fmt;
 use std::str::FromStr;
 
 pub use model::Report;
+pub use statistics::statistics;
 
 /// How a report is written down.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

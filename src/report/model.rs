@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use crate::check::finding::LoadReport;
+use crate::check::finding::{LoadReport, Suppressed};
 use crate::check::{Finding, Severity};
 pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 
@@ -31,7 +31,8 @@ impl Report {
         let counts = checkpoints.iter().fold(Counts::default(), |sum, c| sum.plus(c.counts));
         let seams = merge.as_ref().is_some_and(|m| !m.seams.is_empty());
         let verdict = if seams { Severity::Error.name() } else { counts.verdict() };
-        let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts };
+        let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
+        let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts, suppressed };
         Self { schema: 2, tool: Tool::this(), checkpoints, merge, summary }
     }
 }
@@ -67,8 +68,14 @@ pub struct CheckpointReport {
     pub verdict: String,
     /// Findings by severity.
     pub counts: Counts,
+    /// The settings file that was gone by.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub settings: Option<String>,
     /// Findings sorted by file, place and code.
     pub findings: Vec<Finding>,
+    /// Findings that settings or a baseline accept; they are not counted.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub suppressed: Vec<Suppressed>,
     /// Predicted load reports, one for each loader; none when the architecture is unknown or there are no tensors.
     pub loads: Vec<LoadReport>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
@@ -141,4 +148,12 @@ pub struct Summary {
     pub verdict: String,
     /// Findings by severity.
     pub counts: Counts,
+    /// Findings that are accepted, and not among the counts.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub suppressed: usize,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands fields by reference")]
+const fn is_zero(n: &usize) -> bool {
+    *n == 0
 }

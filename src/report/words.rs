@@ -159,6 +159,10 @@ fn silence(reason: &str) -> String {
 pub fn summary(report: &Report) -> String {
     let found = counts(report.summary.counts);
     let checkpoints = plural(report.summary.checkpoints, "checkpoint");
+    let checkpoints = match report.summary.suppressed {
+        0 => checkpoints,
+        n => format!("{checkpoints}, {n} suppressed"),
+    };
     let outcome = report.merge.as_ref().and_then(outcome);
     match (outcome, found.is_empty()) {
         (None, true) => format!("All clean: {checkpoints}"),

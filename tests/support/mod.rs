@@ -24,11 +24,13 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Knowledge, Outcome, check};
+use ckpt_doctor::check::{Knowledge, Outcome, check, policy};
 use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::knowledge::Library;
 use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::rule::RuleSet;
+use ckpt_doctor::knowledge::selection::Choice;
+use ckpt_doctor::knowledge::settings::{Chain, Policy, Source};
 use ckpt_doctor::knowledge::source;
 use serde::Deserialize;
 
@@ -53,6 +55,9 @@ pub struct Case {
     /// Whether the tensors' bytes are read, as `check --deep` does. Those of sound cases always are.
     #[serde(default)]
     deep: bool,
+    /// Settings to check it under.
+    #[serde(default)]
+    settings: Option<serde_json::Value>,
     /// What has to be said; absent for a sound case.
     #[serde(default)]
     pub expect: Option<Expect>,
@@ -145,7 +150,26 @@ pub fn texts(folder: &str) -> Vec<(String, String)> {
 
 /// All that a checker knows.
 pub fn knowledge() -> Knowledge {
-    Knowledge { rules: rules(), library: Library::embedded(), processors: Processor::embedded().expect("processors") }
+    Knowledge {
+        rules: rules(),
+        library: Library::embedded(),
+        processors: Processor::embedded().expect("processors"),
+        policy: Policy::default(),
+    }
+}
+
+/// What is found in a directory under settings that lie in the folder above it.
+fn under(settings: &serde_json::Value, dir: &Path) -> Outcome {
+    let mut knowledge = knowledge();
+    let above = dir.parent().expect("a folder above");
+    let source = Source::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
+    knowledge.policy =
+        Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
+    let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
+    let mut outcome = check(&checkpoint, &knowledge);
+    let unused = policy::unused(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
+    outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
+    outcome
 }
 
 /// All cases, by name.
@@ -175,6 +199,7 @@ pub fn cases() -> Vec<Case> {
         base: (*base).to_owned(),
         changes: Vec::new(),
         deep: true,
+        settings: None,
         expect: None,
     });
     cases.extend(plain);
@@ -287,7 +312,10 @@ fn try_all() -> Vec<Tried> {
             let base = bases.get(case.base.as_str()).unwrap_or_else(|| panic!("{}: no base {}", case.name, case.base));
             let room = temporary.path().join(number.to_string());
             let made = change::make(&case.name, base, &case.changes, &room);
-            let outcome = look(&made, case.deep, &knowledge);
+            let outcome = match &case.settings {
+                Some(settings) => under(settings, &made),
+                None => look(&made, case.deep, &knowledge),
+            };
             let before = before[case.base.as_str()].findings.iter().map(|f| f.code.clone()).collect();
             fs::remove_dir_all(&room).expect("removing a fixture");
             done.lock().expect("no panic").insert(number, Tried { case, outcome, before });

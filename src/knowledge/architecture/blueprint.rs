@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 use super::conversions::Rows;
 use super::member::Member;
-use super::ordered::ordered;
+use crate::knowledge::ordered::ordered;
 use crate::knowledge::{Expression, Loader, Scope, Template};
 
 /// One architecture file.

@@ -3,7 +3,7 @@
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::ordered::{ordered, ordered_option};
+use crate::knowledge::ordered::{ordered, ordered_option};
 use crate::knowledge::{Expression, Template};
 
 /// An entry of `tensors`: its name is a template, and says one of `shape`, `weight`, `buffer`, `tensors`, `part`.

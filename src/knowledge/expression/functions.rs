@@ -5,7 +5,7 @@ use cel::common::value::Val;
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 use serde_json::Value;
 
-use super::Scope;
+use super::{Scope, steps};
 
 /// Longest list `range` makes.
 const RANGE_CAP: i64 = 100_000;
@@ -29,6 +29,7 @@ pub(super) fn register(scope: &mut Scope<'static>) {
     scope.add("min", cel::functions::min);
     scope.add("max", cel::functions::max);
     scope.add("get", get);
+    steps::register(scope);
 }
 
 fn pow(arguments: &[Value]) -> Outcome {

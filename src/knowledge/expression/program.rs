@@ -1,10 +1,11 @@
 //! What an expression is compiled to.
 
+use cel::common::ast::IdedExpr;
 use cel::common::types::CelString;
 use cel::common::value::Val;
 use cel::{Context, ExecutionError, Value as Cel};
 
-use super::ENV;
+use super::{ENV, steps};
 
 /// Most expressions of the data files are a number, a flag, or a path such as `c.hidden_size`: those need neither CEL's
 /// parser, which is slow, nor its interpreter.
@@ -15,6 +16,8 @@ pub(super) enum Program {
     Path { variable: String, keys: Vec<CelString<'static>> },
     /// Anything else.
     General(cel::Program),
+    /// Anything else in a user's file: as it was parsed, and with its loops counted.
+    Counted(cel::Program, Box<IdedExpr>),
 }
 
 /// Words that are no variables.
@@ -22,11 +25,19 @@ const RESERVED: [&str; 4] = ["true", "false", "null", "in"];
 
 impl Program {
     /// The cause is CEL's message, with its place in the text.
-    pub fn compile(source: &str) -> Result<Self, String> {
+    pub fn compile(source: &str, counted: bool) -> Result<Self, String> {
         if let Some(simple) = Self::constant(source).or_else(|| Self::path(source)) {
             return Ok(simple);
         }
-        ENV.compile(source).map(Self::General).map_err(|errors| {
+        let compiled = |program: cel::Program| {
+            if counted {
+                let counted = steps::count(program.expression());
+                Self::Counted(program, Box::new(counted))
+            } else {
+                Self::General(program)
+            }
+        };
+        ENV.compile(source).map(compiled).map_err(|errors| {
             let errors = errors.errors.iter().map(|e| format!("column {}: {}", e.pos.1, e.msg));
             errors.collect::<Vec<_>>().join("; ")
         })
@@ -65,6 +76,7 @@ impl Program {
                 follow(root.as_ref(), keys)
             }
             Self::General(program) => program.execute(context),
+            Self::Counted(_, expression) => Cel::resolve(expression, context),
         }
     }
 
@@ -73,7 +85,7 @@ impl Program {
         match self {
             Self::Constant(_) => Vec::new(),
             Self::Path { variable, .. } => vec![variable.clone()],
-            Self::General(program) => {
+            Self::General(program) | Self::Counted(program, _) => {
                 let references = program.references();
                 let mut names: Vec<String> = references.variables().into_iter().map(str::to_owned).collect();
                 names.sort();

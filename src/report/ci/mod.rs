@@ -14,7 +14,8 @@ use sha2::{Digest as _, Sha256};
 
 use super::model::{CheckpointReport, MergeReport, Report};
 use super::words::{fix, sentence};
-use crate::check::{Location, Severity};
+use crate::check::finding::Accepted;
+use crate::check::{Finding, Location, Severity};
 
 /// Longest path written, in characters: no longer one exists on Linux.
 const PATH: usize = 4_096;
@@ -27,6 +28,8 @@ pub struct Group<'a> {
     pub path: String,
     /// In the order of the report.
     pub items: Vec<Item<'a>>,
+    /// Findings that are accepted, with where that is written and why.
+    pub suppressed: Vec<(Item<'a>, &'a Accepted)>,
 }
 
 /// A finding, or a seam that does not fit.
@@ -59,25 +62,29 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
     let path = tidy(&checkpoint.path);
     let role = checkpoint.role.as_deref().unwrap_or_default();
     let title = if role.is_empty() { path.clone() } else { format!("{path} ({role})") };
-    let items = checkpoint.findings.iter().map(|finding| {
-        let mut parts = vec![path.as_str(), role, &finding.code];
-        // One place is enough: a finding stays what it is when it gets a place more.
-        if let Some(first) = finding.locations.first() {
-            parts.extend([&first.file, &first.pointer, &first.tensor].map(|p| p.as_deref().unwrap_or_default()));
-        }
-        parts.push(&finding.message);
-        Item {
-            code: &finding.code,
-            name: &finding.name,
-            severity: finding.severity,
-            message: sentence(&finding.message),
-            locations: &finding.locations,
-            help: finding.fix.as_ref().map(fix),
-            fingerprint: fingerprint(&parts, seen),
-        }
-    });
-    let items = items.collect();
-    Group { title, path, items }
+    let mut item = |finding: &'a Finding| Item {
+        code: &finding.code,
+        name: &finding.name,
+        severity: finding.severity,
+        message: sentence(&finding.message),
+        locations: &finding.locations,
+        help: finding.fix.as_ref().map(fix),
+        fingerprint: of_finding(finding, &path, role, seen),
+    };
+    let items = checkpoint.findings.iter().map(&mut item).collect();
+    let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
+    Group { title, path, items, suppressed }
+}
+
+/// Fingerprint of a finding of the checkpoint at `path`.
+pub fn of_finding(finding: &Finding, path: &str, role: &str, seen: &mut BTreeMap<String, usize>) -> String {
+    let mut parts = vec![path, role, &finding.code];
+    // One place is enough: a finding stays what it is when it gets a place more.
+    if let Some(first) = finding.locations.first() {
+        parts.extend([&first.file, &first.pointer, &first.tensor].map(|p| p.as_deref().unwrap_or_default()));
+    }
+    parts.push(&finding.message);
+    fingerprint(&parts, seen)
 }
 
 fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
@@ -92,7 +99,7 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         fingerprint: fingerprint(&[&path, "seam", &merge.recipe, &seam.message], seen),
     });
     let items = items.collect();
-    Group { title: format!("merge {}", merge.recipe), path, items }
+    Group { title: format!("merge {}", merge.recipe), path, items, suppressed: Vec::new() }
 }
 
 /// Parts are hashed with their lengths, so that none can pass for another; what occurs again is numbered.

@@ -8,6 +8,7 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::{Group, Item, file, groups};
+use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
 use crate::report::words::{name, sentence};
 use crate::report::{Report, json};
@@ -78,6 +79,16 @@ struct Found {
     message: Text,
     locations: Vec<Place>,
     partial_fingerprints: BTreeMap<&'static str, String>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    suppressions: Vec<Suppression>,
+}
+
+/// Why a result is not counted (3.35); `external`, because it is not written beside what it is about.
+#[derive(Serialize)]
+struct Suppression {
+    kind: &'static str,
+    status: &'static str,
+    justification: String,
 }
 
 #[derive(Serialize)]
@@ -123,7 +134,8 @@ pub fn render(report: &Report) -> String {
     let mut known: BTreeMap<String, usize> = BTreeMap::new();
     let mut results = Vec::new();
     for group in groups(report) {
-        for item in &group.items {
+        let accepted = group.suppressed.iter().map(|(item, accepted)| (item, Some(*accepted)));
+        for (item, accepted) in group.items.iter().map(|item| (item, None)).chain(accepted) {
             let id = name(item.code);
             let rule_index = *known.entry(id.clone()).or_insert_with(|| {
                 rules.push(rule(id.clone(), item));
@@ -137,6 +149,7 @@ pub fn render(report: &Report) -> String {
                 message: text(&item.message),
                 locations: locations(&group, item),
                 partial_fingerprints,
+                suppressions: accepted.map(suppression).into_iter().collect(),
             });
         }
     }
@@ -149,6 +162,12 @@ pub fn render(report: &Report) -> String {
     // Columns of findings count characters (3.14.17).
     let run = Run { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
     json::pretty(&Log { schema: SCHEMA, version: "2.1.0", runs: [run] })
+}
+
+fn suppression(accepted: &Accepted) -> Suppression {
+    let reason = accepted.reason.iter().map(|reason| sentence(&format!("{reason} ({})", accepted.by)));
+    let justification = reason.chain([sentence(&accepted.by)]).next().unwrap_or_default();
+    Suppression { kind: "external", status: "accepted", justification }
 }
 
 const fn level(severity: Severity) -> &'static str {

@@ -56,6 +56,12 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
     let _ok = writeln!(out, ", {}", paint.verdict(&checkpoint.verdict, verdict));
+    let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
+    let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
+    let said: Vec<String> = settings.into_iter().chain(suppressed).collect();
+    if !said.is_empty() {
+        let _ok = writeln!(out, "  {}", paint.quiet(&said.join(", ")));
+    }
 }
 
 fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {

@@ -1,0 +1,80 @@
+//! Reading and writing baselines.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use anyhow::{Context, bail};
+use ckpt_doctor::checkpoint::open::{JSON_CAP, read_capped};
+use ckpt_doctor::report::baseline::Baseline;
+use ckpt_doctor::report::model::CheckpointReport;
+
+use super::output;
+use super::settings::Resolved;
+
+/// Gone findings that are named.
+const NAMED: usize = 10;
+
+/// Sets the findings aside that are in the baselines, which are written first if that is asked for.
+pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool) -> anyhow::Result<()> {
+    let mut of_file: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
+    for (at, resolved) in by.iter().enumerate() {
+        match &resolved.baseline {
+            Some(file) => of_file.entry(file).or_default().push(at),
+            None if write => bail!("no baseline to write: --baseline FILE names it, or `baseline` in the settings"),
+            None => {}
+        }
+    }
+    for (file, here) in of_file {
+        let name = file.display().to_string();
+        let folder =
+            file.parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(|| PathBuf::from("."), Path::to_owned);
+        let asked: BTreeSet<&str> = here.iter().filter_map(|at| by.get(*at)).flat_map(|r| codes(r)).collect();
+        let older = read(file, &name, write)?;
+        let baseline = if write {
+            let looked: Vec<&CheckpointReport> = here.iter().filter_map(|at| reports.get(*at)).collect();
+            let mut baseline = Baseline::of(looked.iter().copied(), &folder);
+            if let Some(older) = older {
+                baseline.keep(older, &looked, &folder, &asked);
+            }
+            output::write(file, &baseline.text()).with_context(|| format!("writing {name}"))?;
+            output::note(&format!("{name}: {} findings", baseline.len()));
+            baseline
+        } else {
+            older.unwrap_or_else(|| Baseline::of(std::iter::empty(), &folder))
+        };
+        let mut gone = Vec::new();
+        for at in here {
+            if let Some(report) = reports.get_mut(at) {
+                gone.extend(baseline.accept(report, &name, &folder, &asked));
+            }
+        }
+        if !gone.is_empty() {
+            output::note(&format!(
+                "note: gone since {name} was written ({}); --write-baseline drops them:",
+                gone.len()
+            ));
+            for entry in gone.iter().take(NAMED) {
+                output::note(&output::safe(&format!("  {}: {} {}", entry.path, entry.code, entry.message)));
+            }
+            if gone.len() > NAMED {
+                output::note(&format!("  and {} more", gone.len().saturating_sub(NAMED)));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn codes(resolved: &Resolved) -> impl Iterator<Item = &str> {
+    resolved.knowledge.rules.rules.iter().map(|rule| rule.code.as_str())
+}
+
+/// The baseline in a file; one that is to be written may not be there yet.
+fn read(file: &Path, name: &str, write: bool) -> anyhow::Result<Option<Baseline>> {
+    if write && file.symlink_metadata().is_err() {
+        return Ok(None);
+    }
+    let text = read_capped(file, JSON_CAP).context("the baseline cannot be read; --write-baseline writes it")?;
+    let text = String::from_utf8(text).with_context(|| format!("{name}: not UTF-8"))?;
+    Ok(Some(Baseline::parse(name, &text)?))
+}

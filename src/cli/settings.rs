@@ -1,0 +1,125 @@
+//! From what was typed and what settings files say to what is meant.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use ckpt_doctor::check::{Knowledge, Severity};
+use ckpt_doctor::knowledge::processor::Processor;
+use ckpt_doctor::knowledge::selection::Choice;
+use ckpt_doctor::knowledge::settings::{Chain, nearest};
+
+use super::args::{CheckArgs, SettingsArgs};
+use super::{library, output};
+
+/// What is meant for the checkpoints of one settings file.
+pub struct Resolved {
+    /// The settings file, if there is one.
+    pub file: Option<PathBuf>,
+    /// What the checks know, the settings included.
+    pub knowledge: Knowledge,
+    /// Versions to predict the load for.
+    pub versions: Vec<String>,
+    /// Least severity that fails.
+    pub fail_on: Severity,
+    /// The baseline.
+    pub baseline: Option<PathBuf>,
+}
+
+/// What was typed. It has the last word over every settings file.
+#[derive(Default)]
+pub struct Typed {
+    config: Option<PathBuf>,
+    isolated: bool,
+    rules: Option<PathBuf>,
+    choice: Choice,
+    versions: Vec<String>,
+    fail_on: Option<Severity>,
+    baseline: Option<PathBuf>,
+}
+
+impl Typed {
+    /// Which settings and rules.
+    pub fn new(settings: &SettingsArgs, rules: Option<&Path>) -> Self {
+        Self {
+            config: settings.config.clone(),
+            isolated: settings.isolated,
+            rules: rules.map(Path::to_owned),
+            ..Self::default()
+        }
+    }
+
+    /// As `check` has it.
+    pub fn check(args: &CheckArgs, rules: Option<&Path>) -> Self {
+        Self {
+            choice: Choice {
+                select: (!args.select.is_empty()).then(|| args.select.clone()),
+                extend_select: args.extend_select.clone(),
+                ignore: args.ignore.clone(),
+            },
+            versions: args.versions.clone(),
+            fail_on: args.report.fail_on.map(super::args::FailOn::severity),
+            baseline: args.baseline.baseline.clone(),
+            ..Self::new(&args.settings, rules)
+        }
+    }
+}
+
+/// Finds the settings of checkpoints, and reads each file once.
+pub struct Resolver {
+    typed: Typed,
+    read: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
+    told: BTreeSet<PathBuf>,
+}
+
+impl Resolver {
+    pub fn new(typed: Typed) -> Self {
+        Self { typed, read: BTreeMap::new(), told: BTreeSet::new() }
+    }
+
+    /// What is meant for the checkpoint in this directory.
+    pub fn of(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
+        let file = if self.typed.isolated {
+            None
+        } else if let Some(config) = &self.typed.config {
+            Some(config.clone())
+        } else {
+            let found = nearest(checkpoint);
+            if let Some(passed_over) = found.passed_over
+                && self.told.insert(passed_over.clone())
+            {
+                let file = output::safe(&passed_over.display().to_string());
+                output::note(&format!("note: {file} lies in a checkpoint and is not used; --config {file} uses it"));
+            }
+            found.file
+        };
+        if let Some(resolved) = self.read.get(&file) {
+            return Ok(Rc::clone(resolved));
+        }
+        let resolved = Rc::new(self.resolve(file.clone())?);
+        self.read.insert(file, Rc::clone(&resolved));
+        Ok(resolved)
+    }
+
+    /// Every settings file that was found, and what it means.
+    pub fn all(&self) -> impl Iterator<Item = &Rc<Resolved>> {
+        self.read.values()
+    }
+
+    fn resolve(&self, file: Option<PathBuf>) -> anyhow::Result<Resolved> {
+        let typed = &self.typed;
+        let chain = file.as_deref().map(Chain::load).transpose()?.unwrap_or_default();
+        let folder = typed.rules.clone().or_else(|| chain.rules());
+        let mut rules = library::rules(folder.as_deref())?;
+        let policy = chain.govern(&mut rules, typed.choice.clone())?;
+        let library = library::with(folder.as_deref())?;
+        let versions = if typed.versions.is_empty() { chain.versions()? } else { typed.versions.clone() };
+        Ok(Resolved {
+            knowledge: Knowledge { rules, library, processors: Processor::embedded()?, policy },
+            versions,
+            fail_on: typed.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
+            baseline: typed.baseline.clone().or_else(|| chain.baseline()),
+            file,
+        })
+    }
+}

@@ -1,0 +1,167 @@
+//! What settings say of single findings: other severities in some places, silence in others, and what is accepted.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use globset::{GlobBuilder, GlobMatcher};
+
+use super::{Source, absolute};
+use crate::knowledge::rule::{RuleSet, Severity};
+use crate::knowledge::source::DataError;
+
+/// What becomes of findings, by their rule and place.
+#[derive(Debug, Clone, Default)]
+pub struct Policy {
+    places: Vec<Place>,
+    /// What is accepted, in the order it was written.
+    pub suppressions: Vec<Suppression>,
+}
+
+/// Other severities, and silence, in some place.
+#[derive(Debug, Clone)]
+struct Place {
+    area: Area,
+    ignore: BTreeSet<String>,
+    severity: BTreeMap<String, Severity>,
+}
+
+/// Findings that are accepted.
+#[derive(Debug, Clone)]
+pub struct Suppression {
+    /// Codes of its rules.
+    pub codes: BTreeSet<String>,
+    /// The rule as it was written.
+    pub rule: String,
+    /// Where, as it was written.
+    pub path: Option<String>,
+    /// Why.
+    pub reason: String,
+    /// `ckpt-doctor.json5: suppress[0]`.
+    pub written: String,
+    area: Area,
+}
+
+/// The files that a glob is about.
+#[derive(Debug, Clone)]
+struct Area {
+    /// Where the glob starts, absolute.
+    dir: PathBuf,
+    /// None for everything below `dir`.
+    glob: Option<GlobMatcher>,
+    /// The folders before its first wildcard, absolute.
+    base: PathBuf,
+}
+
+impl Policy {
+    /// What the sources say, of which a later one has the last word.
+    pub(super) fn of(sources: &[Source], rules: &RuleSet) -> Result<Self, DataError> {
+        let mut policy = Self::default();
+        for source in sources {
+            let codes = |word: &String| rules.codes(word).map_err(|e| source.wrong(word, e.to_string()));
+            for (glob, said) in &source.settings.per_path {
+                let mut place =
+                    Place { area: Area::of(source, Some(glob))?, ignore: BTreeSet::new(), severity: BTreeMap::new() };
+                for word in &said.ignore {
+                    place.ignore.extend(codes(word)?);
+                }
+                // Short words first: a code has the last word over its family.
+                let mut graded: Vec<&(String, Severity)> = said.severity.iter().collect();
+                graded.sort_by_key(|(word, _)| word.len());
+                for (word, severity) in graded {
+                    place.severity.extend(codes(word)?.into_iter().map(|code| (code, *severity)));
+                }
+                policy.places.push(place);
+            }
+            for (number, said) in source.settings.suppress.iter().enumerate() {
+                if said.reason.trim().is_empty() {
+                    let reason = format!("suppress[{number}] of {} has no reason; say why it is accepted", said.rule);
+                    return Err(source.wrong(&said.rule, reason));
+                }
+                policy.suppressions.push(Suppression {
+                    codes: codes(&said.rule)?.into_iter().collect(),
+                    rule: said.rule.clone(),
+                    path: said.path.clone(),
+                    reason: said.reason.clone(),
+                    written: format!("{}: suppress[{number}]", source.name),
+                    area: Area::of(source, said.path.as_ref())?,
+                });
+            }
+        }
+        Ok(policy)
+    }
+
+    /// Whether it leaves every finding as it is.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.places.is_empty() && self.suppressions.is_empty()
+    }
+
+    /// The severity of a rule's finding in `file` of the checkpoint at `root`, if settings give it another one; none at
+    /// all where the rule is to be silent.
+    #[must_use]
+    pub fn grade(&self, root: &Path, file: Option<&str>, code: &str, severity: Severity) -> Option<Severity> {
+        let here = || self.places.iter().filter(|place| place.area.holds(root, file));
+        if here().any(|place| place.ignore.contains(code)) {
+            return None;
+        }
+        Some(here().filter_map(|place| place.severity.get(code)).next_back().copied().unwrap_or(severity))
+    }
+
+    /// The suppression of a rule's finding in `file` of the checkpoint at `root`: its number.
+    #[must_use]
+    pub fn suppression(&self, root: &Path, file: Option<&str>, code: &str) -> Option<usize> {
+        self.suppressions.iter().position(|s| s.codes.contains(code) && s.area.holds(root, file))
+    }
+}
+
+impl Suppression {
+    /// Whether it is about the checkpoint at `root`, or about one of these files in it.
+    pub fn concerns<'f>(&self, root: &Path, mut files: impl Iterator<Item = &'f str>) -> bool {
+        self.area.holds(root, None) || files.any(|file| self.area.holds(root, Some(file)))
+    }
+
+    /// The folders before the first wildcard of its glob: everything it is about lies below.
+    #[must_use]
+    pub fn base(&self) -> &Path {
+        &self.area.base
+    }
+}
+
+impl Area {
+    fn of(source: &Source, glob: Option<&String>) -> Result<Self, DataError> {
+        let mut dir = source.dir.clone();
+        let Some(written) = glob else { return Ok(Self { base: dir.clone(), dir, glob: None }) };
+        let mut rest = written.trim_end_matches('/');
+        if written.starts_with('/') {
+            dir = PathBuf::from("/");
+            rest = rest.trim_start_matches('/');
+        }
+        loop {
+            if let Some(below) = rest.strip_prefix("./") {
+                rest = below;
+            } else if let Some(above) = rest.strip_prefix("../") {
+                dir.pop();
+                rest = above;
+            } else {
+                break;
+            }
+        }
+        if rest.is_empty() || rest == "." {
+            return Ok(Self { base: dir.clone(), dir, glob: None });
+        }
+        let plain = |part: &&str| !part.contains(['*', '?', '[', '{', '\\']);
+        let base = rest.split('/').take_while(plain).fold(dir.clone(), |base, part| base.join(part));
+        let glob = GlobBuilder::new(rest).literal_separator(true).build();
+        let glob = glob.map_err(|e| source.wrong(written, format!("`{written}` is no glob: {}", e.kind())))?;
+        Ok(Self { dir, glob: Some(glob.compile_matcher()), base })
+    }
+
+    /// Whether the checkpoint at `root` lies in it, or this file of the checkpoint.
+    fn holds(&self, root: &Path, file: Option<&str>) -> bool {
+        let root = absolute(root);
+        let Ok(below) = root.strip_prefix(&self.dir) else { return false };
+        let Some(glob) = &self.glob else { return true };
+        let folder = |path: &Path| path.ancestors().any(|path| glob.is_match(path));
+        folder(below) || file.is_some_and(|file| glob.is_match(below.join(file)))
+    }
+}

@@ -1,0 +1,59 @@
+//! How often each rule spoke, instead of what it said.
+
+use std::collections::BTreeMap;
+
+use comfy_table::{CellAlignment, Table, presets};
+use serde::Serialize;
+
+use super::words::{name, summary};
+use super::{Format, Report, json};
+use crate::check::{Finding, Severity};
+
+#[derive(Serialize)]
+struct Line<'a> {
+    code: &'a str,
+    name: &'a str,
+    severity: Severity,
+    count: usize,
+    /// Safety of the fix: `safe`, `unsafe` or `manual`.
+    fix: Option<&'a str>,
+}
+
+/// A line for each rule, the most frequent first: a table for `full` and `concise`, an array for `json`. The other formats
+/// have no place for it.
+#[must_use]
+pub fn statistics(report: &Report, format: Format) -> Option<String> {
+    let mut counts: BTreeMap<(&str, Severity), (usize, &Finding)> = BTreeMap::new();
+    for finding in report.checkpoints.iter().flat_map(|c| &c.findings) {
+        let (count, _) = counts.entry((&finding.code, finding.severity)).or_insert((0, finding));
+        // The last of many says how many more there are.
+        let more = finding.evidence.get("more").and_then(serde_json::Value::as_u64).unwrap_or(0);
+        *count = count.saturating_add(1).saturating_add(usize::try_from(more).unwrap_or(usize::MAX));
+    }
+    let mut lines: Vec<Line<'_>> = counts
+        .into_iter()
+        .map(|((code, severity), (count, finding))| {
+            let fix = finding.fix.as_ref().map(|fix| fix.safety.as_str());
+            Line { code, name: &finding.name, severity, count, fix }
+        })
+        .collect();
+    lines.sort_by_key(|line| std::cmp::Reverse(line.count));
+    match format {
+        Format::Json => Some(json::pretty(&lines)),
+        Format::Full | Format::Concise => Some(text(&lines, report)),
+        _ => None,
+    }
+}
+
+fn text(lines: &[Line<'_>], report: &Report) -> String {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    for line in lines {
+        table.add_row([&line.count.to_string(), &name(line.code), line.severity.name(), &name(line.name)]);
+    }
+    if let Some(counts) = table.column_mut(0) {
+        counts.set_cell_alignment(CellAlignment::Right);
+    }
+    let rows = table.lines().filter(|_| !lines.is_empty()).map(|row| format!("{}\n", row.trim_end()));
+    format!("{}{}\n", rows.collect::<String>(), summary(report))
+}
