@@ -1,15 +1,18 @@
 #!/usr/bin/env python3
 """Predicted load reports against recorded ones. Needs neither torch nor transformers.
 
-    recorded.py DIRECTORY      with sample.jsonl and omitted-keys.jsonl
+    recorded.py FILE... [--summary JSON]      records, one a line, gzip or not; a directory: its sample.jsonl and omitted-keys.jsonl
+
+The summary is what docs/architectures.md says of loads: tools/derive/loads.json.
 
 A record is a class, its config.json, the tensors in its file as name -> [dtype, shape], and what the loader said of that
 file and of changed copies of it. The weights are holes: only headers count.
 """
 
+import argparse
+import gzip
 import json
-import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 from mutations import differences, predicted_report, prediction
@@ -22,6 +25,9 @@ FIRM = {
     "LlavaForConditionalGeneration", "ZoeDepthForDepthEstimation",
 }
 
+SHARE = 0.95  # of the loads of known classes that have to agree
+BATCH = 400  # directories that are on disk at a time
+
 
 def changed(tensors, mutation):
     """A copy of the file's tensors with the mutation applied, in the order the records define."""
@@ -29,57 +35,119 @@ def changed(tensors, mutation):
     for name in mutation.get("drop", []):
         del tensors[name]
     for name, (_, shape) in mutation.get("reshape", {}).items():
-        tensors[name] = [tensors[name][0], shape]
+        if name in tensors:  # several changes at once may hit one tensor: then it is gone
+            tensors[name] = [tensors[name][0], shape]
     for old, new in mutation.get("rename", {}).items():
         tensors[new] = tensors.pop(old)
     return tensors | mutation.get("add", {})
 
 
-def cases(directory):
-    """(what, record, tensors, the loader's report)"""
-    for file in ("sample.jsonl", "omitted-keys.jsonl"):
-        for number, line in enumerate((Path(directory) / file).read_text().splitlines()):
+def read(file):
+    """The records of a file, each with where it stands."""
+    with (gzip.open if str(file).endswith(".gz") else open)(file, "rt") as lines:
+        for number, line in enumerate(lines, 1):
             record = json.loads(line)
-            what = f"{file}:{number + 1} {record['class']} {record['transformers_version']}"
-            yield f"{what} as saved", record, record["saved"], record["load"]
-            for mutation in record["mutations"]:
-                yield f"{what} {mutation['kind']}", record, changed(record["saved"], mutation), mutation["load"]
+            yield f"{Path(file).name}:{number} {record['class']} {record['transformers_version']}", record
+
+
+def loads(what, record):
+    """(what, record, tensors, the loader's report) for each load of a record; none when it was too large to be loaded."""
+    if record["saved"] is not None:
+        yield f"{what} as saved", record, record["saved"], record["load"]
+        for mutation in record["mutations"]:
+            yield f"{what} {mutation['kind']}", record, changed(record["saved"], mutation), mutation["load"]
+
+
+def agreement(record, entry, load):
+    """None when no prediction was made, else whether it is the loader's, and how it differs."""
+    version = record["transformers_version"]
+    got = predicted_report(entry, version)
+    if "error" in load:
+        raises = bool((prediction(entry, version) or {}).get("raises"))
+        return None if got is None and not raises else (raises, load["error"])
+    if got is None:
+        return None
+    want = {kind: sorted(load[kind]) for kind in ("missing", "unexpected", "mismatched")}
+    return got == want, "" if got == want else differences(got, want)
+
+
+def hold(cases, judge):
+    """Makes a checkpoint of each case, `check`s them, and gives `judge` each with its entry in the report."""
+    cases = list(cases)
+    for at in range(0, len(cases), BATCH):
+        with workplace() as work:
+            made = []
+            for number, case in enumerate(cases[at : at + BATCH]):
+                out = work / f"case{number:03}"
+                out.mkdir()
+                (out / "config.json").write_text(json.dumps(case[1]["config"]))
+                write_holes(out / "model.safetensors", case[2])
+                made.append(out)
+            entries, _ = check(*made)
+            for out, case in zip(made, cases[at : at + BATCH]):
+                judge(case, entries[str(out.resolve())])
+
+
+class Shares:
+    """How many loads of each version, and of each kind of change, agree; says which do not."""
+
+    def __init__(self, tally):
+        self.tally, self.agreed, self.compared = tally, Counter(), Counter()
+        self.classes = defaultdict(set)
+        self.differ = defaultdict(lambda: defaultdict(list))
+
+    def count(self, what, record, told, why):
+        version = record["transformers_version"]
+        self.compared[version] += 1
+        self.agreed[version] += told
+        self.classes[version].add(record["class"])
+        if not told:
+            self.differ[version][record["class"]].append(what.split(maxsplit=3)[3])
+            print(f"differs: {what}: {why}"[:300])
+
+    def summary(self):
+        return {
+            version: {
+                "classes": len(self.classes[version]), "loads": count, "agree": self.agreed[version],
+                "differ": {name: sorted(kinds) for name, kinds in sorted(self.differ[version].items())},
+            }
+            for version, count in sorted(self.compared.items())
+        }
+
+    def close(self):
+        for version, count in sorted(self.compared.items()):
+            share = f"{self.agreed[version]} of {count} loads of {len(self.classes[version])} classes agree"
+            print(f"{version}: {share}")
+            self.tally.expect(self.agreed[version] >= SHARE * count, f"{version}: fewer than {SHARE:.0%} agree")
 
 
 def main():
-    if len(sys.argv) != 2:
-        sys.exit(__doc__)
-    tally, agreed, compared = Tally(), Counter(), Counter()
-    with workplace() as work:
-        made = []
-        for what, record, tensors, load in cases(sys.argv[1]):
-            out = work / f"case{len(made):03}"
-            out.mkdir()
-            (out / "config.json").write_text(json.dumps(record["config"]))
-            write_holes(out / "model.safetensors", tensors)
-            made.append((what, out, record, load))
-        entries, _ = check(*(out for _, out, _, _ in made))
-        for what, out, record, load in made:
-            entry, version = entries[str(out.resolve())], record["transformers_version"]
-            firm = version == FIRM_VERSION and record["class"] in FIRM
-            got = predicted_report(entry, version)
-            if got is None and not firm:
-                continue  # not known here, and nobody said it has to be
-            if "error" in load:
-                told = bool(errors(entry) if firm else prediction(entry, version).get("raises"))
-                why = load["error"]
-            else:
-                want = {kind: sorted(load[kind]) for kind in ("missing", "unexpected", "mismatched")}
-                told, why = got == want, got and differences(got, want)
-            compared[version] += 1
-            agreed[version] += told
-            if firm:
-                tally.expect(told, f"{what}: load report", why)
-            elif not told:
-                print(f"differs: {what}: {why}"[:300])
-    for version, count in sorted(compared.items()):
-        print(f"{version}: {agreed[version]} of {count} agree")
-        tally.expect(agreed[version] >= 0.95 * count, f"{version}: fewer than 95 % agree")
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("files", nargs="+", type=Path)
+    p.add_argument("--summary", type=Path)
+    a = p.parse_args()
+    files = []
+    for name in a.files:
+        files += [name / "sample.jsonl", name / "omitted-keys.jsonl"] if name.is_dir() else [name]
+    tally = Tally()
+    shares = Shares(tally)
+
+    def judge(case, entry):
+        what, record, _, load = case
+        firm = record["transformers_version"] == FIRM_VERSION and record["class"] in FIRM
+        said = agreement(record, entry, load)
+        if said is None and firm:
+            said = bool("error" in load and errors(entry)), "no prediction"
+        if said is None:
+            return  # not known here, and nobody said it has to be
+        shares.count(what, record, *said)
+        if firm:
+            tally.expect(said[0], f"{what}: load report", said[1])
+
+    hold((load for file in files for where, record in read(file) for load in loads(where, record)), judge)
+    shares.close()
+    if a.summary:
+        a.summary.write_text(json.dumps(shares.summary(), indent=1) + "\n")
     tally.finish()
 
 

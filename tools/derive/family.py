@@ -41,6 +41,11 @@ UNDECLARED = {
     "siglip_vision_model": ("vision_use_head", True, re.compile(r"(vision_model\.)?head\."), "c.vision_use_head == true"),
 }
 
+# Tensors that are not there when two values are equal, which random values hardly ever are: {model_type: (names, condition)}.
+UNEQUAL = {
+    # modeling_sew.py: `self.project_features = config.conv_dim[-1] != config.hidden_size`
+    "sew": (re.compile(r"(sew\.)?feature_projection\."), "c.conv_dim[size(c.conv_dim) - 1] != c.hidden_size"),
+}
 
 # What a config class computes whatever is given, from a list's length that no sample varies: {model_type: {key: how}}.
 SWIN = {"hidden_size": "c.embed_dim * pow(2, size(c.depths) - 1)"}  # configuration_swin.py: `int(embed_dim * 2 ** (len(depths) - 1))`
@@ -48,6 +53,13 @@ COMPUTED = {"swin": SWIN, "swinv2": SWIN, "maskformer-swin": SWIN, "donut-swin":
 
 # Sub-configs that take the outer config's own values when there is none: `Qwen2VLConfig.__post_init__` of transformers 5.
 FLAT = {"qwen2_vl": "text_config", "qwen2_5_vl": "text_config"}
+
+
+def hand_conditions(model_type):
+    if model_type in UNDECLARED:
+        yield UNDECLARED[model_type][2:]
+    if model_type in UNEQUAL:
+        yield UNEQUAL[model_type]
 
 
 def always(model_type, value):
@@ -109,8 +121,7 @@ class Fit:
                 continue
             item = Item(name, repeats(e), e.get("when"), buffer=True)
             out.insert(neighbour(name, out), item)
-        if self.raw["model_type"] in UNDECLARED:
-            _, _, names, condition = UNDECLARED[self.raw["model_type"]]
+        for names, condition in hand_conditions(self.raw["model_type"]):
             out = [replace(i, when=also(condition, i.when)) if names.match(i.name) else i for i in out]
         return out
 

@@ -1,0 +1,72 @@
+#!/usr/bin/env python3
+"""Predicted load reports against loads made on the spot, of classes and configs that no other test has seen.
+
+    fresh.py RECORDER PYTHON... [--classes N] [--seed S]
+
+Each PYTHON has one version of transformers. RECORDER is a script that writes, with `--out FILE.jsonl.gz --only REGEX
+--seed S`, a record for each class, as recorded.py reads them. The classes are drawn from those shipped for that version; the seed,
+printed first, says which, and the configs and changes made of them.
+"""
+
+import argparse
+import random
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from peer import ROOT, Tally, workplace
+from recorded import Shares, agreement, hold, loads, read
+
+sys.path.insert(0, str(ROOT / "tools"))
+from derive.table import provenance  # noqa: E402
+
+
+def record(recorder, python, names, seed, work):
+    """A file of records of these classes, made by that interpreter's version."""
+    out = Path(work) / f"{re.sub('[^A-Za-z0-9]', '-', python)}.jsonl.gz"
+    only = f"^(?:{'|'.join(map(re.escape, names))})$"
+    command = [python, recorder, "--out", out, "--only", only, "--seed", str(seed), "--n", "1", "--n-other", "1", "--mutations", "5"]
+    done = subprocess.run([*map(str, command), "--tmp", str(work)], capture_output=True, text=True, timeout=900)
+    if done.returncode:
+        sys.exit(f"{recorder} failed under {python}:\n{done.stderr[-2000:]}")
+    return out
+
+
+def version_of(python):
+    asked = "import importlib.metadata as m; print(m.version('transformers'))"
+    return subprocess.run([python, "-c", asked], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("recorder")
+    p.add_argument("python", nargs="+")
+    p.add_argument("--classes", type=int, default=30)
+    p.add_argument("--seed", type=int, default=random.randrange(10**6))
+    a = p.parse_args()
+    print(f"seed {a.seed}")
+    tally = Tally()
+    shares = Shares(tally)
+
+    def judge(case, entry):
+        what, each, _, load = case
+        told, why = agreement(each, entry, load) or (False, "no prediction")
+        shares.count(what, each, told, why)
+
+    shipped, _ = provenance()
+    with workplace() as work:
+        for python in a.python:
+            version = version_of(python)
+            names = random.Random(a.seed).sample(sorted(shipped[version]), a.classes)
+            records = list(read(record(a.recorder, python, names, a.seed, work)))
+            # Some classes are in no mapping that the recorder walks.
+            print(f"{version}: {len(records)} of {len(names)} classes recorded")
+            tally.expect(len(records) >= 0.7 * len(names), f"{version}: too few records")
+            hold((load for where, each in records for load in loads(where, each)), judge)
+    shares.close()
+    tally.finish()
+
+
+if __name__ == "__main__":
+    main()
