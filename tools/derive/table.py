@@ -66,7 +66,7 @@ def page():
     told = json.loads(LOADS.read_text())
     row("classes whose loads were compared", lambda v: told[v]["classes"])
     row("loads: of a saved file, and of changed copies", lambda v: told[v]["loads"])
-    row("**of them the report is the loader's**", lambda v: f"**{told[v]['agree']} ({told[v]['agree'] / told[v]['loads']:.1%})**")
+    row("**of them the report is the loader's**", lambda v: f"**{told[v]['agree']} ({told[v]['agree'] / told[v]['loads']:.2%})**")
     lines += ["", f"Beside them, written by hand: {', '.join(f'`{s}`' for s in by_hand)}.", "", "## Families people meet", "",
               "| family | " + " | ".join(versions) + " |", "|---|" + "---|" * len(versions)]
     for family in " ".join(FAMILIES.split()).split("; "):
