@@ -11,6 +11,8 @@ pub mod quantization;
 pub mod recipe;
 pub mod resemblance;
 pub mod rule;
+#[cfg(test)]
+mod schemas;
 pub mod selection;
 pub mod settings;
 pub mod source;

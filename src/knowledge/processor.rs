@@ -8,6 +8,7 @@ use super::source::{self, DataError};
 /// A processor as its file in `rules/processors/` gives it. Expressions see the checkpoint's
 /// `processor` (`processor_config.json`) and what `let` has named so far.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Processor {
     /// Its name.
@@ -23,6 +24,7 @@ pub struct Processor {
 
 /// A name for an expression.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Let {
     /// The name.
@@ -33,6 +35,7 @@ pub struct Let {
 
 /// A token, or a numbered run of them.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TokenRun {
     /// Content; `i` is the number within the run: `<loc{zpad(i, 4)}>`.

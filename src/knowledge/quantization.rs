@@ -22,6 +22,7 @@ pub use applied::{Applied, Shapes};
 /// tensor: `rows` and `cols` (its last two dimensions), `lead` (those before them), `count` (of its values), and what
 /// `let` names. `held` lists the names that are stored of a module. `init(list)` and `last(list)` take a list apart.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Scheme {
     /// Its name: the stem of its file.
@@ -83,6 +84,7 @@ pub struct Scheme {
 
 /// A value that shapes depend on.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Parameter {
     /// Name in expressions.
@@ -99,6 +101,7 @@ pub struct Parameter {
 
 /// One of the tensors that stand in place of a plain one.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Part {
     /// How its name ends.

@@ -15,6 +15,7 @@ use super::source::{self, DataError};
 /// class's defaults filled in), `processor`, `preprocessor`, `tokens`, what `let` has named so far, and the
 /// functions `shape(role, tensor)` and `has(role, prefix)`.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
     /// Name on the command line.
@@ -49,6 +50,7 @@ pub struct Recipe {
 
 /// A donor role.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct DonorSpec {
     /// Role on the command line.
@@ -68,6 +70,7 @@ pub struct DonorSpec {
 
 /// An option.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct OptionSpec {
     /// Name on the command line.
@@ -83,6 +86,7 @@ pub struct OptionSpec {
 
 /// Which processor adds its tokens to which donor's tokenizer.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TokenSpec {
     /// Role whose tokenizer it is.
@@ -93,6 +97,7 @@ pub struct TokenSpec {
 
 /// Something that must fit.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SeamSpec {
     /// The condition.
@@ -115,6 +120,7 @@ pub struct SeamSpec {
 
 /// A donor tensor named by a seam.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SeamTensor {
     /// Role.
@@ -125,6 +131,7 @@ pub struct SeamTensor {
 
 /// A JSON document of the result.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct DocumentSpec {
     /// File name.
@@ -148,6 +155,7 @@ pub struct DocumentSpec {
 
 /// A change to a document.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Edit {
     /// Sets a value; missing objects on the way are made.
@@ -162,6 +170,7 @@ pub enum Edit {
 
 /// Writes the added tokens.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TokensEdit {
     /// JSON pointer.
@@ -175,6 +184,7 @@ pub struct TokensEdit {
 
 /// How added tokens are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum TokensForm {
     /// `added_tokens_decoder`: id to properties.
@@ -185,6 +195,7 @@ pub enum TokensForm {
 
 /// Sets a value.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SetEdit {
     /// JSON pointer.
@@ -198,6 +209,7 @@ pub struct SetEdit {
 
 /// Puts a donor's document there.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct GraftEdit {
     /// JSON pointer.
@@ -211,6 +223,7 @@ pub struct GraftEdit {
 
 /// Removes values.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct RemoveEdit {
     /// JSON pointers.
@@ -222,6 +235,7 @@ pub struct RemoveEdit {
 
 /// Where tensors come from, or that they are left behind.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TensorSpec {
     /// Role.
@@ -250,6 +264,7 @@ pub struct TensorSpec {
 
 /// A file that is not a JSON document.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum FileSpec {
     /// Copies files, those that are there.
@@ -262,6 +277,7 @@ pub enum FileSpec {
 
 /// Copies files.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct CopySpec {
     /// Role.
@@ -275,6 +291,7 @@ pub struct CopySpec {
 
 /// Copies Python modules and what they import.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ModulesSpec {
     /// Roles, the first that is given and has the module is taken.
@@ -288,6 +305,7 @@ pub struct ModulesSpec {
 
 /// Writes a file that comes with the recipe.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TemplateSpec {
     /// File name in the result.
@@ -304,6 +322,7 @@ pub struct TemplateSpec {
 
 /// A sentence for the report.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Note {
     /// When.
@@ -350,6 +369,7 @@ impl Recipe {
 
 /// A merge written down in a file: `build-merged merge.json5`. Relative paths start at the file's folder.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct MergeFile {
     /// Recipe name, or a path of one; chosen by the donors when absent.

@@ -8,6 +8,7 @@ use crate::checkpoint::fault::FAULT_KINDS;
 
 /// How bad a finding is; a rule says it for all of its findings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
     /// Worth knowing; nothing needs doing.
@@ -32,6 +33,7 @@ impl Severity {
 
 /// A rule as its file in `rules/checks/` gives it.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
     /// Family and number: `IDX003`.
@@ -67,6 +69,7 @@ pub struct Rule {
 
 /// The kinds of check. Adding a rule rarely needs another.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Check {
     /// Reports faults of some kinds.
@@ -78,6 +81,7 @@ pub enum Check {
 /// Faults of these kinds become findings; the message sees each fault's `kind` and details as variables,
 /// and `file`, `tensor`, `pointer` of its first place.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct FaultCheck {
     /// Kinds, as the reader and the comparisons name them.
@@ -101,6 +105,7 @@ pub struct FaultCheck {
 /// its header was read), and the functions `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`,
 /// `id_of(token)`. A condition that cannot be evaluated because a value is not there is not a finding.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Assert {
     /// A list; the condition is asked for each element, bound as `it`.
@@ -115,6 +120,7 @@ pub struct Assert {
 
 /// A place named by a rule.
 #[derive(Debug, Clone, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct At {
     /// File name.
@@ -127,6 +133,7 @@ pub struct At {
 
 /// How safe a fix is, as ruff grades it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Safety {
     /// Restores bookkeeping; every tensor and value a loader reads stays.
@@ -151,6 +158,7 @@ impl Safety {
 
 /// What can be done about a finding.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Fix {
     /// How safe it is.

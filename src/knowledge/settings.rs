@@ -19,6 +19,7 @@ pub use policy::{Policy, Suppression};
 
 /// A settings file. Paths in it start at its own folder.
 #[derive(Debug, Clone, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
     /// A settings file that this one builds on, and may overrule.
@@ -35,10 +36,12 @@ pub struct Settings {
     pub ignore: Vec<String>,
     /// Severities that rules have here: `{ "JSN001": "error" }`.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Severity>"))]
     pub severity: Vec<(String, Severity)>,
     /// What is different in some places, by a glob from this file's folder: a folder means all that is in it, `*` stays
     /// within a name, `**` does not.
     #[serde(default, rename = "per-path", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, PerPath>"))]
     pub per_path: Vec<(String, PerPath)>,
     /// Findings that are accepted, each with the reason.
     #[serde(default)]
@@ -59,6 +62,7 @@ pub struct Settings {
 
 /// What is different in a place.
 #[derive(Debug, Clone, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PerPath {
     /// Rules that are silent there.
@@ -66,11 +70,13 @@ pub struct PerPath {
     pub ignore: Vec<String>,
     /// Severities that rules have there.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Severity>"))]
     pub severity: Vec<(String, Severity)>,
 }
 
 /// A finding that is accepted.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Suppress {
     /// The rule: a code, the start of one, or a name.

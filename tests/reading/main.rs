@@ -4,6 +4,7 @@
 //! promise that an oddity is clean.
 
 #![allow(
+    clippy::expect_used,
     clippy::unwrap_used,
     clippy::indexing_slicing,
     clippy::arithmetic_side_effects,

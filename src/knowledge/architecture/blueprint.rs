@@ -17,6 +17,7 @@ use crate::knowledge::{Expression, Loader, Scope, Template};
 /// Expressions see the config, defaults filled in, as `c`, the loader's major version as `major`, the names of
 /// `let`, and the indices of the repeats around them.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Blueprint {
     /// Its name, the file's stem.
@@ -33,6 +34,7 @@ pub(crate) struct Blueprint {
     /// By version: how many samples it was derived from, and on how many unseen configs each class was verified.
     /// Absent in files written by hand.
     #[serde(default)]
+    #[cfg_attr(test, schemars(with = "Option<Value>"))]
     pub derived: Option<IgnoredAny>,
     /// Which configs the file speaks for, seen as they are written, as `c`: other code may stand behind the same names.
     #[serde(default)]
@@ -45,9 +47,11 @@ pub(crate) struct Blueprint {
     defaults: Map<String, Value>,
     /// Values of config keys that are absent or null, computed from the others, in order.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     computed: Vec<(String, Expression)>,
     /// Sub-configs: how each is resolved.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, SubConfig>"))]
     configs: Vec<(String, SubConfig)>,
     /// By version, what that loader has different of the four above: merged over them key by key.
     #[serde(default)]
@@ -61,6 +65,7 @@ pub(crate) struct Blueprint {
     pub require: Vec<Requirement>,
     /// Names for what the shapes of all classes say often, in order.
     #[serde(default, rename = "let", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     pub lets: Vec<(String, Expression)>,
     /// Renamings and merges that transformers 5 does at load, by the class or `model_type` it looks them up by: a list
     /// of rows (`kind`, `from`, `to`, `ops`), or the identifier whose rows they share.
@@ -75,6 +80,7 @@ pub(crate) struct Blueprint {
 
 /// What a config class fills in under one loader, and what it means.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ConfigClass {
     /// As in the file.
@@ -85,15 +91,18 @@ pub(crate) struct ConfigClass {
     pub defaults: Map<String, Value>,
     /// As in the file.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     pub computed: Vec<(String, Expression)>,
     /// As in the file; each field that an entry gives replaces that field.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, SubConfig>"))]
     pub configs: Vec<(String, SubConfig)>,
 }
 
 /// How the config inside a config gets its values. In `absent` and `set` a string that starts with `=` is an
 /// expression over the outer `c`.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SubConfig {
     /// The `model_type` of one that names none; the file of that model type fills in the rest.
@@ -114,11 +123,13 @@ pub(crate) struct SubConfig {
     pub defaults: Map<String, Value>,
     /// As in the file, over the sub-config.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     pub computed: Vec<(String, Expression)>,
 }
 
 /// A condition on the config, and what to say when it does not hold.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Requirement {
     /// The condition.
@@ -129,6 +140,7 @@ pub(crate) struct Requirement {
 
 /// A model class.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Class {
     /// Its name, as in `architectures` of config.json.
@@ -154,9 +166,11 @@ pub(crate) struct Class {
     pub chosen_by: Vec<String>,
     /// Names for what the shapes below say often, in order.
     #[serde(default, rename = "let", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     pub lets: Vec<(String, Expression)>,
     /// The tensors, in the order of the class's state dict.
     #[serde(deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Member>"))]
     pub tensors: Vec<(Template, Member)>,
 }
 

@@ -13,6 +13,7 @@ use crate::knowledge::{Library, Loader};
 ///
 /// `kind`, `from`, `to` and `ops` are named after the classes and arguments of `core_model_loading.py`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Conversion {
     /// `WeightRenaming`, `WeightConverter`, `PrefixChange`, or the name of a rarer class.
     pub kind: String,
@@ -34,6 +35,7 @@ pub struct Conversion {
 
 /// What the table says under one identifier.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(untagged)]
 pub(crate) enum Rows {
     /// The same as under another one, which may stand in another file.

@@ -49,6 +49,7 @@ pub(crate) struct Model {
 
 /// Another class as part of this one.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Part {
     /// The class, whatever the config says.
@@ -73,6 +74,7 @@ pub(crate) struct Part {
 
 /// An entry of `tensors` as it is written.
 #[derive(Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 struct RawMember {
     /// The entry counts only then; asked for each index of `repeat`.
@@ -80,9 +82,11 @@ struct RawMember {
     when: Option<Expression>,
     /// Names that run from 0 to below their counts, in the entry's name as `{i}`.
     #[serde(default, deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     repeat: Vec<(String, Expression)>,
     /// Names for what is said often, in order.
     #[serde(default, rename = "let", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
     lets: Vec<(String, Expression)>,
     /// Name of a group that a checkpoint has whole or not at all.
     #[serde(default)]
@@ -107,6 +111,7 @@ struct RawMember {
     buffer: bool,
     /// Entries whose names start with this one's.
     #[serde(default, deserialize_with = "ordered_option")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Member>"))]
     tensors: Option<Vec<(Template, Member)>>,
     /// Beside `tensors`: the class that builds them, when it is a `PreTrainedModel`.
     #[serde(default)]
@@ -155,5 +160,17 @@ impl Part {
             return Err("a part says `class`, or `auto` or `by_model_type`".to_owned());
         }
         Ok(self)
+    }
+}
+
+/// A file has it as it is written.
+#[cfg(test)]
+impl schemars::JsonSchema for Member {
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "Member".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        RawMember::json_schema(generator)
     }
 }
