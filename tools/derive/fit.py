@@ -19,6 +19,7 @@ from .vectors import Column
 MANY = 160                                                    # rows an expression is searched on; it must hold on all
 SEARCHES, ONE_SEARCH = 300, 40                                # for one class, for one expression
 ENOUGH = 6                                                    # unexplained templates after which a class is given up
+ACCIDENTAL = 8                                                # numbers from here on may as well be widths of the samples
 STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|offset|start|end|last|moe|layer|num_")
 
 
@@ -342,7 +343,22 @@ class Fitter:
         ranks = {len(v) for d in per.values() for v in d.values()}
         if len(ranks) != 1:
             raise Unexplained(f"number of dimensions varies: {sorted(ranks)}")
-        return [self.dimension(per, k, places) for k in range(ranks.pop())]
+        out = [self.dimension(per, k, places) for k in range(ranks.pop())]
+        for k, text in enumerate(out):
+            self.no_accident(f"dim {k}", text, per)
+        return out
+
+    def no_accident(self, what, text, per):
+        """Refuses a number that may as well be the value of a key: one that has it wherever the tensor is, and others elsewhere.
+
+        A tensor of one or two samples otherwise gets their widths, and is wrong for every other config."""
+        if not text.isdigit() or int(text) < ACCIDENTAL or len(per) == len(self.samples):
+            return
+        having = [self.by_number[n].flat for n in per]
+        for key, value in having[0].items():
+            if type(value) is int and value == int(text) and not NOISE.search(key.split(".")[-1]):
+                if all(f.get(key) == value for f in having) and any(s.flat.get(key, value) != value for s in self.samples):
+                    raise Unexplained(f"{what}: {text} in {len(per)} of {len(self.samples)} samples, as {key} is there")
 
     def dimension(self, per, k, places):
         values = {n: tuple(sorted((ix, v[k]) for ix, v in d.items())) for n, d in per.items()}

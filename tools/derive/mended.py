@@ -4,6 +4,7 @@ A run of the tool leaves them as they are. Delete the line of one that the tool 
 
 # {stem: what was mended}
 MENDED = {
+    "audio-spectrogram-transformer": "heads other than four",
     "beit": "pooling by its scales, any auxiliary channels",
     "bert-generation": "cross attention",
     "blip": "when the decoder is tied",
@@ -28,6 +29,7 @@ MENDED = {
     "ernie4_5_vl_moe_text": "keys the above reads",
     "esm": "rotary frequencies in every layer",
     "esmc": "biases of all heads",
+    "flaubert": "language embeddings",
     "focalnet": "stages in one repeat",
     "gemma3n_text": "layers that share keys and values; frequencies by layer type",
     "gemma4_audio": "what the projection gives out",
@@ -53,6 +55,7 @@ MENDED = {
     "lilt": "distances in every layer",
     "llama4_text": "dense layers, and which layers have experts",
     "llama4_vision_model": "heads other than four",
+    "lw_detr_vit": "heads other than four",
     "markuplm": "distances in every layer",
     "maskformer-swin": "stages in one repeat",
     "minicpm3": "queries of no rank",
@@ -86,6 +89,7 @@ MENDED = {
     "sam_vision_model": "the neck's channels",
     "slanext": "the neck's channels, positions of global layers",
     "slanext_vision": "a key the above reads",
+    "smollm3": "head widths rounded down",
     "squeezebert": "widths are hidden_size, divided by groups; 4.47.0 too",
     "swin": "stages in one repeat, norms by out_features",
     "swin2sr": "all upsamplers, deep residual connections; 4.47.0 too",
@@ -102,6 +106,7 @@ MENDED = {
     "wav2vec2-bert": "relative and rotary positions of both versions, the kernel's width",
     "wav2vec2-conformer": "rotary positions, the kernel's width, layer weights",
     "wavlm": "norms of all layers of the feature extractor",
+    "xlm": "language embeddings",
     "youtu": "queries of no rank",
     "zamba": "the head is tied",
 }

@@ -3,8 +3,7 @@ import json
 import re
 from pathlib import Path
 
-from .mended import MENDED
-from .write import put
+from .write import mended_classes, put
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "rules" / "architectures"
@@ -50,17 +49,6 @@ def write(writer, out=None):
     for v in writer.versions:
         print(f"{v.version}: {len(writer.ships[v.version])} classes, {sum(map(len, rows[v.version].values()))} not shipped")
     print(f"{len(sizes)} files, {sum(sizes)} bytes in {folder}")
-
-
-def mended_classes(folder):
-    """{version: classes} of the files that were mended by hand."""
-    out = {}
-    for stem in MENDED:
-        path = folder / f"{stem}.json5"
-        head = path.read_text().partition("\n  auto: ")[0] if path.exists() else ""
-        for version, told in re.findall(r'"([\d.]+)": \{\s*samples: \d+,\s*verified: \{([^}]*)\}', head):
-            out.setdefault(version, set()).update(re.findall(r"(\w+): \d+", told))
-    return out
 
 
 def short(reason):

@@ -2,13 +2,15 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
 from . import ship
 from .family import load
-from .write import Writer, put, read_conversions, read_versions
+from .mended import MENDED
+from .write import Writer, mended_classes, put, read_conversions, read_versions
 
 
 class Program:
@@ -76,7 +78,7 @@ class Verifier:
         files = self.writer.files()
         out = {}
         with tempfile.TemporaryDirectory() as folder:
-            put(files, Path(folder) / "architectures")
+            place(files, Path(folder) / "architectures")
             for v in self.writer.versions:
                 names = sorted(n for n in self.writer.ships[v.version] if only is None or n in only)
                 lines = [line for n in names for line in self.records[v.version][n]]
@@ -143,7 +145,7 @@ class Verifier:
         if not names:
             return
         with tempfile.TemporaryDirectory() as folder:
-            put(self.writer.files(), Path(folder) / "architectures")
+            place(self.writer.files(), Path(folder) / "architectures")
             answers = self.program.expect(folder, v.version, [self.records[v.version][n][0] for n in names])
         wrong = {}
         for name, answer in zip(names, answers):
@@ -162,6 +164,15 @@ class Verifier:
             report(f"  {name}: {'; '.join(how)}")
 
 
+def place(files, folder):
+    """The candidates in a folder of their own, and the files that were mended by hand over theirs."""
+    put(files, folder)
+    for stem in MENDED:
+        path = ship.RULES / f"{stem}.json5"
+        if path.exists():
+            shutil.copy(path, folder)
+
+
 LEGACY = 5                                                   # rows that apply to every model, at the end
 
 
@@ -172,6 +183,7 @@ def comparable(row):
 def main(args):
     versions = read_versions(args.cache)
     writer = Writer(versions, read_conversions(args.cache, versions))
+    writer.mended = mended_classes(ship.RULES)
     verifier = Verifier(writer, Program(args.binary or os.environ.get("CKPT_DOCTOR", "ckpt-doctor")))
     verifier.run()
     verifier.conversions(print)

@@ -21,6 +21,7 @@ class Writer:
         self.prefer = {}
         self.ships = {}
         self.verified = {}                                   # version -> {class: configs}
+        self.mended = {}                                     # version -> classes of files that are not written
         self.apart = {}
 
     def start(self):
@@ -34,7 +35,7 @@ class Writer:
             while again:
                 again = False
                 for name in sorted(ships):
-                    lacking = missing_part(v.fits[name], ships)
+                    lacking = missing_part(v.fits[name], ships | self.mended.get(v.version, set()))
                     if lacking:
                         ships.discard(name)
                         v.reasons[name] = f"a part is not shipped: {lacking}"
@@ -238,7 +239,7 @@ class Writer:
     def shippable(self, v, items):
         """The items; of a part that the config chooses, only classes that are there."""
         out = []
-        known_classes = set().union(*self.ships.values())
+        known_classes = set().union(*self.ships.values(), *self.mended.values())
         for item in items:
             table = (item.part or {}).get("by_model_type")
             if table:
@@ -328,6 +329,17 @@ def with_loaders(entry, loaders):
 def derived_files(folder):
     """Architecture files that this tool wrote, as opposed to those written by hand."""
     return [p for p in sorted(Path(folder).glob("*.json5")) if MARK.search(p.read_text())]
+
+
+def mended_classes(folder):
+    """{version: classes} of the files that were mended by hand."""
+    out = {}
+    for stem in MENDED:
+        path = Path(folder) / f"{stem}.json5"
+        head = path.read_text().partition("\n  classes: ")[0] if path.exists() else ""
+        for version, told in re.findall(r'"([\d.]+)": \{\s*samples: \d+,\s*verified: \{([^}]*)\}', head):
+            out.setdefault(version, set()).update(re.findall(r"(\w+): \d+", told))
+    return out
 
 
 def put(files, folder):
