@@ -4,7 +4,7 @@ from pathlib import Path
 
 from . import json5
 from .family import Version, first, load, used_keys
-from .mended import MENDED
+from .mended import MENDED, REFUSED
 from .merge import Apart, merged, share
 from .naming import name_all
 from .tree import Clash, layout, nest
@@ -25,7 +25,9 @@ class Writer:
         self.apart = {}
 
     def start(self):
-        self.ships = {v.version: set(v.fits) for v in self.versions}
+        self.ships = {v.version: set(v.fits) - set(REFUSED) for v in self.versions}
+        for v in self.versions:
+            v.reasons.update({name: f"not explained: {why}" for name, why in REFUSED.items() if name in v.fits})
         self.drop_dependent()
 
     def drop_dependent(self):
