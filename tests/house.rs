@@ -331,6 +331,16 @@ fn the_page_of_rules_is_fresh() {
     );
 }
 
+/// What is reported and why is one page: no rule is forgotten there, and none is made up.
+#[test]
+fn every_rule_is_a_decision_that_is_written_down() {
+    let text = fs::read_to_string(project().join("docs/decisions.md")).expect("text");
+    let code = Regex::new(r"\b[A-Z]{3}\d{3}\b").expect("a pattern");
+    let named: BTreeSet<String> = code.find_iter(&text).map(|m| m.as_str().to_owned()).collect();
+    let codes: BTreeSet<String> = rules().rules.into_iter().map(|r| r.code).collect();
+    assert_eq!(named, codes, "codes in docs/decisions.md, and rules there are");
+}
+
 /// Nothing in the repository's fixtures is heavier than text has to be.
 #[test]
 fn fixtures_are_small() {

@@ -6,11 +6,11 @@ use serde_json::{Map, Value, json};
 
 use super::tokens::OpenedTokenizer;
 use super::{index, modules};
-use crate::checkpoint::{Checkpoint, Vocabulary};
+use crate::checkpoint::{Checkpoint, Document, Vocabulary};
 use crate::knowledge::{Expression, Scope};
 
-/// Keys of `tokenizer_config.json` that hold thousands of entries; rules reach them through `tokenizer` and `id_of`.
-const BULKY: [&str; 2] = ["added_tokens_decoder", "additional_special_tokens"];
+/// Keys of `tokenizer_config.json` that are large; rules reach them through `tokenizer`, `id_of` and `chat_templates`.
+const BULKY: [&str; 3] = ["added_tokens_decoder", "additional_special_tokens", "chat_template"];
 
 /// Documents by the name expressions use.
 const DOCUMENTS: [(&str, &str); 6] = [
@@ -42,7 +42,9 @@ pub fn scope(
 ) -> Scope<'static> {
     let mut scope = Scope::new();
     for (name, file) in DOCUMENTS {
-        let value = checkpoint.document(file).and_then(|d| d.value.as_ref());
+        // Of two versions that a merge left in it neither is the document.
+        let torn = |d: &&Document| d.faults.iter().any(|f| f.kind == "merge-conflict-marker");
+        let value = checkpoint.document(file).filter(|d| !torn(d)).and_then(|d| d.value.as_ref());
         match value {
             Some(Value::Object(map)) if name == "tokenizer_config" => {
                 let lean: Map<String, Value> = map
@@ -61,6 +63,7 @@ pub fn scope(
     let text = model.get("text_config").or_else(|| model.get("llm_config")).unwrap_or(model);
     scope.bind("text", text);
     scope.bind("tokenizer", &tokenizer(checkpoint));
+    scope.bind("chat_templates", &chat_templates(checkpoint));
     scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
     scope.bind("rows", &rows.map_or(Value::Null, Value::from));
     scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
@@ -80,6 +83,23 @@ pub fn scope(
     scope
 }
 
+/// Chat templates by the file that holds them; of several in one list the default.
+fn chat_templates(checkpoint: &Checkpoint) -> Value {
+    let mut found = Map::new();
+    for (name, text) in &checkpoint.texts {
+        found.insert(name.clone(), json!(text.trim()));
+    }
+    for name in ["chat_template.json", "tokenizer_config.json"] {
+        let Some(value) = checkpoint.document(name).and_then(|d| d.get("/chat_template")) else { continue };
+        let is_default = |item: &&Value| item.get("name").and_then(Value::as_str) == Some("default");
+        let listed = || value.as_array()?.iter().find(is_default)?.get("template")?.as_str();
+        if let Some(text) = value.as_str().or_else(listed) {
+            found.insert(name.to_owned(), json!(text.trim()));
+        }
+    }
+    Value::Object(found)
+}
+
 fn tokenizer(checkpoint: &Checkpoint) -> Value {
     let t = &checkpoint.tokenizer;
     let special = |attribute: &str| {
@@ -97,5 +117,6 @@ fn tokenizer(checkpoint: &Checkpoint) -> Value {
         "bos": special("bos_token"),
         "eos": special("eos_token"),
         "pad": special("pad_token"),
+        "highest": t.stated().keys().last().copied().max(t.base().and_then(Vocabulary::max_id)),
     })
 }

@@ -116,6 +116,10 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
             faults.push(fault.at(place).with("shard", name).with("tensors", tensors));
         }
     }
+    let is_pickle = |name: &&&str| index.is_of_pickles() && checkpoint.has_file(name) && !is_pointer(checkpoint, name);
+    if let Some(name) = referenced.keys().find(is_pickle) {
+        faults.push(Fault::new("pickle-weights").at(Place::file(*name)));
+    }
     let holders = by_tensor(checkpoint);
     // A name may lie in a shard that cannot be read: then nothing is known of it.
     let all_read = referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(readable));
@@ -266,13 +270,26 @@ fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     }
     if names.is_empty() && checkpoint.has_file("config.json") {
         let pickle = checkpoint.entries.keys().find(|n| {
-            (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt")
+            let named =
+                (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt");
+            named && !is_pointer(checkpoint, n)
         });
+        let is_told = |f: &Fault| {
+            f.kind == "lfs-pointer" && f.places.iter().any(|p| p.file.as_deref().is_some_and(|n| n.ends_with(".bin")))
+        };
+        if pickle.is_none() && checkpoint.faults.iter().any(is_told) {
+            return;
+        }
         faults.push(match pickle {
             Some(name) => Fault::new("pickle-weights").at(Place::file(name)),
             None => Fault::new("no-weights"),
         });
     }
+}
+
+/// Whether a git-lfs pointer stands in place of the file; it has a finding of its own.
+fn is_pointer(checkpoint: &Checkpoint, name: &str) -> bool {
+    checkpoint.entries.get(name).is_some_and(|entry| entry.lfs.is_some())
 }
 
 /// The shard whose name differs from this one only in what some file systems ignore.

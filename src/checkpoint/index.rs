@@ -11,6 +11,9 @@ use super::{Document, Fault, Place};
 
 /// The name transformers looks for first.
 pub const INDEX_NAME: &str = "model.safetensors.index.json";
+/// The index of pickled shards, which transformers takes where there is no safetensors file. Its shards are never
+/// opened; it tells their names and size all the same.
+pub const PICKLE_INDEX_NAME: &str = "pytorch_model.bin.index.json";
 
 /// What `*.safetensors.index.json` says.
 #[derive(Debug, Clone, Default)]
@@ -34,6 +37,12 @@ impl Index {
     #[must_use]
     pub fn is_index(name: &str) -> bool {
         name.ends_with(".safetensors.index.json")
+    }
+
+    /// Whether its shards are pickle files.
+    #[must_use]
+    pub fn is_of_pickles(&self) -> bool {
+        self.document == PICKLE_INDEX_NAME
     }
 
     /// Reads the index that `document` holds.

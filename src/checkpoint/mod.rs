@@ -29,7 +29,7 @@ pub use contents::Contents;
 pub use discover::{find_checkpoints, is_checkpoint};
 pub use document::Document;
 pub use fault::{FAULT_KINDS, Fault, Place};
-pub use index::{INDEX_NAME, Index};
+pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::Module;
 pub use open::{OpenError, is_plain_file_name, open_regular};
@@ -86,6 +86,8 @@ pub struct Checkpoint {
     pub modules: BTreeMap<String, Module>,
     /// The tokenizer.
     pub tokenizer: Tokenizer,
+    /// Text of files that are neither document nor module, by name: `chat_template.jinja`.
+    pub texts: BTreeMap<String, Arc<str>>,
     /// What the tensors' bytes hold; `None` when they were not read.
     pub contents: Option<Contents>,
     /// Faults of the directory itself; [`Checkpoint::all_faults`] has those of its parts too.
@@ -156,7 +158,8 @@ impl Checkpoint {
         let name = if self.documents.contains_key(INDEX_NAME) {
             Some(INDEX_NAME.to_owned())
         } else {
-            self.documents.keys().find(|name| Index::is_index(name)).cloned()
+            let pickles = || self.documents.keys().find(|name| *name == PICKLE_INDEX_NAME && self.shards.is_empty());
+            self.documents.keys().find(|name| Index::is_index(name)).or_else(pickles).cloned()
         };
         if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
             self.index = Some(Index::of(document));

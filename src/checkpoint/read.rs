@@ -26,6 +26,14 @@ const DOCUMENTS: [&str; 6] = [
 /// Vocabulary files that are no documents.
 const VOCABULARIES: [&str; 4] = ["tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.txt"];
 
+/// Files of plain text that a loader reads.
+const TEXTS: [&str; 1] = ["chat_template.jinja"];
+
+/// Whether the name is one that pickled weights have.
+fn is_pickle(name: &str) -> bool {
+    has_ending(name, "bin") && ["pytorch_model", "adapter_model", "model"].iter().any(|start| name.starts_with(start))
+}
+
 /// Whether the name ends so; loaders compare names as they are, and so do we.
 fn has_ending(name: &str, ending: &str) -> bool {
     Path::new(name).extension().is_some_and(|e| e == ending)
@@ -64,6 +72,13 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
                 Err(error) => Module::unread(&*name, error.fault(&name)),
             };
             checkpoint.modules.insert(name.clone(), module);
+        } else if TEXTS.contains(&&*name) && entry.lfs.is_none() {
+            match read_capped(&path, MODULE_CAP) {
+                Ok(bytes) => {
+                    checkpoint.texts.insert(name.clone(), String::from_utf8_lossy(&bytes).into());
+                }
+                Err(error) => checkpoint.faults.push(error.fault(&name)),
+            }
         } else if VOCABULARIES.contains(&&*name) {
             match vocabulary(&path, &name) {
                 Ok(vocabulary) => {
@@ -75,6 +90,10 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
             && let Err(error) = fs::metadata(&path)
         {
             checkpoint.faults.push(OpenError::from_io(&path, error).fault(&name));
+        }
+        if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_pickle(&name) || TEXTS.contains(&&*name)) {
+            let fault = Fault::new("lfs-pointer").at(Place::file(&*name));
+            checkpoint.faults.push(fault.with("oid", pointer.oid.as_str()).with("size", pointer.size));
         }
         if let Some(of) = UNFINISHED.iter().find_map(|ending| name.strip_suffix(ending)) {
             checkpoint.faults.push(Fault::new("partial-download").at(Place::file(&*name)).with("of", of));

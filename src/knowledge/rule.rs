@@ -99,7 +99,8 @@ pub struct FaultCheck {
 /// Expressions see the documents as `config`, `generation`, `processor`, `preprocessor`,
 /// `tokenizer_config`, `special_tokens` (null when absent or broken), `model` (the config with the
 /// class's defaults filled in), `text` (its language part), `arch`, `rows` (of the token embedding),
-/// `tokenizer` (`length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`),
+/// `tokenizer` (`length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`,
+/// `highest` id), `chat_templates` (by file),
 /// `tokens` (what the processor makes of it, by the names in `rules/processors/`, with `length` and
 /// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, `all_read` (every shard is there and
 /// its header was read), and the functions `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`,

@@ -1,7 +1,5 @@
 //! Bytes of tensors, read on demand.
 
-#![allow(clippy::disallowed_methods, reason = "fixtures are written, not checkpoints")]
-
 use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
@@ -15,18 +13,18 @@ const NAME: &str = "model.safetensors";
 /// Writes a shard of one tensor `w` of 4 by 8 numbers in two bytes each.
 fn write(file: &Path, data: &[u8; 64]) {
     let header = br#"{"__metadata__":{"format":"pt"},"w":{"dtype":"BF16","shape":[4,8],"data_offsets":[0,64]}}"#;
-    let length = u64::try_from(header.len()).expect("small").to_le_bytes();
-    fs::write(file, [&length[..], header, data].concat()).expect("write");
+    let length = u64::try_from(header.len()).unwrap().to_le_bytes();
+    fs::write(file, [&length[..], header, data].concat()).unwrap();
 }
 
 /// What is found in a directory that is changed between opening it and reading the tensors.
 fn faults(before: impl Fn(&Path), after: impl Fn(&Path)) -> Vec<Fault> {
-    let dir = tempfile::tempdir().expect("a directory");
+    let dir = tempfile::tempdir().unwrap();
     before(dir.path());
-    let mut checkpoint = Checkpoint::open(dir.path()).expect("a directory");
+    let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     after(dir.path());
     checkpoint.read_contents();
-    checkpoint.shards.remove(NAME).expect("a shard").faults
+    checkpoint.shards.remove(NAME).unwrap().faults
 }
 
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
@@ -38,13 +36,13 @@ fn cases() -> Vec<Case> {
         faults(|dir| write(&dir.join(NAME), &data), |_| ())
     };
     let cut = |dir: &Path| {
-        let whole = fs::read(dir.join(NAME)).expect("read");
-        fs::write(dir.join(NAME), &whole[..whole.len() - 10]).expect("write");
+        let whole = fs::read(dir.join(NAME)).unwrap();
+        fs::write(dir.join(NAME), &whole[..whole.len() - 10]).unwrap();
     };
     let cached = |dir: &Path| {
         let blob = "4d7a".repeat(16);
         write(&dir.join(&blob), &[1; 64]);
-        std::os::unix::fs::symlink(blob, dir.join(NAME)).expect("a link");
+        std::os::unix::fs::symlink(blob, dir.join(NAME)).unwrap();
     };
     vec![
         Case::new("ordinary numbers", &[], with(|_| ())),
@@ -64,17 +62,17 @@ fn each_content_is_named() {
 /// Space that was set aside and never written, as the file system tells it; where it cannot tell, nothing is said.
 #[test]
 fn a_hole_at_the_end_is_seen_without_reading() {
-    let dir = tempfile::tempdir().expect("a directory");
+    let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join(NAME);
     let header = br#"{"__metadata__":{"format":"pt"},"v":{"dtype":"U8","shape":[1024,1024],"data_offsets":[0,1048576]},"w":{"dtype":"U8","shape":[1024,1024],"data_offsets":[1048576,2097152]}}"#;
-    let length = u64::try_from(header.len()).expect("small").to_le_bytes();
-    let start = u64::try_from(header.len() + 8).expect("small");
-    fs::write(&file, [&length[..], header, &[1; 1_000_000]].concat()).expect("write");
-    let written = fs::OpenOptions::new().write(true).open(&file).expect("open");
-    written.set_len(start + 2_097_152).expect("grow");
-    let hole = rustix::fs::seek(&written, rustix::fs::SeekFrom::Hole(0)).expect("SEEK_HOLE");
+    let length = u64::try_from(header.len()).unwrap().to_le_bytes();
+    let start = u64::try_from(header.len() + 8).unwrap();
+    fs::write(&file, [&length[..], header, &vec![1; 1_000_000]].concat()).unwrap();
+    let written = fs::OpenOptions::new().write(true).open(&file).unwrap();
+    written.set_len(start + 2_097_152).unwrap();
+    let hole = rustix::fs::seek(&written, rustix::fs::SeekFrom::Hole(0)).unwrap();
     let tells = hole < start + 2_097_152;
-    let mut checkpoint = Checkpoint::open(dir.path()).expect("a directory");
+    let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     let kinds = |c: &Checkpoint| c.shards[NAME].faults.iter().map(|f| f.kind).collect::<Vec<_>>();
     assert_eq!(kinds(&checkpoint), if tells { vec!["zero-tail"] } else { vec![] });
     checkpoint.read_contents();
