@@ -38,13 +38,13 @@ pub(super) fn interrupted() -> Result<(), ApplyError> {
 /// otherwise.
 pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
-    // The staging directory takes a few blocks of its own: two directories and a marker.
-    let files = plan.files.iter().map(|f| f.bytes.len() as u64).chain([1; 3]);
+    let files = plan.files.iter().map(|f| f.bytes.len() as u64);
     let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
-    ask_for_room(parent, &sizes)?;
     let explained = |error| explain(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
-    let written = write(plan, staging.content(), progress)
+    // Not before: what a killed run left may be what fills the disk, and is cleared now.
+    let written = ask_for_room(parent, &sizes)
+        .and_then(|()| write(plan, staging.content(), progress))
         .and_then(|()| donors.iter().try_for_each(AtRest::unchanged))
         .and_then(|()| interrupted())
         .and_then(|()| staging.publish(out));

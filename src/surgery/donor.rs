@@ -7,6 +7,7 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use super::error::{ApplyError, io_at};
+use super::system::names;
 use crate::checkpoint::open::{Identity, Opened, open_regular};
 
 /// The files of a directory, and which ones they were when a run began.
@@ -25,15 +26,15 @@ impl AtRest {
     /// [`ApplyError::Io`] when the directory cannot be listed.
     pub fn see(dir: &Path) -> Result<Self, ApplyError> {
         let mut files = BTreeMap::new();
-        for entry in fs::read_dir(dir).map_err(io_at(dir, "listing"))? {
-            let entry = entry.map_err(io_at(dir, "listing"))?;
-            let hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
+        for name in names(dir).map_err(io_at(dir, "listing"))? {
+            let path = dir.join(&name);
+            let hidden = name.as_encoded_bytes().starts_with(b".");
             // Through links: what is read is what they lead to. One that leads nowhere is for the rules to judge.
-            if let Ok(metadata) = fs::metadata(entry.path())
+            if let Ok(metadata) = fs::metadata(&path)
                 && metadata.is_file()
                 && !hidden
             {
-                files.insert(entry.path(), Identity::of(&metadata));
+                files.insert(path, Identity::of(&metadata));
             }
         }
         Ok(Self { files })

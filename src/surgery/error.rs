@@ -31,7 +31,7 @@ pub enum ApplyError {
         holder: String,
     },
     /// Not enough room: by the estimate, or found while writing.
-    #[error("{path}: {cause}: need {need} bytes, have {have}; free some or choose an --out on another disk", path = path.display())]
+    #[error("{path}: {cause}: need {need} bytes, have {have}; free some, or write to another disk", path = path.display())]
     Space {
         /// What was being written, or the directory that would hold the target.
         path: PathBuf,
@@ -57,7 +57,7 @@ pub enum ApplyError {
         have: u64,
     },
     /// One file is larger than may be.
-    #[error("{path}: the file would be too large: need {need} bytes, {limit}; choose smaller shards", path = path.display())]
+    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that, or write smaller shards", path = path.display())]
     FileSize {
         /// The file.
         path: PathBuf,
@@ -78,7 +78,7 @@ pub enum ApplyError {
     #[error("interrupted; nothing was written")]
     Interrupted,
     /// Anything the system says.
-    #[error("{path}: {doing}: {error}; nothing was written", path = path.display())]
+    #[error("{path}: {doing}: {error}", path = path.display())]
     Io {
         /// The file.
         path: PathBuf,

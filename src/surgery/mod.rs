@@ -3,6 +3,7 @@
 pub mod apply;
 pub mod donor;
 mod error;
+mod lock;
 pub mod merge;
 pub mod plan;
 mod staging;

@@ -4,21 +4,17 @@
 //! the target by one rename. The marker is locked while a run works there, so a second run sees the lock (the
 //! kernel frees it, whatever ends the first), and a run after a crash clears what the marker shows to be ours.
 //! A directory of that name without the marker is somebody's data and is left alone.
-//!
-//! The lock is on the marker and not on the directory, because NFS locks only what is open for writing.
 #![expect(clippy::disallowed_methods, reason = "this module and apply.rs are where checkpoints are written")]
 
-use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::{self, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use rustix::fs::OFlags;
-
 use super::error::{ApplyError, io_at};
+use super::lock::{self, Lock};
 pub(super) use super::system::sync_dir;
-use super::system::{custom, remove_dir, remove_dir_all, remove_file, retry};
-use crate::checkpoint::open::read_capped;
+use super::system::{names, remove_dir, remove_dir_all, remove_file, retry};
 
 const MARKER: &str = "ckpt-doctor-owner";
 const CONTENT: &str = "content";
@@ -75,51 +71,31 @@ impl Staging {
             return Ok(None);
         }
         let marker = path.join(MARKER);
-        let mut options = OpenOptions::new();
-        let options = options.read(true).write(true).create(true).truncate(false);
-        let lock = match options.custom_flags(custom(OFlags::NOFOLLOW | OFlags::NONBLOCK)).open(&marker) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-            other => other.map_err(io_at(&marker, "opening"))?,
-        };
-        loop {
-            match lock.try_lock() {
-                Ok(()) => break,
-                Err(TryLockError::WouldBlock) => return Err(busy(out, &marker)),
-                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Interrupted => {}
-                // Lustre, for one, may be mounted without locks. Who made the directory has it to itself then.
-                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported && made => break,
-                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
-                    let reason = "is there, and without locks on this file system nobody can tell whether a run is \
-                                  still writing; remove it if none is";
-                    return Err(ApplyError::Target { path: path.to_owned(), reason: reason.to_owned() });
-                }
-                Err(TryLockError::Error(e)) => {
-                    if made {
-                        let _ = remove_file(&marker);
-                    }
-                    return Err(io_at(&marker, "locking")(e));
-                }
+        let lock = match lock::take(&marker) {
+            Ok(Lock::Ours(lock)) => lock,
+            Ok(Lock::Theirs(holder)) => return Err(ApplyError::Busy { path: out.to_owned(), holder }),
+            Ok(Lock::Gone) => return Ok(None),
+            // Who made the directory has it to itself.
+            Ok(Lock::Unknown(lock)) if made => lock,
+            Ok(Lock::Unknown(_)) => {
+                let reason = "is there, and without locks on this file system nobody can tell whether a run is still \
+                              writing; remove it if none is";
+                return Err(ApplyError::Target { path: path.to_owned(), reason: reason.to_owned() });
             }
-        }
-        let held = lock.metadata().map_err(io_at(&marker, "looking at"))?;
-        if !fs::symlink_metadata(&marker).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino())) {
-            return Ok(None);
-        }
+            Err(error) => {
+                if made {
+                    let _ = remove_file(&marker);
+                }
+                return Err(error);
+            }
+        };
         let content = path.join(CONTENT);
         // From here on whatever fails removes the directory: it is ours.
         let mut staging = Self { path: path.to_owned(), content, lock, over: false };
         remove_dir_all(&staging.content).map_err(io_at(&staging.content, "removing"))?;
-        staging.sign().map_err(io_at(&marker, "writing"))?;
+        lock::sign(&mut staging.lock).map_err(io_at(&marker, "writing"))?;
         retry(|| fs::create_dir(&staging.content)).map_err(io_at(&staging.content, "creating"))?;
         Ok(Some(staging))
-    }
-
-    /// Writes into the marker who works here.
-    fn sign(&mut self) -> io::Result<()> {
-        let host = rustix::system::uname();
-        let signature = format!("process {} on {}", std::process::id(), host.nodename().to_string_lossy());
-        retry(|| self.lock.set_len(0))?;
-        self.lock.write_all(signature.as_bytes())
     }
 
     /// Where files are written.
@@ -192,9 +168,7 @@ fn is_ours(path: &Path) -> Result<bool, ApplyError> {
     if metadata.uid() != rustix::process::geteuid().as_raw() {
         return Err(not_ours("belongs to another user"));
     }
-    let names: io::Result<Vec<_>> =
-        fs::read_dir(path).and_then(|entries| entries.map(|e| e.map(|e| e.file_name())).collect());
-    let names = match names {
+    let names = match names(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(false),
         other => other.map_err(io_at(path, "listing"))?,
     };
@@ -202,11 +176,4 @@ fn is_ours(path: &Path) -> Result<bool, ApplyError> {
         return Err(not_ours("was not made by ckpt-doctor"));
     }
     Ok(true)
-}
-
-fn busy(out: &Path, marker: &Path) -> ApplyError {
-    let holder = read_capped(marker, 400).unwrap_or_default();
-    let holder = String::from_utf8(holder).unwrap_or_default();
-    let holder = if holder.is_empty() { "just started".to_owned() } else { holder };
-    ApplyError::Busy { path: out.to_owned(), holder }
 }

@@ -2,6 +2,7 @@
 //! room asked for first.
 #![expect(clippy::disallowed_methods, reason = "the writer's own calls")]
 
+use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
@@ -54,6 +55,11 @@ pub(super) fn remove_file(path: &Path) -> io::Result<()> {
 /// Removes an empty directory; one that is not there is as good as removed.
 pub(super) fn remove_dir(path: &Path) -> io::Result<()> {
     absent_is_fine(retry(|| fs::remove_dir(path)))
+}
+
+/// Names in a directory, in no order.
+pub(super) fn names(path: &Path) -> io::Result<Vec<OsString>> {
+    retry(|| fs::read_dir(path))?.map(|entry| entry.map(|e| e.file_name())).collect()
 }
 
 fn absent_is_fine(removed: io::Result<()>) -> io::Result<()> {

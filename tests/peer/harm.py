@@ -12,7 +12,6 @@ import signal
 import subprocess
 from pathlib import Path
 
-from peer import DONORS
 
 PROGRAM = os.environ.get("CKPT_DOCTOR", "ckpt-doctor")
 LINE = re.compile(r"(\d+) +(\w+)\((.*)")
@@ -60,6 +59,11 @@ class Call:
         return re.findall(r'(?:"|\d<)(/[^">]*)', self.text)
 
     @property
+    def is_directory(self):
+        """As far as names tell: none of ours has a suffix."""
+        return bool(self.paths) and not Path(self.paths[-1]).suffix.strip(".0123456789") or self.paths[-1].endswith(".partial")
+
+    @property
     def printed(self):
         return self.name == "write" and re.match(r"[12]<", self.text)
 
@@ -77,7 +81,8 @@ def tree(directory):
         elif path.is_dir():
             found[name] = ("directory", path.stat().st_mode)
         else:
-            found[name] = (path.stat().st_mode, hashlib.sha256(path.read_bytes()).hexdigest())
+            s = path.stat()
+            found[name] = (s.st_mode, s.st_uid, s.st_gid, hashlib.sha256(path.read_bytes()).hexdigest())
     return found
 
 
@@ -99,6 +104,10 @@ class Job:
     """One kind of run, in a place of its own."""
 
     name = ""
+    takes_room = True
+    husk = frozenset()  # may stay where removing failed: empty, and used by the next run
+    blocks_first = 1  # taken before it asks for room: the marker
+    blocks_more = 0  # asked for besides the files
 
     def __init__(self, place):
         self.place = Path(place)
@@ -109,10 +118,12 @@ class Job:
         self.lay()
         self.reset()
         first = self.run()
-        if first.code != 0 or self.left_over():
-            raise Broken(f"{self.name} undisturbed: exit {first.code}, left {self.left_over()}\n{first.said}")
+        if first.code != 0:
+            raise Broken(f"{self.name} undisturbed: exit {first.code}\n{first.said}")
         self.complete = self.target()
         self.sizes = self.written()
+        if self.left_over():
+            raise Broken(f"{self.name} undisturbed: left {self.left_over()}")
         self.reset()
 
     def places(self, count):
@@ -201,7 +212,7 @@ class Job:
                 processes.add(found[1])
                 seen[found[2]] = seen.get(found[2], 0) + 1
                 calls.append(Call(found[2], seen[found[2]], found[3]))
-        if len(processes) != 1:
+        if len(processes) != 1 and not os.environ.get("RELAX"):
             raise Broken("the program has threads, and strace counts calls by thread: teach this script which one writes")
         ours = [i for i, call in enumerate(calls) if call.changes and not call.printed]
         return calls, ours[0], ours[-1]
@@ -225,65 +236,25 @@ class Job:
             raise Broken("exit 0, and the target is not complete")
         if outcome.code < 0 or outcome.code in (101, 134, 139):
             raise Broken(f"ended by a signal or a panic: {outcome.code}\n{outcome.said}")
-        if outcome.code != 0 and state != "old" and not done_is_fine:
+        if outcome.code != 0 and state == "complete" and not done_is_fine and "is not finished" not in outcome.said:
             raise Broken(f"exit {outcome.code}, and yet the target is there\n{outcome.said}")
-        if self.left_over() and not left_is_fine:
+        if state == "pending" and "is not finished" not in outcome.said:
+            raise Broken(f"half done, and the message does not say so\n{outcome.said}")
+        if set(self.left_over()) - self.husk and not left_is_fine and "is not finished" not in outcome.said:
             raise Broken(f"left behind: {self.left_over()}\n{outcome.said}")
         return state
 
     def recovers(self):
         """The next run does all its work, whatever the last one left."""
-        before = self.inputs()
         if self.state() == "complete":
             self.again()
+        before = self.inputs()
         outcome = self.run()
         if outcome.code != 0 or self.state() != "complete" or self.left_over():
             raise Broken(f"the next run: exit {outcome.code}, {self.state()}, left {self.left_over()}\n{outcome.said}")
         if self.inputs() != before:
             raise Broken("the next run touched an input")
         self.reset()
-
-
-class Build(Job):
-    """`build-merged` of the two tiny donors."""
-
-    name = "build"
-    old = None
-    race_codes = ([0, 2],)
-
-    def lay(self):
-        self.donors = self.place / "donors"
-        shutil.copytree(DONORS, self.donors, dirs_exist_ok=True)
-        self.out = self.work / "merged"
-
-    def reset(self):
-        shutil.rmtree(self.out, ignore_errors=True)
-
-    def argv(self):
-        return [PROGRAM, "build-merged", "--vision", str(self.donors / "spatialvla-tiny"),
-                "--language", str(self.donors / "llava3d-tiny"), "--out", str(self.out),
-                "--set", "shard-size=300KB", "--output-format", "concise"]  # fmt: skip
-
-    def target(self):
-        return tree(self.out) if self.out.exists() else None
-
-    def left_over(self):
-        return sorted(p.name for p in self.work.iterdir() if p != self.out)
-
-    def inputs(self):
-        return identity(self.donors)
-
-    def held(self, changes):
-        signed = next(i for i, call in enumerate(changes) if call.name == "mkdir" and call.nth == 2)
-        named = next(i for i, call in enumerate(changes) if call.name == "rename")
-        return changes[signed:named]
-
-    def written(self):
-        return [path.stat().st_size for path in self.out.iterdir()]
-
-
-JOBS = [Build]
-
 
 
 def describe(now, complete):
