@@ -92,6 +92,13 @@ fn directories_are_searched_and_files_mean_their_checkpoint() {
     // pre-commit passes files, several of one checkpoint.
     let (config, index) = (a.join("config.json"), a.join("model.safetensors.index.json"));
     assert_eq!(paths(&[config.to_str().unwrap(), index.to_str().unwrap()]), names(&[&a]));
+    // Beside those of other checkpoints, of none, and one that the commit deletes.
+    let (readme, gone) = (zoo.join("README.md"), b.join("model-00001-of-00002.safetensors"));
+    fs::write(&readme, "").unwrap();
+    let mixed = [readme.to_str().unwrap(), config.to_str().unwrap(), gone.to_str().unwrap()];
+    assert_eq!(paths(&mixed), names(&[&a, &b]));
+    assert_eq!(paths(&mixed[..1]), Vec::<String>::new());
+    assert_eq!(doctor(&["check", mixed[0]]).status.code(), Some(0));
 }
 
 #[test]

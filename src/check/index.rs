@@ -58,6 +58,24 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
     faults
 }
 
+/// An index that states more bytes of tensors than its shards have, when git-lfs pointers say how large these are.
+fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item = &'n str> + Clone) -> Option<Fault> {
+    let index = checkpoint.index.as_ref()?;
+    let stated = index.total_bytes()?;
+    let entry = |name| checkpoint.entries.get(name);
+    if !shards.clone().any(|name| entry(name).is_some_and(|e| e.lfs.is_some())) {
+        return None;
+    }
+    let size = |name| entry(name).map(|e| e.lfs.as_ref().map_or(e.size, |pointer| pointer.size));
+    let sum = shards.clone().try_fold(0_u64, |sum, name| Some(sum.saturating_add(size(name)?)))?;
+    let fault = Fault::new("lfs-sizes-below-total")
+        .at(Place::file(&index.document).pointer("/metadata/total_size"))
+        .with("stated", stated)
+        .with("sum", sum)
+        .with("count", shards.count());
+    (sum < stated).then_some(fault)
+}
+
 /// Weights, as far as file names tell: base-model shards, not adapters.
 fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
     checkpoint
@@ -89,6 +107,7 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         let count = referenced.entry(file).or_default();
         *count = count.saturating_add(1);
     }
+    faults.extend(pointers_below_total(checkpoint, referenced.keys().copied()));
     let is_there = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
     let absent: Vec<(&str, usize)> = referenced.iter().filter(|(n, _)| !is_there(n)).map(|(n, c)| (*n, *c)).collect();
     let all_absent = absent.len() == referenced.len();

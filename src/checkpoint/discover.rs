@@ -8,7 +8,7 @@ const MAX_DEPTH: usize = 6;
 
 /// The checkpoint directories at or below `path`, sorted.
 ///
-/// A file means the checkpoint that owns it. A directory that is a checkpoint is the answer itself, and
+/// A file means the checkpoint that owns it ([`owner`]), if one does. A directory that is a checkpoint is the answer itself, and
 /// folders inside it (`checkpoint-500`, ONNX copies) are not searched; any other directory is searched
 /// to a depth of six. Hidden folders and links to folders are not followed. A path that does not
 /// exist comes back as it is, so that opening it says so.
@@ -21,10 +21,25 @@ pub fn find_checkpoints(path: &Path) -> Vec<PathBuf> {
         return found;
     }
     if path.exists() {
-        let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
-        return vec![parent.to_owned()];
+        return owner(path).into_iter().collect();
     }
     vec![path.to_owned()]
+}
+
+/// The checkpoint that a file belongs to, there or not: the nearest folder above it that is one, within the git work tree
+/// and, for a relative path, within the current directory.
+#[must_use]
+pub fn owner(file: &Path) -> Option<PathBuf> {
+    for dir in file.ancestors().skip(1).take(MAX_DEPTH) {
+        let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
+        if is_checkpoint(dir) {
+            return Some(dir.to_owned());
+        }
+        if dir.join(".git").symlink_metadata().is_ok() {
+            return None;
+        }
+    }
+    None
 }
 
 fn search(dir: &Path, depth: usize, found: &mut Vec<PathBuf>) {

@@ -14,6 +14,7 @@ mod contents;
 mod discover;
 pub mod document;
 pub mod fault;
+mod git;
 pub mod index;
 mod lfs;
 pub mod module;
@@ -26,7 +27,7 @@ pub mod text;
 pub mod tokenizer;
 
 pub use contents::Contents;
-pub use discover::{find_checkpoints, is_checkpoint};
+pub use discover::{find_checkpoints, is_checkpoint, owner};
 pub use document::Document;
 pub use fault::{FAULT_KINDS, Fault, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};

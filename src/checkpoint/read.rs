@@ -5,6 +5,7 @@ use std::fs::{self, Metadata};
 use std::path::{Component, Path};
 use std::sync::Arc;
 
+use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
@@ -102,6 +103,7 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
     }
     checkpoint.derive(vocabularies);
     checkpoint.tokenizer.faults = faults_of_vocabularies;
+    git::mark_pointers(&mut checkpoint);
     Ok(checkpoint)
 }
 

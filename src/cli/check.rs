@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use ckpt_doctor::check::{Outcome, check_for, policy};
-use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints};
+use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints, owner};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::CheckpointReport;
 
@@ -29,17 +29,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut seen = BTreeSet::new();
     let mut looked = Vec::new();
     for path in &args.paths {
-        if !path.exists() {
-            bail!("{}: no such file or directory", path.display());
-        }
-        let found = find_checkpoints(path);
-        if found.is_empty() {
-            bail!(
-                "{}: no checkpoint there (no config.json, adapter_config.json, index or *.safetensors)",
-                path.display()
-            );
-        }
-        for dir in found {
+        for dir in directories(path)? {
             // Two files of one checkpoint, as pre-commit passes them, are one checkpoint.
             if !seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone())) {
                 continue;
@@ -66,6 +56,20 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         }
     }
     Ok(if failed && !args.report.exit_zero { FINDINGS } else { CLEAN })
+}
+
+/// The checkpoints that a path means. A file may belong to none, as when pre-commit passes all that a commit changes; one
+/// that is gone means the checkpoint it is missing from.
+fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    if !path.exists() {
+        let Some(owner) = owner(path) else { bail!("{}: no such file or directory", path.display()) };
+        return Ok(vec![owner]);
+    }
+    let found = find_checkpoints(path);
+    if found.is_empty() && path.is_dir() {
+        bail!("{}: no checkpoint there (no config.json, adapter_config.json, index or *.safetensors)", path.display());
+    }
+    Ok(found)
 }
 
 fn look(dir: PathBuf, deep: bool, settings: &mut Resolver) -> anyhow::Result<Looked> {

@@ -273,6 +273,7 @@ pub const COMPARISON_KINDS: &[&str] = &[
     "index-missing",
     "index-names-other-shard",
     "layer-lacks-tensor",
+    "lfs-sizes-below-total",
     "load-raises",
     "loads-differ",
     "missing-tensors",

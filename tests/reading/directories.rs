@@ -199,6 +199,14 @@ fn checkpoints_are_found_below_a_folder_and_around_a_file() {
     symlink(root, root.join("d/loop")).unwrap();
     assert_eq!(find_checkpoints(root), [root.join("a"), root.join("b/c")]);
     assert_eq!(find_checkpoints(&root.join("a/config.json")), [root.join("a")]);
+    // The nearest one above, in the same work tree; a note in a folder that is none belongs to nobody.
+    assert_eq!(find_checkpoints(&root.join("b/c/onnx/config.json")), [root.join("b/c/onnx")]);
+    fs::create_dir(root.join("a/extra")).unwrap();
+    fs::write(root.join("a/extra/notes.txt"), "").unwrap();
+    assert_eq!(find_checkpoints(&root.join("a/extra/notes.txt")), [root.join("a")]);
+    assert_eq!(find_checkpoints(&root.join("d/notes.txt")), Vec::<std::path::PathBuf>::new());
+    fs::create_dir(root.join("a/extra/.git")).unwrap();
+    assert_eq!(find_checkpoints(&root.join("a/extra/notes.txt")), Vec::<std::path::PathBuf>::new());
     assert_eq!(find_checkpoints(&root.join("d")), Vec::<std::path::PathBuf>::new());
     assert_eq!(find_checkpoints(&root.join("gone")), [root.join("gone")]);
 }

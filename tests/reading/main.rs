@@ -4,7 +4,6 @@
 //! promise that an oddity is clean.
 
 #![allow(
-    clippy::expect_used,
     clippy::unwrap_used,
     clippy::indexing_slicing,
     clippy::arithmetic_side_effects,

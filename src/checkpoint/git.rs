@@ -1,0 +1,127 @@
+//! What a git work tree says of a checkpoint's files: which of them git-lfs keeps.
+//!
+//! A model repository holds pointers in the place of its large files, and a work tree without their content is how
+//! `GIT_LFS_SKIP_SMUDGE=1` leaves it. No git is run: `.gitattributes` says which files are meant
+//! (<https://git-scm.com/docs/gitattributes>).
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use globset::{GlobBuilder, GlobMatcher};
+
+use super::open::read_capped;
+use super::{Checkpoint, Fault};
+
+/// Most bytes read of a `.gitattributes`.
+const CAP: u64 = 256 << 10;
+/// Most lines of one that are looked at.
+const LINES: usize = 2_000;
+
+/// One line that says something of the filter: files that match it, and whether git-lfs keeps them.
+struct Line {
+    glob: GlobMatcher,
+    /// Whether the glob is for the path below its folder; else it is for the file's name.
+    whole: bool,
+    lfs: bool,
+}
+
+/// Marks the pointers among the faults that stand where a git work tree has them stand.
+pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
+    let pointers: BTreeSet<String> =
+        checkpoint.entries.iter().filter(|(_, e)| e.lfs.is_some()).map(|(name, _)| name.clone()).collect();
+    if pointers.is_empty() {
+        return;
+    }
+    let kept = kept(&checkpoint.root, pointers);
+    let mark = |fault: &mut Fault| {
+        let file = fault.places.first().and_then(|place| place.file.as_deref());
+        if fault.kind == "lfs-pointer" && file.is_some_and(|file| kept.contains(file)) {
+            fault.detail.insert("tracked".to_owned(), true.into());
+        }
+    };
+    let documents = checkpoint.documents.values_mut().flat_map(|d| &mut d.faults);
+    let shards = checkpoint.shards.values_mut().flat_map(|s| &mut s.faults);
+    let modules = checkpoint.modules.values_mut().flat_map(|m| &mut m.faults);
+    let others = checkpoint.faults.iter_mut().chain(&mut checkpoint.tokenizer.faults);
+    documents.chain(shards).chain(modules).chain(others).for_each(mark);
+}
+
+/// Those of the files that git-lfs keeps by the `.gitattributes` of the work tree that `root` lies in.
+fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
+    let Ok(root) = root.canonicalize() else { return BTreeSet::new() };
+    let Some(top) = root.ancestors().find(|dir| dir.join(".git").symlink_metadata().is_ok()) else {
+        return BTreeSet::new();
+    };
+    // From the work tree's top down: the line that comes last decides.
+    let mut folders: Vec<&Path> = root.ancestors().take_while(|dir| dir.starts_with(top)).collect();
+    folders.reverse();
+    let lines: Vec<(&Path, Vec<Line>)> = folders.into_iter().map(|dir| (dir, lines(dir))).collect();
+    files.retain(|file| {
+        let path = root.join(file);
+        let says = |(dir, line): (&Path, &Line)| {
+            let below = path.strip_prefix(dir).ok()?;
+            line.glob.is_match(if line.whole { below } else { Path::new(file) }).then_some(line.lfs)
+        };
+        let all = lines.iter().flat_map(|(dir, lines)| lines.iter().map(move |line| (*dir, line)));
+        all.filter_map(says).last().unwrap_or(false)
+    });
+    files
+}
+
+fn lines(dir: &Path) -> Vec<Line> {
+    let Ok(bytes) = read_capped(&dir.join(".gitattributes"), CAP) else { return Vec::new() };
+    let text = String::from_utf8_lossy(&bytes);
+    text.lines().filter(|line| line.contains("filter")).take(LINES).filter_map(line).collect()
+}
+
+/// A line: `*.safetensors filter=lfs diff=lfs merge=lfs -text`.
+fn line(line: &str) -> Option<Line> {
+    let line = line.trim();
+    let (pattern, attributes) = match line.strip_prefix('"') {
+        Some(quoted) => quoted.split_once('"')?,
+        None => line.split_once(char::is_whitespace)?,
+    };
+    let lfs = attributes.split_whitespace().filter_map(|word| match word {
+        "filter=lfs" => Some(true),
+        "filter" | "-filter" | "!filter" => Some(false),
+        other => other.starts_with("filter=").then_some(false),
+    });
+    let lfs = lfs.last()?;
+    if pattern.starts_with('#') {
+        return None;
+    }
+    let whole = pattern.contains('/');
+    // git knows no braces.
+    let pattern = pattern.trim_start_matches('/').replace('{', "[{]").replace('}', "[}]");
+    let glob = GlobBuilder::new(&pattern).literal_separator(true).build().ok()?;
+    Some(Line { glob: glob.compile_matcher(), whole, lfs })
+}
+
+#[cfg(test)]
+#[allow(clippy::disallowed_methods, reason = "makes the files it reads")]
+mod tests {
+    use std::fs;
+
+    use super::kept;
+
+    #[test]
+    fn the_last_line_that_matches_decides() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path().join("models/a");
+        fs::create_dir_all(&root).unwrap();
+        let all = ["a.bin", "a.safetensors", "model.safetensors", "t.json", "x{y}.npy"];
+        let kept = || {
+            let kept = kept(&root, all.map(str::to_owned).into());
+            kept.into_iter().collect::<Vec<_>>().join(" ")
+        };
+        let attributes = "# *.json filter=lfs\n*.safetensors filter=lfs diff=lfs -text\nmodels/**/*.bin filter=lfs\n\
+                          a/t.json filter=lfs\n\"x{y}.npy\" filter=lfs\n*.json text\n";
+        fs::write(dir.path().join(".gitattributes"), attributes).unwrap();
+        assert_eq!(kept(), "", "no work tree");
+        fs::write(dir.path().join(".git"), "gitdir: elsewhere").unwrap();
+        assert_eq!(kept(), "a.bin a.safetensors model.safetensors x{y}.npy");
+        fs::write(root.join(".gitattributes"), "/model.safetensors !filter\na.bin filter=other\nt.json filter=lfs")
+            .unwrap();
+        assert_eq!(kept(), "a.safetensors t.json x{y}.npy");
+    }
+}

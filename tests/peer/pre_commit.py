@@ -1,0 +1,128 @@
+"""The hooks under the real pre-commit, in a scratch git repository with a model directory.
+
+    pre_commit.py SOURCE
+
+SOURCE is a copy of this project's files; it is made a git repository, which the `language: rust` hook is installed from.
+The program that the `language: system` hook finds is the one that CKPT_DOCTOR names.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+DOCTOR = Path(os.environ["CKPT_DOCTOR"]).resolve()
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:{}\nsize 5000000\n"
+GIT = ["git", "-c", "user.name=CI", "-c", "user.email=ci@example.invalid", "-c", "init.defaultBranch=main"]
+
+
+def run(*command, cwd, ok=True):
+    done = subprocess.run([str(c) for c in command], cwd=cwd, env=ENV, capture_output=True, text=True)
+    said = done.stdout + done.stderr
+    if (done.returncode == 0) != ok:
+        sys.exit(f"{' '.join(map(str, command))}: exit {done.returncode}\n{said}")
+    return said
+
+
+def git(*args, cwd, ok=True):
+    return run(*GIT, *args, cwd=cwd, ok=ok)
+
+
+def commit(repo, message, ok=True):
+    git("add", "-A", cwd=repo)
+    return git("commit", "-qm", message, cwd=repo, ok=ok)
+
+
+def repository(at):
+    at.mkdir(parents=True, exist_ok=True)
+    git("init", "-q", cwd=at)
+
+
+def configure(repo, source, rev, hook, args=()):
+    repo.joinpath(".pre-commit-config.yaml").write_text(
+        f"repos:\n- repo: {source}\n  rev: {rev}\n  hooks:\n  - id: {hook}\n    args: {json.dumps(list(args))}\n"
+    )
+    run(sys.executable, "-m", "pre_commit", "install", cwd=repo)
+
+
+def expect(said, *words):
+    for word in words:
+        if word not in said:
+            sys.exit(f"not said: {word}\n{said}")
+
+
+def main(files, room):
+    source, repo = room / "source", room / "repo"
+    shutil.copytree(files, source)
+    repository(source)
+    commit(source, "source")
+    rev = git("rev-parse", "HEAD", cwd=source).strip()
+
+    repository(repo)
+    model = repo / "models" / "a"
+    shutil.copytree(files / "fixtures/donors/llava3d-tiny", model)
+    repo.joinpath("package.json").write_text("{}\n")
+    configure(repo, source, rev, "ckpt-doctor-system")
+    commit(repo, "a sound model, and a document that belongs to none")
+
+    index = model / "model.safetensors.index.json"
+    sound = index.read_text()
+    broken = json.loads(sound)
+    name = sorted(broken["weight_map"])[0]
+    broken["weight_map"][name] = "model-00009-of-00009.safetensors"
+    index.write_text(json.dumps(broken, indent=2))
+    head = git("rev-parse", "HEAD", cwd=repo)
+    expect(commit(repo, "broken", ok=False), "Failed", "error[", "model-00009-of-00009.safetensors")
+    if git("rev-parse", "HEAD", cwd=repo) != head:
+        sys.exit("the broken commit was made")
+    if "--fix " in run(DOCTOR, "check", "--help", cwd=repo):
+        configure(repo, source, rev, "ckpt-doctor-system", ["--fix"])
+        expect(commit(repo, "broken", ok=False), "files were modified by this hook")
+        commit(repo, "repaired by the hook")
+        configure(repo, source, rev, "ckpt-doctor-system")
+        print("a broken index is repaired by --fix in the hook")
+    else:
+        index.write_text(sound)
+    run("git", "checkout", "-q", "HEAD", "--", ".", cwd=repo)
+    print("a commit that breaks a model is refused")
+
+    # One that deletes a shard: pre-commit passes no file that is gone, but the index changes along with it.
+    shard = sorted(model.glob("*.safetensors"))[0]
+    kept = json.loads(index.read_text())
+    shard.unlink()
+    index.write_text(json.dumps(kept))
+    expect(commit(repo, "a shard less", ok=False), shard.name)
+    git("checkout", "-q", "-f", "HEAD", cwd=repo)
+
+    # What a clone without git-lfs has: pointers, which are as they should be.
+    other = repo / "models" / "b"
+    shutil.copytree(model, other)
+    other.joinpath(".gitattributes").write_text("*.safetensors filter=lfs diff=lfs merge=lfs -text\n")
+    for n, shard in enumerate(sorted(other.glob("*.safetensors"))):
+        shard.write_text(POINTER.format(f"{n:064x}"))
+    for key in ("clean", "smudge"):
+        git("config", f"filter.lfs.{key}", "cat", cwd=repo)
+    commit(repo, "pointers of git-lfs")
+    print("pointers of git-lfs are committed")
+
+    configure(repo, source, rev, "ckpt-doctor")
+    run(sys.executable, "-m", "pre_commit", "run", "--all-files", cwd=repo)
+    index.write_text(json.dumps(broken, indent=2))
+    expect(commit(repo, "broken", ok=False), "Failed", "model-00009-of-00009.safetensors")
+    print("the hook that pre-commit builds says the same")
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as room:
+        room = Path(room).resolve()
+        ENV = {
+            **os.environ,
+            "PATH": f"{DOCTOR.parent}:{os.environ['PATH']}",
+            "PRE_COMMIT_HOME": str(room / "home"),
+            "GIT_CONFIG_GLOBAL": os.devnull,
+            "GIT_CONFIG_NOSYSTEM": "1",
+        }
+        main(Path(sys.argv[1]).resolve(), room)
