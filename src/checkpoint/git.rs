@@ -63,7 +63,7 @@ fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
             line.glob.is_match(if line.whole { below } else { Path::new(file) }).then_some(line.lfs)
         };
         let all = lines.iter().flat_map(|(dir, lines)| lines.iter().map(move |line| (*dir, line)));
-        all.filter_map(says).last().unwrap_or(false)
+        all.filter_map(says).next_back().unwrap_or(false)
     });
     files
 }
@@ -81,12 +81,12 @@ fn line(line: &str) -> Option<Line> {
         Some(quoted) => quoted.split_once('"')?,
         None => line.split_once(char::is_whitespace)?,
     };
-    let lfs = attributes.split_whitespace().filter_map(|word| match word {
+    let mut lfs = attributes.split_whitespace().filter_map(|word| match word {
         "filter=lfs" => Some(true),
         "filter" | "-filter" | "!filter" => Some(false),
         other => other.starts_with("filter=").then_some(false),
     });
-    let lfs = lfs.last()?;
+    let lfs = lfs.next_back()?;
     if pattern.starts_with('#') {
         return None;
     }
