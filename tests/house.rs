@@ -19,7 +19,7 @@ use ckpt_doctor::checkpoint::fault::FAULT_KINDS;
 use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::quantization::Scheme;
 use ckpt_doctor::knowledge::recipe::Recipe;
-use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, Rule, RuleSet, Severity};
+use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, EditSpec, REPAIRS, Rule, RuleSet, Safety, Severity};
 use ckpt_doctor::knowledge::{Library, source};
 use regex::Regex;
 use support::{cases, files, keys, project, rules, texts};
@@ -81,13 +81,13 @@ fn rules_are_written_alike() {
         hold(rule.why.len() > 20 && rule.why.ends_with(['.', ')', '"']), "`why` is whole sentences");
         hold(one_line(message) && !message.ends_with('.'), "the message has no full stop");
         hold(starts_low(message), "the message starts with a small letter, a name or a value");
-        if let Some(fix) = &rule.fix {
+        for fix in &rule.fixes {
             let help = fix.help.source();
             hold(one_line(help) && !help.ends_with('.'), "the help has no full stop");
             hold(IMPERATIVES.contains(&first_word(help)), "the help starts with a verb of the list in tests/house.rs");
         }
         // Information may leave nothing to be done; what is wrong never does.
-        hold(rule.fix.is_some() || rule.severity == Severity::Info, "a rule above info says what to do");
+        hold(!rule.fixes.is_empty() || rule.severity == Severity::Info, "a rule above info says what to do");
     }
     none(&wrong);
 }
@@ -243,8 +243,8 @@ fn one_word_for_one_thing() {
         }
     }
     for rule in rules().rules {
-        let help = rule.fix.as_ref().map_or("", |f| f.help.source());
-        for text in [&rule.name, &rule.summary, &rule.why, rule.message.source(), help] {
+        let help = rule.fixes.iter().map(|f| f.help.source()).collect::<Vec<_>>().join(" ");
+        for text in [&rule.name, &rule.summary, &rule.why, rule.message.source(), &help] {
             look(&rule.code, text);
         }
     }
@@ -273,6 +273,7 @@ const FAMILIES: &[(&str, &str)] = &[
 /// The forms of data files, and the sources that read them.
 const KEYS: &[(&str, &str)] = &[
     ("Keys of a rule", "rule.rs"),
+    ("Keys of a fix", "rule/fix.rs"),
     ("Keys of an architecture", "architecture/blueprint.rs"),
     ("Keys of an entry of `tensors`", "architecture/member.rs"),
     ("Keys of a quantisation scheme", "quantization.rs"),
@@ -304,7 +305,7 @@ fn page() -> String {
                 Severity::Warning => "warning",
                 Severity::Info => "info",
             };
-            let fix = rule.fix.as_ref().map_or("", |f| f.safety.name());
+            let fix = rule.fixes.iter().map(|f| f.safety.name()).collect::<Vec<_>>().join(", ");
             let path = format!("checks/{}/{}.json5", family.to_lowercase(), rule.code);
             let summary = rule.summary.replace('|', "\\|").replace("__", "\\_\\_");
             let _ = writeln!(page, "| [{}]({path}) | {} | {severity} | {summary} | {fix} |", rule.code, rule.name);
@@ -350,6 +351,36 @@ fn fixtures_are_small() {
     };
     let total = size("rules") + size("sound") + size("bases");
     assert!(total < 200_000, "{total} bytes; weights are made when the tests run");
+}
+
+/// Repairs that rules name are there, and none is there that no rule names.
+#[test]
+fn every_repair_is_there_and_used() {
+    let source = fs::read_to_string(project().join("src/check/fix/repairs.rs")).expect("text");
+    let rules = rules().rules;
+    let used = |name: &str| {
+        let is = |edit: &EditSpec| matches!(edit, EditSpec::Repair(repair) if repair == name);
+        rules.iter().flat_map(|r| &r.fixes).flat_map(|f| &f.edits).any(is)
+    };
+    let wrong: Vec<String> = REPAIRS
+        .iter()
+        .filter(|name| !used(name) || !source.contains(&format!("\"{name}\" =>")))
+        .map(|name| (*name).to_owned())
+        .collect();
+    none(&wrong);
+    assert!(REPAIRS.is_sorted());
+}
+
+/// Edits belong to a fix that is made by the program, and every such fix has some.
+#[test]
+fn a_fix_has_edits_unless_it_is_manual() {
+    let rules = rules().rules;
+    let wrong: Vec<String> = rules
+        .iter()
+        .filter(|rule| rule.fixes.iter().any(|fix| (fix.safety == Safety::Manual) != fix.edits.is_empty()))
+        .map(|rule| rule.code.clone())
+        .collect();
+    none(&wrong);
 }
 
 /// Every folder of fixtures is described where its reader looks first.

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, FixHint, LoadReport, Location, Skipped, Suppressed};
+use super::finding::{Finding, LoadReport, Location, Skipped, Suppressed};
+use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::Stored;
 use super::votes::Vote;
 use super::{adapter, facts, index, judge, modules, policy, tokens};
@@ -14,7 +15,7 @@ use crate::knowledge::expression::within;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
 use crate::knowledge::settings::Policy;
-use crate::knowledge::{EvalError, Expression, Library, Scope};
+use crate::knowledge::{EvalError, Expression, Library, Loader, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
 const CAP: usize = 100;
@@ -107,12 +108,15 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
             checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
-    let scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
+    let mut scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
+    scope.bind("loaders", &json!(loaders(config, versions)));
+    let architecture = outcome.architecture.as_deref();
+    let bench = Bench::new(checkpoint, &outcome.loads);
     for rule in &knowledge.rules.rules {
         // Rules of the program are known to end; of a user's rule that is found out.
         let (found, stopped) = match rule.origin {
-            Some(_) => within(STEPS, || ask(rule, checkpoint, &faults, &scope, &outcome)),
-            None => (ask(rule, checkpoint, &faults, &scope, &outcome), false),
+            Some(_) => within(STEPS, || ask(rule, &bench, &faults, &scope, architecture)),
+            None => (ask(rule, &bench, &faults, &scope, architecture), false),
         };
         if stopped {
             let why = "takes too many steps; let its loops go over less".to_owned();
@@ -140,7 +144,18 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
     let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if f.kinds.iter().any(|k| faults.iter().any(|f| f.kind == k)));
     let rules = knowledge.rules.rules.iter().filter(asked);
-    rules.flat_map(|rule| run(rule, checkpoint, faults, &Scope::new()).unwrap_or_default()).collect()
+    let bench = Bench::new(checkpoint, &[]);
+    rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect()
+}
+
+/// Versions of the loaders that the checkpoint has to load under.
+fn loaders(config: Option<&Value>, versions: &[String]) -> Vec<&'static str> {
+    let wrote = config.and_then(|c| c.get("transformers_version")).and_then(Value::as_str);
+    match (versions, wrote) {
+        ([], None) => vec![Loader::NEWEST.version()],
+        ([], Some(version)) => vec![Loader::nearest(version).version()],
+        (asked, _) => asked.iter().map(|version| Loader::nearest(version).version()).collect(),
+    }
 }
 
 fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
@@ -173,17 +188,16 @@ fn embedding_rows(checkpoint: &Checkpoint) -> Option<u64> {
 /// A rule's findings, or why it was not asked.
 fn ask(
     rule: &Rule,
-    checkpoint: &Checkpoint,
+    bench: &Bench<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
-    outcome: &Outcome,
+    architecture: Option<&str>,
 ) -> Result<Vec<Finding>, String> {
-    let architecture = outcome.architecture.as_deref();
     if !rule.applies.is_empty() && !architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a)) {
         let is = architecture.unwrap_or("unknown");
         return Err(format!("about {}; the architecture is {is}", rule.applies.join(", ")));
     }
-    let cannot = |expression: &Expression, error: &EvalError| match facts::absent(checkpoint, expression) {
+    let cannot = |expression: &Expression, error: &EvalError| match facts::absent(bench.checkpoint, expression) {
         Some(file) => format!("{file} is not there"),
         None => format!("cannot be asked: {}", error.cause),
     };
@@ -194,7 +208,7 @@ fn ask(
             Err(error) => return Err(cannot(when, &error)),
         }
     }
-    run(rule, checkpoint, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
+    run(rule, bench, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
 /// An expression that could not be evaluated, and why.
@@ -202,13 +216,13 @@ type Unasked<'r> = (&'r Expression, EvalError);
 
 fn run<'r>(
     rule: &'r Rule,
-    checkpoint: &Checkpoint,
+    bench: &Bench<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unasked<'r>> {
     let mut findings = match &rule.check {
-        Check::Fault(check) => from_faults(rule, check, checkpoint, faults, scope),
-        Check::Assert(check) => from_assert(rule, check, checkpoint, scope)?,
+        Check::Fault(check) => from_faults(rule, check, bench, faults, scope),
+        Check::Assert(check) => from_assert(rule, check, bench, scope)?,
     };
     let more = findings.len().saturating_sub(CAP);
     if more > 0 {
@@ -224,7 +238,7 @@ fn run<'r>(
 fn from_faults(
     rule: &Rule,
     check: &FaultCheck,
-    checkpoint: &Checkpoint,
+    bench: &Bench<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Vec<Finding> {
@@ -238,7 +252,9 @@ fn from_faults(
         let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
         let mut evidence = first.detail.clone();
         evidence.insert("count".to_owned(), json!(all.len()));
-        return vec![finding(rule, &fault_scope(scope, first, all.len()), locate(checkpoint, &places), evidence)];
+        let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, all.len())));
+        let (fix, places) = (fix.reduce(together).flatten(), locate(bench.checkpoint, &places));
+        return vec![finding(rule, &fault_scope(scope, first, all.len()), places, evidence, fix)];
     }
     let mut out = Vec::new();
     // Of a kind that one file has too often the reader keeps some, and says with the last how many more there were.
@@ -247,11 +263,20 @@ fn from_faults(
     for fault in matching.by_ref().take(CAP) {
         let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
         more = more.saturating_add(unkept(fault));
-        out.push(finding(rule, &fault_scope(scope, fault, 1), locate(checkpoint, &places), fault.detail.clone()));
+        let inner = fault_scope(scope, fault, 1);
+        let fix = hint(rule, bench, fault, &inner);
+        out.push(finding(rule, &inner, locate(bench.checkpoint, &places), fault.detail.clone(), fix));
     }
-    // The rest is only counted.
+    // The rest is only counted, and repaired with the last where each has a place of its own in a text.
     for fault in matching {
         more = more.saturating_add(unkept(fault)).saturating_add(1);
+        let last = out.last_mut().and_then(|last| last.fix.as_mut());
+        if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
+            && let Some(fix) = hint(rule, bench, fault, &fault_scope(scope, fault, 1))
+            && fix.safety == last.safety
+        {
+            last.edits.extend(fix.edits);
+        }
     }
     if more > 0
         && let Some(last) = out.last_mut()
@@ -281,11 +306,11 @@ fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'
 fn from_assert<'r>(
     rule: &'r Rule,
     check: &'r Assert,
-    checkpoint: &Checkpoint,
+    bench: &Bench<'_>,
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unasked<'r>> {
     let Some(each) = &check.each else {
-        let found = one_assert(rule, check, checkpoint, scope).map_err(|error| (&check.that, error))?;
+        let found = one_assert(rule, check, bench, scope).map_err(|error| (&check.that, error))?;
         return Ok(found.into_iter().collect());
     };
     let items = match each.eval(scope).map_err(|error| (each, error))? {
@@ -297,22 +322,18 @@ fn from_assert<'r>(
         let mut inner = scope.child();
         inner.bind("it", &item);
         // A value that is not there cannot be wrong: whether it has to be there is another rule's question.
-        out.extend(one_assert(rule, check, checkpoint, &inner).unwrap_or(None));
+        out.extend(one_assert(rule, check, bench, &inner).unwrap_or(None));
     }
     Ok(out)
 }
 
-fn one_assert(
-    rule: &Rule,
-    check: &Assert,
-    checkpoint: &Checkpoint,
-    scope: &Scope<'_>,
-) -> Result<Option<Finding>, EvalError> {
+fn one_assert(rule: &Rule, check: &Assert, bench: &Bench<'_>, scope: &Scope<'_>) -> Result<Option<Finding>, EvalError> {
     if check.that.eval_bool(scope)? {
         return Ok(None);
     }
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
-    Ok(Some(finding(rule, scope, locate(checkpoint, &places), Map::new())))
+    let fix = fix::hint(&rule.fixes, &Site { bench, fault: None, scope });
+    Ok(Some(finding(rule, scope, locate(bench.checkpoint, &places), Map::new(), fix)))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {
@@ -320,7 +341,29 @@ fn place(at: &At, scope: &Scope<'_>) -> Place {
     Place { file: render(&at.file), span: None, pointer: render(&at.pointer), tensor: render(&at.tensor) }
 }
 
-fn finding(rule: &Rule, scope: &Scope<'_>, locations: Vec<Location>, evidence: Map<String, Value>) -> Finding {
+fn hint(rule: &Rule, bench: &Bench<'_>, fault: &Fault, scope: &Scope<'_>) -> Option<FixHint> {
+    fix::hint(&rule.fixes, &Site { bench, fault: Some(fault), scope })
+}
+
+/// The fix of a finding that stands for several faults: all their edits, where each has some of the same safety.
+fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
+    let (first, next) = (first?, next?);
+    let mut edits = Vec::new();
+    if first.safety == next.safety {
+        edits = first.edits;
+        let new: Vec<_> = next.edits.into_iter().filter(|edit| edits.last() != Some(edit)).collect();
+        edits.extend(new);
+    }
+    Some(FixHint::new(first.safety, first.title, edits))
+}
+
+fn finding(
+    rule: &Rule,
+    scope: &Scope<'_>,
+    locations: Vec<Location>,
+    evidence: Map<String, Value>,
+    fix: Option<FixHint>,
+) -> Finding {
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
@@ -328,7 +371,7 @@ fn finding(rule: &Rule, scope: &Scope<'_>, locations: Vec<Location>, evidence: M
         message: rule.message.render(scope),
         locations,
         evidence,
-        fix: rule.fix.as_ref().map(|f| FixHint { safety: f.safety.name().to_owned(), title: f.help.render(scope) }),
+        fix,
     }
 }
 

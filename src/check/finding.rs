@@ -5,6 +5,7 @@ use std::ops::Range;
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use super::fix::FixHint;
 pub use crate::knowledge::rule::Severity;
 
 /// Where a finding points: a file, a place in it, a tensor.
@@ -23,15 +24,6 @@ pub struct Location {
     /// Byte range in the file, for renderers that show the source.
     #[serde(skip)]
     pub span: Option<Range<usize>>,
-}
-
-/// What can be done about a finding.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct FixHint {
-    /// `safe`, `unsafe` or `manual`.
-    pub safety: String,
-    /// The step, as an imperative sentence.
-    pub title: String,
 }
 
 /// One finding of one rule.

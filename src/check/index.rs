@@ -11,7 +11,7 @@ use crate::checkpoint::{Checkpoint, Fault, Place, Shard};
 const SINGLE: &str = "model.safetensors";
 
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
-fn readable(shard: &Shard) -> bool {
+pub(super) fn readable(shard: &Shard) -> bool {
     const UNREADABLE: [&str; 10] = [
         "lfs-pointer",
         "not-safetensors",
@@ -35,7 +35,7 @@ pub fn all_read(checkpoint: &Checkpoint) -> bool {
 }
 
 /// Which shard holds a tensor of that name; the first when there are several.
-fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
+pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
     let mut map: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (shard, tensor) in checkpoint.tensors() {
         let shards = map.entry(&tensor.name).or_default();
@@ -77,7 +77,7 @@ fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item 
 }
 
 /// Weights, as far as file names tell: base-model shards, not adapters.
-fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
+pub(super) fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
     checkpoint
         .shards
         .keys()
@@ -253,7 +253,7 @@ fn whole(value: &Value) -> Option<u64> {
 }
 
 /// Number and count of `model-00001-of-00002.safetensors`.
-fn numbered(name: &str) -> Option<(&str, u32, u32)> {
+pub(super) fn numbered(name: &str) -> Option<(&str, u32, u32)> {
     let stem = name.strip_suffix(".safetensors")?;
     let (rest, count) = stem.rsplit_once("-of-")?;
     let (prefix, number) = rest.rsplit_once('-')?;
@@ -312,7 +312,7 @@ fn is_pointer(checkpoint: &Checkpoint, name: &str) -> bool {
 }
 
 /// The shard whose name differs from this one only in what some file systems ignore.
-fn similar<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<&'c str> {
+pub(super) fn similar<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<&'c str> {
     checkpoint.shards.keys().map(String::as_str).find(|s| *s != name && folded(s) == folded(name))
 }
 

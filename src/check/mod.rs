@@ -4,6 +4,7 @@ pub mod adapter;
 pub mod engine;
 pub mod facts;
 pub mod finding;
+pub mod fix;
 pub mod index;
 pub mod inspect;
 pub mod judge;
@@ -16,5 +17,7 @@ pub mod size;
 pub mod tokens;
 pub mod votes;
 
+pub use crate::knowledge::rule::Safety;
 pub use engine::{Knowledge, Outcome, check, check_for};
-pub use finding::{Finding, FixHint, Location, Severity};
+pub use finding::{Finding, Location, Severity};
+pub use fix::{Edit, FixHint};

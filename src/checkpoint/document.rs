@@ -9,6 +9,7 @@ use super::Fault;
 use super::scan::{Scanner, Token};
 use super::text::pointer_steps;
 
+pub mod edit;
 mod encoding;
 mod explain;
 mod read;
@@ -39,6 +40,12 @@ impl Document {
     #[must_use]
     pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
         read::parse(name.into(), bytes)
+    }
+
+    /// The text of a document in UTF-16 or UTF-32; `None` for any other, and where characters would be lost.
+    #[must_use]
+    pub fn decoded(bytes: &[u8]) -> Option<String> {
+        encoding::wide(bytes).map(|(_, text)| text).filter(|text| !text.contains(char::REPLACEMENT_CHARACTER))
     }
 
     /// A document that is to be written: two spaces of indent and a final line break, as Hugging Face

@@ -138,6 +138,7 @@ pub const FAULT_KINDS: &[&str] = &[
     "partial-download",
     "python-syntax",
     "python-too-complex",
+    "repair-interrupted",
     "shape-byte-mismatch",
     "shape-overflow",
     "shard-truncated",

@@ -29,6 +29,7 @@ pub mod tokenizer;
 pub use contents::Contents;
 pub use discover::{find_checkpoints, is_checkpoint, owner};
 pub use document::Document;
+pub use document::edit::{Splice, spliced};
 pub use fault::{FAULT_KINDS, Fault, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
@@ -38,6 +39,11 @@ pub use shard::{Dtype, Shard, Tensor, byte_len};
 pub use sniff::looks_like;
 pub use text::{escape, line_column};
 pub use tokenizer::{Tokenizer, Vocabulary};
+
+/// Folder in a checkpoint where a repair keeps what it takes to undo it.
+pub const REPAIR_FOLDER: &str = ".ckpt-doctor";
+/// File in [`REPAIR_FOLDER`] that is there while a repair is being written.
+pub const REPAIR_JOURNAL: &str = "journal.json";
 
 /// A directory entry, and what it turned out to be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -150,6 +156,47 @@ impl Checkpoint {
         };
         checkpoint.derive(vocabularies);
         checkpoint
+    }
+
+    /// The same checkpoint with these parts in place of those of the same name, or beside the others.
+    ///
+    /// Only what changed is worked out anew: entries of other files and the faults of the directory stay.
+    #[must_use]
+    pub fn replaced(&self, parts: Parts) -> Self {
+        let Parts { documents, shards, modules, mut vocabularies, entries } = parts;
+        let mut next = self.clone();
+        next.entries.extend(entries);
+        let mut entry = |name: &str, size: Option<u64>| {
+            let entry = next.entries.entry(name.to_owned()).or_default();
+            *entry = Entry { kind: EntryKind::Regular, size: size.unwrap_or(0), ..entry.clone() };
+        };
+        let len = |text: &Option<Arc<str>>| text.as_ref().and_then(|t| u64::try_from(t.len()).ok());
+        let own = |name: &str| tokenizer::VOCABULARY_FILES.contains(&name) && documents.iter().any(|d| d.name == name);
+        let kept = self.tokenizer.vocabularies.iter().filter(|(name, _)| !own(name));
+        for (name, vocabulary) in kept {
+            vocabularies.entry(name.clone()).or_insert_with(|| Arc::clone(vocabulary));
+        }
+        let indexed = documents.iter().any(|d| Index::is_index(&d.name));
+        for document in documents {
+            entry(&document.name, len(&document.text));
+            next.documents.insert(document.name.clone(), document);
+        }
+        for module in modules {
+            entry(&module.name, len(&module.text));
+            next.modules.insert(module.name.clone(), module);
+        }
+        for shard in shards {
+            entry(&shard.name, Some(shard.file_len));
+            next.shards.insert(shard.name.clone(), shard);
+        }
+        let (index, faults) = (next.index.take(), std::mem::take(&mut next.tokenizer.faults));
+        next.derive(vocabularies);
+        // Faults of keys given twice have moved from the document to the index: it is not read a second time.
+        if !indexed {
+            next.index = index;
+        }
+        next.tokenizer.faults = faults;
+        next
     }
 
     /// Derives index and tokenizer from the documents.

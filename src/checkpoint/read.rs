@@ -9,7 +9,10 @@ use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
-use super::{Checkpoint, Document, Entry, EntryKind, Fault, LfsPointer, Module, OpenError, Place, Shard, Vocabulary};
+use super::{
+    Checkpoint, Document, Entry, EntryKind, Fault, LfsPointer, Module, OpenError, Place, REPAIR_FOLDER, REPAIR_JOURNAL,
+    Shard, Vocabulary,
+};
 
 /// Endings that a downloader gives to a file it has not finished.
 const UNFINISHED: [&str; 5] = [".incomplete", ".aria2", ".part", ".crdownload", ".download"];
@@ -100,6 +103,10 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
             checkpoint.faults.push(Fault::new("partial-download").at(Place::file(&*name)).with("of", of));
         }
         checkpoint.entries.insert(name, entry);
+    }
+    if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
+        let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
+        checkpoint.faults.push(Fault::new("repair-interrupted").at(place));
     }
     checkpoint.derive(vocabularies);
     checkpoint.tokenizer.faults = faults_of_vocabularies;

@@ -26,6 +26,8 @@ pub struct Cli {
 pub enum Command {
     /// Check checkpoint directories
     Check(CheckArgs),
+    /// Take back the latest repair of a checkpoint, byte for byte
+    Undo(UndoArgs),
     /// Build one checkpoint from parts of two
     BuildMerged(BuildMergedArgs),
     /// Say what a checkpoint is: tensors, class, and the config values that the tensors show
@@ -188,9 +190,46 @@ pub struct CheckArgs {
     /// Which settings to go by.
     #[command(flatten)]
     pub settings: SettingsArgs,
+    /// What to do about findings.
+    #[command(flatten)]
+    pub fix: FixArgs,
     /// How to report.
     #[command(flatten)]
     pub report: ReportArgs,
+}
+
+/// What `check` does about findings.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Fixes")]
+#[allow(clippy::struct_excessive_bools, reason = "each is a switch of its own on the command line")]
+pub struct FixArgs {
+    /// Make the safe fixes; `undo` takes them back
+    #[arg(long)]
+    pub fix: bool,
+    /// Count unsafe fixes as well: they change what a loader would compute
+    #[arg(long)]
+    pub unsafe_fixes: bool,
+    /// Show what the fixes would change and write nothing; the exit code is 1 if there is anything
+    #[arg(long, conflicts_with_all = ["output", "fix_only"])]
+    pub diff: bool,
+    /// Make the fixes, and neither say what is left nor fail because of it
+    #[arg(long)]
+    pub fix_only: bool,
+    /// Exit with 1 if anything was fixed, even if nothing is left
+    #[arg(long)]
+    pub exit_non_zero_on_fix: bool,
+    /// Leave the checkpoint alone and make a repaired copy here, with links to the files that stay; needs --fix
+    #[arg(long, value_name = "DIR")]
+    pub output: Option<PathBuf>,
+}
+
+/// Arguments of `undo`.
+#[derive(Debug, Args)]
+#[command(after_help = "Exit codes: 0 undone, 2 there was nothing to undo, or a file has changed since.")]
+pub struct UndoArgs {
+    /// The checkpoint that `check --fix` has repaired
+    #[arg(value_name = "DIR", default_value = ".")]
+    pub path: PathBuf,
 }
 
 /// Arguments of `build-merged`.

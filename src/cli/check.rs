@@ -8,12 +8,12 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use ckpt_doctor::check::{Outcome, check_for, policy};
 use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints, owner};
-use ckpt_doctor::report::Report;
-use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
+use ckpt_doctor::report::{Report, fixes};
 
 use super::args::CheckArgs;
 use super::settings::{Resolved, Resolver, Typed};
-use super::{CLEAN, FINDINGS, baseline, output, unasked};
+use super::{CLEAN, FINDINGS, baseline, fix, output, signals, unasked};
 
 /// A checkpoint that was looked at.
 struct Looked {
@@ -21,29 +21,48 @@ struct Looked {
     checkpoint: Arc<Checkpoint>,
     outcome: Outcome,
     by: Rc<Resolved>,
+    /// What was fixed, and what was tried.
+    repaired: (Vec<Fixed>, Vec<Withdrawn>),
 }
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut settings = Resolver::new(Typed::check(args, rules));
     let mut seen = BTreeSet::new();
-    let mut looked = Vec::new();
+    let mut dirs = Vec::new();
     for path in &args.paths {
         for dir in directories(path)? {
             // Two files of one checkpoint, as pre-commit passes them, are one checkpoint.
             if !seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone())) {
                 continue;
             }
-            looked.push(look(dir, args.deep, &mut settings)?);
+            dirs.push(dir);
         }
+    }
+    args.fix.refuse(dirs.len())?;
+    if args.fix.writes() {
+        signals::install()?;
+    }
+    let mut looked = dirs.into_iter().map(|dir| look(dir, args, &mut settings)).collect::<anyhow::Result<Vec<_>>>()?;
+    if args.fix.diff {
+        let changes = looked.iter().map(|l| fix::show(&args.fix, &l.dir, &l.checkpoint, &l.outcome, &check_by(&l.by)));
+        let changes = changes.sum::<anyhow::Result<usize>>()?;
+        return Ok(if changes > 0 { FINDINGS } else { CLEAN });
     }
     suppressions_without_use(&mut looked, &settings, &args.paths);
     let reports = looked.iter().map(|l| {
         let mut report = CheckpointReport::new(l.dir.display().to_string(), None, &l.checkpoint, &l.outcome);
         report.settings = l.by.file.as_ref().map(|file| file.display().to_string());
+        (report.fixed, report.withdrawn) = l.repaired.clone();
+        report.fixing = Some(Fixing { unsafe_fixes: args.fix.unsafe_fixes, made: args.fix.writes() });
         report
     });
     let mut reports: Vec<CheckpointReport> = reports.collect();
+    let fixed = args.fix.exit_non_zero_on_fix && reports.iter().any(|r| !r.fixed.is_empty());
+    if args.fix.fix_only {
+        output::print(&fixes::made(&reports))?;
+        return Ok(if fixed { FINDINGS } else { CLEAN });
+    }
     let by: Vec<Rc<Resolved>> = looked.iter().map(|l| Rc::clone(&l.by)).collect();
     baseline::apply(&mut reports, &by, args.baseline.write_baseline)?;
     let fails =
@@ -55,7 +74,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
             unasked::say(&l.dir, &l.outcome, &l.by.knowledge.rules);
         }
     }
-    Ok(if failed && !args.report.exit_zero { FINDINGS } else { CLEAN })
+    Ok(if fixed || failed && !args.report.exit_zero { FINDINGS } else { CLEAN })
 }
 
 /// The checkpoints that a path means. A file may belong to none, as when pre-commit passes all that a commit changes; one
@@ -72,19 +91,33 @@ fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-fn look(dir: PathBuf, deep: bool, settings: &mut Resolver) -> anyhow::Result<Looked> {
+/// Judges a checkpoint as its settings say.
+fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
+    |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
+}
+
+fn look(dir: PathBuf, args: &CheckArgs, settings: &mut Resolver) -> anyhow::Result<Looked> {
     let by = settings.of(&dir)?;
-    let mut checkpoint = Checkpoint::open(&dir).with_context(|| dir.display().to_string())?;
-    if deep {
-        checkpoint.read_contents();
-    }
-    let checkpoint = Arc::new(checkpoint);
-    let outcome = check_for(&checkpoint, &by.knowledge, &by.versions);
+    let open = |dir: &Path| {
+        let mut checkpoint = Checkpoint::open(dir).with_context(|| dir.display().to_string())?;
+        if args.deep {
+            checkpoint.read_contents();
+        }
+        Ok(Arc::new(checkpoint))
+    };
+    fix::recover(&args.fix, &dir)?;
+    let checkpoint = open(&dir)?;
+    let outcome = check_by(&by)(&checkpoint);
     if let Some(rule) = outcome.unusable.first() {
         let origin = by.knowledge.rules.find(&rule.code)?.origin.as_deref().unwrap_or_default();
         bail!("{origin}: {} on {}: {}", rule.code, dir.display(), rule.why);
     }
-    Ok(Looked { dir, checkpoint, outcome, by })
+    if !args.fix.writes() {
+        return Ok(Looked { dir, checkpoint, outcome, by, repaired: Default::default() });
+    }
+    let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } =
+        fix::repair(&args.fix, dir, &checkpoint, outcome, &open, &check_by(&by))?;
+    Ok(Looked { dir, checkpoint, outcome, by, repaired: (fixed, withdrawn) })
 }
 
 /// Adds a finding for each suppression that had nothing to suppress.

@@ -5,6 +5,7 @@ mod baseline;
 mod build_merged;
 mod check;
 mod expect;
+mod fix;
 mod init;
 mod inspect;
 mod library;
@@ -13,9 +14,12 @@ mod rules;
 mod settings;
 mod signals;
 mod unasked;
+mod undo;
 
 use std::process::ExitCode;
 
+use ckpt_doctor::surgery::apply::ApplyError;
+use ckpt_doctor::surgery::journal::JournalError;
 use clap::Parser;
 
 /// Nothing at or above `--fail-on`.
@@ -25,11 +29,17 @@ const FINDINGS: u8 = 1;
 /// It could not be tried.
 const FAILED: u8 = 2;
 
+/// Whether a signal ended the run.
+fn interrupted(error: &anyhow::Error) -> bool {
+    matches!(error.downcast_ref(), Some(JournalError::Apply(ApplyError::Interrupted)))
+}
+
 /// Runs the program.
 pub fn main() -> ExitCode {
     let args::Cli { command, rules } = args::Cli::parse();
     let result = match &command {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
+        args::Command::Undo(args) => undo::run(args),
         args::Command::Inspect(args) => inspect::run(args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(args, rules.as_deref()),
         args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
@@ -39,6 +49,10 @@ pub fn main() -> ExitCode {
     };
     match result {
         Ok(code) => ExitCode::from(code),
+        Err(error) if interrupted(&error) => {
+            output::note("interrupted; nothing was written");
+            ExitCode::from(signals::exit_code())
+        }
         Err(error) => {
             // Names in an error may come from a checkpoint: nothing of them may reach the terminal raw.
             let lines: Vec<String> =

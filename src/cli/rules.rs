@@ -40,7 +40,7 @@ fn page(rule: &Rule) -> Result<String, std::fmt::Error> {
         writeln!(out, "\nApplies to\n  {}", rule.applies.join(", "))?;
     }
     writeln!(out, "\nMessage\n  {}", rule.message.source())?;
-    if let Some(fix) = &rule.fix {
+    for fix in &rule.fixes {
         writeln!(out, "\nFix ({})\n  {}", fix.safety.name(), fix.help.source())?;
     }
     if let Some(origin) = &rule.origin {

@@ -2,6 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+mod fix;
+
+pub use fix::{EditSpec, Fix, REPAIRS, Safety};
+
 use super::expression::{Expression, Template};
 use super::source::{self, DataError};
 use crate::checkpoint::fault::FAULT_KINDS;
@@ -56,9 +60,10 @@ pub struct Rule {
     pub check: Check,
     /// The finding's sentence.
     pub message: Template,
-    /// What can be done.
-    #[serde(default)]
-    pub fix: Option<Fix>,
+    /// What can be done: of several, the first whose `when` holds and whose edits can be made; else its help alone.
+    #[serde(default, rename = "fix", deserialize_with = "fix::one_or_many")]
+    #[cfg_attr(test, schemars(with = "fix::OneOrMany"))]
+    pub fixes: Vec<Fix>,
     /// Where the facts come from.
     #[serde(default)]
     pub references: Vec<String>,
@@ -103,8 +108,9 @@ pub struct FaultCheck {
 /// `highest` id), `chat_templates` (by file),
 /// `tokens` (what the processor makes of it, by the names in `rules/processors/`, with `length` and
 /// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, `all_read` (every shard is there and
-/// its header was read), and the functions `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`,
-/// `id_of(token)`. A condition that cannot be evaluated because a value is not there is not a finding.
+/// its header was read), `loaders` (the versions it has to load under), and the functions `shape(tensor)`,
+/// `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`. A condition that cannot be evaluated because a
+/// value is not there is not a finding.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -130,42 +136,6 @@ pub struct At {
     pub pointer: Option<Template>,
     /// Tensor name.
     pub tensor: Option<Template>,
-}
-
-/// How safe a fix is, as ruff grades it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(rename_all = "lowercase")]
-pub enum Safety {
-    /// Restores bookkeeping; every tensor and value a loader reads stays.
-    Safe,
-    /// Changes what a loader would compute, on strong evidence.
-    Unsafe,
-    /// The information is not here; the exact next step is shown.
-    Manual,
-}
-
-impl Safety {
-    /// The word used in output.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Safe => "safe",
-            Self::Unsafe => "unsafe",
-            Self::Manual => "manual",
-        }
-    }
-}
-
-/// What can be done about a finding.
-#[derive(Debug, Clone, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
-pub struct Fix {
-    /// How safe it is.
-    pub safety: Safety,
-    /// The step, as an imperative sentence.
-    pub help: Template,
 }
 
 /// Rules, by code.
@@ -222,6 +192,11 @@ impl RuleSet {
                 && let Some(kind) = f.kinds.iter().find(|k| !is_known_kind(k))
             {
                 return wrong(format!("no such kind of fault: {kind}"));
+            }
+            for edit in rule.fixes.iter().flat_map(|f| &f.edits) {
+                if let Err(reason) = edit.check() {
+                    return wrong(reason);
+                }
             }
             if let Some(twin) = self.rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
                 return wrong(format!("{} {} is already taken by {} {}", rule.code, rule.name, twin.code, twin.name));

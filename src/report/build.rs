@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::model::{CheckpointReport, Counts};
 use crate::check::finding::{Accepted, Suppressed};
-use crate::check::{Finding, Outcome};
+use crate::check::{Edit, Finding, Outcome};
 use crate::checkpoint::Checkpoint;
 
 impl CheckpointReport {
@@ -13,7 +13,9 @@ impl CheckpointReport {
     pub fn new(path: impl Into<String>, role: Option<String>, checkpoint: &Checkpoint, outcome: &Outcome) -> Self {
         let counts = Counts::of(&outcome.findings);
         let mut sources = BTreeMap::new();
-        for file in outcome.findings.iter().flat_map(|f| &f.locations).filter_map(|l| l.file.as_ref()) {
+        let places = outcome.findings.iter().flat_map(|f| &f.locations).filter_map(|l| l.file.as_ref());
+        let edits = outcome.findings.iter().filter_map(|f| f.fix.as_ref()).flat_map(|fix| &fix.edits);
+        for file in places.chain(edits.filter_map(Edit::text_file)) {
             let document = checkpoint.document(file).and_then(|d| d.text.clone());
             let text = document.or_else(|| checkpoint.modules.get(file).and_then(|m| m.text.clone()));
             if let Some(text) = text {
@@ -31,6 +33,9 @@ impl CheckpointReport {
             findings: outcome.findings.clone(),
             suppressed: outcome.suppressed.clone(),
             loads: outcome.loads.clone(),
+            fixed: Vec::new(),
+            withdrawn: Vec::new(),
+            fixing: None,
             sources,
             tensors: (checkpoint.tensors().count(), bytes),
         }

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use super::fixes::mark;
 use super::model::{CheckpointReport, Report};
 use super::words::{capped, more, name, place, sentence};
 
@@ -36,8 +37,14 @@ fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
                 let _ok = write!(out, ":{column}");
             }
         }
-        let _ok =
-            writeln!(out, ": {}[{}] {}", finding.severity.name(), name(&finding.code), sentence(&finding.message));
+        let _ok = writeln!(
+            out,
+            ": {}[{}] {}{}",
+            finding.severity.name(),
+            name(&finding.code),
+            mark(finding, checkpoint.fixing),
+            sentence(&finding.message)
+        );
     }
     for (code, n) in hidden {
         let _ok = writeln!(out, "{}: and {n} more {}", name(&checkpoint.path), name(code));

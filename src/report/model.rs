@@ -5,9 +5,11 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
+pub use super::fixes::Fixing;
 use crate::check::finding::{LoadReport, Suppressed};
 use crate::check::{Finding, Severity};
 pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
+pub use crate::surgery::repair::{Fixed, Withdrawn};
 
 /// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 2).
 #[derive(Debug, Clone, Serialize)]
@@ -78,6 +80,15 @@ pub struct CheckpointReport {
     pub suppressed: Vec<Suppressed>,
     /// Predicted load reports, one for each loader; none when the architecture is unknown or there are no tensors.
     pub loads: Vec<LoadReport>,
+    /// Findings whose fixes were made; `findings` are those that are left.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub fixed: Vec<Fixed>,
+    /// Fixes that were tried and not kept.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub withdrawn: Vec<Withdrawn>,
+    /// What the run was asked to do about findings; for renderers that offer fixes.
+    #[serde(skip)]
+    pub fixing: Option<Fixing>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
     #[serde(skip)]
     pub sources: BTreeMap<String, Arc<str>>,

@@ -33,7 +33,7 @@ pub fn statistics(report: &Report, format: Format) -> Option<String> {
     let mut lines: Vec<Line<'_>> = counts
         .into_iter()
         .map(|((code, severity), (count, finding))| {
-            let fix = finding.fix.as_ref().map(|fix| fix.safety.as_str());
+            let fix = finding.fix.as_ref().map(|fix| fix.safety.name());
             Line { code, name: &finding.name, severity, count, fix }
         })
         .collect();

@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::collapse::{Group, collapse};
 use super::model::{Counts, MergeReport, Report};
 use crate::check::finding::LoadReport;
-use crate::check::{Finding, FixHint, Location};
+use crate::check::{Finding, FixHint, Location, Safety};
 use crate::checkpoint::escape;
 
 /// Longest name shown, in characters.
@@ -224,9 +224,10 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
 pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     let mut together: Vec<Finding> = Vec::new();
     for finding in findings {
+        let step = |f: &Finding| f.fix.as_ref().map(|fix| (fix.safety, fix.title.clone()));
         let same = |last: &Finding| {
-            (&last.code, last.severity, &last.message, &last.fix)
-                == (&finding.code, finding.severity, &finding.message, &finding.fix)
+            (&last.code, last.severity, &last.message) == (&finding.code, finding.severity, &finding.message)
+                && step(last) == step(finding)
                 && evidence(last) == evidence(finding)
         };
         match together.last_mut() {
@@ -263,7 +264,7 @@ pub fn more(total: usize, cap: usize) -> Option<String> {
 /// The step a fix proposes, with what kind of fix it is when it is not a manual one.
 pub fn fix(hint: &FixHint) -> String {
     let title = sentence(&hint.title);
-    if hint.safety == "manual" { title } else { format!("{title} ({} fix)", name(&hint.safety)) }
+    if hint.safety == Safety::Manual { title } else { format!("{title} ({} fix)", hint.safety.name()) }
 }
 
 fn value(v: &Value) -> String {

@@ -3,9 +3,11 @@
 pub mod apply;
 pub mod donor;
 mod error;
+pub mod journal;
 mod lock;
 pub mod merge;
 pub mod plan;
+pub mod repair;
 mod staging;
 mod system;
 mod target;

@@ -38,6 +38,14 @@ pub struct PlannedShard {
     pub name: String,
     /// Tensors in the order their bytes are written.
     pub tensors: Vec<PlannedTensor>,
+    /// `__metadata__`; transformers does not open a shard without a `format` in it.
+    pub metadata: BTreeMap<String, String>,
+}
+
+/// The metadata that `save_pretrained` writes.
+#[must_use]
+pub fn format_pt() -> BTreeMap<String, String> {
+    BTreeMap::from([("format".to_owned(), "pt".to_owned())])
 }
 
 /// A tensor of a planned shard.
@@ -148,12 +156,13 @@ impl PlannedShard {
             shape: &'a [u64],
             data_offsets: [u64; 2],
         }
-        let mut json = String::from(r#"{"__metadata__":{"format":"pt"}"#);
+        // Strings and integers always serialise.
+        let metadata = serde_json::to_string(&self.metadata).unwrap_or_default();
+        let mut json = format!(r#"{{"__metadata__":{metadata}"#);
         let mut at = 0_u64;
         for t in &self.tensors {
             let end = at.saturating_add(t.len());
             let entry = Entry { dtype: t.dtype.name(), shape: &t.shape, data_offsets: [at, end] };
-            // Strings and integers always serialise.
             let name = serde_json::to_string(&t.name).unwrap_or_default();
             let entry = serde_json::to_string(&entry).unwrap_or_default();
             json.push(',');
@@ -190,7 +199,7 @@ impl PlannedShard {
             file_len: data_start.saturating_add(at),
             data_start,
             tensors,
-            metadata: Some(BTreeMap::from([("format".to_owned(), "pt".to_owned())])),
+            metadata: Some(self.metadata.clone()),
             ..Shard::default()
         }
     }
@@ -255,7 +264,7 @@ pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard>
             } else {
                 format!("model-{:05}-of-{count:05}.safetensors", i.saturating_add(1))
             };
-            PlannedShard { name, tensors }
+            PlannedShard { name, tensors, metadata: format_pt() }
         })
         .collect()
 }

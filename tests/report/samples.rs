@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ckpt_doctor::check::finding::{LoadReport, Mismatch, Silent};
-use ckpt_doctor::check::{Finding, FixHint, Location, Severity};
+use ckpt_doctor::check::{Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage,
@@ -26,6 +26,9 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
         loads: vec![],
         sources: sources.iter().map(|(file, text)| ((*file).to_owned(), Arc::from(*text))).collect(),
         tensors: (690, 1_234_567),
+        fixed: Vec::new(),
+        withdrawn: Vec::new(),
+        fixing: None,
     }
 }
 
@@ -59,8 +62,8 @@ pub fn at(file: &str, source: &str, what: &str, nth: usize, pointer: &str) -> Lo
 }
 
 #[allow(clippy::unnecessary_wraps, reason = "it fills an optional field")]
-pub fn fix(safety: &str, title: &str) -> Option<FixHint> {
-    Some(FixHint { safety: safety.to_owned(), title: title.to_owned() })
+pub fn fix(safety: Safety, title: &str) -> Option<FixHint> {
+    Some(FixHint { safety, title: title.to_owned(), edits: Vec::new() })
 }
 
 pub fn clean() -> Report {
@@ -112,7 +115,7 @@ pub fn findings() -> Report {
             )
         })
         .collect();
-    infinity.fix = fix("unsafe", "Write 0.0: `std` is not read when actions are decoded");
+    infinity.fix = fix(Safety::Unsafe, "Write 0.0: `std` is not read when actions are decoded");
 
     let mut module = finding(
         "CFG012",
@@ -123,7 +126,7 @@ pub fn findings() -> Report {
     );
     module.locations =
         vec![at("processor_config.json", PROCESSOR, "\"processing_tiny.TinyProcessor\"", 0, "/auto_map/AutoProcessor")];
-    module.fix = fix("manual", "Copy processing_tiny.py from the repository the checkpoint came from");
+    module.fix = fix(Safety::Manual, "Copy processing_tiny.py from the repository the checkpoint came from");
 
     let mut ids = finding(
         "CFG020",
@@ -133,7 +136,7 @@ pub fn findings() -> Report {
         json!({ "image_token_index": -200, "image": 32000, "rows": 41347 }),
     );
     ids.locations = vec![at("config.json", CONFIG, "-200", 0, "/image_token_index")];
-    ids.fix = fix("unsafe", "Set image_token_index to 32000");
+    ids.fix = fix(Safety::Unsafe, "Set image_token_index to 32000");
 
     let mut unmapped = finding(
         "IDX003",
@@ -149,7 +152,7 @@ pub fn findings() -> Report {
             ..Location::default()
         })
         .collect();
-    unmapped.fix = fix("safe", "Rebuild the index from the shard headers");
+    unmapped.fix = fix(Safety::Safe, "Rebuild the index from the shard headers");
 
     let twin = |file: &str| Finding {
         locations: vec![Location { file: Some(file.to_owned()), ..Location::default() }],
@@ -262,7 +265,7 @@ pub fn hostile() -> Report {
             ..Location::default()
         },
     ];
-    one.fix = fix(HOSTILE, HOSTILE);
+    one.fix = fix(Safety::Manual, HOSTILE);
     let mut checkpoint = checkpoint(HOSTILE, vec![one], &[("config.json", &source)]);
     checkpoint.architecture = Some(HOSTILE.to_owned());
     checkpoint.loads = vec![LoadReport {

@@ -213,7 +213,7 @@ pub fn tried() -> &'static [Tried] {
 }
 
 /// Opens and checks a directory.
-fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
+pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
     let mut checkpoint = Checkpoint::open(dir).expect("a directory");
     if deep {
         checkpoint.read_contents();
@@ -298,13 +298,27 @@ pub fn seeded() -> &'static AllSeeded {
 
 fn try_all() -> Vec<Tried> {
     let knowledge = knowledge();
-    let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
-    let bases = base::make_all(&temporary.path().join("bases"), BASES, &knowledge);
-    let before: BTreeMap<&str, Outcome> =
-        bases.iter().map(|(name, dir)| (*name, look(dir, true, &knowledge))).collect();
+    let before: OnceLock<BTreeMap<&str, BTreeSet<String>>> = OnceLock::new();
+    let tried = on_every_case(&knowledge, |bases, case, made| {
+        let codes = |dir: &PathBuf| look(dir, true, &knowledge).findings.into_iter().map(|f| f.code).collect();
+        let before = before.get_or_init(|| bases.iter().map(|(name, dir)| (*name, codes(dir))).collect());
+        let outcome = match &case.settings {
+            Some(settings) => under(settings, made),
+            None => look(made, case.deep, &knowledge),
+        };
+        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone() }
+    });
+    tried.into_iter().map(|(_, tried)| tried).collect()
+}
 
-    let cases = cases();
-    let pending = Mutex::new(cases.into_iter().enumerate());
+/// Makes every case in a temporary directory and looks at it, on several threads; in the order of the cases.
+pub fn on_every_case<T: Send>(
+    knowledge: &Knowledge,
+    look: impl Fn(&BTreeMap<&'static str, PathBuf>, &Case, &Path) -> T + Sync,
+) -> Vec<(Case, T)> {
+    let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
+    let bases = base::make_all(&temporary.path().join("bases"), BASES, knowledge);
+    let pending = Mutex::new(cases().into_iter().enumerate());
     let done = Mutex::new(BTreeMap::new());
     let next = || pending.lock().expect("no panic").next();
     let work = || {
@@ -312,13 +326,9 @@ fn try_all() -> Vec<Tried> {
             let base = bases.get(case.base.as_str()).unwrap_or_else(|| panic!("{}: no base {}", case.name, case.base));
             let room = temporary.path().join(number.to_string());
             let made = change::make(&case.name, base, &case.changes, &room);
-            let outcome = match &case.settings {
-                Some(settings) => under(settings, &made),
-                None => look(&made, case.deep, &knowledge),
-            };
-            let before = before[case.base.as_str()].findings.iter().map(|f| f.code.clone()).collect();
+            let seen = look(&bases, &case, &made);
             fs::remove_dir_all(&room).expect("removing a fixture");
-            done.lock().expect("no panic").insert(number, Tried { case, outcome, before });
+            done.lock().expect("no panic").insert(number, (case, seen));
         }
     };
     let threads = std::thread::available_parallelism().map_or(1, usize::from).min(8);
@@ -328,4 +338,11 @@ fn try_all() -> Vec<Tried> {
         }
     });
     done.into_inner().expect("no panic").into_values().collect()
+}
+
+/// Makes a checkpoint of a base and changes, which are written as in a case, below `room`.
+pub fn made(base: &'static str, changes: &str, room: &Path) -> PathBuf {
+    let bases = base::make_all(&room.join("bases"), &[base], &knowledge());
+    let changes: Vec<Change> = source::parse("the changes", changes).unwrap_or_else(|e| panic!("{e}"));
+    change::make("the changes", &bases[base], &changes, &room.join("room"))
 }

@@ -38,7 +38,7 @@ pub(super) fn decode<'a>(name: &str, bytes: &'a [u8]) -> Decoded<'a> {
 }
 
 /// UTF-16 and UTF-32, by their byte-order mark or by where the NUL bytes of ASCII text fall.
-fn wide(bytes: &[u8]) -> Option<(&'static str, String)> {
+pub(super) fn wide(bytes: &[u8]) -> Option<(&'static str, String)> {
     let (encoding, skip) = match bytes {
         [0xff, 0xfe, 0, 0, ..] => ("UTF-32LE", 4),
         [0, 0, 0xfe, 0xff, ..] => ("UTF-32BE", 4),

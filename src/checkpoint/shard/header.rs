@@ -270,7 +270,14 @@ impl<'t> Reader<'_, 't> {
                         }
                         other => {
                             self.scanner.skip_rest_of(&other)?;
-                            self.faults.push(fault.clone().with("key", escape(&key, 80)));
+                            let plain = match other {
+                                Token::Number(literal) => Some(literal.to_owned()),
+                                Token::Bool(value) => Some(value.to_string()),
+                                _ => None,
+                            };
+                            let fault = fault.clone().with("key", escape(&key, 80)).with("scalar", plain.is_some());
+                            self.faults.push(fault);
+                            strings.extend(plain.map(|value| (key, value)));
                         }
                     }
                 }

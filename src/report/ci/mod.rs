@@ -9,13 +9,14 @@ pub mod sarif;
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 
 use super::model::{CheckpointReport, MergeReport, Report};
 use super::words::{fix, sentence};
 use crate::check::finding::Accepted;
-use crate::check::{Finding, Location, Severity};
+use crate::check::{Finding, FixHint, Location, Severity};
 
 /// Longest path written, in characters: no longer one exists on Linux.
 const PATH: usize = 4_096;
@@ -26,6 +27,8 @@ pub struct Group<'a> {
     pub title: String,
     /// Where it is, [`tidy`].
     pub path: String,
+    /// Texts of its documents; none for a merge.
+    pub sources: Option<&'a BTreeMap<String, Arc<str>>>,
     /// In the order of the report.
     pub items: Vec<Item<'a>>,
     /// Findings that are accepted, with where that is written and why.
@@ -44,6 +47,8 @@ pub struct Item<'a> {
     pub message: String,
     /// Where; may be empty.
     pub locations: &'a [Location],
+    /// The fix, if there is one.
+    pub fix: Option<&'a FixHint>,
     /// The next step, safe to show.
     pub help: Option<String>,
     /// SHA-256 in hexadecimal. The same while the finding is, wherever in its file it moves; unique in a report.
@@ -68,12 +73,13 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
         severity: finding.severity,
         message: sentence(&finding.message),
         locations: &finding.locations,
+        fix: finding.fix.as_ref(),
         help: finding.fix.as_ref().map(fix),
         fingerprint: of_finding(finding, &path, role, seen),
     };
     let items = checkpoint.findings.iter().map(&mut item).collect();
     let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
-    Group { title, path, items, suppressed }
+    Group { title, path, sources: Some(&checkpoint.sources), items, suppressed }
 }
 
 /// Fingerprint of a finding of the checkpoint at `path`.
@@ -95,11 +101,12 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         severity: Severity::Error,
         message: sentence(&seam.message),
         locations: &[],
+        fix: None,
         help: (!seam.options.is_empty()).then(|| sentence(&format!("Try {}", seam.options.join(" or ")))),
         fingerprint: fingerprint(&[&path, "seam", &merge.recipe, &seam.message], seen),
     });
     let items = items.collect();
-    Group { title: format!("merge {}", merge.recipe), path, items, suppressed: Vec::new() }
+    Group { title: format!("merge {}", merge.recipe), path, sources: None, items, suppressed: Vec::new() }
 }
 
 /// Parts are hashed with their lengths, so that none can pass for another; what occurs again is numbered.

@@ -2,6 +2,8 @@
 //!
 //! <https://docs.oasis-open.org/sarif/sarif/v2.1.0/sarif-v2.1.0.html>; the numbers below are its sections.
 
+mod fixes;
+
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
@@ -81,6 +83,8 @@ struct Found {
     partial_fingerprints: BTreeMap<&'static str, String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     suppressions: Vec<Suppression>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    fixes: Vec<fixes::Fix>,
 }
 
 /// Why a result is not counted (3.35); `external`, because it is not written beside what it is about.
@@ -150,6 +154,7 @@ pub fn render(report: &Report) -> String {
                 locations: locations(&group, item),
                 partial_fingerprints,
                 suppressions: accepted.map(suppression).into_iter().collect(),
+                fixes: item.fix.zip(group.sources).map_or_else(Vec::new, |(f, s)| fixes::of(f, &group.path, s)),
             });
         }
     }
@@ -216,12 +221,21 @@ fn physical(group: &Group<'_>, location: &Location) -> Physical {
         .line
         .filter(|_| found.is_some())
         .map(|start_line| Region { start_line, start_column: location.column });
-    let path = found.as_deref().unwrap_or(&group.path);
+    Physical { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
+}
+
+/// A file of the checkpoint at `path`.
+fn artifact(path: &str, name: &str) -> Artifact {
+    let location = Location { file: Some(name.to_owned()), ..Location::default() };
+    artifact_at(file(path, &location).as_deref().unwrap_or(path))
+}
+
+fn artifact_at(path: &str) -> Artifact {
     let (uri, uri_base_id) = match path.strip_prefix('/') {
         Some(below) => (uri(below), ROOT),
         None => (uri(path), SOURCES),
     };
-    Physical { artifact_location: Artifact { uri, uri_base_id }, region }
+    Artifact { uri, uri_base_id }
 }
 
 /// A path as a relative reference (RFC 3986): only unreserved characters and `/` stand for themselves.

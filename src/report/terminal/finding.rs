@@ -7,6 +7,7 @@ use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer,
 
 use super::super::Style;
 use super::super::excerpt::{cut, near};
+use super::super::fixes::mark;
 use super::super::model::CheckpointReport;
 use super::super::words::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use crate::check::{Finding, Location, Severity};
@@ -23,7 +24,8 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
         Severity::Warning => Level::WARNING,
         Severity::Info => Level::INFO,
     };
-    let title = level.primary_title(sentence(&finding.message)).id(name(&finding.code));
+    let message = format!("{}{}", mark(finding, checkpoint.fixing), sentence(&finding.message));
+    let title = level.primary_title(message).id(name(&finding.code));
     let mut group = Group::with_title(title);
     let places = gather(&finding.locations, checkpoint);
     let mut shown: Vec<Shown> = places.iter().take(PLACES).map(|one| show(one, checkpoint)).collect();

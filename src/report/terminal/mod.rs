@@ -8,9 +8,9 @@ pub(super) mod paint;
 use std::fmt::Write as _;
 
 use self::paint::Paint;
-use super::Style;
 use super::model::{CheckpointReport, Report};
 use super::words::{agreeing, alike, bytes, capped, counts, name, plural, summary};
+use super::{Style, fixes};
 
 pub fn render(report: &Report, style: Style) -> String {
     let paint = Paint(style.color);
@@ -22,6 +22,7 @@ pub fn render(report: &Report, style: Style) -> String {
             let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
         } else {
             findings(&mut out, checkpoint, style);
+            out.push_str(&fixes::section(checkpoint));
             for loaders in agreeing(&checkpoint.loads) {
                 load::render(&mut out, &loaders, style);
             }
@@ -34,6 +35,9 @@ pub fn render(report: &Report, style: Style) -> String {
         out.push('\n');
     }
     let _ok = writeln!(out, "{}", paint.verdict(&report.summary.verdict, &summary(report)));
+    if let Some(closing) = fixes::closing(report) {
+        let _ok = writeln!(out, "{closing}");
+    }
     out
 }
 

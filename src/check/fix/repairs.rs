@@ -1,0 +1,110 @@
+//! Repairs that need more than an expression, by the names rules use.
+//!
+//! Each says which edits would do, or nothing where the checkpoint does not hold what it takes.
+
+use std::collections::BTreeSet;
+
+mod modules;
+mod names;
+mod texts;
+mod tokens;
+
+use super::{Edit, Site};
+use crate::check::index::{by_tensor, numbered, readable, shard_names, similar};
+use crate::checkpoint::{Checkpoint, INDEX_NAME, Shard};
+
+/// Runs the repair of this name, one of [`crate::knowledge::rule::REPAIRS`].
+pub(super) fn run(name: &str, site: &Site<'_>) -> Option<Vec<Edit>> {
+    match name {
+        "add-auto-class" => modules::add_auto_class(site),
+        "add-imports" => modules::add_imports(site),
+        "cut-nul-bytes" => texts::cut_nul_bytes(site),
+        "drop-equal-key" => texts::drop_equal_key(site),
+        "fill-token-holes" => tokens::fill_token_holes(site.checkpoint()),
+        "quote-string" => texts::quote_string(site),
+        "rebuild-index" => {
+            let edit = site.bench.index.get_or_init(|| rebuild_index(site.checkpoint()));
+            edit.clone().map(|edit| vec![edit])
+        }
+        "reencode" => Some(vec![Edit::Reencode { file: site.place()?.file.clone()? }]),
+        "rename-prefix" => site.bench.names.get_or_init(|| names::rename_prefix(site)).clone(),
+        "write-header" => write_headers(site),
+        _ => None,
+    }
+}
+
+/// The index from the headers, when every shard that belongs to it is there and can be read.
+fn rebuild_index(checkpoint: &Checkpoint) -> Option<Edit> {
+    let usable = checkpoint.index.as_ref().filter(|index| !index.weight_map.is_empty());
+    let (file, shards) = match usable {
+        Some(index) => {
+            // Without an absent shard its tensors would vanish from the index, and nobody would miss them. One that
+            // is there under a name that differs in case only counts under the name it has.
+            let there =
+                |name: &str| if checkpoint.has_file(name) { Some(name.to_owned()) } else { twin(checkpoint, name) };
+            let named: BTreeSet<&str> = index.weight_map.values().map(String::as_str).collect();
+            let shards: Option<BTreeSet<String>> = named.into_iter().map(there).collect();
+            (index.document.clone(), shards?.into_iter().collect())
+        }
+        None => family(checkpoint)?,
+    };
+    let whole = |name: &String| checkpoint.shards.get(name).is_some_and(is_whole);
+    if shards.is_empty() || !shards.iter().all(whole) {
+        return None;
+    }
+    // Which of two tensors of one name is meant only an index can say.
+    let said = |tensor: &str| usable.is_some_and(|index| index.weight_map.contains_key(tensor));
+    let twice = by_tensor(checkpoint)
+        .into_iter()
+        .any(|(tensor, held)| held.iter().filter(|h| shards.iter().any(|s| s == **h)).count() > 1 && !said(tensor));
+    (!twice).then_some(Edit::Index { file, shards })
+}
+
+fn twin(checkpoint: &Checkpoint, name: &str) -> Option<String> {
+    similar(checkpoint, name).map(str::to_owned)
+}
+
+/// The numbered shards of a checkpoint without an index that can be used: the index's name, and all of them.
+fn family(checkpoint: &Checkpoint) -> Option<(String, Vec<String>)> {
+    let names = shard_names(checkpoint);
+    let parts: Vec<_> = names.iter().filter_map(|name| numbered(name)).collect();
+    let (prefix, _, count) = parts.first().copied()?;
+    let numbers: BTreeSet<u32> = parts.iter().map(|(_, number, _)| *number).collect();
+    let alike = parts.iter().all(|(p, _, c)| (*p, *c) == (prefix, count)) && parts.len() == names.len();
+    let complete = alike && usize::try_from(count).is_ok_and(|count| numbers.len() == count);
+    let document = checkpoint.index.as_ref().map(|index| index.document.clone());
+    let file = document.unwrap_or_else(|| match prefix {
+        "model" => INDEX_NAME.to_owned(),
+        other => format!("{other}.safetensors.index.json"),
+    });
+    complete.then(|| (file, names.into_iter().map(str::to_owned).collect()))
+}
+
+/// Whether every entry of a shard could be read and fills its bytes.
+fn is_whole(shard: &Shard) -> bool {
+    readable(shard) && !shard.unread && shard.unreadable.is_empty()
+}
+
+/// Faults that a new header cures; with any other one the tensors are in doubt.
+const OF_THE_HEADER: [&str; 7] = [
+    "data-hole",
+    "header-padding-not-spaces",
+    "metadata-not-strings",
+    "metadata-null",
+    "no-format-metadata",
+    "odd-tensor-name",
+    "trailing-bytes",
+];
+
+/// Writes the header of every shard that the finding names anew.
+fn write_headers(site: &Site<'_>) -> Option<Vec<Edit>> {
+    let files: BTreeSet<&str> = site.fault?.places.iter().filter_map(|p| p.file.as_deref()).collect();
+    let sound = |file: &&str| {
+        let shard = site.checkpoint().shards.get(*file);
+        shard.is_some_and(|s| is_whole(s) && s.faults.iter().all(|f| OF_THE_HEADER.contains(&f.kind)))
+    };
+    if files.is_empty() || !files.iter().all(sound) {
+        return None;
+    }
+    Some(files.into_iter().map(|file| Edit::Header { file: file.to_owned() }).collect())
+}

@@ -1,0 +1,51 @@
+//! Repairs of tokenizer files, where one of them proves what another lacks.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::{Value, json};
+
+use crate::check::fix::Edit;
+use crate::checkpoint::{Checkpoint, Vocabulary};
+
+/// Adds to `added_tokens_decoder` what it leaves out and another file names, so that every id keeps its token.
+pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
+    let tokenizer = &checkpoint.tokenizer;
+    let decoder = tokenizer.added_tokens_decoder.as_ref()?;
+    let known: BTreeMap<u64, &str> = decoder.iter().map(|t| (t.id, t.content.as_str())).collect();
+    let used: BTreeSet<&str> = known.values().copied().collect();
+    let others = tokenizer.added_tokens_json.iter().chain(&tokenizer.tokenizer_json_added).flatten();
+    let proven: BTreeMap<u64, &str> = others.map(|t| (t.id, t.content.as_str())).collect();
+    let first = tokenizer.base().map(Vocabulary::len)?;
+    let last = *known.keys().next_back()?;
+    // More holes than this are no slip, and the ids of a file are its own word.
+    let holes: Vec<u64> = (first..last).filter(|id| !known.contains_key(id)).take(10_001).collect();
+    if holes.is_empty() || holes.len() > 10_000 {
+        return None;
+    }
+    let edit = |id: u64| {
+        let content = *proven.get(&id).filter(|content| !used.contains(**content))?;
+        let value = entry(checkpoint, id, content);
+        let file = "tokenizer_config.json".to_owned();
+        Some(Edit::Set { file, pointer: format!("/added_tokens_decoder/{id}"), value })
+    };
+    holes.into_iter().map(edit).collect()
+}
+
+/// The entry as `save_pretrained` writes it; `tokenizer.json` says more than the others.
+fn entry(checkpoint: &Checkpoint, id: u64, content: &str) -> Value {
+    let list = checkpoint.document("tokenizer.json").and_then(|d| d.get("/added_tokens")).and_then(Value::as_array);
+    let full = list.into_iter().flatten().find(|token| token.get("id").and_then(Value::as_u64) == Some(id));
+    let special = checkpoint.tokenizer.special_tokens.iter().any(|(_, token)| token == content);
+    let flag = |name: &str, otherwise: bool| {
+        full.and_then(|token| token.get(name)).and_then(Value::as_bool).unwrap_or(otherwise)
+    };
+    // What an AddedToken is when nothing is said of it: normalised unless special.
+    json!({
+        "content": content,
+        "lstrip": flag("lstrip", false),
+        "normalized": flag("normalized", !special),
+        "rstrip": flag("rstrip", false),
+        "single_word": flag("single_word", false),
+        "special": flag("special", special),
+    })
+}

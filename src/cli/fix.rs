@@ -1,0 +1,121 @@
+//! `check --fix` and what belongs to it.
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::bail;
+use ckpt_doctor::check::Outcome;
+use ckpt_doctor::checkpoint::{Checkpoint, escape};
+use ckpt_doctor::report::model::{Fixed, Withdrawn};
+use ckpt_doctor::report::{diff, fixes};
+use ckpt_doctor::surgery::journal::{self, Recovered};
+use ckpt_doctor::surgery::repair::{Repair, overlay, plan};
+
+use super::args::FixArgs;
+use super::output;
+
+/// What judges a checkpoint.
+type Check<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
+
+impl FixArgs {
+    /// Whether anything is to be written.
+    pub const fn writes(&self) -> bool {
+        (self.fix || self.fix_only) && !self.diff
+    }
+
+    /// Refuses what cannot be meant.
+    pub fn refuse(&self, checkpoints: usize) -> anyhow::Result<()> {
+        if self.output.is_some() && !self.writes() {
+            bail!("--output needs --fix");
+        }
+        if self.output.is_some() && checkpoints > 1 {
+            bail!("--output takes one checkpoint, and there are {checkpoints}");
+        }
+        Ok(())
+    }
+}
+
+/// Finishes or takes back what an earlier run was interrupted in, before the checkpoint is looked at.
+pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
+    if args.writes() && args.output.is_none() {
+        let done = match journal::recover(dir)? {
+            None => return Ok(()),
+            Some(Recovered::Finished) => "finished",
+            Some(Recovered::TakenBack) => "taken back",
+        };
+        let dir = escape(&dir.display().to_string(), 300);
+        output::note(&format!("{dir}: an interrupted repair is {done}"));
+    }
+    Ok(())
+}
+
+/// A checkpoint after its fixes were made.
+pub struct Repaired {
+    /// Where it is: the directory itself, or the copy that was made.
+    pub dir: PathBuf,
+    pub checkpoint: Arc<Checkpoint>,
+    pub outcome: Outcome,
+    pub fixed: Vec<Fixed>,
+    pub withdrawn: Vec<Withdrawn>,
+}
+
+/// Makes the fixes of a checkpoint, of which `outcome` tells.
+pub fn repair(
+    args: &FixArgs,
+    dir: PathBuf,
+    checkpoint: &Arc<Checkpoint>,
+    outcome: Outcome,
+    open: &dyn Fn(&Path) -> anyhow::Result<Arc<Checkpoint>>,
+    check: Check<'_>,
+) -> anyhow::Result<Repaired> {
+    let repair = plan(checkpoint, outcome, args.unsafe_fixes, check);
+    let written = write(args, &dir, &repair)?;
+    let Repair { outcome, fixed, withdrawn, .. } = repair;
+    Ok(match written {
+        // What counts is what a reader finds there now.
+        Some(dir) => {
+            let checkpoint = open(&dir)?;
+            Repaired { outcome: check(&checkpoint), dir, checkpoint, fixed, withdrawn }
+        }
+        None => Repaired { dir, checkpoint: Arc::clone(checkpoint), outcome, fixed, withdrawn },
+    })
+}
+
+/// Writes a repair; where it is, if there was anything to write.
+fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<PathBuf>> {
+    if repair.changes.is_empty() {
+        return Ok(None);
+    }
+    let total = repair.changes.iter().fold(0_u64, |n, change| n.saturating_add(change.new.len()));
+    let (mut done, mut last) = (0_u64, 0);
+    let terminal = std::io::stderr().is_terminal();
+    let mut progress = |bytes: u64| {
+        done = done.saturating_add(bytes);
+        let percent = done.saturating_mul(100).checked_div(total).unwrap_or(100);
+        if terminal && percent > last {
+            last = percent;
+            output::progress(percent);
+        }
+    };
+    if let Some(out) = &args.output {
+        overlay(repair, out, &mut progress)?;
+        return Ok(Some(out.clone()));
+    }
+    journal::write(repair, &mut progress)?;
+    Ok(Some(dir.to_owned()))
+}
+
+/// Shows what the fixes of a checkpoint would change; how many there are.
+pub fn show(
+    args: &FixArgs,
+    dir: &Path,
+    checkpoint: &Arc<Checkpoint>,
+    outcome: &Outcome,
+    check: Check<'_>,
+) -> anyhow::Result<usize> {
+    let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, check);
+    output::print(&diff::render(&dir.display().to_string(), &repair))?;
+    output::note(&fixes::would(repair.fixed.len(), repair.changes.len()));
+    Ok(repair.changes.len())
+}

@@ -1,0 +1,26 @@
+//! `undo`.
+
+use std::fmt::Write as _;
+
+use ckpt_doctor::checkpoint::escape;
+use ckpt_doctor::surgery::journal;
+
+use super::args::UndoArgs;
+use super::{CLEAN, output};
+
+/// Runs `undo`.
+pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {
+    let undone = journal::undo(&args.path)?;
+    let mut out = String::new();
+    for (what, names) in [("restored", &undone.restored), ("removed", &undone.removed)] {
+        for name in names {
+            writeln!(out, "{what} {}", escape(name, 200))?;
+        }
+    }
+    if undone.left > 0 {
+        let earlier = if undone.left == 1 { "repair" } else { "repairs" };
+        writeln!(out, "{} earlier {earlier} can be undone too", undone.left)?;
+    }
+    output::print(&out)?;
+    Ok(CLEAN)
+}

@@ -1,0 +1,98 @@
+//! What can be fixed, and what was: marks at findings, a list for each checkpoint, a line at the end.
+
+use std::fmt::Write as _;
+
+use super::model::{CheckpointReport, Report};
+use super::words::{name, plural, sentence};
+use crate::check::{Finding, Safety};
+
+/// What the run was asked to do about findings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Fixing {
+    /// Whether unsafe fixes count as well.
+    pub unsafe_fixes: bool,
+    /// Whether fixes were made, or only offered.
+    pub made: bool,
+}
+
+/// The mark of a finding that `--fix` would do something about, as ruff has it; else nothing.
+pub(super) fn mark(finding: &Finding, fixing: Option<Fixing>) -> &'static str {
+    let permitted = |fixing: Fixing| finding.fix.as_ref().is_some_and(|fix| fix.is_permitted(fixing.unsafe_fixes));
+    // After the fixes are made, what is left was tried and is told below.
+    if fixing.is_some_and(|fixing| !fixing.made && permitted(fixing)) { "[*] " } else { "" }
+}
+
+/// What was done about a checkpoint, and what was tried and taken back.
+pub(super) fn section(checkpoint: &CheckpointReport) -> String {
+    let mut out = String::new();
+    for (many, (code, file, title)) in together(checkpoint.fixed.iter().map(|f| (&*f.code, f.file.as_deref(), &*f.title))) {
+        let file = file.map(|file| format!(" in {}", name(file))).unwrap_or_default();
+        let _ok = writeln!(out, "  fixed {}{file}: {}{many}", name(code), sentence(title));
+    }
+    for one in &checkpoint.withdrawn {
+        let (code, title, reason) = (name(&one.code), sentence(&one.title), sentence(&one.reason));
+        let _ok = writeln!(out, "  not fixed {code}: {title}; {reason}");
+    }
+    out
+}
+
+/// Equal lines once, with how many there are.
+fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
+    let mut counted: Vec<(usize, T)> = Vec::new();
+    for line in lines {
+        match counted.iter_mut().find(|(_, other)| *other == line) {
+            Some((count, _)) => *count = count.saturating_add(1),
+            None => counted.push((1, line)),
+        }
+    }
+    let many = |n: usize| if n > 1 { format!(" ({n} times)") } else { String::new() };
+    counted.into_iter().map(|(n, line)| (many(n), line)).collect()
+}
+
+/// The closing line; `None` where there is nothing to say.
+pub(super) fn closing(report: &Report) -> Option<String> {
+    let fixing = report.checkpoints.iter().find_map(|c| c.fixing)?;
+    let fixes = || report.checkpoints.iter().flat_map(|c| &c.findings).filter_map(|f| f.fix.as_ref());
+    let permitted = fixes().filter(|fix| fix.is_permitted(fixing.unsafe_fixes)).count();
+    let hidden = fixes().filter(|fix| fix.safety == Safety::Unsafe).count();
+    let hidden = if fixing.unsafe_fixes { 0 } else { hidden };
+    if fixing.made {
+        let fixed: usize = report.checkpoints.iter().map(|c| c.fixed.len()).sum();
+        let remaining: usize = report.checkpoints.iter().map(|c| c.findings.len()).sum();
+        let more = if hidden > 0 { format!("; {hidden} more with --unsafe-fixes") } else { String::new() };
+        return Some(format!("{fixed} fixed, {remaining} remaining{more}"));
+    }
+    let option = if fixing.unsafe_fixes { "--fix --unsafe-fixes" } else { "--fix" };
+    match (permitted, hidden) {
+        (0, 0) => None,
+        (0, hidden) => Some(format!("No fixes with {option}; {hidden} with --unsafe-fixes")),
+        (n, 0) => Some(format!("[*] {n} fixable with {option}")),
+        (n, hidden) => Some(format!("[*] {n} fixable with {option}; {hidden} more with --unsafe-fixes")),
+    }
+}
+
+/// What was fixed, for a run that says nothing of the rest.
+#[must_use]
+pub fn made(checkpoints: &[CheckpointReport]) -> String {
+    let mut out = String::new();
+    for checkpoint in checkpoints.iter().filter(|c| !c.fixed.is_empty() || !c.withdrawn.is_empty()) {
+        let _ok = writeln!(out, "{}", name(&checkpoint.path));
+        out.push_str(&section(checkpoint));
+    }
+    let fixed: usize = checkpoints.iter().map(|c| c.fixed.len()).sum();
+    let _ok = writeln!(out, "{fixed} fixed in {}", plural(checkpoints.len(), "checkpoint"));
+    out
+}
+
+/// What a run without a report says of the fixes alone.
+#[must_use]
+pub fn would(fixed: usize, files: usize) -> String {
+    match fixed {
+        0 => "No fixes to make".to_owned(),
+        n => format!(
+            "Would make {} in {}",
+            if n == 1 { "1 fix".to_owned() } else { format!("{n} fixes") },
+            plural(files, "file")
+        ),
+    }
+}

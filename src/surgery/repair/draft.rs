@@ -1,0 +1,303 @@
+//! The repaired checkpoint before it is written: changed texts and shards over the original.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+
+use crate::check::Edit;
+use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
+use crate::checkpoint::{Checkpoint, Document, Module, Parts, Splice, spliced};
+use crate::surgery::plan::{PlannedShard, PlannedTensor, Source, TensorRef, format_pt};
+
+/// What became of the edits of one fix.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Made {
+    /// They are made.
+    All,
+    /// Another fix of this round works at the same place: the next round decides.
+    Later,
+    /// They cannot be made, or change nothing.
+    Nothing,
+}
+
+/// How this round has touched a file.
+#[derive(Debug, Clone)]
+enum Touch {
+    /// Splices of the text that the round began with.
+    Splices(Vec<Splice>),
+    /// Values at these pointers; the text is changed already.
+    Pointers(Vec<String>),
+    /// All of it.
+    Whole,
+}
+
+/// A checkpoint with some of its files changed.
+#[derive(Debug, Clone)]
+pub(super) struct Draft {
+    original: Arc<Checkpoint>,
+    /// As it was when the round began.
+    current: Arc<Checkpoint>,
+    /// Changed documents and modules.
+    pub(super) texts: BTreeMap<String, Arc<str>>,
+    /// Shards with a new header.
+    pub(super) shards: BTreeMap<String, PlannedShard>,
+    touched: BTreeMap<String, Touch>,
+    /// Edits of whole files that this round has made: several findings may ask for the same.
+    made: Vec<Edit>,
+}
+
+impl Draft {
+    pub(super) fn new(original: &Arc<Checkpoint>) -> Self {
+        Self {
+            original: Arc::clone(original),
+            current: Arc::clone(original),
+            texts: BTreeMap::new(),
+            shards: BTreeMap::new(),
+            touched: BTreeMap::new(),
+            made: Vec::new(),
+        }
+    }
+
+    /// The checkpoint as it was when the round began.
+    pub(super) fn current(&self) -> &Arc<Checkpoint> {
+        &self.current
+    }
+
+    /// Makes all edits of a fix, or none.
+    pub(super) fn make(&mut self, edits: &[Edit]) -> Made {
+        let mut trial = self.clone();
+        for edit in edits {
+            match trial.make_one(edit) {
+                Made::All => {}
+                other => return other,
+            }
+        }
+        *self = trial;
+        Made::All
+    }
+
+    /// Ends the round: the checkpoint with everything made so far.
+    pub(super) fn finish(&mut self) -> Option<()> {
+        for (file, touch) in std::mem::take(&mut self.touched) {
+            if let Touch::Splices(splices) = touch {
+                let text = spliced(&self.text(&file)?, &splices)?;
+                self.texts.insert(file, text.into());
+            }
+        }
+        self.made.clear();
+        let mut parts = Parts::default();
+        for (name, text) in &self.texts {
+            if name.ends_with(".py") {
+                parts.modules.push(Module::parse(name.as_str(), text.as_bytes()));
+            } else {
+                parts.documents.push(Document::parse(name.as_str(), text.as_bytes()));
+            }
+        }
+        parts.shards = self.shards.values().map(PlannedShard::preview).collect();
+        self.current = Arc::new(self.original.replaced(parts));
+        Some(())
+    }
+
+    /// The text of a document or module as it is now.
+    fn text(&self, file: &str) -> Option<Arc<str>> {
+        let document = || self.current.document(file)?.text.clone();
+        let module = || self.current.modules.get(file)?.text.clone();
+        self.texts.get(file).cloned().or_else(document).or_else(module)
+    }
+
+    fn make_one(&mut self, edit: &Edit) -> Made {
+        let made = match edit {
+            Edit::Splice { file, range, text } => {
+                return self.splice(file, Splice { range: range.clone(), text: text.clone() });
+            }
+            Edit::Set { file, pointer, value } => return self.point(file, pointer, |d| d.set(pointer, value)),
+            Edit::Remove { file, pointer } => return self.point(file, pointer, |d| d.remove(pointer)),
+            whole if self.made.contains(whole) => return Made::All,
+            Edit::Write { file, text } => self.claim([file.as_str()]).then(|| self.write(file, text)),
+            Edit::Reencode { file } => self.claim([file.as_str()]).then(|| self.reencode(file)),
+            Edit::Index { file, shards } => {
+                let files = shards.iter().chain([file]).map(String::as_str);
+                self.claim(files).then(|| self.index(file, shards))
+            }
+            Edit::Header { file } => self.claim([file.as_str()]).then(|| self.header(file)),
+            Edit::Rename { prefixes } => {
+                let (current, index) = (Arc::clone(&self.current), self.current.index.as_ref());
+                let index = index.map(|i| i.document.clone());
+                let files = current.shards.keys().chain(&index).map(String::as_str);
+                self.claim(files).then(|| self.rename(prefixes, index.as_deref()))
+            }
+        };
+        match made {
+            None => Made::Later,
+            Some(None) => Made::Nothing,
+            Some(Some(())) => {
+                self.made.push(edit.clone());
+                Made::All
+            }
+        }
+    }
+
+    /// Takes whole files for one edit, unless this round has touched one of them.
+    fn claim<'f>(&mut self, files: impl IntoIterator<Item = &'f str>) -> bool {
+        let files: Vec<&str> = files.into_iter().collect();
+        let free = files.iter().all(|file| !self.touched.contains_key(*file));
+        if free {
+            self.touched.extend(files.into_iter().map(|file| (file.to_owned(), Touch::Whole)));
+        }
+        free
+    }
+
+    fn splice(&mut self, file: &str, splice: Splice) -> Made {
+        let Some(old) = self.text(file).and_then(|text| Some(text.get(splice.range.clone())? == splice.text)) else {
+            return Made::Nothing;
+        };
+        if old {
+            return Made::Nothing;
+        }
+        match self.touched.entry(file.to_owned()).or_insert_with(|| Touch::Splices(Vec::new())) {
+            Touch::Splices(all) if all.contains(&splice) => Made::All,
+            Touch::Splices(all) if !all.iter().any(|other| other.meets(&splice)) => {
+                all.push(splice);
+                Made::All
+            }
+            _ => Made::Later,
+        }
+    }
+
+    fn point(&mut self, file: &str, pointer: &str, edit: impl Fn(&Document) -> Option<Splice>) -> Made {
+        let Some(text) = self.text(file) else { return Made::Nothing };
+        let inside = |inner: &str, outer: &str| inner.strip_prefix(outer).is_some_and(|rest| rest.starts_with('/'));
+        match self.touched.get(file) {
+            None => {}
+            Some(Touch::Pointers(all))
+                if !all.iter().any(|p| p == pointer || inside(p, pointer) || inside(pointer, p)) => {}
+            Some(_) => return Made::Later,
+        }
+        let document = Document { name: file.to_owned(), text: Some(Arc::clone(&text)), ..Document::default() };
+        let new = edit(&document).and_then(|splice| spliced(&text, &[splice]));
+        let Some(new) = new.filter(|new| **new != *text) else { return Made::Nothing };
+        self.texts.insert(file.to_owned(), new.into());
+        match self.touched.entry(file.to_owned()).or_insert_with(|| Touch::Pointers(Vec::new())) {
+            Touch::Pointers(all) => all.push(pointer.to_owned()),
+            Touch::Splices(_) | Touch::Whole => return Made::Later,
+        }
+        Made::All
+    }
+
+    fn write(&mut self, file: &str, text: &str) -> Option<()> {
+        let changed = self.text(file).is_none_or(|old| *old != *text);
+        changed.then(|| self.texts.insert(file.to_owned(), text.into()))?;
+        Some(())
+    }
+
+    fn reencode(&mut self, file: &str) -> Option<()> {
+        let bytes = read_capped(&self.original.root.join(file), TOKENIZER_CAP).ok()?;
+        let text = Document::decoded(&bytes)?;
+        self.write(file, &text)
+    }
+
+    /// The index as `save_pretrained` writes it: sorted, two spaces of indent.
+    fn index(&mut self, file: &str, shards: &[String]) -> Option<()> {
+        let old = self.current.document(file).and_then(|d| d.value.as_ref());
+        let entries = |key: &str| old.and_then(|v| v.get(key)).and_then(Value::as_object).cloned().unwrap_or_default();
+        let said = self.current.index.as_ref().map(|index| &index.weight_map);
+        let mut map: BTreeMap<String, String> = said.cloned().unwrap_or_default();
+        let named: BTreeSet<&String> = shards.iter().collect();
+        let mut bytes = 0_u64;
+        for shard in shards {
+            let shard = self.current.shards.get(shard)?;
+            for tensor in &shard.tensors {
+                bytes = bytes.saturating_add(tensor.len());
+                // Of two shards that have it the one stays that the index says.
+                let right = map.get(&tensor.name).is_some_and(|said| {
+                    named.contains(said)
+                        && self.current.shards.get(said).is_some_and(|s| s.tensor(&tensor.name).is_some())
+                });
+                if !right {
+                    map.insert(tensor.name.clone(), shard.name.clone());
+                }
+            }
+        }
+        let mut metadata = entries("metadata");
+        metadata.insert("total_size".to_owned(), json!(bytes));
+        let mut root = entries("");
+        if let Some(Value::Object(old)) = old {
+            root.extend(old.clone());
+        }
+        root.insert("metadata".to_owned(), Value::Object(metadata));
+        let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k, Value::String(v))).collect();
+        root.insert("weight_map".to_owned(), Value::Object(map));
+        let text = Document::from_value(file, Value::Object(root)).text?;
+        self.write(file, &text)
+    }
+
+    /// The shard with its bytes where they are in the original.
+    fn planned(&self, file: &str) -> Option<PlannedShard> {
+        if let Some(planned) = self.shards.get(file) {
+            return Some(planned.clone());
+        }
+        let shard = self.original.shards.get(file)?;
+        let path = self.original.root.join(file);
+        let mut tensors: Vec<_> = shard.tensors.iter().collect();
+        tensors.sort_by_key(|t| (t.begin, t.end));
+        let tensors = tensors.into_iter().map(|t| PlannedTensor {
+            name: t.name.clone(),
+            dtype: t.dtype,
+            shape: t.shape.clone(),
+            source: Source::Copy(TensorRef {
+                donor: String::new(),
+                path: path.clone(),
+                name: t.name.clone(),
+                shape: t.shape.clone(),
+                offset: shard.data_start.saturating_add(t.begin),
+                len: t.len(),
+            }),
+        });
+        let metadata = shard.metadata.clone().unwrap_or_default();
+        Some(PlannedShard { name: file.to_owned(), tensors: tensors.collect(), metadata })
+    }
+
+    fn header(&mut self, file: &str) -> Option<()> {
+        let mut planned = self.planned(file)?;
+        for (key, value) in format_pt() {
+            planned.metadata.entry(key).or_insert(value);
+        }
+        self.shards.insert(file.to_owned(), planned);
+        Some(())
+    }
+
+    fn rename(&mut self, prefixes: &[(String, String)], index: Option<&str>) -> Option<()> {
+        let renamed = |name: &str| {
+            let fit = |(from, to): &(String, String)| Some(format!("{to}{}", name.strip_prefix(from.as_str())?));
+            prefixes.iter().find_map(fit)
+        };
+        let names: Vec<&str> = self.current.tensors().map(|(_, t)| t.name.as_str()).collect();
+        let after: BTreeSet<String> = names.iter().map(|n| renamed(n).unwrap_or_else(|| (*n).to_owned())).collect();
+        let before: BTreeSet<&str> = names.iter().copied().collect();
+        let moved: BTreeSet<String> = self
+            .current
+            .tensors()
+            .filter(|(_, t)| renamed(&t.name).is_some_and(|new| new != t.name))
+            .map(|(s, _)| s.name.clone())
+            .collect();
+        // Two tensors of one name would be one too few.
+        if after.len() != before.len() || moved.is_empty() {
+            return None;
+        }
+        for file in moved {
+            let mut planned = self.planned(&file)?;
+            for tensor in &mut planned.tensors {
+                if let Some(new) = renamed(&tensor.name) {
+                    tensor.name = new;
+                }
+            }
+            self.shards.insert(file, planned);
+        }
+        let Some(index) = index else { return Some(()) };
+        let text = self.text(index)?;
+        let splices = self.current.document(index)?.rename_keys("/weight_map", renamed)?;
+        self.texts.insert(index.to_owned(), spliced(&text, &splices)?.into());
+        Some(())
+    }
+}
