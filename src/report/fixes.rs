@@ -25,7 +25,9 @@ pub(super) fn mark(finding: &Finding, fixing: Option<Fixing>) -> &'static str {
 /// What was done about a checkpoint, and what was tried and taken back.
 pub(super) fn section(checkpoint: &CheckpointReport) -> String {
     let mut out = String::new();
-    for (many, (code, file, title)) in together(checkpoint.fixed.iter().map(|f| (&*f.code, f.file.as_deref(), &*f.title))) {
+    for (many, (code, file, title)) in
+        together(checkpoint.fixed.iter().map(|f| (&*f.code, f.file.as_deref(), &*f.title)))
+    {
         let file = file.map(|file| format!(" in {}", name(file))).unwrap_or_default();
         let _ok = writeln!(out, "  fixed {}{file}: {}{many}", name(code), sentence(title));
     }
