@@ -316,9 +316,19 @@ pub fn on_every_case<T: Send>(
     knowledge: &Knowledge,
     look: impl Fn(&BTreeMap<&'static str, PathBuf>, &Case, &Path) -> T + Sync,
 ) -> Vec<(Case, T)> {
+    on_cases(knowledge, |_| true, look)
+}
+
+/// The same for the cases whose names are wanted.
+pub fn on_cases<T: Send>(
+    knowledge: &Knowledge,
+    wanted: impl Fn(&str) -> bool,
+    look: impl Fn(&BTreeMap<&'static str, PathBuf>, &Case, &Path) -> T + Sync,
+) -> Vec<(Case, T)> {
     let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
     let bases = base::make_all(&temporary.path().join("bases"), BASES, knowledge);
-    let pending = Mutex::new(cases().into_iter().enumerate());
+    let cases: Vec<Case> = cases().into_iter().filter(|case| wanted(&case.name)).collect();
+    let pending = Mutex::new(cases.into_iter().enumerate());
     let done = Mutex::new(BTreeMap::new());
     let next = || pending.lock().expect("no panic").next();
     let work = || {

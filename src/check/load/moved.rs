@@ -62,6 +62,8 @@ struct Step {
     from: String,
     to: String,
     names: Vec<String>,
+    /// Whether no other tensor's name starts so.
+    alone: bool,
 }
 
 impl Step {
@@ -70,6 +72,7 @@ impl Step {
             .with("from", self.from.as_str())
             .with("to", self.to.as_str())
             .with("count", self.names.len())
+            .with("alone", self.alone)
             .with("names", super::listed(&self.names));
         fault.places = self.names.iter().take(super::NAMES_SHOWN).map(Place::tensor).collect();
         fault
@@ -96,15 +99,19 @@ fn best(expected: &Expected, stored: &Stored) -> Option<Step> {
         let arrives = |n: &&&str| n.strip_prefix(*from).is_some_and(|rest| wanted.contains(&*format!("{to}{rest}")));
         *count = strays.iter().filter(arrives).count();
     }
-    let ((from, to), count) =
-        pairs.into_iter().max_by_key(|((from, to), count)| (*count, Reverse(from.len().saturating_add(to.len()))))?;
+    // Of two that bring as many to their place, the prefix that no other tensor has, so that it can be said and renamed
+    // as a prefix; then the shorter one.
+    let alone = |from: &str, count: usize| here.iter().filter(|n| n.starts_with(from)).count() == count;
+    let ((from, to), count) = pairs.into_iter().max_by_key(|((from, to), count)| {
+        (*count, alone(from, *count), Reverse(from.len().saturating_add(to.len())))
+    })?;
     // One tensor under another name may be another tensor.
     if count < 2 {
         return None;
     }
     let arrives = |n: &&str| n.strip_prefix(from).is_some_and(|rest| wanted.contains(&*format!("{to}{rest}")));
     let names = strays.into_iter().filter(arrives).map(str::to_owned).collect();
-    Some(Step { from: from.to_owned(), to: to.to_owned(), names })
+    Some(Step { from: from.to_owned(), to: to.to_owned(), names, alone: alone(from, count) })
 }
 
 /// A name taken apart after each of its first dots, and before the first; never behind a number, which is a place in a
