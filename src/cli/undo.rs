@@ -6,10 +6,11 @@ use ckpt_doctor::checkpoint::escape;
 use ckpt_doctor::surgery::journal;
 
 use super::args::UndoArgs;
-use super::{CLEAN, output};
+use super::{CLEAN, output, signals};
 
 /// Runs `undo`.
 pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {
+    signals::install()?;
     let undone = journal::undo(&args.path)?;
     let mut out = String::new();
     for (what, names) in [("restored", &undone.restored), ("removed", &undone.removed)] {

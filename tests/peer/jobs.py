@@ -189,4 +189,4 @@ class Overlay(Build):
         return [PROGRAM, "check", str(self.donors / "model"), "--fix", "--output", str(self.out), "--output-format", "concise"]
 
 
-JOBS = [Build]
+JOBS = [Build, Repair, Undo, Overlay]

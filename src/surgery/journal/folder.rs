@@ -1,21 +1,29 @@
 //! The folder `.ckpt-doctor` of a checkpoint, locked.
 #![expect(clippy::disallowed_methods, reason = "surgery is where checkpoints are written")]
 
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File};
 use std::io::{self, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::OFlags;
-
+use super::run::look;
 use super::{Journal, JournalError, Result};
 use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
-use crate::surgery::apply::io_at;
-use crate::surgery::system::{self, create, custom, retry, sync_dir};
+use crate::surgery::apply::{ApplyError, io_at};
+use crate::surgery::lock::{self, Lock};
+use crate::surgery::system::{self, create, explain, retry, sync_dir};
 
 /// Says that the folder is nothing for version control, as caches of other tools say it.
 const IGNORE: (&str, &str) = (".gitignore", "# made by ckpt-doctor, so that a repair can be undone\n*\n");
+
+/// Where new files are staged.
+const NEW: &str = "new";
+
+/// The journal before it counts.
+const DRAFT: &str = "journal.json.part";
+
+/// Says who works in the folder, and is locked meanwhile.
+const LOCK: &str = "lock";
 
 /// The version of the journal that this program writes and reads.
 pub(super) const VERSION: u32 = 1;
@@ -28,33 +36,35 @@ pub(super) struct Folder {
 }
 
 impl Folder {
+    /// Whether a run that was interrupted left anything.
+    pub(super) fn left_over(root: &Path) -> bool {
+        let path = root.join(REPAIR_FOLDER);
+        [REPAIR_JOURNAL, DRAFT, NEW].iter().any(|name| fs::symlink_metadata(path.join(name)).is_ok())
+    }
+
     /// Locks the folder of a checkpoint; `None` when it has none.
     pub(super) fn open(root: &Path) -> Result<Option<Self>> {
         let path = root.join(REPAIR_FOLDER);
-        let flags = custom(OFlags::DIRECTORY | OFlags::NOFOLLOW);
-        let lock = match OpenOptions::new().read(true).custom_flags(flags).open(&path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-            other => other.map_err(io_at(&path, "opening"))?,
-        };
-        loop {
-            match lock.try_lock() {
-                Ok(()) => break,
-                Err(TryLockError::WouldBlock) => return Err(JournalError::Busy { path: root.to_owned() }),
-                Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Interrupted => {}
-                Err(TryLockError::Error(e)) => return Err(io_at(&path, "locking")(e).into()),
+        only_folders(&path)?;
+        match lock::take(&path.join(LOCK))? {
+            // Without locks one run at a time is what the user has to see to.
+            Lock::Ours(mut lock) | Lock::Unknown(mut lock) => {
+                // It is for the message of another run only, and may fail on a full disk, where `undo` may help.
+                let _ = lock::sign(&mut lock);
+                Ok(Some(Self { root: root.to_owned(), path, _lock: lock }))
             }
+            Lock::Theirs(holder) => Err(JournalError::Busy { path: root.to_owned(), holder }),
+            Lock::Gone => Ok(None),
         }
-        let held = lock.metadata().map_err(io_at(&path, "looking at"))?;
-        // A run that ended between our open and our lock may have taken the folder with it.
-        let same = fs::symlink_metadata(&path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
-        Ok(same.then(|| Self { root: root.to_owned(), path, _lock: lock }))
     }
 
     /// Locks the folder of a checkpoint, and makes it when there is none.
     pub(super) fn create(root: &Path) -> Result<Self> {
         let path = root.join(REPAIR_FOLDER);
         for _ in 0..8 {
-            match retry(|| fs::create_dir(&path)) {
+            let made = retry(|| fs::create_dir(&path));
+            let new = made.is_ok();
+            match made {
                 Err(error)
                     if matches!(error.kind(), io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem) =>
                 {
@@ -63,21 +73,43 @@ impl Folder {
                 Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&path, "creating")(e).into()),
                 _ => {}
             }
-            if let Some(folder) = Self::open(root)? {
-                let (name, text) = IGNORE;
-                let file = folder.path.join(name);
-                if !file.exists() {
-                    fs::write(&file, text).map_err(io_at(&file, "writing"))?;
+            match Self::open(root) {
+                Ok(None) => {}
+                Ok(Some(folder)) => return folder.for_version_control(),
+                Err(error) => {
+                    if new && !matches!(error, JournalError::Busy { .. }) {
+                        let _ = system::remove_file(&path.join(LOCK));
+                        let _ = system::remove_dir(&path);
+                    }
+                    return Err(error);
                 }
-                return Ok(folder);
             }
         }
-        Err(JournalError::Busy { path: root.to_owned() })
+        Err(JournalError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
+    }
+
+    fn for_version_control(self) -> Result<Self> {
+        let (name, text) = IGNORE;
+        let path = self.path.join(name);
+        let write = || -> Result<()> {
+            if look(&path)?.is_none() {
+                create(&path)?.write_all(text.as_bytes()).map_err(io_at(&path, "writing"))?;
+            }
+            Ok(())
+        };
+        match write() {
+            Ok(()) => Ok(self),
+            Err(error) => {
+                let _ = system::remove_file(&path);
+                self.tidy();
+                Err(error)
+            }
+        }
     }
 
     /// Where new files are staged.
     pub(super) fn staged(&self) -> PathBuf {
-        self.path.join("new")
+        self.path.join(NEW)
     }
 
     /// Where the originals of a repair are kept.
@@ -121,20 +153,36 @@ impl Folder {
     /// Writes the journal of what begins now; from here on the next run would finish it.
     pub(super) fn begin(&self, journal: &Journal) -> Result<()> {
         let path = self.journal();
-        let draft = path.with_extension("json.part");
+        let draft = self.path.join(DRAFT);
         let text = serde_json::to_vec_pretty(journal).unwrap_or_default();
         remove_file(&draft)?;
-        let mut file = create(&draft)?;
-        file.write_all(&text).map_err(io_at(&draft, "writing"))?;
-        file.sync_all().map_err(io_at(&draft, "syncing"))?;
-        retry(|| fs::rename(&draft, &path)).map_err(io_at(&path, "publishing"))?;
-        sync_dir(&self.path)?;
-        Ok(sync_dir(&self.root)?)
+        let write = || -> std::result::Result<(), ApplyError> {
+            let mut file = create(&draft)?;
+            file.write_all(&text).map_err(io_at(&draft, "writing"))?;
+            file.sync_all().map_err(io_at(&draft, "syncing"))?;
+            retry(|| fs::rename(&draft, &path)).map_err(io_at(&path, "publishing"))?;
+            sync_dir(&self.path)?;
+            sync_dir(&self.root)
+        };
+        write().map_err(|error| {
+            // Nothing is changed yet. What cannot be removed is finished by the next run.
+            let _ = system::remove_file(&path);
+            let _ = system::remove_file(&draft);
+            explain(error, &self.root, &[text.len() as u64]).into()
+        })
     }
 
     /// Makes a folder in this one, and durable.
     pub(super) fn folder(&self, path: &Path) -> Result<()> {
-        fs::create_dir_all(path).map_err(io_at(path, "creating"))?;
+        let inner = path.strip_prefix(&self.path).unwrap_or(Path::new(""));
+        let mut made = self.path.clone();
+        for step in inner {
+            made.push(step);
+            match retry(|| fs::create_dir(&made)) {
+                Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&made, "creating")(e).into()),
+                _ => {}
+            }
+        }
         let parents = path.ancestors().skip(1).take_while(|p| p.starts_with(&self.path));
         for parent in parents {
             sync_dir(parent)?;
@@ -156,7 +204,7 @@ impl Folder {
     /// Removes what a run left that was killed before it had a journal.
     pub(super) fn clear(&self) -> Result<()> {
         remove_tree(&self.staged())?;
-        remove_file(&self.journal().with_extension("json.part"))?;
+        remove_file(&self.path.join(DRAFT))?;
         let kept = self.numbers()?;
         for name in names(&self.path.join("undo"))? {
             if name.parse::<u32>().is_ok_and(|n| !kept.contains(&n)) {
@@ -170,24 +218,39 @@ impl Folder {
     pub(super) fn tidy(&self) {
         if self.numbers().is_ok_and(|numbers| numbers.is_empty()) && !self.journal().exists() && self.clear().is_ok() {
             let _ = system::remove_dir(&self.path.join("undo"));
-            let others = names(&self.path).unwrap_or_default().into_iter().any(|name| name != IGNORE.0);
+            let others = names(&self.path).unwrap_or_default().into_iter().any(|name| name != IGNORE.0 && name != LOCK);
             if !others {
                 let _ = system::remove_file(&self.path.join(IGNORE.0));
+                // Last: without it the next run may begin, and then the folder stays.
+                let _ = system::remove_file(&self.path.join(LOCK));
                 let _ = system::remove_dir(&self.path);
-                let _ = sync_dir(&self.root);
             }
         }
     }
 }
 
+/// Refuses links where folders are made: through them a checkpoint from elsewhere could have files moved that are not
+/// its own.
+fn only_folders(path: &Path) -> Result<()> {
+    let undo = path.join("undo");
+    let mut folders = vec![path.to_owned(), path.join(NEW), undo.clone()];
+    if look(&undo)?.is_some_and(|m| m.is_dir()) {
+        folders.extend(names(&undo)?.iter().filter(|name| name.parse::<u32>().is_ok()).map(|name| undo.join(name)));
+    }
+    for folder in folders {
+        if look(&folder)?.is_some_and(|m| !m.is_dir()) {
+            return Err(JournalError::Journal { path: folder, reason: "it is not a directory".to_owned() });
+        }
+    }
+    Ok(())
+}
+
 /// Names in a folder; none when it is not there.
 fn names(path: &Path) -> Result<Vec<String>> {
-    let entries = match fs::read_dir(path) {
+    let names = match system::names(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         other => other.map_err(io_at(path, "listing"))?,
     };
-    let names: io::Result<Vec<_>> = entries.map(|e| e.map(|e| e.file_name())).collect();
-    let names = names.map_err(io_at(path, "listing"))?;
     Ok(names.into_iter().map(|name| name.to_string_lossy().into_owned()).collect())
 }
 

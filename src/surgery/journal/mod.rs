@@ -19,7 +19,7 @@ use super::apply::ApplyError;
 
 pub use undo::{Undone, undo};
 pub use write::write;
-pub(super) use write::{explained, write_content};
+pub(super) use write::{explained, unchanged, write_content};
 
 use folder::Folder;
 use run::Run;
@@ -54,10 +54,12 @@ pub enum JournalError {
         error: io::Error,
     },
     /// Another run works there.
-    #[error("{path}: another run is repairing this checkpoint; wait for it", path = path.display())]
+    #[error("{path}: another run is repairing this checkpoint ({holder}); wait for it", path = path.display())]
     Busy {
         /// The checkpoint.
         path: PathBuf,
+        /// Who it is.
+        holder: String,
     },
     /// Not enough room.
     #[error("{path}: {cause}: need {need} bytes, have {have}; free some, or use `--fix --output DIR` on another disk", path = path.display())]
@@ -101,7 +103,7 @@ pub enum JournalError {
         reason: String,
     },
     /// Something went wrong while files were put in place, and taking it back did too.
-    #[error("{error}; the repair is half done: run `ckpt-doctor undo` or `check --fix` again when the cause is gone")]
+    #[error("{error}; this is not finished: run `ckpt-doctor undo` or `check --fix` again when the cause is gone")]
     Half {
         /// What went wrong.
         error: Box<JournalError>,
@@ -174,6 +176,10 @@ pub enum Recovered {
 /// # Errors
 /// A [`JournalError`]; then everything is as it was, the journal included.
 pub fn recover(root: &Path) -> Result<Option<Recovered>> {
+    // What is read only, and has nothing left over, needs no lock.
+    if !Folder::left_over(root) {
+        return Ok(None);
+    }
     match Folder::open(root)? {
         None => Ok(None),
         Some(folder) => {

@@ -181,10 +181,10 @@ fn keep(target: &Path, original: &Path) -> io::Result<()> {
 
 /// Gives a file a name that must be free.
 fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
-    match renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE) {
+    match rustix::io::retry_on_intr(|| renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE)) {
         // Some file systems do not know the flag.
         Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) if fs::symlink_metadata(to).is_err() => {
-            fs::rename(from, to)
+            retry(|| fs::rename(from, to))
         }
         other => other.map_err(io::Error::from),
     }

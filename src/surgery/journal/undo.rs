@@ -5,6 +5,7 @@ use std::path::Path;
 use super::folder::Folder;
 use super::run::Run;
 use super::{Journal, JournalError, Kind, Recovered, Result, recover_in};
+use crate::surgery::apply::interrupted;
 
 /// What was undone.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -43,8 +44,9 @@ pub fn undo(root: &Path) -> Result<Undone> {
     if let Some(path) = run.changed()? {
         return Err(JournalError::Changed { path, originals: folder.originals(journal.number) });
     }
+    interrupted()?;
     folder.begin(&journal)?;
-    run.restore()?;
+    run.restore().map_err(|error| JournalError::Half { error: Box::new(error) })?;
     Ok(undone(&folder, &journal))
 }
 

@@ -1,14 +1,16 @@
 //! A repaired copy beside the untouched original: changed files are written, all others linked.
 
 use std::fs;
+use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsupported};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
 use super::Repair;
 use crate::surgery::apply::{ApplyError, check_target, interrupted, io_at};
-use crate::surgery::journal::{JournalError, explained, write_content};
+use crate::surgery::donor::AtRest;
+use crate::surgery::journal::{JournalError, explained, unchanged, write_content};
 use crate::surgery::staging::Staging;
-use crate::surgery::system::ask_for_room;
+use crate::surgery::system::{ask_for_room, retry};
 
 /// Makes the directory `out`: the repaired checkpoint, its unchanged files as hard links to the original's or, on
 /// another file system, as symbolic links. Hidden files stay behind.
@@ -21,12 +23,16 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
     let original = &repair.original;
     let out = check_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
-    ask_for_room(parent, &repair.sizes())?;
-    let staging = Staging::new(&out)?;
-    let written = fill(repair, staging.content(), progress)
+    let donor = AtRest::see(&original.root)?;
+    let explained = |error| explained(error, parent, repair);
+    let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
+    let written = ask_for_room(parent, &repair.sizes())
+        .map_err(JournalError::from)
+        .and_then(|()| fill(repair, staging.content(), progress))
+        .and_then(|()| Ok(donor.unchanged()?))
         .and_then(|()| Ok(interrupted()?))
         .and_then(|()| Ok(staging.publish(&out)?))
-        .map_err(|error| explained(error, repair));
+        .map_err(explained);
     match (written, staging.discard()) {
         (Ok(()), _) => Ok(out), // what may be left is a marker that the next run removes
         (Err(error), _) => Err(error),
@@ -36,6 +42,7 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
 fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), JournalError> {
     for change in &repair.changes {
         interrupted()?;
+        unchanged(repair, change, &repair.original.root.join(&change.name))?;
         write_content(&dir.join(&change.name), &change.new, progress)?;
     }
     let original = &repair.original;
@@ -49,9 +56,13 @@ fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<()
 fn link(from: &Path, to: &Path) -> Result<(), ApplyError> {
     let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
     let is_file = fs::metadata(&real).map_err(io_at(from, "looking at"))?.is_file();
-    // Another file system, no links, or somebody else's file: a symbolic link can always be made.
-    if is_file && fs::hard_link(&real, to).is_ok() {
-        return Ok(());
+    if is_file {
+        match retry(|| fs::hard_link(&real, to)) {
+            Ok(()) => return Ok(()),
+            // Another file system, no links, or somebody else's file: a symbolic link can be made.
+            Err(e) if matches!(e.kind(), CrossesDevices | PermissionDenied | Unsupported | TooManyLinks) => {}
+            Err(e) => return Err(io_at(to, "linking")(e)),
+        }
     }
-    symlink(&real, to).map_err(io_at(to, "linking"))
+    retry(|| symlink(&real, to)).map_err(io_at(to, "linking"))
 }
