@@ -107,7 +107,7 @@ class Crash(Pressure):
             some = [c for c in cases if c[0].name not in ("copy_file_range", "pread64")]
             same = [c for c in cases if c[0].name in ("copy_file_range", "pread64")]
             if not self.full:
-                some = self.sample(some, 170)
+                some = self.sample(some, 120 if job.name == "build" else 80)
             some += self.sample(same, 400 if self.full else 30)
             ended = sum(self.each(job, some, self.fault))
             self.say(f"{job.name}: {len(some)} injected faults ({ended} ended in an error, {len(some) - ended} did no harm)")
@@ -165,7 +165,7 @@ class Crash(Pressure):
             after = [b for a, b in zip(phase, phase[1:], strict=False) if a.changes]
             must = list({(c.name, c.nth): c for c in [*[c for c in phase if c.changes], *after]}.values())
             rest = [c for c in phase if not c.changes]
-            most = {"build": 1000}.get(job.name, 300) if self.full else {"build": 120}.get(job.name, 60)
+            most = {"build": 1000}.get(job.name, 300) if self.full else {"build": 80}.get(job.name, 40)
             chosen = self.sample(must, most)
             chosen += self.sample(rest, max(0, most - len(chosen)))
             moments = [(self.rng.random() * 0.15,) for _ in range(most // 5)]
@@ -212,7 +212,7 @@ class Crash(Pressure):
             calls, first, last = job.calls()
             phase = calls[first : last + 1]
             changes = [c for c in phase if c.changes]
-            chosen = self.sample(changes, 250 if self.full else 40) + self.sample(phase, 100 if self.full else 10)
+            chosen = self.sample(changes, 250 if self.full else 15) + self.sample(phase, 100 if self.full else 5)
             cases = [(call, ("INT", "TERM", "HUP")[i % 3]) for i, call in enumerate(chosen)]
             stopped = sum(self.each(job, cases, self.interrupt))
             before = job.inputs()

@@ -91,7 +91,7 @@ class Pressure:
                 # Whichever write crosses the limit first is the one that is cut short.
                 if call.result > 1 and begin + call.result // 2 >= max([0, *(e for p, e in ends.items() if p != path)]):
                     cut.append((call, begin + call.result // 2))
-        chosen = self.sample(cut, 50 if self.full else 10)
+        chosen = self.sample(cut, 50 if self.full else 5)
         for call, limit in chosen:
             job.reset()
             before = job.inputs()
@@ -151,7 +151,7 @@ class Pressure:
         for job in self.jobs:
             calls, first, last = job.calls()
             held = job.held([c for c in calls[first : last + 1] if c.changes])
-            rounds = 50 if self.full else 8
+            rounds = 50 if self.full else 4
             for _ in range(rounds):
                 self.second_run(job, self.rng.choice(held))
             for _ in range(rounds):
