@@ -178,7 +178,7 @@ impl Planner<'_> {
                 Made::All => made.push(finding.clone()),
                 Made::Later if !made.is_empty() => {}
                 // What changes nothing now, or stands in its own way, does so later too.
-                Made::Later | Made::Nothing => self.barred.push(fix.edits.clone()),
+                Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made here".to_owned()),
             }
         }
         if made.is_empty() {
