@@ -22,12 +22,12 @@ use support::project;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Modes {
-    modes: Vec<Mode>,
+    modes: Vec<Listed>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Mode {
+struct Listed {
     mode: String,
     /// Names of cases below `fixtures/rules`.
     cases: Vec<String>,
@@ -39,7 +39,7 @@ struct Mode {
     why: Option<String>,
 }
 
-fn modes() -> Vec<Mode> {
+fn modes() -> Vec<Listed> {
     let path = "fixtures/failure-modes.json5";
     let text = fs::read_to_string(project().join(path)).expect("text");
     source::parse::<Modes>(path, &text).unwrap_or_else(|e| panic!("{e}")).modes
