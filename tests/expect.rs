@@ -90,7 +90,10 @@ fn rules_of_a_folder_are_known_too() {
     fs::create_dir_all(&folder).unwrap();
     fs::write(dir.join("config.json"), json!({ "architectures": ["Mine"], "n": 2 }).to_string()).unwrap();
     let (wrong, code) = expect(dir, &["config.json", "--rules", "mine"]);
-    assert_eq!((code, wrong.as_str()), (Some(2), "error: mine/architectures has no *.json5\n"));
+    assert_eq!(
+        (code, wrong.as_str()),
+        (Some(2), "error: mine has neither architectures/*.json5 nor checks/**/*.json5\n")
+    );
     let file = |tensors: &str| {
         let text = format!(
             r#"{{ architecture: "mine", summary: "", sources: [], loaders: ["5.23.0"], classes: [{{ class: "Mine", {tensors} }}] }}"#
@@ -108,6 +111,6 @@ fn rules_of_a_folder_are_known_too() {
     file(r#"tensors: { "w": { shape: ["c.n +"] } }"#);
     let (wrong, code) = expect(dir, &["config.json", "--rules", "mine"]);
     assert_eq!(code, Some(2));
-    assert!(wrong.starts_with("error: mine/architectures/mine.json5: "), "{wrong}");
+    assert!(wrong.starts_with("error: mine/architectures/mine.json5:1:"), "{wrong}");
     assert!(wrong.contains("`c.n +` is not an expression"), "{wrong}");
 }

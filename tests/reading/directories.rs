@@ -55,6 +55,10 @@ fn cases() -> Vec<Case> {
     };
     vec![
         case("empty directory", &[], &|_| {}),
+        case("a repair that was killed", &["repair-interrupted"], &|root| {
+            fs::create_dir(root.join(".ckpt-doctor")).unwrap();
+            fs::write(root.join(".ckpt-doctor/journal.json"), "{}").unwrap();
+        }),
         case("hub cache", &[], &blob),
         case("inner link", &[], &|root| {
             fs::write(root.join("a.json"), "{}").unwrap();
