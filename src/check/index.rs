@@ -102,17 +102,19 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     if index.weight_map.is_empty() {
         return;
     }
-    let mut referenced: BTreeMap<&str, usize> = BTreeMap::new();
-    for file in index.weight_map.values() {
-        let count = referenced.entry(file).or_default();
+    let mut referenced: Referenced<'_> = BTreeMap::new();
+    for (tensor, file) in &index.weight_map {
+        let (count, _) = referenced.entry(file).or_insert((0, tensor));
         *count = count.saturating_add(1);
     }
     faults.extend(pointers_below_total(checkpoint, referenced.keys().copied()));
     let is_there = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
-    let absent: Vec<(&str, usize)> = referenced.iter().filter(|(n, _)| !is_there(n)).map(|(n, c)| (*n, *c)).collect();
+    let absent: Vec<_> =
+        referenced.iter().filter(|(name, _)| !is_there(name)).map(|(n, (c, t))| (*n, *c, *t)).collect();
+    let lookalikes = Lookalikes::of(checkpoint);
     let all_absent = absent.len() == referenced.len();
     if all_absent {
-        let (first, _) = absent.first().copied().unwrap_or_default();
+        let first = absent.first().map_or("", |(name, ..)| *name);
         faults.push(
             Fault::new("all-shards-absent")
                 .at(Place::file(&index.document))
@@ -121,10 +123,9 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
                 .with("first", first),
         );
     } else {
-        for (name, tensors) in absent {
-            let similar = similar(checkpoint, name);
-            let pointer = index.weight_map.iter().find(|(_, f)| *f == name).map(|(t, _)| pointer_to(t));
-            let fault = match similar {
+        for (name, tensors, first) in absent {
+            let pointer = Some(pointer_to(first));
+            let fault = match lookalikes.get(name) {
                 Some(s) => {
                     let by = if name.eq_ignore_ascii_case(s) { "case" } else { "Unicode normalisation" };
                     Fault::new("shard-name-differs-in-case").with("similar", s).with("by", by)
@@ -142,11 +143,13 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     let holders = by_tensor(checkpoint);
     // A name may lie in a shard that cannot be read: then nothing is known of it.
     let all_read = referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(readable));
+    let unreadable: BTreeSet<&str> =
+        checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
     for (tensor, said) in &index.weight_map {
         let Some(shard) = checkpoint.shards.get(said).filter(|s| readable(s)) else { continue };
         let held = holders.get(tensor.as_str());
-        let unreadable = || checkpoint.shards.values().any(|s| s.unreadable.contains(tensor));
-        if held.is_some_and(|h| h.contains(&shard.name.as_str())) || (held.is_none() && unreadable()) {
+        let unreadable = held.is_none() && unreadable.contains(tensor.as_str());
+        if held.is_some_and(|h| h.contains(&shard.name.as_str())) || unreadable {
             continue;
         }
         let place = Place::file(&index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
@@ -186,7 +189,7 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
 /// Safetensors files that the index does not mention.
 fn strays(
     checkpoint: &Checkpoint,
-    referenced: &BTreeMap<&str, usize>,
+    referenced: &Referenced<'_>,
     holders: &BTreeMap<&str, Vec<&str>>,
     faults: &mut Vec<Fault>,
 ) {
@@ -200,9 +203,11 @@ fn strays(
             }
         }
     }
+    let lookalikes = Lookalikes::of(checkpoint);
+    let missed: BTreeSet<&str> = referenced.keys().filter_map(|name| lookalikes.get(name)).collect();
     for name in shard_names(checkpoint) {
         // Under a name that differs in case only it is missing already.
-        if referenced.contains_key(name) || referenced.keys().any(|r| similar(checkpoint, r) == Some(name)) {
+        if referenced.contains_key(name) || missed.contains(name) {
             continue;
         }
         let twice = shared.get(name).copied().unwrap_or_default();
@@ -224,7 +229,7 @@ fn strays(
     }
 }
 
-fn total_size(checkpoint: &Checkpoint, referenced: &BTreeMap<&str, usize>, faults: &mut Vec<Fault>) {
+fn total_size(checkpoint: &Checkpoint, referenced: &Referenced<'_>, faults: &mut Vec<Fault>) {
     let Some(index) = &checkpoint.index else { return };
     let Some(stated) = index.total_size.as_ref().and_then(whole) else { return };
     let actual = referenced
@@ -314,6 +319,27 @@ fn is_pointer(checkpoint: &Checkpoint, name: &str) -> bool {
 /// The shard whose name differs from this one only in what some file systems ignore.
 pub(super) fn similar<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<&'c str> {
     checkpoint.shards.keys().map(String::as_str).find(|s| *s != name && folded(s) == folded(name))
+}
+
+/// Files that the index names: how many tensors it says are there, and the first of them.
+type Referenced<'i> = BTreeMap<&'i str, (usize, &'i str)>;
+
+/// Shards by what is left of their names where case and composition of characters are ignored.
+struct Lookalikes<'c>(BTreeMap<String, Vec<&'c str>>);
+
+impl<'c> Lookalikes<'c> {
+    fn of(checkpoint: &'c Checkpoint) -> Self {
+        let mut names: BTreeMap<String, Vec<&str>> = BTreeMap::new();
+        for name in checkpoint.shards.keys() {
+            names.entry(folded(name)).or_default().push(name);
+        }
+        Self(names)
+    }
+
+    /// The shard whose name differs from this one only in what some file systems ignore.
+    fn get(&self, name: &str) -> Option<&'c str> {
+        self.0.get(&folded(name))?.iter().copied().find(|other| *other != name)
+    }
 }
 
 /// A name as file systems that ignore case and composition of characters compare it.

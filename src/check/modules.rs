@@ -35,17 +35,43 @@ impl Entry {
 const DOCUMENTS: [&str; 4] =
     ["config.json", "processor_config.json", "preprocessor_config.json", "tokenizer_config.json"];
 
+/// Most `auto_map` entries that are looked at; a class needs a handful.
+const MAX_ENTRIES: usize = 1_000;
+
 /// Every `auto_map` entry of a checkpoint, outer ones first.
 #[must_use]
 pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
+    read(checkpoint).0
+}
+
+/// Every entry, and a fault for each that is none.
+fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
     let mut out = Vec::new();
+    let mut faults = Vec::new();
     for name in DOCUMENTS {
         let Some(value) = checkpoint.document(name).and_then(|d| d.value.as_ref()) else { continue };
         let mut pending = vec![(String::new(), value, 0_usize)];
         while let Some((pointer, value, depth)) = pending.pop() {
             let Value::Object(map) = value else { continue };
+            let mut malformed = |pointer: String, key: &str, found: &Value| {
+                // Strings have been escaped where they are shown; anything else is told by its kind.
+                let target = match found {
+                    Value::Array(_) => "a list".to_owned(),
+                    Value::Object(_) => "an object".to_owned(),
+                    other => other.to_string(),
+                };
+                let fault = Fault::new("auto-map-malformed").at(Place::file(name).pointer(pointer));
+                faults.push(fault.with("key", key).with("target", target).with("dots", 0));
+            };
+            match map.get("auto_map") {
+                None | Some(Value::Null | Value::Object(_)) => {}
+                Some(other) => malformed(format!("{pointer}/auto_map"), "itself", other),
+            }
             if let Some(Value::Object(auto_map)) = map.get("auto_map") {
-                for (key, target) in auto_map {
+                if auto_map.len() > MAX_ENTRIES {
+                    malformed(format!("{pointer}/auto_map"), "itself", &Value::Object(serde_json::Map::new()));
+                }
+                for (key, target) in auto_map.iter().take(MAX_ENTRIES) {
                     let base = format!("{pointer}/auto_map/{}", escape(key));
                     let mut push = |pointer: String, target: &str| {
                         let entry = Entry {
@@ -61,13 +87,16 @@ pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
                         Value::String(s) => push(base, s),
                         // Slow and fast tokenizer; null for none.
                         Value::Array(items) => {
-                            for (i, item) in items.iter().enumerate() {
-                                if let Value::String(s) = item {
-                                    push(format!("{base}/{i}"), s);
+                            for (i, item) in items.iter().enumerate().take(MAX_ENTRIES) {
+                                match item {
+                                    Value::String(s) => push(format!("{base}/{i}"), s),
+                                    Value::Null => {}
+                                    other => malformed(format!("{base}/{i}"), key, other),
                                 }
                             }
                         }
-                        _ => {}
+                        Value::Null => {}
+                        other => malformed(base, key, other),
                     }
                 }
             }
@@ -78,7 +107,7 @@ pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
             }
         }
     }
-    out
+    (out, faults)
 }
 
 fn escape(key: &str) -> String {
@@ -119,8 +148,7 @@ fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
 /// Faults of every `auto_map` entry.
 #[must_use]
 pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let entries = entries(checkpoint);
-    let mut faults = Vec::new();
+    let (entries, mut faults) = read(checkpoint);
     let mut roots: BTreeSet<&str> = BTreeSet::new();
     for entry in &entries {
         let fault = |kind| {
@@ -129,15 +157,16 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
                 .with("target", entry.target.as_str())
                 .with("key", entry.key.as_str())
         };
-        if let Some((repository, _)) = entry.target.split_once("--") {
-            faults.push(fault("auto-map-remote").with("repository", repository));
+        let unsafe_path = |target: &str| {
+            let module = target.split('.').next().unwrap_or_default();
+            target.contains(['/', '\\']) || target.starts_with('.') || !is_plain_file_name(&format!("{module}.py"))
+        };
+        if let Some((repository, target)) = entry.target.split_once("--") {
+            let kind = if unsafe_path(target) { "auto-map-unsafe-path" } else { "auto-map-remote" };
+            faults.push(fault(kind).with("repository", repository));
             continue;
         }
-        let module = entry.target.split('.').next().unwrap_or_default();
-        if entry.target.contains(['/', '\\'])
-            || entry.target.starts_with('.')
-            || !is_plain_file_name(&format!("{module}.py"))
-        {
+        if unsafe_path(&entry.target) {
             faults.push(fault("auto-map-unsafe-path"));
             continue;
         }

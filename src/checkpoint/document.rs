@@ -6,13 +6,15 @@ use std::sync::Arc;
 use serde_json::Value;
 
 use super::Fault;
-use super::scan::{Scanner, Token};
-use super::text::pointer_steps;
 
 pub mod edit;
 mod encoding;
 mod explain;
+mod locate;
 mod read;
+
+pub use locate::Locator;
+use locate::value_at;
 
 pub use super::text::line_column;
 
@@ -69,69 +71,15 @@ impl Document {
         self.value.as_ref()?.pointer(pointer)
     }
 
-    /// Byte range of the value at a JSON pointer. Reads the text anew, in one pass for each step.
+    /// Byte range of the value at a JSON pointer. Reads the text anew; for many pointers take a [`Locator`].
     #[must_use]
     pub fn locate(&self, pointer: &str) -> Option<Range<usize>> {
-        self.find(pointer).map(|found| found.value)
+        Locator::new(self.text.as_deref()?).value(pointer)
     }
 
     /// Byte range of the key, quotes included, that the last step of a JSON pointer names.
     #[must_use]
     pub fn locate_key(&self, pointer: &str) -> Option<Range<usize>> {
-        self.find(pointer)?.key
-    }
-
-    fn find(&self, pointer: &str) -> Option<Found> {
-        let text = self.text.as_deref()?;
-        let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
-        let mut found: Option<Found> = None;
-        for step in pointer_steps(pointer)? {
-            found = Some(child(text, found.map_or(start, |f| f.value.start), &step)?);
-        }
-        found.or_else(|| Some(Found { key: None, value: value_at(text, start)? }))
-    }
-}
-
-/// Where a member stands.
-#[derive(Debug, Clone)]
-struct Found {
-    key: Option<Range<usize>>,
-    value: Range<usize>,
-}
-
-/// Bytes of the value that starts at or after `start`.
-fn value_at(text: &str, start: usize) -> Option<Range<usize>> {
-    let mut scanner = Scanner::lenient(text, start);
-    let (token, span) = scanner.next().ok()??;
-    scanner.skip_rest_of(&token).ok()?;
-    Some(span.start..scanner.position())
-}
-
-/// The member `step` of the container that starts at `start`; of equal keys the last.
-fn child(text: &str, start: usize, step: &str) -> Option<Found> {
-    let mut scanner = Scanner::lenient(text, start);
-    let (open, _) = scanner.next().ok()??;
-    let mut last = None;
-    let mut index = 0_usize;
-    loop {
-        let (token, span) = scanner.next().ok()??;
-        match (open, token) {
-            (_, Token::EndObject | Token::EndArray) => return last,
-            (Token::BeginObject, Token::Key(key)) => {
-                let (first, value) = scanner.next().ok()??;
-                scanner.skip_rest_of(&first).ok()?;
-                if key.decode().0 == step {
-                    last = Some(Found { key: Some(span), value: value.start..scanner.position() });
-                }
-            }
-            (Token::BeginArray, first) => {
-                scanner.skip_rest_of(&first).ok()?;
-                if step.parse() == Ok(index) {
-                    return Some(Found { key: None, value: span.start..scanner.position() });
-                }
-                index = index.checked_add(1)?;
-            }
-            _ => return None,
-        }
+        Locator::new(self.text.as_deref()?).key(pointer)
     }
 }

@@ -15,8 +15,8 @@ use super::{Fault, Place};
 
 /// Most bytes read of a JSON document.
 pub const JSON_CAP: u64 = 64 << 20;
-/// Most bytes read of a vocabulary file or of `tokenizer.json`.
-pub const TOKENIZER_CAP: u64 = 512 << 20;
+/// Most bytes read of a vocabulary file or of `tokenizer.json`; the largest published has 34 MB.
+pub const TOKENIZER_CAP: u64 = 64 << 20;
 /// Most bytes read of a Python module.
 pub const MODULE_CAP: u64 = 4 << 20;
 

@@ -109,7 +109,7 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
         checkpoint.faults.push(Fault::new("repair-interrupted").at(place));
     }
     checkpoint.derive(vocabularies);
-    checkpoint.tokenizer.faults = faults_of_vocabularies;
+    checkpoint.tokenizer.faults.extend(faults_of_vocabularies);
     git::mark_pointers(&mut checkpoint);
     Ok(checkpoint)
 }

@@ -33,6 +33,9 @@ pub(crate) enum Token<'a> {
     Null,
 }
 
+/// Why a number is refused that no double can hold.
+const HUGE: &str = "a number larger than any double";
+
 /// Most slips kept of one text.
 const SLIP_CAP: usize = 100_000;
 
@@ -100,6 +103,8 @@ pub(crate) struct Scanner<'a> {
     comma: Option<Range<usize>>,
     /// Slips read past so far, the first [`SLIP_CAP`] of them; a strict scan makes none.
     pub(crate) slips: Vec<Slip>,
+    /// The first token of a strict scan that has a form here, for the sake of its faults, and none in strict JSON.
+    pub(crate) refused: Option<ScanError>,
 }
 
 type Step<'a> = Result<Option<(Token<'a>, Range<usize>)>, ScanError>;
@@ -116,6 +121,7 @@ impl<'a> Scanner<'a> {
             last_end: start,
             comma: None,
             slips: Vec::new(),
+            refused: None,
         }
     }
 
@@ -185,9 +191,10 @@ impl<'a> Scanner<'a> {
                     if byte != b'"' && !(byte == b'\'' && self.lenient) {
                         return Err(self.unexpected("expected a key in double quotes"));
                     }
-                    let key = self.string(byte)?;
+                    let key = Token::Key(self.string(byte)?);
+                    self.refuse(&key, at);
                     self.expect = Expect::Colon;
-                    return Ok(Some((Token::Key(key), at..self.pos)));
+                    return Ok(Some((key, at..self.pos)));
                 }
                 Expect::Value | Expect::ElementOrEnd => return self.value(byte, at).map(Some),
             }
@@ -283,8 +290,23 @@ impl<'a> Scanner<'a> {
             b'-' | b'0'..=b'9' => self.number(at)?,
             _ => self.word(at)?,
         };
+        self.refuse(&token, at);
         self.after_value();
         Ok((token, at..self.pos))
+    }
+
+    /// Notes what Rust's readers of JSON refuse and Python's takes.
+    fn refuse(&mut self, token: &Token<'a>, at: usize) {
+        if self.lenient || self.refused.is_some() {
+            return;
+        }
+        let reason = match token {
+            Token::NonFinite(_) => "a number that is not finite",
+            Token::Number(literal) if !literal.parse::<f64>().is_ok_and(f64::is_finite) => HUGE,
+            Token::Key(text) | Token::String(text) if text.decode().1 => "half of a surrogate pair",
+            _ => return,
+        };
+        self.refused = Some(self.syntax(at, self.pos, reason));
     }
 
     fn slip(&mut self, kind: SlipKind, span: Range<usize>) {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::{Document, Fault};
+use super::{Document, Fault, Place};
 
 mod sentencepiece;
 mod vocabulary;
@@ -82,13 +82,20 @@ impl Tokenizer {
         mut vocabularies: BTreeMap<String, Arc<Vocabulary>>,
         files: BTreeSet<String>,
     ) -> Self {
+        let mut faults = Vec::new();
         for name in ["tokenizer.json", "vocab.json"] {
             let pointer = if name == "vocab.json" { "" } else { "/model/vocab" };
             if !vocabularies.contains_key(name)
                 && let Some(document) = documents.get(name)
-                && let Some(vocabulary) = Vocabulary::of_document(document, pointer)
             {
-                vocabularies.insert(name.to_owned(), Arc::new(vocabulary));
+                match Vocabulary::of_document(document, pointer) {
+                    Ok(Some(vocabulary)) => drop(vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
+                    Ok(None) => {}
+                    Err(reason) => {
+                        let fault = Fault::new("vocabulary-malformed").at(Place::file(name).pointer(pointer));
+                        faults.push(fault.with("reason", reason));
+                    }
+                }
             }
         }
         let get = |name: &str, pointer: &str| documents.get(name)?.get(pointer);
@@ -113,6 +120,7 @@ impl Tokenizer {
             added_tokens_json: json,
             tokenizer_json_added: own,
             special_tokens: special_tokens(&special_from, &get),
+            faults,
             ..Self::default()
         };
         let prefix = get(config, "/add_prefix_space").is_some_and(|v| !v.is_null());

@@ -19,7 +19,7 @@ pub use refusal::{Refusal, UnknownPart};
 use super::{Evidence, Library, Loader};
 
 /// Tensors an architecture may have; a config that asks for more is refused.
-pub const TENSOR_CAP: usize = 200_000;
+pub const TENSOR_CAP: usize = 60_000;
 
 /// A model class of the library, as one loader builds it.
 #[derive(Clone, Copy)]

@@ -37,35 +37,40 @@ pub fn make_all(root: &Path, names: &[&'static str], knowledge: &Knowledge) -> B
         .iter()
         .map(|name| {
             let dir = root.join(name);
-            match *name {
-                "llama" => documents("llama", &dir, 1, knowledge),
-                "llama-sharded" => documents("llama", &dir, 2, knowledge),
-                "llama-gptq" => {
-                    documents("llama", &dir, 1, knowledge);
-                    let case = cases().into_iter().find(|c| c.name == "sound/quantized-gptq").expect("the case");
-                    apply_all(&case.name, &case.changes, &dir);
-                }
-                "lora" => lora(&dir),
-                "paligemma" => documents("paligemma", &dir, 1, knowledge),
-                "spatialvla" => {
-                    copy(&project().join("fixtures/donors/spatialvla-tiny"), &dir);
-                    let file = dir.join("processor_config.json");
-                    let text = fs::read_to_string(&file).expect("text").replace("Infinity", "1.0");
-                    let mut value: Value = serde_json::from_str(&text).expect("JSON");
-                    value["statistics"].as_object_mut().expect("an object").shift_remove("rh20t_rlds/1.0.0");
-                    fs::write(file, serde_json::to_string_pretty(&value).expect("JSON")).expect("write");
-                }
-                "llava3d" => copy(&project().join("fixtures/donors/llava3d-tiny"), &dir),
-                "merged" => merge(&dir, &[("shard-size", "300KB")], knowledge),
-                "merged-baked" => merge(&dir, &[("tokenizer", "baked")], knowledge),
-                "merged-wrapped" => {
-                    merge(&dir, &[("layout", "wrapped"), ("spatial", "off"), ("zoe", "off")], knowledge);
-                }
-                other => panic!("no base {other}"),
-            }
+            make(name, &dir, knowledge);
             (*name, dir)
         })
         .collect()
+}
+
+/// Makes one base.
+pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
+    match name {
+        "llama" => documents("llama", dir, 1, knowledge),
+        "llama-sharded" => documents("llama", dir, 2, knowledge),
+        "llama-gptq" => {
+            documents("llama", dir, 1, knowledge);
+            let case = cases().into_iter().find(|c| c.name == "sound/quantized-gptq").expect("the case");
+            apply_all(&case.name, &case.changes, dir);
+        }
+        "lora" => lora(dir),
+        "paligemma" => documents("paligemma", dir, 1, knowledge),
+        "spatialvla" => {
+            copy(&project().join("fixtures/donors/spatialvla-tiny"), dir);
+            let file = dir.join("processor_config.json");
+            let text = fs::read_to_string(&file).expect("text").replace("Infinity", "1.0");
+            let mut value: Value = serde_json::from_str(&text).expect("JSON");
+            value["statistics"].as_object_mut().expect("an object").shift_remove("rh20t_rlds/1.0.0");
+            fs::write(file, serde_json::to_string_pretty(&value).expect("JSON")).expect("write");
+        }
+        "llava3d" => copy(&project().join("fixtures/donors/llava3d-tiny"), dir),
+        "merged" => merge(dir, &[("shard-size", "300KB")], knowledge),
+        "merged-baked" => merge(dir, &[("tokenizer", "baked")], knowledge),
+        "merged-wrapped" => {
+            merge(dir, &[("layout", "wrapped"), ("spatial", "off"), ("zoe", "off")], knowledge);
+        }
+        other => panic!("no base {other}"),
+    }
 }
 
 /// Copies the files of a directory, links as links.

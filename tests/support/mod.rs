@@ -34,7 +34,8 @@ use ckpt_doctor::knowledge::settings::{Chain, Policy, Source};
 use ckpt_doctor::knowledge::source;
 use serde::Deserialize;
 
-pub use base::BASES;
+#[allow(unused_imports, reason = "each test binary uses its share")]
+pub use base::{BASES, copy};
 use change::Change;
 
 /// One case.
@@ -170,6 +171,11 @@ fn under(settings: &serde_json::Value, dir: &Path) -> Outcome {
     let unused = policy::unused(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
     outcome
+}
+
+/// Makes one of [`BASES`].
+pub fn make_base(name: &str, dir: &Path) {
+    base::make(name, dir, &knowledge());
 }
 
 /// All cases, by name.

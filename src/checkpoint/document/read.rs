@@ -131,7 +131,7 @@ impl Reader<'_> {
     fn pass(&mut self, text: &str) -> (Option<Value>, Option<ScanError>) {
         let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
         let mut scanner = Scanner::lenient(text, start);
-        let mut builder = Builder::new(self.left_out.clone());
+        let mut builder = Builder::new(self.left_out.clone(), build::most_nodes(self.name));
         let mut duplicates = Duplicates::new(text);
         let error = loop {
             let (token, span) = match scanner.next() {
@@ -162,7 +162,7 @@ impl Reader<'_> {
         }
         if builder.overflowed() {
             let fault = Fault::new("json-too-many-values").at(Place::file(self.name));
-            self.faults.push(fault.with("cap", build::MAX_NODES));
+            self.faults.push(fault.with("cap", build::most_nodes(self.name)));
         }
         (builder.finish(), error)
     }

@@ -12,6 +12,10 @@ use crate::checkpoint::{Fault, Place};
 /// Most syntax nodes looked at: some 3 MB of honest Python, ten times the largest module known.
 const MAX_NODES: usize = 1_000_000;
 
+/// Most bytes parsed, ten times as many as modules of models have: a syntax tree takes some 140 bytes for each byte of
+/// brackets or one-letter statements.
+const MAX_BYTES: usize = 512 << 10;
+
 /// How often the parser may ask whether to go on. It asks about every hundred steps.
 const MAX_PROGRESS: usize = 200_000;
 
@@ -38,7 +42,7 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Module {
     };
     let mut module = Module { name, text: Some(text.into()), ..Module::default() };
     let mut faults = Faults::default();
-    if let Some(tree) = tree_of(text) {
+    if let Some(tree) = Some(text).filter(|text| text.len() <= MAX_BYTES).and_then(tree_of) {
         Reader { text, module: &mut module, faults: &mut faults }.walk(&tree);
     } else {
         module.unread = true;

@@ -57,7 +57,11 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
         metadata: Metadata::Absent,
     };
     let error = reader.object().err();
-    let Reader { mut faults, entries, metadata, .. } = reader;
+    let Reader { mut faults, entries, metadata, scanner, .. } = reader;
+    if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
+        let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
+        faults.push(fault.with("offset", span.start));
+    }
     let mut unread = true;
     match error {
         None => unread = false,
@@ -156,7 +160,7 @@ fn other_format(head: &[u8]) -> Option<String> {
 
 /// Most entries read of one header, tensors and metadata apart; the largest models have some hundred
 /// thousand over all shards, and each takes more memory than its bytes.
-const MAX_ENTRIES: usize = 500_000;
+const MAX_ENTRIES: usize = 200_000;
 
 /// What `__metadata__` held.
 enum Metadata {

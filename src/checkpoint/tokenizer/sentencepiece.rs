@@ -1,7 +1,7 @@
 //! The pieces of a sentencepiece model: a bounded walk over its protocol buffer.
 
 /// More pieces than any vocabulary has.
-const MAX_PIECES: usize = 4_000_000;
+const MAX_PIECES: usize = 1_500_000;
 
 /// Piece strings in id order. Source: `ModelProto` (field 1, repeated `SentencePiece`) and
 /// `SentencePiece` (field 1, the string) in `sentencepiece_model.proto`.
@@ -14,7 +14,7 @@ pub(super) fn pieces(bytes: &[u8]) -> Result<Vec<&str>, &'static str> {
             continue;
         }
         if pieces.len() >= MAX_PIECES {
-            return Err("it has more than four million pieces");
+            return Err("it has more than a million and a half pieces");
         }
         let mut message = value.ok_or("its first field is not a message")?;
         let mut piece = "";

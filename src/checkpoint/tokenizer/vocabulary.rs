@@ -1,8 +1,14 @@
 //! A vocabulary in little memory: all tokens in one string, sorted.
 
+use std::borrow::Cow;
+
 use super::super::Document;
 use super::super::scan::{Scanner, Token};
 use super::sentencepiece;
+
+/// Most tokens that are read; the largest published vocabulary has 901 629 (XLM-V).
+const MAX_TOKENS: usize = 1_500_000;
+const TOO_MANY: &str = "it has more than a million and a half tokens";
 
 /// Tokens and their ids. A 256 000-word vocabulary takes some 5 MB.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -30,17 +36,32 @@ impl Vocabulary {
 
     /// Reads the vocabulary at `pointer` of a document: an object of ids by token, or a list of pairs
     /// of token and score.
-    pub(super) fn of_document(document: &Document, pointer: &str) -> Option<Self> {
+    ///
+    /// # Errors
+    /// With the reason, when it is more than is read of one.
+    pub(super) fn of_document(document: &Document, pointer: &str) -> Result<Option<Self>, &'static str> {
+        let mut many = false;
+        let entries = Self::entries(document, pointer, &mut many);
+        if many { Err(TOO_MANY) } else { entries.map(Self::collect).transpose() }
+    }
+
+    /// Tokens and ids in the order of the text; `many` says that there are too many of them.
+    fn entries<'d>(document: &'d Document, pointer: &str, many: &mut bool) -> Option<Vec<(Cow<'d, str>, u32)>> {
         let text = document.text.as_deref()?;
         // A document that was not understood has no value, and no vocabulary either.
         document.value.as_ref()?;
         let span = document.locate(pointer)?;
         let mut scanner = Scanner::lenient(text, span.start);
         let mut entries = Vec::new();
+        let mut full = |entries: &Vec<_>| {
+            *many = entries.len() >= MAX_TOKENS;
+            *many
+        };
         match scanner.next().ok()??.0 {
             Token::BeginObject => loop {
                 match scanner.next().ok()??.0 {
                     Token::EndObject => break,
+                    _ if full(&entries) => return None,
                     Token::Key(key) => {
                         let id = match scanner.next().ok()??.0 {
                             Token::Number(id) => id.parse().ok()?,
@@ -54,6 +75,7 @@ impl Vocabulary {
             Token::BeginArray => loop {
                 match scanner.next().ok()??.0 {
                     Token::EndArray => break,
+                    _ if full(&entries) => return None,
                     Token::BeginArray => {
                         let Token::String(token) = scanner.next().ok()??.0 else { return None };
                         entries.push((token.decode().0, u32::try_from(entries.len()).ok()?));
@@ -64,13 +86,16 @@ impl Vocabulary {
             },
             _ => return None,
         }
-        Self::collect(entries).ok()
+        Some(entries)
     }
 
     fn collect(entries: impl IntoIterator<Item = (impl AsRef<str>, u32)>) -> Result<Self, &'static str> {
         const TOO_LARGE: &str = "it is larger than 4 GiB";
         let mut vocabulary = Self::default();
         for (token, id) in entries {
+            if vocabulary.tokens.len() >= MAX_TOKENS {
+                return Err(TOO_MANY);
+            }
             let start = u32::try_from(vocabulary.arena.len()).map_err(|_| TOO_LARGE)?;
             vocabulary.arena.push_str(token.as_ref());
             let end = u32::try_from(vocabulary.arena.len()).map_err(|_| TOO_LARGE)?;

@@ -6,9 +6,23 @@ use super::is_huge;
 use crate::checkpoint::scan::Token;
 use crate::checkpoint::text::push_pointer;
 
-/// Most values kept of one document: a value takes some 100 bytes, so a 64 MiB `[0,0,0,…` would
-/// otherwise become gigabytes.
-pub(super) const MAX_NODES: usize = 2_000_000;
+/// Bytes of text that take as much room as a value does.
+const NODE_BYTES: usize = 100;
+
+/// Most values kept of a document of this name, long texts counted as several: a value takes 100 bytes and more, in
+/// expressions some 1000, so a 64 MiB `[0,0,0,…` would otherwise become gigabytes.
+///
+/// An index has a value for each tensor, some hundred thousand in the largest models; no published config has a tenth of
+/// what is read of one.
+pub(super) fn most_nodes(name: &str) -> usize {
+    if name.ends_with(".index.json") {
+        400_000
+    } else if name.starts_with("tokenizer") {
+        250_000
+    } else {
+        100_000
+    }
+}
 
 /// Longest JSON pointer made for a fault.
 const MAX_POINTER: usize = 4096;
@@ -23,19 +37,20 @@ pub(super) struct Builder {
     stack: Vec<Open>,
     root: Option<Value>,
     nodes: usize,
+    most: usize,
     left_out: Vec<&'static str>,
     /// Depth of the part being left out, when inside one.
     skipping: Option<usize>,
 }
 
 impl Builder {
-    pub(super) fn new(left_out: Vec<&'static str>) -> Self {
-        Self { stack: Vec::new(), root: None, nodes: 0, left_out, skipping: None }
+    pub(super) fn new(left_out: Vec<&'static str>, most: usize) -> Self {
+        Self { stack: Vec::new(), root: None, nodes: 0, most, left_out, skipping: None }
     }
 
     /// Whether there were more values than are kept.
     pub(super) const fn overflowed(&self) -> bool {
-        self.nodes > MAX_NODES
+        self.nodes > self.most
     }
 
     /// The whole value; `None` when there was none or too much.
@@ -72,6 +87,9 @@ impl Builder {
             Token::Key(key) => {
                 if let Some(Open::Object(_, next)) = self.stack.last_mut() {
                     *next = key.decode().0.into_owned();
+                    let weight =
+                        if self.skipping.is_some() { 0 } else { next.len().checked_div(NODE_BYTES).unwrap_or(0) };
+                    self.nodes = self.nodes.saturating_add(weight);
                 }
             }
             Token::BeginObject => {
@@ -116,7 +134,8 @@ impl Builder {
     }
 
     fn put(&mut self, value: Value) {
-        self.nodes = self.nodes.saturating_add(1);
+        let weight = value.as_str().map_or(0, str::len).checked_div(NODE_BYTES).unwrap_or(0);
+        self.nodes = self.nodes.saturating_add(weight).saturating_add(1);
         if !self.overflowed() {
             match self.stack.last_mut() {
                 Some(Open::Object(map, key)) => {

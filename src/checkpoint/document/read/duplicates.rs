@@ -127,7 +127,7 @@ fn same(a: &str, b: &str) -> bool {
     }
     let value = |text| {
         let mut scanner = Scanner::lenient(text, 0);
-        let mut builder = Builder::new(Vec::new());
+        let mut builder = Builder::new(Vec::new(), COMPARE_CAP);
         while let Ok(Some((token, _))) = scanner.next() {
             builder.see(&token);
         }

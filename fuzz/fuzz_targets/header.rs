@@ -1,0 +1,43 @@
+//! Shard headers.
+//!
+//! The first byte says what the rest is: 255, a whole file; anything else, a header in front of so many bytes of data
+//! (0: as many as its entries ask for). A length field that the fuzzer had to keep in step would cost it most of its
+//! inputs.
+
+#![no_main]
+
+#[path = "../../tests/laws/mod.rs"]
+mod laws;
+
+use std::cell::RefCell;
+
+use ckpt_doctor::checkpoint::Shard;
+use libfuzzer_sys::fuzz_target;
+
+/// Most bytes of data put behind a header.
+const MOST: u64 = 1 << 16;
+
+thread_local! {
+    static FILE: RefCell<Vec<u8>> = const { RefCell::new(Vec::new()) };
+}
+
+fuzz_target!(|data: &[u8]| {
+    let Some((mode, rest)) = data.split_first() else { return };
+    if *mode == 255 {
+        return laws::header::hold(rest);
+    }
+    FILE.with_borrow_mut(|file| {
+        let header = 8 + rest.len();
+        if file.len() < header + MOST as usize {
+            file.resize(header + MOST as usize, 0);
+        }
+        file[..8].copy_from_slice(&(rest.len() as u64).to_le_bytes());
+        file[8..header].copy_from_slice(rest);
+        let mut region = u64::from(*mode);
+        if region == 0 {
+            let shard = Shard::parse(laws::header::NAME, header as u64, &file[..header]);
+            region = shard.tensors.iter().map(|t| t.end).max().unwrap_or(0).min(MOST);
+        }
+        laws::header::hold(&file[..header + region as usize]);
+    });
+});

@@ -1,0 +1,168 @@
+//! Finds places in a text: the bytes of a value, the line of a byte.
+
+use std::collections::HashMap;
+use std::ops::Range;
+
+use crate::checkpoint::scan::{Scanner, Token};
+use crate::checkpoint::text::pointer_steps;
+
+/// Finds many places in one text. Each container on the way to one is read once, and so is the text for its lines:
+/// a hundred findings in a document of one line and fifty megabytes would otherwise read it some thousand times.
+#[derive(Debug)]
+pub struct Locator<'t> {
+    text: &'t str,
+    /// Members of the containers looked into, by where these begin.
+    containers: HashMap<usize, Container>,
+    /// Line, start of the line and characters before it in the line, for every [`STRIDE`] bytes.
+    lines: Vec<Mark>,
+}
+
+/// Where a member stands.
+#[derive(Debug, Clone)]
+struct Found {
+    key: Option<Range<usize>>,
+    value: Range<usize>,
+}
+
+#[derive(Debug)]
+enum Container {
+    /// By key; of equal keys the last.
+    Object(HashMap<String, Found>),
+    Array(Vec<Range<usize>>),
+}
+
+/// What stands before a byte of the text.
+#[derive(Debug, Clone, Copy, Default)]
+struct Mark {
+    line_breaks: usize,
+    /// Characters since the last line break.
+    characters: usize,
+}
+
+/// Bytes from one mark to the next.
+const STRIDE: usize = 4096;
+
+impl<'t> Locator<'t> {
+    /// Looks for places in `text`; reads nothing yet.
+    #[must_use]
+    pub fn new(text: &'t str) -> Self {
+        Self { text, containers: HashMap::new(), lines: Vec::new() }
+    }
+
+    /// Byte range of the value at a JSON pointer.
+    pub fn value(&mut self, pointer: &str) -> Option<Range<usize>> {
+        self.find(pointer).map(|found| found.value)
+    }
+
+    /// Byte range of the key, quotes included, that the last step of a JSON pointer names.
+    pub fn key(&mut self, pointer: &str) -> Option<Range<usize>> {
+        self.find(pointer)?.key
+    }
+
+    /// Line and column of a byte offset, as [`line_column`](crate::checkpoint::line_column) counts them.
+    pub fn line_column(&mut self, offset: usize) -> (usize, usize) {
+        if self.lines.is_empty() {
+            self.lines = marks(self.text);
+        }
+        let bytes = self.text.as_bytes();
+        let offset = self.text.floor_char_boundary(offset.min(bytes.len()));
+        let at = offset.checked_div(STRIDE).unwrap_or(0);
+        let mark = self.lines.get(at).copied().unwrap_or_default();
+        let between = bytes.get(at.saturating_mul(STRIDE)..offset).unwrap_or_default();
+        let mark = mark.after(between);
+        (mark.line_breaks.saturating_add(1), mark.characters.saturating_add(1))
+    }
+
+    fn find(&mut self, pointer: &str) -> Option<Found> {
+        let start = if self.text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
+        let mut found: Option<Found> = None;
+        for step in pointer_steps(pointer)? {
+            let start = found.map_or(start, |f| f.value.start);
+            if !self.containers.contains_key(&start) {
+                self.containers.insert(start, members(self.text, start)?);
+            }
+            found = Some(match self.containers.get(&start)? {
+                Container::Object(members) => members.get(&step)?.clone(),
+                Container::Array(items) => Found { key: None, value: items.get(step.parse::<usize>().ok()?)?.clone() },
+            });
+        }
+        found.or_else(|| Some(Found { key: None, value: value_at(self.text, start)? }))
+    }
+}
+
+impl Mark {
+    /// The mark after these bytes of UTF-8.
+    fn after(self, bytes: &[u8]) -> Self {
+        let line = bytes.iter().rposition(|b| *b == b'\n');
+        let breaks = bytes.iter().filter(|b| **b == b'\n').count();
+        let rest = line.map_or(bytes, |at| bytes.get(at.saturating_add(1)..).unwrap_or_default());
+        // A character begins with any byte but those that continue one.
+        let characters = rest.iter().filter(|b| (**b & 0xc0) != 0x80).count();
+        Self {
+            line_breaks: self.line_breaks.saturating_add(breaks),
+            characters: if line.is_some() { characters } else { self.characters.saturating_add(characters) },
+        }
+    }
+}
+
+fn marks(text: &str) -> Vec<Mark> {
+    let mut mark = Mark::default();
+    let mut marks = vec![mark];
+    for bytes in text.as_bytes().chunks(STRIDE) {
+        mark = mark.after(bytes);
+        marks.push(mark);
+    }
+    marks
+}
+
+/// Bytes of the value that starts at or after `start`.
+pub(super) fn value_at(text: &str, start: usize) -> Option<Range<usize>> {
+    let mut scanner = Scanner::lenient(text, start);
+    let (token, span) = scanner.next().ok()??;
+    scanner.skip_rest_of(&token).ok()?;
+    Some(span.start..scanner.position())
+}
+
+/// The members of the container that starts at `start`.
+fn members(text: &str, start: usize) -> Option<Container> {
+    let mut scanner = Scanner::lenient(text, start);
+    match scanner.next().ok()??.0 {
+        Token::BeginObject => {
+            let mut members = HashMap::new();
+            loop {
+                let (Token::Key(key), span) = scanner.next().ok()?? else { return Some(Container::Object(members)) };
+                let (first, value) = scanner.next().ok()??;
+                scanner.skip_rest_of(&first).ok()?;
+                let found = Found { key: Some(span), value: value.start..scanner.position() };
+                members.insert(key.decode().0.into_owned(), found);
+            }
+        }
+        Token::BeginArray => {
+            let mut items = Vec::new();
+            loop {
+                let (first, span) = scanner.next().ok()??;
+                if first == Token::EndArray {
+                    return Some(Container::Array(items));
+                }
+                scanner.skip_rest_of(&first).ok()?;
+                items.push(span.start..scanner.position());
+            }
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Locator;
+    use crate::checkpoint::line_column;
+
+    #[test]
+    fn lines_are_counted_as_in_one_go() {
+        let text = "é\n日本語\r\n\n".repeat(1500) + &"ü".repeat(9000);
+        let mut locator = Locator::new(&text);
+        for offset in (0..text.len() + 3).step_by(7) {
+            assert_eq!(locator.line_column(offset), line_column(&text, offset), "{offset}");
+        }
+    }
+}

@@ -1,0 +1,157 @@
+//! Changes bytes the way disks, hands and attackers do.
+
+/// What is put in: brackets, literals, encodings, figures at the edge of a type.
+const PIECES: &[&[u8]] = &[
+    b"{",
+    b"}",
+    b"[",
+    b"]",
+    b"\"",
+    b"\\",
+    b",",
+    b":",
+    b"'",
+    b"//",
+    b"/*",
+    b"\0",
+    b"\n",
+    b"\xff",
+    b"\xef\xbb\xbf",
+    b"\\ud800",
+    b"\\u0000",
+    b"\\u001b[31m",
+    b"\xe2\x80\xae",
+    b"NaN",
+    b"-Infinity",
+    b"1e999",
+    b"-",
+    b"0",
+    b"-1",
+    b"1.5",
+    b"null",
+    b"true",
+    b"{}",
+    b"[]",
+    b"\"\"",
+    b"../",
+    b"/",
+    b"18446744073709551615",
+    b"18446744073709551616",
+    b"9223372036854775808",
+    b"4294967296",
+    b"2305843009213693951",
+    b"=======\n",
+    b"<<<<<<< HEAD\n",
+    b"__metadata__",
+    b"data_offsets",
+    b"\"dtype\":\"F4\"",
+    b"class ",
+    b"import ",
+    b"from . import x\n",
+    b"    ",
+    b"\t",
+    b"(",
+    b")",
+    b"\"\"\"",
+    b"f'{",
+];
+
+/// A source of changes that follows from its seed.
+pub struct Mutator(u64);
+
+impl Mutator {
+    /// The source of this seed.
+    pub fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x2545_f491_4f6c_dd1d) | 1)
+    }
+
+    /// The next number. Source: Marsaglia, "Xorshift RNGs" (2003).
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    /// A number below `end`; 0 below 0.
+    pub fn below(&mut self, end: usize) -> usize {
+        usize::try_from(self.next() >> 1).map_or(0, |n| n.checked_rem(end).unwrap_or(0))
+    }
+
+    /// The bytes after one to four changes; `other` is another file, to take parts from.
+    pub fn mutate(&mut self, bytes: &[u8], other: &[u8]) -> Vec<u8> {
+        let mut bytes = bytes.to_vec();
+        for _ in 0..=self.below(4) {
+            self.change(&mut bytes, other);
+        }
+        // Half of the broken headers would otherwise end at a length that no longer fits.
+        if self.below(2) == 0 {
+            mend_length(&mut bytes);
+        }
+        bytes
+    }
+
+    fn change(&mut self, bytes: &mut Vec<u8>, other: &[u8]) {
+        // Headers and the keys that matter stand at the beginning.
+        let reach = if self.below(2) == 0 { bytes.len().min(600) } else { bytes.len() };
+        let at = self.below(reach + 1).min(bytes.len());
+        let end = (at + self.below(12)).min(bytes.len());
+        match self.below(10) {
+            0 => bytes.truncate(at),
+            1 => drop(bytes.drain(at..end)),
+            2 => bytes.splice(at..at, bytes[at..end].to_vec()).for_each(drop),
+            3 | 4 => {
+                let piece = PIECES[self.below(PIECES.len())];
+                bytes.splice(at..end, piece.iter().copied()).for_each(drop);
+            }
+            5 => {
+                let piece = PIECES[self.below(PIECES.len())];
+                let times = 1 << self.below(9);
+                bytes.splice(at..at, piece.repeat(times)).for_each(drop);
+            }
+            6 => self.number(bytes, at),
+            7 => {
+                let from = self.below(other.len());
+                let part = &other[from..(from + self.below(400)).min(other.len())];
+                bytes.splice(at..end, part.iter().copied()).for_each(drop);
+            }
+            _ => {
+                for _ in 0..=self.below(3) {
+                    let at = self.below(reach);
+                    let flip = 1 << self.below(8);
+                    if let Some(byte) = bytes.get_mut(at) {
+                        *byte ^= flip;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Changes the number that comes next.
+    fn number(&mut self, bytes: &mut Vec<u8>, at: usize) {
+        let Some(start) = bytes[at..].iter().position(u8::is_ascii_digit).map(|n| at + n) else { return };
+        let len = bytes[start..].iter().take_while(|b| b.is_ascii_digit()).count();
+        let old: u64 = std::str::from_utf8(&bytes[start..start + len]).unwrap().parse().unwrap_or(0);
+        let new = match self.below(6) {
+            0 => old.wrapping_add(1),
+            1 => old.wrapping_sub(1),
+            2 => old.wrapping_mul(2),
+            3 => 0,
+            4 => u64::MAX - old % 16,
+            _ => 1_u64 << self.below(64),
+        };
+        bytes.splice(start..start + len, new.to_string().into_bytes()).for_each(drop);
+    }
+}
+
+/// Sets the length field of a shard to where its header now ends, if it still has one.
+fn mend_length(bytes: &mut [u8]) {
+    if bytes.get(8) != Some(&b'{') {
+        return;
+    }
+    // The header of every seed ends in these brackets, and spaces.
+    let Some(end) = bytes.windows(3).rposition(|w| w == b"]}}").map(|n| n + 3) else { return };
+    let spaces = bytes[end..].iter().take_while(|b| **b == b' ').count();
+    let length = (end + spaces - 8) as u64;
+    bytes[..8].copy_from_slice(&length.to_le_bytes());
+}
