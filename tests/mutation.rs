@@ -119,7 +119,7 @@ fn whatever_becomes_of_a_file_the_laws_hold() {
             let bytes = mutator.mutate(&seed.bytes, &other.bytes);
             let tried = catch_unwind(AssertUnwindSafe(|| {
                 hold(&seed.name, &bytes);
-                if number % CHECKED == 0 {
+                if number.is_multiple_of(CHECKED) {
                     let format = Format::ALL[number / CHECKED % Format::ALL.len()];
                     look(&bases[base], file, &bytes, &knowledge, format);
                 }

@@ -10,7 +10,8 @@ use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::Stored;
 use super::votes::Vote;
 use super::{adapter, facts, index, judge, modules, policy, tokens};
-use crate::checkpoint::{Checkpoint, Document, Fault, Place, line_column};
+use crate::checkpoint::document::Locator;
+use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::expression::within;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
@@ -135,6 +136,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     }
     let unselected = knowledge.rules.unselected.iter();
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not chosen".to_owned() }));
+    pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
     policy::apply(&knowledge.policy, checkpoint, &mut outcome);
     outcome
@@ -145,7 +147,10 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
     let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if f.kinds.iter().any(|k| faults.iter().any(|f| f.kind == k)));
     let rules = knowledge.rules.rules.iter().filter(asked);
     let bench = Bench::new(checkpoint, &[]);
-    rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect()
+    let mut findings: Vec<Finding> =
+        rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect();
+    pinpoint(checkpoint, &mut findings);
+    findings
 }
 
 /// Versions of the loaders that the checkpoint has to load under.
@@ -253,7 +258,7 @@ fn from_faults(
         let mut evidence = first.detail.clone();
         evidence.insert("count".to_owned(), json!(all.len()));
         let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, all.len())));
-        let (fix, places) = (fix.reduce(together).flatten(), locate(bench.checkpoint, &places));
+        let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
         return vec![finding(rule, &fault_scope(scope, first, all.len()), places, evidence, fix)];
     }
     let mut out = Vec::new();
@@ -265,7 +270,7 @@ fn from_faults(
         more = more.saturating_add(unkept(fault));
         let inner = fault_scope(scope, fault, 1);
         let fix = hint(rule, bench, fault, &inner);
-        out.push(finding(rule, &inner, locate(bench.checkpoint, &places), fault.detail.clone(), fix));
+        out.push(finding(rule, &inner, locate(&places), fault.detail.clone(), fix));
     }
     // The rest is only counted, and repaired with the last where each has a place of its own in a text.
     for fault in matching {
@@ -333,7 +338,7 @@ fn one_assert(rule: &Rule, check: &Assert, bench: &Bench<'_>, scope: &Scope<'_>)
     }
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
     let fix = fix::hint(&rule.fixes, &Site { bench, fault: None, scope });
-    Ok(Some(finding(rule, scope, locate(bench.checkpoint, &places), Map::new(), fix)))
+    Ok(Some(finding(rule, scope, locate(&places), Map::new(), fix)))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {
@@ -375,37 +380,45 @@ fn finding(
     }
 }
 
-/// Turns places into locations with line and column; a pointer that names no value points at the nearest parent.
-fn locate(checkpoint: &Checkpoint, places: &[Place]) -> Vec<Location> {
-    let mut spans: BTreeMap<(&str, &str), Option<std::ops::Range<usize>>> = BTreeMap::new();
-    places
-        .iter()
-        .map(|place| {
-            let document = place.file.as_deref().and_then(|f| checkpoint.document(f));
-            let span = place.span.clone().or_else(|| {
-                let (file, pointer) = (place.file.as_deref()?, place.pointer.as_deref()?);
-                spans.entry((file, pointer)).or_insert_with(|| nearest(document?, pointer)).clone()
-            });
-            let text = document.and_then(|d| d.text.as_deref()).or_else(|| {
-                place.file.as_deref().and_then(|f| checkpoint.modules.get(f)).and_then(|m| m.text.as_deref())
-            });
-            let at = span.as_ref().zip(text).map(|(s, t)| line_column(t, s.start));
-            Location {
-                file: place.file.clone(),
-                line: at.map(|a| a.0),
-                column: at.map(|a| a.1),
-                pointer: place.pointer.clone(),
-                tensor: place.tensor.clone(),
-                span,
-            }
-        })
-        .collect()
+/// Places as locations; [`pinpoint`] says where in their files they stand.
+fn locate(places: &[Place]) -> Vec<Location> {
+    let location = |place: &Place| Location {
+        file: place.file.clone(),
+        pointer: place.pointer.clone(),
+        tensor: place.tensor.clone(),
+        span: place.span.clone(),
+        ..Location::default()
+    };
+    places.iter().map(location).collect()
 }
 
-fn nearest(document: &Document, pointer: &str) -> Option<std::ops::Range<usize>> {
-    let mut pointer = pointer;
+/// Gives locations their line and column; a pointer that names no value points at the nearest parent.
+///
+/// All at once, so that each text is read once, however many findings point into it.
+fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
+    let mut locators: BTreeMap<String, Option<Locator<'_>>> = BTreeMap::new();
+    for location in findings.iter_mut().flat_map(|f| &mut f.locations) {
+        let Some(file) = &location.file else { continue };
+        let document = checkpoint.document(file);
+        let text = || {
+            let document = document.and_then(|d| d.text.as_deref());
+            document.or_else(|| checkpoint.modules.get(file).and_then(|m| m.text.as_deref()))
+        };
+        let locator = locators.entry(file.clone()).or_insert_with(|| text().map(Locator::new));
+        let Some(locator) = locator else { continue };
+        if location.span.is_none() && document.is_some() {
+            location.span = location.pointer.as_deref().and_then(|pointer| nearest(locator, pointer));
+        }
+        if let Some(span) = &location.span {
+            let (line, column) = locator.line_column(span.start);
+            (location.line, location.column) = (Some(line), Some(column));
+        }
+    }
+}
+
+fn nearest(locator: &mut Locator<'_>, mut pointer: &str) -> Option<std::ops::Range<usize>> {
     loop {
-        if let Some(span) = document.locate(pointer) {
+        if let Some(span) = locator.value(pointer) {
             return Some(span);
         }
         pointer = pointer.rsplit_once('/')?.0;

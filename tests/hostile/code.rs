@@ -110,7 +110,10 @@ fn exhausting() -> Vec<Case> {
         let _ = writeln!(classes, "{indent}class A{depth}:");
         let _ = writeln!(ifs, "{indent}if a:");
     }
-    let imports: String = (0..50_000).map(|i| format!("from .m{i} import a{i}\n")).collect();
+    let mut imports = String::new();
+    for i in 0..50_000 {
+        let _ = writeln!(imports, "from .m{i} import a{i}");
+    }
     vec![
         of("brackets", "(".repeat(100_000)),
         of("brackets, closed", format!("{}{}", "(".repeat(100_000), ")".repeat(100_000))),

@@ -54,7 +54,7 @@ fn lengths() -> Vec<Case> {
 fn sizes() -> Vec<Case> {
     let one = |row, name: &str, codes, dtype: &'static str, shape: &'static str, end: u64| {
         case(row, name, codes, "a", move |d| {
-            d.tensors(&entry("a", dtype, shape, 0, end), usize::try_from(end).unwrap())
+            d.tensors(&entry("a", dtype, shape, 0, end), usize::try_from(end).unwrap());
         })
     };
     let huge = |count: u64, size: u64| {

@@ -226,7 +226,7 @@ fn size() -> Vec<Case> {
             format!("{{{}}}", keys.join(","))
         }),
         case("J8", "a string of 60 MB", "JSN018", CONFIG, |d| {
-            d.config(format!("{{\"model_type\":\"{}\"}}", "x".repeat(60_000_000)))
+            d.config(format!("{{\"model_type\":\"{}\"}}", "x".repeat(60_000_000)));
         }),
         bounded("J8", "a hundred thousand values", |d| {
             d.config(format!("{{\"model_type\":\"x\",\"x\":[{}0]}}", "0,".repeat(99_000)));

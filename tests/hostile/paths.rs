@@ -216,7 +216,7 @@ fn many() -> Vec<Case> {
         of("missing shards", "IDX005", |i| format!("model-{i}.safetensors")),
         of("tensors that are nowhere", "IDX009", |_| numbered(1)),
         case("P9", "keys twice", "IDX004", INDEX, move |d| {
-            d.map(&[members(|_| numbered(1)), members(|_| numbered(2))].join(", "))
+            d.map(&[members(|_| numbered(1)), members(|_| numbered(2))].join(", "));
         }),
         case("P9", "empty shards", "SAF003", "", |d| {
             d.small();

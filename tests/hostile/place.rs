@@ -31,7 +31,7 @@ impl Dir {
         fs::create_dir_all(&root).unwrap();
         let dir = Self { root, outer };
         for name in ["evil.safetensors", "evil.py", "evil.json", "x.safetensors"] {
-            fs::write(dir.outer.join(name), file(&header(&entry("a", "U8", "[1]", 0, 1)), 1)).unwrap();
+            fs::write(dir.outer.join(name), file(header(&entry("a", "U8", "[1]", 0, 1)), 1)).unwrap();
         }
         dir
     }
@@ -61,7 +61,7 @@ impl Dir {
 
     /// A shard of these entries and so many bytes of data.
     pub fn entries(&self, entries: &str, data: usize) {
-        self.put(SHARD, file(&header(entries), data));
+        self.put(SHARD, file(header(entries), data));
     }
 
     /// The small one, with a shard of these entries.
@@ -75,7 +75,7 @@ impl Dir {
         self.small();
         fs::remove_file(self.root.join(SHARD)).unwrap();
         for (number, name) in [(1, "a"), (2, "b")] {
-            self.put(&numbered(number), file(&header(&entry(name, "U8", "[4]", 0, 4)), 4));
+            self.put(&numbered(number), file(header(&entry(name, "U8", "[4]", 0, 4)), 4));
         }
         self.put(INDEX, text);
     }

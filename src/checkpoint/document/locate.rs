@@ -93,8 +93,8 @@ impl<'t> Locator<'t> {
 impl Mark {
     /// The mark after these bytes of UTF-8.
     fn after(self, bytes: &[u8]) -> Self {
-        let line = bytes.iter().rposition(|b| *b == b'\n');
-        let breaks = bytes.iter().filter(|b| **b == b'\n').count();
+        let line = memchr::memrchr(b'\n', bytes);
+        let breaks = memchr::memchr_iter(b'\n', bytes).count();
         let rest = line.map_or(bytes, |at| bytes.get(at.saturating_add(1)..).unwrap_or_default());
         // A character begins with any byte but those that continue one.
         let characters = rest.iter().filter(|b| (**b & 0xc0) != 0x80).count();
