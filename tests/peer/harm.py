@@ -201,6 +201,7 @@ class Job:
 
     def calls(self):
         """All calls of an undisturbed run, and where those that write begin and end."""
+        self.reset()  # what the harm before left is not to be found repaired
         outcome = self.strace("-y", "-s", "8")
         if outcome.code != 0:
             raise Broken(f"{self.name} under strace: exit {outcome.code}\n{outcome.said}")
