@@ -85,6 +85,8 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
         }
     }
     let targets = Targets::of(config);
+    let vectors = modules.values().filter(|module| module.contains_key(&Role::Magnitude)).count();
+    let alike = vectors == 0 || vectors == modules.len();
     for (name, module) in &modules {
         pairs(name, module, &targets, faults);
         if !targets.may_cover(name) {
@@ -95,7 +97,7 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
         if magnitude.is_some() != targets.dora {
             let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
             let fault = Fault::new("adapter-dora-disagrees").at(at).with("module", *name);
-            faults.push(fault.with("stored", magnitude.is_some()));
+            faults.push(fault.with("stored", magnitude.is_some()).with("alike", alike));
         }
     }
     if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == "adapter-key-unread") {

@@ -111,6 +111,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     });
     let mut scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     scope.bind("loaders", &json!(loaders(config, versions)));
+    facts::bind_loads(&mut scope, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let bench = Bench::new(checkpoint, &outcome.loads);
     for rule in &knowledge.rules.rules {

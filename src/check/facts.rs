@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
+use super::finding::LoadReport;
 use super::tokens::OpenedTokenizer;
 use super::{index, modules};
 use crate::checkpoint::{Checkpoint, Document, Vocabulary};
@@ -81,6 +82,14 @@ pub fn scope(
     let here = Arc::clone(checkpoint);
     scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));
     scope
+}
+
+/// `stays_random`: what the loaders would say of a name.
+pub fn bind_loads(scope: &mut Scope<'static>, loads: Vec<LoadReport>) {
+    scope.function1("stays_random", move |name| match loads.as_slice() {
+        [] => Value::Null,
+        loads => json!(loads.iter().any(|report| report.leaves_random(name))),
+    });
 }
 
 /// Chat templates by the file that holds them; of several in one list the default.

@@ -102,6 +102,13 @@ impl LoadReport {
         self.missing.is_empty() && self.mismatched.is_empty() && self.raises.is_none()
     }
 
+    /// Whether a tensor of the class keeps its random start, reported or not.
+    #[must_use]
+    pub fn leaves_random(&self, name: &str) -> bool {
+        let absent = |silent: &Silent| silent.reason == "indexed-but-absent" && silent.name == name;
+        self.missing.iter().any(|missing| missing == name) || self.silent.iter().any(absent)
+    }
+
     /// Whether two loaders say the same.
     #[must_use]
     pub fn agrees(&self, other: &Self) -> bool {

@@ -109,8 +109,8 @@ pub struct FaultCheck {
 /// `tokens` (what the processor makes of it, by the names in `rules/processors/`, with `length` and
 /// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, `all_read` (every shard is there and
 /// its header was read), `loaders` (the versions it has to load under), and the functions `shape(tensor)`,
-/// `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`. A condition that cannot be evaluated because a
-/// value is not there is not a finding.
+/// `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, `stays_random(tensor)` (a loader starts it at random; null
+/// when the class is unknown). A condition that cannot be evaluated because a value is not there is not a finding.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
