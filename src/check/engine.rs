@@ -113,7 +113,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     scope.bind("loaders", &json!(loaders(config, versions)));
     facts::bind_loads(&mut scope, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
-    let bench = Bench::new(checkpoint, &outcome.loads);
+    let bench = Bench::new(checkpoint);
     for rule in &knowledge.rules.rules {
         // Rules of the program are known to end; of a user's rule that is found out.
         let (found, stopped) = match rule.origin {
@@ -147,7 +147,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
     let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if f.kinds.iter().any(|k| faults.iter().any(|f| f.kind == k)));
     let rules = knowledge.rules.rules.iter().filter(asked);
-    let bench = Bench::new(checkpoint, &[]);
+    let bench = Bench::new(checkpoint);
     let mut findings: Vec<Finding> =
         rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);

@@ -6,7 +6,6 @@ use std::ops::Range;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::finding::LoadReport;
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::rule::{EditSpec, Fix, Safety};
 use crate::knowledge::{Scope, source};
@@ -84,6 +83,12 @@ impl Edit {
     }
 }
 
+/// The name of a tensor after a renaming by prefixes; `None` where none of them fits.
+#[must_use]
+pub fn renamed(prefixes: &[(String, String)], name: &str) -> Option<String> {
+    prefixes.iter().find_map(|(from, to)| Some(format!("{to}{}", name.strip_prefix(from.as_str())?)))
+}
+
 /// What can be done about a finding.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FixHint {
@@ -118,17 +123,13 @@ impl FixHint {
 /// What fixes of one checkpoint share: what takes long is worked out once.
 pub(super) struct Bench<'a> {
     pub(super) checkpoint: &'a Checkpoint,
-    /// What the loaders say of the tensors.
-    loads: &'a [LoadReport],
     /// The edit that rebuilds the index, if that can be done.
     index: OnceCell<Option<Edit>>,
-    /// The edits that rename tensors to what the class has.
-    names: OnceCell<Option<Vec<Edit>>>,
 }
 
 impl<'a> Bench<'a> {
-    pub(super) fn new(checkpoint: &'a Checkpoint, loads: &'a [LoadReport]) -> Self {
-        Self { checkpoint, loads, index: OnceCell::new(), names: OnceCell::new() }
+    pub(super) fn new(checkpoint: &'a Checkpoint) -> Self {
+        Self { checkpoint, index: OnceCell::new() }
     }
 }
 
@@ -200,8 +201,9 @@ fn made(specs: &[EditSpec], site: &Site<'_>) -> Option<Vec<Edit>> {
                 let (file, range) = (place.file.clone()?, place.span.clone()?);
                 edits.push(Edit::Splice { file, range, text: text(with)? });
             }
-            EditSpec::Rename { from, to } => {
-                edits.push(Edit::Rename { prefixes: vec![(text(from)?, text(to)?)] });
+            EditSpec::Rename(prefixes) => {
+                let prefixes = serde_json::from_value(prefixes.eval(site.scope).ok()?).ok()?;
+                edits.push(repairs::rename(site.checkpoint(), prefixes)?);
             }
             EditSpec::Write { file, text: path } => {
                 let (file, text) = (text(file)?, source::text(&format!("recipes/{path}"))?.to_owned());

@@ -9,6 +9,8 @@ mod names;
 mod texts;
 mod tokens;
 
+pub(super) use names::rename;
+
 use super::{Edit, Site};
 use crate::check::index::{by_tensor, numbered, readable, shard_names, similar};
 use crate::checkpoint::{Checkpoint, INDEX_NAME, Shard};
@@ -27,7 +29,6 @@ pub(super) fn run(name: &str, site: &Site<'_>) -> Option<Vec<Edit>> {
             edit.clone().map(|edit| vec![edit])
         }
         "reencode" => Some(vec![Edit::Reencode { file: site.place()?.file.clone()? }]),
-        "rename-prefix" => site.bench.names.get_or_init(|| names::rename_prefix(site)).clone(),
         "write-header" => write_headers(site),
         _ => None,
     }
@@ -96,14 +97,15 @@ const OF_THE_HEADER: [&str; 7] = [
     "trailing-bytes",
 ];
 
+/// Whether nothing is lost when the shard is written with a header made from what was read of the old one.
+fn is_rewritable(shard: &Shard) -> bool {
+    is_whole(shard) && shard.faults.iter().all(|f| OF_THE_HEADER.contains(&f.kind))
+}
+
 /// Writes the header of every shard that the finding names anew.
 fn write_headers(site: &Site<'_>) -> Option<Vec<Edit>> {
     let files: BTreeSet<&str> = site.fault?.places.iter().filter_map(|p| p.file.as_deref()).collect();
-    let sound = |file: &&str| {
-        let shard = site.checkpoint().shards.get(*file);
-        shard.is_some_and(|s| is_whole(s) && s.faults.iter().all(|f| OF_THE_HEADER.contains(&f.kind)))
-    };
-    if files.is_empty() || !files.iter().all(sound) {
+    if files.is_empty() || !files.iter().all(|file| site.checkpoint().shards.get(*file).is_some_and(is_rewritable)) {
         return None;
     }
     Some(files.into_iter().map(|file| Edit::Header { file: file.to_owned() }).collect())

@@ -7,6 +7,8 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde_json::json;
+
 use super::{Stored, predict};
 use crate::check::finding::LoadReport;
 use crate::checkpoint::{Fault, Place};
@@ -18,6 +20,8 @@ const SAMPLES: usize = 48;
 const DEPTH: usize = 4;
 /// Prefixes that are told, one after the other.
 const ROUNDS: usize = 3;
+/// Pairs of prefixes that one of them may come to, so that it moves no other tensor.
+const PAIRS: usize = 64;
 
 /// A checkpoint with its tensors under the names of the class.
 #[derive(Debug, Clone)]
@@ -46,7 +50,8 @@ pub fn moved(expected: &Expected, stored: &Stored, report: &LoadReport) -> Optio
         if cleared < step.names.len() {
             break;
         }
-        found.faults.push(step.fault());
+        // Those that an earlier step has moved were under other names before.
+        found.faults.push(step.fault(stored));
         found.stored = renamed;
         found.report = report;
     }
@@ -62,20 +67,50 @@ struct Step {
     from: String,
     to: String,
     names: Vec<String>,
-    /// Whether no other tensor's name starts so.
-    alone: bool,
 }
 
 impl Step {
-    fn fault(&self) -> Fault {
+    fn fault(&self, stored: &Stored) -> Fault {
         let mut fault = Fault::new("names-moved")
             .with("from", self.from.as_str())
             .with("to", self.to.as_str())
             .with("count", self.names.len())
-            .with("alone", self.alone)
+            .with("prefixes", json!(self.prefixes(stored)))
             .with("names", super::listed(&self.names));
         fault.places = self.names.iter().take(super::NAMES_SHOWN).map(Place::tensor).collect();
         fault
+    }
+
+    /// Pairs of prefixes that rename these tensors and no other: where others have the prefix too, longer ones. None
+    /// when there would be too many, or a whole name is the start of another one.
+    fn prefixes(&self, stored: &Stored) -> Vec<(String, String)> {
+        let ours: BTreeSet<&str> = self.names.iter().map(String::as_str).collect();
+        let all: BTreeSet<&str> = stored.names().chain(stored.shapes().map(|(name, _)| name)).collect();
+        let mut shared: BTreeSet<&str> = BTreeSet::new();
+        let mut found: Vec<(String, String)> = Vec::new();
+        for name in &self.names {
+            if found.iter().any(|(from, _)| name.starts_with(from)) {
+                continue;
+            }
+            let rest = self.from.len();
+            let ends = name.match_indices('.').map(|(at, _)| at.saturating_add(1)).filter(|end| *end > rest);
+            let ends = std::iter::once(rest).chain(ends.take(DEPTH)).chain([name.len()]);
+            let exact = ends.filter_map(|end| name.get(..end)).find(|prefix| {
+                let alone = !shared.contains(prefix)
+                    && all.range(*prefix..).take_while(|n| n.starts_with(prefix)).all(|n| ours.contains(n));
+                if !alone {
+                    shared.insert(prefix);
+                }
+                alone
+            });
+            match exact.and_then(|prefix| Some((prefix, prefix.strip_prefix(&self.from)?))) {
+                Some((prefix, rest)) if found.len() < PAIRS => {
+                    found.push((prefix.to_owned(), format!("{}{rest}", self.to)));
+                }
+                _ => return Vec::new(),
+            }
+        }
+        found
     }
 }
 
@@ -111,7 +146,7 @@ fn best(expected: &Expected, stored: &Stored) -> Option<Step> {
     }
     let arrives = |n: &&str| n.strip_prefix(from).is_some_and(|rest| wanted.contains(&*format!("{to}{rest}")));
     let names = strays.into_iter().filter(arrives).map(str::to_owned).collect();
-    Some(Step { from: from.to_owned(), to: to.to_owned(), names, alone: alone(from, count) })
+    Some(Step { from: from.to_owned(), to: to.to_owned(), names })
 }
 
 /// A name taken apart after each of its first dots, and before the first; never behind a number, which is a place in a

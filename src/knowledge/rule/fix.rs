@@ -79,13 +79,9 @@ pub enum EditSpec {
         /// The text; empty to take them away.
         with: Template,
     },
-    /// Gives every tensor whose name starts so another start, in the shards and in the index.
-    Rename {
-        /// How the names start.
-        from: Template,
-        /// How they start afterwards.
-        to: Template,
-    },
+    /// Gives tensors whose names start so another start, in the shards and in the index: pairs of how names start and how
+    /// they start afterwards, of which the first that fits a name counts.
+    Rename(Expression),
     /// Adds a file from `rules/recipes/`, under a name that must be free.
     Write {
         /// File name.
@@ -122,7 +118,6 @@ pub const REPAIRS: &[&str] = &[
     "quote-string",
     "rebuild-index",
     "reencode",
-    "rename-prefix",
     "write-header",
 ];
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use crate::check::Edit;
+use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
 use crate::checkpoint::{Checkpoint, Document, Module, Parts, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, Source, TensorRef, format_pt};
@@ -268,31 +268,16 @@ impl Draft {
     }
 
     fn rename(&mut self, prefixes: &[(String, String)], index: Option<&str>) -> Option<()> {
-        let renamed = |name: &str| {
-            let fit = |(from, to): &(String, String)| Some(format!("{to}{}", name.strip_prefix(from.as_str())?));
-            prefixes.iter().find_map(fit)
-        };
-        let names: Vec<&str> = self.current.tensors().map(|(_, t)| t.name.as_str()).collect();
-        let after: BTreeSet<String> = names.iter().map(|n| renamed(n).unwrap_or_else(|| (*n).to_owned())).collect();
-        let before: BTreeSet<&str> = names.iter().copied().collect();
-        let moved: BTreeSet<String> = self
-            .current
-            .tensors()
-            .filter(|(_, t)| renamed(&t.name).is_some_and(|new| new != t.name))
-            .map(|(s, _)| s.name.clone())
-            .collect();
-        // Two tensors of one name would be one too few.
-        if after.len() != before.len() || moved.is_empty() {
-            return None;
-        }
-        for file in moved {
-            let mut planned = self.planned(&file)?;
+        let renamed = |name: &str| renamed(prefixes, name);
+        let shards = Arc::clone(&self.current);
+        for shard in shards.shards.values().filter(|s| s.tensors.iter().any(|t| renamed(&t.name).is_some())) {
+            let mut planned = self.planned(&shard.name)?;
             for tensor in &mut planned.tensors {
                 if let Some(new) = renamed(&tensor.name) {
                     tensor.name = new;
                 }
             }
-            self.shards.insert(file, planned);
+            self.shards.insert(shard.name.clone(), planned);
         }
         let Some(index) = index else { return Some(()) };
         let text = self.text(index)?;
