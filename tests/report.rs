@@ -43,6 +43,11 @@ fn findings() {
 }
 
 #[test]
+fn fixes_of_text_are_replacements_in_sarif() {
+    insta::assert_snapshot!("fixable-sarif", show(&samples::fixable(), Format::Sarif));
+}
+
+#[test]
 fn long_lists_are_capped_but_in_json() {
     let report = samples::long_lists();
     for format in [Format::Full, Format::Concise, Format::Markdown] {

@@ -12,6 +12,7 @@
 mod cli;
 mod edits;
 mod journal;
+mod sarif;
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -9,10 +9,11 @@ use serde_json::{Value, json};
 use super::{samples, show};
 
 /// Every sample, and how many findings and seams there are in it.
-fn all() -> [(&'static str, Report, usize); 6] {
+fn all() -> [(&'static str, Report, usize); 7] {
     [
         ("clean", samples::clean(), 0),
         ("findings", samples::findings(), 8),
+        ("fixable", samples::fixable(), 3),
         ("long", samples::long_lists(), 42),
         ("hostile", samples::hostile(), 1),
         ("merge", samples::merge_ok(), 2),

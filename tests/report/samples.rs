@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ckpt_doctor::check::finding::{LoadReport, Mismatch, Silent};
-use ckpt_doctor::check::{Finding, FixHint, Location, Safety, Severity};
+use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage,
@@ -208,6 +208,30 @@ fn load() -> LoadReport {
 }
 
 /// More of everything than anyone wants to read.
+/// A document whose lines hold characters of several bytes, and fixes of each kind that is text.
+pub fn fixable() -> Report {
+    const ODD: &str = "{\n  \"größe\": NaN, \"rope_theta\": -1,\n  \"字\": {\"trust_remote_code\": true}\n}\n";
+    let file = || "config.json".to_owned();
+    let start = ODD.find("NaN").expect("the sample holds it");
+    let mut literal = finding("JSN002", "nan", Severity::Warning, "a number is NaN", json!({}));
+    literal.locations = vec![at("config.json", ODD, "NaN", 0, "/größe")];
+    let edits = vec![Edit::Splice { file: file(), range: start..start + 3, text: "null".to_owned() }];
+    literal.fix = Some(FixHint::new(Safety::Safe, "write null", edits));
+
+    let mut value = finding("CFG099", "rope-theta", Severity::Error, "rope_theta is -1", json!({}));
+    value.locations = vec![at("config.json", ODD, "-1", 0, "/rope_theta")];
+    let edits = vec![
+        Edit::Set { file: file(), pointer: "/rope_theta".to_owned(), value: json!(10000.0) },
+        Edit::Remove { file: file(), pointer: "/字/trust_remote_code".to_owned() },
+    ];
+    value.fix = Some(FixHint::new(Safety::Unsafe, "set rope_theta to 10000.0", edits));
+
+    let mut header = finding("SAF009", "no-format", Severity::Error, "no shard names its format", json!({}));
+    let edits = vec![Edit::Header { file: "model.safetensors".to_owned() }];
+    header.fix = Some(FixHint::new(Safety::Safe, "write the header anew", edits));
+    Report::new(vec![checkpoint("models/odd", vec![literal, value, header], &[("config.json", ODD)])], None)
+}
+
 pub fn long_lists() -> Report {
     let mut findings: Vec<Finding> = (0..40)
         .map(|n| {
