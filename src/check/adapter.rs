@@ -87,12 +87,9 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
     let targets = Targets::of(config);
     let vectors = modules.values().filter(|module| module.contains_key(&Role::Magnitude)).count();
     let alike = vectors == 0 || vectors == modules.len();
+    let trained = if targets.is_uniform() { trained_rank(&modules) } else { None };
     for (name, module) in &modules {
-        pairs(name, module, &targets, faults);
-        if !targets.may_cover(name) {
-            let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
-            faults.push(Fault::new("adapter-module-untargeted").at(at).with("module", *name));
-        }
+        pairs(name, module, &targets, trained, faults);
         let magnitude = module.get(&Role::Magnitude);
         if magnitude.is_some() != targets.dora {
             let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
@@ -100,6 +97,7 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
             faults.push(fault.with("stored", magnitude.is_some()).with("alike", alike));
         }
     }
+    untargeted(config, &modules, &targets, faults);
     if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == "adapter-key-unread") {
         faults.push(Fault::new("adapter-without-matrices").at(Place::file(CONFIG)));
     }
@@ -112,9 +110,40 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
     }
 }
 
+/// One fault for all modules that have matrices and get none, with the list that would name them.
+fn untargeted(config: &Value, modules: &BTreeMap<&str, Module<'_>>, targets: &Targets<'_>, faults: &mut Vec<Fault>) {
+    let left_out: Vec<(&&str, &Module<'_>)> = modules.iter().filter(|(name, _)| !targets.may_cover(name)).collect();
+    let Some((first, _)) = left_out.first() else { return };
+    let mut fault = Fault::new("adapter-module-untargeted").with("module", **first).with("count", left_out.len());
+    fault.places = left_out.iter().filter_map(|(_, m)| Some(Place::tensor(&*m.values().next()?.name))).collect();
+    let narrowed = ["exclude_modules", "layers_to_transform", "layers_pattern"];
+    let is_plain = narrowed.iter().all(|key| config.get(key).is_none_or(Value::is_null));
+    if let Some(Value::Array(named)) = config.get("target_modules").filter(|_| is_plain) {
+        let names = left_out.iter().map(|(name, _)| Value::from(**name));
+        fault = fault.with("targets", named.iter().cloned().chain(names).collect::<Vec<_>>());
+    }
+    faults.push(fault);
+}
+
+/// The two matrices of a module, as weights and as embeddings.
+const PAIRS: [(Role, Role); 2] = [(Role::A, Role::B), (Role::EmbeddingA, Role::EmbeddingB)];
+
+/// The rank of every pair, when all have the same.
+fn trained_rank(modules: &BTreeMap<&str, Module<'_>>) -> Option<u64> {
+    let pairs = modules.values().flat_map(|m| PAIRS.iter().filter_map(|(a, b)| Some((m.get(a)?, m.get(b)?))));
+    let ranks: Option<BTreeSet<u64>> = pairs
+        .map(|(a, b)| {
+            let (rank, other) = (a.shape.first()?, b.shape.get(1)?);
+            (rank == other).then_some(*rank)
+        })
+        .collect();
+    let ranks = ranks.filter(|ranks| ranks.len() == 1)?;
+    ranks.first().copied().filter(|rank| *rank > 0)
+}
+
 /// `lora_A [r, in]` and `lora_B [out, r]` of one module, of one rank, and that of the config.
-fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, faults: &mut Vec<Fault>) {
-    for (down, up) in [(Role::A, Role::B), (Role::EmbeddingA, Role::EmbeddingB)] {
+fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, trained: Option<u64>, faults: &mut Vec<Fault>) {
+    for (down, up) in PAIRS {
         let (a, b) = match (module.get(&down), module.get(&up)) {
             (None, None) => continue,
             (Some(a), Some(b)) => (a, b),
@@ -135,7 +164,8 @@ fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, faults: &mut Ve
         if rank != other || expected.is_some_and(|expected| expected != rank) {
             let fault = Fault::new("adapter-rank-disagrees").at(Place::tensor(&*a.name)).with("module", name);
             let fault = fault.with("a", a.shape.clone()).with("b", b.shape.clone());
-            faults.push(fault.with("rank", expected.map_or(Value::Null, Value::from)));
+            let fault = fault.with("rank", expected.map_or(Value::Null, Value::from));
+            faults.push(trained.into_iter().fold(fault, |fault, trained| fault.with("trained", trained)));
         }
         if down == Role::A
             && let Some(magnitude) = module.get(&Role::Magnitude)

@@ -114,6 +114,17 @@ fn escape(key: &str) -> String {
     key.replace('~', "~0").replace('/', "~1")
 }
 
+/// A repository on the hub that the files name: where other entries take their code from, or the model that this one was
+/// made from.
+fn origin(checkpoint: &Checkpoint, entries: &[Entry]) -> Option<String> {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let is_part = |part: &str| part.starts_with(|c: char| c.is_ascii_alphanumeric()) && part.chars().all(is_plain);
+    let is_id = |id: &&str| id.split_once('/').is_some_and(|(owner, model)| is_part(owner) && is_part(model));
+    let of_code = entries.iter().filter_map(|entry| Some(entry.target.split_once("--")?.0));
+    let of_model = checkpoint.config().and_then(|config| config.get("_name_or_path")?.as_str());
+    of_code.chain(of_model).find(is_id).map(str::to_owned)
+}
+
 /// Modules beside this one that it imports.
 pub fn relative_modules(module: &Module) -> BTreeSet<String> {
     let beside = module.relative_imports.iter().filter(|i| i.level == 1 && !i.module.is_empty());
@@ -149,6 +160,7 @@ fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
 #[must_use]
 pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
     let (entries, mut faults) = read(checkpoint);
+    let origin = origin(checkpoint, &entries);
     let mut roots: BTreeSet<&str> = BTreeSet::new();
     for entry in &entries {
         let fault = |kind| {
@@ -178,7 +190,8 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             let kind = if entry.nested { "auto-map-nested-missing" } else { "auto-map-module-missing" };
             // Stop at one entry a module: the second says nothing new.
             if entry.nested || roots.insert(module) {
-                faults.push(fault(kind).with("module", format!("{module}.py")));
+                let fault = fault(kind).with("module", format!("{module}.py"));
+                faults.push(origin.iter().fold(fault, |fault, origin| fault.with("origin", origin.as_str())));
             }
             continue;
         };

@@ -1,8 +1,8 @@
 //! What a git work tree says of a checkpoint's files: which of them git-lfs keeps.
 //!
 //! A model repository holds pointers in the place of its large files, and a work tree without their content is how
-//! `GIT_LFS_SKIP_SMUDGE=1` leaves it. No git is run: `.gitattributes` says which files are meant
-//! (<https://git-scm.com/docs/gitattributes>).
+//! `GIT_LFS_SKIP_SMUDGE=1` leaves it; so does a clone where git-lfs is not installed, and there nobody meant it. No git is
+//! run: `.gitattributes` says which files git-lfs keeps (<https://git-scm.com/docs/gitattributes>).
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -52,6 +52,9 @@ fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
     let Some(top) = root.ancestors().find(|dir| dir.join(".git").symlink_metadata().is_ok()) else {
         return BTreeSet::new();
     };
+    if !lfs_was_here(top) {
+        return BTreeSet::new();
+    }
     // From the work tree's top down: the line that comes last decides.
     let mut folders: Vec<&Path> = root.ancestors().take_while(|dir| dir.starts_with(top)).collect();
     folders.reverse();
@@ -66,6 +69,15 @@ fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
         all.filter_map(says).next_back().unwrap_or(false)
     });
     files
+}
+
+/// Whether git-lfs has run in this work tree, and so its files are pointers by choice; without it a clone has pointers
+/// because nobody fetched the content. Its filter leaves a folder and a hook behind, even where it is told to fetch
+/// nothing. What is elsewhere, for a work tree of another clone, is taken for granted.
+fn lfs_was_here(top: &Path) -> bool {
+    let git = top.join(".git");
+    let is_there = |path: &str| git.join(path).symlink_metadata().is_ok();
+    !git.is_dir() || is_there("lfs") || is_there("hooks/pre-push")
 }
 
 fn lines(dir: &Path) -> Vec<Line> {
@@ -118,7 +130,9 @@ mod tests {
                           a/t.json filter=lfs\n\"x{y}.npy\" filter=lfs\n*.json text\n";
         fs::write(dir.path().join(".gitattributes"), attributes).unwrap();
         assert_eq!(kept(), "", "no work tree");
-        fs::write(dir.path().join(".git"), "gitdir: elsewhere").unwrap();
+        fs::create_dir_all(dir.path().join(".git/hooks")).unwrap();
+        assert_eq!(kept(), "", "a clone without git-lfs");
+        fs::create_dir(dir.path().join(".git/lfs")).unwrap();
         assert_eq!(kept(), "a.bin a.safetensors model.safetensors x{y}.npy");
         fs::write(root.join(".gitattributes"), "/model.safetensors !filter\na.bin filter=other\nt.json filter=lfs")
             .unwrap();

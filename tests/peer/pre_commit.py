@@ -97,7 +97,7 @@ def main(files, room):
     expect(commit(repo, "a shard less", ok=False), shard.name)
     git("checkout", "-q", "-f", "HEAD", cwd=repo)
 
-    # What a clone without git-lfs has: pointers, which are as they should be.
+    # What GIT_LFS_SKIP_SMUDGE=1 leaves: pointers, which are as they should be where git-lfs is at work.
     other = repo / "models" / "b"
     shutil.copytree(model, other)
     other.joinpath(".gitattributes").write_text("*.safetensors filter=lfs diff=lfs merge=lfs -text\n")
@@ -105,6 +105,7 @@ def main(files, room):
         shard.write_text(POINTER.format(f"{n:064x}"))
     for key in ("clean", "smudge"):
         git("config", f"filter.lfs.{key}", "cat", cwd=repo)
+    repo.joinpath(".git/lfs").mkdir()
     commit(repo, "pointers of git-lfs")
     print("pointers of git-lfs are committed")
 

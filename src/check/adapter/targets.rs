@@ -65,6 +65,11 @@ impl<'c> Targets<'c> {
         }
     }
 
+    /// Whether all modules have the same rank.
+    pub(super) fn is_uniform(&self) -> bool {
+        self.ranks.is_empty()
+    }
+
     /// The rank of a module, when it follows from the config.
     pub(super) fn rank(&self, module: &str) -> Option<u64> {
         for (pattern, rank) in &self.ranks {

@@ -33,6 +33,8 @@ pub(super) fn read(dir: &Path, name: &str) -> Shard {
     shard
 }
 
+/// Bytes before a hole that may be zero and were written: the largest block of a usual file system.
+const BLOCK: u64 = 64 << 10;
 /// Stretches of a file that are looked at for its last hole.
 const STRETCHES: usize = 10_000;
 
@@ -54,12 +56,22 @@ fn unwritten_tail(shard: &Shard, opened: &Opened) -> Option<Fault> {
             Ok(data) if data > hole => at = data,
             Err(Errno::NXIO) => {
                 let tensors: Vec<&Tensor> = shard.tensors.iter().collect();
-                return tail(shard, &tensors, hole.saturating_sub(shard.data_start));
+                return tail(shard, &tensors, written(opened, shard.data_start, hole)?);
             }
             _ => return None,
         }
     }
     None
+}
+
+/// Where the zeros begin that a hole goes on with, counted in the data: the block before it was written whole.
+fn written(opened: &Opened, data_start: u64, hole: u64) -> Option<u64> {
+    let end = hole.saturating_sub(data_start);
+    let mut block = vec![0; usize::try_from(end.min(BLOCK)).ok()?];
+    let begin = hole.saturating_sub(end.min(BLOCK));
+    opened.file.read_exact_at(&mut block, begin).ok()?;
+    let last = block.iter().rposition(|byte| *byte != 0).map_or(0, |at| at.saturating_add(1));
+    Some(begin.saturating_sub(data_start).saturating_add(u64::try_from(last).ok()?))
 }
 
 fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
