@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 pub enum ApplyError {
     /// The target is in the way.
-    #[error("{path}: {reason}; choose an --out that does not exist yet or is an empty directory", path = path.display())]
+    #[error("{path}: {reason}; choose a directory that does not exist yet or is empty", path = path.display())]
     Target {
         /// The target.
         path: PathBuf,
@@ -15,7 +15,7 @@ pub enum ApplyError {
         reason: String,
     },
     /// The target and a donor overlap.
-    #[error("{path}: {reason}; donors are never written to, choose an --out elsewhere", path = path.display())]
+    #[error("{path}: {reason}; what is read is never written to, choose a directory elsewhere", path = path.display())]
     Donor {
         /// The target.
         path: PathBuf,
@@ -23,7 +23,7 @@ pub enum ApplyError {
         reason: String,
     },
     /// Another run holds the staging directory.
-    #[error("{path}: another run is writing there ({holder}); wait for it or choose another --out", path = path.display())]
+    #[error("{path}: another run is writing there ({holder}); wait for it or choose another directory", path = path.display())]
     Busy {
         /// The target.
         path: PathBuf,
@@ -43,7 +43,7 @@ pub enum ApplyError {
         have: u64,
     },
     /// No more files can be made, however small they are.
-    #[error("{path}: {doing}: {error}: need {need} files, have {have} (inodes); choose an --out on another disk", path = path.display())]
+    #[error("{path}: {doing}: {error}: need {need} files, have {have} (inodes); remove some, or write to another disk", path = path.display())]
     Files {
         /// What was being made.
         path: PathBuf,
@@ -57,7 +57,7 @@ pub enum ApplyError {
         have: u64,
     },
     /// One file is larger than may be.
-    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that, or write smaller shards", path = path.display())]
+    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that, or save in smaller shards", path = path.display())]
     FileSize {
         /// The file.
         path: PathBuf,
@@ -88,7 +88,7 @@ pub enum ApplyError {
         error: io::Error,
     },
     /// Writing failed, and so did removing what was written until then.
-    #[error("{error}; {path} could not be removed ({why}), the next run with the same --out will try again", path = path.display())]
+    #[error("{error}; {path} could not be removed ({why}), the next run that writes to the same place will try again", path = path.display())]
     Left {
         /// What went wrong first.
         error: Box<Self>,

@@ -84,6 +84,7 @@ fn a_copy_is_made_elsewhere() {
     ] {
         let (code, text) = doctor(room.path(), args);
         assert!(code == 2 && text.contains(why), "{args:?}: {code} {text}");
+        assert!(!text.contains("--out "), "that is an option of another command: {text}");
     }
 }
 

@@ -126,6 +126,12 @@ impl Scope<'_> {
         Scope { context: self.context.new_inner_scope() }
     }
 
+    /// A variable that is bound here or further out; `None` when there is none, or it has no form in JSON.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<Value> {
+        to_json(&Cel::try_from(self.context.get_variable(name)?.as_ref()).ok()?)
+    }
+
     pub(super) fn context(&self) -> &Context<'_, 'static> {
         &self.context
     }

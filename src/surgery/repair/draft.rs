@@ -32,6 +32,14 @@ enum Touch {
     Whole,
 }
 
+/// A file before a fix was tried.
+struct Before {
+    file: String,
+    text: Option<Arc<str>>,
+    shard: Option<Arc<PlannedShard>>,
+    touch: Option<Touch>,
+}
+
 /// A checkpoint with some of its files changed.
 #[derive(Debug, Clone)]
 pub(super) struct Draft {
@@ -41,7 +49,7 @@ pub(super) struct Draft {
     /// Changed documents and modules.
     pub(super) texts: BTreeMap<String, Arc<str>>,
     /// Shards with a new header.
-    pub(super) shards: BTreeMap<String, PlannedShard>,
+    pub(super) shards: BTreeMap<String, Arc<PlannedShard>>,
     touched: BTreeMap<String, Touch>,
     /// Edits of whole files that this round has made: several findings may ask for the same.
     made: Vec<Edit>,
@@ -66,15 +74,56 @@ impl Draft {
 
     /// Makes all edits of a fix, or none.
     pub(super) fn make(&mut self, edits: &[Edit]) -> Made {
-        let mut trial = self.clone();
-        for edit in edits {
-            match trial.make_one(edit) {
-                Made::All => {}
-                other => return other,
+        let (before, whole) = (self.before(edits), self.made.len());
+        let failed = edits.iter().map(|edit| self.make_one(edit)).find(|made| *made != Made::All);
+        if failed.is_some() {
+            self.made.truncate(whole);
+            self.restore(before);
+        }
+        failed.unwrap_or(Made::All)
+    }
+
+    /// What is known of the files that these edits touch.
+    fn before(&self, edits: &[Edit]) -> Vec<Before> {
+        let files: BTreeSet<String> = edits.iter().flat_map(|edit| self.files(edit)).collect();
+        let state = |file: String| Before {
+            text: self.texts.get(&file).cloned(),
+            shard: self.shards.get(&file).cloned(),
+            touch: self.touched.get(&file).cloned(),
+            file,
+        };
+        files.into_iter().map(state).collect()
+    }
+
+    fn restore(&mut self, before: Vec<Before>) {
+        fn put<T>(map: &mut BTreeMap<String, T>, file: &str, old: Option<T>) {
+            match old {
+                Some(old) => drop(map.insert(file.to_owned(), old)),
+                None => drop(map.remove(file)),
             }
         }
-        *self = trial;
-        Made::All
+        for Before { file, text, shard, touch } in before {
+            put(&mut self.texts, &file, text);
+            put(&mut self.shards, &file, shard);
+            put(&mut self.touched, &file, touch);
+        }
+    }
+
+    /// The files that an edit changes, or takes for itself.
+    fn files(&self, edit: &Edit) -> Vec<String> {
+        match edit {
+            Edit::Splice { file, .. }
+            | Edit::Set { file, .. }
+            | Edit::Remove { file, .. }
+            | Edit::Write { file, .. }
+            | Edit::Reencode { file }
+            | Edit::Header { file } => vec![file.clone()],
+            Edit::Index { file, shards } => shards.iter().chain([file]).cloned().collect(),
+            Edit::Rename { .. } => {
+                let index = self.current.index.as_ref().map(|index| &index.document);
+                self.current.shards.keys().chain(index).cloned().collect()
+            }
+        }
     }
 
     /// Ends the round: the checkpoint with everything made so far.
@@ -94,7 +143,7 @@ impl Draft {
                 parts.documents.push(Document::parse(name.as_str(), text.as_bytes()));
             }
         }
-        parts.shards = self.shards.values().map(PlannedShard::preview).collect();
+        parts.shards = self.shards.values().map(|shard| shard.preview()).collect();
         self.current = Arc::new(self.original.replaced(parts));
         Some(())
     }
@@ -114,36 +163,25 @@ impl Draft {
             Edit::Set { file, pointer, value } => return self.point(file, pointer, |d| d.set(pointer, value)),
             Edit::Remove { file, pointer } => return self.point(file, pointer, |d| d.remove(pointer)),
             whole if self.made.contains(whole) => return Made::All,
-            Edit::Write { file, text } => self.claim([file.as_str()]).then(|| self.write(file, text)),
-            Edit::Reencode { file } => self.claim([file.as_str()]).then(|| self.reencode(file)),
-            Edit::Index { file, shards } => {
-                let files = shards.iter().chain([file]).map(String::as_str);
-                self.claim(files).then(|| self.index(file, shards))
-            }
-            Edit::Header { file } => self.claim([file.as_str()]).then(|| self.header(file)),
-            Edit::Rename { prefixes } => {
-                let (current, index) = (Arc::clone(&self.current), self.current.index.as_ref());
-                let index = index.map(|i| i.document.clone());
-                let files = current.shards.keys().chain(&index).map(String::as_str);
-                self.claim(files).then(|| self.rename(prefixes, index.as_deref()))
-            }
+            whole if !self.claim(self.files(whole)) => return Made::Later,
+            Edit::Write { file, text } => self.write(file, text),
+            Edit::Reencode { file } => self.reencode(file),
+            Edit::Index { file, shards } => self.index(file, shards),
+            Edit::Header { file } => self.header(file),
+            Edit::Rename { prefixes } => self.rename(prefixes),
         };
-        match made {
-            None => Made::Later,
-            Some(None) => Made::Nothing,
-            Some(Some(())) => {
-                self.made.push(edit.clone());
-                Made::All
-            }
+        if made.is_none() {
+            return Made::Nothing;
         }
+        self.made.push(edit.clone());
+        Made::All
     }
 
     /// Takes whole files for one edit, unless this round has touched one of them.
-    fn claim<'f>(&mut self, files: impl IntoIterator<Item = &'f str>) -> bool {
-        let files: Vec<&str> = files.into_iter().collect();
-        let free = files.iter().all(|file| !self.touched.contains_key(*file));
+    fn claim(&mut self, files: Vec<String>) -> bool {
+        let free = files.iter().all(|file| !self.touched.contains_key(file));
         if free {
-            self.touched.extend(files.into_iter().map(|file| (file.to_owned(), Touch::Whole)));
+            self.touched.extend(files.into_iter().map(|file| (file, Touch::Whole)));
         }
         free
     }
@@ -235,7 +273,7 @@ impl Draft {
     /// The shard with its bytes where they are in the original.
     fn planned(&self, file: &str) -> Option<PlannedShard> {
         if let Some(planned) = self.shards.get(file) {
-            return Some(planned.clone());
+            return Some(PlannedShard::clone(planned));
         }
         let shard = self.original.shards.get(file)?;
         let path = self.original.root.join(file);
@@ -263,26 +301,50 @@ impl Draft {
         for (key, value) in format_pt() {
             planned.metadata.entry(key).or_insert(value);
         }
-        self.shards.insert(file.to_owned(), planned);
+        self.shards.insert(file.to_owned(), Arc::new(planned));
         Some(())
     }
 
-    fn rename(&mut self, prefixes: &[(String, String)], index: Option<&str>) -> Option<()> {
+    fn rename(&mut self, prefixes: &[(String, String)]) -> Option<()> {
         let renamed = |name: &str| renamed(prefixes, name);
-        let shards = Arc::clone(&self.current);
-        for shard in shards.shards.values().filter(|s| s.tensors.iter().any(|t| renamed(&t.name).is_some())) {
+        let current = Arc::clone(&self.current);
+        for shard in current.shards.values().filter(|s| s.tensors.iter().any(|t| renamed(&t.name).is_some())) {
             let mut planned = self.planned(&shard.name)?;
             for tensor in &mut planned.tensors {
                 if let Some(new) = renamed(&tensor.name) {
                     tensor.name = new;
                 }
             }
-            self.shards.insert(shard.name.clone(), planned);
+            self.shards.insert(shard.name.clone(), Arc::new(planned));
         }
-        let Some(index) = index else { return Some(()) };
-        let text = self.text(index)?;
-        let splices = self.current.document(index)?.rename_keys("/weight_map", renamed)?;
-        self.texts.insert(index.to_owned(), spliced(&text, &splices)?.into());
+        let Some(index) = current.index.as_ref().map(|index| index.document.as_str()) else { return Some(()) };
+        let splices = current.document(index)?.rename_keys("/weight_map", renamed)?;
+        self.texts.insert(index.to_owned(), spliced(&self.text(index)?, &splices)?.into());
         Some(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::disallowed_methods, reason = "makes the files it reads")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fix_that_fails_leaves_nothing_behind() {
+        let dir = tempfile::tempdir().expect("a directory");
+        std::fs::write(dir.path().join("config.json"), r#"{"a": 1, "b": 2}"#).expect("a file");
+        let checkpoint = Arc::new(Checkpoint::open(dir.path()).expect("a checkpoint"));
+        let mut draft = Draft::new(&checkpoint);
+        let file = || "config.json".to_owned();
+        let set = |pointer: &str| Edit::Set { file: file(), pointer: pointer.to_owned(), value: json!(3) };
+        let write = || Edit::Write { file: "alias.py".to_owned(), text: "import torch\n".to_owned() };
+        let impossible = || Edit::Remove { file: file(), pointer: "/c".to_owned() };
+
+        assert_eq!(draft.make(&[set("/b")]), Made::All);
+        assert_eq!(draft.make(&[set("/a"), write(), impossible()]), Made::Nothing);
+        assert_eq!((draft.texts.len(), draft.text("config.json").as_deref()), (1, Some(r#"{"a": 1, "b": 3}"#)));
+        assert_eq!(draft.make(&[set("/a"), set("/b")]), Made::Later, "another fix of this round has set b");
+        assert_eq!(draft.make(&[write(), set("/a")]), Made::All, "neither place is taken by a fix that failed");
+        assert_eq!(draft.text("config.json").as_deref(), Some(r#"{"a": 3, "b": 3}"#));
     }
 }

@@ -153,7 +153,8 @@ pub fn plan(
     let Planner { draft, outcome, fixed, withdrawn, .. } = planner;
     let planned = Arc::clone(draft.current());
     let texts = draft.texts.into_iter().map(|(name, text)| Change { name, new: Content::Text(text) });
-    let shards = draft.shards.into_iter().map(|(name, shard)| Change { name, new: Content::Shard(shard) });
+    let shards =
+        draft.shards.into_iter().map(|(name, shard)| Change { name, new: Content::Shard(Arc::unwrap_or_clone(shard)) });
     let mut changes: Vec<Change> = shards.chain(texts).collect();
     changes.sort_by(|a, b| a.name.cmp(&b.name));
     Repair { original: Arc::clone(checkpoint), planned, outcome, fixed, withdrawn, changes }

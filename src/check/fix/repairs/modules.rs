@@ -61,7 +61,7 @@ fn reaches(checkpoint: &Checkpoint, from: &Module, to: &str) -> bool {
 /// Names the class in `auto_map` that the checkpoint has for this loader: `AutoConfig` or `AutoModel`.
 pub(super) fn add_auto_class(site: &Site<'_>) -> Option<Vec<Edit>> {
     let config = site.checkpoint().config()?;
-    let key = crate::knowledge::Expression::parse("it").ok()?.eval(site.scope).ok()?;
+    let key = site.scope.get("it")?;
     let key = key.as_str()?;
     let wanted = |class: &crate::checkpoint::module::Class| match key {
         "AutoConfig" => class.bases.iter().any(|base| base.rsplit('.').next() == Some("PretrainedConfig")),
