@@ -1,31 +1,17 @@
 //! Where and how a checkpoint is written: targets that are refused, modes, locks, signals.
 //!
 //! What needs failing calls, full disks and kills at a given call is in `tests/peer/crash.py`.
-#![allow(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::disallowed_methods,
-    missing_docs,
-    reason = "a test that panics has failed, as it should"
-)]
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::os::unix::process::ExitStatusExt;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use tempfile::TempDir;
 
-fn donor(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors").join(name)
-}
-
-fn text(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
+use super::{copy, donor, names, text, tiny};
 
 /// A merge of the donors in `work`, or of the fixtures where it has none.
 fn merge(work: &Path, out: &Path) -> Command {
@@ -34,19 +20,6 @@ fn merge(work: &Path, out: &Path) -> Command {
     command.arg("build-merged").arg("--vision").arg(place("spatialvla-tiny"));
     command.arg("--language").arg(place("llava3d-tiny")).arg("--out").arg(out).current_dir(work);
     command
-}
-
-fn names(dir: &Path) -> Vec<String> {
-    let mut names: Vec<_> = fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name()).collect();
-    names.sort();
-    names.into_iter().map(|n| n.to_string_lossy().into_owned()).collect()
-}
-
-fn copy(from: &Path, to: &Path) {
-    fs::create_dir(to).unwrap();
-    for name in names(from) {
-        fs::copy(from.join(&name), to.join(&name)).unwrap();
-    }
 }
 
 #[test]
@@ -196,4 +169,38 @@ fn a_full_standard_error_is_no_panic() {
     assert_eq!(run.status.code(), Some(2));
     assert!(text(&run).contains("is written; its report is not"), "{}", text(&run));
     assert!(out.join("config.json").is_file());
+}
+
+#[test]
+fn staging_of_a_crashed_run_is_cleared_and_anybody_elses_is_not() {
+    let work = TempDir::new().unwrap();
+    let stale = work.path().join(".out.partial");
+    fs::create_dir_all(stale.join("content")).unwrap();
+    fs::write(stale.join("content/model.safetensors"), "half").unwrap();
+    fs::write(stale.join("ckpt-doctor-owner"), "process 1").unwrap();
+    let out = work.path().join("out");
+    assert_eq!(tiny(&out, &[]).status.code(), Some(0));
+    assert_eq!(names(work.path()), ["out"]);
+    fs::remove_dir_all(&out).unwrap();
+
+    fs::create_dir_all(&stale).unwrap();
+    fs::write(stale.join("thesis.txt"), "years of work").unwrap();
+    let run = tiny(&out, &[]);
+    assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+    assert_eq!(fs::read_to_string(stale.join("thesis.txt")).unwrap(), "years of work");
+    assert_eq!(names(&stale), ["thesis.txt"]);
+}
+
+#[test]
+fn a_run_under_way_is_respected() {
+    let work = TempDir::new().unwrap();
+    let staging = work.path().join(".out.partial");
+    fs::create_dir(&staging).unwrap();
+    fs::write(staging.join("ckpt-doctor-owner"), "process 4711").unwrap();
+    let lock = fs::File::open(staging.join("ckpt-doctor-owner")).unwrap();
+    lock.lock().unwrap();
+    let run = tiny(&work.path().join("out"), &[]);
+    assert_eq!(run.status.code(), Some(2));
+    assert!(text(&run).contains("process 4711"), "{}", text(&run));
+    assert_eq!(names(&staging), ["ckpt-doctor-owner"]);
 }
