@@ -27,7 +27,10 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
     let Architecture { library, file, class, loader } = architecture;
     let resolver = Resolver { library, loader, evidence };
     let mut builder = Builder { resolver, expected: Expected::default(), modules: Vec::new(), steps: 0 };
-    let outcome = resolver.resolve(file, config.clone(), 0).and_then(|config| {
+    let mut read = config.clone();
+    // No template reads which modules a loader would fetch, and hostile ones are many.
+    read.shift_remove("auto_map");
+    let outcome = resolver.resolve(file, read, 0).and_then(|config| {
         let scope = resolver.scope(&config);
         builder.class(file, class, Config { map: &config, scope: &scope }, Place::default())?;
         Ok(config)

@@ -137,10 +137,15 @@ fn fill(config: &mut Map<String, Value>, defaults: &Map<String, Value>) {
 }
 
 fn compute(config: &mut Map<String, Value>, computed: &[(String, Expression)], scope: &mut Scope<'_>) -> Outcome<()> {
+    // Binding a large config is dear: only what is evaluated next has to see what was computed last.
+    let mut stale = false;
     for (key, expression) in computed {
         if config.get(key).is_none_or(Value::is_null) {
+            if std::mem::take(&mut stale) {
+                bind(scope, config);
+            }
             config.insert(key.clone(), expression.eval(scope)?);
-            bind(scope, config);
+            stale = true;
         }
     }
     Ok(())
