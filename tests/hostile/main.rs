@@ -15,6 +15,7 @@
 
 mod code;
 mod container;
+mod donors;
 mod downloads;
 mod json;
 mod paths;
@@ -30,7 +31,7 @@ use std::fmt::Write as _;
 use std::sync::Mutex;
 
 use place::Dir;
-use run::{Bench, Verdict};
+use run::Bench;
 
 /// One case.
 pub struct Case {
@@ -86,14 +87,14 @@ fn cases() -> Vec<Case> {
 }
 
 /// Runs every case, some at a time, and returns the verdicts in order.
-fn judge(cases: &[Case]) -> Vec<Verdict> {
+fn judge<T: Send>(cases: &[Case], judge: impl Fn(&Bench, usize, &Case) -> T + Sync) -> Vec<T> {
     let bench = Bench::new();
     let pending = Mutex::new(cases.iter().enumerate());
     let done = Mutex::new(Vec::new());
     let work = || {
         loop {
             let Some((number, case)) = pending.lock().unwrap().next() else { return };
-            let verdict = bench.judge(number, &*case.make);
+            let verdict = judge(&bench, number, case);
             done.lock().unwrap().push((number, verdict));
         }
     };
@@ -112,7 +113,7 @@ fn judge(cases: &[Case]) -> Vec<Verdict> {
 fn every_hazard_gets_its_verdict() {
     let cases = cases();
     assert!(cases.len() >= 250, "{} cases", cases.len());
-    let verdicts = judge(&cases);
+    let verdicts = judge(&cases, |bench, number, case| bench.judge(number, &*case.make));
     let mut wrong = String::new();
     let mut table = String::new();
     for (case, verdict) in cases.iter().zip(&verdicts) {

@@ -1,10 +1,11 @@
 //! Runs the program on a case, within limits, and watches what it does.
 
 use std::collections::BTreeMap;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::mem::MaybeUninit;
 use std::os::unix::process::ExitStatusExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
@@ -16,10 +17,10 @@ use tempfile::TempDir;
 use crate::ANYTHING;
 use crate::place::Dir;
 
-/// Address space of one run.
+/// Address space of one run, for each checkpoint it looks at.
 const MEMORY_KIB: u64 = 256 << 10;
-/// Seconds of CPU of one run: what is optimised has one.
-const CPU: u64 = if cfg!(debug_assertions) { 20 } else { 1 };
+/// Seconds of CPU of one run, for each checkpoint it looks at: of the program as it is built for tests.
+const CPU: u64 = 20;
 /// After so long it hangs, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(2);
 /// Most bytes on the terminal for one checkpoint.
@@ -58,6 +59,19 @@ impl Bench {
         let room = self.temporary.path().join(number.to_string());
         let dir = Dir::new(&room);
         make(&dir);
+        let verdict = self.watch(&room, &dir, 1, &["check".as_ref(), dir.root.as_os_str()]);
+        fs::remove_dir_all(&room).unwrap();
+        verdict
+    }
+
+    /// A directory of its own for one case.
+    pub fn room(&self, name: &str) -> PathBuf {
+        self.temporary.path().join(name)
+    }
+
+    /// Runs the program on so many checkpoints, and watches this one, what is around it and the programs it must not
+    /// start.
+    pub fn watch(&self, room: &Path, dir: &Dir, checkpoints: u64, args: &[&OsStr]) -> Verdict {
         let programs = self.temporary.path().join("bin");
         let watch = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC).unwrap();
         let writes =
@@ -68,7 +82,7 @@ impl Bench {
             inotify::add_watch(&watch, path, flags).unwrap();
         }
         let [out, report] = ["out", "report.json"].map(|name| room.join(name));
-        let status = run(&dir, &out, &report, &programs);
+        let status = run(args, checkpoints, &out, &report, &programs);
         let mut touched = Vec::new();
         let mut buffer = [MaybeUninit::uninit(); 4096];
         let mut events = Reader::new(&watch, &mut buffer);
@@ -79,24 +93,32 @@ impl Bench {
                 touched.push(format!("{name:?} {:?}", event.events()));
             }
         }
-        let verdict = Verdict {
+        Verdict {
             status,
             report: fs::read(&report).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default(),
             terminal: fs::read(&out).unwrap(),
             touched,
-        };
-        fs::remove_dir_all(&room).unwrap();
-        verdict
+        }
     }
 }
 
+/// An optimised program to run instead, as CI has it: it has every case as a donor, and two seconds. Alone on a machine
+/// it needs less than one.
+pub fn optimised() -> Option<OsString> {
+    std::env::var_os("CKPT_DOCTOR_OPTIMISED")
+}
+
 /// The exit status, or none of what did not end. The shell sets the limits and becomes the program.
-fn run(dir: &Dir, out: &Path, report: &Path, programs: &Path) -> Option<ExitStatus> {
-    let limits = format!("ulimit -c 0 && ulimit -v {MEMORY_KIB} && ulimit -t {CPU} && exec \"$0\" \"$@\"");
+fn run(args: &[&OsStr], checkpoints: u64, out: &Path, report: &Path, programs: &Path) -> Option<ExitStatus> {
+    let optimised = optimised();
+    let cpu = checkpoints * if optimised.is_some() { 2 } else { CPU };
+    let memory = checkpoints * MEMORY_KIB;
+    let limits = format!("ulimit -c 0 && ulimit -v {memory} && ulimit -t {cpu} && exec \"$0\" \"$@\"");
     let output = File::create(out).unwrap();
     let mut child = Command::new("/bin/sh")
-        .args(["-c", &limits, env!("CARGO_BIN_EXE_ckpt-doctor"), "check"])
-        .arg(&dir.root)
+        .args(["-c", &limits])
+        .arg(optimised.unwrap_or_else(|| env!("CARGO_BIN_EXE_ckpt-doctor").into()))
+        .args(args)
         .arg("--report")
         .arg(format!("json={}", report.display()))
         .env("PATH", programs)
@@ -147,7 +169,7 @@ impl Verdict {
     pub fn shown(&self) -> String {
         let mut lines = vec![format!("exit {}: {}", self.exit(), self.codes())];
         lines.extend(self.findings().take(4).map(|f| format!("{} {} {}", f["code"], f["message"], f["locations"])));
-        lines.push(String::from_utf8_lossy(&self.terminal).chars().take(600).collect());
+        lines.push(self.text().chars().take(600).collect());
         lines.join("\n    ")
     }
 
@@ -172,12 +194,25 @@ impl Verdict {
             let help = finding["fix"]["title"].as_str().unwrap_or_default();
             hold(!help.is_empty(), &format!("{} says no next step", finding["code"]));
         }
-        let text = String::from_utf8_lossy(&self.terminal);
-        hold(!text.contains(|c| c != '\n' && steers(c)), "a character that steers the terminal comes out");
-        hold(self.terminal.len() <= SCREEN, &format!("{} bytes on the terminal", self.terminal.len()));
-        hold(!text.contains("panicked"), "it panics");
-        hold(self.touched.is_empty(), &format!("it touches {:?}", self.touched));
+        complaints.extend(self.conduct());
         complaints
+    }
+
+    /// What is wrong with how the program behaves, whatever it finds.
+    pub fn conduct(&self) -> Vec<String> {
+        let text = self.text();
+        let held = [
+            (!text.contains(|c| c != '\n' && steers(c)), "a character that steers the terminal comes out".to_owned()),
+            (self.terminal.len() <= SCREEN, format!("{} bytes on the terminal", self.terminal.len())),
+            (!text.contains("panicked"), "it panics".to_owned()),
+            (self.touched.is_empty(), format!("it touches {:?}", self.touched)),
+        ];
+        held.into_iter().filter(|(is, _)| !is).map(|(_, what)| what).collect()
+    }
+
+    /// What came out on the terminal.
+    pub fn text(&self) -> String {
+        String::from_utf8_lossy(&self.terminal).into_owned()
     }
 }
 
