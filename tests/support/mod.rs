@@ -55,7 +55,7 @@ pub struct Case {
     changes: Vec<Change>,
     /// Whether the tensors' bytes are read, as `check --deep` does. Those of sound cases always are.
     #[serde(default)]
-    deep: bool,
+    pub deep: bool,
     /// Settings to check it under.
     #[serde(default)]
     settings: Option<serde_json::Value>,
@@ -265,7 +265,7 @@ struct Planted {
 struct SeededCase {
     changes: Vec<Change>,
     #[serde(default)]
-    deep: bool,
+    pub deep: bool,
     code: String,
     says: String,
     #[serde(default)]
