@@ -183,7 +183,7 @@ class Overlay(Build):
         return {path: (*s[:3], *s[4:5], *s[6:]) for path, s in identity(self.donors).items()}
 
     def written(self):
-        return [p.stat().st_size for p in self.out.iterdir() if p.stat().st_nlink == 1]
+        return [p.stat().st_size for p in self.out.iterdir() if p.lstat().st_nlink == 1 and not p.is_symlink()]
 
     def argv(self):
         return [PROGRAM, "check", str(self.donors / "model"), "--fix", "--output", str(self.out), "--output-format", "concise"]

@@ -210,10 +210,11 @@ class Pressure:
 
     def small_disks(self):
         page = 4096
-        for job in (j for j in self.jobs if j.name in ("build", "fix")):
-            calls = job.calls()[0]
-            asked = [call for call in calls if call.name == "statfs"][-1]
+        for job in (j for j in self.jobs if j.takes_room):
             with job.disk("size=64m"):
+                job.measure()  # on another disk than its input
+                calls = job.calls()[0]
+                asked = [call for call in calls if call.name == "statfs"][-1]
                 there = os.statvfs(job.work)
                 used, inodes = there.f_blocks - there.f_bavail, there.f_files - there.f_ffree
             need = sum(-(-size // page) for size in job.sizes) + job.blocks_more
