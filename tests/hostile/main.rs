@@ -2,8 +2,8 @@
 //!
 //! The rows are hazards seen in published models, upstream's own attacks and crash reports: C the container, P index and
 //! paths, D download state, J JSON, X code from the model, F file system. A case is written by a few lines of code and
-//! judged by the program itself, in a process of its own: within a second of CPU and 256 MiB of memory, without a file
-//! opened beside the checkpoint, a program started or a byte written. The verdicts are kept as a snapshot.
+//! judged by the program itself, in a process of its own: within limits of CPU and memory, without a file opened beside
+//! the checkpoint, a program started or a byte written. The verdicts are kept as a snapshot.
 
 #![allow(
     clippy::unwrap_used,

@@ -102,8 +102,7 @@ impl Bench {
     }
 }
 
-/// An optimised program to run instead, as CI has it: it has every case as a donor, and two seconds. Alone on a machine
-/// it needs less than one.
+/// An optimised program to run instead, as CI has it: it has every case as a donor, and two seconds.
 pub fn optimised() -> Option<OsString> {
     std::env::var_os("CKPT_DOCTOR_OPTIMISED")
 }
