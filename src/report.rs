@@ -133,5 +133,5 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
 
 /// The Rust in README.md compiles and runs.
 #[cfg(doctest)]
-#[doc = include_str!("../../README.md")]
+#[doc = include_str!("../README.md")]
 struct Readme;
