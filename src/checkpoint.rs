@@ -30,7 +30,7 @@ pub use contents::Contents;
 pub use discover::{find_checkpoints, is_checkpoint, owner};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
-pub use fault::{FAULT_KINDS, Fault, Place};
+pub use fault::{Fault, FaultKind, FaultSource, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::Module;
@@ -212,7 +212,7 @@ impl Checkpoint {
         if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
             self.index = Some(Index::of(document));
             // The index reports these itself, under a kind of its own.
-            document.faults.retain(|f| f.kind != "duplicate-json-key");
+            document.faults.retain(|f| f.kind != FaultKind::DuplicateJsonKey);
         }
     }
 

@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, LoadReport, Location, Skipped, Suppressed};
+use super::finding::{Finding, Location, Skipped, Suppressed};
 use super::fix::{self, Bench, Edit, FixHint, Site};
+use super::load::LoadReport;
 use super::load::Stored;
 use super::votes::Vote;
 use super::{adapter, facts, index, judge, modules, policy, tokens};
@@ -145,7 +146,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 
 /// What the rules that name these faults make of them, outside the checks of a checkpoint.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
-    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if f.kinds.iter().any(|k| faults.iter().any(|f| f.kind == k)));
+    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(asked);
     let bench = Bench::new(checkpoint);
     let mut findings: Vec<Finding> =
@@ -250,7 +251,7 @@ fn from_faults(
 ) -> Vec<Finding> {
     let mut matching = faults
         .iter()
-        .filter(|f| check.kinds.iter().any(|k| k == f.kind))
+        .filter(|f| check.kinds.contains(&f.kind))
         .filter(|f| check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false)));
     if check.group {
         let all: Vec<&Fault> = matching.collect();

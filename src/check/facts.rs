@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::LoadReport;
+use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
 use super::{index, modules};
-use crate::checkpoint::{Checkpoint, Document, Vocabulary};
+use crate::checkpoint::{Checkpoint, Document, FaultKind, Vocabulary};
 use crate::knowledge::{Expression, Scope};
 
 /// Keys of `tokenizer_config.json` that are large; rules reach them through `tokenizer`, `id_of` and `chat_templates`.
@@ -44,7 +44,7 @@ pub fn scope(
     let mut scope = Scope::new();
     for (name, file) in DOCUMENTS {
         // Of two versions that a merge left in it neither is the document.
-        let torn = |d: &&Document| d.faults.iter().any(|f| f.kind == "merge-conflict-marker");
+        let torn = |d: &&Document| d.faults.iter().any(|f| f.kind == FaultKind::MergeConflictMarker);
         let value = checkpoint.document(file).filter(|d| !torn(d)).and_then(|d| d.value.as_ref());
         match value {
             Some(Value::Object(map)) if name == "tokenizer_config" => {

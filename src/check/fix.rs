@@ -212,7 +212,7 @@ fn made(specs: &[EditSpec], site: &Site<'_>) -> Option<Vec<Edit>> {
                 }
                 edits.push(Edit::Write { file, text });
             }
-            EditSpec::Repair(name) => edits.extend(repairs::run(name, site)?),
+            EditSpec::Repair(repair) => edits.extend(repairs::run(*repair, site)?),
         }
     }
     Some(edits)

@@ -5,26 +5,27 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::checkpoint::{Checkpoint, Fault, Place, Shard};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Shard};
 
 /// The file that, when it is there, a loader takes without looking at an index.
 const SINGLE: &str = "model.safetensors";
 
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
 pub(super) fn readable(shard: &Shard) -> bool {
-    const UNREADABLE: [&str; 10] = [
-        "lfs-pointer",
-        "not-safetensors",
-        "empty-file",
-        "file-too-short",
-        "header-length-out-of-range",
-        "header-too-large",
-        "header-not-utf8",
-        "header-not-json",
-        "header-too-deep",
-        "unreadable-file",
+    const UNREADABLE: [FaultKind; 11] = [
+        FaultKind::LfsPointer,
+        FaultKind::NotSafetensors,
+        FaultKind::EmptyFile,
+        FaultKind::FileTooShort,
+        FaultKind::HeaderLengthOutOfRange,
+        FaultKind::HeaderTooLarge,
+        FaultKind::HeaderNotUtf8,
+        FaultKind::HeaderNotJson,
+        FaultKind::HeaderTooDeep,
+        FaultKind::UnreadableFile,
+        FaultKind::NotARegularFile,
     ];
-    !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind) || f.kind == "not-a-regular-file")
+    !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind))
 }
 
 /// Whether every shard is there and its header could be read, so that a tensor that is not seen is not there.
@@ -68,7 +69,7 @@ fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item 
     }
     let size = |name| entry(name).map(|e| e.lfs.as_ref().map_or(e.size, |pointer| pointer.size));
     let sum = shards.clone().try_fold(0_u64, |sum, name| Some(sum.saturating_add(size(name)?)))?;
-    let fault = Fault::new("lfs-sizes-below-total")
+    let fault = Fault::new(FaultKind::LfsSizesBelowTotal)
         .at(Place::file(&index.document).pointer("/metadata/total_size"))
         .with("stated", stated)
         .with("sum", sum)
@@ -116,7 +117,7 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     if all_absent {
         let first = absent.first().map_or("", |(name, ..)| *name);
         faults.push(
-            Fault::new("all-shards-absent")
+            Fault::new(FaultKind::AllShardsAbsent)
                 .at(Place::file(&index.document))
                 .with("count", absent.len())
                 .with("tensors", index.weight_map.len())
@@ -128,9 +129,9 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
             let fault = match lookalikes.get(name) {
                 Some(s) => {
                     let by = if name.eq_ignore_ascii_case(s) { "case" } else { "Unicode normalisation" };
-                    Fault::new("shard-name-differs-in-case").with("similar", s).with("by", by)
+                    Fault::new(FaultKind::ShardNameDiffersInCase).with("similar", s).with("by", by)
                 }
-                None => Fault::new("shard-missing"),
+                None => Fault::new(FaultKind::ShardMissing),
             };
             let place = Place { file: Some(index.document.clone()), pointer, ..Place::default() };
             faults.push(fault.at(place).with("shard", name).with("tensors", tensors));
@@ -138,7 +139,7 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     }
     let is_pickle = |name: &&&str| index.is_of_pickles() && checkpoint.has_file(name) && !is_pointer(checkpoint, name);
     if let Some(name) = referenced.keys().find(is_pickle) {
-        faults.push(Fault::new("pickle-weights").at(Place::file(*name)));
+        faults.push(Fault::new(FaultKind::PickleWeights).at(Place::file(*name)));
     }
     let holders = by_tensor(checkpoint);
     // A name may lie in a shard that cannot be read: then nothing is known of it.
@@ -154,10 +155,11 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         }
         let place = Place::file(&index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
         if let Some(other) = held.and_then(|h| h.first()) {
-            faults
-                .push(Fault::new("index-names-other-shard").at(place).with("said", said.as_str()).with("held", *other));
+            faults.push(
+                Fault::new(FaultKind::IndexNamesOtherShard).at(place).with("said", said.as_str()).with("held", *other),
+            );
         } else if all_read {
-            faults.push(Fault::new("index-key-nowhere").at(place).with("said", said.as_str()));
+            faults.push(Fault::new(FaultKind::IndexKeyNowhere).at(place).with("said", said.as_str()));
         }
     }
     // Entries that name no file are the reader's fault to report.
@@ -171,12 +173,14 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         if !index.weight_map.contains_key(*tensor) {
             if let Some(shard) = mapped.first() {
                 let place = Place::file(**shard).in_tensor(*tensor);
-                faults.push(Fault::new("shard-tensor-not-in-index").at(place).with("index", index.document.as_str()));
+                faults.push(
+                    Fault::new(FaultKind::ShardTensorNotInIndex).at(place).with("index", index.document.as_str()),
+                );
             }
         } else if let (Some(first), Some(second)) = (mapped.first(), mapped.get(1)) {
             let place = Place::file(**first).in_tensor(*tensor);
             let kept = index.weight_map.get(*tensor).map_or("", String::as_str);
-            faults.push(Fault::new("tensor-in-two-shards").at(place).with("other", **second).with("kept", kept));
+            faults.push(Fault::new(FaultKind::TensorInTwoShards).at(place).with("other", **second).with("kept", kept));
         }
     }
     strays(checkpoint, &referenced, &holders, faults);
@@ -213,14 +217,14 @@ fn strays(
         let twice = shared.get(name).copied().unwrap_or_default();
         if name == SINGLE {
             faults.push(
-                Fault::new("single-file-beside-index")
+                Fault::new(FaultKind::SingleFileBesideIndex)
                     .at(Place::file(name))
                     .with("index", index.document.as_str())
                     .with("twice", twice),
             );
         } else if twice > 0 || numbered(name).is_some() {
             faults.push(
-                Fault::new("stray-shard")
+                Fault::new(FaultKind::StrayShard)
                     .at(Place::file(name))
                     .with("index", index.document.as_str())
                     .with("twice", twice),
@@ -239,7 +243,7 @@ fn total_size(checkpoint: &Checkpoint, referenced: &Referenced<'_>, faults: &mut
         .fold(0_u64, |n, t| n.saturating_add(t.len()));
     if stated != actual {
         faults.push(
-            Fault::new("total-size-wrong")
+            Fault::new(FaultKind::TotalSizeWrong)
                 .at(Place::file(&index.document).pointer("/metadata/total_size"))
                 .with("stated", stated)
                 .with("actual", actual),
@@ -273,7 +277,7 @@ fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     let numbers: Vec<(&str, u32, u32)> = names.iter().filter_map(|n| numbered(n)).collect();
     if let Some((prefix, _, count)) = numbers.first().copied() {
         faults.push(
-            Fault::new("index-missing")
+            Fault::new(FaultKind::IndexMissing)
                 .with("shards", numbers.len())
                 .with("index", format!("{prefix}.safetensors.index.json")),
         );
@@ -284,7 +288,7 @@ fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
         for n in (first..=last.min(10_000)).filter(|n| !present.contains(n)) {
             let name = format!("{prefix}-{n:05}-of-{count:05}.safetensors");
             faults.push(
-                Fault::new("shard-missing")
+                Fault::new(FaultKind::ShardMissing)
                     .at(Place::file(&name))
                     .with("shard", name.as_str())
                     .with("tensors", Value::Null),
@@ -299,14 +303,15 @@ fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
             named && !is_pointer(checkpoint, n)
         });
         let is_told = |f: &Fault| {
-            f.kind == "lfs-pointer" && f.places.iter().any(|p| p.file.as_deref().is_some_and(|n| n.ends_with(".bin")))
+            f.kind == FaultKind::LfsPointer
+                && f.places.iter().any(|p| p.file.as_deref().is_some_and(|n| n.ends_with(".bin")))
         };
         if pickle.is_none() && checkpoint.faults.iter().any(is_told) {
             return;
         }
         faults.push(match pickle {
-            Some(name) => Fault::new("pickle-weights").at(Place::file(name)),
-            None => Fault::new("no-weights"),
+            Some(name) => Fault::new(FaultKind::PickleWeights).at(Place::file(name)),
+            None => Fault::new(FaultKind::NoWeights),
         });
     }
 }

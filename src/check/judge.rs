@@ -5,12 +5,12 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use super::finding::LoadReport;
+use super::load::LoadReport;
 use super::load::{self, Judged, Moved, Stored, Target};
 use super::quantization::{self, Quantised};
 use super::votes::{self, Explanation, Vote};
 use super::{index, layers, size};
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::quantization::{Said, said};
 use crate::knowledge::{Architecture, Expected, Library, Loader, Refusal, UnknownPart};
 
@@ -107,7 +107,7 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                 candidates.push(Candidate { target, expected, quantised, report, explained });
             }
             Err(Refusal::Impossible(reasons)) if target.leads => faults.push(
-                Fault::new("config-incomputable")
+                Fault::new(FaultKind::ConfigIncomputable)
                     .at(Place::file("config.json"))
                     .with("architecture", architecture.name())
                     .with("reason", reasons.first().map_or("", String::as_str)),
@@ -127,7 +127,7 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
             return fault;
         };
         match same_bytes(checkpoint, tensor, by) {
-            Some(false) => Fault { kind: "tied-over-another", ..fault },
+            Some(false) => Fault { kind: FaultKind::TiedOverAnother, ..fault },
             _ => fault,
         }
     }));
@@ -169,7 +169,7 @@ fn finished(checkpoint: &Checkpoint, target: &Target, mut report: LoadReport) ->
         checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
     report.missing.retain(|name| !unreadable.contains(name.as_str()));
     // A shape that no bytes can have is the container's fault to report.
-    let impossible = |f: &&Fault| matches!(f.kind, "shape-overflow" | "sub-byte-misaligned");
+    let impossible = |f: &&Fault| matches!(f.kind, FaultKind::ShapeOverflow | FaultKind::SubByteMisaligned);
     let faults = checkpoint.shards.values().flat_map(|s| &s.faults).filter(impossible);
     let impossible: BTreeSet<&str> = faults.flat_map(|f| &f.places).filter_map(|p| p.tensor.as_deref()).collect();
     report.mismatched.retain(|m| !impossible.contains(m.name.as_str()));
@@ -252,7 +252,7 @@ fn unknown(config: &Value, built: &[Built<'_>], versions: &[String]) -> Vec<Faul
             Some(part) if !part.config.is_empty() => format!("/{}/model_type", part.config.replace('.', "/")),
             _ => "/model_type".to_owned(),
         };
-        let fault = Fault::new("unknown-architecture")
+        let fault = Fault::new(FaultKind::UnknownArchitecture)
             .at(Place::file("config.json").pointer(pointer))
             .with("model_type", text("model_type"))
             .with("class", class.as_str());

@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Layers a stack must have before its majority says anything.
 const STACK: usize = 6;
@@ -62,7 +62,7 @@ fn lacking(stack: &str, layers: &BTreeMap<u64, BTreeSet<&str>>) -> Vec<Fault> {
     odd.iter()
         .map(|(index, held)| {
             let lost: Vec<String> = usual.difference(held).map(|rest| format!("{stack}{index}.{rest}")).collect();
-            let mut fault = Fault::new("layer-lacks-tensor")
+            let mut fault = Fault::new(FaultKind::LayerLacksTensor)
                 .with("layer", format!("{stack}{index}"))
                 .with("siblings", members.len())
                 .with("names", lost.join(", "))

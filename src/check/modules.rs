@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Fault, Module, Place, is_plain_file_name};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Module, Place, is_plain_file_name};
 
 /// An `auto_map` entry: where it stands and what it says.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,7 +60,7 @@ fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
                     Value::Object(_) => "an object".to_owned(),
                     other => other.to_string(),
                 };
-                let fault = Fault::new("auto-map-malformed").at(Place::file(name).pointer(pointer));
+                let fault = Fault::new(FaultKind::AutoMapMalformed).at(Place::file(name).pointer(pointer));
                 faults.push(fault.with("key", key).with("target", target).with("dots", 0));
             };
             match map.get("auto_map") {
@@ -174,20 +174,20 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             target.contains(['/', '\\']) || target.starts_with('.') || !is_plain_file_name(&format!("{module}.py"))
         };
         if let Some((repository, target)) = entry.target.split_once("--") {
-            let kind = if unsafe_path(target) { "auto-map-unsafe-path" } else { "auto-map-remote" };
+            let kind = if unsafe_path(target) { FaultKind::AutoMapUnsafePath } else { FaultKind::AutoMapRemote };
             faults.push(fault(kind).with("repository", repository));
             continue;
         }
         if unsafe_path(&entry.target) {
-            faults.push(fault("auto-map-unsafe-path"));
+            faults.push(fault(FaultKind::AutoMapUnsafePath));
             continue;
         }
         let Some((module, class)) = entry.parts() else {
-            faults.push(fault("auto-map-malformed").with("dots", entry.target.matches('.').count()));
+            faults.push(fault(FaultKind::AutoMapMalformed).with("dots", entry.target.matches('.').count()));
             continue;
         };
         let Some(parsed) = checkpoint.modules.get(&format!("{module}.py")) else {
-            let kind = if entry.nested { "auto-map-nested-missing" } else { "auto-map-module-missing" };
+            let kind = if entry.nested { FaultKind::AutoMapNestedMissing } else { FaultKind::AutoMapModuleMissing };
             // Stop at one entry a module: the second says nothing new.
             if entry.nested || roots.insert(module) {
                 let fault = fault(kind).with("module", format!("{module}.py"));
@@ -196,7 +196,9 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             continue;
         };
         if !entry.nested && parsed.defines(class) == Some(false) {
-            faults.push(fault("auto-map-class-missing").with("module", format!("{module}.py")).with("class", class));
+            faults.push(
+                fault(FaultKind::AutoMapClassMissing).with("module", format!("{module}.py")).with("class", class),
+            );
         }
         if !entry.nested && roots.insert(module) {
             imports(checkpoint, &entries, entry, module, &mut faults);
@@ -225,7 +227,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
     let packages = needed_packages(checkpoint, root);
     if !packages.is_empty() {
         faults.push(
-            Fault::new("module-needs-package")
+            Fault::new(FaultKind::ModuleNeedsPackage)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
                 .with("packages", packages.into_iter().collect::<Vec<_>>().join(", ")),
@@ -233,7 +235,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
     }
     for name in absent {
         faults.push(
-            Fault::new("relative-import-missing")
+            Fault::new(FaultKind::RelativeImportMissing)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
                 .with("imported", format!("{name}.py"))
@@ -243,7 +245,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
     if !missing.is_empty() {
         let names: Vec<String> = missing.into_iter().map(|n| format!("{n}.py")).collect();
         faults.push(
-            Fault::new("alias-misses-import")
+            Fault::new(FaultKind::AliasMissesImport)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
                 .with("imports", names.join(", "))

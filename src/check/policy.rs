@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::engine::{self, Knowledge, Outcome};
 use super::finding::{Accepted, Finding, Suppressed};
-use crate::checkpoint::{Checkpoint, Fault};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::settings::{Policy, Suppression, absolute};
 
 /// Regrades findings and sets those aside that are accepted.
@@ -54,7 +54,7 @@ pub fn unused(
         let concerned = |c: &Checkpoint| suppression.concerns(&c.root, c.entries.keys().map(String::as_str));
         let at = looked.iter().position(|(checkpoint, _)| concerned(checkpoint)).unwrap_or(0);
         let Some((checkpoint, _)) = looked.get(at) else { continue };
-        let fault = Fault::new("suppression-unused")
+        let fault = Fault::new(FaultKind::SuppressionUnused)
             .with("rule", suppression.rule.as_str())
             .with("path", suppression.path.as_deref().unwrap_or(""))
             .with("written", suppression.written.as_str())

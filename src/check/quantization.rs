@@ -11,9 +11,9 @@ mod skipped;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::finding::{LoadReport, Mismatch};
 use super::load::Stored;
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use super::load::{LoadReport, Mismatch};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 use crate::knowledge::expression::glob;
 use crate::knowledge::quantization::{Applied, Said, Scheme};
@@ -158,12 +158,14 @@ impl<'a> Quantised<'a> {
         let mut faults = Vec::new();
         if let Some(program) = &scheme.loaded_by {
             let at = Place::file("config.json").pointer("/quantization");
-            let fault = Fault::new("quantized-for-another-loader").at(at).with("scheme", scheme.summary.as_str());
+            let fault = Fault::new(FaultKind::QuantizedForAnotherLoader).at(at).with("scheme", scheme.summary.as_str());
             faults.push(fault.with("program", program.as_str()));
         }
         if self.modules.is_empty() && self.has_weights && !scheme.plain_too {
             let at = Place::file("config.json").pointer(self.applied.pointer());
-            faults.push(Fault::new("quantized-config-plain-tensors").at(at).with("scheme", scheme.summary.as_str()));
+            faults.push(
+                Fault::new(FaultKind::QuantizedConfigPlainTensors).at(at).with("scheme", scheme.summary.as_str()),
+            );
         }
         for judged in &self.modules {
             let name = judged.module.name;
@@ -172,10 +174,10 @@ impl<'a> Quantised<'a> {
             match judged.state {
                 State::Skipped => {
                     let carrier = scheme.endings().next().unwrap_or_default();
-                    faults.push(fault("quantized-though-skipped").at(Place::tensor(tensor(carrier))));
+                    faults.push(fault(FaultKind::QuantizedThoughSkipped).at(Place::tensor(tensor(carrier))));
                 }
                 State::Plain => {
-                    faults.push(fault("plain-though-quantized").at(Place::tensor(tensor(&scheme.plain))));
+                    faults.push(fault(FaultKind::PlainThoughQuantized).at(Place::tensor(tensor(&scheme.plain))));
                 }
                 State::Quantised => {
                     let lacks: Vec<&str> = judged.lacks(scheme).collect();
@@ -183,16 +185,16 @@ impl<'a> Quantised<'a> {
                         let carrier = scheme.endings().next().unwrap_or_default();
                         let names: Vec<String> = lacks.iter().map(|ending| tensor(ending)).collect();
                         let at = Place::tensor(tensor(carrier));
-                        faults.push(fault("quantized-module-incomplete").at(at).with("lacks", names.join(", ")));
+                        faults.push(fault(FaultKind::QuantizedModuleIncomplete).at(at).with("lacks", names.join(", ")));
                     }
                     faults.extend(judged.misshapen(scheme).map(|(ending, stored, expected)| {
                         let at = Place::tensor(tensor(ending));
-                        let fault = fault("quantized-shape-wrong").at(at).with("stored", stored.to_vec());
+                        let fault = fault(FaultKind::QuantizedShapeWrong).at(at).with("stored", stored.to_vec());
                         fault.with("expected", expected.to_vec()).with("fits", self.fits.as_deref().unwrap_or_default())
                     }));
                     faults.extend(mistyped(scheme, judged).map(|(ending, dtype, allowed)| {
                         let at = Place::tensor(tensor(ending));
-                        fault("quantized-dtype-wrong").at(at).with("dtype", dtype).with("allowed", allowed)
+                        fault(FaultKind::QuantizedDtypeWrong).at(at).with("dtype", dtype).with("allowed", allowed)
                     }));
                 }
             }

@@ -7,10 +7,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::finding::LoadReport;
+use super::load::LoadReport;
 use super::load::{self, Stored};
 use super::votes::{leaves, with};
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::{Architecture, Evidence, Expected};
 
 /// Tensors that may be built while values are tried.
@@ -57,7 +57,7 @@ pub fn compare(
     if values.is_empty() && (least..=most).contains(&stated) {
         return None;
     }
-    let mut fault = Fault::new("total-size-not-of-class")
+    let mut fault = Fault::new(FaultKind::TotalSizeNotOfClass)
         .at(Place::file(&index.document).pointer("/metadata/total_size"))
         .with("stated", stated)
         .with("computed", *sizes.first()?)

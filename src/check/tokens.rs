@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use crate::checkpoint::{Checkpoint, Fault, Place, Tokenizer, Vocabulary};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, Vocabulary};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::{EvalError, Scope};
 
@@ -110,7 +110,7 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
         let above: Vec<(&u64, &&str)> = stated.range(rows..).collect();
         if let (Some((first, token)), Some((last, _))) = (above.first(), above.last()) {
             faults.push(
-                Fault::new("token-above-rows")
+                Fault::new(FaultKind::TokenAboveRows)
                     .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{first}")))
                     .with("count", above.len())
                     .with("first", **first)
@@ -126,7 +126,7 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
         for (id, token) in stated.range(base..) {
             if *id != expected {
                 faults.push(
-                    Fault::new("token-hole")
+                    Fault::new(FaultKind::TokenHole)
                         .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
                         .with("missing", expected)
                         .with("next", *id)
@@ -141,7 +141,7 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     for (id, token) in &stated {
         if let Some(first) = by_content.insert(token, *id) {
             faults.push(
-                Fault::new("token-id-twice")
+                Fault::new(FaultKind::TokenIdTwice)
                     .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
                     .with("token", *token)
                     .with("first", first)
@@ -153,7 +153,7 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
         if let Some(decoder_id) = by_content.get(added.content.as_str()).filter(|d| **d != added.id) {
             let pointer = added.content.replace('~', "~0").replace('/', "~1");
             faults.push(
-                Fault::new("added-tokens-disagree")
+                Fault::new(FaultKind::AddedTokensDisagree)
                     .at(Place::file("added_tokens.json").pointer(format!("/{pointer}")))
                     .with("token", added.content.as_str())
                     .with("id", added.id)

@@ -11,7 +11,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::open::{Opened, open_regular};
 use super::shard::hex;
-use super::{Checkpoint, Dtype, Entry, Fault, Shard, Tensor};
+use super::{Checkpoint, Dtype, Entry, Fault, FaultKind, Shard, Tensor};
 
 mod numbers;
 
@@ -44,9 +44,9 @@ impl Checkpoint {
             reading.run(&self.root, self.entries.get(&shard.name));
             let Reading { digests, faults, .. } = reading;
             contents.digests.insert(shard.name.clone(), digests);
-            if faults.iter().any(|f| f.kind == "zero-tail") {
+            if faults.iter().any(|f| f.kind == FaultKind::ZeroTail) {
                 // The reader of headers saw a part of it already, where the file system told.
-                shard.faults.retain(|f| f.kind != "zero-tail");
+                shard.faults.retain(|f| f.kind != FaultKind::ZeroTail);
             }
             shard.faults.extend(faults);
         }
@@ -81,7 +81,7 @@ impl Reading<'_> {
     }
 
     fn unread(&mut self, reason: &str) {
-        self.faults.push(Fault::new("contents-unread").at(self.shard.place()).with("reason", reason));
+        self.faults.push(Fault::new(FaultKind::ContentsUnread).at(self.shard.place()).with("reason", reason));
     }
 
     fn tensors(&mut self, opened: &Opened, entry: Option<&Entry>) -> std::io::Result<()> {
@@ -90,7 +90,8 @@ impl Reading<'_> {
         let mut tensors: Vec<&Tensor> = self.shard.tensors.iter().filter(|t| t.begin <= t.end).collect();
         tensors.sort_by_key(|t| (t.begin, t.end, t.name.as_str()));
         // Only a shard that is covered by its tensors is a file read to its end.
-        let stated = entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == "zero-tail"));
+        let stated =
+            entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == FaultKind::ZeroTail));
         let mut whole = stated.as_ref().map(|_| Sha256::new());
         if let Some(whole) = &mut whole {
             each_chunk(opened, 0, self.shard.data_start, &mut buffer, |bytes| whole.update(bytes))?;
@@ -127,7 +128,7 @@ impl Reading<'_> {
         if let (Some(whole), Some(stated)) = (whole, stated) {
             let found = hex(&whole.finalize());
             if found != stated {
-                let fault = Fault::new("content-hash-differs").at(self.shard.place());
+                let fault = Fault::new(FaultKind::ContentHashDiffers).at(self.shard.place());
                 self.faults.push(fault.with("stated", stated).with("found", found));
             }
         }
@@ -150,7 +151,7 @@ pub(super) fn tail(shard: &Shard, tensors: &[&Tensor], from: u64) -> Option<Faul
     let all: Vec<&Tensor> = tensors.iter().filter(zero).copied().collect();
     let whole = all.iter().find(|t| matrix(t)).copied();
     let first = whole.or_else(|| tensors.iter().copied().filter(|t| matrix(t)).find(|t| ends_within(t, from)))?;
-    let fault = Fault::new("zero-tail").at(shard.place().in_tensor(first.name.clone()));
+    let fault = Fault::new(FaultKind::ZeroTail).at(shard.place().in_tensor(first.name.clone()));
     let region = shard.file_len.saturating_sub(shard.data_start);
     let fault = fault.with("tensors", all.len()).with("bytes", region.saturating_sub(from));
     Some(fault.with("partly", whole.is_none()))

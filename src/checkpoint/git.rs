@@ -10,7 +10,7 @@ use std::path::Path;
 use globset::{GlobBuilder, GlobMatcher};
 
 use super::open::read_capped;
-use super::{Checkpoint, Fault};
+use super::{Checkpoint, Fault, FaultKind};
 
 /// Most bytes read of a `.gitattributes`.
 const CAP: u64 = 256 << 10;
@@ -35,7 +35,7 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
     let kept = kept(&checkpoint.root, pointers);
     let mark = |fault: &mut Fault| {
         let file = fault.places.first().and_then(|place| place.file.as_deref());
-        if fault.kind == "lfs-pointer" && file.is_some_and(|file| kept.contains(file)) {
+        if fault.kind == FaultKind::LfsPointer && file.is_some_and(|file| kept.contains(file)) {
             fault.detail.insert("tracked".to_owned(), true.into());
         }
     };

@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::fault::Faults;
 use super::open::is_plain_file_name;
 use super::text::{escape, push_pointer};
-use super::{Document, Fault, Place};
+use super::{Document, Fault, FaultKind, Place};
 
 /// The name transformers looks for first.
 pub const INDEX_NAME: &str = "model.safetensors.index.json";
@@ -62,12 +62,12 @@ impl Index {
                 index.total_size = metadata.get("total_size").cloned();
                 let place = at("/metadata/total_size");
                 if let Some(found) = metadata.get("total_size").filter(|v| !is_size(v)) {
-                    let fault = Fault::new("total-size-malformed").at(place);
+                    let fault = Fault::new(FaultKind::TotalSizeMalformed).at(place);
                     faults.push(fault.with("found", escape(&found.to_string(), 60)));
                 }
             }
             other => {
-                let fault = Fault::new("index-metadata-missing").at(at(""));
+                let fault = Fault::new(FaultKind::IndexMetadataMissing).at(at(""));
                 faults.push(fault.with("present", other.is_some()));
             }
         }
@@ -85,25 +85,25 @@ impl Index {
                             index.weight_map.insert(tensor.clone(), file.to_owned());
                         }
                         Some(file) => {
-                            let fault = Fault::new("index-unsafe-path").at(place());
+                            let fault = Fault::new(FaultKind::IndexUnsafePath).at(place());
                             faults.push(fault.with("path", escape(file, 200)));
                         }
                         None => {
-                            let fault = Fault::new("weight-map-malformed").at(place());
+                            let fault = Fault::new(FaultKind::WeightMapMalformed).at(place());
                             faults.push(fault.with("found", escape(&shown(file), 60)));
                         }
                     }
                 }
             }
             Some(other) => {
-                let fault = Fault::new("weight-map-malformed").at(at("/weight_map"));
+                let fault = Fault::new(FaultKind::WeightMapMalformed).at(at("/weight_map"));
                 faults.push(fault.with("found", escape(&shown(other), 60)));
             }
-            None => faults.push(Fault::new("weight-map-missing").at(at(""))),
+            None => faults.push(Fault::new(FaultKind::WeightMapMissing).at(at(""))),
         }
 
-        for fault in document.faults.iter().filter(|f| f.kind == "duplicate-json-key") {
-            faults.push(Fault { kind: "duplicate-index-key", ..fault.clone() });
+        for fault in document.faults.iter().filter(|f| f.kind == FaultKind::DuplicateJsonKey) {
+            faults.push(Fault { kind: FaultKind::DuplicateIndexKey, ..fault.clone() });
         }
         index.faults = faults.into_vec();
         index

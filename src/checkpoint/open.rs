@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::OFlags;
 use thiserror::Error;
 
-use super::{Fault, Place};
+use super::{Fault, FaultKind, Place};
 
 /// Most bytes read of a JSON document.
 pub const JSON_CAP: u64 = 64 << 20;
@@ -119,15 +119,15 @@ impl OpenError {
     pub fn fault(&self, name: &str) -> Fault {
         let fault = |kind| Fault::new(kind).at(Place::file(name));
         match self {
-            Self::NotRegular { what, .. } => fault("not-a-regular-file").with("what", *what),
-            Self::TooLarge { size, cap, .. } => fault("file-too-large").with("size", *size).with("cap", *cap),
+            Self::NotRegular { what, .. } => fault(FaultKind::NotARegularFile).with("what", *what),
+            Self::TooLarge { size, cap, .. } => fault(FaultKind::FileTooLarge).with("size", *size).with("cap", *cap),
             Self::DanglingLink { target, .. } => {
-                fault("dangling-symlink").with("target", target.to_string_lossy().into_owned())
+                fault(FaultKind::DanglingSymlink).with("target", target.to_string_lossy().into_owned())
             }
-            Self::SymlinkLoop { .. } => fault("symlink-loop"),
-            Self::Io { source, .. } => fault("unreadable-file").with("reason", source.to_string()),
+            Self::SymlinkLoop { .. } => fault(FaultKind::SymlinkLoop),
+            Self::Io { source, .. } => fault(FaultKind::UnreadableFile).with("reason", source.to_string()),
             Self::NotFound { .. } | Self::NotADirectory { .. } => {
-                fault("unreadable-file").with("reason", "it does not exist")
+                fault(FaultKind::UnreadableFile).with("reason", "it does not exist")
             }
         }
     }

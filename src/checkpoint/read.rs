@@ -10,8 +10,8 @@ use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
 use super::{
-    Checkpoint, Document, Entry, EntryKind, Fault, LfsPointer, Module, OpenError, Place, REPAIR_FOLDER, REPAIR_JOURNAL,
-    Shard, Vocabulary,
+    Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Module, OpenError, Place, REPAIR_FOLDER,
+    REPAIR_JOURNAL, Shard, Vocabulary,
 };
 
 /// Endings that a downloader gives to a file it has not finished.
@@ -96,17 +96,17 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
             checkpoint.faults.push(OpenError::from_io(&path, error).fault(&name));
         }
         if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_pickle(&name) || TEXTS.contains(&&*name)) {
-            let fault = Fault::new("lfs-pointer").at(Place::file(&*name));
+            let fault = Fault::new(FaultKind::LfsPointer).at(Place::file(&*name));
             checkpoint.faults.push(fault.with("oid", pointer.oid.as_str()).with("size", pointer.size));
         }
         if let Some(of) = UNFINISHED.iter().find_map(|ending| name.strip_suffix(ending)) {
-            checkpoint.faults.push(Fault::new("partial-download").at(Place::file(&*name)).with("of", of));
+            checkpoint.faults.push(Fault::new(FaultKind::PartialDownload).at(Place::file(&*name)).with("of", of));
         }
         checkpoint.entries.insert(name, entry);
     }
     if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
         let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
-        checkpoint.faults.push(Fault::new("repair-interrupted").at(place));
+        checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(place));
     }
     checkpoint.derive(vocabularies);
     checkpoint.tokenizer.faults.extend(faults_of_vocabularies);
@@ -143,7 +143,7 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
         && metadata.is_file()
         && is_outside(root, &path, target)
     {
-        let fault = Fault::new("symlink-outside").at(Place::file(name));
+        let fault = Fault::new(FaultKind::SymlinkOutside).at(Place::file(name));
         faults.push(fault.with("target", target.to_string_lossy().into_owned()));
     }
     let kind = kind_of(&metadata);
@@ -184,10 +184,11 @@ fn vocabulary(path: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {
     let bytes = read_capped(path, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
     let fault = |kind| Fault::new(kind).at(Place::file(name));
     if let Some(pointer) = LfsPointer::parse(&bytes) {
-        return Err(fault("lfs-pointer").with("oid", pointer.oid).with("size", pointer.size).into());
+        return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());
     }
     if bytes.is_empty() {
-        return Err(fault("empty-file").into());
+        return Err(fault(FaultKind::EmptyFile).into());
     }
-    Vocabulary::parse(name, &bytes).map_err(|reason| fault("vocabulary-malformed").with("reason", reason).into())
+    Vocabulary::parse(name, &bytes)
+        .map_err(|reason| fault(FaultKind::VocabularyMalformed).with("reason", reason).into())
 }

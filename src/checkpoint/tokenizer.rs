@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::{Document, Fault, Place};
+use super::{Document, Fault, FaultKind, Place};
 
 mod sentencepiece;
 mod vocabulary;
@@ -92,7 +92,7 @@ impl Tokenizer {
                     Ok(Some(vocabulary)) => drop(vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
                     Ok(None) => {}
                     Err(reason) => {
-                        let fault = Fault::new("vocabulary-malformed").at(Place::file(name).pointer(pointer));
+                        let fault = Fault::new(FaultKind::VocabularyMalformed).at(Place::file(name).pointer(pointer));
                         faults.push(fault.with("reason", reason));
                     }
                 }

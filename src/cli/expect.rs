@@ -101,7 +101,7 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) 
 fn parse(bytes: &[u8]) -> Result<Value, String> {
     let document = Document::parse("config.json", bytes);
     document.value.ok_or_else(|| {
-        let kind = document.faults.first().map_or("not JSON", |f| f.kind);
+        let kind = document.faults.first().map_or("not JSON", |f| f.kind.name());
         format!("the config cannot be read: {kind}")
     })
 }

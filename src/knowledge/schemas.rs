@@ -18,6 +18,7 @@ use super::recipe::Recipe;
 use super::rule::Rule;
 use super::settings::Settings;
 use super::source;
+use crate::checkpoint::FaultKind;
 
 macro_rules! text {
     ($type:ty, $name:literal, $about:literal) => {
@@ -36,6 +37,17 @@ macro_rules! text {
 text!(Expression, "Expression", "An expression in CEL, the Common Expression Language: https://cel.dev");
 text!(Template, "Template", "Text with expressions in braces; a brace itself is written twice.");
 text!(Loader, "Loader", "A version of transformers; the nearest known one stands for it.");
+
+impl JsonSchema for FaultKind {
+    fn schema_name() -> Cow<'static, str> {
+        "FaultKind".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        let names: Vec<&str> = Self::ALL.iter().map(|kind| kind.name()).collect();
+        json_schema!({ "type": "string", "enum": names, "description": "A kind of fault." })
+    }
+}
 
 fn project() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

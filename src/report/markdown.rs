@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use super::collapse::{Group, collapse};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
 use super::words::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
-use crate::check::finding::LoadReport;
+use crate::check::load::LoadReport;
 use crate::check::{Finding, Location};
 
 pub fn render(report: &Report, cap: usize) -> String {

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use serde::Serialize;
 
 pub use super::fixes::Fixing;
-use crate::check::finding::{LoadReport, Suppressed};
+use crate::check::finding::Suppressed;
+use crate::check::load::LoadReport;
 use crate::check::{Finding, Severity};
 pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 pub use crate::surgery::repair::{Fixed, Withdrawn};

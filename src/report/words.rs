@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::collapse::{Group, collapse};
 use super::model::{Counts, MergeReport, Report};
-use crate::check::finding::LoadReport;
+use crate::check::load::{LoadReport, SilentReason};
 use crate::check::{Finding, FixHint, Location, Safety};
 use crate::checkpoint::escape;
 
@@ -138,20 +138,21 @@ pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
 
 /// Silent tensors by reason, in words.
 pub fn silent(load: &LoadReport) -> Vec<(String, Vec<Group>)> {
-    let mut reasons: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    let mut reasons: BTreeMap<SilentReason, Vec<&str>> = BTreeMap::new();
     for one in &load.silent {
-        reasons.entry(&one.reason).or_default().push(&one.name);
+        reasons.entry(one.reason).or_default().push(&one.name);
     }
-    reasons.into_iter().map(|(reason, names)| (silence(reason), collapse(names))).collect()
+    reasons.into_iter().map(|(reason, names)| (silence(reason).to_owned(), collapse(names))).collect()
 }
 
-/// Why a tensor loads wrong in silence, in words.
-fn silence(reason: &str) -> String {
+/// Why a tensor loads wrong without a message, in words.
+const fn silence(reason: SilentReason) -> &'static str {
     match reason {
-        "indexed-but-absent" => "in the index and in no shard, so it stays random".to_owned(),
-        "prefix-hijack" => "one stray key with the base-model prefix, so every tensor is initialised anew".to_owned(),
-        "tied-over" => "tied to another tensor, which overwrites it".to_owned(),
-        other => name(other),
+        SilentReason::IndexedButAbsent => "in the index and in no shard, so it stays randomly initialised",
+        SilentReason::PrefixHijack => {
+            "one stray key with the base-model prefix, so every tensor is randomly initialised"
+        }
+        SilentReason::TiedOver => "tied to another tensor, which overwrites it",
     }
 }
 

@@ -6,12 +6,11 @@ use std::fs;
 use std::path::Path;
 
 use crate::support::{cases, files, keys, project, rules, texts};
-use ckpt_doctor::checkpoint::Dtype;
-use ckpt_doctor::checkpoint::fault::FAULT_KINDS;
+use ckpt_doctor::checkpoint::{Dtype, FaultKind};
 use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::quantization::Scheme;
 use ckpt_doctor::knowledge::recipe::Recipe;
-use ckpt_doctor::knowledge::rule::{COMPARISON_KINDS, Check, EditSpec, REPAIRS, Rule, RuleSet, Safety, Severity};
+use ckpt_doctor::knowledge::rule::{BuiltInRepair, Check, EditSpec, Rule, RuleSet, Safety, Severity};
 use ckpt_doctor::knowledge::{Library, source};
 use regex::Regex;
 
@@ -75,7 +74,10 @@ fn rules_are_written_alike() {
         for fix in &rule.fixes {
             let help = fix.help.source();
             hold(one_line(help) && !help.ends_with('.'), "the help has no full stop");
-            hold(IMPERATIVES.contains(&first_word(help)), "the help starts with a verb of the list in tests/it/house.rs");
+            hold(
+                IMPERATIVES.contains(&first_word(help)),
+                "the help starts with a verb of the list in tests/it/house.rs",
+            );
         }
         // Information may leave nothing to be done; what is wrong never does.
         hold(!rule.fixes.is_empty() || rule.severity == Severity::Info, "a rule above info says what to do");
@@ -116,35 +118,12 @@ fn every_rule_has_a_fixture_and_every_fixture_a_rule() {
 }
 
 #[test]
-fn every_kind_of_fault_has_a_rule() {
+fn every_kind_of_fault_is_named_by_some_rule() {
     let rules = rules();
-    let named: BTreeSet<&str> = rules
-        .rules
-        .iter()
-        .filter_map(|r| if let Check::Fault(f) = &r.check { Some(f.kinds.iter().map(String::as_str)) } else { None })
-        .flatten()
-        .collect();
-    let known: BTreeSet<&str> = FAULT_KINDS.iter().chain(COMPARISON_KINDS).copied().collect();
-    assert_eq!(named, known, "kinds that rules name, and kinds there are");
-    assert_eq!(known.len(), FAULT_KINDS.len() + COMPARISON_KINDS.len(), "a kind is in one list only");
-    assert!(FAULT_KINDS.is_sorted());
-}
-
-/// `Fault::new("…")` with a kind that is in neither list would be dropped without a word.
-#[test]
-fn every_kind_that_the_code_makes_is_listed() {
-    let made = Regex::new(r#"(?:Fault::new|\bfault|\bpush_fault|kind:)\(?\s*\(?"([a-z0-9]+(?:-[a-z0-9]+)+)""#)
-        .expect("a pattern");
-    let mut wrong = Vec::new();
-    for (path, text) in sources() {
-        for found in made.captures_iter(&without_tests(&text)) {
-            let kind = &found[1];
-            if !FAULT_KINDS.contains(&kind) && !COMPARISON_KINDS.contains(&kind) {
-                wrong.push(format!("{path}: {kind} is in no list"));
-            }
-        }
-    }
-    none(&wrong);
+    let fault_checks = rules.rules.iter().filter_map(|r| if let Check::Fault(f) = &r.check { Some(f) } else { None });
+    let named: BTreeSet<FaultKind> = fault_checks.flat_map(|f| &f.kinds).copied().collect();
+    let unnamed: Vec<String> = FaultKind::ALL.iter().filter(|k| !named.contains(k)).map(ToString::to_string).collect();
+    none(&unnamed);
 }
 
 #[test]
@@ -368,22 +347,12 @@ fn fixtures_are_small() {
     assert!(total < 200_000, "{total} bytes; weights are made when the tests run");
 }
 
-/// Repairs that rules name are there, and none is there that no rule names.
 #[test]
-fn every_repair_is_there_and_used() {
-    let source = fs::read_to_string(project().join("src/check/fix/repairs.rs")).expect("text");
-    let rules = rules().rules;
-    let used = |name: &str| {
-        let is = |edit: &EditSpec| matches!(edit, EditSpec::Repair(repair) if repair == name);
-        rules.iter().flat_map(|r| &r.fixes).flat_map(|f| &f.edits).any(is)
-    };
-    let wrong: Vec<String> = REPAIRS
-        .iter()
-        .filter(|name| !used(name) || !source.contains(&format!("\"{name}\" =>")))
-        .map(|name| (*name).to_owned())
-        .collect();
-    none(&wrong);
-    assert!(REPAIRS.is_sorted());
+fn every_built_in_repair_is_used_by_some_rule() {
+    let rules = rules();
+    let edits = || rules.rules.iter().flat_map(|rule| &rule.fixes).flat_map(|fix| &fix.edits);
+    let used = |repair: &BuiltInRepair| edits().any(|e| matches!(e, EditSpec::Repair(used) if used == repair));
+    none(&BuiltInRepair::ALL.iter().filter(|r| !used(r)).map(|r| format!("{r:?}")).collect::<Vec<_>>());
 }
 
 /// Edits belong to a fix that is made by the program, and every such fix has some.

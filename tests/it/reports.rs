@@ -4,7 +4,7 @@ mod formats;
 mod samples;
 
 use ckpt_doctor::check::Location;
-use ckpt_doctor::check::finding::{LoadReport, Mismatch};
+use ckpt_doctor::check::load::{LoadReport, Mismatch};
 use ckpt_doctor::report::{Format, Report, Style, render};
 
 use proptest::prelude::*;

@@ -3,12 +3,14 @@
 mod failure_modes;
 mod seeded;
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use crate::support::{Expect, Tried, tried};
 use ckpt_doctor::check::check;
-use ckpt_doctor::check::finding::{Finding, LoadReport, Severity};
-use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::check::finding::{Finding, Severity};
+use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, FaultSource};
 
 fn failures(of: impl Fn(&Tried) -> Option<String>) -> Vec<String> {
     tried().iter().filter_map(|t| of(t).map(|why| format!("{}: {why}\n  found {}", t.case.name, t.codes()))).collect()
@@ -139,6 +141,14 @@ fn the_donor_has_three_infinities() {
         "{}",
         shown(&loud)
     );
+}
+
+#[test]
+fn every_kind_of_a_comparison_is_produced_by_some_case() {
+    let produced: BTreeSet<FaultKind> = tried().iter().flat_map(|t| &t.kinds).copied().collect();
+    let comparisons = FaultKind::ALL.iter().filter(|kind| kind.source() == FaultSource::Comparison);
+    let never: Vec<&FaultKind> = comparisons.filter(|kind| !produced.contains(kind)).collect();
+    assert!(never.is_empty(), "{never:?}");
 }
 
 /// Every rule on every case. A rule that starts to speak elsewhere shows up here.

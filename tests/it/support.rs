@@ -18,7 +18,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::{Knowledge, Outcome, check, policy};
-use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
 use ckpt_doctor::knowledge::Library;
 use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::rule::RuleSet;
@@ -94,6 +94,8 @@ pub struct Tried {
     pub outcome: Outcome,
     /// Codes found in the base alone.
     pub before: BTreeSet<String>,
+    /// Kinds of the faults that readers and comparisons produced.
+    pub kinds: BTreeSet<FaultKind>,
 }
 
 impl Tried {
@@ -163,8 +165,7 @@ pub fn knowledge() -> Knowledge {
 }
 
 /// What is found in a directory under settings that lie in the folder above it.
-fn under(settings: &serde_json::Value, dir: &Path) -> Outcome {
-    let mut knowledge = knowledge();
+fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> Outcome {
     let above = dir.parent().expect("a folder above");
     let source = Source::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
     knowledge.policy =
@@ -305,17 +306,45 @@ pub fn seeded() -> &'static AllSeeded {
     })
 }
 
+/// Code of the rules that [`with_kinds`] adds.
+const KIND: &str = "KIND";
+
+/// Knowledge with one more rule for each kind of fault, which reports that the kind was produced.
+fn with_kinds() -> Knowledge {
+    let mut knowledge = knowledge();
+    let rule = |(number, kind): (usize, &FaultKind)| {
+        let text = format!(
+            "{{ code: '{KIND}{number}', name: 'produces-{kind}', severity: 'info', summary: '', why: '', \
+               check: {{ fault: {{ kinds: ['{kind}'], group: true }} }}, message: '{kind}' }}"
+        );
+        (format!("{kind}.json5"), text)
+    };
+    let texts: Vec<(String, String)> = FaultKind::ALL.iter().enumerate().map(rule).collect();
+    let texts = texts.iter().map(|(path, text)| (path.clone(), text.as_str()));
+    knowledge.rules = knowledge.rules.and_files(texts).unwrap_or_else(|e| panic!("{e}"));
+    knowledge
+}
+
+/// Takes the findings of the rules of [`with_kinds`] out of an outcome.
+fn take_kinds(outcome: &mut Outcome) -> BTreeSet<FaultKind> {
+    let (kinds, findings) = outcome.findings.drain(..).partition(|f| f.code.starts_with(KIND));
+    outcome.findings = findings;
+    let kind = |f: Finding| FaultKind::from_name(&f.message).unwrap_or_else(|| panic!("{} is a kind", f.message));
+    Vec::into_iter(kinds).map(kind).collect()
+}
+
 fn try_all() -> Vec<Tried> {
-    let knowledge = knowledge();
+    let (knowledge, observing) = (knowledge(), with_kinds());
     let before: OnceLock<BTreeMap<&str, BTreeSet<String>>> = OnceLock::new();
     let tried = on_every_case(&knowledge, |bases, case, made| {
         let codes = |dir: &PathBuf| look(dir, true, &knowledge).findings.into_iter().map(|f| f.code).collect();
         let before = before.get_or_init(|| bases.iter().map(|(name, dir)| (*name, codes(dir))).collect());
-        let outcome = match &case.settings {
-            Some(settings) => under(settings, made),
-            None => look(made, case.deep, &knowledge),
+        let mut outcome = match &case.settings {
+            Some(settings) => under(settings, made, with_kinds()),
+            None => look(made, case.deep, &observing),
         };
-        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone() }
+        let kinds = take_kinds(&mut outcome);
+        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds }
     });
     tried.into_iter().map(|(_, tried)| tried).collect()
 }

@@ -1,6 +1,6 @@
 //! Numbers that are none: NaN and infinity, by the bits of each element type.
 
-use super::super::{Dtype, Fault, Place, Shard, Tensor};
+use super::super::{Dtype, Fault, FaultKind, Place, Shard, Tensor};
 
 /// Counts of one tensor.
 pub(super) struct Numbers {
@@ -65,7 +65,8 @@ impl Numbers {
     pub(super) fn fault(&self, shard: &Shard, tensor: &Tensor) -> Option<Fault> {
         let first = self.first?;
         let place = Place::file(&*shard.name).in_tensor(&*tensor.name);
-        let fault = Fault::new("non-finite-weights").at(place).with("nan", self.nan).with("infinite", self.infinite);
+        let fault =
+            Fault::new(FaultKind::NonFiniteWeights).at(place).with("nan", self.nan).with("infinite", self.infinite);
         Some(fault.with("elements", self.seen).with("first", first))
     }
 }

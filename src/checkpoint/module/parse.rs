@@ -7,7 +7,7 @@ use tree_sitter::{Node, ParseOptions, Parser, Tree, TreeCursor};
 use super::{Class, Import, Module, RelativeImport};
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Most syntax nodes looked at: some 3 MB of honest Python, ten times the largest module known.
 const MAX_NODES: usize = 1_000_000;
@@ -30,13 +30,13 @@ struct Scope {
 pub(super) fn parse(name: String, bytes: &[u8]) -> Module {
     let place = Place::file(&*name);
     if let Some(pointer) = LfsPointer::parse(bytes) {
-        let fault = Fault::new("lfs-pointer").at(place).with("oid", pointer.oid).with("size", pointer.size);
+        let fault = Fault::new(FaultKind::LfsPointer).at(place).with("oid", pointer.oid).with("size", pointer.size);
         return Module::unread(name, fault);
     }
     let text = match std::str::from_utf8(bytes) {
         Ok(text) => text,
         Err(error) => {
-            let fault = Fault::new("invalid-utf8").at(place).with("offset", error.valid_up_to());
+            let fault = Fault::new(FaultKind::InvalidUtf8).at(place).with("offset", error.valid_up_to());
             return Module::unread(name, fault);
         }
     };
@@ -46,7 +46,7 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Module {
         Reader { text, module: &mut module, faults: &mut faults }.walk(&tree);
     } else {
         module.unread = true;
-        faults.push(Fault::new("python-too-complex").at(place));
+        faults.push(Fault::new(FaultKind::PythonTooComplex).at(place));
     }
     module.faults = faults.into_vec();
     module
@@ -93,7 +93,7 @@ impl<'a> Reader<'a> {
             }
         }
         self.module.unread = true;
-        self.faults.push(Fault::new("python-too-complex").at(Place::file(&*self.module.name)));
+        self.faults.push(Fault::new(FaultKind::PythonTooComplex).at(Place::file(&*self.module.name)));
     }
 
     #[allow(clippy::unused_self, reason = "reads like the other steps")]
@@ -119,7 +119,7 @@ impl<'a> Reader<'a> {
             let rest = self.text.get(node.byte_range()).unwrap_or_default();
             let len = rest.find('\n').unwrap_or(rest.len());
             let place = Place::file(&*self.module.name).span(start..start.saturating_add(len));
-            self.faults.push(Fault::new("python-syntax").at(place));
+            self.faults.push(Fault::new(FaultKind::PythonSyntax).at(place));
             return Some(scope);
         }
         let top = !scope.function && !scope.class;

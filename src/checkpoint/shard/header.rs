@@ -10,7 +10,7 @@ use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::scan::{ScanError, ScanErrorKind, Scanner, Token};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::text::escape;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 mod entry;
 
@@ -32,7 +32,7 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     shard.header_sha256 = hex(&Sha256::digest(head.get(..header.len().saturating_add(8)).unwrap_or(head)));
 
     let mut faults = Faults::default();
-    let padding = |what: &str| Fault::new("header-padding-not-spaces").at(shard.place()).with("what", what);
+    let padding = |what: &str| Fault::new(FaultKind::HeaderPaddingNotSpaces).at(shard.place()).with("what", what);
     let header = match header.strip_prefix(b"\xef\xbb\xbf") {
         Some(rest) => {
             faults.push(padding("a byte-order mark"));
@@ -43,7 +43,7 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     let text = match std::str::from_utf8(header) {
         Ok(text) => text,
         Err(error) => {
-            faults.push(Fault::new("header-not-utf8").at(shard.place()).with("offset", error.valid_up_to()));
+            faults.push(Fault::new(FaultKind::HeaderNotUtf8).at(shard.place()).with("offset", error.valid_up_to()));
             shard.faults = faults.into_vec();
             return shard;
         }
@@ -59,7 +59,7 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     let error = reader.object().err();
     let Reader { mut faults, entries, metadata, scanner, .. } = reader;
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
-        let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
+        let fault = Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason);
         faults.push(fault.with("offset", span.start));
     }
     let mut unread = true;
@@ -75,13 +75,13 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
             }));
         }
         Some(ScanError { kind: ScanErrorKind::TooDeep, span }) => {
-            faults.push(Fault::new("header-too-deep").at(shard.place()).with("offset", span.start));
+            faults.push(Fault::new(FaultKind::HeaderTooDeep).at(shard.place()).with("offset", span.start));
         }
         Some(ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), .. }) => {
-            faults.push(Fault::new("json-too-many-values").at(shard.place()).with("cap", MAX_ENTRIES));
+            faults.push(Fault::new(FaultKind::JsonTooManyValues).at(shard.place()).with("cap", MAX_ENTRIES));
         }
         Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) => {
-            let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
+            let fault = Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason);
             faults.push(fault.with("offset", span.start));
         }
     }
@@ -110,29 +110,30 @@ fn frame<'a>(shard: &Shard, head: &'a [u8]) -> Result<(&'a [u8], u64), Box<Fault
     let fault = |kind| Fault::new(kind).at(shard.place());
     let file_len = shard.file_len;
     if file_len == 0 {
-        return Err(fault("empty-file").into());
+        return Err(fault(FaultKind::EmptyFile).into());
     }
     let whole = u64::try_from(head.len()).is_ok_and(|len| len == file_len);
     if let Some(pointer) = LfsPointer::parse(head).filter(|_| whole) {
-        return Err(fault("lfs-pointer").with("oid", pointer.oid).with("size", pointer.size).into());
+        return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());
     }
     if file_len < 8 {
-        return Err(fault("file-too-short").with("file_len", file_len).into());
+        return Err(fault(FaultKind::FileTooShort).with("file_len", file_len).into());
     }
-    let short = || Box::new(fault("unreadable-file").with("reason", "fewer bytes could be read than the file has"));
+    let short =
+        || Box::new(fault(FaultKind::UnreadableFile).with("reason", "fewer bytes could be read than the file has"));
     let length = head.first_chunk::<8>().ok_or_else(short)?;
     let stated = u64::from_le_bytes(*length);
     let available = file_len.saturating_sub(8);
     if stated == 0 || stated > available || stated > MAX_HEADER {
         if let Some(what) = other_format(head) {
-            return Err(fault("not-safetensors").with("what", what).into());
+            return Err(fault(FaultKind::NotSafetensors).with("what", what).into());
         }
         if stated > MAX_HEADER && stated <= available {
-            return Err(fault("header-too-large").with("stated", stated).with("cap", MAX_HEADER).into());
+            return Err(fault(FaultKind::HeaderTooLarge).with("stated", stated).with("cap", MAX_HEADER).into());
         }
         let big = u64::from_be_bytes(*length);
         let big_endian = big >= 2 && big <= available.min(MAX_HEADER);
-        let fault = fault("header-length-out-of-range").with("stated", stated).with("file_len", file_len);
+        let fault = fault(FaultKind::HeaderLengthOutOfRange).with("stated", stated).with("file_len", file_len);
         return Err(fault.with("big_endian", big_endian).into());
     }
     let end = stated.saturating_add(8);
@@ -175,7 +176,7 @@ fn check_format(shard: &Shard, metadata: &Metadata, faults: &mut Faults) {
         Metadata::Absent | Metadata::Null => None,
     };
     if format.is_none_or(|f| !FORMATS.contains(&f.as_str())) {
-        let fault = Fault::new("no-format-metadata").at(shard.place());
+        let fault = Fault::new(FaultKind::NoFormatMetadata).at(shard.place());
         faults.push(fault.with("format", format.map(|f| escape(f, 80))));
     }
 }
@@ -191,7 +192,7 @@ fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -
     }
     for entry in entries.iter().zip(&drop).filter_map(|(e, d)| d.then_some(e)) {
         let place = shard.place().in_tensor(entry.name.clone());
-        faults.push(Fault::new("duplicate-header-key").at(place).with("key", escape(&entry.name, 200)));
+        faults.push(Fault::new(FaultKind::DuplicateHeaderKey).at(place).with("key", escape(&entry.name, 200)));
     }
     entries.into_iter().zip(drop).filter_map(|(e, d)| (!d).then_some(e)).collect()
 }
@@ -235,7 +236,7 @@ impl<'t> Reader<'_, 't> {
             let (name, lone) = key.decode();
             if name == "__metadata__" {
                 if metadata_seen {
-                    let fault = Fault::new("duplicate-header-key").at(self.shard.place());
+                    let fault = Fault::new(FaultKind::DuplicateHeaderKey).at(self.shard.place());
                     self.faults.push(fault.with("key", "__metadata__"));
                 }
                 metadata_seen = true;
@@ -250,10 +251,10 @@ impl<'t> Reader<'_, 't> {
     }
 
     fn read_metadata(&mut self) -> Result<(), ScanError> {
-        let fault = Fault::new("metadata-not-strings").at(self.shard.place());
+        let fault = Fault::new(FaultKind::MetadataNotStrings).at(self.shard.place());
         match self.token()? {
             Token::Null => {
-                self.faults.push(Fault::new("metadata-null").at(self.shard.place()));
+                self.faults.push(Fault::new(FaultKind::MetadataNull).at(self.shard.place()));
                 self.metadata = Metadata::Null;
             }
             Token::BeginObject => {
@@ -267,7 +268,7 @@ impl<'t> Reader<'_, 't> {
                         Token::String(value) if !value.decode().1 => {
                             if strings.contains_key(&key) {
                                 let label = format!("__metadata__.{}", escape(&key, 80));
-                                let fault = Fault::new("duplicate-header-key").at(self.shard.place());
+                                let fault = Fault::new(FaultKind::DuplicateHeaderKey).at(self.shard.place());
                                 self.faults.push(fault.with("key", label));
                             }
                             strings.insert(key, value.decode().0.into_owned());
@@ -310,7 +311,8 @@ impl<'t> Reader<'_, 't> {
             return;
         };
         let place = self.shard.place().in_tensor(name);
-        self.faults.push(Fault::new("odd-tensor-name").at(place).with("reason", reason).with("bytes", name.len()));
+        self.faults
+            .push(Fault::new(FaultKind::OddTensorName).at(place).with("reason", reason).with("bytes", name.len()));
     }
 }
 

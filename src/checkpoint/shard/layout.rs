@@ -2,8 +2,8 @@
 
 use super::Shard;
 use super::header::Entry;
-use crate::checkpoint::Fault;
 use crate::checkpoint::fault::Faults;
+use crate::checkpoint::{Fault, FaultKind};
 
 /// Reports every fault of sizes and places.
 pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
@@ -23,10 +23,10 @@ pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
     for (begin, end, entry) in &ranges {
         let place = shard.place().in_tensor(entry.name.clone());
         if *begin > filled && all_known {
-            let fault = Fault::new("data-hole").at(place).with("begin", filled).with("end", *begin);
+            let fault = Fault::new(FaultKind::DataHole).at(place).with("begin", filled).with("end", *begin);
             faults.push(fault.with("bytes", begin.saturating_sub(filled)));
         } else if *begin < filled {
-            let mut fault = Fault::new("tensors-overlap").at(place);
+            let mut fault = Fault::new(FaultKind::TensorsOverlap).at(place);
             if let Some(other) = holder {
                 fault = fault.at(shard.place().in_tensor(other.name.clone()));
             }
@@ -42,7 +42,7 @@ pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
     let region = shard.file_len.saturating_sub(shard.data_start);
     if filled > region {
         let cut: Vec<_> = ranges.iter().filter(|(_, end, _)| *end > region).collect();
-        let mut fault = Fault::new("shard-truncated");
+        let mut fault = Fault::new(FaultKind::ShardTruncated);
         fault = match cut.first() {
             Some((_, _, entry)) => fault.at(shard.place().in_tensor(entry.name.clone())),
             None => fault.at(shard.place()),
@@ -51,7 +51,7 @@ pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
         let fault = fault.with("needed", needed).with("file_len", shard.file_len);
         faults.push(fault.with("missing", filled.saturating_sub(region)).with("tensors", cut.len()));
     } else if filled < region && all_known {
-        let fault = Fault::new("trailing-bytes").at(shard.place());
+        let fault = Fault::new(FaultKind::TrailingBytes).at(shard.place());
         faults.push(fault.with("count", region.saturating_sub(filled)));
     }
 }
@@ -62,7 +62,7 @@ fn check_size(shard: &Shard, entry: &Entry, faults: &mut Faults) {
     if let Some((begin, end)) = entry.offsets
         && end < begin
     {
-        faults.push(fault("offsets-out-of-order").with("begin", begin).with("end", end));
+        faults.push(fault(FaultKind::OffsetsOutOfOrder).with("begin", begin).with("end", end));
         return;
     }
     let (Some(dtype), Some(shape)) = (entry.dtype, entry.shape.as_deref()) else { return };
@@ -71,13 +71,17 @@ fn check_size(shard: &Shard, entry: &Entry, faults: &mut Faults) {
     let shown: Vec<u64> = shape.iter().copied().take(16).collect();
     let detail = |f: Fault| f.with("dtype", dtype.name()).with("shape", shown.clone());
     match bits {
-        None => faults.push(detail(fault("shape-overflow"))),
-        Some(bits) if !bits.is_multiple_of(8) => faults.push(detail(fault("sub-byte-misaligned")).with("bits", bits)),
+        None => faults.push(detail(fault(FaultKind::ShapeOverflow))),
+        Some(bits) if !bits.is_multiple_of(8) => {
+            faults.push(detail(fault(FaultKind::SubByteMisaligned)).with("bits", bits))
+        }
         Some(bits) => {
             let Some((begin, end)) = entry.offsets else { return };
             let (computed, stored) = (bits / 8, end.saturating_sub(begin));
             if computed != stored {
-                faults.push(detail(fault("shape-byte-mismatch")).with("computed", computed).with("stored", stored));
+                faults.push(
+                    detail(fault(FaultKind::ShapeByteMismatch)).with("computed", computed).with("stored", stored),
+                );
             }
         }
     }

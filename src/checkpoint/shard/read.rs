@@ -10,7 +10,7 @@ use super::{MAX_HEADER, Shard, Tensor};
 use crate::checkpoint::contents::tail;
 use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::sniff::looks_like;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Enough to recognise what a file is, and most tiny headers whole.
 const SAMPLE: u64 = 4096;
@@ -23,7 +23,7 @@ pub(super) fn read(dir: &Path, name: &str) -> Shard {
     let head = match read_head(&opened) {
         Ok(head) => head,
         Err(error) => {
-            let fault = Fault::new("unreadable-file").at(Place::file(name)).with("reason", error.to_string());
+            let fault = Fault::new(FaultKind::UnreadableFile).at(Place::file(name)).with("reason", error.to_string());
             return Shard { file_len: opened.identity.size, ..Shard::unread(name, fault) };
         }
     };
@@ -93,7 +93,7 @@ fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
 
 /// Adds what the bytes behind the last tensor look like, when they are recognisable.
 fn name_trailing_bytes(shard: &mut Shard, opened: &Opened) {
-    for fault in shard.faults.iter_mut().filter(|f| f.kind == "trailing-bytes") {
+    for fault in shard.faults.iter_mut().filter(|f| f.kind == FaultKind::TrailingBytes) {
         let Some(count) = fault.detail.get("count").and_then(serde_json::Value::as_u64) else { continue };
         let mut bytes = vec![0; usize::try_from(count.min(512)).unwrap_or(0)];
         if opened.file.read_exact_at(&mut bytes, opened.identity.size.saturating_sub(count)).is_err() {

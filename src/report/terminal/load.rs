@@ -8,7 +8,7 @@ use super::super::Style;
 use super::super::collapse::{Group, collapse};
 use super::super::words::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
-use crate::check::finding::LoadReport;
+use crate::check::load::LoadReport;
 
 /// What these loaders say alike.
 pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {

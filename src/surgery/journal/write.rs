@@ -1,5 +1,6 @@
 //! Writes a repair into its checkpoint.
 
+use crate::checkpoint::FaultKind;
 use std::fs::{self, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -124,7 +125,7 @@ pub(in crate::surgery) fn unchanged(repair: &Repair, change: &Change, path: &Pat
         (_, None) => there.is_none(),
         (Content::Shard(_), Some(_)) => original.shards.get(&change.name).is_some_and(|was| {
             let now = Shard::read(&original.root, &change.name);
-            if let Some(fault) = now.faults.iter().find(|f| f.kind == "unreadable-file") {
+            if let Some(fault) = now.faults.iter().find(|f| f.kind == FaultKind::UnreadableFile) {
                 let reason = fault.detail.get("reason").and_then(serde_json::Value::as_str).unwrap_or_default();
                 unreadable = Some(io::Error::other(reason.to_owned()));
             }

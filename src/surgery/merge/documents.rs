@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::{Context, Draft, MergeError};
 use crate::check::tokens::OpenedTokenizer;
-use crate::checkpoint::{Document, Vocabulary};
+use crate::checkpoint::{Document, FaultKind, Vocabulary};
 use crate::knowledge::recipe::{CODE_SWITCHES, DocumentSpec, Edit, GraftEdit, TokensForm};
 
 /// A document of the result and where it came from.
@@ -81,7 +81,7 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
 /// Puts the recipe's value where the donor has `Infinity` or `NaN`: the result is strict JSON.
 fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut Draft) -> Result<(), MergeError> {
     let mut places = Vec::new();
-    for fault in source.faults.iter().filter(|f| f.kind == "non-finite-number") {
+    for fault in source.faults.iter().filter(|f| f.kind == FaultKind::NonFiniteNumber) {
         let Some(pointer) = fault.places.first().and_then(|p| p.pointer.as_deref()) else { continue };
         let Some(stand_in) = &spec.non_finite else {
             return Err(MergeError::Donor(format!(
@@ -203,10 +203,9 @@ fn not_there(context: &Context<'_>, spec: &DocumentSpec, pointer: &str) -> Merge
 
 /// Refuses a document with a key twice: which value a reader takes depends on the reader.
 fn unambiguous(document: &Document, role: &str) -> Result<(), MergeError> {
-    let twice = document
-        .faults
-        .iter()
-        .find(|f| f.kind == "duplicate-json-key" && f.detail.get("equal").is_none_or(|e| *e == Value::Bool(false)));
+    let twice = document.faults.iter().find(|f| {
+        f.kind == FaultKind::DuplicateJsonKey && f.detail.get("equal").is_none_or(|e| *e == Value::Bool(false))
+    });
     twice.map_or(Ok(()), |fault| {
         let key = fault.detail.get("key").and_then(Value::as_str).unwrap_or_default();
         Err(MergeError::Donor(format!(

@@ -3,7 +3,7 @@
 use std::fs;
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Document, spliced};
+use ckpt_doctor::checkpoint::{Document, FaultKind, spliced};
 use proptest::prelude::*;
 use proptest::sample::Index;
 use serde_json::{Value, json};
@@ -63,7 +63,7 @@ fn edited(document: &Document, splice: &ckpt_doctor::checkpoint::Splice) -> Docu
     assert_eq!(&new[..splice.range.start], &text[..splice.range.start]);
     assert_eq!(&new[splice.range.start + splice.text.len()..], &text[splice.range.end..]);
     let new = Document::parse(&*document.name, new.as_bytes());
-    let known = |kind: &str| kind == "not-an-object" || document.faults.iter().any(|old| old.kind == kind);
+    let known = |kind: FaultKind| kind == FaultKind::NotAnObject || document.faults.iter().any(|old| old.kind == kind);
     assert!(new.faults.iter().all(|fault| known(fault.kind)), "{:?}", new.faults);
     new
 }

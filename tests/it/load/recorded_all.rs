@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use ckpt_doctor::check::finding::LoadReport;
+use ckpt_doctor::check::load::LoadReport;
 use ckpt_doctor::check::load::{Stored, predict};
 use ckpt_doctor::knowledge::{Conversion, Expected, ExpectedTensor, Loader};
 use serde::Deserialize;

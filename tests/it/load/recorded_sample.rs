@@ -1,6 +1,6 @@
 //! Predicted load reports against what transformers 4.47.0 said of the same files.
 
-use ckpt_doctor::check::finding::LoadReport;
+use ckpt_doctor::check::load::LoadReport;
 use ckpt_doctor::check::load::{Stored, predict};
 use ckpt_doctor::knowledge::{Library, Loader};
 

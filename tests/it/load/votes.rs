@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use ckpt_doctor::check::finding::LoadReport;
 use ckpt_doctor::check::inspect::{Inspection, inspect};
+use ckpt_doctor::check::load::LoadReport;
 use ckpt_doctor::check::load::{Stored, predict};
 use ckpt_doctor::check::votes::{Votes, explain, vote};
 use ckpt_doctor::checkpoint::{Checkpoint, Dtype, Parts, Shard, Tensor};

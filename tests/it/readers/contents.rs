@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Checkpoint, Fault};
+use ckpt_doctor::checkpoint::{Checkpoint, Fault, FaultKind};
 
 use super::{Case, hold};
 
@@ -46,11 +46,15 @@ fn cases() -> Vec<Case> {
     };
     vec![
         Case::new("ordinary numbers", &[], with(|_| ())),
-        Case::new("a NaN", &["non-finite-weights"], with(|data| data[6..8].copy_from_slice(&[0xc0, 0x7f]))),
-        Case::new("nothing but zeros", &["zero-tail"], with(|data| data.fill(0))),
+        Case::new("a NaN", &[FaultKind::NonFiniteWeights], with(|data| data[6..8].copy_from_slice(&[0xc0, 0x7f]))),
+        Case::new("nothing but zeros", &[FaultKind::ZeroTail], with(|data| data.fill(0))),
         Case::new("half of the only tensor is zero", &[], with(|data| data[32..].fill(0))),
-        Case::new("cut off meanwhile", &["contents-unread"], faults(|dir| write(&dir.join(NAME), &[1; 64]), cut)),
-        Case::new("another content than the cache says", &["content-hash-differs"], faults(cached, |_| ())),
+        Case::new(
+            "cut off meanwhile",
+            &[FaultKind::ContentsUnread],
+            faults(|dir| write(&dir.join(NAME), &[1; 64]), cut),
+        ),
+        Case::new("another content than the cache says", &[FaultKind::ContentHashDiffers], faults(cached, |_| ())),
     ]
 }
 
@@ -74,9 +78,9 @@ fn a_hole_at_the_end_is_seen_without_reading() {
     let tells = hole < start + 2_097_152;
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     let kinds = |c: &Checkpoint| c.shards[NAME].faults.iter().map(|f| f.kind).collect::<Vec<_>>();
-    assert_eq!(kinds(&checkpoint), if tells { vec!["zero-tail"] } else { vec![] });
+    assert_eq!(kinds(&checkpoint), if tells { vec![FaultKind::ZeroTail] } else { vec![] });
     checkpoint.read_contents();
-    assert_eq!(kinds(&checkpoint), ["zero-tail"]);
+    assert_eq!(kinds(&checkpoint), [FaultKind::ZeroTail]);
     let detail = &checkpoint.shards[NAME].faults[0].detail;
     assert_eq!((detail["tensors"].as_u64(), detail["bytes"].as_u64()), (Some(1), Some(1_097_152)));
 }

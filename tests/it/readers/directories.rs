@@ -8,7 +8,7 @@ use std::sync::LazyLock;
 
 use ckpt_doctor::checkpoint::open::{JSON_CAP, MODULE_CAP, read_capped};
 use ckpt_doctor::checkpoint::{
-    Checkpoint, Document, EntryKind, OpenError, Shard, find_checkpoints, is_plain_file_name, open_regular,
+    Checkpoint, Document, EntryKind, FaultKind, OpenError, Shard, find_checkpoints, is_plain_file_name, open_regular,
 };
 use ckpt_doctor::checkpoint::{Parts, escape};
 use serde_json::json;
@@ -37,7 +37,7 @@ fn sparse(path: &Path, size: u64) {
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
-    let case = |label, expected: &[&'static str], build: &dyn Fn(&Path)| {
+    let case = |label, expected: &[FaultKind], build: &dyn Fn(&Path)| {
         let dir = TempDir::new().unwrap();
         let root = dir.path().join("repo/snapshots/main");
         fs::create_dir_all(&root).unwrap();
@@ -55,7 +55,7 @@ fn cases() -> Vec<Case> {
     };
     vec![
         case("empty directory", &[], &|_| {}),
-        case("a repair that was killed", &["repair-interrupted"], &|root| {
+        case("a repair that was killed", &[FaultKind::RepairInterrupted], &|root| {
             fs::create_dir(root.join(".ckpt-doctor")).unwrap();
             fs::write(root.join(".ckpt-doctor/journal.json"), "{}").unwrap();
         }),
@@ -64,7 +64,7 @@ fn cases() -> Vec<Case> {
             fs::write(root.join("a.json"), "{}").unwrap();
             symlink("a.json", root.join("config.json")).unwrap();
         }),
-        case("link out", &["symlink-outside"], &|root| {
+        case("link out", &[FaultKind::SymlinkOutside], &|root| {
             fs::write(root.join("../other.json"), "{}").unwrap();
             symlink("../other.json", root.join("config.json")).unwrap();
         }),
@@ -75,34 +75,34 @@ fn cases() -> Vec<Case> {
             fs::create_dir(root.join("checkpoint-500")).unwrap();
             fs::write(root.join("checkpoint-500/config.json"), "broken").unwrap();
         }),
-        case("FIFO config", &["not-a-regular-file"], &at("config.json", &fifo)),
-        case("FIFO shard", &["not-a-regular-file"], &at("model.safetensors", &fifo)),
-        case("FIFO module", &["not-a-regular-file"], &at("modeling_x.py", &fifo)),
-        case("FIFO vocabulary", &["not-a-regular-file"], &at("tokenizer.model", &fifo)),
-        case("folder config", &["not-a-regular-file"], &|root| folder(&root.join("config.json"))),
-        case("folder shard", &["not-a-regular-file"], &|root| folder(&root.join("model.safetensors"))),
-        case("device", &["not-a-regular-file"], &|root| symlink("/dev/zero", root.join("config.json")).unwrap()),
-        case("socket", &["not-a-regular-file"], &|root| {
+        case("FIFO config", &[FaultKind::NotARegularFile], &at("config.json", &fifo)),
+        case("FIFO shard", &[FaultKind::NotARegularFile], &at("model.safetensors", &fifo)),
+        case("FIFO module", &[FaultKind::NotARegularFile], &at("modeling_x.py", &fifo)),
+        case("FIFO vocabulary", &[FaultKind::NotARegularFile], &at("tokenizer.model", &fifo)),
+        case("folder config", &[FaultKind::NotARegularFile], &|root| folder(&root.join("config.json"))),
+        case("folder shard", &[FaultKind::NotARegularFile], &|root| folder(&root.join("model.safetensors"))),
+        case("device", &[FaultKind::NotARegularFile], &|root| symlink("/dev/zero", root.join("config.json")).unwrap()),
+        case("socket", &[FaultKind::NotARegularFile], &|root| {
             // The path of a socket is short by nature; the folder's own may not be.
             drop(UnixListener::bind(root.join("config.json")).unwrap());
         }),
-        case("dangling", &["dangling-symlink"], &|root| {
+        case("dangling", &[FaultKind::DanglingSymlink], &|root| {
             symlink("../../blobs/gone", root.join("model.safetensors")).unwrap();
         }),
-        case("dangling neighbour", &["dangling-symlink"], &|root| {
+        case("dangling neighbour", &[FaultKind::DanglingSymlink], &|root| {
             symlink("gone", root.join("pytorch_model.bin")).unwrap();
         }),
-        case("loop", &["symlink-loop"], &|root| symlink("config.json", root.join("config.json")).unwrap()),
-        case("6 GiB config", &["file-too-large"], &|root| sparse(&root.join("config.json"), 6 << 30)),
-        case("large module", &["file-too-large"], &|root| sparse(&root.join("m.py"), MODULE_CAP + 1)),
-        case("partial download", &["partial-download"], &|root| {
+        case("loop", &[FaultKind::SymlinkLoop], &|root| symlink("config.json", root.join("config.json")).unwrap()),
+        case("6 GiB config", &[FaultKind::FileTooLarge], &|root| sparse(&root.join("config.json"), 6 << 30)),
+        case("large module", &[FaultKind::FileTooLarge], &|root| sparse(&root.join("m.py"), MODULE_CAP + 1)),
+        case("partial download", &[FaultKind::PartialDownload], &|root| {
             fs::write(root.join("model-00001-of-00002.safetensors.incomplete"), "x").unwrap();
         }),
-        case("aria2", &["partial-download"], &|root| {
+        case("aria2", &[FaultKind::PartialDownload], &|root| {
             fs::write(root.join("model.safetensors"), file(br#"{"__metadata__":{"format":"pt"}}"#, 0)).unwrap();
             fs::write(root.join("model.safetensors.aria2"), "x").unwrap();
         }),
-        case("unreadable", &["unreadable-file"], &|root| {
+        case("unreadable", &[FaultKind::UnreadableFile], &|root| {
             // A name longer than the system takes, behind a link: an error of no other kind.
             symlink("x".repeat(300), root.join("config.json")).unwrap();
         }),
@@ -137,7 +137,7 @@ fn no_file_is_opened_because_another_names_it() {
     let index = checkpoint.index.as_ref().unwrap();
     assert_eq!(index.weight_map.keys().collect::<Vec<_>>(), ["c"]);
     assert!(checkpoint.shards.is_empty());
-    assert_eq!(checkpoint.all_faults().filter(|f| f.kind == "index-unsafe-path").count(), 2);
+    assert_eq!(checkpoint.all_faults().filter(|f| f.kind == FaultKind::IndexUnsafePath).count(), 2);
 }
 
 #[test]
@@ -163,7 +163,7 @@ fn what_follows_the_last_tensor_is_named() {
     bytes.extend(b"PK\x03\x04appended");
     let checkpoint = open_with("model.safetensors", &bytes);
     let fault = checkpoint.all_faults().next().unwrap();
-    assert_eq!(fault.kind, "trailing-bytes");
+    assert_eq!(fault.kind, FaultKind::TrailingBytes);
     assert!(fault.detail["looks_like"].as_str().unwrap().contains("zip"));
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Document, Fault, Index, line_column};
+use ckpt_doctor::checkpoint::{Document, Fault, FaultKind, Index, line_column};
 use serde_json::json;
 
 use super::{Case, hold};
@@ -28,7 +28,7 @@ pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 fn cases() -> Vec<Case> {
     let one = |label, kind, text: &[u8]| Case::new(label, &[kind], faults(text));
     let clean = |label, text: &[u8]| Case::new(label, &[], faults(text));
-    let index = |label, expected: &[&'static str], text: &str| Case::new(label, expected, index_faults(text));
+    let index = |label, expected: &[FaultKind], text: &str| Case::new(label, expected, index_faults(text));
     let deep = |n: usize| format!("{{\"a\":{}{}}}", "[".repeat(n), "]".repeat(n));
     let objects = format!("{}1{}", "{\"a\":".repeat(100_000), "}".repeat(100_000));
     let digits = format!("{{\"a\": {}}}", "7".repeat(1_000_000));
@@ -45,63 +45,79 @@ fn cases() -> Vec<Case> {
         clean("127 levels", deep(126).as_bytes()),
         clean("escaped pair", br#"{"a": "\ud83d\ude00"}"#),
         clean("carriage returns", b"{\r\n\t\"a\": 1\r\n}\r\n"),
-        one("128 levels", "json-too-deep", deep(127).as_bytes()),
-        one("100 000 arrays", "json-too-deep", deep(100_000).as_bytes()),
-        one("100 000 objects", "json-too-deep", objects.as_bytes()),
-        one("NaN", "non-finite-number", br#"{"a": NaN}"#),
-        one("Infinity", "non-finite-number", br#"{"a": [Infinity, -Infinity]}"#),
-        one("duplicate key", "duplicate-json-key", br#"{"a": 1, "b": {}, "a": 2}"#),
-        one("duplicate by escape", "duplicate-json-key", br#"{"a": 1, "\u0061": 1}"#),
-        one("nested duplicate", "duplicate-json-key", br#"{"x": [{"a": 1, "a": 2}]}"#),
-        one("trailing comma", "trailing-comma", br#"{"a": [1, 2,], "b": 1}"#),
-        one("missing comma", "missing-comma", b"{\"a\": 1\n \"b\": [1 2]}"),
-        one("comment", "comment-in-json", b"{\"a\": 1 // one\n, /* two */ \"b\": 2}"),
-        one("single quotes", "single-quoted-string", br"{'a': 'it\'s'}"),
-        one("byte-order mark", "byte-order-mark", b"\xef\xbb\xbf{\"a\": 1}"),
-        one("UTF-16 with mark", "wrong-encoding", &bom16),
-        one("UTF-16 without", "wrong-encoding", &utf16(r#"{"a": 1}"#, false)),
-        one("UTF-32", "wrong-encoding", &utf32),
-        one("Latin-1", "invalid-utf8", b"{\"a\": \"caf\xe9\"}"),
-        one("NUL padding", "nul-bytes", b"{\"a\": 1}\0\0\0\0"),
-        one("only NULs", "nul-bytes", &[0; 4096]),
-        one("10^400", "huge-number", br#"{"a": 1e400}"#),
-        one("10^400 in digits", "huge-number", googol4.as_bytes()),
-        one("a million digits", "huge-number", digits.as_bytes()),
-        one("empty", "empty-document", b""),
-        one("blank", "empty-document", b" \n\t\n"),
-        one("list", "not-an-object", b"[1, 2]"),
-        one("string", "not-an-object", b"\"Entry not found\""),
-        one("second value", "trailing-content", b"{\"a\": 1}\n{\"b\": 2}\n"),
-        one("bracket too many", "trailing-content", b"{\"a\": 1}}\n"),
-        one("appended section", "appended-section", b"{\"a\": 1}\n[http]\n\tpostBuffer = 524288000\n"),
-        one("conflict", "merge-conflict-marker", b"{\n<<<<<<< HEAD\n\"a\": 1\n=======\n\"a\": 2\n>>>>>>> b\n}\n"),
-        one("half a conflict", "merge-conflict-marker", b"{\n\"a\": 1,\n=======\n\"b\": 2\n}\n"),
-        one("pointer", "lfs-pointer", POINTER.as_bytes()),
-        one("pointer, CRLF", "lfs-pointer", POINTER.replace('\n', "\r\n").as_bytes()),
-        one("pointer, hawser", "lfs-pointer", POINTER.replace("git-lfs.github", "hawser.github").as_bytes()),
-        one("pointer, ext", "lfs-pointer", POINTER.replace("oid", "ext-0-foo sha256:ab\noid").as_bytes()),
-        one("login page", "html-instead", b"\n<!DOCTYPE html><html><body>Sign in</body></html>"),
-        one("gzip", "html-instead", b"\x1f\x8b\x08\0\0\0\0\0\0\x03"),
-        one("lone surrogate", "lone-surrogate", br#"{"a": "\ud83d"}"#),
-        one("cut off", "json-syntax", br#"{"a": {"b": 1"#),
-        one("Python literal", "json-syntax", br#"{"a": True}"#),
-        one("bare word", "json-syntax", br"{a: 1}"),
-        one("leading zero", "json-syntax", br#"{"a": 012}"#),
-        one("tab in a string", "json-syntax", b"{\"a\": \"x\ty\"}"),
-        one("two commas", "json-syntax", br#"{"a": 1,, "b": 2}"#),
-        one("comma only", "json-syntax", br"{,}"),
-        one("two million zeros", "json-too-many-values", many.as_bytes()),
-        Case::new("slips together", &["missing-comma", "trailing-comma"], faults("{\"a\": 1\n\"b\": 2,\n}")),
+        one("128 levels", FaultKind::JsonTooDeep, deep(127).as_bytes()),
+        one("100 000 arrays", FaultKind::JsonTooDeep, deep(100_000).as_bytes()),
+        one("100 000 objects", FaultKind::JsonTooDeep, objects.as_bytes()),
+        one("NaN", FaultKind::NonFiniteNumber, br#"{"a": NaN}"#),
+        one("Infinity", FaultKind::NonFiniteNumber, br#"{"a": [Infinity, -Infinity]}"#),
+        one("duplicate key", FaultKind::DuplicateJsonKey, br#"{"a": 1, "b": {}, "a": 2}"#),
+        one("duplicate by escape", FaultKind::DuplicateJsonKey, br#"{"a": 1, "\u0061": 1}"#),
+        one("nested duplicate", FaultKind::DuplicateJsonKey, br#"{"x": [{"a": 1, "a": 2}]}"#),
+        one("trailing comma", FaultKind::TrailingComma, br#"{"a": [1, 2,], "b": 1}"#),
+        one("missing comma", FaultKind::MissingComma, b"{\"a\": 1\n \"b\": [1 2]}"),
+        one("comment", FaultKind::CommentInJson, b"{\"a\": 1 // one\n, /* two */ \"b\": 2}"),
+        one("single quotes", FaultKind::SingleQuotedString, br"{'a': 'it\'s'}"),
+        one("byte-order mark", FaultKind::ByteOrderMark, b"\xef\xbb\xbf{\"a\": 1}"),
+        one("UTF-16 with mark", FaultKind::WrongEncoding, &bom16),
+        one("UTF-16 without", FaultKind::WrongEncoding, &utf16(r#"{"a": 1}"#, false)),
+        one("UTF-32", FaultKind::WrongEncoding, &utf32),
+        one("Latin-1", FaultKind::InvalidUtf8, b"{\"a\": \"caf\xe9\"}"),
+        one("NUL padding", FaultKind::NulBytes, b"{\"a\": 1}\0\0\0\0"),
+        one("only NULs", FaultKind::NulBytes, &[0; 4096]),
+        one("10^400", FaultKind::HugeNumber, br#"{"a": 1e400}"#),
+        one("10^400 in digits", FaultKind::HugeNumber, googol4.as_bytes()),
+        one("a million digits", FaultKind::HugeNumber, digits.as_bytes()),
+        one("empty", FaultKind::EmptyDocument, b""),
+        one("blank", FaultKind::EmptyDocument, b" \n\t\n"),
+        one("list", FaultKind::NotAnObject, b"[1, 2]"),
+        one("string", FaultKind::NotAnObject, b"\"Entry not found\""),
+        one("second value", FaultKind::TrailingContent, b"{\"a\": 1}\n{\"b\": 2}\n"),
+        one("bracket too many", FaultKind::TrailingContent, b"{\"a\": 1}}\n"),
+        one("appended section", FaultKind::AppendedSection, b"{\"a\": 1}\n[http]\n\tpostBuffer = 524288000\n"),
+        one(
+            "conflict",
+            FaultKind::MergeConflictMarker,
+            b"{\n<<<<<<< HEAD\n\"a\": 1\n=======\n\"a\": 2\n>>>>>>> b\n}\n",
+        ),
+        one("half a conflict", FaultKind::MergeConflictMarker, b"{\n\"a\": 1,\n=======\n\"b\": 2\n}\n"),
+        one("pointer", FaultKind::LfsPointer, POINTER.as_bytes()),
+        one("pointer, CRLF", FaultKind::LfsPointer, POINTER.replace('\n', "\r\n").as_bytes()),
+        one("pointer, hawser", FaultKind::LfsPointer, POINTER.replace("git-lfs.github", "hawser.github").as_bytes()),
+        one("pointer, ext", FaultKind::LfsPointer, POINTER.replace("oid", "ext-0-foo sha256:ab\noid").as_bytes()),
+        one("login page", FaultKind::HtmlInstead, b"\n<!DOCTYPE html><html><body>Sign in</body></html>"),
+        one("gzip", FaultKind::HtmlInstead, b"\x1f\x8b\x08\0\0\0\0\0\0\x03"),
+        one("lone surrogate", FaultKind::LoneSurrogate, br#"{"a": "\ud83d"}"#),
+        one("cut off", FaultKind::JsonSyntax, br#"{"a": {"b": 1"#),
+        one("Python literal", FaultKind::JsonSyntax, br#"{"a": True}"#),
+        one("bare word", FaultKind::JsonSyntax, br"{a: 1}"),
+        one("leading zero", FaultKind::JsonSyntax, br#"{"a": 012}"#),
+        one("tab in a string", FaultKind::JsonSyntax, b"{\"a\": \"x\ty\"}"),
+        one("two commas", FaultKind::JsonSyntax, br#"{"a": 1,, "b": 2}"#),
+        one("comma only", FaultKind::JsonSyntax, br"{,}"),
+        one("two million zeros", FaultKind::JsonTooManyValues, many.as_bytes()),
+        Case::new(
+            "slips together",
+            &[FaultKind::MissingComma, FaultKind::TrailingComma],
+            faults("{\"a\": 1\n\"b\": 2,\n}"),
+        ),
         index("index", &[], &format!(r#"{{{meta},"weight_map":{{"a":"model-00001-of-00002.safetensors"}}}}"#)),
         index("float size", &[], r#"{"metadata":{"total_size":16582751232.0},"weight_map":{}}"#),
         index("no size, more keys", &[], r#"{"metadata":{"total_parameters":5},"weight_map":{}}"#),
-        index("no metadata", &["index-metadata-missing"], r#"{"weight_map":{}}"#),
-        index("metadata null", &["index-metadata-missing"], r#"{"metadata":null,"weight_map":{}}"#),
-        index("no map", &["weight-map-missing"], &format!("{{{meta}}}")),
-        index("map a list", &["weight-map-malformed"], &format!(r#"{{{meta},"weight_map":[]}}"#)),
-        index("file a number", &["weight-map-malformed"], &format!(r#"{{{meta},"weight_map":{{"a":1}}}}"#)),
-        index("two maps", &["duplicate-index-key"], &format!(r#"{{{meta},"weight_map":{{}},"weight_map":{{}}}}"#)),
-        index("tensor twice", &["duplicate-index-key"], &format!(r#"{{{meta},"weight_map":{{"a":"x","a":"y"}}}}"#)),
+        index("no metadata", &[FaultKind::IndexMetadataMissing], r#"{"weight_map":{}}"#),
+        index("metadata null", &[FaultKind::IndexMetadataMissing], r#"{"metadata":null,"weight_map":{}}"#),
+        index("no map", &[FaultKind::WeightMapMissing], &format!("{{{meta}}}")),
+        index("map a list", &[FaultKind::WeightMapMalformed], &format!(r#"{{{meta},"weight_map":[]}}"#)),
+        index("file a number", &[FaultKind::WeightMapMalformed], &format!(r#"{{{meta},"weight_map":{{"a":1}}}}"#)),
+        index(
+            "two maps",
+            &[FaultKind::DuplicateIndexKey],
+            &format!(r#"{{{meta},"weight_map":{{}},"weight_map":{{}}}}"#),
+        ),
+        index(
+            "tensor twice",
+            &[FaultKind::DuplicateIndexKey],
+            &format!(r#"{{{meta},"weight_map":{{"a":"x","a":"y"}}}}"#),
+        ),
     ];
     let unsafe_paths = [
         "../x.safetensors",
@@ -118,11 +134,11 @@ fn cases() -> Vec<Case> {
     ];
     let unsafe_paths = unsafe_paths.map(str::to_owned).into_iter().chain([format!("{}.safetensors", "x".repeat(5000))]);
     let paths = unsafe_paths.map(|path| {
-        index("unsafe path", &["index-unsafe-path"], &format!(r#"{{{meta},"weight_map":{{"a":"{path}"}}}}"#))
+        index("unsafe path", &[FaultKind::IndexUnsafePath], &format!(r#"{{{meta},"weight_map":{{"a":"{path}"}}}}"#))
     });
     let sizes = ["\"8\"", "NaN", "-1", "1e40", "0.5", "null", &format!("1{}", "0".repeat(40))].map(|size| {
         let text = format!(r#"{{"metadata":{{"total_size":{size}}},"weight_map":{{}}}}"#);
-        index("size", &["total-size-malformed"], &text)
+        index("size", &[FaultKind::TotalSizeMalformed], &text)
     });
     rows.into_iter().chain(paths).chain(sizes).collect()
 }
@@ -137,13 +153,13 @@ fn slips_and_non_finite_numbers_say_exactly_where() {
     let text = "{\n  \"é\": {\"x/y~z\": [0, Infinity]}\n  \"b\": 'c',\n}\n";
     let document = Document::parse("config.json", text.as_bytes());
     let place = |kind| document.faults.iter().find(|f| f.kind == kind).unwrap().places.first().unwrap().clone();
-    let infinity = place("non-finite-number");
+    let infinity = place(FaultKind::NonFiniteNumber);
     assert_eq!(infinity.pointer.as_deref(), Some("/é/x~1y~0z/1"));
     assert_eq!(&text[infinity.span.clone().unwrap()], "Infinity");
     assert_eq!(line_column(text, infinity.span.unwrap().start), (2, 22));
-    assert_eq!(line_column(text, place("missing-comma").span.unwrap().start), (2, 32));
-    assert_eq!(&text[place("single-quoted-string").span.unwrap()], "'c'");
-    assert_eq!(line_column(text, place("trailing-comma").span.unwrap().start), (3, 11));
+    assert_eq!(line_column(text, place(FaultKind::MissingComma).span.unwrap().start), (2, 32));
+    assert_eq!(&text[place(FaultKind::SingleQuotedString).span.unwrap()], "'c'");
+    assert_eq!(line_column(text, place(FaultKind::TrailingComma).span.unwrap().start), (3, 11));
     assert_eq!(document.value, Some(json!({"é": {"x/y~z": [0, null]}, "b": "c"})));
 }
 

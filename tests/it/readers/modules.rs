@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::Module;
+use ckpt_doctor::checkpoint::{FaultKind, Module};
 
 use super::{Case, hold};
 
@@ -55,9 +55,8 @@ a, b = 1, 2
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
-    let case = |label, expected: &[&'static str], bytes: &[u8]| {
-        Case::new(label, expected, Module::parse("m.py", bytes).faults)
-    };
+    let case =
+        |label, expected: &[FaultKind], bytes: &[u8]| Case::new(label, expected, Module::parse("m.py", bytes).faults);
     let nested = "(".repeat(100_000);
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n";
     // More syntax than is read of one module, within the size that is read.
@@ -65,11 +64,11 @@ fn cases() -> Vec<Case> {
     vec![
         case("plain", &[], SOURCE.as_bytes()),
         case("empty", &[], b""),
-        case("broken", &["python-syntax"], b"class A(:\n    pass\n"),
-        case("Latin-1", &["invalid-utf8"], b"# caf\xe9\n"),
-        case("pointer", &["lfs-pointer"], pointer),
-        case("nested", &["python-syntax"], nested.as_bytes()),
-        case("endless", &["python-too-complex"], endless.as_bytes()),
+        case("broken", &[FaultKind::PythonSyntax], b"class A(:\n    pass\n"),
+        case("Latin-1", &[FaultKind::InvalidUtf8], b"# caf\xe9\n"),
+        case("pointer", &[FaultKind::LfsPointer], pointer),
+        case("nested", &[FaultKind::PythonSyntax], nested.as_bytes()),
+        case("endless", &[FaultKind::PythonTooComplex], endless.as_bytes()),
     ]
 }
 

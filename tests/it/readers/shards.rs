@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Fault, Shard};
+use ckpt_doctor::checkpoint::{Fault, FaultKind, Shard};
 use serde_json::json;
 
 use super::{Case, hold};
@@ -30,8 +30,8 @@ fn entry(name: &str, dtype: &str, shape: &str, begin: u64, end: u64) -> String {
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
-    let case = |label, expected: &[&'static str], faults| Case::new(label, expected, faults);
-    let raw = |label, expected: &[&'static str], bytes: &[u8]| Case::new(label, expected, read(bytes).faults);
+    let case = |label, expected: &[FaultKind], faults| Case::new(label, expected, faults);
+    let raw = |label, expected: &[FaultKind], bytes: &[u8]| Case::new(label, expected, read(bytes).faults);
     let f = |begin, end| entry("a", "F32", "[1]", begin, end);
     let good = format!("{{\"__metadata__\":{{\"format\":\"pt\"}},{}}}", f(0, 4));
     let with = |before: &str, after: &str| file(format!("{before}{good}{after}").as_bytes(), 4);
@@ -72,121 +72,157 @@ fn cases() -> Vec<Case> {
         case("keys in any order", &[], of(r#""a":{"data_offsets":[0,1],"shape":[1],"dtype":"U8"}"#, 1)),
         raw("no tensors", &[], &file(br#"{"__metadata__":{"format":"pt"}}"#, 0)),
         // C1: the length field.
-        raw("empty", &["empty-file"], b""),
-        raw("short", &["file-too-short"], b"\x02\0\0"),
-        raw("length 0", &["header-length-out-of-range"], &length(0, 20)),
-        raw("length beyond the file", &["header-length-out-of-range"], &length(1000, 20)),
-        raw("length 2^63", &["header-length-out-of-range"], &length(1 << 63, 20)),
-        raw("length 2^64-8", &["header-length-out-of-range"], &length(u64::MAX - 7, 20)),
-        raw("big-endian", &["header-length-out-of-range"], &swapped),
+        raw("empty", &[FaultKind::EmptyFile], b""),
+        raw("short", &[FaultKind::FileTooShort], b"\x02\0\0"),
+        raw("length 0", &[FaultKind::HeaderLengthOutOfRange], &length(0, 20)),
+        raw("length beyond the file", &[FaultKind::HeaderLengthOutOfRange], &length(1000, 20)),
+        raw("length 2^63", &[FaultKind::HeaderLengthOutOfRange], &length(1 << 63, 20)),
+        raw("length 2^64-8", &[FaultKind::HeaderLengthOutOfRange], &length(u64::MAX - 7, 20)),
+        raw("big-endian", &[FaultKind::HeaderLengthOutOfRange], &swapped),
         case(
             "length over the format's limit",
-            &["header-too-large"],
+            &[FaultKind::HeaderTooLarge],
             Shard::parse("m.safetensors", 1 << 40, &length(100_000_001, 20)).faults,
         ),
-        case("header not read", &["unreadable-file"], Shard::parse("m.safetensors", 1 << 40, &length(1000, 20)).faults),
+        case(
+            "header not read",
+            &[FaultKind::UnreadableFile],
+            Shard::parse("m.safetensors", 1 << 40, &length(1000, 20)).faults,
+        ),
         // C2, C3: arithmetic.
-        case("eight of 2^61-1", &["shard-truncated"], of(&huge.join(","), 8)),
-        case("product overflows", &["shape-overflow"], of(&entry("a", "U8", "[4294967296,4294967296,2]", 0, 4), 4)),
-        case("wraps to the size", &["shape-overflow"], of(&entry("a", "F32", "[4611686018427387905]", 0, 4), 4)),
-        case("zero after overflow", &["shape-overflow"], of(&entry("a", "U8", "[9223372036854775808,4,0]", 0, 0), 0)),
+        case("eight of 2^61-1", &[FaultKind::ShardTruncated], of(&huge.join(","), 8)),
+        case(
+            "product overflows",
+            &[FaultKind::ShapeOverflow],
+            of(&entry("a", "U8", "[4294967296,4294967296,2]", 0, 4), 4),
+        ),
+        case(
+            "wraps to the size",
+            &[FaultKind::ShapeOverflow],
+            of(&entry("a", "F32", "[4611686018427387905]", 0, 4), 4),
+        ),
+        case(
+            "zero after overflow",
+            &[FaultKind::ShapeOverflow],
+            of(&entry("a", "U8", "[9223372036854775808,4,0]", 0, 0), 0),
+        ),
         case(
             "offset 2^64",
-            &["entry-malformed"],
+            &[FaultKind::EntryMalformed],
             of(r#""a":{"dtype":"U8","shape":[0],"data_offsets":[0,18446744073709551616]}"#, 0),
         ),
         case(
             "largest offset",
-            &["shape-byte-mismatch", "shard-truncated"],
+            &[FaultKind::ShapeByteMismatch, FaultKind::ShardTruncated],
             of(&entry("a", "U8", "[1]", 0, u64::MAX), 1),
         ),
         // C4: duplicates.
-        case("tensor twice", &["duplicate-header-key"], of(&format!("{},{}", f(0, 4), f(0, 4)), 4)),
+        case("tensor twice", &[FaultKind::DuplicateHeaderKey], of(&format!("{},{}", f(0, 4), f(0, 4)), 4)),
         case(
             "twice by escape",
-            &["duplicate-header-key"],
+            &[FaultKind::DuplicateHeaderKey],
             of(&format!("{},{}", f(0, 4), entry("\\u0061", "U8", "[4]", 0, 4)), 4),
         ),
         case(
             "field twice",
-            &["duplicate-header-key"],
+            &[FaultKind::DuplicateHeaderKey],
             of(r#""a":{"dtype":"U8","dtype":"U8","shape":[1],"data_offsets":[0,1]}"#, 1),
         ),
         raw(
             "metadata twice",
-            &["duplicate-header-key"],
+            &[FaultKind::DuplicateHeaderKey],
             &file(br#"{"__metadata__":{"format":"pt"},"__metadata__":{"format":"pt"}}"#, 0),
         ),
-        case("metadata key twice", &["duplicate-header-key"], meta(r#"{"format":"pt","format":"pt"}"#)),
+        case("metadata key twice", &[FaultKind::DuplicateHeaderKey], meta(r#"{"format":"pt","format":"pt"}"#)),
         // C5, C6: overlap and holes.
         case(
             "overlap",
-            &["tensors-overlap", "trailing-bytes"],
+            &[FaultKind::TensorsOverlap, FaultKind::TrailingBytes],
             two(&entry("a", "F32", "[1]", 0, 4), &entry("b", "F32", "[1]", 2, 6)),
         ),
-        case("the same bytes", &["tensors-overlap"], of(&[f(0, 4), entry("b", "F32", "[1]", 0, 4)].join(","), 4)),
-        case("empty inside another", &["tensors-overlap"], of(&[f(0, 4), entry("b", "F32", "[0]", 2, 2)].join(","), 4)),
-        case("hole", &["data-hole"], of(&[entry("a", "U8", "[1]", 0, 1), entry("b", "U8", "[1]", 2, 3)].join(","), 3)),
-        case("leading gap", &["data-hole"], of(&f(4, 8), 8)),
-        case("trailing bytes", &["trailing-bytes"], of(&f(0, 4), 5)),
+        case(
+            "the same bytes",
+            &[FaultKind::TensorsOverlap],
+            of(&[f(0, 4), entry("b", "F32", "[1]", 0, 4)].join(","), 4),
+        ),
+        case(
+            "empty inside another",
+            &[FaultKind::TensorsOverlap],
+            of(&[f(0, 4), entry("b", "F32", "[0]", 2, 2)].join(","), 4),
+        ),
+        case(
+            "hole",
+            &[FaultKind::DataHole],
+            of(&[entry("a", "U8", "[1]", 0, 1), entry("b", "U8", "[1]", 2, 3)].join(","), 3),
+        ),
+        case("leading gap", &[FaultKind::DataHole], of(&f(4, 8), 8)),
+        case("trailing bytes", &[FaultKind::TrailingBytes], of(&f(0, 4), 5)),
         // C7, C8, C9: sizes and types.
-        case("truncated", &["shard-truncated"], of(&f(0, 4), 3)),
-        case("unknown dtype", &["unknown-dtype"], of(&entry("a", "I4", "[2]", 0, 1), 1)),
-        case("lower case", &["unknown-dtype"], of(&entry("a", "f32", "[1]", 0, 4), 4)),
-        case("half a byte", &["sub-byte-misaligned"], of(&entry("a", "F4", "[3]", 0, 2), 2)),
-        case("wrong shape", &["shape-byte-mismatch"], of(&entry("a", "F32", "[2]", 0, 4), 4)),
-        case("end before begin", &["offsets-out-of-order"], of(&entry("a", "F32", "[1]", 4, 0), 4)),
-        case("negative", &["entry-malformed"], of(r#""a":{"dtype":"U8","shape":[-1],"data_offsets":[0,0]}"#, 0)),
-        case("float", &["entry-malformed"], of(r#""a":{"dtype":"U8","shape":[1.0],"data_offsets":[0,1]}"#, 1)),
-        case("three offsets", &["entry-malformed"], of(r#""a":{"dtype":"U8","shape":[1],"data_offsets":[0,1,1]}"#, 1)),
-        case("no shape", &["entry-malformed"], of(r#""a":{"dtype":"U8","data_offsets":[0,1]}"#, 1)),
-        case("not an object", &["entry-malformed"], of(r#""a":7"#, 0)),
+        case("truncated", &[FaultKind::ShardTruncated], of(&f(0, 4), 3)),
+        case("unknown dtype", &[FaultKind::UnknownDtype], of(&entry("a", "I4", "[2]", 0, 1), 1)),
+        case("lower case", &[FaultKind::UnknownDtype], of(&entry("a", "f32", "[1]", 0, 4), 4)),
+        case("half a byte", &[FaultKind::SubByteMisaligned], of(&entry("a", "F4", "[3]", 0, 2), 2)),
+        case("wrong shape", &[FaultKind::ShapeByteMismatch], of(&entry("a", "F32", "[2]", 0, 4), 4)),
+        case("end before begin", &[FaultKind::OffsetsOutOfOrder], of(&entry("a", "F32", "[1]", 4, 0), 4)),
+        case(
+            "negative",
+            &[FaultKind::EntryMalformed],
+            of(r#""a":{"dtype":"U8","shape":[-1],"data_offsets":[0,0]}"#, 0),
+        ),
+        case("float", &[FaultKind::EntryMalformed], of(r#""a":{"dtype":"U8","shape":[1.0],"data_offsets":[0,1]}"#, 1)),
+        case(
+            "three offsets",
+            &[FaultKind::EntryMalformed],
+            of(r#""a":{"dtype":"U8","shape":[1],"data_offsets":[0,1,1]}"#, 1),
+        ),
+        case("no shape", &[FaultKind::EntryMalformed], of(r#""a":{"dtype":"U8","data_offsets":[0,1]}"#, 1)),
+        case("not an object", &[FaultKind::EntryMalformed], of(r#""a":7"#, 0)),
         // C10: padding.
-        raw("NUL padding", &["header-padding-not-spaces"], &with("", "\0\0\0")),
-        raw("byte-order mark", &["header-padding-not-spaces"], &with("\u{feff}", "")),
-        raw("two objects", &["header-padding-not-spaces"], &with("", "{}")),
+        raw("NUL padding", &[FaultKind::HeaderPaddingNotSpaces], &with("", "\0\0\0")),
+        raw("byte-order mark", &[FaultKind::HeaderPaddingNotSpaces], &with("\u{feff}", "")),
+        raw("two objects", &[FaultKind::HeaderPaddingNotSpaces], &with("", "{}")),
         // C11: metadata.
-        case("metadata a number", &["metadata-not-strings", "no-format-metadata"], meta("7")),
-        case("metadata value a number", &["metadata-not-strings"], meta(r#"{"format":"pt","n":1}"#)),
-        case("metadata null", &["metadata-null", "no-format-metadata"], meta("null")),
+        case("metadata a number", &[FaultKind::MetadataNotStrings, FaultKind::NoFormatMetadata], meta("7")),
+        case("metadata value a number", &[FaultKind::MetadataNotStrings], meta(r#"{"format":"pt","n":1}"#)),
+        case("metadata null", &[FaultKind::MetadataNull, FaultKind::NoFormatMetadata], meta("null")),
         case(
             "metadata a tensor",
-            &["metadata-not-strings", "no-format-metadata"],
+            &[FaultKind::MetadataNotStrings, FaultKind::NoFormatMetadata],
             meta(r#"{"dtype":"U8","shape":[0],"data_offsets":[0,0]}"#),
         ),
-        raw("no metadata", &["no-format-metadata"], &file(b"{}", 0)),
-        case("unknown format", &["no-format-metadata"], meta(r#"{"format":"np"}"#)),
+        raw("no metadata", &[FaultKind::NoFormatMetadata], &file(b"{}", 0)),
+        case("unknown format", &[FaultKind::NoFormatMetadata], meta(r#"{"format":"np"}"#)),
         // C12, C13.
-        raw("deep", &["header-too-deep"], &file(deep.as_bytes(), 0)),
+        raw("deep", &[FaultKind::HeaderTooDeep], &file(deep.as_bytes(), 0)),
         raw(
             "half a million entries",
-            &["json-too-many-values"],
+            &[FaultKind::JsonTooManyValues],
             &file(format!("{{\"__metadata__\":{{{crowd}\"format\":\"pt\"}}}}").as_bytes(), 0),
         ),
-        raw("not UTF-8", &["header-not-utf8"], &file(b"{\"\xff\":1}", 0)),
-        raw("not JSON", &["header-not-json"], &file(b"{\"a\":", 0)),
-        raw("trailing comma", &["header-not-json"], &file(b"{\"__metadata__\":{\"format\":\"pt\"},}", 0)),
+        raw("not UTF-8", &[FaultKind::HeaderNotUtf8], &file(b"{\"\xff\":1}", 0)),
+        raw("not JSON", &[FaultKind::HeaderNotJson], &file(b"{\"a\":", 0)),
+        raw("trailing comma", &[FaultKind::HeaderNotJson], &file(b"{\"__metadata__\":{\"format\":\"pt\"},}", 0)),
         case(
             "NaN",
-            &["entry-malformed", "header-not-json"],
+            &[FaultKind::EntryMalformed, FaultKind::HeaderNotJson],
             of(r#""a":{"dtype":"U8","shape":[NaN],"data_offsets":[0,1]}"#, 1),
         ),
-        case("no name", &["odd-tensor-name"], name("")),
-        case("NUL", &["odd-tensor-name"], name("a\\u0000")),
-        case("escape code", &["odd-tensor-name"], name("\\u001b[31m")),
-        case("path", &["odd-tensor-name"], name("../../x")),
-        case("1 MiB", &["odd-tensor-name"], name(&"x".repeat(1 << 20))),
-        case("lone surrogate", &["odd-tensor-name", "header-not-json"], name("\\ud800")),
+        case("no name", &[FaultKind::OddTensorName], name("")),
+        case("NUL", &[FaultKind::OddTensorName], name("a\\u0000")),
+        case("escape code", &[FaultKind::OddTensorName], name("\\u001b[31m")),
+        case("path", &[FaultKind::OddTensorName], name("../../x")),
+        case("1 MiB", &[FaultKind::OddTensorName], name(&"x".repeat(1 << 20))),
+        case("lone surrogate", &[FaultKind::OddTensorName, FaultKind::HeaderNotJson], name("\\ud800")),
         // D1, D4: something else.
-        raw("pointer", &["lfs-pointer"], pointer),
-        raw("web page", &["not-safetensors"], b"<!DOCTYPE html>\n<html><head><title>Sign in</title>"),
-        raw("JSON error", &["not-safetensors"], br#"{"error":"Repository not found"}"#),
-        raw("text", &["not-safetensors"], b"Invalid username or password."),
-        raw("gzip", &["not-safetensors"], b"\x1f\x8b\x08\0\0\0\0\0\0\x03abcdef"),
-        raw("zip", &["not-safetensors"], b"PK\x03\x04\x14\0\0\0\0\0\0\0"),
-        raw("pickle", &["not-safetensors"], b"\x80\x02}q\0(X\x05\0\0\0a"),
-        raw("GGUF", &["not-safetensors"], b"GGUF\x03\0\0\0\x01\0\0\0"),
-        raw("NULs", &["not-safetensors"], &[0; 4096]),
+        raw("pointer", &[FaultKind::LfsPointer], pointer),
+        raw("web page", &[FaultKind::NotSafetensors], b"<!DOCTYPE html>\n<html><head><title>Sign in</title>"),
+        raw("JSON error", &[FaultKind::NotSafetensors], br#"{"error":"Repository not found"}"#),
+        raw("text", &[FaultKind::NotSafetensors], b"Invalid username or password."),
+        raw("gzip", &[FaultKind::NotSafetensors], b"\x1f\x8b\x08\0\0\0\0\0\0\x03abcdef"),
+        raw("zip", &[FaultKind::NotSafetensors], b"PK\x03\x04\x14\0\0\0\0\0\0\0"),
+        raw("pickle", &[FaultKind::NotSafetensors], b"\x80\x02}q\0(X\x05\0\0\0a"),
+        raw("GGUF", &[FaultKind::NotSafetensors], b"GGUF\x03\0\0\0\x01\0\0\0"),
+        raw("NULs", &[FaultKind::NotSafetensors], &[0; 4096]),
     ]
 }
 
@@ -200,13 +236,13 @@ fn faults_name_file_tensor_and_figures() {
     let entries = [entry("first", "F32", "[1]", 0, 4), entry("second", "BF16", "[2,3]", 4, 14)].join(",");
     let faults = of(&entries, 7);
     let by = |kind| faults.iter().find(|f| f.kind == kind).unwrap();
-    let mismatch = by("shape-byte-mismatch");
+    let mismatch = by(FaultKind::ShapeByteMismatch);
     assert_eq!(mismatch.places[0].file.as_deref(), Some("model.safetensors"));
     assert_eq!(mismatch.places[0].tensor.as_deref(), Some("second"));
     assert_eq!(mismatch.detail["computed"], json!(12));
     assert_eq!(mismatch.detail["stored"], json!(10));
     assert_eq!(mismatch.detail["shape"], json!([2, 3]));
-    let truncated = by("shard-truncated");
+    let truncated = by(FaultKind::ShardTruncated);
     assert_eq!(truncated.places[0].tensor.as_deref(), Some("second"));
     assert_eq!(truncated.detail["missing"], json!(7));
 }
@@ -221,7 +257,13 @@ fn every_fault_of_a_header_is_reported_not_the_first_alone() {
     ];
     let shard = read(&file(format!("{{{}}}", entries.join(",")).as_bytes(), 9));
     let kinds: Vec<_> = shard.faults.iter().map(|f| f.kind).collect();
-    for kind in ["unknown-dtype", "shape-byte-mismatch", "odd-tensor-name", "entry-malformed", "no-format-metadata"] {
+    for kind in [
+        FaultKind::UnknownDtype,
+        FaultKind::ShapeByteMismatch,
+        FaultKind::OddTensorName,
+        FaultKind::EntryMalformed,
+        FaultKind::NoFormatMetadata,
+    ] {
         assert!(kinds.contains(&kind), "{kind} in {kinds:?}");
     }
     assert_eq!(shard.unreadable, ["a", "c"]);

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Document, Tokenizer, Vocabulary};
+use ckpt_doctor::checkpoint::{Document, FaultKind, Tokenizer, Vocabulary};
 use serde_json::json;
 
 use super::directories::open_with;
@@ -29,19 +29,23 @@ pub fn sentencepiece(pieces: &[&str]) -> Vec<u8> {
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
-    let model = |label, expected: &[&'static str], bytes: &[u8]| {
+    let model = |label, expected: &[FaultKind], bytes: &[u8]| {
         Case::new(label, expected, open_with("tokenizer.model", bytes).tokenizer.faults)
     };
     let mut cut = sentencepiece(&["<unk>", "<s>", "</s>"]);
     cut.truncate(20);
     vec![
         model("model", &[], &sentencepiece(&["<unk>", "<s>", "</s>", "▁a"])),
-        model("cut off", &["vocabulary-malformed"], &cut),
-        model("text", &["vocabulary-malformed"], b"hello, this is not a protocol buffer"),
-        model("number without end", &["vocabulary-malformed"], &[0xff; 64]),
-        model("length 2^63", &["vocabulary-malformed"], b"\x0a\xff\xff\xff\xff\xff\xff\xff\xff\x7f"),
-        model("empty", &["empty-file"], b""),
-        model("pointer", &["lfs-pointer"], b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n"),
+        model("cut off", &[FaultKind::VocabularyMalformed], &cut),
+        model("text", &[FaultKind::VocabularyMalformed], b"hello, this is not a protocol buffer"),
+        model("number without end", &[FaultKind::VocabularyMalformed], &[0xff; 64]),
+        model("length 2^63", &[FaultKind::VocabularyMalformed], b"\x0a\xff\xff\xff\xff\xff\xff\xff\xff\x7f"),
+        model("empty", &[FaultKind::EmptyFile], b""),
+        model(
+            "pointer",
+            &[FaultKind::LfsPointer],
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n",
+        ),
     ]
 }
 

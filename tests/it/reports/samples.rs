@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ckpt_doctor::check::finding::{LoadReport, Mismatch, Silent};
+use ckpt_doctor::check::load::{LoadReport, Mismatch, Silent, SilentReason};
 use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
@@ -196,12 +196,8 @@ fn load() -> LoadReport {
             mismatch("language_model.model.layers.1.mlp.down_proj.weight", &[64, 48], &[48, 64]),
         ],
         silent: vec![
-            Silent {
-                name: "spatial_embed_tokens.weight".to_owned(),
-                reason: "indexed-but-absent".to_owned(),
-                by: None,
-            },
-            Silent { name: "language_model.lm_head.weight".to_owned(), reason: "tied-over".to_owned(), by: None },
+            Silent { name: "spatial_embed_tokens.weight".to_owned(), reason: SilentReason::IndexedButAbsent, by: None },
+            Silent { name: "language_model.lm_head.weight".to_owned(), reason: SilentReason::TiedOver, by: None },
         ],
         raises: Some("ValueError: The state dictionary is corrupted.".to_owned()),
     }
@@ -298,7 +294,7 @@ pub fn hostile() -> Report {
         missing: vec![HOSTILE.to_owned()],
         unexpected: vec![HOSTILE.to_owned()],
         mismatched: vec![Mismatch { name: HOSTILE.to_owned(), stored: vec![1; 10_000], expected: vec![u64::MAX] }],
-        silent: vec![Silent { name: HOSTILE.to_owned(), reason: HOSTILE.to_owned(), by: None }],
+        silent: vec![Silent { name: HOSTILE.to_owned(), reason: SilentReason::TiedOver, by: Some(HOSTILE.to_owned()) }],
         ..LoadReport::default()
     }];
     Report::new(vec![checkpoint], None)

@@ -7,6 +7,7 @@ pub fn tables(source: &str) -> String {
     let mut out = String::new();
     let (mut docs, mut serde, mut read) = (Vec::new(), String::new(), false);
     let mut inside = false;
+    let mut separator = '_';
     for line in source.lines() {
         let text = line.trim();
         if let Some(doc) = text.strip_prefix("///") {
@@ -17,6 +18,7 @@ pub fn tables(source: &str) -> String {
             serde.push_str(text);
         } else if let Some(name) = declared(line) {
             // What is only made on the way from a file is no part of its form.
+            separator = if serde.contains("kebab-case") { '-' } else { '_' };
             inside = read && !docs.is_empty() && !serde.contains("try_from");
             if inside {
                 let _ = write!(out, "\n**{name}.** {}\n\n| key | | what it says |\n|---|---|---|\n", cell(&docs));
@@ -27,7 +29,7 @@ pub fn tables(source: &str) -> String {
         } else {
             if inside
                 && !serde.contains("(skip)")
-                && let Some(key) = key(text, &serde)
+                && let Some(key) = key(text, &serde, separator)
             {
                 let optional = if serde.contains("default") || text.contains(": Option<") { "optional" } else { "" };
                 let _ = writeln!(out, "| `{key}` | {optional} | {} |", cell(&docs));
@@ -57,7 +59,7 @@ fn declared(line: &str) -> Option<&str> {
 }
 
 /// The key of a field, or of a variant, as a file spells it.
-fn key(text: &str, serde: &str) -> Option<String> {
+fn key(text: &str, serde: &str, separator: char) -> Option<String> {
     if let Some((_, rest)) = serde.split_once("rename = \"") {
         return rest.split('"').next().map(str::to_owned);
     }
@@ -67,7 +69,7 @@ fn key(text: &str, serde: &str) -> Option<String> {
     let mut key = String::new();
     for (i, c) in word.char_indices() {
         if c.is_uppercase() && i > 0 {
-            key.push('_');
+            key.push(separator);
         }
         key.extend(c.to_lowercase());
     }

@@ -1,6 +1,6 @@
 //! One entry of a header.
 
-use super::{Dtype, Fault, Place, Reader, ScanError, Tensor, Token, escape};
+use super::{Dtype, Fault, FaultKind, Place, Reader, ScanError, Tensor, Token, escape};
 
 /// An entry as far as it could be read; a field is `None` when it is absent or malformed.
 pub(in crate::checkpoint::shard) struct Entry {
@@ -42,7 +42,7 @@ impl Reader<'_, '_> {
     pub(super) fn read_entry(&mut self, name: String) -> Result<(), ScanError> {
         let shard = self.shard;
         let place = || shard.place().in_tensor(name.clone());
-        let malformed = |reason: &str| Fault::new("entry-malformed").at(place()).with("reason", reason);
+        let malformed = |reason: &str| Fault::new(FaultKind::EntryMalformed).at(place()).with("reason", reason);
         let (mut dtype, mut shape, mut offsets) = (Field::Absent, Field::Absent, Field::Absent);
         let first = self.token()?;
         if first == Token::BeginObject {
@@ -55,7 +55,7 @@ impl Reader<'_, '_> {
                     _ => false,
                 };
                 if seen {
-                    self.faults.push(Fault::new("duplicate-header-key").at(place()).with("key", &*key));
+                    self.faults.push(Fault::new(FaultKind::DuplicateHeaderKey).at(place()).with("key", &*key));
                 }
                 match &*key {
                     "dtype" => dtype = self.dtype(place)?,
@@ -103,14 +103,15 @@ impl Reader<'_, '_> {
         let token = self.token()?;
         let Token::String(text) = token else {
             self.scanner.skip_rest_of(&token)?;
-            self.faults.push(Fault::new("entry-malformed").at(place()).with("reason", "`dtype` is not a string"));
+            self.faults
+                .push(Fault::new(FaultKind::EntryMalformed).at(place()).with("reason", "`dtype` is not a string"));
             return Ok(Field::Bad);
         };
         let name = text.decode().0;
         Ok(if let Some(dtype) = Dtype::from_name(&name) {
             Field::Good(dtype)
         } else {
-            self.faults.push(Fault::new("unknown-dtype").at(place()).with("dtype", escape(&name, 40)));
+            self.faults.push(Fault::new(FaultKind::UnknownDtype).at(place()).with("dtype", escape(&name, 40)));
             Field::Bad
         })
     }

@@ -3,15 +3,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ckpt_doctor::checkpoint::{Document, INDEX_NAME, Index, Tokenizer, Vocabulary, is_plain_file_name};
+use ckpt_doctor::checkpoint::{Document, FaultKind, INDEX_NAME, Index, Tokenizer, Vocabulary, is_plain_file_name};
 use serde_json::Value;
 
 /// Faults of documents that are strict JSON all the same, and why they are faults.
-pub const STRICT_ALL_THE_SAME: &[(&str, &str)] = &[
-    ("duplicate-json-key", "JSON leaves open what equal keys mean; serde_json keeps the last"),
-    ("huge-number", "the grammar has no largest number; Python's integers and doubles do"),
-    ("not-an-object", "any value is JSON; a config is an object"),
-    ("json-too-many-values", "a value takes far more room than its text"),
+pub const STRICT_ALL_THE_SAME: &[(FaultKind, &str)] = &[
+    (FaultKind::DuplicateJsonKey, "JSON leaves open what equal keys mean; serde_json keeps the last"),
+    (FaultKind::HugeNumber, "the grammar has no largest number; Python's integers and doubles do"),
+    (FaultKind::NotAnObject, "any value is JSON; a config is an object"),
+    (FaultKind::JsonTooManyValues, "a value takes far more room than its text"),
 ];
 
 /// The laws for a document of this name.
@@ -28,7 +28,9 @@ pub fn hold(name: &str, bytes: &[u8]) -> Document {
             assert!(grave.is_none(), "serde_json reads it: {grave:?}");
             // With `arbitrary_precision` an object with a key of the crate's own becomes a number there.
             let private = text.is_some_and(|text| text.contains("$serde_json::private"));
-            let unlike = ["huge-number", "json-too-many-values"].iter().any(|kind| super::has(&document.faults, kind));
+            let unlike = [FaultKind::HugeNumber, FaultKind::JsonTooManyValues]
+                .iter()
+                .any(|kind| super::has(&document.faults, *kind));
             let same = document.left_out.is_empty() && !private && !unlike;
             if same {
                 assert_eq!(document.value.as_ref(), Some(&strict));
@@ -43,11 +45,12 @@ pub fn hold(name: &str, bytes: &[u8]) -> Document {
 /// A pointer leads back to the value that the span of the same place covers.
 fn places_are_found_again(document: &Document) {
     // Without the markers of a merge the text has a value; with them, as it stands, it has none.
-    let unclear = ["duplicate-json-key", "merge-conflict-marker"];
-    if unclear.iter().any(|kind| super::has(&document.faults, kind)) || document.value.is_none() {
+    let unclear = [FaultKind::DuplicateJsonKey, FaultKind::MergeConflictMarker];
+    if unclear.iter().any(|kind| super::has(&document.faults, *kind)) || document.value.is_none() {
         return;
     }
-    for place in document.faults.iter().filter(|f| f.kind == "non-finite-number").flat_map(|f| &f.places).take(4) {
+    for place in document.faults.iter().filter(|f| f.kind == FaultKind::NonFiniteNumber).flat_map(|f| &f.places).take(4)
+    {
         let (Some(pointer), Some(span)) = (&place.pointer, &place.span) else { continue };
         assert_eq!(document.locate(pointer).as_ref(), Some(span), "{pointer}");
     }
@@ -66,7 +69,8 @@ pub fn index(bytes: &[u8]) {
     }
     // An entry that is not taken is told of.
     let left = stated.map_or(0, |map| map.len() - index.weight_map.len());
-    let told = ["index-unsafe-path", "weight-map-malformed"].iter().any(|kind| super::has(&index.faults, kind));
+    let told =
+        [FaultKind::IndexUnsafePath, FaultKind::WeightMapMalformed].iter().any(|kind| super::has(&index.faults, *kind));
     assert!(left == 0 || told);
     if let Some(total) = index.total_bytes() {
         let float = index.total_size.as_ref().and_then(Value::as_f64).expect("a number");

@@ -2,7 +2,7 @@
 
 use std::panic::catch_unwind;
 
-use ckpt_doctor::checkpoint::{Fault, Shard, byte_len};
+use ckpt_doctor::checkpoint::{Fault, FaultKind, Shard, byte_len};
 use safetensors::SafeTensors;
 use safetensors::tensor::Metadata;
 use serde_json::Value;
@@ -11,17 +11,20 @@ use serde_json::Value;
 pub const NAME: &str = "model.safetensors";
 
 /// Faults of shards that the crate opens all the same, and why they are faults.
-pub const OPENS_ALL_THE_SAME: &[(&str, &str)] = &[
-    ("no-format-metadata", "transformers 4 asks for `format`; the container does not"),
-    ("odd-tensor-name", "names that make trouble on a terminal or as a path are valid strings"),
-    ("metadata-null", "serde reads null as an absent `__metadata__`"),
+pub const OPENS_ALL_THE_SAME: &[(FaultKind, &str)] = &[
+    (FaultKind::NoFormatMetadata, "transformers 4 asks for `format`; the container does not"),
+    (FaultKind::OddTensorName, "names that make trouble on a terminal or as a path are valid strings"),
+    (FaultKind::MetadataNull, "serde reads null as an absent `__metadata__`"),
 ];
 
 /// Further faults that the crate does not see: here it is the crate that is too generous.
-pub const TOO_GENEROUS: &[(&str, &str)] = &[
-    ("duplicate-header-key", "the format forbids duplicate keys; the crate keeps the last of two names without a word"),
-    ("entry-malformed", "serde also reads a struct from an array: [\"F32\",[1],[0,4]]"),
-    ("header-not-json", "with serde_json's feature `arbitrary_precision`, as here, no number is too large"),
+pub const TOO_GENEROUS: &[(FaultKind, &str)] = &[
+    (
+        FaultKind::DuplicateHeaderKey,
+        "the format forbids duplicate keys; the crate keeps the last of two names without a word",
+    ),
+    (FaultKind::EntryMalformed, "serde also reads a struct from an array: [\"F32\",[1],[0,4]]"),
+    (FaultKind::HeaderNotJson, "with serde_json's feature `arbitrary_precision`, as here, no number is too large"),
 ];
 
 /// The laws for a whole file.
@@ -38,8 +41,8 @@ pub fn hold(bytes: &[u8]) {
                 assert!(among(TOO_GENEROUS, fault.kind), "the crate opens it: {fault:?}");
                 let reason = fault.detail.get("reason").and_then(Value::as_str).unwrap_or_default();
                 match fault.kind {
-                    "entry-malformed" => assert_eq!(reason, "it is not an object"),
-                    "header-not-json" => assert_eq!(reason, "a number larger than any double"),
+                    FaultKind::EntryMalformed => assert_eq!(reason, "it is not an object"),
+                    FaultKind::HeaderNotJson => assert_eq!(reason, "a number larger than any double"),
                     _ => {}
                 }
             }
@@ -66,7 +69,7 @@ fn second_opinion(bytes: &[u8]) -> Result<(usize, Metadata), String> {
     opinion.map_err(|_| "a panic".to_owned())?.map_err(|error| error.to_string())
 }
 
-fn among(list: &[(&str, &str)], kind: &str) -> bool {
+fn among(list: &[(FaultKind, &str)], kind: FaultKind) -> bool {
     list.iter().any(|(k, _)| *k == kind)
 }
 

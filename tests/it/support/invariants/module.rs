@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use ckpt_doctor::checkpoint::Module;
+use ckpt_doctor::checkpoint::{FaultKind, Module};
 
 /// Name under which the module is read.
 pub const NAME: &str = "modeling_x.py";
@@ -11,7 +11,10 @@ pub const NAME: &str = "modeling_x.py";
 pub fn hold(bytes: &[u8]) {
     let module = Module::parse(NAME, bytes);
     super::faults_are_placed(&module.faults, NAME, module.text.as_deref());
-    assert_eq!(module.text.is_some(), std::str::from_utf8(bytes).is_ok() && !super::has(&module.faults, "lfs-pointer"));
+    assert_eq!(
+        module.text.is_some(),
+        std::str::from_utf8(bytes).is_ok() && !super::has(&module.faults, FaultKind::LfsPointer)
+    );
     let Some(text) = &module.text else {
         assert!(module.unread && module.classes.is_empty());
         return;
