@@ -2,7 +2,6 @@
 
 pub mod adapter;
 pub mod engine;
-pub mod facts;
 pub mod finding;
 pub mod fix;
 pub mod index;
@@ -11,13 +10,18 @@ pub mod judge;
 pub mod layers;
 pub mod load;
 pub mod modules;
-pub mod policy;
+mod outcome;
+mod policy;
 pub mod quantization;
 pub mod size;
+mod suppressions;
 pub mod tokens;
+pub mod variables;
 pub mod votes;
 
 pub use crate::knowledge::rule::Safety;
-pub use engine::{Knowledge, Outcome, check, check_for};
+pub use engine::{check, check_for};
 pub use finding::{Finding, Location, Severity};
 pub use fix::{Edit, FixHint, renamed};
+pub use outcome::Outcome;
+pub use suppressions::unused_suppressions;

@@ -19,6 +19,7 @@ pub mod index;
 mod lfs;
 pub mod module;
 pub mod open;
+pub(crate) mod pointer;
 mod read;
 mod scan;
 pub mod shard;
@@ -37,6 +38,7 @@ pub use module::Module;
 pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
 pub use sniff::looks_like;
+pub(crate) use text::hex;
 pub use text::{escape, line_column};
 pub use tokenizer::{Tokenizer, Vocabulary};
 

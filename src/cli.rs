@@ -18,8 +18,8 @@ mod undo;
 
 use std::process::ExitCode;
 
-use ckpt_doctor::surgery::apply::ApplyError;
-use ckpt_doctor::surgery::journal::JournalError;
+use ckpt_doctor::merge::PipelineError;
+use ckpt_doctor::surgery::{ApplyError, RepairError};
 use clap::Parser;
 
 /// Nothing at or above `--fail-on`.
@@ -31,7 +31,8 @@ const FAILED: u8 = 2;
 
 /// Whether a signal ended the run.
 fn interrupted(error: &anyhow::Error) -> bool {
-    matches!(error.downcast_ref(), Some(JournalError::Apply(ApplyError::Interrupted)))
+    matches!(error.downcast_ref(), Some(RepairError::Apply(ApplyError::Interrupted)))
+        || matches!(error.downcast_ref(), Some(PipelineError::Apply(ApplyError::Interrupted)))
 }
 
 /// Runs the program.
@@ -49,16 +50,17 @@ pub fn main() -> ExitCode {
     };
     match result {
         Ok(code) => ExitCode::from(code),
-        Err(error) if interrupted(&error) => {
-            output::note("interrupted; nothing was written");
-            ExitCode::from(signals::exit_code())
-        }
         Err(error) => {
             // Names in an error may come from a checkpoint: nothing of them may reach the terminal raw.
-            let lines: Vec<String> =
-                error.chain().map(|e| ckpt_doctor::checkpoint::escape(&e.to_string(), 4000)).collect();
-            output::note(&format!("error: {}", lines.join(": ")));
-            ExitCode::from(FAILED)
+            let causes: Vec<String> = error.chain().map(|e| output::safe(&e.to_string())).collect();
+            let causes = causes.join(": ");
+            if interrupted(&error) {
+                output::note(&causes);
+                ExitCode::from(signals::exit_code())
+            } else {
+                output::note(&format!("error: {causes}"));
+                ExitCode::from(FAILED)
+            }
         }
     }
 }

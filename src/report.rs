@@ -10,13 +10,14 @@ mod concise;
 pub mod diff;
 mod excerpt;
 pub mod fixes;
+mod format;
 pub mod inspect;
 mod json;
 mod markdown;
+mod merge;
 pub mod model;
 mod statistics;
 mod terminal;
-mod words;
 
 use std::fmt;
 use std::str::FromStr;

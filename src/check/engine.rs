@@ -5,19 +5,16 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, Location, Skipped, Suppressed};
+use super::finding::{Finding, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
-use super::load::LoadReport;
 use super::load::Stored;
-use super::votes::Vote;
-use super::{adapter, facts, index, judge, modules, policy, tokens};
+use super::outcome::Outcome;
+use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::expression::within;
-use crate::knowledge::processor::Processor;
-use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
-use crate::knowledge::settings::Policy;
-use crate::knowledge::{EvalError, Expression, Library, Loader, Scope};
+use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule};
+use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
 const CAP: usize = 100;
@@ -27,55 +24,6 @@ const STEPS: u64 = 2_000_000;
 
 /// Places of one finding that are kept.
 const PLACES: usize = 20;
-
-/// What checking a checkpoint gave.
-#[derive(Debug, Clone, Default)]
-pub struct Outcome {
-    /// Architecture the load reports were predicted with.
-    pub architecture: Option<String>,
-    /// Sorted by file, place and code.
-    pub findings: Vec<Finding>,
-    /// One for each loader that was asked; none when the architecture is unknown or there are no weights to speak of.
-    pub loads: Vec<LoadReport>,
-    /// The config with the class's defaults filled in; null when the architecture is unknown.
-    pub config: Value,
-    /// Values of config.json that stored tensors contradict.
-    pub votes: Vec<Vote>,
-    /// Findings that settings accept, in the order of the others.
-    pub suppressed: Vec<Suppressed>,
-    /// Rules that did not apply, or were not chosen.
-    pub skipped: Vec<Skipped>,
-    /// Rules of the user's own that cannot be used, and why: they take more steps than a rule may, or name what there is
-    /// not.
-    pub unusable: Vec<Skipped>,
-}
-
-/// What a checker knows: rules, architectures, processors; and what becomes of its findings.
-pub struct Knowledge {
-    /// Rules.
-    pub rules: RuleSet,
-    /// Architectures.
-    pub library: Library,
-    /// Processors.
-    pub processors: Vec<Processor>,
-    /// What settings say of single findings.
-    pub policy: Policy,
-}
-
-impl Knowledge {
-    /// What is inside the program.
-    ///
-    /// # Errors
-    /// A data file that is not right; the house tests see to it that there is none.
-    pub fn embedded() -> Result<Self, crate::knowledge::source::DataError> {
-        Ok(Self {
-            rules: RuleSet::embedded()?,
-            library: Library::embedded(),
-            processors: Processor::embedded()?,
-            policy: Policy::default(),
-        })
-    }
-}
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
 #[must_use]
@@ -90,7 +38,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     faults.extend(index::compare(checkpoint));
     faults.extend(modules::compare(checkpoint));
     faults.extend(adapter::compare(checkpoint));
-    let judged = judge::judge(checkpoint, &knowledge.library, versions, &Stored::of(checkpoint));
+    let judged = judge::judge(checkpoint, knowledge, versions, &Stored::of(checkpoint));
     faults.extend(judged.faults);
     let config = checkpoint.config();
     let mut outcome = Outcome {
@@ -110,9 +58,9 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
             checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
-    let mut scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
+    let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     scope.bind("loaders", &json!(loaders(config, versions)));
-    facts::bind_loads(&mut scope, outcome.loads.clone());
+    variables::bind_loads(&mut scope, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let bench = Bench::new(checkpoint);
     for rule in &knowledge.rules.rules {
@@ -204,7 +152,7 @@ fn ask(
         let is = architecture.unwrap_or("unknown");
         return Err(format!("about {}; the architecture is {is}", rule.applies.join(", ")));
     }
-    let cannot = |expression: &Expression, error: &EvalError| match facts::absent(bench.checkpoint, expression) {
+    let cannot = |expression: &Expression, error: &EvalError| match variables::absent(bench.checkpoint, expression) {
         Some(file) => format!("{file} is not there"),
         None => format!("cannot be asked: {}", error.cause),
     };

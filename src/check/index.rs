@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Shard};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Shard, pointer};
 
 /// The file that, when it is there, a loader takes without looking at an index.
 const SINGLE: &str = "model.safetensors";
@@ -353,5 +353,5 @@ fn folded(name: &str) -> String {
 }
 
 fn pointer_to(tensor: &str) -> String {
-    format!("/weight_map/{}", tensor.replace('~', "~0").replace('/', "~1"))
+    pointer::join("/weight_map", tensor)
 }

@@ -7,7 +7,7 @@ use serde_json::{Map, Value};
 
 use super::load::{self, Stored};
 use super::votes::{self, Fit, Votes, vote};
-use crate::checkpoint::{Checkpoint, Tensor};
+use crate::checkpoint::{Checkpoint, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
 use crate::knowledge::{Architecture, Library, Loader};
 
@@ -253,7 +253,7 @@ fn parts(
         let types = alike.iter().filter_map(|r| r.architecture.model_type()).filter(|t| tried.insert(*t));
         let choices = types.take(PARTS).map(|model_type| {
             let mut config = start.clone();
-            votes::put(&mut config, &pointer, model_type.into());
+            pointer::put(&mut config, &Value::Null, &pointer, model_type.into());
             config
         });
         // The one that the composition takes when nothing is said comes first among equals.
@@ -275,7 +275,7 @@ fn proven(architecture: Architecture<'_>, votes: &Votes, given: bool) -> Value {
     }
     let mut config = Value::Object(config);
     for (pointer, model_type) in votes::model_types(&votes.config) {
-        votes::put(&mut config, &pointer, model_type);
+        pointer::put(&mut config, &Value::Null, &pointer, model_type);
     }
     let open: BTreeSet<&String> = votes.undecided.iter().flat_map(|u| &u.pointers).filter(|_| !given).collect();
     for vote in votes.votes.iter().filter(|v| v.votes_for >= v.votes_against && !open.contains(&v.pointer)) {

@@ -11,8 +11,8 @@ use super::quantization::{self, Quantised};
 use super::votes::{self, Explanation, Vote};
 use super::{index, layers, size};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
-use crate::knowledge::quantization::{Said, said};
-use crate::knowledge::{Architecture, Expected, Library, Loader, Refusal, UnknownPart};
+use crate::knowledge::quantization::{DeclaredScheme, declared_scheme};
+use crate::knowledge::{Architecture, Expected, Knowledge, Loader, Refusal, UnknownPart};
 
 /// The outcome for all loaders.
 #[derive(Debug, Default)]
@@ -52,19 +52,19 @@ impl Candidate<'_> {
 
 /// Asks the loaders for these versions; without any, that of the version that wrote config.json and the newest.
 #[must_use]
-pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], stored: &Stored) -> Judgement {
+pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String], stored: &Stored) -> Judgement {
     let Some(config) = checkpoint.config() else { return Judgement::default() };
     let names: Vec<&str> = stored.names().collect();
-    let targets = load::targets(library, config, &names, versions);
+    let targets = load::targets(&knowledge.library, config, &names, versions);
     let architecture = targets.first().map(|(_, architecture)| architecture.name().to_owned());
-    let said = said(config);
+    let said = declared_scheme(config, &knowledge.schemes);
     let quantise = |expected: Option<&Expected>| match &said {
-        Said::Known(applied) => Some(Quantised::new(applied, expected, checkpoint, stored)),
+        DeclaredScheme::Known(applied) => Some(Quantised::new(applied, expected, checkpoint, stored)),
         _ => None,
     };
     let evidence = stored.evidence();
     // How a version unpacks weights that another one packed is not known.
-    let asked = targets.into_iter().filter(|(target, _)| target.leads || matches!(said, Said::Plain));
+    let asked = targets.into_iter().filter(|(target, _)| target.leads || matches!(said, DeclaredScheme::Plain));
     let built = asked.map(|(target, class)| (target, class, class.expect_given(config, &evidence))).collect();
     let built = leading(built, config, versions);
     let mut faults: Vec<Fault> = unknown(config, &built, versions);
@@ -73,17 +73,17 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
         faults.extend(layers::compare(stored.names()));
     }
     let mut candidates: Vec<Candidate<'_>> = Vec::new();
-    let (is_plain, mut sized) = (matches!(said, Said::Plain), None);
+    let (is_plain, mut sized) = (matches!(said, DeclaredScheme::Plain), None);
     for (target, architecture, expected) in built {
         match expected {
             Ok(expected) => {
                 let quantised = quantise(Some(&expected));
                 // How a scheme that is not known stores what cannot be guessed.
-                let comparable = !matches!(said, Said::Unknown(_)) && !stored.is_empty();
+                let comparable = !matches!(said, DeclaredScheme::Unknown(_)) && !stored.is_empty();
                 let report = comparable.then(|| predicted(checkpoint, &target, &expected, quantised.as_ref(), stored));
                 let report = report.flatten();
                 // A quantised tensor has the shape that its scheme packs it into, and does not vote.
-                let voting = report.as_ref().filter(|_| target.leads && matches!(said, Said::Plain));
+                let voting = report.as_ref().filter(|_| target.leads && matches!(said, DeclaredScheme::Plain));
                 // Under another prefix they are of no use to any loader, and still say what the config should.
                 let moved = voting.and_then(|report| load::moved(&expected, stored, report));
                 let explained = voting.and_then(|report| {
@@ -141,8 +141,8 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
     let resolved = candidates.first().map_or(Value::Null, |c| c.expected.config.clone());
     let loads: Vec<LoadReport> = candidates.into_iter().filter_map(|c| completed(c, checkpoint)).collect();
     let explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
-    if matches!(said, Said::Plain) && !explained {
-        faults.extend(quantization::undeclared(stored.names()));
+    if matches!(said, DeclaredScheme::Plain) && !explained {
+        faults.extend(quantization::undeclared(&knowledge.schemes, stored.names()));
     }
     Judgement { architecture, config: resolved, loads, faults, votes }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Module, Place, is_plain_file_name};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Module, Place, is_plain_file_name, pointer};
 
 /// An `auto_map` entry: where it stands and what it says.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -72,7 +72,7 @@ fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
                     malformed(format!("{pointer}/auto_map"), "itself", &Value::Object(serde_json::Map::new()));
                 }
                 for (key, target) in auto_map.iter().take(MAX_ENTRIES) {
-                    let base = format!("{pointer}/auto_map/{}", escape(key));
+                    let base = pointer::join(&format!("{pointer}/auto_map"), key);
                     let mut push = |pointer: String, target: &str| {
                         let entry = Entry {
                             file: name.to_owned(),
@@ -103,15 +103,11 @@ fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
             // Sub-configs lie one or two levels down; statistics and vocabularies are not searched.
             if depth < 2 {
                 let inner = map.iter().filter(|(k, v)| v.is_object() && k.ends_with("config"));
-                pending.extend(inner.map(|(k, v)| (format!("{pointer}/{}", escape(k)), v, depth.saturating_add(1))));
+                pending.extend(inner.map(|(k, v)| (pointer::join(&pointer, k), v, depth.saturating_add(1))));
             }
         }
     }
     (out, faults)
-}
-
-fn escape(key: &str) -> String {
-    key.replace('~', "~0").replace('/', "~1")
 }
 
 /// A repository on the hub that the files name: where other entries take their code from, or the model that this one was

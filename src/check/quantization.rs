@@ -16,7 +16,7 @@ use super::load::{LoadReport, Mismatch};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 use crate::knowledge::expression::glob;
-use crate::knowledge::quantization::{Applied, Said, Scheme};
+use crate::knowledge::quantization::{AppliedScheme, DeclaredScheme, Scheme};
 use judge::{Judge, Judged, State};
 use module::{Tensors, kind};
 use skipped::Skipped;
@@ -25,9 +25,9 @@ pub use config::undeclared;
 
 /// What can be said of a config's scheme, and of the tensors that it is about.
 #[must_use]
-pub fn faults(checkpoint: &Checkpoint, said: &Said, quantised: Option<&Quantised<'_>>) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint, declared: &DeclaredScheme<'_>, quantised: Option<&Quantised<'_>>) -> Vec<Fault> {
     let mut faults = config::disagreements(checkpoint);
-    if let (Said::Unknown(method), Some(config)) = (said, checkpoint.config()) {
+    if let (DeclaredScheme::Unknown(method), Some(config)) = (declared, checkpoint.config()) {
         faults.push(config::unknown(method, config));
     }
     faults.extend(quantised.into_iter().flat_map(Quantised::faults));
@@ -36,7 +36,7 @@ pub fn faults(checkpoint: &Checkpoint, said: &Said, quantised: Option<&Quantised
 
 /// The quantised modules of a checkpoint whose config says how they are stored.
 pub struct Quantised<'a> {
-    applied: &'a Applied,
+    applied: &'a AppliedScheme<'a>,
     modules: Vec<Judged<'a>>,
     /// Kinds of module (names with their numbers taken out) of which at least one is quantised.
     kinds: BTreeSet<String>,
@@ -50,7 +50,7 @@ impl<'a> Quantised<'a> {
     /// Looks at the stored tensors; plain shapes come from the class where it is known.
     #[must_use]
     pub fn new(
-        applied: &'a Applied,
+        applied: &'a AppliedScheme<'a>,
         expected: Option<&Expected>,
         checkpoint: &'a Checkpoint,
         stored: &'a Stored,

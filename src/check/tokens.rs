@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, Vocabulary};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, Vocabulary, pointer};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::{EvalError, Scope};
 
@@ -151,10 +151,9 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     }
     for added in tokenizer.added_tokens_json.iter().flatten() {
         if let Some(decoder_id) = by_content.get(added.content.as_str()).filter(|d| **d != added.id) {
-            let pointer = added.content.replace('~', "~0").replace('/', "~1");
             faults.push(
                 Fault::new(FaultKind::AddedTokensDisagree)
-                    .at(Place::file("added_tokens.json").pointer(format!("/{pointer}")))
+                    .at(Place::file("added_tokens.json").pointer(pointer::join("", &added.content)))
                     .with("token", added.content.as_str())
                     .with("id", added.id)
                     .with("decoder_id", *decoder_id),

@@ -22,6 +22,7 @@ use self::solve::State;
 use self::space::Space;
 pub(super) use self::space::{leaves, with};
 use super::load::Stored;
+use crate::checkpoint::pointer;
 use crate::knowledge::{Architecture, Evidence, Expected};
 
 /// Times the stored names are spelled anew after the config has changed.
@@ -159,20 +160,15 @@ impl Votes {
         let ends = vote.pointer.match_indices('/').map(|(at, _)| at).skip(1);
         let outer = ends.filter_map(|end| vote.pointer.get(..end));
         match outer.filter_map(|p| Some((p, self.resolved.pointer(p)?))).find(|(_, value)| value.is_array()) {
-            Some((pointer, list)) => put(config, pointer, list.clone()),
-            None => put(config, &vote.pointer, vote.voted_value.clone()),
-        }
+            Some((pointer, list)) => pointer::put(config, &Value::Null, pointer, list.clone()),
+            None => pointer::put(config, &Value::Null, &vote.pointer, vote.voted_value.clone()),
+        };
     }
 
     /// The votes that contradict the config.
     pub fn outvoted(&self) -> impl Iterator<Item = &Vote> {
         self.votes.iter().filter(|vote| vote.outvotes())
     }
-}
-
-/// Puts a value into a config, with the objects around it where there are none.
-pub fn put(config: &mut Value, pointer: &str, value: Value) {
-    space::put(config, &Value::Null, pointer, value);
 }
 
 /// The `model_type` of every config inside a config.

@@ -10,7 +10,7 @@ use std::path::Path;
 use sha2::{Digest as _, Sha256};
 
 use super::open::{Opened, open_regular};
-use super::shard::hex;
+use super::text::hex;
 use super::{Checkpoint, Dtype, Entry, Fault, FaultKind, Shard, Tensor};
 
 mod numbers;

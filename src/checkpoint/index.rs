@@ -6,7 +6,8 @@ use serde_json::Value;
 
 use super::fault::Faults;
 use super::open::is_plain_file_name;
-use super::text::{escape, push_pointer};
+use super::pointer;
+use super::text::escape;
 use super::{Document, Fault, FaultKind, Place};
 
 /// The name transformers looks for first.
@@ -77,7 +78,7 @@ impl Index {
                 for (tensor, file) in map {
                     let place = || {
                         let mut pointer = "/weight_map".to_owned();
-                        push_pointer(&mut pointer, tensor);
+                        pointer::push(&mut pointer, tensor);
                         at(&pointer).in_tensor(tensor.clone())
                     };
                     match file.as_str() {

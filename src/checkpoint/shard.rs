@@ -14,7 +14,6 @@ mod layout;
 mod read;
 
 pub use dtype::{Dtype, byte_len};
-pub(super) use header::hex;
 
 /// Longest header the format allows, in bytes. Source: `MAX_HEADER_SIZE` in safetensors 0.8.0.
 pub const MAX_HEADER: u64 = 100_000_000;

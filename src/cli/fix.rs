@@ -10,13 +10,14 @@ use ckpt_doctor::checkpoint::{Checkpoint, escape};
 use ckpt_doctor::report::model::{Fixed, Withdrawn};
 use ckpt_doctor::report::{diff, fixes};
 use ckpt_doctor::surgery::journal::{self, Recovered};
-use ckpt_doctor::surgery::repair::{Repair, overlay, plan};
+use ckpt_doctor::surgery::repair::{Repair, plan};
+use ckpt_doctor::surgery::{ApplyError, RepairError, overlay};
 
 use super::args::FixArgs;
 use super::output;
 
 /// What judges a checkpoint.
-type Check<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
+type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
 
 impl FixArgs {
     /// Whether anything is to be written.
@@ -67,7 +68,7 @@ pub fn repair(
     checkpoint: &Arc<Checkpoint>,
     outcome: Outcome,
     open: &dyn Fn(&Path) -> anyhow::Result<Arc<Checkpoint>>,
-    check: Check<'_>,
+    check: CheckFn<'_>,
 ) -> anyhow::Result<Repaired> {
     let repair = plan(checkpoint, outcome, args.unsafe_fixes, check);
     let written = write(args, &dir, &repair)?;
@@ -99,11 +100,19 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         }
     };
     if let Some(out) = &args.output {
-        overlay(repair, out, &mut progress)?;
+        overlay(repair, out, &mut progress).map_err(|error| name_interrupted(error, out))?;
         return Ok(Some(out.clone()));
     }
-    journal::write(repair, &mut progress)?;
+    journal::write(repair, &mut progress).map_err(|error| name_interrupted(error, dir))?;
     Ok(Some(dir.to_owned()))
+}
+
+/// Names the directory that an interrupted repair did not write: others may have been repaired before it.
+fn name_interrupted(error: RepairError, dir: &Path) -> anyhow::Error {
+    match error {
+        RepairError::Apply(ApplyError::Interrupted) => anyhow::Error::new(error).context(dir.display().to_string()),
+        other => other.into(),
+    }
 }
 
 /// Shows what the fixes of a checkpoint would change; how many there are.
@@ -112,7 +121,7 @@ pub fn show(
     dir: &Path,
     checkpoint: &Arc<Checkpoint>,
     outcome: &Outcome,
-    check: Check<'_>,
+    check: CheckFn<'_>,
 ) -> anyhow::Result<usize> {
     let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, check);
     output::print(&diff::render(&dir.display().to_string(), &repair))?;

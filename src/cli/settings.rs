@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use ckpt_doctor::check::{Knowledge, Severity};
-use ckpt_doctor::knowledge::processor::Processor;
+use ckpt_doctor::check::Severity;
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, nearest};
 
@@ -115,7 +115,7 @@ impl Resolver {
         let library = library::with(folder.as_deref())?;
         let versions = if typed.versions.is_empty() { chain.versions()? } else { typed.versions.clone() };
         Ok(Resolved {
-            knowledge: Knowledge { rules, library, processors: Processor::embedded()?, policy },
+            knowledge: Knowledge { policy, ..Knowledge::with(rules, library)? },
             versions,
             fail_on: typed.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
             baseline: typed.baseline.clone().or_else(|| chain.baseline()),

@@ -5,8 +5,6 @@
 
 mod applied;
 
-use std::sync::OnceLock;
-
 use serde::Deserialize;
 use serde_json::Value;
 
@@ -14,7 +12,7 @@ use super::expression::{Expression, Scope};
 use super::processor::Let;
 use super::source::{self, DataError};
 
-pub use applied::{Applied, Shapes};
+pub use applied::{AppliedScheme, Shapes};
 
 /// A scheme as its file gives it.
 ///
@@ -116,14 +114,14 @@ pub struct Part {
     pub required: Option<Expression>,
 }
 
-/// What a config says of how the weights are stored.
-pub enum Said {
-    /// Plainly.
+/// How the weights are stored, as config.json declares it.
+pub enum DeclaredScheme<'k> {
+    /// Not quantised.
     Plain,
-    /// By a scheme that is not known here.
+    /// A scheme that is not among the known ones, by the name that the config gives it.
     Unknown(String),
-    /// By this one.
-    Known(Box<Applied>),
+    /// A known scheme.
+    Known(Box<AppliedScheme<'k>>),
 }
 
 impl Scheme {
@@ -132,16 +130,7 @@ impl Scheme {
     /// # Errors
     /// [`DataError`]; the house tests see to it that there is none.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
-        source::embedded("quantization").iter().map(|(path, text)| source::parse(path, text)).collect()
-    }
-
-    /// The same, read once and only when a checkpoint is quantised.
-    ///
-    /// # Panics
-    /// As [`Self::embedded`] has errors.
-    pub fn all() -> &'static [Self] {
-        static ALL: OnceLock<Vec<Scheme>> = OnceLock::new();
-        ALL.get_or_init(|| Self::embedded().unwrap_or_else(|e| panic!("{e}")))
+        source::embedded("quantization").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 
     /// Endings of its tensors, in order.
@@ -167,17 +156,17 @@ pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
         .find_map(|pointer| Some((pointer, config.pointer(pointer).filter(|block| block.is_object())?)))
 }
 
-/// How the weights are stored, by the config.
+/// The scheme that a config declares, one of `schemes` where it is known.
 #[must_use]
-pub fn said(config: &Value) -> Said {
-    let Some((pointer, block)) = block(config) else { return Said::Plain };
+pub fn declared_scheme<'k>(config: &Value, schemes: &'k [Scheme]) -> DeclaredScheme<'k> {
+    let Some((pointer, block)) = block(config) else { return DeclaredScheme::Plain };
     let mut scope = Scope::new();
     scope.bind("config", config);
     scope.bind("q", block);
     let meant = |scheme: &&Scheme| scheme.when.eval_bool(&scope).unwrap_or(false);
-    match Scheme::all().iter().find(meant) {
-        Some(scheme) => Said::Known(Box::new(Applied::new(scheme, config, (pointer, block)))),
-        None => Said::Unknown(method(block)),
+    match schemes.iter().find(meant) {
+        Some(scheme) => DeclaredScheme::Known(Box::new(AppliedScheme::new(scheme, config, (pointer, block)))),
+        None => DeclaredScheme::Unknown(method(block)),
     }
 }
 

@@ -150,14 +150,14 @@ pub struct DocumentSpec {
     pub non_finite: Option<Value>,
     /// Changes, in order.
     #[serde(default)]
-    pub edits: Vec<Edit>,
+    pub edits: Vec<DocumentEdit>,
 }
 
 /// A change to a document.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum Edit {
+pub enum DocumentEdit {
     /// Sets a value; missing objects on the way are made.
     Set(SetEdit),
     /// Puts a donor's config there.

@@ -9,9 +9,9 @@ use std::path::{Component, Path};
 use serde::{Deserialize, Serialize};
 
 use super::ci::{of_finding, tidy};
+use super::format::{name, sentence};
 use super::json;
 use super::model::CheckpointReport;
-use super::words::{name, sentence};
 use crate::check::finding::Accepted;
 use crate::knowledge::settings::absolute;
 use crate::knowledge::source::{self, DataError};

@@ -13,10 +13,11 @@ use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 
+use super::format::{fix, sentence};
 use super::model::{CheckpointReport, MergeReport, Report};
-use super::words::{fix, sentence};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
+use crate::checkpoint::hex;
 
 /// Longest path written, in characters: no longer one exists on Linux.
 const PATH: usize = 4_096;
@@ -65,7 +66,7 @@ pub fn groups(report: &Report) -> Vec<Group<'_>> {
 
 fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
     let path = tidy(&checkpoint.path);
-    let role = checkpoint.role.as_deref().unwrap_or_default();
+    let role = checkpoint.role.as_ref().map(ToString::to_string).unwrap_or_default();
     let title = if role.is_empty() { path.clone() } else { format!("{path} ({role})") };
     let mut item = |finding: &'a Finding| Item {
         code: &finding.code,
@@ -75,7 +76,7 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
         locations: &finding.locations,
         fix: finding.fix.as_ref(),
         help: finding.fix.as_ref().map(fix),
-        fingerprint: of_finding(finding, &path, role, seen),
+        fingerprint: of_finding(finding, &path, &role, seen),
     };
     let items = checkpoint.findings.iter().map(&mut item).collect();
     let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
@@ -118,11 +119,7 @@ fn fingerprint(parts: &[&str], seen: &mut BTreeMap<String, usize>) -> String {
             hasher.update(part);
         }
         hasher.update(nth.to_be_bytes());
-        let mut hex = String::with_capacity(64);
-        for byte in hasher.finalize() {
-            let _infallible = write!(hex, "{byte:02x}");
-        }
-        hex
+        hex(&hasher.finalize())
     };
     let first = hash("finding", 0);
     let times = seen.entry(first.clone()).or_default();

@@ -5,18 +5,18 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::Style;
+use super::format::{bytes, more, name, plural, sentence};
 use super::json::pretty;
-use super::model::Tool;
+use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
-use super::words::{bytes, more, name, plural, sentence};
 use crate::check::inspect::{Amount, Candidate, Inspection};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
 struct Document<'a> {
     schema: u32,
-    tool: Tool,
+    tool: ToolInfo,
     path: &'a str,
     #[serde(flatten)]
     inspection: &'a Inspection,
@@ -25,7 +25,7 @@ struct Document<'a> {
 /// The whole of an inspection as JSON (`schema` 1).
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection) -> String {
-    pretty(&Document { schema: 1, tool: Tool::this(), path, inspection })
+    pretty(&Document { schema: 1, tool: ToolInfo::this(), path, inspection })
 }
 
 /// An inspection for a terminal.

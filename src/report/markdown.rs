@@ -4,8 +4,8 @@
 use std::fmt::Write as _;
 
 use super::collapse::{Group, collapse};
+use super::format::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
-use super::words::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
 use crate::check::load::LoadReport;
 use crate::check::{Finding, Location};
 
@@ -19,32 +19,32 @@ pub fn render(report: &Report, cap: usize) -> String {
     for checkpoint in &report.checkpoints {
         section(&mut out, checkpoint, cap);
     }
-    let _ok = writeln!(out, "\n---\n\nVerdict: **{}**. {}.", text(&report.summary.verdict), summary(report));
+    let _ok = writeln!(out, "\n---\n\nVerdict: **{}**. {}.", report.summary.verdict.name(), summary(report));
     let _ok = writeln!(out, "\n{} {}", report.tool.name, report.tool.version);
     out
 }
 
 fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
-    let title = match checkpoint.role.as_deref() {
-        Some(role) => text(role),
+    let title = match &checkpoint.role {
+        Some(role) => text(&role.to_string()),
         None => code(&name(&checkpoint.path)),
     };
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
     let (tensors, size) = checkpoint.tensors;
-    let verdict = text(&checkpoint.verdict);
+    let verdict = checkpoint.verdict.name();
     let _ok =
         writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
     if !checkpoint.suppressed.is_empty() {
         let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in words::alike(shown) {
+    for finding in format::alike(shown) {
         render_finding(out, &finding);
     }
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", text_name(code));
     }
-    for loaders in words::agreeing(&checkpoint.loads) {
+    for loaders in format::agreeing(&checkpoint.loads) {
         render_load(out, &loaders, cap);
     }
 }
@@ -98,7 +98,7 @@ fn place(location: &Location) -> Option<String> {
 
 fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
     let Some(load) = loaders.first() else { return };
-    let versions = text(&words::versions(loaders));
+    let versions = text(&format::versions(loaders));
     let (missing, unexpected) = (load.missing.len(), load.unexpected.len());
     let (mismatched, silent) = (load.mismatched.len(), load.silent.len());
     let _ok = writeln!(
@@ -112,14 +112,14 @@ fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
     groups(out, "Missing: the loader initialises them anew", &names(&load.missing), cap);
     groups(out, "Unexpected: the loader ignores them", &names(&load.unexpected), cap);
     if !load.mismatched.is_empty() {
-        let rows: Vec<_> = words::mismatched(load)
+        let rows: Vec<_> = format::mismatched(load)
             .into_iter()
             .map(|[tensor, stored, expected]| [code(&tensor), stored, expected])
             .collect();
         let _ok = writeln!(out, "\nMismatched: the load raises");
         table(out, ["tensor", "stored", "expected"], &rows, cap);
     }
-    for (reason, names) in words::silent(load) {
+    for (reason, names) in format::silent(load) {
         groups(out, &format!("Silent, reported by nobody: {}", text(&reason)), &names, cap);
     }
 }
@@ -152,7 +152,7 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
     }
     seams(out, merge, cap);
     if !merge.transforms.is_empty() {
-        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", text_name(how))).collect();
+        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
         let _ok = writeln!(
             out,
             "\n## Tensors\n\n{}, {}: {}",
@@ -166,7 +166,7 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
         let rows: Vec<_> = merge
             .changed
             .iter()
-            .map(|c| [code(&name(&c.name)), text(&sentence(&c.transform)), from(c.from.as_deref()), shape(&c.to)])
+            .map(|c| [code(&name(&c.name)), c.transform.name().to_owned(), from(c.from.as_deref()), shape(&c.to)])
             .collect();
         table(out, ["not a copy", "how", "from", "to"], &rows, cap);
     }

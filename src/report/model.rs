@@ -5,11 +5,12 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-pub use super::fixes::Fixing;
+pub use super::merge::{
+    ChangedTensor, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName, StageOutcome,
+};
 use crate::check::finding::Suppressed;
 use crate::check::load::LoadReport;
 use crate::check::{Finding, Severity};
-pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
 /// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 2).
@@ -18,7 +19,7 @@ pub struct Report {
     /// Version of this contract.
     pub schema: u32,
     /// Which program wrote it.
-    pub tool: Tool,
+    pub tool: ToolInfo,
     /// One entry for each checkpoint, in the order given.
     pub checkpoints: Vec<CheckpointReport>,
     /// What a merge did; absent for `check`.
@@ -33,23 +34,23 @@ impl Report {
     pub fn new(checkpoints: Vec<CheckpointReport>, merge: Option<MergeReport>) -> Self {
         let counts = checkpoints.iter().fold(Counts::default(), |sum, c| sum.plus(c.counts));
         let seams = merge.as_ref().is_some_and(|m| !m.seams.is_empty());
-        let verdict = if seams { Severity::Error.name() } else { counts.verdict() };
+        let verdict = if seams { Verdict::Error } else { counts.verdict() };
         let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
-        let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts, suppressed };
-        Self { schema: 2, tool: Tool::this(), checkpoints, merge, summary }
+        let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed };
+        Self { schema: 2, tool: ToolInfo::this(), checkpoints, merge, summary }
     }
 }
 
 /// Name and version of the program.
 #[derive(Debug, Clone, Serialize)]
-pub struct Tool {
+pub struct ToolInfo {
     /// Always `ckpt-doctor`.
     pub name: &'static str,
     /// Its version.
     pub version: &'static str,
 }
 
-impl Tool {
+impl ToolInfo {
     /// This program.
     #[must_use]
     pub const fn this() -> Self {
@@ -57,18 +58,18 @@ impl Tool {
     }
 }
 
-/// The verdict over one checkpoint.
+/// The report on one checkpoint.
 #[derive(Debug, Clone, Serialize)]
 pub struct CheckpointReport {
     /// As the user named it.
     pub path: String,
-    /// What it is in this run, for a merge: `donor vision`, `planned`, `written`; absent for `check`.
+    /// What it is in a merge; absent for `check`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub role: Option<String>,
+    pub role: Option<Role>,
     /// Architecture the load reports were predicted with.
     pub architecture: Option<String>,
-    /// `clean`, or the worst severity.
-    pub verdict: String,
+    /// Clean, or the worst severity.
+    pub verdict: Verdict,
     /// Findings by severity.
     pub counts: Counts,
     /// The settings file that was gone by.
@@ -98,6 +99,52 @@ pub struct CheckpointReport {
     pub tensors: (usize, u64),
 }
 
+/// The verdict over one checkpoint, or over all of a run: clean, or the worst severity of its findings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Verdict {
+    /// No findings.
+    Clean,
+    /// Information at most.
+    Info,
+    /// Warnings at most.
+    Warning,
+    /// Errors.
+    Error,
+}
+
+impl Verdict {
+    /// The word for it in reports.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Clean => "clean",
+            Self::Info => "info",
+            Self::Warning => "warning",
+            Self::Error => "error",
+        }
+    }
+}
+
+impl From<Severity> for Verdict {
+    fn from(worst: Severity) -> Self {
+        match worst {
+            Severity::Info => Self::Info,
+            Severity::Warning => Self::Warning,
+            Severity::Error => Self::Error,
+        }
+    }
+}
+
+/// What the run was asked to do about findings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Fixing {
+    /// Whether unsafe fixes count as well.
+    pub unsafe_fixes: bool,
+    /// Whether fixes were made, or only offered.
+    pub made: bool,
+}
+
 /// How many findings there are of each severity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
@@ -112,7 +159,7 @@ pub struct Counts {
 impl Counts {
     /// Counts findings.
     #[must_use]
-    pub fn of(findings: &[Finding]) -> Self {
+    pub fn new(findings: &[Finding]) -> Self {
         let n = |s| findings.iter().filter(|f| f.severity == s).count();
         Self { error: n(Severity::Error), warning: n(Severity::Warning), info: n(Severity::Info) }
     }
@@ -127,13 +174,10 @@ impl Counts {
         }
     }
 
-    /// `clean`, or the worst severity present.
+    /// Clean, or the worst severity present.
     #[must_use]
-    pub const fn verdict(self) -> &'static str {
-        match self.worst() {
-            Some(severity) => severity.name(),
-            None => "clean",
-        }
+    pub fn verdict(self) -> Verdict {
+        self.worst().map_or(Verdict::Clean, Verdict::from)
     }
 
     /// The worst severity present.
@@ -156,8 +200,8 @@ impl Counts {
 pub struct Summary {
     /// Checkpoints looked at.
     pub checkpoints: usize,
-    /// `clean`, or the worst severity.
-    pub verdict: String,
+    /// Clean, or the worst severity.
+    pub verdict: Verdict,
     /// Findings by severity.
     pub counts: Counts,
     /// Findings that are accepted, and not among the counts.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use comfy_table::{CellAlignment, Table, presets};
 use serde::Serialize;
 
-use super::words::{name, summary};
+use super::format::{name, summary};
 use super::{Format, Report, json};
 use crate::check::{Finding, Severity};
 

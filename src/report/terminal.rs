@@ -8,8 +8,8 @@ pub(super) mod paint;
 use std::fmt::Write as _;
 
 use self::paint::Paint;
+use super::format::{agreeing, alike, bytes, capped, counts, name, plural, summary};
 use super::model::{CheckpointReport, Report};
-use super::words::{agreeing, alike, bytes, capped, counts, name, plural, summary};
 use super::{Style, fixes};
 
 pub fn render(report: &Report, style: Style) -> String {
@@ -34,7 +34,7 @@ pub fn render(report: &Report, style: Style) -> String {
         merge::render(&mut out, merge, style);
         out.push('\n');
     }
-    let _ok = writeln!(out, "{}", paint.verdict(&report.summary.verdict, &summary(report)));
+    let _ok = writeln!(out, "{}", paint.verdict(report.summary.verdict, &summary(report)));
     if let Some(closing) = fixes::closing(report) {
         let _ok = writeln!(out, "{closing}");
     }
@@ -51,7 +51,7 @@ fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
 fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     out.push_str(&paint.strong(&name(&checkpoint.path)));
     if let Some(role) = &checkpoint.role {
-        let _ok = write!(out, " ({})", name(role));
+        let _ok = write!(out, " ({})", name(&role.to_string()));
     }
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
     let _ok = write!(out, ": {architecture}");
@@ -59,7 +59,7 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     let _ok = write!(out, ", {}, {}", plural(tensors, "tensor"), bytes(size));
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
-    let _ok = writeln!(out, ", {}", paint.verdict(&checkpoint.verdict, verdict));
+    let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
     let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
     let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
     let said: Vec<String> = settings.into_iter().chain(suppressed).collect();

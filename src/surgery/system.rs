@@ -3,7 +3,7 @@
 #![expect(clippy::disallowed_methods, reason = "the writer's own calls")]
 
 use std::ffi::OsString;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -55,6 +55,15 @@ pub(super) fn remove_file(path: &Path) -> io::Result<()> {
 /// Removes an empty directory; one that is not there is as good as removed.
 pub(super) fn remove_dir(path: &Path) -> io::Result<()> {
     absent_is_fine(retry(|| fs::remove_dir(path)))
+}
+
+/// The metadata of `path`, links not followed; `None` when nothing has this name.
+pub(super) fn look(path: &Path) -> Result<Option<Metadata>, ApplyError> {
+    match fs::symlink_metadata(path) {
+        Ok(metadata) => Ok(Some(metadata)),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(io_at(path, "looking at")(e)),
+    }
 }
 
 /// Names in a directory, in no order.

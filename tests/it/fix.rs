@@ -11,9 +11,10 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Arc;
 
-use ckpt_doctor::check::{Finding, Knowledge, Outcome, Safety, Severity, check};
+use ckpt_doctor::check::{Finding, Outcome, Safety, Severity, check};
 use ckpt_doctor::checkpoint::Checkpoint;
-use ckpt_doctor::surgery::journal::JournalError;
+use ckpt_doctor::knowledge::Knowledge;
+use ckpt_doctor::surgery::RepairError;
 use ckpt_doctor::surgery::repair::{Repair, plan};
 
 /// What can be seen of a directory: names, kinds, bytes, modes and times.
@@ -73,7 +74,7 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
     let fixed = codes(repair.fixed.iter().map(|f| &f.code));
     match ckpt_doctor::surgery::journal::write(&repair, &mut |_| {}) {
         // FIFOs and links in a fixture are left alone.
-        Err(JournalError::Linked { .. }) => return Ok(Some(format!("{fixed} (linked)"))),
+        Err(RepairError::Linked { .. }) => return Ok(Some(format!("{fixed} (linked)"))),
         other => other.map_err(|e| format!("writing: {e}"))?,
     }
     let (after, again) = planned(dir, deep, knowledge);

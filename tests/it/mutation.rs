@@ -11,8 +11,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use ckpt_doctor::check::{Knowledge, check};
+use ckpt_doctor::check::check;
 use ckpt_doctor::checkpoint::{Checkpoint, Document, Module, Parts, Shard, Vocabulary};
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{Format, Report, Style, render};
 use mutate::Mutator;

@@ -17,14 +17,12 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Knowledge, Outcome, check, policy};
+use ckpt_doctor::check::{Outcome, check, unused_suppressions};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
-use ckpt_doctor::knowledge::Library;
-use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
-use ckpt_doctor::knowledge::settings::{Chain, Policy, Source};
-use ckpt_doctor::knowledge::source;
+use ckpt_doctor::knowledge::settings::{Chain, Source};
+use ckpt_doctor::knowledge::{Knowledge, Library, source};
 use serde::Deserialize;
 
 pub use base::{BASES, copy};
@@ -156,12 +154,7 @@ pub fn texts(folder: &str) -> Vec<(String, String)> {
 
 /// All that a checker knows.
 pub fn knowledge() -> Knowledge {
-    Knowledge {
-        rules: rules(),
-        library: Library::embedded(),
-        processors: Processor::embedded().expect("processors"),
-        policy: Policy::default(),
-    }
+    Knowledge::with(rules(), Library::embedded()).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// What is found in a directory under settings that lie in the folder above it.
@@ -172,7 +165,7 @@ fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> 
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
     let mut outcome = check(&checkpoint, &knowledge);
-    let unused = policy::unused(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
+    let unused = unused_suppressions(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
     outcome
 }

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::module;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
-use crate::knowledge::quantization::block;
+use crate::knowledge::quantization::{Scheme, block};
 
 /// What AutoGPTQ and AutoAWQ write beside config.json.
 const BESIDE: [&str; 2] = ["quantize_config.json", "quant_config.json"];
@@ -56,9 +56,9 @@ pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
 
 /// Names that nothing explains and that are a scheme's, under a config that says of none.
 #[must_use]
-pub fn undeclared<'n>(names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
+pub fn undeclared<'n>(schemes: &[Scheme], names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
     let names: BTreeSet<&str> = names.into_iter().collect();
-    let (scheme, module) = module::signature(&names)?;
+    let (scheme, module) = module::signature(schemes, &names)?;
     let carrier = scheme.endings().next().unwrap_or_default();
     let at = Place::tensor(format!("{module}{carrier}"));
     Some(

@@ -8,7 +8,7 @@ use super::module::Module;
 use super::plain_of;
 use super::skipped::Skipped;
 use crate::knowledge::Expected;
-use crate::knowledge::quantization::{Applied, Scheme, Shapes};
+use crate::knowledge::quantization::{AppliedScheme, Scheme, Shapes};
 
 /// What became of a module.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,7 +60,7 @@ fn same(a: &[u64], b: &[u64]) -> bool {
 
 /// Judges modules by one config and, where it is known, one class.
 pub(super) struct Judge<'j> {
-    pub(super) applied: &'j Applied,
+    pub(super) applied: &'j AppliedScheme<'j>,
     pub(super) expected: Option<&'j Expected>,
     pub(super) skipped: &'j Skipped<'j>,
 }

@@ -108,10 +108,10 @@ pub(super) fn kind(name: &str) -> String {
 ///
 /// Only a module that has all that its scheme requires is taken for one.
 #[must_use]
-pub(super) fn signature<'n>(names: &BTreeSet<&'n str>) -> Option<(&'static Scheme, &'n str)> {
+pub(super) fn signature<'k, 'n>(schemes: &'k [Scheme], names: &BTreeSet<&'n str>) -> Option<(&'k Scheme, &'n str)> {
     let has = |module: &str, part: &Part| names.contains(&*format!("{module}{}", part.name));
     let whole = |scheme: &Scheme, module: &str| scheme.tensors.iter().all(|p| p.required.is_some() || has(module, p));
-    let found = Scheme::all().iter().filter_map(|scheme| {
+    let found = schemes.iter().filter_map(|scheme| {
         let sign = scheme.sign.as_deref()?;
         let module = names.iter().find_map(|name| name.strip_suffix(sign).filter(|module| whole(scheme, module)))?;
         Some((scheme, module))

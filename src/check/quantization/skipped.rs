@@ -7,7 +7,7 @@
 use regex::Regex;
 
 use crate::knowledge::expression::glob;
-use crate::knowledge::quantization::Applied;
+use crate::knowledge::quantization::AppliedScheme;
 
 /// Longest regular expression of a config that is compiled.
 const PATTERN_CAP: usize = 1_000;
@@ -26,7 +26,7 @@ enum Pattern<'a> {
 }
 
 impl<'a> Skipped<'a> {
-    pub(super) fn of(applied: &'a Applied) -> Self {
+    pub(super) fn of(applied: &'a AppliedScheme<'_>) -> Self {
         let pattern = |text: &'a str| match text.strip_prefix("re:") {
             Some(regex) if regex.len() > PATTERN_CAP => Pattern::Regex(None),
             Some(regex) => Pattern::Regex(Regex::new(&format!("^(?:{regex})")).ok()),

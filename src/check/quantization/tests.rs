@@ -1,3 +1,5 @@
+use std::sync::LazyLock;
+
 use serde_json::{Value, json};
 
 use super::*;
@@ -5,11 +7,16 @@ use crate::check::load;
 use crate::checkpoint::Parts;
 use crate::checkpoint::{Document, Dtype, FaultKind, Shard, Tensor};
 use crate::knowledge::ExpectedTensor;
-use crate::knowledge::quantization::said;
+use crate::knowledge::quantization::declared_scheme;
 
-fn applied(block: &Value) -> Box<Applied> {
-    match said(&json!({ "quantization_config": block })) {
-        Said::Known(applied) => applied,
+fn schemes() -> &'static [Scheme] {
+    static SCHEMES: LazyLock<Vec<Scheme>> = LazyLock::new(|| Scheme::embedded().expect("schemes"));
+    &SCHEMES
+}
+
+fn applied(block: &Value) -> Box<AppliedScheme<'static>> {
+    match declared_scheme(&json!({ "quantization_config": block }), schemes()) {
+        DeclaredScheme::Known(applied) => applied,
         _ => panic!("{block} means no scheme"),
     }
 }
@@ -130,12 +137,14 @@ fn absurd_parameters_are_no_panic() {
     }
     let document = Document::parse("config.json", br#"{"quantization_config": 7}"#);
     let config = Checkpoint::planned("", Parts { documents: vec![document], ..Parts::default() });
-    assert!(matches!(said(config.config().expect("JSON")), Said::Plain));
+    assert!(matches!(declared_scheme(config.config().expect("JSON"), schemes()), DeclaredScheme::Plain));
 }
 
 #[test]
 fn tensors_tell_their_scheme() {
-    let told = |names: &[&'static str]| Some(module::signature(&names.iter().copied().collect())?.0.scheme.as_str());
+    let told = |names: &[&'static str]| {
+        Some(module::signature(schemes(), &names.iter().copied().collect())?.0.scheme.as_str())
+    };
     for (scheme, endings) in [
         ("gptq", &["q.qweight", "q.qzeros", "q.scales", "q.g_idx"][..]),
         ("awq", &["q.qweight", "q.qzeros", "q.scales"]),

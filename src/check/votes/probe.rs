@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use super::space::{Numbered, Space, put, with};
+use super::space::{Numbered, Space, with};
+use crate::checkpoint::pointer;
 use crate::knowledge::Expected;
 
 /// Another value for a leaf, to see what it changes. Half rather than double: it makes builds cheaper, and lists
@@ -64,7 +65,7 @@ pub(super) fn keys(space: &Space<'_>, config: &Value, base: &Expected) -> Vec<Ke
 fn split(space: &Space<'_>, config: &Value, base: &Expected, group: &[(String, Value, Value)], found: &mut Vec<Key>) {
     let mut changed = config.clone();
     for (pointer, _, other) in group {
-        put(&mut changed, &base.config, pointer, other.clone());
+        pointer::put(&mut changed, &base.config, pointer, other.clone());
     }
     let built = space.build(&changed);
     if built.as_ref().is_some_and(|b| b.tensors == base.tensors) || space.exhausted() {

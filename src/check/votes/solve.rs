@@ -5,7 +5,8 @@ use std::collections::BTreeSet;
 use serde_json::Value;
 
 use super::probe::{Key, Tally, by_dimensions, by_names, dimensions, keys, stored_dimension};
-use super::space::{Space, put, with};
+use super::space::{Space, with};
+use crate::checkpoint::pointer;
 use crate::knowledge::Expected;
 
 /// Times all values are voted on: a value can hide behind another (image size behind patch size), rarely two.
@@ -59,7 +60,7 @@ impl State {
 pub(super) fn put_all(config: &Value, resolved: &Value, values: &[(String, Value)]) -> Value {
     let mut config = config.clone();
     for (pointer, value) in values {
-        put(&mut config, resolved, pointer, value.clone());
+        pointer::put(&mut config, resolved, pointer, value.clone());
     }
     config
 }
@@ -80,8 +81,7 @@ pub(super) fn stretch(config: &mut Value, resolved: &Value, pointer: &str, value
             && items.len() == before
         {
             let longer: Vec<Value> = items.iter().cycle().take(after).cloned().collect();
-            let key = key.replace('~', "~0").replace('/', "~1");
-            put(config, resolved, &format!("{parent}/{key}"), Value::Array(longer));
+            pointer::put(config, resolved, &pointer::join(parent, key), Value::Array(longer));
         }
     }
 }
@@ -98,7 +98,7 @@ fn reconciled(space: &Space<'_>, config: &mut Value, resolved: &Value, values: &
             }
             let Some(heads) = sibling.as_u64() else { continue };
             let mut other = config.clone();
-            put(&mut other, resolved, &format!("{parent}/{key}"), common_divisor(width, heads).into());
+            pointer::put(&mut other, resolved, &pointer::join(parent, key), common_divisor(width, heads).into());
             if let Some(built) = space.build(&other) {
                 *config = other;
                 return Some(built);

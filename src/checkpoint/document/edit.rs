@@ -9,8 +9,8 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::Document;
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
-use crate::checkpoint::text::pointer_steps;
 
 mod layout;
 
@@ -126,7 +126,7 @@ impl Document {
     #[must_use]
     pub fn set(&self, pointer: &str, value: &Value) -> Option<Splice> {
         let text = self.text.as_deref()?;
-        let steps = pointer_steps(pointer)?;
+        let steps = pointer::steps(pointer)?;
         let layout = Layout::of(text);
         let mut at = start_of(text);
         for (depth, step) in steps.iter().enumerate() {
@@ -180,7 +180,7 @@ impl Document {
     }
 
     fn parent(&self, text: &str, pointer: &str) -> Option<(Container, String)> {
-        let step = pointer_steps(pointer)?.pop()?;
+        let step = pointer::steps(pointer)?.pop()?;
         let (parent, _) = pointer.rsplit_once('/')?;
         Some((Container::read(text, self.locate(parent)?.start)?, step))
     }

@@ -3,8 +3,8 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
-use crate::checkpoint::text::pointer_steps;
 
 /// Finds many places in one text. Each container on the way to one is read once, and so is the text for its lines:
 /// a hundred findings in a document of one line and fifty megabytes would otherwise read it some thousand times.
@@ -76,7 +76,7 @@ impl<'t> Locator<'t> {
     fn find(&mut self, pointer: &str) -> Option<Found> {
         let start = if self.text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
         let mut found: Option<Found> = None;
-        for step in pointer_steps(pointer)? {
+        for step in pointer::steps(pointer)? {
             let start = found.map_or(start, |f| f.value.start);
             if !self.containers.contains_key(&start) {
                 self.containers.insert(start, members(self.text, start)?);

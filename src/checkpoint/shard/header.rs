@@ -9,7 +9,7 @@ use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::scan::{ScanError, ScanErrorKind, Scanner, Token};
 use crate::checkpoint::sniff::looks_like;
-use crate::checkpoint::text::escape;
+use crate::checkpoint::text::{escape, hex};
 use crate::checkpoint::{Fault, FaultKind, Place};
 
 mod entry;
@@ -314,13 +314,4 @@ impl<'t> Reader<'_, 't> {
         self.faults
             .push(Fault::new(FaultKind::OddTensorName).at(place).with("reason", reason).with("bytes", name.len()));
     }
-}
-
-pub(in crate::checkpoint) fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write as _;
-    bytes.iter().fold(String::new(), |mut out, byte| {
-        // Writing to a String cannot fail.
-        let _ = write!(out, "{byte:02x}");
-        out
-    })
 }

@@ -73,7 +73,7 @@ fn check_size(shard: &Shard, entry: &Entry, faults: &mut Faults) {
     match bits {
         None => faults.push(detail(fault(FaultKind::ShapeOverflow))),
         Some(bits) if !bits.is_multiple_of(8) => {
-            faults.push(detail(fault(FaultKind::SubByteMisaligned)).with("bits", bits))
+            faults.push(detail(fault(FaultKind::SubByteMisaligned)).with("bits", bits));
         }
         Some(bits) => {
             let Some((begin, end)) = entry.offsets else { return };

@@ -7,8 +7,8 @@ use serde::Serialize;
 use super::{file, groups};
 use crate::check::Severity;
 use crate::report::Report;
+use crate::report::format::name;
 use crate::report::json;
-use crate::report::words::name;
 
 #[derive(Serialize)]
 struct Entry {

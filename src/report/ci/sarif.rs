@@ -12,7 +12,7 @@ use serde::Serialize;
 use super::{Group, Item, file, groups};
 use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
-use crate::report::words::{name, sentence};
+use crate::report::format::{name, sentence};
 use crate::report::{Report, json};
 
 const SCHEMA: &str = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json";

@@ -8,8 +8,8 @@ use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer,
 use super::super::Style;
 use super::super::excerpt::{cut, near};
 use super::super::fixes::mark;
+use super::super::format::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use super::super::model::CheckpointReport;
-use super::super::words::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use crate::check::{Finding, Location, Severity};
 use crate::checkpoint::line_column;
 

@@ -6,7 +6,7 @@ use comfy_table::{ContentArrangement, Table, presets};
 
 use super::super::Style;
 use super::super::collapse::{Group, collapse};
-use super::super::words::{mismatched, more, name, sentence, silent, versions};
+use super::super::format::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
 use crate::check::load::LoadReport;
 

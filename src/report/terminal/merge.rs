@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use super::super::Style;
-use super::super::model::{MergeReport, Seam, ShapedName};
-use super::super::words::{bytes, more, name, plural, sentence, shape, wrap};
+use super::super::format::{bytes, more, name, plural, sentence, shape, wrap};
+use super::super::model::{MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
 use super::paint::Paint;
 
@@ -56,7 +56,7 @@ fn stages(out: &mut String, merge: &MergeReport, style: Style) {
 fn render_seam(out: &mut String, seam: &Seam, style: Style) {
     let paint = Paint(style.color);
     let said = hang(&sentence(&seam.message), 4, style);
-    let title = format!("{}:\n    {}", paint.verdict("error", "error[seam]"), paint.strong(&said));
+    let title = format!("{}:\n    {}", paint.verdict(Verdict::Error, "error[seam]"), paint.strong(&said));
     let _ok = writeln!(out, "\n  {title}");
     let mut rows = Vec::new();
     let mut row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
@@ -87,7 +87,7 @@ fn changed(out: &mut String, merge: &MergeReport, style: Style) {
     if merge.transforms.is_empty() {
         return;
     }
-    let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", name(how))).collect();
+    let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
     let _ok = writeln!(out, "\n  tensors: {}", how.join(", "));
     if merge.changed.is_empty() {
         return;
@@ -98,7 +98,7 @@ fn changed(out: &mut String, merge: &MergeReport, style: Style) {
         .map(|c| {
             [
                 name(&c.name),
-                sentence(&c.transform),
+                c.transform.name().to_owned(),
                 c.from.as_deref().map_or_else(|| "new".to_owned(), shape),
                 shape(&c.to),
             ]

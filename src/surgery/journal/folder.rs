@@ -5,13 +5,14 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::run::look;
-use super::{Journal, JournalError, Result};
+use super::record::Journal;
 use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
-use crate::surgery::apply::{ApplyError, io_at};
+use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::lock::{self, Lock};
-use crate::surgery::system::{self, create, explain, retry, sync_dir};
+use crate::surgery::system::{self, create, explain, look, retry, sync_dir};
+
+type Result<T> = std::result::Result<T, RepairError>;
 
 /// Says that the folder is nothing for version control, as caches of other tools say it.
 const IGNORE: (&str, &str) = (".gitignore", "# made by ckpt-doctor, so that a repair can be undone\n*\n");
@@ -53,7 +54,7 @@ impl Folder {
                 let _ = lock::sign(&mut lock);
                 Ok(Some(Self { root: root.to_owned(), path, _lock: lock }))
             }
-            Lock::Theirs(holder) => Err(JournalError::Busy { path: root.to_owned(), holder }),
+            Lock::Theirs(holder) => Err(RepairError::Busy { path: root.to_owned(), holder }),
             Lock::Gone => Ok(None),
         }
     }
@@ -68,7 +69,7 @@ impl Folder {
                 Err(error)
                     if matches!(error.kind(), io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem) =>
                 {
-                    return Err(JournalError::ReadOnly { path: root.to_owned(), error });
+                    return Err(RepairError::ReadOnly { path: root.to_owned(), error });
                 }
                 Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&path, "creating")(e).into()),
                 _ => {}
@@ -77,7 +78,7 @@ impl Folder {
                 Ok(None) => {}
                 Ok(Some(folder)) => return folder.for_version_control(),
                 Err(error) => {
-                    if new && !matches!(error, JournalError::Busy { .. }) {
+                    if new && !matches!(error, RepairError::Busy { .. }) {
                         let _ = system::remove_file(&path.join(LOCK));
                         let _ = system::remove_dir(&path);
                     }
@@ -85,7 +86,7 @@ impl Folder {
                 }
             }
         }
-        Err(JournalError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
+        Err(RepairError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
     }
 
     fn for_version_control(self) -> Result<Self> {
@@ -129,12 +130,12 @@ impl Folder {
 
     /// What is under way, if anything is.
     pub(super) fn pending(&self) -> Result<Option<Journal>> {
-        Self::read(&self.journal())
+        Self::read_journal(&self.journal())
     }
 
     /// A journal; `None` when there is none of this name.
-    pub(super) fn read(path: &Path) -> Result<Option<Journal>> {
-        let unusable = |reason: String| JournalError::Journal { path: path.to_owned(), reason };
+    pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>> {
+        let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
         let bytes = match read_capped(path, JSON_CAP) {
             Err(OpenError::NotFound { .. }) => return Ok(None),
             other => other.map_err(|e| unusable(e.to_string()))?,
@@ -239,7 +240,7 @@ fn only_folders(path: &Path) -> Result<()> {
     }
     for folder in folders {
         if look(&folder)?.is_some_and(|m| !m.is_dir()) {
-            return Err(JournalError::Journal { path: folder, reason: "it is not a directory".to_owned() });
+            return Err(RepairError::UnusableJournal { path: folder, reason: "it is not a directory".to_owned() });
         }
     }
     Ok(())

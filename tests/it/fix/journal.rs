@@ -8,8 +8,9 @@ use std::sync::Arc;
 
 use ckpt_doctor::check::check;
 use ckpt_doctor::checkpoint::Checkpoint;
-use ckpt_doctor::surgery::journal::{self, JournalError, Recovered};
-use ckpt_doctor::surgery::repair::{Repair, overlay, plan};
+use ckpt_doctor::surgery::journal::{self, Recovered};
+use ckpt_doctor::surgery::repair::{Repair, plan};
+use ckpt_doctor::surgery::{RepairError, overlay};
 use tempfile::TempDir;
 
 use super::seen;
@@ -132,7 +133,7 @@ fn what_changed_since_is_left_alone() {
     fs::write(dir.join("config.json"), "{}").expect("a file");
     let now = contents(&dir);
     let error = journal::undo(&dir).expect_err("refused");
-    assert!(matches!(&error, JournalError::Changed { path, .. } if path.ends_with("config.json")), "{error}");
+    assert!(matches!(&error, RepairError::ChangedSinceRepair { path, .. } if path.ends_with("config.json")), "{error}");
     assert!(error.to_string().contains(".ckpt-doctor/undo/1"), "{error}");
     assert_eq!(contents(&dir), now);
 }
@@ -143,7 +144,7 @@ fn a_file_that_changes_meanwhile_stops_the_repair() {
     let repair = repair(&dir);
     fs::write(dir.join("config.json"), "{}").expect("a file");
     let now = contents(&dir);
-    assert!(matches!(journal::write(&repair, &mut |_| {}), Err(JournalError::Moved { .. })));
+    assert!(matches!(journal::write(&repair, &mut |_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
     assert_eq!(contents(&dir), now);
     assert!(!dir.join(".ckpt-doctor").exists());
 }
@@ -168,7 +169,7 @@ fn mode_is_kept_and_the_last_repair_is_undone_first() {
     fs::write(dir.join("config.json"), &text).expect("a file");
     assert_eq!(journal::undo(&dir).expect("undone").left, 0);
     assert_eq!(seen(&dir), before);
-    assert!(matches!(journal::undo(&dir), Err(JournalError::Nothing { .. })));
+    assert!(matches!(journal::undo(&dir), Err(RepairError::NothingToUndo { .. })));
 }
 
 #[test]

@@ -5,8 +5,9 @@ use std::fs;
 use std::path::Path;
 use std::sync::Arc;
 
-use ckpt_doctor::check::{Knowledge, Outcome, check};
+use ckpt_doctor::check::{Outcome, check};
 use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{Format, Report, Style, render};
 use ckpt_doctor::surgery::repair::{Content, plan};

@@ -7,18 +7,20 @@ use ckpt_doctor::check::load::{LoadReport, Mismatch, Silent, SilentReason};
 use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
-    ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage,
+    ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName,
+    StageOutcome,
 };
+use ckpt_doctor::surgery::plan::Transform;
 use serde_json::{Map, Value, json};
 
 /// A checkpoint with these findings.
 pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) -> CheckpointReport {
-    let counts = Counts::of(&findings);
+    let counts = Counts::new(&findings);
     CheckpointReport {
         path: path.to_owned(),
         role: None,
         architecture: Some("spatialvla".to_owned()),
-        verdict: counts.verdict().to_owned(),
+        verdict: counts.verdict(),
         counts,
         settings: None,
         findings,
@@ -300,8 +302,8 @@ pub fn hostile() -> Report {
     Report::new(vec![checkpoint], None)
 }
 
-fn stage(name: &str, outcome: &str) -> Stage {
-    Stage { name: name.to_owned(), outcome: outcome.to_owned() }
+fn stage(name: &str, outcome: &str) -> StageOutcome {
+    StageOutcome { name: name.to_owned(), outcome: outcome.to_owned() }
 }
 
 fn map(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
@@ -311,7 +313,7 @@ fn map(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
 fn merge() -> MergeReport {
     MergeReport {
         recipe: "spatialvla-llava3d".to_owned(),
-        stage: "written".to_owned(),
+        stage: Some(MergeStage::Written),
         out: "out/merged".to_owned(),
         donors: map(&[("vision", "donors/spatialvla-tiny"), ("language", "donors/llava3d-tiny/")]),
         options: map(&[("projector", "pad"), ("spatial", "off"), ("rows", "grow"), ("layout", "upstream")]),
@@ -324,21 +326,21 @@ fn merge() -> MergeReport {
             stage("checked", "clean"),
         ],
         seams: vec![],
-        transforms: [("copy", 724), ("grow-rows", 2), ("pad", 2)].map(|(k, n)| (k.to_owned(), n)).into(),
+        transforms: [(Transform::Copy, 724), (Transform::GrowRows, 2), (Transform::Pad, 2)].into(),
         changed: vec![
             ChangedTensor {
                 name: "language_model.lm_head.weight".to_owned(),
-                transform: "grow-rows".to_owned(),
+                transform: Transform::GrowRows,
                 from: Some(vec![32000, 64]),
                 to: vec![33174, 64],
             },
             ChangedTensor {
                 name: "multi_modal_projector.linear.weight".to_owned(),
-                transform: "pad".to_owned(),
+                transform: Transform::Pad,
                 from: Some(vec![48, 32]),
                 to: vec![64, 32],
             },
-            ChangedTensor { name: "fresh.weight".to_owned(), transform: "reinit".to_owned(), from: None, to: vec![64] },
+            ChangedTensor { name: "fresh.weight".to_owned(), transform: Transform::Reinit, from: None, to: vec![64] },
         ],
         dropped: vec![Dropped {
             donor: "language".to_owned(),
@@ -359,11 +361,12 @@ fn merge() -> MergeReport {
 
 pub fn merge_ok() -> Report {
     let note = || finding("TOK006", "tokenizer-needs-conversion", Severity::Info, "protobuf is needed", json!({}));
-    let parts = ["donor vision", "donor language", "planned", "written"].map(|role| {
-        let donor = role.starts_with("donor");
+    let donor = |role: &str| Role::Donor(role.to_owned());
+    let parts = [donor("vision"), donor("language"), Role::Planned, Role::Written].map(|role| {
+        let donor = matches!(role, Role::Donor(_));
         let mut part =
             if donor { checkpoint("donors/x", vec![], &[]) } else { checkpoint("out/merged", vec![note()], &[]) };
-        part.role = Some(role.to_owned());
+        part.role = Some(role);
         part.loads = vec![LoadReport { loader: "4.47.0".to_owned(), ..LoadReport::default() }];
         part
     });
@@ -372,7 +375,7 @@ pub fn merge_ok() -> Report {
 
 pub fn merge_seam() -> Report {
     let mut merge = merge();
-    "seam".clone_into(&mut merge.stage);
+    merge.stage = Some(MergeStage::Seam);
     merge.options.insert("projector".to_owned(), "keep".to_owned());
     merge.stages.truncate(2);
     merge.stages.push(stage("plan", "stopped: 1 seam does not fit"));

@@ -8,8 +8,9 @@ use std::sync::Arc;
 
 use crate::support::project;
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Knowledge, Outcome, check};
+use ckpt_doctor::check::{Outcome, check};
 use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::knowledge::source;
 use ckpt_doctor::surgery::journal;
 use ckpt_doctor::surgery::repair::plan;

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ckpt_doctor::check::Knowledge;
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::knowledge::Loader;
-use ckpt_doctor::surgery::merge::pipeline::{self, Request};
+use ckpt_doctor::merge::{self, MergeRequest};
+use ckpt_doctor::report::model::MergeStage;
 use serde_json::Value;
 
 use super::change::apply_all;
@@ -125,7 +126,7 @@ fn lora(dir: &Path) {
 
 fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {
     let donors = project().join("fixtures/donors");
-    let request = Request {
+    let request = MergeRequest {
         recipe: None,
         donors: [("vision", "spatialvla-tiny"), ("language", "llava3d-tiny")]
             .map(|(role, dir)| (role.to_owned(), donors.join(dir)))
@@ -135,6 +136,12 @@ fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {
         dry_run: false,
         hash: false,
     };
-    let run = pipeline::run(&request, knowledge, &|_| String::new(), &mut |_, _| {}).unwrap_or_else(|e| panic!("{e}"));
-    assert_eq!(run.record.stage, "written", "{}: {:?}", out.display(), run.looked.last().map(|l| &l.outcome.findings));
+    let run = merge::run(&request, knowledge, &mut |_, _| {}).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(
+        run.record.stage,
+        Some(MergeStage::Written),
+        "{}: {:?}",
+        out.display(),
+        run.checked.last().map(|l| &l.outcome.findings)
+    );
 }

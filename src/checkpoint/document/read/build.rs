@@ -3,8 +3,8 @@
 use serde_json::{Map, Number, Value};
 
 use super::is_huge;
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::Token;
-use crate::checkpoint::text::push_pointer;
 
 /// Bytes of text that take as much room as a value does.
 const NODE_BYTES: usize = 100;
@@ -63,8 +63,8 @@ impl Builder {
         let mut pointer = String::new();
         for open in &self.stack {
             match open {
-                Open::Object(_, key) => push_pointer(&mut pointer, key),
-                Open::Array(_, index) => push_pointer(&mut pointer, &index.to_string()),
+                Open::Object(_, key) => pointer::push(&mut pointer, key),
+                Open::Array(_, index) => pointer::push(&mut pointer, &index.to_string()),
             }
             if pointer.len() > MAX_POINTER {
                 return None;

@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use super::build::Builder;
 use crate::checkpoint::fault::KIND_CAP;
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
-use crate::checkpoint::text::push_pointer;
 
 /// Two members of one object with the same key.
 pub(super) struct Duplicate {
@@ -84,7 +84,7 @@ impl<'t> Duplicates<'t> {
                 continue;
             }
             let pointer = builder.container().map(|mut pointer| {
-                push_pointer(&mut pointer, &later.name);
+                pointer::push(&mut pointer, &later.name);
                 pointer
             });
             let equal =

@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::{Artifact, Text, artifact, text};
 use crate::check::{Edit, FixHint};
 use crate::checkpoint::{Document, Splice, line_column, spliced};
-use crate::report::words::sentence;
+use crate::report::format::sentence;
 
 /// Most replacements of one fix; a viewer is no place for more.
 const REPLACEMENTS: usize = 200;

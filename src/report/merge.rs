@@ -1,16 +1,19 @@
-//! What a merge planned and did, as data for every report.
+//! The record of a merge: what it planned and what it wrote, as data for every renderer.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
-/// What a merge planned and did.
+use crate::surgery::plan::Transform;
+
+/// The record of a merge.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct MergeReport {
     /// Recipe name.
     pub recipe: String,
-    /// How far it came: `seam`, `donors`, `planned`, `dry-run`, `written`.
-    pub stage: String,
+    /// The stage it ended with; none while it runs, as in the report that is written into the result.
+    pub stage: Option<MergeStage>,
     /// Where the result is or would be.
     pub out: String,
     /// Donor role to path.
@@ -18,11 +21,11 @@ pub struct MergeReport {
     /// Options in force, defaults included.
     pub options: BTreeMap<String, String>,
     /// Stages in the order they ran, with one line each.
-    pub stages: Vec<Stage>,
+    pub stages: Vec<StageOutcome>,
     /// Seams that do not fit; non-empty means nothing was written.
     pub seams: Vec<Seam>,
-    /// How many tensors came how: `copy`, `pad`, `grow-rows`, `reinit`.
-    pub transforms: BTreeMap<String, usize>,
+    /// Number of tensors by how their bytes are made.
+    pub transforms: BTreeMap<Transform, usize>,
     /// The tensors that are not plain copies.
     pub changed: Vec<ChangedTensor>,
     /// Donor tensors that were left behind, by donor role and pattern.
@@ -39,9 +42,52 @@ pub struct MergeReport {
     pub bytes: u64,
 }
 
-/// One stage of the pipeline.
+/// The stage that a merge ended with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MergeStage {
+    /// A donor has errors that the recipe does not tolerate; nothing was written.
+    Donors,
+    /// Seams do not fit; nothing was written.
+    Seam,
+    /// The planned checkpoint has errors; nothing was written.
+    Planned,
+    /// The plan is sound, and `--dry-run` asked for no more.
+    DryRun,
+    /// The result was written.
+    Written,
+}
+
+/// What a checkpoint is in a merge. Reports spell it `donor vision`, `planned`, `written`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Role {
+    /// A donor, by its role in the recipe.
+    Donor(String),
+    /// The checkpoint that the plan describes.
+    Planned,
+    /// The result, read again from disk.
+    Written,
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Donor(role) => write!(f, "donor {role}"),
+            Self::Planned => f.write_str("planned"),
+            Self::Written => f.write_str("written"),
+        }
+    }
+}
+
+impl Serialize for Role {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// One line about one stage of the pipeline.
 #[derive(Debug, Clone, Serialize)]
-pub struct Stage {
+pub struct StageOutcome {
     /// Its name.
     pub name: String,
     /// What came of it.
@@ -79,8 +125,8 @@ pub struct ShapedName {
 pub struct ChangedTensor {
     /// Name in the result.
     pub name: String,
-    /// How it was made.
-    pub transform: String,
+    /// How its bytes are made.
+    pub transform: Transform,
     /// Shape in the donor; absent when nothing was taken.
     pub from: Option<Vec<u64>>,
     /// Shape in the result.

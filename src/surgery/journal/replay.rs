@@ -1,7 +1,6 @@
-//! What a journal says, step by step. Each step may have been made already: a run may have been killed after any.
+//! The steps of a journal. Each may have been made already: a run may have been killed after any of them.
 #![expect(clippy::disallowed_methods, reason = "surgery is where checkpoints are written")]
 
-use std::fmt::Write as _;
 use std::fs::{self, Metadata};
 use std::io;
 use std::os::unix::fs::MetadataExt;
@@ -11,27 +10,30 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use sha2::{Digest, Sha256};
 
 use super::folder::{Folder, remove_file, remove_tree};
-use super::{Entry, Journal, JournalError, New, Old, Result};
+use super::record::{Journal, JournaledFile, NewFile, OldFile};
+use crate::checkpoint::hex;
 use crate::checkpoint::open::open_regular;
-use crate::surgery::apply::io_at;
-use crate::surgery::system::{retry, sync_dir};
+use crate::surgery::error::{RepairError, io_at};
+use crate::surgery::system::{look, retry, sync_dir};
+
+type Result<T> = std::result::Result<T, RepairError>;
 
 /// A journal and the folder it lies in.
-pub(super) struct Run<'a> {
+pub(super) struct Replay<'a> {
     folder: &'a Folder,
     journal: &'a Journal,
 }
 
-impl<'a> Run<'a> {
+impl<'a> Replay<'a> {
     pub(super) const fn new(folder: &'a Folder, journal: &'a Journal) -> Self {
         Self { folder, journal }
     }
 
-    fn target(&self, entry: &Entry) -> PathBuf {
+    fn target(&self, entry: &JournaledFile) -> PathBuf {
         self.folder.root.join(&entry.name)
     }
 
-    fn staged(&self, entry: &Entry) -> PathBuf {
+    fn staged(&self, entry: &JournaledFile) -> PathBuf {
         self.folder.staged().join(&entry.name)
     }
 
@@ -39,7 +41,7 @@ impl<'a> Run<'a> {
         self.folder.originals(self.journal.number)
     }
 
-    fn original(&self, entry: &Entry) -> PathBuf {
+    fn original(&self, entry: &JournaledFile) -> PathBuf {
         self.originals().join(&entry.name)
     }
 
@@ -49,7 +51,7 @@ impl<'a> Run<'a> {
             let target = self.target(entry);
             let ready = if look(&self.staged(entry))?.is_some() {
                 let untouched = match (look(&target)?, &entry.old) {
-                    (Some(is), Some(was)) => Old::of(&is) == *was,
+                    (Some(is), Some(was)) => OldFile::from_metadata(&is) == *was,
                     (None, Some(_)) => look(&self.original(entry))?.is_some(),
                     (there, None) => there.is_none(),
                 };
@@ -105,7 +107,7 @@ impl<'a> Run<'a> {
                 (Some(_), None) => back.push(entry),
                 (Some(_) | None, Some(_)) if self.is_new(entry)? => back.push(entry),
                 (Some(_), Some(_)) => {
-                    return Err(JournalError::Changed { path: target, originals: self.originals() });
+                    return Err(RepairError::ChangedSinceRepair { path: target, originals: self.originals() });
                 }
                 (None, _) => {}
             }
@@ -123,7 +125,7 @@ impl<'a> Run<'a> {
     }
 
     /// Whether the repair's own file stands in its place.
-    fn is_new(&self, entry: &Entry) -> Result<bool> {
+    fn is_new(&self, entry: &JournaledFile) -> Result<bool> {
         let published = look(&self.staged(entry))?.is_none();
         Ok(published && entry.new.matches(&self.target(entry))?)
     }
@@ -190,38 +192,25 @@ fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
     }
 }
 
-/// What is there, links not followed; `None` when nothing is.
-pub(super) fn look(path: &Path) -> Result<Option<Metadata>> {
-    match fs::symlink_metadata(path) {
-        Ok(metadata) => Ok(Some(metadata)),
-        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-        Err(e) => Err(io_at(path, "looking at")(e).into()),
-    }
-}
-
-impl Old {
-    pub(super) fn of(metadata: &Metadata) -> Self {
+impl OldFile {
+    pub(super) fn from_metadata(metadata: &Metadata) -> Self {
         Self { len: metadata.len(), mtime: (metadata.mtime(), metadata.mtime_nsec()), mode: metadata.mode() & 0o7777 }
     }
 }
 
-impl New {
+impl NewFile {
     /// Reads a file to its end.
-    pub(super) fn of(path: &Path) -> Result<Self> {
+    pub(super) fn hash(path: &Path) -> Result<Self> {
         let opened = open_regular(path, u64::MAX).map_err(|e| io_at(path, "reading")(io::Error::other(e)))?;
         let mut hasher = Hasher(Sha256::new());
         let len = io::copy(&mut &opened.file, &mut hasher).map_err(io_at(path, "reading"))?;
-        let mut sha256 = String::new();
-        for byte in hasher.0.finalize() {
-            let _infallible = write!(sha256, "{byte:02x}");
-        }
-        Ok(Self { len, sha256 })
+        Ok(Self { len, sha256: hex(&hasher.0.finalize()) })
     }
 
     /// Whether the file at `path` is this one.
     fn matches(&self, path: &Path) -> Result<bool> {
         let is_file = look(path)?.is_some_and(|m| m.is_file() && m.len() == self.len);
-        Ok(is_file && Self::of(path)? == *self)
+        Ok(is_file && Self::hash(path)? == *self)
     }
 }
 

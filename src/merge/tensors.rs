@@ -5,32 +5,34 @@ use std::collections::{BTreeMap, HashMap};
 use regex::Regex;
 use serde_json::Value;
 
-use super::documents::Built;
-use super::record::{ChangedTensor, Dropped, Seam, ShapedName};
-use super::{Context, Donor, Draft, MergeError};
+use super::context::{Context, Donor};
+use super::documents::MergedDocument;
+use super::draft::MergeDraft;
+use super::error::MergeError;
 use crate::checkpoint::{Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Library, Loader};
-use crate::surgery::plan::{PlannedTensor, Source, TensorRef, into_shards};
+use crate::report::model::{ChangedTensor, Dropped, Seam, ShapedName};
+use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, Transform, into_shards};
 use crate::surgery::transform::can_compute;
 
 /// A tensor spec with its parts evaluated once.
-struct Rule<'a> {
+struct TensorRule<'a> {
     spec: &'a TensorSpec,
     names: Regex,
     rename: Option<String>,
-    fit: String,
+    fit: Transform,
 }
 
-pub(super) fn build(
+pub(super) fn plan(
     context: &Context<'_>,
-    documents: &[Built],
+    documents: &[MergedDocument],
     library: &Library,
     limit: u64,
-    draft: &mut Draft,
+    draft: &mut MergeDraft,
 ) -> Result<(), MergeError> {
     let rules = rules(context)?;
-    let mut taken: Vec<(String, &Donor, &Shard, &Tensor, &Rule<'_>)> = Vec::new();
+    let mut taken: Vec<(String, &Donor, &Shard, &Tensor, &TensorRule<'_>)> = Vec::new();
     let mut dropped: BTreeMap<(String, String, String), usize> = BTreeMap::new();
     for donor in context.donors {
         for (shard, tensor) in donor.checkpoint.tensors() {
@@ -80,12 +82,12 @@ pub(super) fn build(
         }
         let position = expected.get(&name).map_or(usize::MAX, |e| e.0);
         let shape = expected.get(&name).map_or_else(|| tensor.shape.clone(), |e| e.1.clone());
-        match source(from, tensor, &shape, &rule.fit) {
+        match source(from, tensor, &shape, rule.fit) {
             Ok(source) => {
-                if !matches!(source, Source::Copy(_)) {
+                if !matches!(source, TensorSource::Copy(_)) {
                     draft.changed.push(ChangedTensor {
                         name: name.clone(),
-                        transform: source.word().to_owned(),
+                        transform: source.transform(),
                         from: Some(tensor.shape.clone()),
                         to: shape.clone(),
                     });
@@ -101,7 +103,7 @@ pub(super) fn build(
     Ok(())
 }
 
-fn rules<'a>(context: &Context<'a>) -> Result<Vec<Rule<'a>>, MergeError> {
+fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
     let mut out = Vec::new();
     for spec in &context.recipe.tensors {
         if !context.holds(spec.when.as_ref(), &spec.names)? {
@@ -116,18 +118,18 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<Rule<'a>>, MergeError> {
             .transpose()
             .map_err(context.at(spec.names.as_str()))?;
         let fit = match &spec.fit {
-            None => "copy".to_owned(),
-            Some(e) => match e.eval(&context.scope).map_err(context.at(spec.names.as_str()))? {
-                Value::String(s) if matches!(s.as_str(), "copy" | "pad" | "grow-rows" | "reinit") => s,
-                other => {
-                    return Err(MergeError::Recipe(format!(
-                        "{}: fit of {} is {other}, not copy, pad, grow-rows or reinit",
+            None => Transform::Copy,
+            Some(e) => {
+                let value = e.eval(&context.scope).map_err(context.at(spec.names.as_str()))?;
+                serde_json::from_value(value.clone()).map_err(|_| {
+                    MergeError::Recipe(format!(
+                        "{}: fit of {} is {value}, not copy, pad, grow-rows or reinit",
                         context.recipe.recipe, spec.names
-                    )));
-                }
-            },
+                    ))
+                })?
+            }
         };
-        out.push(Rule { spec, names, rename, fit });
+        out.push(TensorRule { spec, names, rename, fit });
     }
     Ok(out)
 }
@@ -148,24 +150,24 @@ fn expected_shapes<'n>(
 }
 
 /// How `tensor` becomes one of `shape`, or why it cannot.
-fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: &str) -> Result<Source, String> {
-    if fit != "reinit" && tensor.shape == shape {
-        return Ok(Source::Copy(from));
+fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: Transform) -> Result<TensorSource, String> {
+    if fit != Transform::Reinit && tensor.shape == shape {
+        return Ok(TensorSource::Copy(from));
     }
-    if fit == "copy" {
-        return Err(String::new());
-    }
-    if !can_compute(tensor.dtype) {
+    if fit != Transform::Copy && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
     let same_rank = tensor.shape.len() == shape.len();
     let nests = same_rank && tensor.shape.iter().zip(shape).all(|(have, want)| have <= want);
     match fit {
-        "reinit" => Ok(Source::Reinit { instead_of: from }),
-        "pad" if nests => Ok(Source::Pad(from)),
-        "pad" => Err("padding cannot make it smaller".to_owned()),
-        _ if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => Ok(Source::GrowRows(from)),
-        _ => Err("only rows can be added".to_owned()),
+        Transform::Copy => Err(String::new()),
+        Transform::Reinit => Ok(TensorSource::Reinit { instead_of: from }),
+        Transform::Pad if nests => Ok(TensorSource::Pad(from)),
+        Transform::Pad => Err("padding cannot make it smaller".to_owned()),
+        Transform::GrowRows if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
+            Ok(TensorSource::GrowRows(from))
+        }
+        Transform::GrowRows => Err("only rows can be added".to_owned()),
     }
 }
 
@@ -173,7 +175,7 @@ fn misfit(
     context: &Context<'_>,
     donor: &Donor,
     tensor: &Tensor,
-    rule: &Rule<'_>,
+    rule: &TensorRule<'_>,
     name: &str,
     needed: Vec<u64>,
     why: &str,

@@ -1,11 +1,11 @@
-//! Wording shared by the renderers: counts, sizes, shapes, evidence, and "and N more".
+//! Formatting shared by the renderers: counts, sizes, shapes, evidence, and "and N more".
 
 use std::collections::BTreeMap;
 
 use serde_json::Value;
 
 use super::collapse::{Group, collapse};
-use super::model::{Counts, MergeReport, Report};
+use super::model::{Counts, MergeReport, MergeStage, Report};
 use crate::check::load::{LoadReport, SilentReason};
 use crate::check::{Finding, FixHint, Location, Safety};
 use crate::checkpoint::escape;
@@ -173,20 +173,19 @@ pub fn summary(report: &Report) -> String {
     }
 }
 
-/// What came of a merge; `None` while it is not known, as in the report that is written with the result.
+/// How a merge ended; `None` in the report that is written with the result.
 fn outcome(merge: &MergeReport) -> Option<String> {
     let size = || format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
-    match merge.stage.as_str() {
-        "seam" => {
+    Some(match merge.stage? {
+        MergeStage::Seam => {
             let verb = if merge.seams.len() == 1 { "does" } else { "do" };
-            Some(format!("Nothing written: {} {verb} not fit", plural(merge.seams.len(), "seam")))
+            format!("Nothing written: {} {verb} not fit", plural(merge.seams.len(), "seam"))
         }
-        "donors" => Some("Nothing written: a donor is not sound".to_owned()),
-        "planned" => Some("Nothing written: the planned checkpoint is not sound".to_owned()),
-        "dry-run" => Some(format!("Nothing written, as asked: {} planned", size())),
-        "written" => Some(format!("Written: {}", size())),
-        _ => None,
-    }
+        MergeStage::Donors => "Nothing written: a donor is not sound".to_owned(),
+        MergeStage::Planned => "Nothing written: the planned checkpoint is not sound".to_owned(),
+        MergeStage::DryRun => format!("Nothing written, as asked: {} planned", size()),
+        MergeStage::Written => format!("Written: {}", size()),
+    })
 }
 
 /// What the message leaves unsaid: `key = value` for each piece of evidence whose value it does not quote.

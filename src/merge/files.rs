@@ -5,35 +5,41 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::documents::Built;
-use super::record::MergedFile;
-use super::{Context, Draft, MergeError};
+use super::context::Context;
+use super::documents::MergedDocument;
+use super::draft::MergeDraft;
+use super::error::MergeError;
 use crate::check::modules::relative_modules;
 use crate::checkpoint::Document;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
 use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
 use crate::knowledge::source;
+use crate::report::model::MergedFile;
 use crate::surgery::plan::PlannedFile;
 
-pub(super) fn build(context: &Context<'_>, documents: Vec<Built>, draft: &mut Draft) -> Result<(), MergeError> {
+pub(super) fn plan(
+    context: &Context<'_>,
+    documents: Vec<MergedDocument>,
+    draft: &mut MergeDraft,
+) -> Result<(), MergeError> {
     let mut files: Vec<PlannedFile> = Vec::new();
     for spec in &context.recipe.files {
         match spec {
             FileSpec::Copy(copy) => {
                 if context.holds(copy.when.as_ref(), "files")? {
                     for name in &copy.names {
-                        files.extend(read(context, &copy.from, name)?);
+                        files.extend(copy_of(context, &copy.from, name)?);
                     }
                 }
             }
-            FileSpec::Modules(modules) => {
-                if context.holds(modules.when.as_ref(), "files")? {
-                    files.extend(closure(context, modules)?);
+            FileSpec::Modules(spec) => {
+                if context.holds(spec.when.as_ref(), "files")? {
+                    files.extend(modules(context, spec)?);
                 }
             }
             FileSpec::Template(template) => {
                 if context.holds(template.when.as_ref(), "files")? {
-                    files.push(filled(context, template)?);
+                    files.push(fill_template(context, template)?);
                 }
             }
         }
@@ -47,7 +53,7 @@ pub(super) fn build(context: &Context<'_>, documents: Vec<Built>, draft: &mut Dr
         draft.documents.push(index);
     }
     // A loader starts at config.json: it comes last, so that even a copy cut short is not taken for a checkpoint.
-    let (config, others): (Vec<Built>, Vec<Built>) =
+    let (config, others): (Vec<MergedDocument>, Vec<MergedDocument>) =
         documents.into_iter().partition(|b| b.document.name == "config.json");
     for built in others.into_iter().chain(config) {
         files.push(PlannedFile {
@@ -74,7 +80,7 @@ fn bytes_of(document: &Document) -> Arc<[u8]> {
 }
 
 /// A donor's file; nothing when the donor has none of that name.
-fn read(context: &Context<'_>, role: &str, name: &str) -> Result<Option<PlannedFile>, MergeError> {
+fn copy_of(context: &Context<'_>, role: &str, name: &str) -> Result<Option<PlannedFile>, MergeError> {
     let Some(donor) = context.donor(role) else { return Ok(None) };
     if !donor.checkpoint.has_file(name) {
         return Ok(None);
@@ -85,7 +91,7 @@ fn read(context: &Context<'_>, role: &str, name: &str) -> Result<Option<PlannedF
 }
 
 /// The root modules and every module they import, each from the first donor that has it.
-fn closure(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>, MergeError> {
+fn modules(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>, MergeError> {
     let mut found: BTreeMap<String, PlannedFile> = BTreeMap::new();
     let mut pending = spec.roots.clone();
     while let Some(module) = pending.pop() {
@@ -95,7 +101,7 @@ fn closure(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>
         }
         for role in &spec.from {
             let Some(parsed) = context.donor(role).and_then(|d| d.checkpoint.modules.get(&name)) else { continue };
-            if let Some(file) = read(context, role, &name)? {
+            if let Some(file) = copy_of(context, role, &name)? {
                 pending.extend(relative_modules(parsed));
                 found.insert(name, file);
                 break;
@@ -105,7 +111,7 @@ fn closure(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>
     Ok(found.into_values().collect())
 }
 
-fn filled(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFile, MergeError> {
+fn fill_template(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFile, MergeError> {
     let recipe = &context.recipe.recipe;
     let mut text = source::text(&format!("recipes/{}", spec.text))
         .ok_or_else(|| MergeError::Recipe(format!("{recipe}: no template {}", spec.text)))?
@@ -123,7 +129,7 @@ fn filled(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFile, Mer
 }
 
 /// The index, when there is more than one shard; one shard needs none.
-fn index(draft: &Draft) -> Option<Document> {
+fn index(draft: &MergeDraft) -> Option<Document> {
     if draft.plan.shards.len() < 2 {
         return None;
     }

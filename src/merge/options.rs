@@ -1,18 +1,19 @@
-//! Options of a recipe: what was given, what that means, what is left to the default.
+//! Options of a recipe: those given, checked, and defaults for the others.
 
 use std::collections::BTreeMap;
 
-use super::{MergeError, Options};
+use super::context::Options;
+use super::error::MergeError;
 use crate::knowledge::recipe::{OptionSpec, Recipe};
 
 /// Largest shard when a recipe has no such option: what `save_pretrained` uses.
-pub const DEFAULT_SHARD: u64 = 5_000_000_000;
+pub(super) const DEFAULT_SHARD: u64 = 5_000_000_000;
 
 /// Options in force: those given, checked, and the recipe's defaults for the rest.
 ///
 /// # Errors
 /// [`MergeError::Option`] for a name the recipe does not have or a value it does not take.
-pub fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Result<Options, MergeError> {
+pub(super) fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Result<Options, MergeError> {
     for name in given.keys() {
         if !recipe.options.iter().any(|o| o.name == *name) {
             let known: Vec<&str> = recipe.options.iter().map(|o| o.name.as_str()).collect();
@@ -33,7 +34,7 @@ pub fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Result<Opti
 
 fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
     if spec.values.is_empty() {
-        return size(value).map(drop);
+        return parse_size(value).map(drop);
     }
     let takes = |v: &String| match v.strip_suffix(':') {
         // What follows the colon goes into a Python import: a dotted module path and nothing else.
@@ -59,7 +60,7 @@ fn is_module_path(text: &str) -> bool {
 ///
 /// # Errors
 /// [`MergeError::Option`] for anything else.
-pub fn size(text: &str) -> Result<u64, MergeError> {
+pub(super) fn parse_size(text: &str) -> Result<u64, MergeError> {
     let bad = || MergeError::Option(format!("shard-size={text} is not a size such as 5GB, 300MiB or 1000000"));
     let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let (number, unit) = text.split_at(digits);
@@ -85,11 +86,11 @@ mod tests {
 
     #[test]
     fn sizes() {
-        assert_eq!(size("5GB").unwrap(), 5_000_000_000);
-        assert_eq!(size("5GiB").unwrap(), 5 << 30);
-        assert_eq!(size("300").unwrap(), 300);
+        assert_eq!(parse_size("5GB").unwrap(), 5_000_000_000);
+        assert_eq!(parse_size("5GiB").unwrap(), 5 << 30);
+        assert_eq!(parse_size("300").unwrap(), 300);
         for bad in ["", "GB", "0", "-1", "5 parsecs", "99999999999TB"] {
-            assert!(size(bad).is_err(), "{bad}");
+            assert!(parse_size(bad).is_err(), "{bad}");
         }
     }
 

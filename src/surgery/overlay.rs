@@ -5,12 +5,14 @@ use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsuppo
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
-use super::Repair;
-use crate::surgery::apply::{ApplyError, check_target, interrupted, io_at};
-use crate::surgery::donor::AtRest;
-use crate::surgery::journal::{JournalError, explained, unchanged, write_content};
-use crate::surgery::staging::Staging;
-use crate::surgery::system::{ask_for_room, retry};
+use super::changes::{check_unchanged, explain_error, write_content};
+use super::donor::AtRest;
+use super::error::{ApplyError, RepairError, io_at};
+use super::repair::Repair;
+use super::staging::Staging;
+use super::stop::interrupted;
+use super::system::{ask_for_room, retry};
+use super::target::check_target;
 
 /// Makes the directory `out`: the repaired checkpoint, its unchanged files as hard links to the original's or, on
 /// another file system, as symbolic links. Hidden files stay behind.
@@ -18,16 +20,16 @@ use crate::surgery::system::{ask_for_room, retry};
 /// `progress` hears of bytes written.
 ///
 /// # Errors
-/// A [`JournalError`]; then there is no new directory.
-pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<PathBuf, JournalError> {
+/// A [`RepairError`]; then there is no new directory.
+pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<PathBuf, RepairError> {
     let original = &repair.original;
     let out = check_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let donor = AtRest::see(&original.root)?;
-    let explained = |error| explained(error, parent, repair);
+    let explained = |error| explain_error(error, parent, repair);
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
     let written = ask_for_room(parent, &repair.sizes())
-        .map_err(JournalError::from)
+        .map_err(RepairError::from)
         .and_then(|()| fill(repair, staging.content(), progress))
         .and_then(|()| Ok(donor.unchanged()?))
         .and_then(|()| Ok(interrupted()?))
@@ -39,10 +41,10 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
     }
 }
 
-fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), JournalError> {
+fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
     for change in &repair.changes {
         interrupted()?;
-        unchanged(repair, change, &repair.original.root.join(&change.name))?;
+        check_unchanged(repair, change, &repair.original.root.join(&change.name))?;
         write_content(&dir.join(&change.name), &change.new, progress)?;
     }
     let original = &repair.original;

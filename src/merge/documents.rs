@@ -2,30 +2,36 @@
 
 use serde_json::{Map, Value, json};
 
-use super::{Context, Draft, MergeError};
+use super::context::Context;
+use super::draft::MergeDraft;
+use super::error::MergeError;
 use crate::check::tokens::OpenedTokenizer;
-use crate::checkpoint::{Document, FaultKind, Vocabulary};
-use crate::knowledge::recipe::{CODE_SWITCHES, DocumentSpec, Edit, GraftEdit, TokensForm};
+use crate::checkpoint::{Document, FaultKind, Vocabulary, pointer};
+use crate::knowledge::recipe::{CODE_SWITCHES, DocumentEdit, DocumentSpec, GraftEdit, TokensForm};
 
 /// A document of the result and where it came from.
-pub(super) struct Built {
+pub(super) struct MergedDocument {
     pub document: Document,
     pub origin: String,
 }
 
-pub(super) fn build(context: &Context<'_>, draft: &mut Draft) -> Result<Vec<Built>, MergeError> {
+pub(super) fn plan(context: &Context<'_>, draft: &mut MergeDraft) -> Result<Vec<MergedDocument>, MergeError> {
     let mut out = Vec::new();
     for spec in &context.recipe.documents {
         if context.holds(spec.when.as_ref(), &spec.name)?
-            && let Some(built) = one(context, spec, draft)?
+            && let Some(document) = plan_document(context, spec, draft)?
         {
-            out.push(built);
+            out.push(document);
         }
     }
     Ok(out)
 }
 
-fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<Option<Built>, MergeError> {
+fn plan_document(
+    context: &Context<'_>,
+    spec: &DocumentSpec,
+    draft: &mut MergeDraft,
+) -> Result<Option<MergedDocument>, MergeError> {
     let donor =
         spec.from.as_ref().map(|role| (role, context.donor(role).and_then(|d| d.checkpoint.document(&spec.name))));
     let (start, faultless) = match donor {
@@ -60,7 +66,7 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
         }
     }
     for edit in &spec.edits {
-        apply(context, spec, edit, &mut value)?;
+        apply_edit(context, spec, edit, &mut value)?;
     }
     let role = spec.from.as_deref().unwrap_or_default();
     if let Some(d) = source.filter(|d| !d.left_out.is_empty() && d.value.as_ref() != Some(&value)) {
@@ -70,16 +76,16 @@ fn one(context: &Context<'_>, spec: &DocumentSpec, draft: &mut Draft) -> Result<
     let document = match source {
         // Nothing changed: the donor's own bytes, not our spelling of them.
         Some(d) if d.value.as_ref() == Some(&value) && d.faults.is_empty() => {
-            return Ok(Some(Built { document: d.clone(), origin: format!("{role} donor, unchanged") }));
+            return Ok(Some(MergedDocument { document: d.clone(), origin: format!("{role} donor, unchanged") }));
         }
         _ => Document::from_value(&spec.name, value),
     };
     let origin = if source.is_some() { format!("{role} donor, edited") } else { "made by the recipe".to_owned() };
-    Ok(Some(Built { document, origin }))
+    Ok(Some(MergedDocument { document, origin }))
 }
 
 /// Puts the recipe's value where the donor has `Infinity` or `NaN`: the result is strict JSON.
-fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut Draft) -> Result<(), MergeError> {
+fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut MergeDraft) -> Result<(), MergeError> {
     let mut places = Vec::new();
     for fault in source.faults.iter().filter(|f| f.kind == FaultKind::NonFiniteNumber) {
         let Some(pointer) = fault.places.first().and_then(|p| p.pointer.as_deref()) else { continue };
@@ -134,31 +140,36 @@ fn strip_switches(value: &mut Value) -> Vec<String> {
     removed
 }
 
-fn apply(context: &Context<'_>, spec: &DocumentSpec, edit: &Edit, value: &mut Value) -> Result<(), MergeError> {
+fn apply_edit(
+    context: &Context<'_>,
+    spec: &DocumentSpec,
+    edit: &DocumentEdit,
+    value: &mut Value,
+) -> Result<(), MergeError> {
     match edit {
-        Edit::Set(set) => {
+        DocumentEdit::Set(set) => {
             if context.holds(set.when.as_ref(), &spec.name)? {
                 let place = format!("{}{}", spec.name, set.at);
                 let to = set.to.eval(&context.scope).map_err(context.at(place))?;
-                put(value, &set.at, to).ok_or_else(|| not_there(context, spec, &set.at))?;
+                pointer::put(value, &Value::Null, &set.at, to).ok_or_else(|| not_there(context, spec, &set.at))?;
             }
         }
-        Edit::Tokens(edit) => {
+        DocumentEdit::Tokens(edit) => {
             if context.holds(edit.when.as_ref(), &spec.name)?
                 && let Some(tokens) = &context.tokens
             {
-                put(value, &edit.at, added(context, tokens, edit.form))
+                pointer::put(value, &Value::Null, &edit.at, added(context, tokens, edit.form))
                     .ok_or_else(|| not_there(context, spec, &edit.at))?;
             }
         }
-        Edit::Graft(graft) => {
+        DocumentEdit::Graft(graft) => {
             let config = grafted(context, graft)?;
-            put(value, &graft.at, config).ok_or_else(|| not_there(context, spec, &graft.at))?;
+            pointer::put(value, &Value::Null, &graft.at, config).ok_or_else(|| not_there(context, spec, &graft.at))?;
         }
-        Edit::Remove(remove) => {
+        DocumentEdit::Remove(remove) => {
             if context.holds(remove.when.as_ref(), &spec.name)? {
                 for pointer in &remove.at {
-                    take(value, pointer);
+                    pointer::remove(value, pointer);
                 }
             }
         }
@@ -231,32 +242,4 @@ fn grafted(context: &Context<'_>, graft: &GraftEdit) -> Result<Value, MergeError
         Value::Object(config.iter().filter(|(k, _)| !left_out(k)).map(|(k, v)| (k.clone(), v.clone())).collect());
     strip_switches(&mut value);
     Ok(value)
-}
-
-/// Splits a pointer into its parent and its last key, unescaped.
-fn split(pointer: &str) -> Option<(&str, String)> {
-    let (parent, key) = pointer.rsplit_once('/')?;
-    Some((parent, key.replace("~1", "/").replace("~0", "~")))
-}
-
-/// Sets the value at `pointer`, making objects on the way; `None` when something else is in the way.
-fn put(root: &mut Value, pointer: &str, to: Value) -> Option<()> {
-    if pointer.is_empty() {
-        *root = to;
-        return Some(());
-    }
-    let (parent, key) = split(pointer)?;
-    if root.pointer(parent).is_none() {
-        put(root, parent, Value::Object(Map::new()))?;
-    }
-    root.pointer_mut(parent)?.as_object_mut()?.insert(key, to);
-    Some(())
-}
-
-fn take(root: &mut Value, pointer: &str) {
-    if let Some((parent, key)) = split(pointer)
-        && let Some(map) = root.pointer_mut(parent).and_then(Value::as_object_mut)
-    {
-        map.shift_remove(&key);
-    }
 }
