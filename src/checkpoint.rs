@@ -34,7 +34,7 @@ pub use document::edit::{Splice, spliced};
 pub use fault::{Fault, FaultKind, FaultSource, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
-pub use module::Module;
+pub use module::PythonModule;
 pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
 pub use sniff::looks_like;
@@ -92,7 +92,7 @@ pub struct Checkpoint {
     /// The index, if there is one.
     pub index: Option<Index>,
     /// Python modules, by file name.
-    pub modules: BTreeMap<String, Module>,
+    pub modules: BTreeMap<String, PythonModule>,
     /// The tokenizer.
     pub tokenizer: Tokenizer,
     /// Text of files that are neither document nor module, by name: `chat_template.jinja`.
@@ -111,7 +111,7 @@ pub struct Parts {
     /// Shards.
     pub shards: Vec<Shard>,
     /// Python modules.
-    pub modules: Vec<Module>,
+    pub modules: Vec<PythonModule>,
     /// Vocabularies that no document holds, by file name (`tokenizer.model`); a donor's
     /// [`Tokenizer::vocabularies`] can be passed on as they are.
     pub vocabularies: BTreeMap<String, Arc<Vocabulary>>,

@@ -13,11 +13,11 @@ use serde_json::Value;
 
 use crate::checkpoint::adapter::{Adapter, CONFIG};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
-use keys::{Key, Role};
+use keys::{AdapterKey, MatrixRole};
 use targets::Targets;
 
 /// The tensors of one module.
-type Module<'c> = BTreeMap<Role, &'c Tensor>;
+type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
 /// Faults of the adapter in this directory; none when there is none.
 #[must_use]
@@ -73,25 +73,25 @@ fn is_path(base: &str) -> bool {
 }
 
 fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
-    let mut modules: BTreeMap<&str, Module<'_>> = BTreeMap::new();
+    let mut modules: BTreeMap<&str, AdapterModule<'_>> = BTreeMap::new();
     let mut whole: BTreeSet<&str> = BTreeSet::new();
     for tensor in tensors {
-        match Key::parse(&tensor.name) {
-            Key::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
-            Key::Whole(name) => drop(whole.insert(name)),
-            Key::Foreign(reason) => {
+        match AdapterKey::parse(&tensor.name) {
+            AdapterKey::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
+            AdapterKey::Whole(name) => drop(whole.insert(name)),
+            AdapterKey::Foreign(reason) => {
                 let fault = Fault::new(FaultKind::AdapterKeyUnread).at(Place::tensor(&*tensor.name));
                 faults.push(fault.with("tensor", tensor.name.as_str()).with("reason", reason));
             }
         }
     }
     let targets = Targets::of(config);
-    let vectors = modules.values().filter(|module| module.contains_key(&Role::Magnitude)).count();
+    let vectors = modules.values().filter(|module| module.contains_key(&MatrixRole::Magnitude)).count();
     let alike = vectors == 0 || vectors == modules.len();
     let trained = if targets.is_uniform() { trained_rank(&modules) } else { None };
     for (name, module) in &modules {
         pairs(name, module, &targets, trained, faults);
-        let magnitude = module.get(&Role::Magnitude);
+        let magnitude = module.get(&MatrixRole::Magnitude);
         if magnitude.is_some() != targets.dora {
             let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
             let fault = Fault::new(FaultKind::AdapterDoraDisagrees).at(at).with("module", *name);
@@ -112,8 +112,14 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
 }
 
 /// One fault for all modules that have matrices and get none, with the list that would name them.
-fn untargeted(config: &Value, modules: &BTreeMap<&str, Module<'_>>, targets: &Targets<'_>, faults: &mut Vec<Fault>) {
-    let left_out: Vec<(&&str, &Module<'_>)> = modules.iter().filter(|(name, _)| !targets.may_cover(name)).collect();
+fn untargeted(
+    config: &Value,
+    modules: &BTreeMap<&str, AdapterModule<'_>>,
+    targets: &Targets<'_>,
+    faults: &mut Vec<Fault>,
+) {
+    let left_out: Vec<(&&str, &AdapterModule<'_>)> =
+        modules.iter().filter(|(name, _)| !targets.may_cover(name)).collect();
     let Some((first, _)) = left_out.first() else { return };
     let mut fault =
         Fault::new(FaultKind::AdapterModuleUntargeted).with("module", **first).with("count", left_out.len());
@@ -128,10 +134,11 @@ fn untargeted(config: &Value, modules: &BTreeMap<&str, Module<'_>>, targets: &Ta
 }
 
 /// The two matrices of a module, as weights and as embeddings.
-const PAIRS: [(Role, Role); 2] = [(Role::A, Role::B), (Role::EmbeddingA, Role::EmbeddingB)];
+const PAIRS: [(MatrixRole, MatrixRole); 2] =
+    [(MatrixRole::A, MatrixRole::B), (MatrixRole::EmbeddingA, MatrixRole::EmbeddingB)];
 
 /// The rank of every pair, when all have the same.
-fn trained_rank(modules: &BTreeMap<&str, Module<'_>>) -> Option<u64> {
+fn trained_rank(modules: &BTreeMap<&str, AdapterModule<'_>>) -> Option<u64> {
     let pairs = modules.values().flat_map(|m| PAIRS.iter().filter_map(|(a, b)| Some((m.get(a)?, m.get(b)?))));
     let ranks: Option<BTreeSet<u64>> = pairs
         .map(|(a, b)| {
@@ -144,7 +151,7 @@ fn trained_rank(modules: &BTreeMap<&str, Module<'_>>) -> Option<u64> {
 }
 
 /// `lora_A [r, in]` and `lora_B [out, r]` of one module, of one rank, and that of the config.
-fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, trained: Option<u64>, faults: &mut Vec<Fault>) {
+fn pairs(name: &str, module: &AdapterModule<'_>, targets: &Targets<'_>, trained: Option<u64>, faults: &mut Vec<Fault>) {
     for (down, up) in PAIRS {
         let (a, b) = match (module.get(&down), module.get(&up)) {
             (None, None) => continue,
@@ -169,8 +176,8 @@ fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, trained: Option
             let fault = fault.with("rank", expected.map_or(Value::Null, Value::from));
             faults.push(trained.into_iter().fold(fault, |fault, trained| fault.with("trained", trained)));
         }
-        if down == Role::A
-            && let Some(magnitude) = module.get(&Role::Magnitude)
+        if down == MatrixRole::A
+            && let Some(magnitude) = module.get(&MatrixRole::Magnitude)
             && let (Some(out), Some(values)) =
                 (b.shape.first(), magnitude.shape.iter().copied().reduce(u64::saturating_mul))
             && *out != values

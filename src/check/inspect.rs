@@ -32,9 +32,9 @@ pub struct Inspection {
     /// By the outer parts of their names, in the order of names.
     pub modules: BTreeMap<String, Amount>,
     /// What config.json says of itself; absent without one.
-    pub config: Option<Said>,
+    pub config: Option<ConfigSummary>,
     /// Classes that the names fit, best first; the class of the config stands first where it is known.
-    pub classes: Vec<Candidate>,
+    pub classes: Vec<ClassCandidate>,
     /// What the tensors say of the values of the config, for the first of `classes`.
     pub votes: Option<Votes>,
     /// A config.json that says what the tensors show, and nothing else; null when no class fits.
@@ -77,7 +77,7 @@ pub struct InspectedFile {
 
 /// What config.json says of itself.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
-pub struct Said {
+pub struct ConfigSummary {
     /// The first of `architectures`.
     pub class: Option<String>,
     /// `model_type`.
@@ -90,7 +90,7 @@ pub struct Said {
 
 /// A class that may have written these tensors.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Candidate {
+pub struct ClassCandidate {
     /// Its name.
     pub class: String,
     /// The file in `rules/architectures/` that knows it.
@@ -155,7 +155,7 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
         inspection.notes.push("no class that is known here has names like these".to_owned());
         return;
     };
-    let mut classes: Vec<Candidate> = Vec::new();
+    let mut classes: Vec<ClassCandidate> = Vec::new();
     for r in &alike {
         if classes.len() < CANDIDATES && classes.iter().all(|c| c.class != r.architecture.class()) {
             classes.push(candidate(library, r.architecture, Some(r)));
@@ -216,10 +216,10 @@ fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
     });
 }
 
-fn candidate(library: &Library, architecture: Architecture<'_>, alike: Option<&Resemblance<'_>>) -> Candidate {
+fn candidate(library: &Library, architecture: Architecture<'_>, alike: Option<&Resemblance<'_>>) -> ClassCandidate {
     let class = architecture.class();
     let known = Loader::ALL.into_iter().filter(|loader| library.class(class, *loader).is_some());
-    Candidate {
+    ClassCandidate {
         class: class.to_owned(),
         architecture: architecture.name().to_owned(),
         loaders: known.map(|loader| loader.to_string()).collect(),
@@ -284,9 +284,9 @@ fn proven(architecture: Architecture<'_>, votes: &Votes, given: bool) -> Value {
     config
 }
 
-fn said(config: &Value) -> Said {
+fn said(config: &Value) -> ConfigSummary {
     let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).map(str::to_owned);
-    Said {
+    ConfigSummary {
         class: text("/architectures/0"),
         model_type: text("/model_type"),
         transformers_version: text("/transformers_version"),

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Module, Place, is_plain_file_name, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, PythonModule, is_plain_file_name, pointer};
 
 /// An `auto_map` entry: where it stands and what it says.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Entry {
+pub struct AutoMapEntry {
     /// Document.
     pub file: String,
     /// JSON pointer of the string.
@@ -21,7 +21,7 @@ pub struct Entry {
     pub nested: bool,
 }
 
-impl Entry {
+impl AutoMapEntry {
     /// Module and class of a well-formed local entry.
     #[must_use]
     pub fn parts(&self) -> Option<(&str, &str)> {
@@ -40,12 +40,12 @@ const MAX_ENTRIES: usize = 1_000;
 
 /// Every `auto_map` entry of a checkpoint, outer ones first.
 #[must_use]
-pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
+pub fn entries(checkpoint: &Checkpoint) -> Vec<AutoMapEntry> {
     read(checkpoint).0
 }
 
 /// Every entry, and a fault for each that is none.
-fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
+fn read(checkpoint: &Checkpoint) -> (Vec<AutoMapEntry>, Vec<Fault>) {
     let mut out = Vec::new();
     let mut faults = Vec::new();
     for name in DOCUMENTS {
@@ -74,7 +74,7 @@ fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
                 for (key, target) in auto_map.iter().take(MAX_ENTRIES) {
                     let base = pointer::join(&format!("{pointer}/auto_map"), key);
                     let mut push = |pointer: String, target: &str| {
-                        let entry = Entry {
+                        let entry = AutoMapEntry {
                             file: name.to_owned(),
                             pointer,
                             key: key.clone(),
@@ -112,7 +112,7 @@ fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
 
 /// A repository on the hub that the files name: where other entries take their code from, or the model that this one was
 /// made from.
-fn origin(checkpoint: &Checkpoint, entries: &[Entry]) -> Option<String> {
+fn origin(checkpoint: &Checkpoint, entries: &[AutoMapEntry]) -> Option<String> {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     let is_part = |part: &str| part.starts_with(|c: char| c.is_ascii_alphanumeric()) && part.chars().all(is_plain);
     let is_id = |id: &&str| id.split_once('/').is_some_and(|(owner, model)| is_part(owner) && is_part(model));
@@ -122,13 +122,13 @@ fn origin(checkpoint: &Checkpoint, entries: &[Entry]) -> Option<String> {
 }
 
 /// Modules beside this one that it imports.
-pub fn relative_modules(module: &Module) -> BTreeSet<String> {
+pub fn relative_modules(module: &PythonModule) -> BTreeSet<String> {
     let beside = module.relative_imports.iter().filter(|i| i.level == 1 && !i.module.is_empty());
     beside.filter_map(|i| i.module.split('.').next()).map(str::to_owned).collect()
 }
 
 /// A module and everything it imports relatively, itself first; and whether all of it is there.
-fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a Module>)> {
+fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a PythonModule>)> {
     let mut seen: BTreeSet<String> = BTreeSet::from([root.to_owned()]);
     let mut pending = vec![root.to_owned()];
     let mut out = Vec::new();
@@ -203,7 +203,13 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
     faults
 }
 
-fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str, faults: &mut Vec<Fault>) {
+fn imports(
+    checkpoint: &Checkpoint,
+    entries: &[AutoMapEntry],
+    entry: &AutoMapEntry,
+    root: &str,
+    faults: &mut Vec<Fault>,
+) {
     // The config is always opened first, into the same folder of the module cache.
     let mut at_hand = copied(checkpoint, root);
     for config in entries.iter().filter(|e| e.key == "AutoConfig" && !e.nested && e.key != entry.key) {

@@ -17,9 +17,9 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 use crate::knowledge::expression::glob;
 use crate::knowledge::quantization::{AppliedScheme, DeclaredScheme, Scheme};
-use judge::{Judge, Judged, State};
-use module::{Tensors, kind};
-use skipped::Skipped;
+use judge::{ModuleJudge, ModuleState, QuantizedModule};
+use module::{TensorLookup, kind};
+use skipped::SkippedModules;
 
 pub use config::undeclared;
 
@@ -37,10 +37,10 @@ pub fn faults(checkpoint: &Checkpoint, declared: &DeclaredScheme<'_>, quantised:
 /// The quantised modules of a checkpoint whose config says how they are stored.
 pub struct Quantised<'a> {
     applied: &'a AppliedScheme<'a>,
-    modules: Vec<Judged<'a>>,
+    modules: Vec<QuantizedModule<'a>>,
     /// Kinds of module (names with their numbers taken out) of which at least one is quantised.
     kinds: BTreeSet<String>,
-    skipped: Skipped<'a>,
+    skipped: SkippedModules<'a>,
     /// Parameters that would explain the shapes where those of the config do not: `bits 8`.
     fits: Option<String>,
     has_weights: bool,
@@ -56,9 +56,9 @@ impl<'a> Quantised<'a> {
         stored: &'a Stored,
     ) -> Self {
         let scheme = applied.scheme();
-        let tensors = Tensors::of(checkpoint, stored);
-        let skipped = Skipped::of(applied);
-        let judge = Judge { applied, expected, skipped: &skipped };
+        let tensors = TensorLookup::of(checkpoint, stored);
+        let skipped = SkippedModules::of(applied);
+        let judge = ModuleJudge { applied, expected, skipped: &skipped };
         let found = module::group(scheme, &tensors, |name| plain_of(expected, name).is_some());
         let (mut modules, fits) = judge.judge(found);
         let kinds = modules.iter().map(|m| kind(m.module.name)).collect();
@@ -77,11 +77,11 @@ impl<'a> Quantised<'a> {
         let mut taken: BTreeSet<String> =
             stored.names().filter(|n| scheme.ignored.iter().any(|g| glob(n, g))).map(str::to_owned).collect();
         let mut added: BTreeMap<String, Option<Vec<u64>>> = BTreeMap::new();
-        for judged in self.modules.iter().filter(|m| m.state != State::Plain) {
+        for judged in self.modules.iter().filter(|m| m.state != ModuleState::Plain) {
             let name = judged.module.name;
             let held = judged.module.endings(scheme).into_iter().map(|ending| format!("{name}{ending}"));
             // The loader takes what is packed in a plain module's place for what it is named.
-            if judged.state == State::Skipped {
+            if judged.state == ModuleState::Skipped {
                 let held: BTreeSet<String> = held.collect();
                 taken.retain(|name| !held.contains(name));
                 continue;
@@ -130,10 +130,10 @@ impl<'a> Quantised<'a> {
     /// Apart from [`Self::spelled`], because [`Self::faults`] speak of these already.
     pub fn complete(&self, report: &mut LoadReport) {
         let scheme = self.applied.scheme();
-        for judged in self.modules.iter().filter(|m| m.state != State::Skipped) {
+        for judged in self.modules.iter().filter(|m| m.state != ModuleState::Skipped) {
             let name = judged.module.name;
             report.missing.extend(judged.lacks(scheme).map(|ending| format!("{name}{ending}")));
-            if judged.state == State::Plain && !scheme.keeps_name() {
+            if judged.state == ModuleState::Plain && !scheme.keeps_name() {
                 report.unexpected.push(format!("{name}{}", scheme.plain));
             }
             let misshapen = judged.misshapen(scheme).filter(|_| judged.of_class);
@@ -172,14 +172,14 @@ impl<'a> Quantised<'a> {
             let tensor = |ending: &str| format!("{name}{ending}");
             let fault = |kind| Fault::new(kind).with("scheme", scheme.summary.as_str()).with("module", name);
             match judged.state {
-                State::Skipped => {
+                ModuleState::Skipped => {
                     let carrier = scheme.endings().next().unwrap_or_default();
                     faults.push(fault(FaultKind::QuantizedThoughSkipped).at(Place::tensor(tensor(carrier))));
                 }
-                State::Plain => {
+                ModuleState::Plain => {
                     faults.push(fault(FaultKind::PlainThoughQuantized).at(Place::tensor(tensor(&scheme.plain))));
                 }
-                State::Quantised => {
+                ModuleState::Quantised => {
                     let lacks: Vec<&str> = judged.lacks(scheme).collect();
                     if !lacks.is_empty() {
                         let carrier = scheme.endings().next().unwrap_or_default();
@@ -203,14 +203,17 @@ impl<'a> Quantised<'a> {
     }
 
     /// Modules of which the loader does not find all it needs.
-    fn incomplete(&self) -> impl Iterator<Item = &Judged<'a>> {
+    fn incomplete(&self) -> impl Iterator<Item = &QuantizedModule<'a>> {
         let scheme = self.applied.scheme();
-        self.modules.iter().filter(move |m| m.state != State::Skipped && m.lacks(scheme).next().is_some())
+        self.modules.iter().filter(move |m| m.state != ModuleState::Skipped && m.lacks(scheme).next().is_some())
     }
 }
 
 /// Tensors of a module whose element type is none of those the scheme writes: ending, type, those allowed.
-fn mistyped<'s>(scheme: &'s Scheme, judged: &'s Judged<'_>) -> impl Iterator<Item = (&'s str, &'static str, String)> {
+fn mistyped<'s>(
+    scheme: &'s Scheme,
+    judged: &'s QuantizedModule<'_>,
+) -> impl Iterator<Item = (&'s str, &'static str, String)> {
     scheme.tensors.iter().zip(&judged.module.held).filter_map(|(part, held)| {
         let dtype = held.as_ref()?.dtype?.name();
         let allowed = part.dtypes.iter().any(|d| d == dtype);

@@ -18,7 +18,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 pub use self::explain::{Explanation, explain, fault};
-use self::solve::State;
+use self::solve::SearchState;
 use self::space::Space;
 pub(super) use self::space::{leaves, with};
 use super::load::Stored;
@@ -189,7 +189,7 @@ pub fn vote(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> 
 /// As [`vote`]; with `changed`, values are only counted if one had to change.
 fn run(architecture: Architecture<'_>, config: &Value, stored: &Stored, changed: bool) -> Option<Votes> {
     let mut space = Space::new(architecture, stored);
-    let mut state = State::new(&mut space, config.clone())?;
+    let mut state = SearchState::new(&mut space, config.clone())?;
     let (said, before) = (state.built.config.clone(), Fit::of(&state.built, &space.stored));
     space.learn(&said);
     for _ in 0..PASSES {

@@ -15,7 +15,7 @@ use super::{Checkpoint, Dtype, Entry, Fault, FaultKind, Shard, Tensor};
 
 mod numbers;
 
-use numbers::Numbers;
+use numbers::NonFiniteCounter;
 
 /// Bytes read at a time: a multiple of every element's width, so that none lies across two reads.
 const CHUNK: usize = 1 << 20;
@@ -40,9 +40,9 @@ impl Checkpoint {
     pub fn read_contents(&mut self) {
         let mut contents = Contents::default();
         for shard in self.shards.values_mut() {
-            let mut reading = Reading { shard, digests: BTreeMap::new(), faults: Vec::new() };
+            let mut reading = ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new() };
             reading.run(&self.root, self.entries.get(&shard.name));
-            let Reading { digests, faults, .. } = reading;
+            let ContentsReader { digests, faults, .. } = reading;
             contents.digests.insert(shard.name.clone(), digests);
             if faults.iter().any(|f| f.kind == FaultKind::ZeroTail) {
                 // The reader of headers saw a part of it already, where the file system told.
@@ -55,13 +55,13 @@ impl Checkpoint {
 }
 
 /// One shard while it is read.
-struct Reading<'s> {
+struct ContentsReader<'s> {
     shard: &'s Shard,
     digests: BTreeMap<String, [u8; 32]>,
     faults: Vec<Fault>,
 }
 
-impl Reading<'_> {
+impl ContentsReader<'_> {
     fn run(&mut self, root: &Path, entry: Option<&Entry>) {
         // A header that is not to be trusted says nothing of what the bytes behind it are; it has its own faults.
         if self.shard.unread || self.shard.tensors.is_empty() {
@@ -104,7 +104,7 @@ impl Reading<'_> {
                 continue;
             }
             let mut digest = Sha256::new();
-            let mut numbers = Numbers::of(tensor.dtype);
+            let mut numbers = NonFiniteCounter::of(tensor.dtype);
             let mut at = tensor.begin;
             let start = self.shard.data_start.saturating_add(tensor.begin);
             each_chunk(opened, start, tensor.len(), &mut buffer, |bytes| {

@@ -10,8 +10,8 @@ use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
 use super::{
-    Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Module, OpenError, Place, REPAIR_FOLDER,
-    REPAIR_JOURNAL, Shard, Vocabulary,
+    Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, OpenError, Place, PythonModule,
+    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Vocabulary,
 };
 
 /// Endings that a downloader gives to a file it has not finished.
@@ -72,8 +72,8 @@ pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
             checkpoint.documents.insert(name.clone(), document);
         } else if has_ending(&name, "py") {
             let module = match read_capped(&path, MODULE_CAP) {
-                Ok(bytes) => Module::parse(&*name, &bytes),
-                Err(error) => Module::unread(&*name, error.fault(&name)),
+                Ok(bytes) => PythonModule::parse(&*name, &bytes),
+                Err(error) => PythonModule::unread(&*name, error.fault(&name)),
             };
             checkpoint.modules.insert(name.clone(), module);
         } else if TEXTS.contains(&&*name) && entry.lfs.is_none() {

@@ -12,7 +12,7 @@ use ckpt_doctor::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
 use ckpt_doctor::report::{Report, fixes};
 
 use super::args::CheckArgs;
-use super::settings::{Resolved, Resolver, Typed};
+use super::settings::{Resolved, SettingsResolver, Typed};
 use super::{CLEAN, FINDINGS, baseline, fix, output, signals, unasked};
 
 /// A checkpoint, the result of checking it and the settings it was checked under.
@@ -27,7 +27,7 @@ struct Checked {
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let mut settings = Resolver::new(Typed::check(args, rules));
+    let mut settings = SettingsResolver::new(Typed::check(args, rules));
     let mut seen = BTreeSet::new();
     let mut dirs = Vec::new();
     for path in &args.paths {
@@ -96,7 +96,7 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
     |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
 }
 
-fn look(dir: PathBuf, args: &CheckArgs, settings: &mut Resolver) -> anyhow::Result<Checked> {
+fn look(dir: PathBuf, args: &CheckArgs, settings: &mut SettingsResolver) -> anyhow::Result<Checked> {
     let by = settings.of(&dir)?;
     let open = |dir: &Path| {
         let mut checkpoint = Checkpoint::open(dir).with_context(|| dir.display().to_string())?;
@@ -121,7 +121,7 @@ fn look(dir: PathBuf, args: &CheckArgs, settings: &mut Resolver) -> anyhow::Resu
 }
 
 /// Adds a finding for each suppression that had nothing to suppress.
-fn suppressions_without_use(looked: &mut [Checked], settings: &Resolver, searched: &[PathBuf]) {
+fn suppressions_without_use(looked: &mut [Checked], settings: &SettingsResolver, searched: &[PathBuf]) {
     for resolved in settings.all() {
         let here: Vec<usize> =
             looked.iter().enumerate().filter(|(_, l)| Rc::ptr_eq(&l.by, resolved)).map(|(at, _)| at).collect();

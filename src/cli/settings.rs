@@ -66,13 +66,13 @@ impl Typed {
 }
 
 /// Finds the settings of checkpoints, and reads each file once.
-pub struct Resolver {
+pub struct SettingsResolver {
     typed: Typed,
     read: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
     told: BTreeSet<PathBuf>,
 }
 
-impl Resolver {
+impl SettingsResolver {
     pub fn new(typed: Typed) -> Self {
         Self { typed, read: BTreeMap::new(), told: BTreeSet::new() }
     }

@@ -90,13 +90,13 @@ pub(crate) fn compiled_when_needed<T>(read: impl FnOnce() -> T) -> T {
 
 fn reading<T>(at_once: bool, read: impl FnOnce() -> T) -> T {
     /// Also after a panic the next file is read as it wishes.
-    struct Before(Reading);
-    impl Drop for Before {
+    struct RestoreReading(Reading);
+    impl Drop for RestoreReading {
         fn drop(&mut self) {
             READING.set(std::mem::take(&mut self.0));
         }
     }
-    let _before = Before(READING.replace(Reading { at_once, seen: Some(HashMap::new()) }));
+    let _before = RestoreReading(READING.replace(Reading { at_once, seen: Some(HashMap::new()) }));
     read()
 }
 

@@ -68,7 +68,7 @@ pub struct Scheme {
     #[serde(default)]
     pub skipped_are_modules: bool,
     /// What stands in place of the plain tensor; the first one holds the values.
-    pub tensors: Vec<Part>,
+    pub tensors: Vec<StoredPart>,
     /// Endings of tensors that a quantised module may have although the class has not.
     #[serde(default)]
     pub extra: Vec<String>,
@@ -101,7 +101,7 @@ pub struct Parameter {
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Part {
+pub struct StoredPart {
     /// How its name ends.
     pub name: String,
     /// Its shape; null, or no expression, for any.

@@ -90,7 +90,7 @@ pub struct Suppress {
 
 /// A settings file that was read.
 #[derive(Debug, Clone)]
-pub struct Source {
+pub struct SettingsSource {
     /// As messages name it.
     pub name: String,
     /// Its folder, absolute.
@@ -102,7 +102,7 @@ pub struct Source {
 
 /// A settings file and those it extends; the one that has the last word comes last.
 #[derive(Debug, Clone, Default)]
-pub struct Chain(pub Vec<Source>);
+pub struct Chain(pub Vec<SettingsSource>);
 
 impl Chain {
     /// Reads a settings file and what it extends.
@@ -110,11 +110,11 @@ impl Chain {
     /// # Errors
     /// A file that cannot be read or is no settings file, and files that extend one another in a circle.
     pub fn load(path: &Path) -> Result<Self, DataError> {
-        let mut chain: Vec<Source> = Vec::new();
+        let mut chain: Vec<SettingsSource> = Vec::new();
         let mut seen = BTreeSet::new();
         let mut next = Some(path.to_owned());
         while let Some(path) = next {
-            let source = Source::read(&path)?;
+            let source = SettingsSource::read(&path)?;
             if !seen.insert(path.canonicalize().unwrap_or(path)) {
                 let circle: Vec<&str> = chain.iter().map(|s| s.name.as_str()).collect();
                 let circle = format!("extends itself: {} → {}", circle.join(" → "), source.name);
@@ -128,7 +128,7 @@ impl Chain {
     }
 
     /// What the file with the last word says, of those that say anything.
-    fn last<'s, T>(&'s self, of: impl Fn(&'s Source) -> Option<T>) -> Option<T> {
+    fn last<'s, T>(&'s self, of: impl Fn(&'s SettingsSource) -> Option<T>) -> Option<T> {
         self.0.iter().rev().find_map(of)
     }
 
@@ -195,7 +195,7 @@ fn words(severity: &[(String, Severity)]) -> impl Iterator<Item = &String> {
     severity.iter().map(|(word, _)| word)
 }
 
-impl Source {
+impl SettingsSource {
     /// Settings from their text, as if it were a file in `dir`; `name` is for messages.
     ///
     /// # Errors

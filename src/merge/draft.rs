@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
-use crate::checkpoint::{Checkpoint, Document, Entry, Module, Parts, Vocabulary};
+use crate::checkpoint::{Checkpoint, Document, Entry, Parts, PythonModule, Vocabulary};
 use crate::report::model::{ChangedTensor, Dropped, MergedFile, Seam};
 use crate::surgery::plan::{Plan, PlannedShard};
 
@@ -36,7 +36,7 @@ impl MergeDraft {
         parts.shards = self.plan.shards.iter().map(PlannedShard::preview).collect();
         for file in &self.plan.files {
             if file.name.ends_with(".py") {
-                parts.modules.push(Module::parse(file.name.as_str(), &file.bytes));
+                parts.modules.push(PythonModule::parse(file.name.as_str(), &file.bytes));
             } else if !self.documents.iter().any(|d| d.name == file.name) {
                 if file.name.ends_with(".json") {
                     parts.documents.push(Document::parse(file.name.as_str(), &file.bytes));

@@ -13,7 +13,7 @@ use crate::checkpoint::{Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Library, Loader};
 use crate::report::model::{ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, Transform, into_shards};
+use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
 use crate::surgery::transform::can_compute;
 
 /// A tensor spec with its parts evaluated once.
@@ -21,7 +21,7 @@ struct TensorRule<'a> {
     spec: &'a TensorSpec,
     names: Regex,
     rename: Option<String>,
-    fit: Transform,
+    fit: TensorTransform,
 }
 
 pub(super) fn plan(
@@ -118,7 +118,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             .transpose()
             .map_err(context.at(spec.names.as_str()))?;
         let fit = match &spec.fit {
-            None => Transform::Copy,
+            None => TensorTransform::Copy,
             Some(e) => {
                 let value = e.eval(&context.scope).map_err(context.at(spec.names.as_str()))?;
                 serde_json::from_value(value.clone()).map_err(|_| {
@@ -150,24 +150,24 @@ fn expected_shapes<'n>(
 }
 
 /// How `tensor` becomes one of `shape`, or why it cannot.
-fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: Transform) -> Result<TensorSource, String> {
-    if fit != Transform::Reinit && tensor.shape == shape {
+fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: TensorTransform) -> Result<TensorSource, String> {
+    if fit != TensorTransform::Reinit && tensor.shape == shape {
         return Ok(TensorSource::Copy(from));
     }
-    if fit != Transform::Copy && !can_compute(tensor.dtype) {
+    if fit != TensorTransform::Copy && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
     let same_rank = tensor.shape.len() == shape.len();
     let nests = same_rank && tensor.shape.iter().zip(shape).all(|(have, want)| have <= want);
     match fit {
-        Transform::Copy => Err(String::new()),
-        Transform::Reinit => Ok(TensorSource::Reinit { instead_of: from }),
-        Transform::Pad if nests => Ok(TensorSource::Pad(from)),
-        Transform::Pad => Err("padding cannot make it smaller".to_owned()),
-        Transform::GrowRows if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
+        TensorTransform::Copy => Err(String::new()),
+        TensorTransform::Reinit => Ok(TensorSource::Reinit { instead_of: from }),
+        TensorTransform::Pad if nests => Ok(TensorSource::Pad(from)),
+        TensorTransform::Pad => Err("padding cannot make it smaller".to_owned()),
+        TensorTransform::GrowRows if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
             Ok(TensorSource::GrowRows(from))
         }
-        Transform::GrowRows => Err("only rows can be added".to_owned()),
+        TensorTransform::GrowRows => Err("only rows can be added".to_owned()),
     }
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use super::collapse::{Group, collapse};
+use super::collapse::{NameGroup, collapse};
 use super::model::{Counts, MergeReport, MergeStage, Report};
 use crate::check::load::{LoadReport, SilentReason};
 use crate::check::{Finding, FixHint, Location, Safety};
@@ -137,7 +137,7 @@ pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
 }
 
 /// Silent tensors by reason, in words.
-pub fn silent(load: &LoadReport) -> Vec<(String, Vec<Group>)> {
+pub fn silent(load: &LoadReport) -> Vec<(String, Vec<NameGroup>)> {
     let mut reasons: BTreeMap<SilentReason, Vec<&str>> = BTreeMap::new();
     for one in &load.silent {
         reasons.entry(one.reason).or_default().push(&one.name);

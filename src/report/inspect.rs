@@ -10,11 +10,11 @@ use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
-use crate::check::inspect::{Amount, Candidate, Inspection};
+use crate::check::inspect::{Amount, ClassCandidate, Inspection};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
-struct Document<'a> {
+struct InspectionJson<'a> {
     schema: u32,
     tool: ToolInfo,
     path: &'a str,
@@ -25,7 +25,7 @@ struct Document<'a> {
 /// The whole of an inspection as JSON (`schema` 1).
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection) -> String {
-    pretty(&Document { schema: 1, tool: ToolInfo::this(), path, inspection })
+    pretty(&InspectionJson { schema: 1, tool: ToolInfo::this(), path, inspection })
 }
 
 /// An inspection for a terminal.
@@ -122,7 +122,7 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
         fit.unwrap_or_default(),
         best.loaders.join(" and ")
     );
-    let others: Vec<&Candidate> = inspection.classes.iter().skip(1).collect();
+    let others: Vec<&ClassCandidate> = inspection.classes.iter().skip(1).collect();
     if !others.is_empty() {
         let mut shown: Vec<String> =
             others.iter().take(style.cap).map(|c| format!("{} {}", name(&c.class), percent(c.names))).collect();

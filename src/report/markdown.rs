@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 
-use super::collapse::{Group, collapse};
+use super::collapse::{NameGroup, collapse};
 use super::format::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
 use crate::check::load::LoadReport;
@@ -124,7 +124,7 @@ fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
     }
 }
 
-fn groups(out: &mut String, title: &str, groups: &[Group], cap: usize) {
+fn groups(out: &mut String, title: &str, groups: &[NameGroup], cap: usize) {
     if groups.is_empty() {
         return;
     }

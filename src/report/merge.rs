@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Serialize, Serializer};
 
-use crate::surgery::plan::Transform;
+use crate::surgery::plan::TensorTransform;
 
 /// The record of a merge.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -25,7 +25,7 @@ pub struct MergeReport {
     /// Seams that do not fit; non-empty means nothing was written.
     pub seams: Vec<Seam>,
     /// Number of tensors by how their bytes are made.
-    pub transforms: BTreeMap<Transform, usize>,
+    pub transforms: BTreeMap<TensorTransform, usize>,
     /// The tensors that are not plain copies.
     pub changed: Vec<ChangedTensor>,
     /// Donor tensors that were left behind, by donor role and pattern.
@@ -126,7 +126,7 @@ pub struct ChangedTensor {
     /// Name in the result.
     pub name: String,
     /// How its bytes are made.
-    pub transform: Transform,
+    pub transform: TensorTransform,
     /// Shape in the donor; absent when nothing was taken.
     pub from: Option<Vec<u64>>,
     /// Shape in the result.

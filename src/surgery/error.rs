@@ -186,9 +186,7 @@ pub enum RepairError {
         reason: String,
     },
     /// Something went wrong while files were put in place, and taking it back did too.
-    #[error(
-        "{error}; only some of the files are in place: remove the cause, then run `ckpt-doctor undo` or `check --fix`"
-    )]
+    #[error("{error}; writing is not finished: remove the cause, then run `ckpt-doctor undo` or `check --fix`")]
     Unfinished {
         /// What went wrong.
         error: Box<RepairError>,

@@ -97,7 +97,7 @@ pub enum TensorSource {
 /// How the bytes of a tensor are made: a [`TensorSource`] without the donor tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Transform {
+pub enum TensorTransform {
     /// The donor's bytes as they are.
     Copy,
     /// The donor's rows, then rows that hold their mean.
@@ -108,7 +108,7 @@ pub enum Transform {
     Reinit,
 }
 
-impl Transform {
+impl TensorTransform {
     /// The word for it in recipes, options and reports.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -124,12 +124,12 @@ impl Transform {
 impl TensorSource {
     /// How the bytes are made.
     #[must_use]
-    pub const fn transform(&self) -> Transform {
+    pub const fn transform(&self) -> TensorTransform {
         match self {
-            Self::Copy(_) => Transform::Copy,
-            Self::Pad(_) => Transform::Pad,
-            Self::GrowRows(_) => Transform::GrowRows,
-            Self::Reinit { .. } => Transform::Reinit,
+            Self::Copy(_) => TensorTransform::Copy,
+            Self::Pad(_) => TensorTransform::Pad,
+            Self::GrowRows(_) => TensorTransform::GrowRows,
+            Self::Reinit { .. } => TensorTransform::Reinit,
         }
     }
 
@@ -178,7 +178,7 @@ impl PlannedShard {
     #[must_use]
     pub fn header(&self) -> Vec<u8> {
         #[derive(Serialize)]
-        struct HeaderEntry<'a> {
+        struct EntryJson<'a> {
             dtype: &'static str,
             shape: &'a [u64],
             data_offsets: [u64; 2],
@@ -189,7 +189,7 @@ impl PlannedShard {
         let mut at = 0_u64;
         for t in &self.tensors {
             let end = at.saturating_add(t.len());
-            let entry = HeaderEntry { dtype: t.dtype.name(), shape: &t.shape, data_offsets: [at, end] };
+            let entry = EntryJson { dtype: t.dtype.name(), shape: &t.shape, data_offsets: [at, end] };
             let name = serde_json::to_string(&t.name).unwrap_or_default();
             let entry = serde_json::to_string(&entry).unwrap_or_default();
             json.push(',');

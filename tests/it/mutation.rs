@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ckpt_doctor::check::check;
-use ckpt_doctor::checkpoint::{Checkpoint, Document, Module, Parts, Shard, Vocabulary};
+use ckpt_doctor::checkpoint::{Checkpoint, Document, Parts, PythonModule, Shard, Vocabulary};
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{Format, Report, Style, render};
@@ -74,7 +74,7 @@ fn look(seeds: &[Seed], changed: usize, bytes: &[u8], knowledge: &Knowledge, for
         } else if name.ends_with(".json") {
             parts.documents.push(Document::parse(name, bytes));
         } else if name.ends_with(".py") {
-            parts.modules.push(Module::parse(name, bytes));
+            parts.modules.push(PythonModule::parse(name, bytes));
         } else if let Ok(vocabulary) = Vocabulary::parse(name, bytes) {
             parts.vocabularies.insert(name.to_owned(), Arc::new(vocabulary));
         }

@@ -21,7 +21,7 @@ use ckpt_doctor::check::{Outcome, check, unused_suppressions};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
-use ckpt_doctor::knowledge::settings::{Chain, Source};
+use ckpt_doctor::knowledge::settings::{Chain, SettingsSource};
 use ckpt_doctor::knowledge::{Knowledge, Library, source};
 use serde::Deserialize;
 
@@ -160,7 +160,8 @@ pub fn knowledge() -> Knowledge {
 /// What is found in a directory under settings that lie in the folder above it.
 fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> Outcome {
     let above = dir.parent().expect("a folder above");
-    let source = Source::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
+    let source =
+        SettingsSource::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
     knowledge.policy =
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));

@@ -4,15 +4,15 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use super::module::Module;
+use super::module::StoredModule;
 use super::plain_of;
-use super::skipped::Skipped;
+use super::skipped::SkippedModules;
 use crate::knowledge::Expected;
 use crate::knowledge::quantization::{AppliedScheme, Scheme, Shapes};
 
 /// What became of a module.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum State {
+pub(super) enum ModuleState {
     /// Stored by the scheme.
     Quantised,
     /// Stored by the scheme although the config leaves it plain.
@@ -23,9 +23,9 @@ pub(super) enum State {
 
 /// A module, and what is right and wrong with it. Lists go by the order of the scheme's tensors.
 #[derive(Debug)]
-pub(super) struct Judged<'c> {
-    pub(super) module: Module<'c>,
-    pub(super) state: State,
+pub(super) struct QuantizedModule<'c> {
+    pub(super) module: StoredModule<'c>,
+    pub(super) state: ModuleState,
     /// The shape its plain tensor would have, where it is known.
     pub(super) plain: Option<Vec<u64>>,
     /// The class says so, not only the stored shapes.
@@ -35,7 +35,7 @@ pub(super) struct Judged<'c> {
     pub(super) required: Vec<bool>,
 }
 
-impl<'c> Judged<'c> {
+impl<'c> QuantizedModule<'c> {
     /// Endings of required tensors that are not stored.
     pub(super) fn lacks<'s>(&self, scheme: &'s Scheme) -> impl Iterator<Item = &'s str> {
         let parts = scheme.endings().zip(&self.module.held).zip(&self.required);
@@ -59,14 +59,14 @@ fn same(a: &[u64], b: &[u64]) -> bool {
 }
 
 /// Judges modules by one config and, where it is known, one class.
-pub(super) struct Judge<'j> {
+pub(super) struct ModuleJudge<'j> {
     pub(super) applied: &'j AppliedScheme<'j>,
     pub(super) expected: Option<&'j Expected>,
-    pub(super) skipped: &'j Skipped<'j>,
+    pub(super) skipped: &'j SkippedModules<'j>,
 }
 
 /// Plain shape of a module, the shapes it asks for, and how many stored ones differ.
-type Fit = (Option<Vec<u64>>, Shapes, usize);
+type ShapeFit = (Option<Vec<u64>>, Shapes, usize);
 
 /// What one choice of parameters makes of all modules.
 struct Attempt {
@@ -76,9 +76,9 @@ struct Attempt {
     wrong: usize,
 }
 
-impl Judge<'_> {
+impl ModuleJudge<'_> {
     /// Every module with its state and shapes, and what else would explain shapes that do not fit: `bits 8`.
-    pub(super) fn judge<'c>(&self, found: Vec<Module<'c>>) -> (Vec<Judged<'c>>, Option<String>) {
+    pub(super) fn judge<'c>(&self, found: Vec<StoredModule<'c>>) -> (Vec<QuantizedModule<'c>>, Option<String>) {
         let scheme = self.applied.scheme();
         let classes: Vec<Option<&[u64]>> =
             found.iter().map(|m| plain_of(self.expected, &format!("{}{}", m.name, scheme.plain))).collect();
@@ -92,24 +92,32 @@ impl Judge<'_> {
         let fits = (best.wrong > 0).then(|| self.explain(&found, &classes, &values, false)).flatten();
         let mut required: BTreeMap<Vec<&str>, Vec<bool>> = BTreeMap::new();
         let judged = found.into_iter().zip(classes).zip(best.shapes).map(|((module, class), (plain, shapes))| {
-            let state = if self.skipped.covers(module.name).is_some() { State::Skipped } else { State::Quantised };
+            let state =
+                if self.skipped.covers(module.name).is_some() { ModuleState::Skipped } else { ModuleState::Quantised };
             let held = module.endings(scheme);
             let required = required.entry(held).or_insert_with_key(|held| self.applied.required(held)).clone();
-            Judged { module, state, plain, of_class: class.is_some(), shapes, required }
+            QuantizedModule { module, state, plain, of_class: class.is_some(), shapes, required }
         });
         (judged.collect(), fits.map(|(name, ..)| name))
     }
 
     /// A module that is stored plainly, to be told what it lacks.
-    pub(super) fn left_plain<'c>(&self, module: Module<'c>) -> Judged<'c> {
+    pub(super) fn left_plain<'c>(&self, module: StoredModule<'c>) -> QuantizedModule<'c> {
         let required = self.applied.required(&module.endings(self.applied.scheme()));
-        Judged { module, state: State::Plain, plain: None, of_class: false, shapes: Shapes::new(), required }
+        QuantizedModule {
+            module,
+            state: ModuleState::Plain,
+            plain: None,
+            of_class: false,
+            shapes: Shapes::new(),
+            required,
+        }
     }
 
     /// Another value of one parameter by which all shapes fit: what it is called, and what it makes of the modules.
     fn explain(
         &self,
-        found: &[Module<'_>],
+        found: &[StoredModule<'_>],
         classes: &[Option<&[u64]>],
         values: &[Value],
         free: bool,
@@ -124,11 +132,11 @@ impl Judge<'_> {
         })
     }
 
-    fn attempt(&self, found: &[Module<'_>], classes: &[Option<&[u64]>], values: &[Value]) -> Attempt {
+    fn attempt(&self, found: &[StoredModule<'_>], classes: &[Option<&[u64]>], values: &[Value]) -> Attempt {
         let mut attempt = Attempt { shapes: Vec::with_capacity(found.len()), wrong: 0 };
         let says = self.applied.says_shapes();
         // Layers repeat: a few shapes stand for thousands of modules.
-        let mut seen: BTreeMap<(Option<&[u64]>, Shapes), Fit> = BTreeMap::new();
+        let mut seen: BTreeMap<(Option<&[u64]>, Shapes), ShapeFit> = BTreeMap::new();
         for (module, class) in found.iter().zip(classes) {
             let stored = module.shapes();
             let unsaid = || (class.map(<[u64]>::to_vec), vec![None; stored.len()], 0);
@@ -144,7 +152,7 @@ impl Judge<'_> {
     }
 
     /// Plain shape, the shapes it asks for, and how many stored ones differ.
-    fn fit(&self, values: &[Value], class: Option<&[u64]>, stored: &Shapes) -> Fit {
+    fn fit(&self, values: &[Value], class: Option<&[u64]>, stored: &Shapes) -> ShapeFit {
         let wrong = |shapes: &Shapes| {
             let pairs = shapes.iter().zip(stored).filter_map(|(e, s)| Some((e.as_deref()?, s.as_deref()?)));
             pairs.filter(|(expected, stored)| !same(expected, stored)).count()

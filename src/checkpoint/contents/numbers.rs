@@ -3,7 +3,7 @@
 use super::super::{Dtype, Fault, FaultKind, Place, Shard, Tensor};
 
 /// Counts of one tensor.
-pub(super) struct Numbers {
+pub(super) struct NonFiniteCounter {
     dtype: Dtype,
     nan: u64,
     infinite: u64,
@@ -12,7 +12,7 @@ pub(super) struct Numbers {
     seen: u64,
 }
 
-impl Numbers {
+impl NonFiniteCounter {
     pub(super) fn of(dtype: Dtype) -> Self {
         Self { dtype, nan: 0, infinite: 0, first: None, seen: 0 }
     }
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     fn counts(dtype: Dtype, bytes: &[u8]) -> (u64, u64, Option<u64>) {
-        let mut numbers = Numbers::of(dtype);
+        let mut numbers = NonFiniteCounter::of(dtype);
         // In two pieces, as a large tensor comes.
         let (one, two) = bytes.split_at(8);
         numbers.add(one);

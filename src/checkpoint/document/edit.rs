@@ -56,13 +56,13 @@ pub fn spliced(text: &str, splices: &[Splice]) -> Option<String> {
 
 /// A member of an object or an element of an array.
 #[derive(Debug, Clone)]
-pub(super) struct Member {
+pub(super) struct DocumentMember {
     pub(super) name: String,
     pub(super) key: Option<Range<usize>>,
     pub(super) value: Range<usize>,
 }
 
-impl Member {
+impl DocumentMember {
     pub(super) fn start(&self) -> usize {
         self.key.as_ref().map_or(self.value.start, |key| key.start)
     }
@@ -73,7 +73,7 @@ impl Member {
 pub(super) struct Container {
     pub(super) is_object: bool,
     pub(super) range: Range<usize>,
-    pub(super) members: Vec<Member>,
+    pub(super) members: Vec<DocumentMember>,
 }
 
 impl Container {
@@ -97,12 +97,12 @@ impl Container {
                     let (first, value) = scanner.next().ok()??;
                     scanner.skip_rest_of(&first).ok()?;
                     let value = value.start..scanner.position();
-                    members.push(Member { name: key.decode().0.into_owned(), key: Some(here), value });
+                    members.push(DocumentMember { name: key.decode().0.into_owned(), key: Some(here), value });
                 }
                 first => {
                     scanner.skip_rest_of(&first).ok()?;
                     let name = members.len().to_string();
-                    members.push(Member { name, key: None, value: here.start..scanner.position() });
+                    members.push(DocumentMember { name, key: None, value: here.start..scanner.position() });
                 }
             }
         }

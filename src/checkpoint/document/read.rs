@@ -16,7 +16,7 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 mod build;
 mod duplicates;
 
-use build::Builder;
+use build::ValueBuilder;
 use duplicates::Duplicates;
 
 /// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
@@ -42,7 +42,7 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
         faults.push(fault);
     }
 
-    let mut reader = Reader { name: &name, verbatim, faults, left_out: left_out(&name) };
+    let mut reader = DocumentReader { name: &name, verbatim, faults, left_out: left_out(&name) };
     let body = reader.cut_nul_bytes(&text);
     let value = reader.read(body);
     if let Some(value) = &value
@@ -52,7 +52,7 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
         let found = kind_of(value);
         reader.faults.push(Fault::new(FaultKind::NotAnObject).at(Place::file(&*name)).with("found", found));
     }
-    let Reader { faults, left_out, .. } = reader;
+    let DocumentReader { faults, left_out, .. } = reader;
     let text = verbatim.then(|| text.into());
     Document { name, text, value, left_out, faults: faults.into_vec() }
 }
@@ -84,14 +84,14 @@ fn kind_of(value: &Value) -> &'static str {
     }
 }
 
-struct Reader<'n> {
+struct DocumentReader<'n> {
     name: &'n str,
     verbatim: bool,
     faults: Faults,
     left_out: Vec<&'static str>,
 }
 
-impl Reader<'_> {
+impl DocumentReader<'_> {
     /// A place at `span`, when spans mean anything in this document.
     fn place(&self, span: Range<usize>) -> Place {
         let place = Place::file(self.name);
@@ -131,7 +131,7 @@ impl Reader<'_> {
     fn pass(&mut self, text: &str) -> (Option<Value>, Option<ScanError>) {
         let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
         let mut scanner = Scanner::lenient(text, start);
-        let mut builder = Builder::new(self.left_out.clone(), build::most_nodes(self.name));
+        let mut builder = ValueBuilder::new(self.left_out.clone(), build::most_nodes(self.name));
         let mut duplicates = Duplicates::new(text);
         let error = loop {
             let (token, span) = match scanner.next() {
@@ -168,7 +168,7 @@ impl Reader<'_> {
     }
 
     /// Faults of single tokens.
-    fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &Builder) {
+    fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
         let fault = match token {
             Token::NonFinite(literal) => Fault::new(FaultKind::NonFiniteNumber).with("literal", *literal),
             Token::Number(literal) if is_huge(literal) => {

@@ -14,7 +14,7 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 
 mod entry;
 
-pub(super) use entry::Entry;
+pub(super) use entry::HeaderEntry;
 
 /// `format` values that transformers opens. Source: `load_state_dict` in transformers 4.47.0.
 const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
@@ -49,15 +49,15 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
         }
     };
 
-    let mut reader = Reader {
+    let mut reader = HeaderReader {
         shard: &shard,
         scanner: Scanner::strict(text, 0),
         faults,
         entries: Vec::new(),
-        metadata: Metadata::Absent,
+        metadata: HeaderMetadata::Absent,
     };
     let error = reader.object().err();
-    let Reader { mut faults, entries, metadata, scanner, .. } = reader;
+    let HeaderReader { mut faults, entries, metadata, scanner, .. } = reader;
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
         let fault = Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason);
         faults.push(fault.with("offset", span.start));
@@ -90,8 +90,8 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     }
     shard.unread = unread;
     shard.metadata = match metadata {
-        Metadata::Strings(strings) => Some(strings),
-        Metadata::Absent | Metadata::Null => None,
+        HeaderMetadata::Strings(strings) => Some(strings),
+        HeaderMetadata::Absent | HeaderMetadata::Null => None,
     };
     let entries = without_duplicates(&shard, entries, &mut faults);
     layout::check(&shard, &entries, &mut faults);
@@ -164,16 +164,16 @@ fn other_format(head: &[u8]) -> Option<String> {
 const MAX_ENTRIES: usize = 200_000;
 
 /// What `__metadata__` held.
-enum Metadata {
+enum HeaderMetadata {
     Absent,
     Null,
     Strings(BTreeMap<String, String>),
 }
 
-fn check_format(shard: &Shard, metadata: &Metadata, faults: &mut Faults) {
+fn check_format(shard: &Shard, metadata: &HeaderMetadata, faults: &mut Faults) {
     let format = match metadata {
-        Metadata::Strings(strings) => strings.get("format"),
-        Metadata::Absent | Metadata::Null => None,
+        HeaderMetadata::Strings(strings) => strings.get("format"),
+        HeaderMetadata::Absent | HeaderMetadata::Null => None,
     };
     if format.is_none_or(|f| !FORMATS.contains(&f.as_str())) {
         let fault = Fault::new(FaultKind::NoFormatMetadata).at(shard.place());
@@ -182,7 +182,7 @@ fn check_format(shard: &Shard, metadata: &Metadata, faults: &mut Faults) {
 }
 
 /// Keeps the last of equal names, as Python does, and reports the others.
-fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -> Vec<Entry> {
+fn without_duplicates(shard: &Shard, entries: Vec<HeaderEntry>, faults: &mut Faults) -> Vec<HeaderEntry> {
     let mut drop = vec![false; entries.len()];
     let mut last: HashMap<&str, usize> = HashMap::with_capacity(entries.len());
     for (at, entry) in entries.iter().enumerate() {
@@ -197,12 +197,12 @@ fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -
     entries.into_iter().zip(drop).filter_map(|(e, d)| (!d).then_some(e)).collect()
 }
 
-struct Reader<'s, 't> {
+struct HeaderReader<'s, 't> {
     shard: &'s Shard,
     scanner: Scanner<'t>,
     faults: Faults,
-    entries: Vec<Entry>,
-    metadata: Metadata,
+    entries: Vec<HeaderEntry>,
+    metadata: HeaderMetadata,
 }
 
 /// Why a header of too many entries is not read on.
@@ -217,7 +217,7 @@ fn ended() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax("the header ends too early"), span: 0..0 }
 }
 
-impl<'t> Reader<'_, 't> {
+impl<'t> HeaderReader<'_, 't> {
     fn token(&mut self) -> Result<Token<'t>, ScanError> {
         Ok(self.scanner.next()?.ok_or_else(ended)?.0)
     }
@@ -255,7 +255,7 @@ impl<'t> Reader<'_, 't> {
         match self.token()? {
             Token::Null => {
                 self.faults.push(Fault::new(FaultKind::MetadataNull).at(self.shard.place()));
-                self.metadata = Metadata::Null;
+                self.metadata = HeaderMetadata::Null;
             }
             Token::BeginObject => {
                 let mut strings = BTreeMap::new();
@@ -286,7 +286,7 @@ impl<'t> Reader<'_, 't> {
                         }
                     }
                 }
-                self.metadata = Metadata::Strings(strings);
+                self.metadata = HeaderMetadata::Strings(strings);
             }
             other => {
                 self.scanner.skip_rest_of(&other)?;

@@ -1,16 +1,16 @@
 //! Whether the tensors of a header fill the data region: each byte once, and no byte besides.
 
 use super::Shard;
-use super::header::Entry;
+use super::header::HeaderEntry;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::{Fault, FaultKind};
 
 /// Reports every fault of sizes and places.
-pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
+pub(super) fn check(shard: &Shard, entries: &[HeaderEntry], faults: &mut Faults) {
     for entry in entries {
         check_size(shard, entry, faults);
     }
-    let mut ranges: Vec<(u64, u64, &Entry)> = entries
+    let mut ranges: Vec<(u64, u64, &HeaderEntry)> = entries
         .iter()
         .filter_map(|e| e.offsets.filter(|(begin, end)| begin <= end).map(|(begin, end)| (begin, end, e)))
         .collect();
@@ -19,7 +19,7 @@ pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
     let all_known = ranges.len() == entries.len() && !shard.unread;
 
     let mut filled = 0_u64;
-    let mut holder: Option<&Entry> = None;
+    let mut holder: Option<&HeaderEntry> = None;
     for (begin, end, entry) in &ranges {
         let place = shard.place().in_tensor(entry.name.clone());
         if *begin > filled && all_known {
@@ -57,7 +57,7 @@ pub(super) fn check(shard: &Shard, entries: &[Entry], faults: &mut Faults) {
 }
 
 /// Whether dtype and shape explain the bytes of one entry.
-fn check_size(shard: &Shard, entry: &Entry, faults: &mut Faults) {
+fn check_size(shard: &Shard, entry: &HeaderEntry, faults: &mut Faults) {
     let fault = |kind| Fault::new(kind).at(shard.place().in_tensor(entry.name.clone()));
     if let Some((begin, end)) = entry.offsets
         && end < begin

@@ -10,7 +10,7 @@ use super::{Scope, steps};
 /// Longest list `range` makes.
 const RANGE_CAP: i64 = 100_000;
 
-type Outcome = Result<Value, String>;
+type FunctionResult = Result<Value, String>;
 
 /// Adds all functions to a root scope.
 pub(super) fn register(scope: &mut Scope<'static>) {
@@ -32,7 +32,7 @@ pub(super) fn register(scope: &mut Scope<'static>) {
     steps::register(scope);
 }
 
-fn pow(arguments: &[Value]) -> Outcome {
+fn pow(arguments: &[Value]) -> FunctionResult {
     let usage = || "pow(base, exponent) takes two integers, the exponent from 0".to_owned();
     let [base, exponent] = arguments else { return Err(usage()) };
     let (Some(base), Some(exponent)) = (base.as_i64(), exponent.as_u64()) else { return Err(usage()) };
@@ -41,7 +41,7 @@ fn pow(arguments: &[Value]) -> Outcome {
 }
 
 /// The whole part of an integer's square root.
-fn isqrt(arguments: &[Value]) -> Outcome {
+fn isqrt(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n] => {
             n.as_i64().and_then(i64::checked_isqrt).map(Value::from).ok_or_else(|| format!("{n} has no square root"))
@@ -51,7 +51,7 @@ fn isqrt(arguments: &[Value]) -> Outcome {
 }
 
 /// The sum of a list of integers, or of numbers when one is not an integer.
-fn sum(arguments: &[Value]) -> Outcome {
+fn sum(arguments: &[Value]) -> FunctionResult {
     let [Value::Array(items)] = arguments else { return Err("sum(list) takes one list of numbers".to_owned()) };
     if let Some(integers) = items.iter().map(Value::as_i64).collect::<Option<Vec<_>>>() {
         let total = integers.into_iter().try_fold(0_i64, i64::checked_add);
@@ -61,7 +61,7 @@ fn sum(arguments: &[Value]) -> Outcome {
     numbers.map(|n| n.into_iter().sum::<f64>().into()).ok_or_else(|| "sum(list) takes numbers only".to_owned())
 }
 
-fn round(arguments: &[Value], to: fn(f64) -> f64) -> Outcome {
+fn round(arguments: &[Value], to: fn(f64) -> f64) -> FunctionResult {
     match arguments {
         [Value::Number(n)] if n.is_i64() => Ok(Value::Number(n.clone())),
         [Value::Number(n)] => {
@@ -79,7 +79,7 @@ fn round(arguments: &[Value], to: fn(f64) -> f64) -> Outcome {
     }
 }
 
-fn range(arguments: &[Value]) -> Outcome {
+fn range(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n] => match n.as_i64() {
             Some(n) if n <= RANGE_CAP => Ok((0..n).collect::<Vec<_>>().into()),
@@ -89,14 +89,14 @@ fn range(arguments: &[Value]) -> Outcome {
     }
 }
 
-fn keys(arguments: &[Value]) -> Outcome {
+fn keys(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [Value::Object(map)] => Ok(map.keys().cloned().collect::<Vec<_>>().into()),
         _ => Err("keys(map) takes one map".to_owned()),
     }
 }
 
-fn zpad(arguments: &[Value]) -> Outcome {
+fn zpad(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n, width] => match (n.as_u64(), width.as_u64()) {
             (Some(n), Some(width @ 0..=64)) => {

@@ -116,7 +116,7 @@ impl<'k> AppliedScheme<'k> {
     pub fn required(&self, held: &[&str]) -> Vec<bool> {
         let mut scope = self.inner(&self.values);
         scope.bind("held", &held.into());
-        let required = |part: &super::Part| {
+        let required = |part: &super::StoredPart| {
             part.required.as_ref().is_none_or(|required| required.eval_bool(&scope).unwrap_or(false))
         };
         self.scheme.tensors.iter().map(required).collect()

@@ -24,72 +24,72 @@ const SOURCES: &str = "%SRCROOT%";
 const ROOT: &str = "ROOT";
 
 #[derive(Serialize)]
-struct Log {
+struct SarifLog {
     #[serde(rename = "$schema")]
     schema: &'static str,
     version: &'static str,
-    runs: [Run; 1],
+    runs: [SarifRun; 1],
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Run {
-    tool: Tool,
+struct SarifRun {
+    tool: SarifTool,
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    original_uri_base_ids: BTreeMap<&'static str, Base>,
+    original_uri_base_ids: BTreeMap<&'static str, SarifBase>,
     column_kind: &'static str,
-    results: Vec<Found>,
+    results: Vec<SarifResult>,
 }
 
 #[derive(Serialize)]
-struct Tool {
-    driver: Driver,
+struct SarifTool {
+    driver: SarifDriver,
 }
 
 #[derive(Serialize)]
-struct Driver {
+struct SarifDriver {
     name: &'static str,
     version: &'static str,
-    rules: Vec<Rule>,
+    rules: Vec<SarifRule>,
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Rule {
+struct SarifRule {
     id: String,
     name: String,
-    short_description: Text,
-    help: Text,
+    short_description: SarifText,
+    help: SarifText,
 }
 
 #[derive(Serialize)]
-struct Text {
+struct SarifText {
     text: String,
 }
 
 #[derive(Serialize)]
-struct Base {
+struct SarifBase {
     uri: &'static str,
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Found {
+struct SarifResult {
     rule_id: String,
     rule_index: usize,
     level: &'static str,
-    message: Text,
-    locations: Vec<Place>,
+    message: SarifText,
+    locations: Vec<SarifLocation>,
     partial_fingerprints: BTreeMap<&'static str, String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    suppressions: Vec<Suppression>,
+    suppressions: Vec<SarifSuppression>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    fixes: Vec<fixes::Fix>,
+    fixes: Vec<fixes::SarifFix>,
 }
 
 /// Why a result is not counted (3.35); `external`, because it is not written beside what it is about.
 #[derive(Serialize)]
-struct Suppression {
+struct SarifSuppression {
     kind: &'static str,
     status: &'static str,
     justification: String,
@@ -97,23 +97,23 @@ struct Suppression {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Place {
-    physical_location: Physical,
+struct SarifLocation {
+    physical_location: PhysicalLocation,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    logical_locations: Vec<Logical>,
+    logical_locations: Vec<LogicalLocation>,
 }
 
 #[derive(Serialize, PartialEq)]
 #[serde(rename_all = "camelCase")]
-struct Physical {
-    artifact_location: Artifact,
+struct PhysicalLocation {
+    artifact_location: ArtifactLocation,
     #[serde(skip_serializing_if = "Option::is_none")]
     region: Option<Region>,
 }
 
 #[derive(Serialize, PartialEq)]
 #[serde(rename_all = "camelCase")]
-struct Artifact {
+struct ArtifactLocation {
     uri: String,
     uri_base_id: &'static str,
 }
@@ -128,13 +128,13 @@ struct Region {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Logical {
+struct LogicalLocation {
     fully_qualified_name: String,
     kind: &'static str,
 }
 
 pub fn render(report: &Report) -> String {
-    let mut rules: Vec<Rule> = Vec::new();
+    let mut rules: Vec<SarifRule> = Vec::new();
     let mut known: BTreeMap<String, usize> = BTreeMap::new();
     let mut results = Vec::new();
     for group in groups(report) {
@@ -146,7 +146,7 @@ pub fn render(report: &Report) -> String {
                 rules.len().saturating_sub(1)
             });
             let partial_fingerprints = BTreeMap::from([("checkpointFinding/v1", item.fingerprint.clone())]);
-            results.push(Found {
+            results.push(SarifResult {
                 rule_id: id,
                 rule_index,
                 level: level(item.severity),
@@ -158,21 +158,21 @@ pub fn render(report: &Report) -> String {
             });
         }
     }
-    let absolute = |place: &Place| place.physical_location.artifact_location.uri_base_id == ROOT;
+    let absolute = |place: &SarifLocation| place.physical_location.artifact_location.uri_base_id == ROOT;
     let mut original_uri_base_ids = BTreeMap::new();
     if results.iter().flat_map(|r| &r.locations).any(absolute) {
-        original_uri_base_ids.insert(ROOT, Base { uri: "file:///" });
+        original_uri_base_ids.insert(ROOT, SarifBase { uri: "file:///" });
     }
-    let tool = Tool { driver: Driver { name: report.tool.name, version: report.tool.version, rules } };
+    let tool = SarifTool { driver: SarifDriver { name: report.tool.name, version: report.tool.version, rules } };
     // Columns of findings count characters (3.14.17).
-    let run = Run { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
-    json::pretty(&Log { schema: SCHEMA, version: "2.1.0", runs: [run] })
+    let run = SarifRun { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
+    json::pretty(&SarifLog { schema: SCHEMA, version: "2.1.0", runs: [run] })
 }
 
-fn suppression(accepted: &Accepted) -> Suppression {
+fn suppression(accepted: &Accepted) -> SarifSuppression {
     let reason = accepted.reason.iter().map(|reason| sentence(&format!("{reason} ({})", accepted.by)));
     let justification = reason.chain([sentence(&accepted.by)]).next().unwrap_or_default();
-    Suppression { kind: "external", status: "accepted", justification }
+    SarifSuppression { kind: "external", status: "accepted", justification }
 }
 
 const fn level(severity: Severity) -> &'static str {
@@ -183,7 +183,7 @@ const fn level(severity: Severity) -> &'static str {
     }
 }
 
-fn rule(id: String, item: &Item<'_>) -> Rule {
+fn rule(id: String, item: &Item<'_>) -> SarifRule {
     let why = if item.code == "seam" {
         String::new()
     } else {
@@ -193,49 +193,52 @@ fn rule(id: String, item: &Item<'_>) -> Rule {
     let help = step.chain([why]).collect::<String>().trim_end().to_owned();
     let stated = sentence(&item.name.replace('-', " "));
     let help = if help.is_empty() { stated.clone() } else { help };
-    Rule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
+    SarifRule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
 }
 
 /// The places of a finding, tensors of the same place together; the checkpoint if it has none.
-fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<Place> {
-    let mut places: Vec<Place> = Vec::new();
+fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<SarifLocation> {
+    let mut places: Vec<SarifLocation> = Vec::new();
     for location in item.locations.iter().take(LOCATIONS) {
         let place = physical(group, location);
         let named = [(&location.pointer, "value"), (&location.tensor, "tensor")].into_iter();
         let named = named.filter_map(|(what, kind)| Some((what.as_deref().filter(|w| !w.is_empty())?, kind)));
-        let logical = named.map(|(what, kind)| Logical { fully_qualified_name: name(what), kind });
+        let logical = named.map(|(what, kind)| LogicalLocation { fully_qualified_name: name(what), kind });
         match places.last_mut() {
             Some(last) if last.physical_location == place => last.logical_locations.extend(logical),
-            _ => places.push(Place { physical_location: place, logical_locations: logical.collect() }),
+            _ => places.push(SarifLocation { physical_location: place, logical_locations: logical.collect() }),
         }
     }
     if places.is_empty() {
-        places.push(Place { physical_location: physical(group, &Location::default()), logical_locations: Vec::new() });
+        places.push(SarifLocation {
+            physical_location: physical(group, &Location::default()),
+            logical_locations: Vec::new(),
+        });
     }
     places
 }
 
-fn physical(group: &Group<'_>, location: &Location) -> Physical {
+fn physical(group: &Group<'_>, location: &Location) -> PhysicalLocation {
     let found = file(&group.path, location);
     let region = location
         .line
         .filter(|_| found.is_some())
         .map(|start_line| Region { start_line, start_column: location.column });
-    Physical { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
+    PhysicalLocation { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
 }
 
 /// A file of the checkpoint at `path`.
-fn artifact(path: &str, name: &str) -> Artifact {
+fn artifact(path: &str, name: &str) -> ArtifactLocation {
     let location = Location { file: Some(name.to_owned()), ..Location::default() };
     artifact_at(file(path, &location).as_deref().unwrap_or(path))
 }
 
-fn artifact_at(path: &str) -> Artifact {
+fn artifact_at(path: &str) -> ArtifactLocation {
     let (uri, uri_base_id) = match path.strip_prefix('/') {
         Some(below) => (uri(below), ROOT),
         None => (uri(path), SOURCES),
     };
-    Artifact { uri, uri_base_id }
+    ArtifactLocation { uri, uri_base_id }
 }
 
 /// A path as a relative reference (RFC 3986): only unreserved characters and `/` stand for themselves.
@@ -253,9 +256,9 @@ fn uri(path: &str) -> String {
 }
 
 /// Plain text in which nothing is a link (3.11.6).
-fn text(plain: &str) -> Text {
+fn text(plain: &str) -> SarifText {
     let linked = plain.contains("](");
-    Text { text: if linked { plain.replace('[', "\\[").replace(']', "\\]") } else { plain.to_owned() } }
+    SarifText { text: if linked { plain.replace('[', "\\[").replace(']', "\\]") } else { plain.to_owned() } }
 }
 
 #[cfg(test)]

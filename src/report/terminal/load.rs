@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use comfy_table::{ContentArrangement, Table, presets};
 
 use super::super::Style;
-use super::super::collapse::{Group, collapse};
+use super::super::collapse::{NameGroup, collapse};
 use super::super::format::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
 use crate::check::load::LoadReport;
@@ -44,7 +44,7 @@ pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
     }
 }
 
-fn list(out: &mut String, title: &str, groups: &[Group], style: Style) {
+fn list(out: &mut String, title: &str, groups: &[NameGroup], style: Style) {
     if groups.is_empty() {
         return;
     }

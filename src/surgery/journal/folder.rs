@@ -12,8 +12,6 @@ use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::lock::{self, Lock};
 use crate::surgery::system::{self, create, explain, look, retry, sync_dir};
 
-type Result<T> = std::result::Result<T, RepairError>;
-
 /// Says that the folder is nothing for version control, as caches of other tools say it.
 const IGNORE: (&str, &str) = (".gitignore", "# made by ckpt-doctor, so that a repair can be undone\n*\n");
 
@@ -44,7 +42,7 @@ impl Folder {
     }
 
     /// Locks the folder of a checkpoint; `None` when it has none.
-    pub(super) fn open(root: &Path) -> Result<Option<Self>> {
+    pub(super) fn open(root: &Path) -> Result<Option<Self>, RepairError> {
         let path = root.join(REPAIR_FOLDER);
         only_folders(&path)?;
         match lock::take(&path.join(LOCK))? {
@@ -60,7 +58,7 @@ impl Folder {
     }
 
     /// Locks the folder of a checkpoint, and makes it when there is none.
-    pub(super) fn create(root: &Path) -> Result<Self> {
+    pub(super) fn create(root: &Path) -> Result<Self, RepairError> {
         let path = root.join(REPAIR_FOLDER);
         for _ in 0..8 {
             let made = retry(|| fs::create_dir(&path));
@@ -89,10 +87,10 @@ impl Folder {
         Err(RepairError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
     }
 
-    fn for_version_control(self) -> Result<Self> {
+    fn for_version_control(self) -> Result<Self, RepairError> {
         let (name, text) = IGNORE;
         let path = self.path.join(name);
-        let write = || -> Result<()> {
+        let write = || -> Result<(), RepairError> {
             if look(&path)?.is_none() {
                 create(&path)?.write_all(text.as_bytes()).map_err(io_at(&path, "writing"))?;
             }
@@ -129,12 +127,12 @@ impl Folder {
     }
 
     /// What is under way, if anything is.
-    pub(super) fn pending(&self) -> Result<Option<Journal>> {
+    pub(super) fn pending(&self) -> Result<Option<Journal>, RepairError> {
         Self::read_journal(&self.journal())
     }
 
     /// A journal; `None` when there is none of this name.
-    pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>> {
+    pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>, RepairError> {
         let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
         let bytes = match read_capped(path, JSON_CAP) {
             Err(OpenError::NotFound { .. }) => return Ok(None),
@@ -152,12 +150,12 @@ impl Folder {
     }
 
     /// Writes the journal of what begins now; from here on the next run would finish it.
-    pub(super) fn begin(&self, journal: &Journal) -> Result<()> {
+    pub(super) fn begin(&self, journal: &Journal) -> Result<(), RepairError> {
         let path = self.journal();
         let draft = self.path.join(DRAFT);
         let text = serde_json::to_vec_pretty(journal).unwrap_or_default();
         remove_file(&draft)?;
-        let write = || -> std::result::Result<(), ApplyError> {
+        let write = || -> Result<(), ApplyError> {
             let mut file = create(&draft)?;
             file.write_all(&text).map_err(io_at(&draft, "writing"))?;
             file.sync_all().map_err(io_at(&draft, "syncing"))?;
@@ -174,7 +172,7 @@ impl Folder {
     }
 
     /// Makes a folder in this one, and durable.
-    pub(super) fn folder(&self, path: &Path) -> Result<()> {
+    pub(super) fn folder(&self, path: &Path) -> Result<(), RepairError> {
         let inner = path.strip_prefix(&self.path).unwrap_or(Path::new(""));
         let mut made = self.path.clone();
         for step in inner {
@@ -192,7 +190,7 @@ impl Folder {
     }
 
     /// Numbers of the repairs that can be undone, latest last.
-    pub(super) fn numbers(&self) -> Result<Vec<u32>> {
+    pub(super) fn numbers(&self) -> Result<Vec<u32>, RepairError> {
         let undo = self.path.join("undo");
         let mut numbers = Vec::new();
         for name in names(&undo)? {
@@ -203,7 +201,7 @@ impl Folder {
     }
 
     /// Removes what a run left that was killed before it had a journal.
-    pub(super) fn clear(&self) -> Result<()> {
+    pub(super) fn clear(&self) -> Result<(), RepairError> {
         remove_tree(&self.staged())?;
         remove_file(&self.path.join(DRAFT))?;
         let kept = self.numbers()?;
@@ -232,7 +230,7 @@ impl Folder {
 
 /// Refuses links where folders are made: through them a checkpoint from elsewhere could have files moved that are not
 /// its own.
-fn only_folders(path: &Path) -> Result<()> {
+fn only_folders(path: &Path) -> Result<(), RepairError> {
     let undo = path.join("undo");
     let mut folders = vec![path.to_owned(), path.join(NEW), undo.clone()];
     if look(&undo)?.is_some_and(|m| m.is_dir()) {
@@ -247,7 +245,7 @@ fn only_folders(path: &Path) -> Result<()> {
 }
 
 /// Names in a folder; none when it is not there.
-fn names(path: &Path) -> Result<Vec<String>> {
+fn names(path: &Path) -> Result<Vec<String>, RepairError> {
     let names = match system::names(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         other => other.map_err(io_at(path, "listing"))?,
@@ -255,10 +253,10 @@ fn names(path: &Path) -> Result<Vec<String>> {
     Ok(names.into_iter().map(|name| name.to_string_lossy().into_owned()).collect())
 }
 
-pub(super) fn remove_file(path: &Path) -> Result<()> {
+pub(super) fn remove_file(path: &Path) -> Result<(), RepairError> {
     Ok(system::remove_file(path).map_err(io_at(path, "removing"))?)
 }
 
-pub(super) fn remove_tree(path: &Path) -> Result<()> {
+pub(super) fn remove_tree(path: &Path) -> Result<(), RepairError> {
     Ok(system::remove_dir_all(path).map_err(io_at(path, "removing"))?)
 }

@@ -16,8 +16,6 @@ use crate::checkpoint::open::open_regular;
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::system::{look, retry, sync_dir};
 
-type Result<T> = std::result::Result<T, RepairError>;
-
 /// A journal and the folder it lies in.
 pub(super) struct Replay<'a> {
     folder: &'a Folder,
@@ -46,7 +44,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Whether everything is there that it takes to finish a repair.
-    pub(super) fn can_finish(&self) -> Result<bool> {
+    pub(super) fn can_finish(&self) -> Result<bool, RepairError> {
         for entry in &self.journal.files {
             let target = self.target(entry);
             let ready = if look(&self.staged(entry))?.is_some() {
@@ -67,7 +65,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Keeps the originals, puts the new files in their places, and files the journal.
-    pub(super) fn finish(&self) -> Result<()> {
+    pub(super) fn finish(&self) -> Result<(), RepairError> {
         self.folder.folder(&self.originals())?;
         for entry in &self.journal.files {
             let (target, original) = (self.target(entry), self.original(entry));
@@ -98,7 +96,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Puts the originals back that a repair has moved, and forgets it.
-    pub(super) fn take_back(&self) -> Result<()> {
+    pub(super) fn take_back(&self) -> Result<(), RepairError> {
         let mut back = Vec::new();
         for entry in &self.journal.files {
             let (target, original) = (self.target(entry), self.original(entry));
@@ -125,13 +123,13 @@ impl<'a> Replay<'a> {
     }
 
     /// Whether the repair's own file stands in its place.
-    fn is_new(&self, entry: &JournaledFile) -> Result<bool> {
+    fn is_new(&self, entry: &JournaledFile) -> Result<bool, RepairError> {
         let published = look(&self.staged(entry))?.is_none();
         Ok(published && entry.new.matches(&self.target(entry))?)
     }
 
     /// The first file that is not what the repair made of it, or whose original is gone.
-    pub(super) fn changed(&self) -> Result<Option<PathBuf>> {
+    pub(super) fn changed(&self) -> Result<Option<PathBuf>, RepairError> {
         for entry in &self.journal.files {
             let kept = look(&self.original(entry))?.map(|m| m.len());
             if !entry.new.matches(&self.target(entry))? {
@@ -145,7 +143,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Undoes a repair that is done; files that are back already are passed over.
-    pub(super) fn restore(&self) -> Result<()> {
+    pub(super) fn restore(&self) -> Result<(), RepairError> {
         for entry in &self.journal.files {
             let (target, original) = (self.target(entry), self.original(entry));
             if entry.old.is_none() {
@@ -161,7 +159,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Removes all that is left of a repair, the journal last.
-    fn forget(&self) -> Result<()> {
+    fn forget(&self) -> Result<(), RepairError> {
         remove_tree(&self.folder.staged())?;
         remove_file(&self.folder.done(self.journal.number))?;
         remove_tree(&self.originals())?;
@@ -200,7 +198,7 @@ impl OldFile {
 
 impl NewFile {
     /// Reads a file to its end.
-    pub(super) fn hash(path: &Path) -> Result<Self> {
+    pub(super) fn hash(path: &Path) -> Result<Self, RepairError> {
         let opened = open_regular(path, u64::MAX).map_err(|e| io_at(path, "reading")(io::Error::other(e)))?;
         let mut hasher = Hasher(Sha256::new());
         let len = io::copy(&mut &opened.file, &mut hasher).map_err(io_at(path, "reading"))?;
@@ -208,7 +206,7 @@ impl NewFile {
     }
 
     /// Whether the file at `path` is this one.
-    fn matches(&self, path: &Path) -> Result<bool> {
+    fn matches(&self, path: &Path) -> Result<bool, RepairError> {
         let is_file = look(path)?.is_some_and(|m| m.is_file() && m.len() == self.len);
         Ok(is_file && Self::hash(path)? == *self)
     }

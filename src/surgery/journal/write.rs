@@ -14,15 +14,13 @@ use crate::surgery::repair::Repair;
 use crate::surgery::stop::interrupted;
 use crate::surgery::system::{ask_for_room, look, retry, sync_dir};
 
-type Result<T> = std::result::Result<T, RepairError>;
-
 /// Writes the changed files of a repair in place of the originals, all of them or none.
 ///
 /// `progress` hears of bytes written. Call [`super::recover`] before the checkpoint is opened.
 ///
 /// # Errors
 /// A [`RepairError`]; then the checkpoint is as it was, but for [`RepairError::Unfinished`], which says so.
-pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<()> {
+pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
     let root = &repair.original.root;
     for change in &repair.changes {
         let path = root.join(&change.name);
@@ -49,7 +47,7 @@ pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<()> {
 }
 
 /// Writes the new files where they do not count yet.
-fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Result<Journal> {
+fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Result<Journal, RepairError> {
     let root = &repair.original.root;
     let donor = AtRest::see(root)?;
     if folder.pending()?.is_some() {
@@ -85,7 +83,7 @@ fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Res
 }
 
 /// Gives a new file the owner and the mode of the old one.
-fn copy_owner_and_mode(path: &Path, old: &fs::Metadata) -> Result<()> {
+fn copy_owner_and_mode(path: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
     let new = fs::metadata(path).map_err(io_at(path, "looking at"))?;
     if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
         retry(|| std::os::unix::fs::chown(path, Some(old.uid()), Some(old.gid())))

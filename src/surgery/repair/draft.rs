@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
-use crate::checkpoint::{Checkpoint, Document, Module, Parts, Splice, spliced};
+use crate::checkpoint::{Checkpoint, Document, Parts, PythonModule, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
 /// What became of the edits of one fix.
@@ -138,7 +138,7 @@ impl RepairDraft {
         let mut parts = Parts::default();
         for (name, text) in &self.texts {
             if name.ends_with(".py") {
-                parts.modules.push(Module::parse(name.as_str(), text.as_bytes()));
+                parts.modules.push(PythonModule::parse(name.as_str(), text.as_bytes()));
             } else {
                 parts.documents.push(Document::parse(name.as_str(), text.as_bytes()));
             }

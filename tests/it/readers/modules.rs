@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{FaultKind, Module};
+use ckpt_doctor::checkpoint::{FaultKind, PythonModule};
 
 use super::{Case, hold};
 
@@ -55,8 +55,9 @@ a, b = 1, 2
 pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
-    let case =
-        |label, expected: &[FaultKind], bytes: &[u8]| Case::new(label, expected, Module::parse("m.py", bytes).faults);
+    let case = |label, expected: &[FaultKind], bytes: &[u8]| {
+        Case::new(label, expected, PythonModule::parse("m.py", bytes).faults)
+    };
     let nested = "(".repeat(100_000);
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n";
     // More syntax than is read of one module, within the size that is read.
@@ -79,7 +80,7 @@ fn faults_of_modules() {
 
 #[test]
 fn classes_with_bases_and_tokenizer_class() {
-    let module = Module::parse("m.py", SOURCE.as_bytes());
+    let module = PythonModule::parse("m.py", SOURCE.as_bytes());
     let names: Vec<_> = module.classes.iter().map(|c| c.name.as_str()).collect();
     assert_eq!(names, ["XModel", "Inner", "XProcessor", "Computed"]);
     let model = module.class("XModel").unwrap();
@@ -92,7 +93,7 @@ fn classes_with_bases_and_tokenizer_class() {
 
 #[test]
 fn imports_relative_and_absolute() {
-    let module = Module::parse("m.py", SOURCE.as_bytes());
+    let module = PythonModule::parse("m.py", SOURCE.as_bytes());
     let relative: Vec<_> =
         module.relative_imports.iter().map(|i| (i.level, i.module.as_str(), i.names.join(","), i.guarded)).collect();
     let name = str::to_owned;
@@ -113,12 +114,12 @@ fn imports_relative_and_absolute() {
 
 #[test]
 fn names_a_module_defines() {
-    let module = Module::parse("m.py", SOURCE.as_bytes());
+    let module = PythonModule::parse("m.py", SOURCE.as_bytes());
     for name in ["XModel", "Alias", "a", "b", "Llama", "Y", "nn", "helper", "action_tokenizer"] {
         assert_eq!(module.defines(name), Some(true), "{name}");
     }
     // A star import may bind anything; without one an absent name is absent.
     assert_eq!(module.defines("Fake"), None);
-    let module = Module::parse("m.py", b"class A: pass\n");
+    let module = PythonModule::parse("m.py", b"class A: pass\n");
     assert_eq!(module.defines("Fake"), Some(false));
 }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use ckpt_doctor::checkpoint::{Document, Fault, FaultKind, Module, Vocabulary};
+use ckpt_doctor::checkpoint::{Document, Fault, FaultKind, PythonModule, Vocabulary};
 use proptest::prelude::*;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView, serialize};
@@ -153,7 +153,7 @@ proptest! {
         let _ = Document::parse("tokenizer.json", &bytes);
         let _ = Document::parse("vocab.json", &bytes);
         let _ = Vocabulary::parse("tokenizer.model", &bytes);
-        let _ = Module::parse("m.py", &bytes);
+        let _ = PythonModule::parse("m.py", &bytes);
         let _ = read(&bytes);
     }
 

@@ -10,7 +10,7 @@ use ckpt_doctor::report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName,
     StageOutcome,
 };
-use ckpt_doctor::surgery::plan::Transform;
+use ckpt_doctor::surgery::plan::TensorTransform;
 use serde_json::{Map, Value, json};
 
 /// A checkpoint with these findings.
@@ -326,21 +326,26 @@ fn merge() -> MergeReport {
             stage("checked", "clean"),
         ],
         seams: vec![],
-        transforms: [(Transform::Copy, 724), (Transform::GrowRows, 2), (Transform::Pad, 2)].into(),
+        transforms: [(TensorTransform::Copy, 724), (TensorTransform::GrowRows, 2), (TensorTransform::Pad, 2)].into(),
         changed: vec![
             ChangedTensor {
                 name: "language_model.lm_head.weight".to_owned(),
-                transform: Transform::GrowRows,
+                transform: TensorTransform::GrowRows,
                 from: Some(vec![32000, 64]),
                 to: vec![33174, 64],
             },
             ChangedTensor {
                 name: "multi_modal_projector.linear.weight".to_owned(),
-                transform: Transform::Pad,
+                transform: TensorTransform::Pad,
                 from: Some(vec![48, 32]),
                 to: vec![64, 32],
             },
-            ChangedTensor { name: "fresh.weight".to_owned(), transform: Transform::Reinit, from: None, to: vec![64] },
+            ChangedTensor {
+                name: "fresh.weight".to_owned(),
+                transform: TensorTransform::Reinit,
+                from: None,
+                to: vec![64],
+            },
         ],
         dropped: vec![Dropped {
             donor: "language".to_owned(),

@@ -7,7 +7,7 @@ use serde::Serialize as _;
 use serde_json::Value;
 use serde_json::ser::{Formatter, PrettyFormatter, Serializer};
 
-use super::{Container, Member, Splice};
+use super::{Container, DocumentMember, Splice};
 
 /// The layout of a document: several lines or one.
 pub(super) struct Layout {
@@ -104,7 +104,7 @@ fn indent_of(line: &str) -> &str {
 }
 
 /// What stands between a member's key and its value.
-fn colon_of<'t>(text: &'t str, member: &Member) -> &'t str {
+fn colon_of<'t>(text: &'t str, member: &DocumentMember) -> &'t str {
     let between = member.key.as_ref().and_then(|key| text.get(key.end..member.value.start));
     between.filter(|b| b.trim() == ":" && !b.contains('\n')).unwrap_or(": ")
 }

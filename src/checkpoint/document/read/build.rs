@@ -33,7 +33,7 @@ enum Open {
     Array(Vec<Value>, usize),
 }
 
-pub(super) struct Builder {
+pub(super) struct ValueBuilder {
     stack: Vec<Open>,
     root: Option<Value>,
     nodes: usize,
@@ -43,7 +43,7 @@ pub(super) struct Builder {
     skipping: Option<usize>,
 }
 
-impl Builder {
+impl ValueBuilder {
     pub(super) fn new(left_out: Vec<&'static str>, most: usize) -> Self {
         Self { stack: Vec::new(), root: None, nodes: 0, most, left_out, skipping: None }
     }

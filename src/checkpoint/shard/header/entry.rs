@@ -1,9 +1,9 @@
 //! One entry of a header.
 
-use super::{Dtype, Fault, FaultKind, Place, Reader, ScanError, Tensor, Token, escape};
+use super::{Dtype, Fault, FaultKind, HeaderReader, Place, ScanError, Tensor, Token, escape};
 
 /// An entry as far as it could be read; a field is `None` when it is absent or malformed.
-pub(in crate::checkpoint::shard) struct Entry {
+pub(in crate::checkpoint::shard) struct HeaderEntry {
     pub(in crate::checkpoint::shard) name: String,
     pub(in crate::checkpoint::shard) dtype: Option<Dtype>,
     pub(in crate::checkpoint::shard) shape: Option<Vec<u64>>,
@@ -11,7 +11,7 @@ pub(in crate::checkpoint::shard) struct Entry {
     pub(in crate::checkpoint::shard) offsets: Option<(u64, u64)>,
 }
 
-impl Entry {
+impl HeaderEntry {
     /// The tensor, or the name alone when a field could not be read.
     pub(super) fn into_tensor(self) -> Result<Tensor, String> {
         match (self.dtype, self.shape, self.offsets) {
@@ -37,7 +37,7 @@ impl<T> Field<T> {
     }
 }
 
-impl Reader<'_, '_> {
+impl HeaderReader<'_, '_> {
     /// Reads the value of the entry `name`.
     pub(super) fn read_entry(&mut self, name: String) -> Result<(), ScanError> {
         let shard = self.shard;
@@ -95,7 +95,7 @@ impl Reader<'_, '_> {
             self.scanner.skip_rest_of(&first)?;
             self.faults.push(malformed("it is not an object"));
         }
-        self.entries.push(Entry { name, dtype: dtype.ok(), shape: shape.ok(), offsets: offsets.ok() });
+        self.entries.push(HeaderEntry { name, dtype: dtype.ok(), shape: shape.ok(), offsets: offsets.ok() });
         Ok(())
     }
 

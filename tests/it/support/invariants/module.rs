@@ -2,14 +2,14 @@
 
 use std::ops::Range;
 
-use ckpt_doctor::checkpoint::{FaultKind, Module};
+use ckpt_doctor::checkpoint::{FaultKind, PythonModule};
 
 /// Name under which the module is read.
 pub const NAME: &str = "modeling_x.py";
 
 /// The laws for a module.
 pub fn hold(bytes: &[u8]) {
-    let module = Module::parse(NAME, bytes);
+    let module = PythonModule::parse(NAME, bytes);
     super::faults_are_placed(&module.faults, NAME, module.text.as_deref());
     assert_eq!(
         module.text.is_some(),
