@@ -4,7 +4,7 @@
 //! tree; a broken shard is a [`Shard`] with faults and whatever entries could be read.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use serde_json::Value;
@@ -13,6 +13,7 @@ pub mod adapter;
 mod contents;
 mod discover;
 pub mod document;
+mod entry;
 pub mod fault;
 mod git;
 pub mod index;
@@ -31,6 +32,7 @@ pub use contents::Contents;
 pub use discover::{find_checkpoints, is_checkpoint, owner};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
+pub use entry::{Entry, EntryKind};
 pub use fault::{Fault, FaultKind, FaultSource, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
@@ -46,37 +48,6 @@ pub use tokenizer::{Tokenizer, Vocabulary};
 pub const REPAIR_FOLDER: &str = ".ckpt-doctor";
 /// File in [`REPAIR_FOLDER`] that is there while a repair is being written.
 pub const REPAIR_JOURNAL: &str = "journal.json";
-
-/// A directory entry, and what it turned out to be.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum EntryKind {
-    /// A regular file.
-    #[default]
-    Regular,
-    /// A directory.
-    Directory,
-    /// A FIFO, which would hang a reader.
-    Fifo,
-    /// A socket.
-    Socket,
-    /// A device.
-    Device,
-    /// A symbolic link that leads nowhere, or in a circle; or nothing the system tells about.
-    Broken,
-}
-
-/// One entry of a checkpoint directory.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Entry {
-    /// What it is, after following symbolic links.
-    pub kind: EntryKind,
-    /// Bytes in the file, after following symbolic links; 0 for anything but a file.
-    pub size: u64,
-    /// What the symbolic link says, if it is one.
-    pub link: Option<String>,
-    /// The pointer, if the file is one.
-    pub lfs: Option<LfsPointer>,
-}
 
 /// A model directory: everything a rule can ask about, and no tensor bytes.
 #[derive(Debug, Clone, Default)]
@@ -120,14 +91,6 @@ pub struct Parts {
 }
 
 impl Checkpoint {
-    /// Reads a checkpoint directory.
-    ///
-    /// # Errors
-    /// When the directory itself cannot be read. Nothing in it can make this fail.
-    pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
-        read::open(path.as_ref())
-    }
-
     /// A checkpoint that is not on disk yet, so that the same checks judge it as if it were.
     #[must_use]
     pub fn planned(root: impl Into<PathBuf>, parts: Parts) -> Self {

@@ -4,6 +4,7 @@ mod args;
 mod baseline;
 mod build_merged;
 mod check;
+mod exit;
 mod expect;
 mod fix;
 mod init;
@@ -21,13 +22,6 @@ use std::process::ExitCode;
 use ckpt_doctor::merge::PipelineError;
 use ckpt_doctor::surgery::{ApplyError, RepairError};
 use clap::Parser;
-
-/// Nothing at or above `--fail-on`.
-const CLEAN: u8 = 0;
-/// Findings at or above `--fail-on`, or a merge that stopped.
-const FINDINGS: u8 = 1;
-/// It could not be tried.
-const FAILED: u8 = 2;
 
 /// Whether a signal ended the run.
 fn interrupted(error: &anyhow::Error) -> bool {
@@ -59,7 +53,7 @@ pub fn main() -> ExitCode {
                 ExitCode::from(signals::exit_code())
             } else {
                 output::note(&format!("error: {causes}"));
-                ExitCode::from(FAILED)
+                ExitCode::from(exit::FAILED)
             }
         }
     }

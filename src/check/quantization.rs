@@ -17,7 +17,7 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 use crate::knowledge::expression::glob;
 use crate::knowledge::quantization::{AppliedScheme, DeclaredScheme, Scheme};
-use judge::{ModuleJudge, ModuleState, QuantizedModule};
+use judge::{ModuleJudge, ModuleState, QuantizedModule, plain_of};
 use module::{TensorLookup, kind};
 use skipped::SkippedModules;
 
@@ -219,16 +219,6 @@ fn mistyped<'s>(
         let allowed = part.dtypes.iter().any(|d| d == dtype);
         (!allowed).then(|| (part.name.as_str(), dtype, part.dtypes.join(" or ")))
     })
-}
-
-/// The shape of a class's tensor of this name, with or without the prefix of its base model.
-fn plain_of<'e>(expected: Option<&'e Expected>, name: &str) -> Option<&'e [u64]> {
-    let expected = expected?;
-    let bare = || name.strip_prefix(&expected.base_model_prefix)?.strip_prefix('.');
-    let tensor = expected.tensors.get(name);
-    let tensor = tensor.or_else(|| expected.tensors.get(bare()?));
-    let tensor = tensor.or_else(|| expected.tensors.get(&format!("{}.{name}", expected.base_model_prefix)));
-    Some(&tensor?.shape)
 }
 
 #[cfg(test)]

@@ -10,12 +10,13 @@ use std::path::Path;
 use sha2::{Digest as _, Sha256};
 
 use super::open::{Opened, open_regular};
+use super::shard::tail::zero_tail;
 use super::text::hex;
-use super::{Checkpoint, Dtype, Entry, Fault, FaultKind, Shard, Tensor};
+use super::{Entry, Fault, FaultKind, Shard, Tensor};
 
 mod numbers;
 
-use numbers::NonFiniteCounter;
+use numbers::{NonFiniteCounter, as_u64};
 
 /// Bytes read at a time: a multiple of every element's width, so that none lies across two reads.
 const CHUNK: usize = 1 << 20;
@@ -27,22 +28,13 @@ pub struct Contents {
 }
 
 impl Contents {
-    /// SHA-256 of a tensor's bytes; `None` where they could not be read.
-    #[must_use]
-    pub fn digest(&self, shard: &str, tensor: &str) -> Option<&[u8; 32]> {
-        self.digests.get(shard)?.get(tensor)
-    }
-}
-
-impl Checkpoint {
-    /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
-    /// their bytes show. Never fails: what cannot be read is a fault too.
-    pub fn read_contents(&mut self) {
-        let mut contents = Contents::default();
-        for shard in self.shards.values_mut() {
-            let mut reading = ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new() };
-            reading.run(&self.root, self.entries.get(&shard.name));
-            let ContentsReader { digests, faults, .. } = reading;
+    /// Reads the bytes of every tensor of these shards, and adds the faults that only their bytes show.
+    pub(super) fn read(root: &Path, entries: &BTreeMap<String, Entry>, shards: &mut BTreeMap<String, Shard>) -> Self {
+        let mut contents = Self::default();
+        for shard in shards.values_mut() {
+            let mut reader = ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new() };
+            reader.run(root, entries.get(&shard.name));
+            let ContentsReader { digests, faults, .. } = reader;
             contents.digests.insert(shard.name.clone(), digests);
             if faults.iter().any(|f| f.kind == FaultKind::ZeroTail) {
                 // The reader of headers saw a part of it already, where the file system told.
@@ -50,7 +42,13 @@ impl Checkpoint {
             }
             shard.faults.extend(faults);
         }
-        self.contents = Some(contents);
+        contents
+    }
+
+    /// SHA-256 of a tensor's bytes; `None` where they could not be read.
+    #[must_use]
+    pub fn digest(&self, shard: &str, tensor: &str) -> Option<&[u8; 32]> {
+        self.digests.get(shard)?.get(tensor)
     }
 }
 
@@ -122,7 +120,7 @@ impl ContentsReader<'_> {
             self.faults.extend(numbers.fault(self.shard, tensor));
         }
         if last_value < region {
-            let tail = tail(self.shard, &tensors, last_value);
+            let tail = zero_tail(self.shard, &tensors, last_value);
             self.faults.extend(tail);
         }
         if let (Some(whole), Some(stated)) = (whole, stated) {
@@ -143,29 +141,6 @@ fn stated_digest(entry: &Entry) -> Option<String> {
     is_digest.then(|| name.to_owned())
 }
 
-/// The fault of a shard whose last bytes from `from` on, counted in its data, are zero: when at least one whole matrix
-/// lies there, or the end of one. A bias may be zero, and so may be the second factor of a LoRA that was not trained.
-pub(super) fn tail(shard: &Shard, tensors: &[&Tensor], from: u64) -> Option<Fault> {
-    let zero = |t: &&&Tensor| t.begin >= from && !t.is_empty();
-    let matrix = |t: &&Tensor| t.shape.len() > 1 && !t.name.contains("lora_B") && !t.name.contains("lora_embedding_B");
-    let all: Vec<&Tensor> = tensors.iter().filter(zero).copied().collect();
-    let whole = all.iter().find(|t| matrix(t)).copied();
-    let first = whole.or_else(|| tensors.iter().copied().filter(|t| matrix(t)).find(|t| ends_within(t, from)))?;
-    let fault = Fault::new(FaultKind::ZeroTail).at(shard.place().in_tensor(first.name.clone()));
-    let region = shard.file_len.saturating_sub(shard.data_start);
-    let fault = fault.with("tensors", all.len()).with("bytes", region.saturating_sub(from));
-    Some(fault.with("partly", whole.is_none()))
-}
-
-/// Whether the values of a matrix end within one of its rows, and at least a row of zeros follows. Rows that are zero
-/// from their start are padding.
-fn ends_within(tensor: &Tensor, from: u64) -> bool {
-    let is_float = matches!(tensor.dtype, Dtype::BF16 | Dtype::F16 | Dtype::F32 | Dtype::F64);
-    let row = tensor.shape.first().and_then(|rows| tensor.len().checked_div(*rows)).unwrap_or(0);
-    let begun = from.checked_sub(tensor.begin).and_then(|written| written.checked_rem(row)).is_some_and(|n| n > 0);
-    is_float && begun && tensor.end.saturating_sub(from) >= row
-}
-
 /// Hands `len` bytes from `start` on to `each`, in pieces.
 fn each_chunk(
     opened: &Opened,
@@ -184,8 +159,4 @@ fn each_chunk(
         left = left.saturating_sub(as_u64(size));
     }
     Ok(())
-}
-
-fn as_u64(n: usize) -> u64 {
-    u64::try_from(n).unwrap_or(u64::MAX)
 }

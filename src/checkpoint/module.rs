@@ -76,12 +76,6 @@ pub struct Import {
 }
 
 impl PythonModule {
-    /// Reads a module. Never fails: what is wrong becomes a fault.
-    #[must_use]
-    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
-        parse::parse(name.into(), bytes)
-    }
-
     /// A module that could not be read at all.
     #[must_use]
     pub fn unread(name: impl Into<String>, fault: Fault) -> Self {

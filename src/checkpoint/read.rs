@@ -5,6 +5,7 @@ use std::fs::{self, Metadata};
 use std::path::{Component, Path};
 use std::sync::Arc;
 
+use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
@@ -48,7 +49,23 @@ pub(super) fn is_document(name: &str) -> bool {
     DOCUMENTS.contains(&name) || name.ends_with("config.json") || name.ends_with(".index.json")
 }
 
-pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
+impl Checkpoint {
+    /// Reads a checkpoint directory.
+    ///
+    /// # Errors
+    /// When the directory itself cannot be read. Nothing in it can make this fail.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
+        open(path.as_ref())
+    }
+
+    /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
+    /// their bytes show. Never fails: what cannot be read is a fault too.
+    pub fn read_contents(&mut self) {
+        self.contents = Some(Contents::read(&self.root, &self.entries, &mut self.shards));
+    }
+}
+
+fn open(root: &Path) -> Result<Checkpoint, OpenError> {
     let io = |source| OpenError::from_io(root, source);
     if !fs::metadata(root).map_err(io)?.is_dir() {
         return Err(OpenError::NotADirectory { path: root.to_owned() });

@@ -14,7 +14,8 @@ use ckpt_doctor::merge::{self, MergeRequest, MergeRun};
 use ckpt_doctor::report::model::{MergeStage, Role};
 
 use super::args::{BuildMergedArgs, FailOn};
-use super::{FINDINGS, library, output, signals};
+use super::exit::{CLEAN, FINDINGS};
+use super::{library, output, signals};
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -38,9 +39,7 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     })?;
     // What matters is the result; findings on a donor that the merge repaired are told, not counted.
     Ok(match stage {
-        Some(MergeStage::Written | MergeStage::DryRun) if args.report.exit_zero || !result_fails(&run, args) => {
-            super::CLEAN
-        }
+        Some(MergeStage::Written | MergeStage::DryRun) if args.report.exit_zero || !result_fails(&run, args) => CLEAN,
         _ => FINDINGS,
     })
 }

@@ -12,8 +12,9 @@ use ckpt_doctor::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
 use ckpt_doctor::report::{Report, fixes};
 
 use super::args::CheckArgs;
+use super::exit::{CLEAN, FINDINGS};
 use super::settings::{Resolved, SettingsResolver, Typed};
-use super::{CLEAN, FINDINGS, baseline, fix, output, signals, unasked};
+use super::{baseline, fix, output, signals, unasked};
 
 /// A checkpoint, the result of checking it and the settings it was checked under.
 struct Checked {

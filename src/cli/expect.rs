@@ -13,7 +13,8 @@ use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::args::{ExpectArgs, ExpectFormat};
-use super::{CLEAN, FINDINGS, library, output};
+use super::exit::{CLEAN, FINDINGS};
+use super::{library, output};
 
 /// A line of `@FILE`; what else it has is ignored.
 #[derive(Deserialize)]

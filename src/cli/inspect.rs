@@ -8,7 +8,8 @@ use ckpt_doctor::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use ckpt_doctor::report::inspect as report;
 
 use super::args::{InspectArgs, InspectFormat};
-use super::{CLEAN, library, output};
+use super::exit::CLEAN;
+use super::{library, output};
 
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {

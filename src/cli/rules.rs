@@ -8,8 +8,9 @@ use ckpt_doctor::knowledge::rule::Rule;
 use comfy_table::{Table, presets};
 
 use super::args::{ExplainArgs, SettingsArgs};
+use super::exit::CLEAN;
+use super::output;
 use super::settings::{SettingsResolver, Typed};
-use super::{CLEAN, output};
 
 /// Runs `rules`: a line for each that is asked here.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {

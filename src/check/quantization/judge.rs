@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::module::StoredModule;
-use super::plain_of;
 use super::skipped::SkippedModules;
 use crate::knowledge::Expected;
 use crate::knowledge::quantization::{AppliedScheme, Scheme, Shapes};
@@ -176,4 +175,14 @@ impl ModuleJudge<'_> {
         }
         (Some(class.to_vec()), shapes, count)
     }
+}
+
+/// The shape of a class's tensor of this name, with or without the prefix of its base model.
+pub(super) fn plain_of<'e>(expected: Option<&'e Expected>, name: &str) -> Option<&'e [u64]> {
+    let expected = expected?;
+    let bare = || name.strip_prefix(&expected.base_model_prefix)?.strip_prefix('.');
+    let tensor = expected.tensors.get(name);
+    let tensor = tensor.or_else(|| expected.tensors.get(bare()?));
+    let tensor = tensor.or_else(|| expected.tensors.get(&format!("{}.{name}", expected.base_model_prefix)));
+    Some(&tensor?.shape)
 }

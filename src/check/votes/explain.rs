@@ -2,8 +2,9 @@
 
 use serde_json::Value;
 
+use super::run::run;
 use super::solve::{put_all, stretch};
-use super::{Vote, run};
+use super::vote::Vote;
 use crate::check::load::{self, Stored};
 use crate::check::load::{LoadReport, SilentReason};
 use crate::checkpoint::{Fault, FaultKind, Place};

@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::probe::{ProbedKey, dimensions, keys, stored_dimension};
 use super::solve::SearchState;
 use super::space::{Space, with};
-use super::{Undecided, Vote, Witness};
+use super::vote::{Undecided, Vote, Witness};
 use crate::knowledge::Expected;
 
 /// Tensors named for one vote.

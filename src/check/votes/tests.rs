@@ -1,5 +1,6 @@
 #![allow(clippy::arithmetic_side_effects, reason = "numbers here are small")]
 
+use crate::check::load::Stored;
 use crate::checkpoint::FaultKind;
 use proptest::prelude::*;
 use serde_json::json;

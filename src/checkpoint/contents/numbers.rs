@@ -46,20 +46,20 @@ impl NonFiniteCounter {
                 self.count(number, infinite);
             }
         }
-        self.seen = self.seen.saturating_add(super::as_u64(elements.len()));
+        self.seen = self.seen.saturating_add(as_u64(elements.len()));
     }
 
     fn narrow(&mut self, bytes: &[u8], is_nan: impl Fn(u8) -> bool) {
         for (number, _) in bytes.iter().enumerate().filter(|(_, b)| is_nan(**b)) {
             self.count(number, false);
         }
-        self.seen = self.seen.saturating_add(super::as_u64(bytes.len()));
+        self.seen = self.seen.saturating_add(as_u64(bytes.len()));
     }
 
     fn count(&mut self, number: usize, infinite: bool) {
         let counter = if infinite { &mut self.infinite } else { &mut self.nan };
         *counter = counter.saturating_add(1);
-        self.first.get_or_insert(self.seen.saturating_add(super::as_u64(number)));
+        self.first.get_or_insert(self.seen.saturating_add(as_u64(number)));
     }
 
     pub(super) fn fault(&self, shard: &Shard, tensor: &Tensor) -> Option<Fault> {
@@ -69,6 +69,10 @@ impl NonFiniteCounter {
             Fault::new(FaultKind::NonFiniteWeights).at(place).with("nan", self.nan).with("infinite", self.infinite);
         Some(fault.with("elements", self.seen).with("first", first))
     }
+}
+
+pub(super) fn as_u64(n: usize) -> u64 {
+    u64::try_from(n).unwrap_or(u64::MAX)
 }
 
 #[cfg(test)]

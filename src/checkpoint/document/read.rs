@@ -16,11 +16,8 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 mod build;
 mod duplicates;
 
-use build::ValueBuilder;
+use build::{ValueBuilder, is_huge};
 use duplicates::Duplicates;
-
-/// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
-const MAX_DIGITS: usize = 4300;
 
 /// Parts of documents that are left out of the value: what a tokenizer holds in less space.
 fn left_out(name: &str) -> Vec<&'static str> {
@@ -31,7 +28,15 @@ fn left_out(name: &str) -> Vec<&'static str> {
     }
 }
 
-pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
+impl Document {
+    /// Reads a document. Never fails: what is wrong becomes a fault.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
+        parse(name.into(), bytes)
+    }
+}
+
+fn parse(name: String, bytes: &[u8]) -> Document {
     let mut faults = Faults::default();
     if let Some(fault) = not_json_at_all(&name, bytes) {
         let text = std::str::from_utf8(bytes).ok().map(Into::into);
@@ -201,11 +206,4 @@ impl DocumentReader<'_> {
             }
         });
     }
-}
-
-/// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
-/// double becomes infinite.
-fn is_huge(literal: &str) -> bool {
-    literal.len() > MAX_DIGITS
-        || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
 }

@@ -27,7 +27,15 @@ struct StatementContext {
     class: bool,
 }
 
-pub(super) fn parse(name: String, bytes: &[u8]) -> PythonModule {
+impl PythonModule {
+    /// Reads a module. Never fails: what is wrong becomes a fault.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
+        parse(name.into(), bytes)
+    }
+}
+
+fn parse(name: String, bytes: &[u8]) -> PythonModule {
     let place = Place::file(&*name);
     if let Some(pointer) = LfsPointer::parse(bytes) {
         let fault = Fault::new(FaultKind::LfsPointer).at(place).with("oid", pointer.oid).with("size", pointer.size);

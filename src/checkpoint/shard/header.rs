@@ -4,23 +4,34 @@ use std::collections::{BTreeMap, HashMap};
 
 use sha2::{Digest as _, Sha256};
 
-use super::{Dtype, MAX_HEADER, Shard, Tensor, layout};
+use super::entry::HeaderEntry;
+use super::{MAX_HEADER, Shard, layout};
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::scan::{ScanError, ScanErrorKind, Scanner, Token};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::text::{escape, hex};
-use crate::checkpoint::{Fault, FaultKind, Place};
+use crate::checkpoint::{Fault, FaultKind};
 
-mod entry;
-
-pub(super) use entry::HeaderEntry;
+mod fields;
 
 /// `format` values that transformers opens. Source: `load_state_dict` in transformers 4.47.0.
 const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
 
+impl Shard {
+    /// Reads a header from the first bytes of a file of `file_len` bytes.
+    ///
+    /// `head` must hold the length field and the header it states, if the file does; of a file that
+    /// is no safetensors file the first few hundred bytes tell what it is.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
+        let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
+        parse(shard, head)
+    }
+}
+
 /// Fills in `shard`, which has its name and length, from the first bytes of the file.
-pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
+fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     let (header, data_start) = match frame(&shard, head) {
         Ok(frame) => frame,
         Err(fault) => {

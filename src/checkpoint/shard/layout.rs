@@ -1,7 +1,7 @@
 //! Whether the tensors of a header fill the data region: each byte once, and no byte besides.
 
 use super::Shard;
-use super::header::HeaderEntry;
+use super::entry::HeaderEntry;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::{Fault, FaultKind};
 

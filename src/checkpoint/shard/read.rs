@@ -6,8 +6,8 @@ use std::path::Path;
 use rustix::fs::SeekFrom;
 use rustix::io::Errno;
 
+use super::tail::zero_tail;
 use super::{MAX_HEADER, Shard, Tensor};
-use crate::checkpoint::contents::tail;
 use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::{Fault, FaultKind, Place};
@@ -15,7 +15,16 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 /// Enough to recognise what a file is, and most tiny headers whole.
 const SAMPLE: u64 = 4096;
 
-pub(super) fn read(dir: &Path, name: &str) -> Shard {
+impl Shard {
+    /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: what is
+    /// wrong becomes a fault.
+    #[must_use]
+    pub fn read(dir: &Path, name: &str) -> Self {
+        read(dir, name)
+    }
+}
+
+fn read(dir: &Path, name: &str) -> Shard {
     let opened = match open_regular(&dir.join(name), u64::MAX) {
         Ok(opened) => opened,
         Err(error) => return Shard::unread(name, error.fault(name)),
@@ -56,7 +65,7 @@ fn unwritten_tail(shard: &Shard, opened: &Opened) -> Option<Fault> {
             Ok(data) if data > hole => at = data,
             Err(Errno::NXIO) => {
                 let tensors: Vec<&Tensor> = shard.tensors.iter().collect();
-                return tail(shard, &tensors, written(opened, shard.data_start, hole)?);
+                return zero_tail(shard, &tensors, written(opened, shard.data_start, hole)?);
             }
             _ => return None,
         }

@@ -5,15 +5,33 @@ use cel::common::value::Val;
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 use serde_json::Value;
 
-use super::{Scope, steps};
+use super::scope::Scope;
+use super::steps;
 
 /// Longest list `range` makes.
 const RANGE_CAP: i64 = 100_000;
 
 type FunctionResult = Result<Value, String>;
 
+impl Scope<'static> {
+    /// A root scope with the standard functions of CEL and those of the data files:
+    /// `pow isqrt sum floor ceil range min max get keys zpad glob`.
+    #[must_use]
+    pub fn new() -> Self {
+        let mut scope = Self::bare();
+        register(&mut scope);
+        scope
+    }
+}
+
+impl Default for Scope<'static> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 /// Adds all functions to a root scope.
-pub(super) fn register(scope: &mut Scope<'static>) {
+fn register(scope: &mut Scope<'static>) {
     scope.function("pow", pow);
     scope.function("isqrt", isqrt);
     scope.function("sum", sum);

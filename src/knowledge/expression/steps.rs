@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use cel::common::ast::{CallExpr, EntryExpr, Expr, IdedExpr, operators};
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 
-use super::Scope;
+use super::scope::Scope;
 
 /// Name of the function; `@` is in no identifier.
 const COUNT: &str = "@count";

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use globset::{GlobBuilder, GlobMatcher};
 
-use super::{SettingsSource, absolute};
+use super::SettingsSource;
+use super::find::absolute;
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::source::DataError;
 

@@ -3,9 +3,9 @@
 //! <https://docs.oasis-open.org/sarif/sarif/v2.1.0/sarif-v2.1.0.html>; the numbers below are its sections.
 
 mod fixes;
+mod parts;
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 
 use serde::Serialize;
 
@@ -14,15 +14,11 @@ use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
 use crate::report::format::{name, sentence};
 use crate::report::{Report, json};
+use parts::{ArtifactLocation, ROOT, SarifText, artifact_at, text};
 
 const SCHEMA: &str = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json";
 /// Most locations of one result: GitHub takes no more.
 const LOCATIONS: usize = 1_000;
-/// What relative paths start from: by custom the root of the sources, which the reader knows.
-const SOURCES: &str = "%SRCROOT%";
-/// What absolute paths start from.
-const ROOT: &str = "ROOT";
-
 #[derive(Serialize)]
 struct SarifLog {
     #[serde(rename = "$schema")]
@@ -60,11 +56,6 @@ struct SarifRule {
     name: String,
     short_description: SarifText,
     help: SarifText,
-}
-
-#[derive(Serialize)]
-struct SarifText {
-    text: String,
 }
 
 #[derive(Serialize)]
@@ -113,13 +104,6 @@ struct PhysicalLocation {
 
 #[derive(Serialize, PartialEq)]
 #[serde(rename_all = "camelCase")]
-struct ArtifactLocation {
-    uri: String,
-    uri_base_id: &'static str,
-}
-
-#[derive(Serialize, PartialEq)]
-#[serde(rename_all = "camelCase")]
 struct Region {
     start_line: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -154,7 +138,7 @@ pub fn render(report: &Report) -> String {
                 locations: locations(&group, item),
                 partial_fingerprints,
                 suppressions: accepted.map(suppression).into_iter().collect(),
-                fixes: item.fix.zip(group.sources).map_or_else(Vec::new, |(f, s)| fixes::of(f, &group.path, s)),
+                fixes: item.fix.zip(group.sources).map_or_else(Vec::new, |(f, s)| fixes::fixes(f, &group.path, s)),
             });
         }
     }
@@ -225,55 +209,4 @@ fn physical(group: &Group<'_>, location: &Location) -> PhysicalLocation {
         .filter(|_| found.is_some())
         .map(|start_line| Region { start_line, start_column: location.column });
     PhysicalLocation { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
-}
-
-/// A file of the checkpoint at `path`.
-fn artifact(path: &str, name: &str) -> ArtifactLocation {
-    let location = Location { file: Some(name.to_owned()), ..Location::default() };
-    artifact_at(file(path, &location).as_deref().unwrap_or(path))
-}
-
-fn artifact_at(path: &str) -> ArtifactLocation {
-    let (uri, uri_base_id) = match path.strip_prefix('/') {
-        Some(below) => (uri(below), ROOT),
-        None => (uri(path), SOURCES),
-    };
-    ArtifactLocation { uri, uri_base_id }
-}
-
-/// A path as a relative reference (RFC 3986): only unreserved characters and `/` stand for themselves.
-fn uri(path: &str) -> String {
-    let mut out = String::with_capacity(path.len());
-    for byte in path.bytes() {
-        if byte.is_ascii_alphanumeric() || b"-._~/".contains(&byte) {
-            out.push(char::from(byte));
-        } else {
-            let _infallible = write!(out, "%{byte:02X}");
-        }
-    }
-    // The directory itself is no empty reference.
-    if out.is_empty() { ".".to_owned() } else { out }
-}
-
-/// Plain text in which nothing is a link (3.11.6).
-fn text(plain: &str) -> SarifText {
-    let linked = plain.contains("](");
-    SarifText { text: if linked { plain.replace('[', "\\[").replace(']', "\\]") } else { plain.to_owned() } }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{text, uri};
-
-    #[test]
-    fn every_byte_that_means_something_is_percent_encoded() {
-        assert_eq!(uri("a b/c:d?e#f%20[é]"), "a%20b/c%3Ad%3Fe%23f%2520%5B%C3%A9%5D");
-        assert_eq!(uri(""), ".");
-    }
-
-    #[test]
-    fn words_make_no_link() {
-        assert_eq!(text("[a](javascript:x)").text, "\\[a\\](javascript:x)");
-        assert_eq!(text("is [1, 2]").text, "is [1, 2]");
-    }
 }

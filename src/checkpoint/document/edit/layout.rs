@@ -7,7 +7,8 @@ use serde::Serialize as _;
 use serde_json::Value;
 use serde_json::ser::{Formatter, PrettyFormatter, Serializer};
 
-use super::{Container, DocumentMember, Splice};
+use super::container::{Container, DocumentMember};
+use super::splice::Splice;
 
 /// The layout of a document: several lines or one.
 pub(super) struct Layout {

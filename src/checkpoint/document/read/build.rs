@@ -2,9 +2,11 @@
 
 use serde_json::{Map, Number, Value};
 
-use super::is_huge;
 use crate::checkpoint::pointer;
 use crate::checkpoint::scan::Token;
+
+/// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
+const MAX_DIGITS: usize = 4300;
 
 /// Bytes of text that take as much room as a value does.
 const NODE_BYTES: usize = 100;
@@ -161,4 +163,11 @@ fn number(literal: &str) -> Value {
         return Value::Null;
     }
     literal.parse::<Number>().map_or(Value::Null, Value::Number)
+}
+
+/// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
+/// double becomes infinite.
+pub(super) fn is_huge(literal: &str) -> bool {
+    literal.len() > MAX_DIGITS
+        || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::{ArtifactLocation, SarifText, artifact, text};
+use super::parts::{ArtifactLocation, SarifText, artifact, text};
 use crate::check::{Edit, FixHint};
 use crate::checkpoint::{Document, Splice, line_column, spliced};
 use crate::report::format::sentence;
@@ -50,7 +50,7 @@ struct SarifContent {
 }
 
 /// The fix of a finding on the checkpoint at `path`; nothing where files have to be made or shards be written.
-pub(super) fn of(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>>) -> Vec<SarifFix> {
+pub(super) fn fixes(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>>) -> Vec<SarifFix> {
     let mut files: BTreeMap<&str, Vec<Splice>> = BTreeMap::new();
     for edit in hint.edits.iter().take(REPLACEMENTS.saturating_add(1)) {
         let Some((file, splice)) = splice(edit, sources) else { return Vec::new() };

@@ -1,25 +1,11 @@
-//! One entry of a header.
+//! Reads the fields of one header entry.
 
-use super::{Dtype, Fault, FaultKind, HeaderReader, Place, ScanError, Tensor, Token, escape};
-
-/// An entry as far as it could be read; a field is `None` when it is absent or malformed.
-pub(in crate::checkpoint::shard) struct HeaderEntry {
-    pub(in crate::checkpoint::shard) name: String,
-    pub(in crate::checkpoint::shard) dtype: Option<Dtype>,
-    pub(in crate::checkpoint::shard) shape: Option<Vec<u64>>,
-    /// Begin and end in the data region, in the order stated.
-    pub(in crate::checkpoint::shard) offsets: Option<(u64, u64)>,
-}
-
-impl HeaderEntry {
-    /// The tensor, or the name alone when a field could not be read.
-    pub(super) fn into_tensor(self) -> Result<Tensor, String> {
-        match (self.dtype, self.shape, self.offsets) {
-            (Some(dtype), Some(shape), Some((begin, end))) => Ok(Tensor { name: self.name, dtype, shape, begin, end }),
-            _ => Err(self.name),
-        }
-    }
-}
+use super::HeaderReader;
+use crate::checkpoint::scan::{ScanError, Token};
+use crate::checkpoint::shard::Dtype;
+use crate::checkpoint::shard::entry::HeaderEntry;
+use crate::checkpoint::text::escape;
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// More dimensions than any library has; a shape of millions of them only takes memory.
 const MAX_RANK: usize = 1024;

@@ -1,0 +1,152 @@
+//! Votes and their outcome.
+
+use std::fmt;
+
+use serde::Serialize;
+use serde_json::Value;
+
+use crate::checkpoint::pointer;
+use crate::knowledge::{Evidence, Expected};
+
+/// What the tensors say of one value of config.json.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Vote {
+    /// JSON pointer into config.json.
+    pub pointer: String,
+    /// What the config says; the class's default where it is silent, null where that is too.
+    pub config_value: Value,
+    /// Whether config.json itself says it.
+    pub given: bool,
+    /// What the tensors say.
+    pub voted_value: Value,
+    /// Stored tensors whose name or shape follows from the voted value, and is so.
+    #[serde(rename = "for")]
+    pub votes_for: usize,
+    /// Stored tensors whose name or shape follows from it, and is otherwise.
+    #[serde(rename = "against")]
+    pub votes_against: usize,
+    /// A few of the tensors that speak for it.
+    pub evidence: Vec<Witness>,
+}
+
+impl Vote {
+    /// Whether the tensors contradict the config.
+    #[must_use]
+    pub fn outvotes(&self) -> bool {
+        self.config_value != self.voted_value
+    }
+}
+
+/// A stored tensor that speaks for a value, under the class's name for it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Witness {
+    /// Its name.
+    pub tensor: String,
+    /// Its stored shape, where it is known.
+    pub shape: Option<Vec<u64>>,
+}
+
+/// `model.norm.weight [4096]`.
+impl fmt::Display for Witness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.tensor)?;
+        let Some(shape) = &self.shape else { return Ok(()) };
+        let sizes: Vec<String> = shape.iter().map(u64::to_string).collect();
+        write!(f, " [{}]", sizes.join(", "))
+    }
+}
+
+/// Values of which the tensors show only a product or a ratio.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Undecided {
+    /// JSON pointers into config.json.
+    pub pointers: Vec<String>,
+    /// What is sure: `head_dim * num_attention_heads = 4096`.
+    pub constraint: String,
+}
+
+/// How a class fits the stored tensors, before any loader's rules.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Fit {
+    /// Tensors the class has; of those that share a storage, one is enough.
+    pub expected: usize,
+    /// Of these, stored.
+    pub found: usize,
+    /// Of these, stored with another shape.
+    pub mismatched: usize,
+    /// Tensors stored.
+    pub stored: usize,
+}
+
+impl Fit {
+    /// Of a class and the tensors stored under its names.
+    #[must_use]
+    pub fn of(expected: &Expected, stored: &Evidence) -> Self {
+        let mut fit = Self { stored: stored.iter().count(), ..Self::default() };
+        for (name, tensor) in &expected.tensors {
+            let here = stored.contains(name);
+            let elsewhere = tensor.tied_to.as_ref().is_some_and(|to| stored.contains(to));
+            if here || !elsewhere {
+                fit.expected = fit.expected.saturating_add(1);
+            }
+            fit.found = fit.found.saturating_add(usize::from(here));
+            let differs = stored.shape(name).is_some_and(|shape| shape != tensor.shape);
+            fit.mismatched = fit.mismatched.saturating_add(usize::from(differs));
+        }
+        fit
+    }
+
+    /// Share of names and shapes that both sides agree on, from 0 to 1.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "counts of tensors are far below 2^52")]
+    pub fn score(&self) -> f64 {
+        let union = self.expected.saturating_add(self.stored).saturating_sub(self.found);
+        let good = self.found.saturating_sub(self.mismatched);
+        if union == 0 { 0.0 } else { good as f64 / union as f64 }
+    }
+
+    /// Whether every name and shape agrees.
+    #[must_use]
+    pub const fn is_exact(&self) -> bool {
+        self.found == self.expected && self.found == self.stored && self.mismatched == 0
+    }
+}
+
+/// The outcome of a vote.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Votes {
+    /// Every value that shapes the class and that the tensors decide, in the order of the config.
+    pub votes: Vec<Vote>,
+    /// What they leave open.
+    pub undecided: Vec<Undecided>,
+    /// The config with the voted values in place.
+    #[serde(skip)]
+    pub config: Value,
+    /// The same with the class's defaults filled in.
+    #[serde(skip)]
+    pub resolved: Value,
+    /// How the class fits with the values it was given.
+    pub before: Fit,
+    /// How it fits with those that were voted for.
+    pub after: Fit,
+    /// Whether the search stopped early because the model is large.
+    #[serde(skip)]
+    pub exhausted: bool,
+}
+
+impl Votes {
+    /// Puts what a vote says into another config; a list it is an element of comes along whole.
+    pub fn put(&self, config: &mut Value, vote: &Vote) {
+        let ends = vote.pointer.match_indices('/').map(|(at, _)| at).skip(1);
+        let outer = ends.filter_map(|end| vote.pointer.get(..end));
+        match outer.filter_map(|p| Some((p, self.resolved.pointer(p)?))).find(|(_, value)| value.is_array()) {
+            Some((pointer, list)) => pointer::put(config, &Value::Null, pointer, list.clone()),
+            None => pointer::put(config, &Value::Null, &vote.pointer, vote.voted_value.clone()),
+        };
+    }
+
+    /// The votes that contradict the config.
+    pub fn outvoted(&self) -> impl Iterator<Item = &Vote> {
+        self.votes.iter().filter(|vote| vote.outvotes())
+    }
+}
