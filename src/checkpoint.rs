@@ -167,7 +167,7 @@ impl Checkpoint {
     /// Derives index and tokenizer from the documents.
     fn derive(&mut self, vocabularies: BTreeMap<String, Arc<Vocabulary>>) {
         let files = tokenizer::VOCABULARY_FILES.into_iter().filter(|f| self.has_file(f)).map(str::to_owned).collect();
-        self.tokenizer = Tokenizer::of(&self.documents, vocabularies, files);
+        self.tokenizer = Tokenizer::new(&self.documents, vocabularies, files);
         let name = if self.documents.contains_key(INDEX_NAME) {
             Some(INDEX_NAME.to_owned())
         } else {
@@ -175,7 +175,7 @@ impl Checkpoint {
             self.documents.keys().find(|name| Index::is_index(name)).or_else(pickles).cloned()
         };
         if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
-            self.index = Some(Index::of(document));
+            self.index = Some(Index::from_document(document));
             // The index reports these itself, under a kind of its own.
             document.faults.retain(|f| f.kind != FaultKind::DuplicateJsonKey);
         }

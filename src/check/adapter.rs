@@ -21,8 +21,8 @@ type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
 /// Faults of the adapter in this directory; none when there is none.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let Some(adapter) = Adapter::of(checkpoint) else { return Vec::new() };
+pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return Vec::new() };
     let mut faults = Vec::new();
     // AdapterHub's library gives its own, other files the same name.
     if adapter.config().is_some_and(|config| config.get("peft_type").is_none() && config.get("model_class").is_some()) {
@@ -85,7 +85,7 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
             }
         }
     }
-    let targets = Targets::of(config);
+    let targets = Targets::from_config(config);
     let vectors = modules.values().filter(|module| module.contains_key(&MatrixRole::Magnitude)).count();
     let alike = vectors == 0 || vectors == modules.len();
     let trained = if targets.is_uniform() { trained_rank(&modules) } else { None };

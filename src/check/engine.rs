@@ -35,9 +35,9 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
-    faults.extend(index::compare(checkpoint));
-    faults.extend(modules::compare(checkpoint));
-    faults.extend(adapter::compare(checkpoint));
+    faults.extend(index::faults(checkpoint));
+    faults.extend(modules::faults(checkpoint));
+    faults.extend(adapter::faults(checkpoint));
     let judged = judge::judge(checkpoint, knowledge, versions, &Stored::of(checkpoint));
     faults.extend(judged.faults);
     let config = checkpoint.config();
@@ -51,7 +51,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint);
-    faults.extend(tokens::compare(checkpoint, rows));
+    faults.extend(tokens::faults(checkpoint, rows));
     let opened = outcome.architecture.as_deref().and_then(|name| {
         let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
         let config =
@@ -88,7 +88,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not chosen".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
-    policy::apply(&knowledge.policy, checkpoint, &mut outcome);
+    policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
 }
 

@@ -50,7 +50,7 @@ pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
 
 /// Faults between index, shards and file names.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let mut faults = Vec::new();
     match &checkpoint.index {
         Some(_) => with_index(checkpoint, &mut faults),
@@ -112,7 +112,7 @@ fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
     let is_there = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
     let absent: Vec<_> =
         referenced.iter().filter(|(name, _)| !is_there(name)).map(|(n, (c, t))| (*n, *c, *t)).collect();
-    let lookalikes = Lookalikes::of(checkpoint);
+    let lookalikes = Lookalikes::new(checkpoint);
     let all_absent = absent.len() == referenced.len();
     if all_absent {
         let first = absent.first().map_or("", |(name, ..)| *name);
@@ -207,7 +207,7 @@ fn strays(
             }
         }
     }
-    let lookalikes = Lookalikes::of(checkpoint);
+    let lookalikes = Lookalikes::new(checkpoint);
     let missed: BTreeSet<&str> = referenced.keys().filter_map(|name| lookalikes.get(name)).collect();
     for name in shard_names(checkpoint) {
         // Under a name that differs in case only it is missing already.
@@ -333,7 +333,7 @@ type Referenced<'i> = BTreeMap<&'i str, (usize, &'i str)>;
 struct Lookalikes<'c>(BTreeMap<String, Vec<&'c str>>);
 
 impl<'c> Lookalikes<'c> {
-    fn of(checkpoint: &'c Checkpoint) -> Self {
+    fn new(checkpoint: &'c Checkpoint) -> Self {
         let mut names: BTreeMap<String, Vec<&str>> = BTreeMap::new();
         for name in checkpoint.shards.keys() {
             names.entry(folded(name)).or_default().push(name);

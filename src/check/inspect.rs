@@ -123,7 +123,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         tensors,
         dtypes,
         modules: modules(checkpoint, tensors),
-        config: checkpoint.config().map(said),
+        config: checkpoint.config().map(config_summary),
         classes: Vec::new(),
         votes: None,
         proven: Value::Null,
@@ -209,7 +209,7 @@ fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
     let Some(tied) = alike.get_mut(..tied) else { return };
     tied.sort_by_cached_key(|r| {
         let expected = r.architecture.expect_given(&r.architecture.start(), &evidence);
-        let fit = expected.map(|e| Fit::of(&e, &load::in_model(&e, stored)));
+        let fit = expected.map(|e| Fit::new(&e, &load::in_model(&e, stored)));
         fit.map_or(usize::MAX, |fit| {
             fit.expected.saturating_add(fit.stored).saturating_sub(fit.found).saturating_add(fit.mismatched)
         })
@@ -239,7 +239,7 @@ fn parts(
     let evidence = stored.evidence();
     let distance = |config: &Value| {
         let expected = whole.expect_given(config, &evidence).ok()?;
-        let fit = Fit::of(&expected, &load::in_model(&expected, stored));
+        let fit = Fit::new(&expected, &load::in_model(&expected, stored));
         Some(fit.expected.saturating_add(fit.stored).saturating_sub(fit.found.saturating_mul(2)))
     };
     for (prefix, config) in alike.into_iter().flat_map(|r| &r.parts) {
@@ -279,12 +279,12 @@ fn proven(architecture: Architecture<'_>, votes: &Votes, given: bool) -> Value {
     }
     let open: BTreeSet<&String> = votes.undecided.iter().flat_map(|u| &u.pointers).filter(|_| !given).collect();
     for vote in votes.votes.iter().filter(|v| v.votes_for >= v.votes_against && !open.contains(&v.pointer)) {
-        votes.put(&mut config, vote);
+        votes.apply(vote, &mut config);
     }
     config
 }
 
-fn said(config: &Value) -> ConfigSummary {
+fn config_summary(config: &Value) -> ConfigSummary {
     let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).map(str::to_owned);
     ConfigSummary {
         class: text("/architectures/0"),

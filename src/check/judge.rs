@@ -70,7 +70,7 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let mut faults: Vec<Fault> = unknown(config, &built, versions);
     if in_doubt(&built) {
         // A known class says more of its layers than they do of one another.
-        faults.extend(layers::compare(stored.names()));
+        faults.extend(layers::faults(stored.names()));
     }
     let mut candidates: Vec<Candidate<'_>> = Vec::new();
     let (is_plain, mut sized) = (matches!(said, DeclaredScheme::Plain), None);
@@ -102,7 +102,7 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
                     rest: finished(checkpoint, &target, rest),
                 });
                 if let Some(report) = report.as_ref().filter(|_| sized.is_none() && target.leads && is_plain) {
-                    sized = size::compare(checkpoint, architecture, config, &expected, stored, report);
+                    sized = size::fault(checkpoint, architecture, config, &expected, stored, report);
                 }
                 candidates.push(Candidate { target, expected, quantised, report, explained });
             }

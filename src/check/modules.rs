@@ -154,7 +154,7 @@ fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
 
 /// Faults of every `auto_map` entry.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let (entries, mut faults) = read(checkpoint);
     let origin = origin(checkpoint, &entries);
     let mut roots: BTreeSet<&str> = BTreeSet::new();

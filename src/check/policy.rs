@@ -6,7 +6,7 @@ use crate::checkpoint::Checkpoint;
 use crate::knowledge::settings::Policy;
 
 /// Regrades findings and sets those aside that are accepted.
-pub(super) fn apply(policy: &Policy, checkpoint: &Checkpoint, outcome: &mut Outcome) {
+pub(super) fn apply_policy(policy: &Policy, checkpoint: &Checkpoint, outcome: &mut Outcome) {
     if policy.is_empty() {
         return;
     }

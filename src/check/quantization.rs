@@ -5,8 +5,8 @@
 //! the wrapping alone is said of the stored tensors, with or without a known class.
 
 mod config;
-mod judge;
 mod module;
+mod shapes;
 mod skipped;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,8 +17,8 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 use crate::knowledge::expression::glob;
 use crate::knowledge::quantization::{AppliedScheme, DeclaredScheme, Scheme};
-use judge::{ModuleJudge, ModuleState, QuantizedModule, plain_of};
 use module::{TensorLookup, kind};
+use shapes::{ModuleShapes, ModuleState, QuantizedModule, plain_of};
 use skipped::SkippedModules;
 
 pub use config::undeclared;
@@ -56,16 +56,16 @@ impl<'a> Quantised<'a> {
         stored: &'a Stored,
     ) -> Self {
         let scheme = applied.scheme();
-        let tensors = TensorLookup::of(checkpoint, stored);
-        let skipped = SkippedModules::of(applied);
-        let judge = ModuleJudge { applied, expected, skipped: &skipped };
+        let tensors = TensorLookup::new(checkpoint, stored);
+        let skipped = SkippedModules::new(applied);
+        let shapes = ModuleShapes { applied, expected, skipped: &skipped };
         let found = module::group(scheme, &tensors, |name| plain_of(expected, name).is_some());
-        let (mut modules, fits) = judge.judge(found);
+        let (mut modules, fits) = shapes.compare(found);
         let kinds = modules.iter().map(|m| kind(m.module.name)).collect();
         if applied.all_alike() {
             let quantised: BTreeSet<&str> = modules.iter().map(|m| m.module.name).collect();
             let plain = module::left_plain(scheme, &tensors, &kinds, &quantised, &skipped);
-            modules.extend(plain.into_iter().map(|module| judge.left_plain(module)));
+            modules.extend(plain.into_iter().map(|module| shapes.left_plain(module)));
         }
         Self { applied, modules, kinds, skipped, fits, has_weights: !stored.is_empty() }
     }

@@ -101,7 +101,7 @@ pub fn open_tokenizer(
 ///
 /// `rows` are the stored rows of the token embedding, where they are known.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     let tokenizer = &checkpoint.tokenizer;
     let mut faults = Vec::new();
     let decoder = "tokenizer_config.json";

@@ -102,7 +102,7 @@ impl ContentsReader<'_> {
                 continue;
             }
             let mut digest = Sha256::new();
-            let mut numbers = NonFiniteCounter::of(tensor.dtype);
+            let mut numbers = NonFiniteCounter::new(tensor.dtype);
             let mut at = tensor.begin;
             let start = self.shard.data_start.saturating_add(tensor.begin);
             each_chunk(opened, start, tensor.len(), &mut buffer, |bytes| {

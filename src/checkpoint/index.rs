@@ -48,7 +48,7 @@ impl Index {
 
     /// Reads the index that `document` holds.
     #[must_use]
-    pub fn of(document: &Document) -> Self {
+    pub fn from_document(document: &Document) -> Self {
         let mut index = Self { document: document.name.clone(), ..Self::default() };
         let mut faults = Faults::default();
         let Some(Value::Object(root)) = &document.value else {

@@ -36,7 +36,7 @@ pub struct Identity {
 impl Identity {
     /// Reads it off a file's metadata.
     #[must_use]
-    pub fn of(metadata: &Metadata) -> Self {
+    pub fn from_metadata(metadata: &Metadata) -> Self {
         Self {
             dev: metadata.dev(),
             ino: metadata.ino(),
@@ -184,7 +184,7 @@ pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
     if let Some(what) = irregular(&metadata) {
         return Err(not_regular(what));
     }
-    let identity = Identity::of(&metadata);
+    let identity = Identity::from_metadata(&metadata);
     if identity.size > cap {
         return Err(OpenError::TooLarge { path: path.to_owned(), size: identity.size, cap });
     }

@@ -77,7 +77,7 @@ impl Tokenizer {
     ///
     /// `files` names the vocabulary files there are, whether they could be read or not.
     #[must_use]
-    pub fn of(
+    pub fn new(
         documents: &BTreeMap<String, Document>,
         mut vocabularies: BTreeMap<String, Arc<Vocabulary>>,
         files: BTreeSet<String>,

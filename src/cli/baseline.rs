@@ -16,7 +16,7 @@ use super::settings::Resolved;
 const NAMED: usize = 10;
 
 /// Sets the findings aside that are in the baselines, which are written first if that is asked for.
-pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool) -> anyhow::Result<()> {
+pub fn apply_baselines(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool) -> anyhow::Result<()> {
     let mut of_file: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
     for (at, resolved) in by.iter().enumerate() {
         match &resolved.baseline {
@@ -33,7 +33,7 @@ pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool)
         let older = read(file, &name, write)?;
         let baseline = if write {
             let looked: Vec<&CheckpointReport> = here.iter().filter_map(|at| reports.get(*at)).collect();
-            let mut baseline = Baseline::of(looked.iter().copied(), &folder);
+            let mut baseline = Baseline::from_reports(looked.iter().copied(), &folder);
             if let Some(older) = older {
                 baseline.keep(older, &looked, &folder, &asked);
             }
@@ -41,7 +41,7 @@ pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool)
             output::note(&format!("{name}: {} findings", baseline.len()));
             baseline
         } else {
-            older.unwrap_or_else(|| Baseline::of(std::iter::empty(), &folder))
+            older.unwrap_or_else(|| Baseline::from_reports(std::iter::empty(), &folder))
         };
         let mut gone = Vec::new();
         for at in here {

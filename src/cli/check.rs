@@ -65,7 +65,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         return Ok(if fixed { FINDINGS } else { CLEAN });
     }
     let by: Vec<Rc<Resolved>> = looked.iter().map(|l| Rc::clone(&l.by)).collect();
-    baseline::apply(&mut reports, &by, args.baseline.write_baseline)?;
+    baseline::apply_baselines(&mut reports, &by, args.baseline.write_baseline)?;
     let fails =
         |(report, by): (&CheckpointReport, &Rc<Resolved>)| report.counts.worst().is_some_and(|w| w >= by.fail_on);
     let failed = reports.iter().zip(&by).any(fails);
@@ -98,7 +98,7 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
 }
 
 fn look(dir: PathBuf, args: &CheckArgs, settings: &mut SettingsResolver) -> anyhow::Result<Checked> {
-    let by = settings.of(&dir)?;
+    let by = settings.resolve(&dir)?;
     let open = |dir: &Path| {
         let mut checkpoint = Checkpoint::open(dir).with_context(|| dir.display().to_string())?;
         if args.deep {

@@ -68,17 +68,17 @@ impl Typed {
 /// Finds the settings of checkpoints, and reads each file once.
 pub struct SettingsResolver {
     typed: Typed,
-    read: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
+    resolved: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
     told: BTreeSet<PathBuf>,
 }
 
 impl SettingsResolver {
     pub fn new(typed: Typed) -> Self {
-        Self { typed, read: BTreeMap::new(), told: BTreeSet::new() }
+        Self { typed, resolved: BTreeMap::new(), told: BTreeSet::new() }
     }
 
     /// What is meant for the checkpoint in this directory.
-    pub fn of(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
+    pub fn resolve(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
         let file = if self.typed.isolated {
             None
         } else if let Some(config) = &self.typed.config {
@@ -93,20 +93,20 @@ impl SettingsResolver {
             }
             found.file
         };
-        if let Some(resolved) = self.read.get(&file) {
+        if let Some(resolved) = self.resolved.get(&file) {
             return Ok(Rc::clone(resolved));
         }
-        let resolved = Rc::new(self.resolve(file.clone())?);
-        self.read.insert(file, Rc::clone(&resolved));
+        let resolved = Rc::new(self.read(file.clone())?);
+        self.resolved.insert(file, Rc::clone(&resolved));
         Ok(resolved)
     }
 
     /// Every settings file that was found, and what it means.
     pub fn all(&self) -> impl Iterator<Item = &Rc<Resolved>> {
-        self.read.values()
+        self.resolved.values()
     }
 
-    fn resolve(&self, file: Option<PathBuf>) -> anyhow::Result<Resolved> {
+    fn read(&self, file: Option<PathBuf>) -> anyhow::Result<Resolved> {
         let typed = &self.typed;
         let chain = file.as_deref().map(Chain::load).transpose()?.unwrap_or_default();
         let folder = typed.rules.clone().or_else(|| chain.rules());

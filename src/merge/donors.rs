@@ -21,7 +21,7 @@ pub(super) fn open(
     let mut donors = Vec::new();
     let mut at_rest = Vec::new();
     for (role, dir) in &request.donors {
-        let seen = AtRest::see(dir);
+        let seen = AtRest::record(dir);
         let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
         at_rest.push(seen?);
         let checkpoint = Arc::new(checkpoint);

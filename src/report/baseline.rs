@@ -56,7 +56,7 @@ impl Baseline {
     }
 
     /// What was found in these checkpoints, for a file in `folder`.
-    pub fn of<'r>(reports: impl Iterator<Item = &'r CheckpointReport>, folder: &Path) -> Self {
+    pub fn from_reports<'r>(reports: impl Iterator<Item = &'r CheckpointReport>, folder: &Path) -> Self {
         let mut findings: Vec<BaselineEntry> = reports.flat_map(|report| entries(report, folder)).collect();
         findings.sort();
         Self { schema: SCHEMA, findings }

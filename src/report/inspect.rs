@@ -139,7 +139,7 @@ fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
         .map(|v| {
             [
                 name(v.pointer.trim_start_matches('/')).replace('/', "."),
-                said(v),
+                config_value(v),
                 name(&v.voted_value.to_string()),
                 tally(v),
                 v.evidence.first().map(|w| name(&w.to_string())).unwrap_or_default(),
@@ -169,7 +169,7 @@ fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
 }
 
 /// What the config says, marked where the tensors say otherwise or it says nothing.
-fn said(vote: &Vote) -> String {
+fn config_value(vote: &Vote) -> String {
     let value = name(&vote.config_value.to_string());
     let value = if vote.given { value } else { format!("({value})") };
     if vote.outvotes() { format!("{value} ✗") } else { value }

@@ -12,7 +12,7 @@ use super::error::{ApplyError, io_at};
 use super::plan::{Plan, PlannedShard, PlannedTensor, TensorRef, TensorSource};
 use super::staging::Staging;
 use super::stop::interrupted;
-use super::system::{ask_for_room, copy_in_kernel, create, explain};
+use super::system::{ask_for_room, copy_in_kernel, create, with_figures};
 use super::transform;
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::open_regular;
@@ -28,7 +28,7 @@ pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMu
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let files = plan.files.iter().map(|f| f.bytes.len() as u64);
     let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
-    let explained = |error| explain(error, parent, &sizes);
+    let explained = |error| with_figures(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
     // Not before: what a killed run left may be what fills the disk, and is cleared now.
     let written = ask_for_room(parent, &sizes)

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::apply::write_shard;
 use super::error::{ApplyError, RepairError, io_at};
 use super::repair::{Change, Content, Repair};
-use super::system::{create, explain, look};
+use super::system::{create, look, with_figures};
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
 use crate::checkpoint::{FaultKind, Shard};
 
@@ -69,7 +69,7 @@ pub(super) fn write_content(path: &Path, content: &Content, progress: &mut dyn F
 /// Gives an error of the system its figures, in the words of a repair.
 pub(super) fn explain_error(error: RepairError, dir: &Path, repair: &Repair) -> RepairError {
     let RepairError::Apply(error) = error else { return error };
-    match explain(error, dir, &repair.sizes()) {
+    match with_figures(error, dir, &repair.sizes()) {
         ApplyError::Space { path, cause, need, have } => RepairError::Space { path, cause, need, have },
         other => other.into(),
     }

@@ -28,7 +28,7 @@ impl AtRest {
     ///
     /// # Errors
     /// [`ApplyError::Io`] when the directory cannot be listed, and [`ApplyError::Interrupted`].
-    pub fn see(dir: &Path) -> Result<Self, ApplyError> {
+    pub fn record(dir: &Path) -> Result<Self, ApplyError> {
         interrupted()?;
         let mut files = BTreeMap::new();
         for name in names(dir).map_err(io_at(dir, "listing"))? {
@@ -39,7 +39,7 @@ impl AtRest {
                 && metadata.is_file()
                 && !hidden
             {
-                files.insert(path, Identity::of(&metadata));
+                files.insert(path, Identity::from_metadata(&metadata));
             }
         }
         Ok(Self { files })
@@ -53,7 +53,7 @@ impl AtRest {
         for (path, was) in &self.files {
             let changed = |reason: &str| ApplyError::Changed { path: path.clone(), reason: reason.to_owned() };
             match fs::metadata(path) {
-                Ok(now) if Identity::of(&now) == *was => {}
+                Ok(now) if Identity::from_metadata(&now) == *was => {}
                 Ok(now) if now.len() < was.size => return Err(changed("was cut short")),
                 Ok(_) => return Err(changed("changed")),
                 Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(changed("was removed")),

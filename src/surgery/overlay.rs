@@ -25,7 +25,7 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
     let original = &repair.original;
     let out = check_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
-    let donor = AtRest::see(&original.root)?;
+    let donor = AtRest::record(&original.root)?;
     let explained = |error| explain_error(error, parent, repair);
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
     let written = ask_for_room(parent, &repair.sizes())

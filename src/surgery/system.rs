@@ -101,7 +101,7 @@ fn room(dir: &Path) -> Result<Option<Room>, ApplyError> {
 /// Refuses files of these sizes that will not fit into `dir`, before the first byte of them is written.
 ///
 /// Each file takes whole blocks. What else a file system needs is its own affair, so this can be a little too
-/// hopeful: [`explain`] has the word when writing fails.
+/// hopeful: [`with_figures`] has the word when writing fails.
 pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> {
     let Some(room) = room(dir)? else { return Ok(()) };
     let blocks = sizes.iter().fold(0_u64, |n, size| n.saturating_add(size.div_ceil(room.block)));
@@ -114,7 +114,7 @@ pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> 
 
 /// Gives an error of the system its figures: files of these sizes were to be written into `dir`, and this is the room
 /// there is. To be asked when what was written is removed again.
-pub(super) fn explain(error: ApplyError, dir: &Path, sizes: &[u64]) -> ApplyError {
+pub(super) fn with_figures(error: ApplyError, dir: &Path, sizes: &[u64]) -> ApplyError {
     let ApplyError::Io { path, doing, error } = error else { return error };
     match Errno::from_io_error(&error) {
         Some(Errno::NOSPC | Errno::DQUOT) => match room(dir) {

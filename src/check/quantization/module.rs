@@ -18,7 +18,7 @@ pub(super) struct Held<'c> {
 pub(super) struct TensorLookup<'c>(BTreeMap<&'c str, Held<'c>>);
 
 impl<'c> TensorLookup<'c> {
-    pub(super) fn of(checkpoint: &'c Checkpoint, stored: &'c Stored) -> Self {
+    pub(super) fn new(checkpoint: &'c Checkpoint, stored: &'c Stored) -> Self {
         let mut tensors: BTreeMap<&str, Held<'_>> = stored.names().map(|name| (name, Held::default())).collect();
         for (_, tensor) in checkpoint.tensors() {
             if let Some(held) = tensors.get_mut(tensor.name.as_str()) {

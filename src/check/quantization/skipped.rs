@@ -26,7 +26,7 @@ enum SkipPattern<'a> {
 }
 
 impl<'a> SkippedModules<'a> {
-    pub(super) fn of(applied: &'a AppliedScheme<'_>) -> Self {
+    pub(super) fn new(applied: &'a AppliedScheme<'_>) -> Self {
         let pattern = |text: &'a str| match text.strip_prefix("re:") {
             Some(regex) if regex.len() > PATTERN_CAP => SkipPattern::Regex(None),
             Some(regex) => SkipPattern::Regex(Regex::new(&format!("^(?:{regex})")).ok()),

@@ -173,7 +173,7 @@ pub(super) fn by_names(numbered: &Numbered, key: &ProbedKey, base: &Expected) ->
     let (Some(value), Some(other)) = (key.value.as_u64(), key.other.as_u64()) else { return tally };
     let (larger, smaller) = if value > other { (base, &key.built) } else { (&key.built, base) };
     let differ = larger.tensors.keys().filter(|name| !smaller.tensors.contains_key(*name)).map(String::as_str);
-    for (pattern, last) in Numbered::of(differ).iter() {
+    for (pattern, last) in Numbered::from_names(differ).iter() {
         if let Some(stored) = numbered.largest(pattern)
             && let Some(wanted) = value.max(other).checked_add(stored).and_then(|n| n.checked_sub(last))
             && wanted > 0

@@ -23,7 +23,7 @@ pub fn vote(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> 
 pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Stored, changed: bool) -> Option<Votes> {
     let mut space = Space::new(architecture, stored);
     let mut state = SearchState::new(&mut space, config.clone())?;
-    let (said, before) = (state.built.config.clone(), Fit::of(&state.built, &space.stored));
+    let (said, before) = (state.built.config.clone(), Fit::new(&state.built, &space.stored));
     space.learn(&said);
     for _ in 0..PASSES {
         let distance = state.distance;
@@ -40,7 +40,7 @@ pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Store
     } else {
         tally::votes(&space, &state, config, &said)
     };
-    let after = Fit::of(&state.built, &space.stored);
+    let after = Fit::new(&state.built, &space.stored);
     let resolved = state.built.config;
     Some(Votes { votes, undecided, config: state.config, resolved, before, after, exhausted: space.exhausted() })
 }

@@ -38,7 +38,7 @@ impl<'a> Space<'a> {
     /// The names are those of the file until [`Self::rename`] is told what the class has.
     pub fn new(architecture: Architecture<'a>, files: &'a Stored) -> Self {
         let evidence = files.evidence();
-        let numbered = Numbered::of(evidence.iter().map(|(name, _)| name));
+        let numbered = Numbered::from_names(evidence.iter().map(|(name, _)| name));
         let stored = evidence.clone();
         Self { architecture, files, evidence, stored, numbered, known: BTreeSet::new(), spent: Cell::new(0) }
     }
@@ -48,7 +48,7 @@ impl<'a> Space<'a> {
         let stored = load::in_model(expected, self.files);
         let changed = !stored.iter().eq(self.stored.iter());
         if changed {
-            self.numbered = Numbered::of(stored.iter().map(|(name, _)| name));
+            self.numbered = Numbered::from_names(stored.iter().map(|(name, _)| name));
             self.stored = stored;
         }
         changed
@@ -203,7 +203,7 @@ pub(in crate::check) fn with(config: &Value, resolved: &Value, pointer: &str, va
 pub(super) struct Numbered(BTreeMap<String, u64>);
 
 impl Numbered {
-    pub fn of<'n>(names: impl Iterator<Item = &'n str>) -> Self {
+    pub fn from_names<'n>(names: impl Iterator<Item = &'n str>) -> Self {
         let mut largest: BTreeMap<String, u64> = BTreeMap::new();
         for name in names {
             for (pattern, number) in patterns(name) {

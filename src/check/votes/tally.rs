@@ -155,7 +155,7 @@ fn undecided(keys: &[ProbedKey], state: &SearchState) -> Vec<Undecided> {
     let mut report = |change: &[(usize, i8)]| {
         if vanishes(change) && change.iter().all(|(at, _)| !taken.contains(at)) {
             taken.extend(change.iter().map(|(at, _)| *at));
-            found.extend(Undecided::of(change, keys));
+            found.extend(Undecided::from_scaling(change, keys));
         }
     };
     for (n, &a) in loose.iter().enumerate() {
@@ -180,7 +180,7 @@ fn undecided(keys: &[ProbedKey], state: &SearchState) -> Vec<Undecided> {
 
 impl Undecided {
     /// From which values can be scaled together, each with the sign of its exponent.
-    fn of(change: &[(usize, i8)], keys: &[ProbedKey]) -> Option<Self> {
+    fn from_scaling(change: &[(usize, i8)], keys: &[ProbedKey]) -> Option<Self> {
         // Name the odd one out first: with it, every other forms a product.
         let positive = change.iter().filter(|(_, sign)| *sign > 0).count();
         let odd = if positive.saturating_mul(2) > change.len() { -1 } else { 1 };

@@ -81,7 +81,7 @@ pub struct Fit {
 impl Fit {
     /// Of a class and the tensors stored under its names.
     #[must_use]
-    pub fn of(expected: &Expected, stored: &Evidence) -> Self {
+    pub fn new(expected: &Expected, stored: &Evidence) -> Self {
         let mut fit = Self { stored: stored.iter().count(), ..Self::default() };
         for (name, tensor) in &expected.tensors {
             let here = stored.contains(name);
@@ -136,7 +136,7 @@ pub struct Votes {
 
 impl Votes {
     /// Puts what a vote says into another config; a list it is an element of comes along whole.
-    pub fn put(&self, config: &mut Value, vote: &Vote) {
+    pub fn apply(&self, vote: &Vote, config: &mut Value) {
         let ends = vote.pointer.match_indices('/').map(|(at, _)| at).skip(1);
         let outer = ends.filter_map(|end| vote.pointer.get(..end));
         match outer.filter_map(|p| Some((p, self.resolved.pointer(p)?))).find(|(_, value)| value.is_array()) {

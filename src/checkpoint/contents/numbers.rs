@@ -13,7 +13,7 @@ pub(super) struct NonFiniteCounter {
 }
 
 impl NonFiniteCounter {
-    pub(super) fn of(dtype: Dtype) -> Self {
+    pub(super) fn new(dtype: Dtype) -> Self {
         Self { dtype, nan: 0, infinite: 0, first: None, seen: 0 }
     }
 
@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     fn counts(dtype: Dtype, bytes: &[u8]) -> (u64, u64, Option<u64>) {
-        let mut numbers = NonFiniteCounter::of(dtype);
+        let mut numbers = NonFiniteCounter::new(dtype);
         // In two pieces, as a large tensor comes.
         let (one, two) = bytes.split_at(8);
         numbers.add(one);

@@ -27,7 +27,7 @@ impl Document {
     pub fn set(&self, pointer: &str, value: &Value) -> Option<Splice> {
         let text = self.text.as_deref()?;
         let steps = pointer::steps(pointer)?;
-        let layout = Layout::of(text);
+        let layout = Layout::from_text(text);
         let mut at = start_of(text);
         for (depth, step) in steps.iter().enumerate() {
             let Some(container) = Container::read(text, at) else {

@@ -128,7 +128,7 @@ impl DocumentReader<'_> {
             self.faults = faults;
             return value.filter(|_| error.is_none());
         }
-        self.explain(text, &error);
+        self.push_scan_fault(text, &error);
         value.filter(|_| error.kind == ScanErrorKind::Trailing)
     }
 
@@ -144,9 +144,9 @@ impl DocumentReader<'_> {
                 Ok(None) => break None,
                 Err(error) => break Some(error),
             };
-            duplicates.see(&token, &span, &builder);
-            self.see(&token, &span, &builder);
-            builder.see(&token);
+            duplicates.on_token(&token, &span, &builder);
+            self.on_token(&token, &span, &builder);
+            builder.on_token(&token);
         };
         for slip in &scanner.slips {
             let kind = match slip.kind {
@@ -173,7 +173,7 @@ impl DocumentReader<'_> {
     }
 
     /// Faults of single tokens.
-    fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
+    fn on_token(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
         let fault = match token {
             Token::NonFinite(literal) => Fault::new(FaultKind::NonFiniteNumber).with("literal", *literal),
             Token::Number(literal) if is_huge(literal) => {
@@ -188,7 +188,7 @@ impl DocumentReader<'_> {
     }
 
     /// Turns what ended a pass early into a fault.
-    fn explain(&mut self, text: &str, error: &ScanError) {
+    fn push_scan_fault(&mut self, text: &str, error: &ScanError) {
         let found = text.get(error.span.clone()).unwrap_or_default().trim_end();
         let place = self.place(error.span.start..error.span.start.saturating_add(found.len()));
         self.faults.push(match error.kind {

@@ -97,7 +97,7 @@ impl Chain {
         let grades = self.0.iter().flat_map(|s| &s.settings.severity).map(|(word, to)| (word.as_str(), *to));
         rules.regrade(&grades.collect::<Vec<_>>()).map_err(typed)?;
         rules.choose(&choices).map_err(typed)?;
-        Policy::of(&self.0, rules)
+        Policy::from_sources(&self.0, rules)
     }
 }
 

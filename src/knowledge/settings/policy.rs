@@ -55,13 +55,13 @@ struct Area {
 
 impl Policy {
     /// What the sources say, of which a later one has the last word.
-    pub(super) fn of(sources: &[SettingsSource], rules: &RuleSet) -> Result<Self, DataError> {
+    pub(super) fn from_sources(sources: &[SettingsSource], rules: &RuleSet) -> Result<Self, DataError> {
         let mut policy = Self::default();
         for source in sources {
             let codes = |word: &String| rules.codes(word).map_err(|e| source.wrong(word, e.to_string()));
             for (glob, said) in &source.settings.per_path {
                 let mut place = AreaSettings {
-                    area: Area::of(source, Some(glob))?,
+                    area: Area::new(source, Some(glob))?,
                     ignore: BTreeSet::new(),
                     severity: BTreeMap::new(),
                 };
@@ -87,7 +87,7 @@ impl Policy {
                     path: said.path.clone(),
                     reason: said.reason.clone(),
                     written: format!("{}: suppress[{number}]", source.name),
-                    area: Area::of(source, said.path.as_ref())?,
+                    area: Area::new(source, said.path.as_ref())?,
                 });
             }
         }
@@ -132,7 +132,7 @@ impl Suppression {
 }
 
 impl Area {
-    fn of(source: &SettingsSource, glob: Option<&String>) -> Result<Self, DataError> {
+    fn new(source: &SettingsSource, glob: Option<&String>) -> Result<Self, DataError> {
         let mut dir = source.dir.clone();
         let Some(written) = glob else { return Ok(Self { base: dir.clone(), dir, glob: None }) };
         let mut rest = written.trim_end_matches('/');

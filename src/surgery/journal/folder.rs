@@ -10,7 +10,7 @@ use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::lock::{self, Lock};
-use crate::surgery::system::{self, create, explain, look, retry, sync_dir};
+use crate::surgery::system::{self, create, look, retry, sync_dir, with_figures};
 
 /// Says that the folder is nothing for version control, as caches of other tools say it.
 const IGNORE: (&str, &str) = (".gitignore", "# made by ckpt-doctor, so that a repair can be undone\n*\n");
@@ -167,7 +167,7 @@ impl Folder {
             // Nothing is changed yet. What cannot be removed is finished by the next run.
             let _ = system::remove_file(&path);
             let _ = system::remove_file(&draft);
-            explain(error, &self.root, &[text.len() as u64]).into()
+            with_figures(error, &self.root, &[text.len() as u64]).into()
         })
     }
 

@@ -49,7 +49,7 @@ pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<(), Repai
 /// Writes the new files where they do not count yet.
 fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Result<Journal, RepairError> {
     let root = &repair.original.root;
-    let donor = AtRest::see(root)?;
+    let donor = AtRest::record(root)?;
     if folder.pending()?.is_some() {
         return Err(RepairError::Busy { path: root.clone(), holder: "one that was interrupted".to_owned() });
     }

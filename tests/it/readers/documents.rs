@@ -13,7 +13,7 @@ fn faults(text: impl AsRef<[u8]>) -> Vec<Fault> {
 
 fn index_faults(text: &str) -> Vec<Fault> {
     let document = Document::parse("model.safetensors.index.json", text.as_bytes());
-    Index::of(&document).faults
+    Index::from_document(&document).faults
 }
 
 fn utf16(text: &str, little: bool) -> Vec<u8> {

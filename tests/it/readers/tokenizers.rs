@@ -62,7 +62,7 @@ fn tokenizer(documents: Vec<Document>, model: Option<Vec<u8>>) -> Tokenizer {
         files.insert("tokenizer.model".into());
         vocabularies.insert("tokenizer.model".into(), Arc::new(Vocabulary::parse("tokenizer.model", &bytes).unwrap()));
     }
-    Tokenizer::of(&documents.into_iter().map(|d| (d.name.clone(), d)).collect(), vocabularies, files)
+    Tokenizer::new(&documents.into_iter().map(|d| (d.name.clone(), d)).collect(), vocabularies, files)
 }
 
 fn document(name: &str, value: &serde_json::Value) -> Document {

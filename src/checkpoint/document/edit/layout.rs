@@ -20,7 +20,7 @@ pub(super) struct Layout {
 
 impl Layout {
     /// Reads it off the first line break and the indentation that follows.
-    pub(super) fn of(text: &str) -> Self {
+    pub(super) fn from_text(text: &str) -> Self {
         let body = text.trim();
         let line = match body.find('\n').and_then(|at| body.get(..at)) {
             Some(first) if first.ends_with('\r') => Some("\r\n"),

@@ -84,7 +84,7 @@ impl ValueBuilder {
     }
 
     /// Takes one token.
-    pub(super) fn see(&mut self, token: &Token<'_>) {
+    pub(super) fn on_token(&mut self, token: &Token<'_>) {
         match token {
             Token::Key(key) => {
                 if let Some(Open::Object(_, next)) = self.stack.last_mut() {
@@ -113,7 +113,7 @@ impl ValueBuilder {
                 if self.skipping == Some(self.stack.len()) {
                     self.skipping = None;
                 }
-                if inside { self.advance() } else { self.put(value) }
+                if inside { self.advance() } else { self.push_value(value) }
             }
             Token::String(text) => self.leaf(|| Value::String(text.decode().0.into_owned())),
             Token::Number(literal) => self.leaf(|| number(literal)),
@@ -132,10 +132,10 @@ impl ValueBuilder {
     }
 
     fn leaf(&mut self, make: impl FnOnce() -> Value) {
-        if self.skipping.is_some() { self.advance() } else { self.put(make()) }
+        if self.skipping.is_some() { self.advance() } else { self.push_value(make()) }
     }
 
-    fn put(&mut self, value: Value) {
+    fn push_value(&mut self, value: Value) {
         let weight = value.as_str().map_or(0, str::len).checked_div(NODE_BYTES).unwrap_or(0);
         self.nodes = self.nodes.saturating_add(weight).saturating_add(1);
         if !self.overflowed() {

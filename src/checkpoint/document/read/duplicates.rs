@@ -54,7 +54,7 @@ impl<'t> Duplicates<'t> {
     }
 
     /// Takes one token; `builder` has not seen it yet.
-    pub(super) fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
+    pub(super) fn on_token(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
         match token {
             Token::BeginObject => self.frames.push(self.keys.len()),
             Token::Key(key) => self.keys.push((self.hasher.hash_one(&*key.decode().0), span.start)),
@@ -129,7 +129,7 @@ fn same(a: &str, b: &str) -> bool {
         let mut scanner = Scanner::lenient(text, 0);
         let mut builder = ValueBuilder::new(Vec::new(), COMPARE_CAP);
         while let Ok(Some((token, _))) = scanner.next() {
-            builder.see(&token);
+            builder.on_token(&token);
         }
         builder.finish()
     };

@@ -59,7 +59,7 @@ fn places_are_found_again(document: &Document) {
 /// The laws for an index.
 pub fn index(bytes: &[u8]) {
     let document = hold(INDEX_NAME, bytes);
-    let index = Index::of(&document);
+    let index = Index::from_document(&document);
     super::faults_are_placed(&index.faults, INDEX_NAME, document.text.as_deref());
     assert_eq!(index.unread, !document.value.as_ref().is_some_and(Value::is_object));
     let stated = document.get("/weight_map").and_then(Value::as_object);
@@ -109,7 +109,7 @@ pub fn tokenizer(files: &[(&str, &[u8])]) {
             vocabularies.insert((*name).to_owned(), Arc::new(vocabulary));
         }
     }
-    let tokenizer = Tokenizer::of(&documents, vocabularies, names);
+    let tokenizer = Tokenizer::new(&documents, vocabularies, names);
     for (token, id) in tokenizer.added() {
         assert_eq!(tokenizer.id_of(token), Some(*id));
     }

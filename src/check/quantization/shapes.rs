@@ -58,7 +58,7 @@ fn same(a: &[u64], b: &[u64]) -> bool {
 }
 
 /// Judges modules by one config and, where it is known, one class.
-pub(super) struct ModuleJudge<'j> {
+pub(super) struct ModuleShapes<'j> {
     pub(super) applied: &'j AppliedScheme<'j>,
     pub(super) expected: Option<&'j Expected>,
     pub(super) skipped: &'j SkippedModules<'j>,
@@ -75,20 +75,20 @@ struct Attempt {
     wrong: usize,
 }
 
-impl ModuleJudge<'_> {
+impl ModuleShapes<'_> {
     /// Every module with its state and shapes, and what else would explain shapes that do not fit: `bits 8`.
-    pub(super) fn judge<'c>(&self, found: Vec<StoredModule<'c>>) -> (Vec<QuantizedModule<'c>>, Option<String>) {
+    pub(super) fn compare<'c>(&self, found: Vec<StoredModule<'c>>) -> (Vec<QuantizedModule<'c>>, Option<String>) {
         let scheme = self.applied.scheme();
         let classes: Vec<Option<&[u64]>> =
             found.iter().map(|m| plain_of(self.expected, &format!("{}{}", m.name, scheme.plain))).collect();
         let mut values = self.applied.values().to_vec();
         let mut best = self.attempt(&found, &classes, &values);
         if best.wrong > 0
-            && let Some((_, chosen, attempt)) = self.explain(&found, &classes, &values, true)
+            && let Some((_, chosen, attempt)) = self.fitting_parameter(&found, &classes, &values, true)
         {
             (values, best) = (chosen, attempt);
         }
-        let fits = (best.wrong > 0).then(|| self.explain(&found, &classes, &values, false)).flatten();
+        let fits = (best.wrong > 0).then(|| self.fitting_parameter(&found, &classes, &values, false)).flatten();
         let mut required: BTreeMap<Vec<&str>, Vec<bool>> = BTreeMap::new();
         let judged = found.into_iter().zip(classes).zip(best.shapes).map(|((module, class), (plain, shapes))| {
             let state =
@@ -114,7 +114,7 @@ impl ModuleJudge<'_> {
     }
 
     /// Another value of one parameter by which all shapes fit: what it is called, and what it makes of the modules.
-    fn explain(
+    fn fitting_parameter(
         &self,
         found: &[StoredModule<'_>],
         classes: &[Option<&[u64]>],
