@@ -44,61 +44,16 @@ pub fn entries(checkpoint: &Checkpoint) -> Vec<AutoMapEntry> {
     read(checkpoint).0
 }
 
-/// Every entry, and a fault for each that is none.
+/// Every entry, and a fault for each that is malformed.
 fn read(checkpoint: &Checkpoint) -> (Vec<AutoMapEntry>, Vec<Fault>) {
-    let mut out = Vec::new();
-    let mut faults = Vec::new();
+    let mut maps = AutoMaps::default();
     for name in DOCUMENTS {
         let Some(value) = checkpoint.document(name).and_then(|d| d.value.as_ref()) else { continue };
         let mut pending = vec![(String::new(), value, 0_usize)];
         while let Some((pointer, value, depth)) = pending.pop() {
             let Value::Object(map) = value else { continue };
-            let mut malformed = |pointer: String, key: &str, found: &Value| {
-                // Strings have been escaped where they are shown; anything else is told by its kind.
-                let target = match found {
-                    Value::Array(_) => "a list".to_owned(),
-                    Value::Object(_) => "an object".to_owned(),
-                    other => other.to_string(),
-                };
-                let fault = Fault::new(FaultKind::AutoMapMalformed).at(Place::file(name).pointer(pointer));
-                faults.push(fault.with("key", key).with("target", target).with("dots", 0));
-            };
-            match map.get("auto_map") {
-                None | Some(Value::Null | Value::Object(_)) => {}
-                Some(other) => malformed(format!("{pointer}/auto_map"), "itself", other),
-            }
-            if let Some(Value::Object(auto_map)) = map.get("auto_map") {
-                if auto_map.len() > MAX_ENTRIES {
-                    malformed(format!("{pointer}/auto_map"), "itself", &Value::Object(serde_json::Map::new()));
-                }
-                for (key, target) in auto_map.iter().take(MAX_ENTRIES) {
-                    let base = pointer::join(&format!("{pointer}/auto_map"), key);
-                    let mut push = |pointer: String, target: &str| {
-                        let entry = AutoMapEntry {
-                            file: name.to_owned(),
-                            pointer,
-                            key: key.clone(),
-                            target: target.to_owned(),
-                            nested: depth > 0,
-                        };
-                        out.push(entry);
-                    };
-                    match target {
-                        Value::String(s) => push(base, s),
-                        // Slow and fast tokenizer; null for none.
-                        Value::Array(items) => {
-                            for (i, item) in items.iter().enumerate().take(MAX_ENTRIES) {
-                                match item {
-                                    Value::String(s) => push(format!("{base}/{i}"), s),
-                                    Value::Null => {}
-                                    other => malformed(format!("{base}/{i}"), key, other),
-                                }
-                            }
-                        }
-                        Value::Null => {}
-                        other => malformed(base, key, other),
-                    }
-                }
+            if let Some(auto_map) = map.get("auto_map") {
+                maps.read(name, &format!("{pointer}/auto_map"), auto_map, depth > 0);
             }
             // Sub-configs lie one or two levels down; statistics and vocabularies are not searched.
             if depth < 2 {
@@ -107,7 +62,63 @@ fn read(checkpoint: &Checkpoint) -> (Vec<AutoMapEntry>, Vec<Fault>) {
             }
         }
     }
-    (out, faults)
+    (maps.entries, maps.faults)
+}
+
+/// The `auto_map`s read so far.
+#[derive(Default)]
+struct AutoMaps {
+    entries: Vec<AutoMapEntry>,
+    faults: Vec<Fault>,
+}
+
+impl AutoMaps {
+    /// Reads the value of `auto_map` at `pointer` of a document.
+    fn read(&mut self, file: &str, pointer: &str, auto_map: &Value, nested: bool) {
+        let map = match auto_map {
+            Value::Null => return,
+            Value::Object(map) => map,
+            other => return self.malformed(file, pointer.to_owned(), "itself", other),
+        };
+        if map.len() > MAX_ENTRIES {
+            self.malformed(file, pointer.to_owned(), "itself", auto_map);
+        }
+        for (key, target) in map.iter().take(MAX_ENTRIES) {
+            let base = pointer::join(pointer, key);
+            // A list has the slow and the fast tokenizer; null for none.
+            let targets = match target {
+                Value::Array(items) => {
+                    let items = items.iter().enumerate().take(MAX_ENTRIES);
+                    items.map(|(i, item)| (format!("{base}/{i}"), item)).collect()
+                }
+                one => vec![(base, one)],
+            };
+            for (pointer, target) in targets {
+                match target {
+                    Value::Null => {}
+                    Value::String(target) => self.entries.push(AutoMapEntry {
+                        file: file.to_owned(),
+                        pointer,
+                        key: key.clone(),
+                        target: target.clone(),
+                        nested,
+                    }),
+                    other => self.malformed(file, pointer, key, other),
+                }
+            }
+        }
+    }
+
+    fn malformed(&mut self, file: &str, pointer: String, key: &str, found: &Value) {
+        // Strings have been escaped where they are shown; anything else is told by its kind.
+        let target = match found {
+            Value::Array(_) => "a list".to_owned(),
+            Value::Object(_) => "an object".to_owned(),
+            other => other.to_string(),
+        };
+        let fault = Fault::new(FaultKind::AutoMapMalformed).at(Place::file(file).pointer(pointer));
+        self.faults.push(fault.with("key", key).with("target", target).with("dots", 0));
+    }
 }
 
 /// A repository on the hub that the files name: where other entries take their code from, or the model that this one was

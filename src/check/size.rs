@@ -213,25 +213,31 @@ fn explain(
         if probe.as_ref() == Some(&now) {
             continue;
         }
-        let mut candidates: BTreeSet<u64> = (1..=5_u32)
-            .flat_map(|n| [value.checked_shl(n), value.checked_shr(n).filter(|v| v.checked_shl(n) == Some(value))])
-            .flatten()
-            .filter(|v| *v > 0)
-            .collect();
-        // Most sizes are linear in most values.
-        for (at, twice) in now.iter().zip(probe.iter().flatten()) {
-            let step = i128::from(*twice).saturating_sub(i128::from(*at));
-            let missing = i128::from(stated).saturating_sub(i128::from(*at)).saturating_mul(i128::from(value));
-            let whole = missing.checked_rem(step) == Some(0);
-            let moved = missing.checked_div(step).filter(|_| whole).map(|n| n.saturating_add(i128::from(value)));
-            candidates.extend(moved.and_then(|v| u64::try_from(v).ok()).filter(|v| *v > 0));
-        }
+        let candidates = candidates(value, stated, &now, probe.as_deref().unwrap_or_default());
         let fits = candidates.into_iter().find(|v| sizes(&pointer, *v).is_some_and(|sizes| sizes.contains(&stated)));
         if let Some(value) = fits {
             found.push((pointer, value.into()));
         }
     }
     found
+}
+
+/// Values worth trying instead of `value`: its doubles and halves, and those that would bridge the gap to the stated size
+/// if sizes are linear in the value. `now` are the sizes with the value, `twice` those with twice as much.
+fn candidates(value: u64, stated: u64, now: &[u64], twice: &[u64]) -> BTreeSet<u64> {
+    let mut candidates: BTreeSet<u64> = (1..=5_u32)
+        .flat_map(|n| [value.checked_shl(n), value.checked_shr(n).filter(|v| v.checked_shl(n) == Some(value))])
+        .flatten()
+        .filter(|v| *v > 0)
+        .collect();
+    for (at, twice) in now.iter().zip(twice) {
+        let step = i128::from(*twice).saturating_sub(i128::from(*at));
+        let missing = i128::from(stated).saturating_sub(i128::from(*at)).saturating_mul(i128::from(value));
+        let whole = missing.checked_rem(step) == Some(0);
+        let moved = missing.checked_div(step).filter(|_| whole).map(|n| n.saturating_add(i128::from(value)));
+        candidates.extend(moved.and_then(|v| u64::try_from(v).ok()).filter(|v| *v > 0));
+    }
+    candidates
 }
 
 #[cfg(test)]

@@ -1,5 +1,9 @@
 //! Entries of a checkpoint directory.
 
+use std::fmt;
+use std::fs::Metadata;
+use std::os::unix::fs::FileTypeExt as _;
+
 use super::lfs::LfsPointer;
 
 /// A directory entry, and what it turned out to be.
@@ -18,6 +22,44 @@ pub enum EntryKind {
     Device,
     /// A symbolic link that leads nowhere, or in a circle; or nothing the system tells about.
     Broken,
+}
+
+impl EntryKind {
+    /// The kind that metadata tell, links followed; what is none of the others is a device.
+    #[must_use]
+    pub(super) fn from_metadata(metadata: &Metadata) -> Self {
+        let kind = metadata.file_type();
+        if kind.is_file() {
+            Self::Regular
+        } else if kind.is_dir() {
+            Self::Directory
+        } else if kind.is_fifo() {
+            Self::Fifo
+        } else if kind.is_socket() {
+            Self::Socket
+        } else {
+            Self::Device
+        }
+    }
+
+    /// The word for it in messages.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Regular => "regular file",
+            Self::Directory => "directory",
+            Self::Fifo => "FIFO",
+            Self::Socket => "socket",
+            Self::Device => "device",
+            Self::Broken => "broken link",
+        }
+    }
+}
+
+impl fmt::Display for EntryKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
 }
 
 /// One entry of a checkpoint directory.

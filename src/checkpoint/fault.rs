@@ -127,6 +127,11 @@ impl Faults {
         }
     }
 
+    /// Adds faults as [`Self::push`] does.
+    pub(crate) fn extend(&mut self, faults: impl IntoIterator<Item = Fault>) {
+        faults.into_iter().for_each(|fault| self.push(fault));
+    }
+
     /// The faults kept; the last of a kind that had too many says how many `more` there were.
     pub(crate) fn into_vec(mut self) -> Vec<Fault> {
         for (kind, (count, last)) in &self.seen {

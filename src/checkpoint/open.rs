@@ -5,13 +5,13 @@
 
 use std::fs::{File, Metadata, OpenOptions};
 use std::io::Read as _;
-use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, OpenOptionsExt as _};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 use thiserror::Error;
 
-use super::{Fault, FaultKind, Place};
+use super::{EntryKind, Fault, FaultKind, Place};
 
 /// Most bytes read of a JSON document.
 pub const JSON_CAP: u64 = 64 << 20;
@@ -66,12 +66,12 @@ pub enum OpenError {
         path: PathBuf,
     },
     /// Something that is not a regular file.
-    #[error("{} is a {what}, not a regular file", path.display())]
+    #[error("{} is a {kind}, not a regular file", path.display())]
     NotRegular {
         /// The path asked for.
         path: PathBuf,
-        /// `FIFO`, `socket`, `device` or `directory`.
-        what: &'static str,
+        /// What it is instead.
+        kind: EntryKind,
     },
     /// A file where a directory was wanted.
     #[error("{} is not a directory", path.display())]
@@ -119,7 +119,7 @@ impl OpenError {
     pub fn fault(&self, name: &str) -> Fault {
         let fault = |kind| Fault::new(kind).at(Place::file(name));
         match self {
-            Self::NotRegular { what, .. } => fault(FaultKind::NotARegularFile).with("what", *what),
+            Self::NotRegular { kind, .. } => fault(FaultKind::NotARegularFile).with("what", kind.name()),
             Self::TooLarge { size, cap, .. } => fault(FaultKind::FileTooLarge).with("size", *size).with("cap", *cap),
             Self::DanglingLink { target, .. } => {
                 fault(FaultKind::DanglingSymlink).with("target", target.to_string_lossy().into_owned())
@@ -148,22 +148,6 @@ impl OpenError {
     }
 }
 
-/// What a file is, when it is not a regular one.
-pub(crate) fn irregular(metadata: &Metadata) -> Option<&'static str> {
-    let kind = metadata.file_type();
-    if kind.is_file() {
-        None
-    } else if kind.is_dir() {
-        Some("directory")
-    } else if kind.is_fifo() {
-        Some("FIFO")
-    } else if kind.is_socket() {
-        Some("socket")
-    } else {
-        Some("device")
-    }
-}
-
 /// Opens a regular file of at most `cap` bytes for reading; symbolic links are followed.
 ///
 /// Asks what the file is before it opens it, because opening a device can do things, and again
@@ -173,17 +157,16 @@ pub(crate) fn irregular(metadata: &Metadata) -> Option<&'static str> {
 /// When there is no such file, it is not a regular one, or it has more than `cap` bytes.
 pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
     let io = |source| OpenError::from_io(path, source);
-    let not_regular = |what| OpenError::NotRegular { path: path.to_owned(), what };
-    if let Some(what) = irregular(&std::fs::metadata(path).map_err(io)?) {
-        return Err(not_regular(what));
-    }
+    let regular = |metadata: &Metadata| match EntryKind::from_metadata(metadata) {
+        EntryKind::Regular => Ok(()),
+        kind => Err(OpenError::NotRegular { path: path.to_owned(), kind }),
+    };
+    regular(&std::fs::metadata(path).map_err(io)?)?;
     let flags = OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY;
     let flags = i32::try_from(flags.bits()).unwrap_or(0);
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path).map_err(io)?;
     let metadata = file.metadata().map_err(io)?;
-    if let Some(what) = irregular(&metadata) {
-        return Err(not_regular(what));
-    }
+    regular(&metadata)?;
     let identity = Identity::from_metadata(&metadata);
     if identity.size > cap {
         return Err(OpenError::TooLarge { path: path.to_owned(), size: identity.size, cap });

@@ -24,6 +24,16 @@ struct TensorRule<'a> {
     fit: TensorTransform,
 }
 
+/// A donor tensor that the recipe takes, under its name in the result.
+struct TakenTensor<'a> {
+    name: String,
+    donor: &'a Donor,
+    shard: &'a Shard,
+    tensor: &'a Tensor,
+    rule: &'a TensorRule<'a>,
+}
+
+/// Plans the shards of the result; tensors that do not fit become seams of the draft.
 pub(super) fn plan(
     context: &Context<'_>,
     documents: &[MergedDocument],
@@ -32,9 +42,41 @@ pub(super) fn plan(
     draft: &mut MergeDraft,
 ) -> Result<(), MergeError> {
     let rules = rules(context)?;
-    let mut taken: Vec<(String, &Donor, &Shard, &Tensor, &TensorRule<'_>)> = Vec::new();
+    let (taken, dropped) = take(context.donors, &rules);
+    draft.dropped = dropped;
+    let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.tensor.shape.clone()))).collect();
+    let names = taken.iter().map(|t| t.name.as_str());
+    let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
+    let expected = expected_shapes(library, config, names, &evidence);
+    let mut tensors = Vec::new();
+    let mut seen: HashMap<String, String> = HashMap::new();
+    for taken in taken {
+        if let Some(first) = seen.insert(taken.name.clone(), taken.tensor.name.clone()) {
+            return Err(MergeError::Recipe(format!(
+                "{}: {first} and {} would both become {}",
+                context.recipe.recipe, taken.tensor.name, taken.name
+            )));
+        }
+        let (position, shape) = match expected.get(&taken.name) {
+            Some((position, shape)) => (*position, shape.clone()),
+            None => (usize::MAX, taken.tensor.shape.clone()),
+        };
+        match source(&taken, &shape) {
+            Ok(source) => tensors.push((position, planned(taken, shape, source, draft))),
+            Err(why) => draft.seams.push(misfit(context, &taken, shape, &why)),
+        }
+    }
+    // The class's own order, so that shards are cut where save_pretrained would cut them.
+    tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
+    draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
+    Ok(())
+}
+
+/// The tensors that the recipe takes, and those it leaves behind.
+fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTensor<'a>>, Vec<Dropped>) {
+    let mut taken = Vec::new();
     let mut dropped: BTreeMap<(String, String, String), usize> = BTreeMap::new();
-    for donor in context.donors {
+    for donor in donors {
         for (shard, tensor) in donor.checkpoint.tensors() {
             let rule = rules.iter().find(|r| r.spec.from == donor.role && r.names.is_match(&tensor.name));
             match rule {
@@ -43,7 +85,7 @@ pub(super) fn plan(
                         Some(to) => rule.names.replace(&tensor.name, to.as_str()).into_owned(),
                         None => tensor.name.clone(),
                     };
-                    taken.push((name, donor, shard, tensor, rule));
+                    taken.push(TakenTensor { name, donor, shard, tensor, rule });
                 }
                 other => {
                     let (pattern, why) = other.map_or(("", "no entry of the recipe names them"), |r| {
@@ -56,51 +98,22 @@ pub(super) fn plan(
             }
         }
     }
-    draft.dropped =
-        dropped.into_iter().map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect();
+    let dropped = dropped.into_iter();
+    (taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect())
+}
 
-    let evidence: Evidence = taken.iter().map(|t| (t.0.clone(), Some(t.3.shape.clone()))).collect();
-    let names = taken.iter().map(|t| t.0.as_str());
-    let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
-    let expected = expected_shapes(library, config, names, &evidence);
-    let mut tensors = Vec::new();
-    let mut seen: HashMap<String, String> = HashMap::new();
-    for (name, donor, shard, tensor, rule) in taken {
-        let from = TensorRef {
-            donor: donor.role.clone(),
-            path: donor.checkpoint.root.join(&shard.name),
-            name: tensor.name.clone(),
-            shape: tensor.shape.clone(),
-            offset: shard.data_start.saturating_add(tensor.begin),
-            len: tensor.len(),
-        };
-        if let Some(first) = seen.insert(name.clone(), tensor.name.clone()) {
-            return Err(MergeError::Recipe(format!(
-                "{}: {first} and {} would both become {name}",
-                context.recipe.recipe, tensor.name
-            )));
-        }
-        let position = expected.get(&name).map_or(usize::MAX, |e| e.0);
-        let shape = expected.get(&name).map_or_else(|| tensor.shape.clone(), |e| e.1.clone());
-        match source(from, tensor, &shape, rule.fit) {
-            Ok(source) => {
-                if !matches!(source, TensorSource::Copy(_)) {
-                    draft.changed.push(ChangedTensor {
-                        name: name.clone(),
-                        transform: source.transform(),
-                        from: Some(tensor.shape.clone()),
-                        to: shape.clone(),
-                    });
-                }
-                tensors.push((position, PlannedTensor { name, dtype: tensor.dtype, shape, source }));
-            }
-            Err(why) => draft.seams.push(misfit(context, donor, tensor, rule, &name, shape, &why)),
-        }
+/// The planned tensor; one that is not a byte copy is also listed in the draft.
+fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft: &mut MergeDraft) -> PlannedTensor {
+    let TakenTensor { name, tensor, .. } = taken;
+    if !matches!(source, TensorSource::Copy(_)) {
+        draft.changed.push(ChangedTensor {
+            name: name.clone(),
+            transform: source.transform(),
+            from: Some(tensor.shape.clone()),
+            to: shape.clone(),
+        });
     }
-    // The class's own order, so that shards are cut where save_pretrained would cut them.
-    tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
-    draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
-    Ok(())
+    PlannedTensor { name, dtype: tensor.dtype, shape, source }
 }
 
 fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
@@ -149,17 +162,26 @@ fn expected_shapes<'n>(
     })
 }
 
-/// How `tensor` becomes one of `shape`, or why it cannot.
-fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: TensorTransform) -> Result<TensorSource, String> {
-    if fit != TensorTransform::Reinit && tensor.shape == shape {
+/// How a tensor becomes one of `shape`, or why it cannot.
+fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String> {
+    let TakenTensor { donor, shard, tensor, rule, .. } = taken;
+    let from = TensorRef {
+        donor: donor.role.clone(),
+        path: donor.checkpoint.root.join(&shard.name),
+        name: tensor.name.clone(),
+        shape: tensor.shape.clone(),
+        offset: shard.data_start.saturating_add(tensor.begin),
+        len: tensor.len(),
+    };
+    if rule.fit != TensorTransform::Reinit && tensor.shape == shape {
         return Ok(TensorSource::Copy(from));
     }
-    if fit != TensorTransform::Copy && !can_compute(tensor.dtype) {
+    if rule.fit != TensorTransform::Copy && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
     let same_rank = tensor.shape.len() == shape.len();
     let nests = same_rank && tensor.shape.iter().zip(shape).all(|(have, want)| have <= want);
-    match fit {
+    match rule.fit {
         TensorTransform::Copy => Err(String::new()),
         TensorTransform::Reinit => Ok(TensorSource::Reinit { instead_of: from }),
         TensorTransform::Pad if nests => Ok(TensorSource::Pad(from)),
@@ -171,22 +193,16 @@ fn source(from: TensorRef, tensor: &Tensor, shape: &[u64], fit: TensorTransform)
     }
 }
 
-fn misfit(
-    context: &Context<'_>,
-    donor: &Donor,
-    tensor: &Tensor,
-    rule: &TensorRule<'_>,
-    name: &str,
-    needed: Vec<u64>,
-    why: &str,
-) -> Seam {
+/// The seam for a tensor that does not fit.
+fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why: &str) -> Seam {
+    let TakenTensor { name, donor, tensor, rule, .. } = taken;
     Seam {
         message: format!(
             "{} of the {} donor is {:?}, {} has to be {needed:?}{}{why}",
             tensor.name,
             donor.role,
             tensor.shape,
-            if name == tensor.name { "in the merged model it" } else { name },
+            if *name == tensor.name { "in the merged model it" } else { name },
             if why.is_empty() { "" } else { "; " },
         ),
         tensor: Some(ShapedName { donor: donor.role.clone(), name: tensor.name.clone(), shape: tensor.shape.clone() }),

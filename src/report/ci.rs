@@ -36,9 +36,12 @@ pub struct Group<'a> {
     pub suppressed: Vec<(Item<'a>, &'a Accepted)>,
 }
 
+/// What stands for a rule code at a seam.
+pub const SEAM: &str = "seam";
+
 /// A finding, or a seam that does not fit.
 pub struct Item<'a> {
-    /// Rule code; `seam` for a seam.
+    /// Rule code; [`SEAM`] for a seam.
     pub code: &'a str,
     /// Rule name.
     pub name: &'a str,
@@ -97,14 +100,14 @@ pub fn of_finding(finding: &Finding, path: &str, role: &str, seen: &mut BTreeMap
 fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
     let path = tidy(&merge.out);
     let items = merge.seams.iter().map(|seam| Item {
-        code: "seam",
+        code: SEAM,
         name: "seam-does-not-fit",
         severity: Severity::Error,
         message: sentence(&seam.message),
         locations: &[],
         fix: None,
         help: (!seam.options.is_empty()).then(|| sentence(&format!("Try {}", seam.options.join(" or ")))),
-        fingerprint: fingerprint(&[&path, "seam", &merge.recipe, &seam.message], seen),
+        fingerprint: fingerprint(&[&path, SEAM, &merge.recipe, &seam.message], seen),
     });
     let items = items.collect();
     Group { title: format!("merge {}", merge.recipe), path, sources: None, items, suppressed: Vec::new() }

@@ -24,22 +24,31 @@ pub fn lines(report: &Report) -> String {
     let mut lines = Vec::new();
     for checkpoint in &report.checkpoints {
         let (path, role) = (&checkpoint.path, checkpoint.role.as_ref());
-        let line = |finding| JsonLine { r#type: "finding", path, role, said: finding };
+        let line = |finding| JsonLine { r#type: LineKind::Finding, path, role, said: finding };
         lines.extend(checkpoint.findings.iter().map(|f| written(serde_json::to_string(&line(f)))));
     }
     if let Some(merge) = &report.merge {
-        let line = |seam| JsonLine { r#type: "seam", path: &merge.out, role: None, said: seam };
+        let line = |seam| JsonLine { r#type: LineKind::Seam, path: &merge.out, role: None, said: seam };
         lines.extend(merge.seams.iter().map(|s| written(serde_json::to_string(&line(s)))));
     }
     let summary =
-        SummaryLine { r#type: "summary", schema: report.schema, tool: &report.tool, summary: &report.summary };
+        SummaryLine { r#type: LineKind::Summary, schema: report.schema, tool: &report.tool, summary: &report.summary };
     lines.push(written(serde_json::to_string(&summary)));
     harmless(&lines.join("\n"))
 }
 
+/// What a line tells of.
+#[derive(Serialize)]
+#[serde(rename_all = "lowercase")]
+enum LineKind {
+    Finding,
+    Seam,
+    Summary,
+}
+
 #[derive(Serialize)]
 struct JsonLine<'a, T> {
-    r#type: &'static str,
+    r#type: LineKind,
     /// The checkpoint, as the user named it; for a seam, where the merge was to go.
     path: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -50,7 +59,7 @@ struct JsonLine<'a, T> {
 
 #[derive(Serialize)]
 struct SummaryLine<'a> {
-    r#type: &'static str,
+    r#type: LineKind,
     schema: u32,
     tool: &'a ToolInfo,
     #[serde(flatten)]

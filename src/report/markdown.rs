@@ -151,53 +151,50 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
         let _ok = writeln!(out, "{n}. {}: {}", text_name(&stage.name), text(&sentence(&stage.outcome)));
     }
     seams(out, merge, cap);
-    if !merge.transforms.is_empty() {
-        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
-        let _ok = writeln!(
-            out,
-            "\n## Tensors\n\n{}, {}: {}",
-            plural(merge.tensors, "tensor"),
-            bytes(merge.bytes),
-            how.join(", ")
-        );
-    }
-    if !merge.changed.is_empty() {
-        let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
-        let rows: Vec<_> = merge
-            .changed
-            .iter()
-            .map(|c| [code(&name(&c.name)), c.transform.name().to_owned(), from(c.from.as_deref()), shape(&c.to)])
-            .collect();
-        table(out, ["not a copy", "how", "from", "to"], &rows, cap);
-    }
-    if !merge.dropped.is_empty() {
-        let rows: Vec<_> = merge
-            .dropped
-            .iter()
-            .map(|d| [text_name(&d.donor), code(&name(&d.pattern)), d.count.to_string(), text(&sentence(&d.why))])
-            .collect();
-        let _ok = writeln!(out, "\n## Left behind");
-        table(out, ["donor", "tensors", "count", "why"], &rows, cap);
-    }
-    if !merge.repairs.is_empty() {
-        let _ok = writeln!(out, "\n## Repaired on the way\n");
-        for repair in merge.repairs.iter().take(cap) {
-            let _ok = writeln!(out, "- {}", text(&sentence(repair)));
-        }
-        if let Some(more) = more(merge.repairs.len(), cap) {
-            let _ok = writeln!(out, "- {more}");
-        }
-    }
-    if !merge.notes.is_empty() {
-        let _ok = writeln!(out, "\n## To know\n");
-        for note in &merge.notes {
-            let _ok = writeln!(out, "- {}", text(&sentence(note)));
-        }
-    }
+    merged_tensors(out, merge, cap);
+    sentences(out, "Repaired on the way", &merge.repairs, cap);
+    sentences(out, "To know", &merge.notes, usize::MAX);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
         let _ok = writeln!(out, "\n## Files");
         table(out, ["file", "from"], &rows, cap);
+    }
+}
+
+/// The tensors of a merge: how they are made, and which are left behind.
+fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
+    if !merge.transforms.is_empty() {
+        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
+        let (tensors, size) = (plural(merge.tensors, "tensor"), bytes(merge.bytes));
+        let _ok = writeln!(out, "\n## Tensors\n\n{tensors}, {size}: {}", how.join(", "));
+    }
+    if !merge.changed.is_empty() {
+        let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
+        let changed = merge.changed.iter();
+        let row = changed
+            .map(|c| [code(&name(&c.name)), c.transform.name().to_owned(), from(c.from.as_deref()), shape(&c.to)]);
+        table(out, ["not a copy", "how", "from", "to"], &row.collect::<Vec<_>>(), cap);
+    }
+    if !merge.dropped.is_empty() {
+        let dropped = merge.dropped.iter();
+        let row = dropped
+            .map(|d| [text_name(&d.donor), code(&name(&d.pattern)), d.count.to_string(), text(&sentence(&d.why))]);
+        let _ok = writeln!(out, "\n## Left behind");
+        table(out, ["donor", "tensors", "count", "why"], &row.collect::<Vec<_>>(), cap);
+    }
+}
+
+/// A list of sentences under a title, if there are any.
+fn sentences(out: &mut String, title: &str, sentences: &[String], cap: usize) {
+    if sentences.is_empty() {
+        return;
+    }
+    let _ok = writeln!(out, "\n## {title}\n");
+    for one in sentences.iter().take(cap) {
+        let _ok = writeln!(out, "- {}", text(&sentence(one)));
+    }
+    if let Some(more) = more(sentences.len(), cap) {
+        let _ok = writeln!(out, "- {more}");
     }
 }
 

@@ -43,9 +43,7 @@ fn parse(name: String, bytes: &[u8]) -> Document {
         return Document { name, text, faults: vec![fault], ..Document::default() };
     }
     let Decoded { text, verbatim, faults: of_encoding } = encoding::decode(&name, bytes);
-    for fault in of_encoding {
-        faults.push(fault);
-    }
+    faults.extend(of_encoding);
 
     let mut reader = DocumentReader { name: &name, verbatim, faults, left_out: left_out(&name) };
     let body = reader.cut_nul_bytes(&text);

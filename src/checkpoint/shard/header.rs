@@ -43,59 +43,21 @@ fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     shard.header_sha256 = hex(&Sha256::digest(head.get(..header.len().saturating_add(8)).unwrap_or(head)));
 
     let mut faults = Faults::default();
-    let padding = |what: &str| Fault::new(FaultKind::HeaderPaddingNotSpaces).at(shard.place()).with("what", what);
-    let header = match header.strip_prefix(b"\xef\xbb\xbf") {
-        Some(rest) => {
-            faults.push(padding("a byte-order mark"));
-            rest
-        }
-        None => header,
+    let Some(text) = header_text(&shard, header, &mut faults) else {
+        shard.faults = faults.into_vec();
+        return shard;
     };
-    let text = match std::str::from_utf8(header) {
-        Ok(text) => text,
-        Err(error) => {
-            faults.push(Fault::new(FaultKind::HeaderNotUtf8).at(shard.place()).with("offset", error.valid_up_to()));
-            shard.faults = faults.into_vec();
-            return shard;
-        }
-    };
-
-    let mut reader = HeaderReader {
-        shard: &shard,
-        scanner: Scanner::strict(text, 0),
-        faults,
-        entries: Vec::new(),
-        metadata: HeaderMetadata::Absent,
-    };
+    let scanner = Scanner::strict(text, 0);
+    let mut reader =
+        HeaderReader { shard: &shard, scanner, faults, entries: Vec::new(), metadata: HeaderMetadata::Absent };
     let error = reader.object().err();
     let HeaderReader { mut faults, entries, metadata, scanner, .. } = reader;
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
-        let fault = Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason);
-        faults.push(fault.with("offset", span.start));
+        faults.push(not_json(&shard, reason, span.start));
     }
-    let mut unread = true;
-    match error {
-        None => unread = false,
-        Some(ScanError { kind: ScanErrorKind::Trailing, span }) => {
-            unread = false;
-            let rest = text.get(span).unwrap_or_default();
-            faults.push(padding(match rest.trim_start().chars().next() {
-                Some('\0') => "NUL bytes",
-                Some('{') => "a second object",
-                _ => "other bytes",
-            }));
-        }
-        Some(ScanError { kind: ScanErrorKind::TooDeep, span }) => {
-            faults.push(Fault::new(FaultKind::HeaderTooDeep).at(shard.place()).with("offset", span.start));
-        }
-        Some(ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), .. }) => {
-            faults.push(Fault::new(FaultKind::JsonTooManyValues).at(shard.place()).with("cap", MAX_ENTRIES));
-        }
-        Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) => {
-            let fault = Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason);
-            faults.push(fault.with("offset", span.start));
-        }
-    }
+    // What follows the object is padding; any other error leaves entries unread.
+    let unread = error.as_ref().is_some_and(|error| error.kind != ScanErrorKind::Trailing);
+    faults.extend(error.map(|error| scan_fault(&shard, text, error)));
     if !unread {
         check_format(&shard, &metadata, &mut faults);
     }
@@ -114,6 +76,52 @@ fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     }
     shard.faults = faults.into_vec();
     shard
+}
+
+/// The header as text, without a byte-order mark; `None` when it is not UTF-8.
+fn header_text<'h>(shard: &Shard, header: &'h [u8], faults: &mut Faults) -> Option<&'h str> {
+    let bare = header.strip_prefix(b"\xef\xbb\xbf");
+    if bare.is_some() {
+        faults.push(padding(shard, "a byte-order mark"));
+    }
+    match std::str::from_utf8(bare.unwrap_or(header)) {
+        Ok(text) => Some(text),
+        Err(error) => {
+            faults.push(Fault::new(FaultKind::HeaderNotUtf8).at(shard.place()).with("offset", error.valid_up_to()));
+            None
+        }
+    }
+}
+
+/// The fault behind what ended the reading of the object.
+fn scan_fault(shard: &Shard, text: &str, error: ScanError) -> Fault {
+    let start = error.span.start;
+    match error.kind {
+        ScanErrorKind::Trailing => {
+            let rest = text.get(error.span).unwrap_or_default();
+            padding(
+                shard,
+                match rest.trim_start().chars().next() {
+                    Some('\0') => "NUL bytes",
+                    Some('{') => "a second object",
+                    _ => "other bytes",
+                },
+            )
+        }
+        ScanErrorKind::TooDeep => Fault::new(FaultKind::HeaderTooDeep).at(shard.place()).with("offset", start),
+        ScanErrorKind::Syntax(TOO_MANY) => {
+            Fault::new(FaultKind::JsonTooManyValues).at(shard.place()).with("cap", MAX_ENTRIES)
+        }
+        ScanErrorKind::Syntax(reason) => not_json(shard, reason, start),
+    }
+}
+
+fn not_json(shard: &Shard, reason: &str, offset: usize) -> Fault {
+    Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason).with("offset", offset)
+}
+
+fn padding(shard: &Shard, what: &str) -> Fault {
+    Fault::new(FaultKind::HeaderPaddingNotSpaces).at(shard.place()).with("what", what)
 }
 
 /// The header's bytes and where the data region starts, if the file is framed like a safetensors file.

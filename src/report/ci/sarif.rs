@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{Group, Item, file, groups};
+use super::{Group, Item, SEAM, file, groups};
 use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
 use crate::report::format::{name, sentence};
@@ -168,7 +168,7 @@ const fn level(severity: Severity) -> &'static str {
 }
 
 fn rule(id: String, item: &Item<'_>) -> SarifRule {
-    let why = if item.code == "seam" {
+    let why = if item.code == SEAM {
         String::new()
     } else {
         format!("`ckpt-doctor explain {id}` says what it means and what to do.")
