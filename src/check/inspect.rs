@@ -135,7 +135,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         stored = Stored::from_shapes(shapes.collect());
     }
     if stored.is_empty() {
-        inspection.notes.push("no tensors: nothing votes on the config".to_owned());
+        inspection.notes.push("no tensors: config values cannot be inferred".to_owned());
         return inspection;
     }
     judge(&mut inspection, checkpoint.config(), &stored, library);
@@ -152,7 +152,7 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
     }
     let best = named.or_else(|| alike.first().map(|r| r.architecture));
     let Some(best) = best else {
-        inspection.notes.push("no class that is known here has names like these".to_owned());
+        inspection.notes.push("no known class has tensor names like these".to_owned());
         return;
     };
     let mut classes: Vec<Candidate> = Vec::new();
@@ -166,7 +166,7 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
     }
     let quantised = config.is_some_and(|c| c.get("quantization_config").is_some_and(Value::is_object));
     if quantised {
-        inspection.notes.push("quantised: shapes are those of packed tensors and do not vote".to_owned());
+        inspection.notes.push("quantised: the shapes of packed tensors do not imply config values".to_owned());
         inspection.classes = classes;
         return;
     }
@@ -180,13 +180,13 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
                 first.fit = Some(votes.after.score());
             }
             if votes.exhausted {
-                inspection.notes.push("the model is large: the search for values stopped early".to_owned());
+                inspection.notes.push("the model is large: the search for config values stopped early".to_owned());
             }
             inspection.proven = proven(best, &votes, named.is_some());
             inspection.votes = Some(votes);
         }
         None => inspection.notes.push(format!(
-            "{} cannot be built {}: its values were not voted on",
+            "{} cannot be built {}: config values cannot be inferred",
             best.class(),
             if named.is_some() { "from config.json" } else { "without a config" }
         )),

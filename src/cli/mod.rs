@@ -1,4 +1,4 @@
-//! The command line: what was typed, what that means, what is printed, which code the program ends with.
+//! The command line: arguments, settings, output and exit codes.
 
 mod args;
 mod baseline;
@@ -6,6 +6,7 @@ mod build_merged;
 mod check;
 mod expect;
 mod fix;
+mod hints;
 mod init;
 mod inspect;
 mod library;
@@ -22,11 +23,11 @@ use ckpt_doctor::surgery::apply::ApplyError;
 use ckpt_doctor::surgery::journal::JournalError;
 use clap::Parser;
 
-/// Nothing at or above `--fail-on`.
+/// Exit code: no findings at or above `--fail-on`.
 const CLEAN: u8 = 0;
-/// Findings at or above `--fail-on`, or a merge that stopped.
+/// Exit code: findings at or above `--fail-on`, or a merge that stopped.
 const FINDINGS: u8 = 1;
-/// It could not be tried.
+/// Exit code: the command could not run.
 const FAILED: u8 = 2;
 
 /// Whether a signal ended the run.
@@ -36,7 +37,7 @@ fn interrupted(error: &anyhow::Error) -> bool {
 
 /// Runs the program.
 pub fn main() -> ExitCode {
-    let args::Cli { command, rules } = args::Cli::parse();
+    let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
     let result = match &command {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
         args::Command::Undo(args) => undo::run(args),

@@ -1,4 +1,4 @@
-//! What can go wrong while a checkpoint is written, in words that say what to do next.
+//! Errors while writing a checkpoint; each text ends with the next step.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ pub enum ApplyError {
         reason: String,
     },
     /// The target and a donor overlap.
-    #[error("{path}: {reason}; what is read is never written to, choose a directory elsewhere", path = path.display())]
+    #[error("{path}: {reason}; the output directory must not overlap a donor; choose another one", path = path.display())]
     Donor {
         /// The target.
         path: PathBuf,
@@ -57,7 +57,7 @@ pub enum ApplyError {
         have: u64,
     },
     /// One file is larger than may be.
-    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that, or save in smaller shards", path = path.display())]
+    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that limit, or use smaller shards", path = path.display())]
     FileSize {
         /// The file.
         path: PathBuf,
@@ -67,7 +67,7 @@ pub enum ApplyError {
         limit: String,
     },
     /// A donor changed while it was read.
-    #[error("{path}: {reason} while it was being read; nothing was written, run again when it is at rest", path = path.display())]
+    #[error("{path}: {reason} while it was being read; nothing was written, retry once nothing else modifies it", path = path.display())]
     Changed {
         /// The donor's file.
         path: PathBuf,
@@ -88,7 +88,7 @@ pub enum ApplyError {
         error: io::Error,
     },
     /// Writing failed, and so did removing what was written until then.
-    #[error("{error}; {path} could not be removed ({why}), the next run that writes to the same place will try again", path = path.display())]
+    #[error("{error}; {path} could not be removed ({why}); the next run with the same target tries again", path = path.display())]
     Left {
         /// What went wrong first.
         error: Box<Self>,
@@ -98,7 +98,7 @@ pub enum ApplyError {
         why: io::Error,
     },
     /// The target has its name, and can neither be made durable nor be taken back.
-    #[error("{path}: is whole, but may not outlive a power failure, because the system failed to sync its name: {error}", path = path.display())]
+    #[error("{path}: is complete, but may not survive a power failure: syncing its parent directory failed: {error}", path = path.display())]
     Unsynced {
         /// The target.
         path: PathBuf,
