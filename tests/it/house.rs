@@ -75,7 +75,10 @@ fn rules_are_written_alike() {
         for fix in &rule.fixes {
             let help = fix.help.source();
             hold(one_line(help) && !help.ends_with('.'), "the help has no full stop");
-            hold(IMPERATIVES.contains(&first_word(help)), "the help starts with a verb of the list in tests/it/house.rs");
+            hold(
+                IMPERATIVES.contains(&first_word(help)),
+                "the help starts with a verb of the list in tests/it/house.rs",
+            );
         }
         // Information may leave nothing to be done; what is wrong never does.
         hold(!rule.fixes.is_empty() || rule.severity == Severity::Info, "a rule above info says what to do");

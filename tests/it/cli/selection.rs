@@ -335,7 +335,7 @@ fn rules_of_ones_own_are_asked_listed_and_explained() {
                 ]
             )
             .lines()
-            .filter(|l| !l.contains("not chosen"))
+            .filter(|l| !l.contains("not selected"))
             .collect::<Vec<_>>()
             .join("\n")
         ));
