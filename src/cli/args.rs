@@ -95,7 +95,7 @@ pub struct InspectArgs {
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,
-    /// When to print colours; auto respects NO_COLOR
+    /// When to print colours; auto respects `NO_COLOR`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }
@@ -147,7 +147,7 @@ pub struct ReportArgs {
     /// Exit with 0 even if there are findings
     #[arg(long)]
     pub exit_zero: bool,
-    /// When to print colours; auto respects NO_COLOR
+    /// When to print colours; auto respects `NO_COLOR`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }
