@@ -9,3 +9,6 @@ pub mod checkpoint;
 pub mod knowledge;
 pub mod report;
 pub mod surgery;
+
+#[cfg(test)]
+mod schemas;

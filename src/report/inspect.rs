@@ -14,7 +14,8 @@ use crate::check::inspect::{Amount, Candidate, Inspection};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
-struct Document<'a> {
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct InspectDocument<'a> {
     schema: u32,
     tool: Tool,
     path: &'a str,
@@ -25,7 +26,7 @@ struct Document<'a> {
 /// The whole of an inspection as JSON (`schema` 1).
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection) -> String {
-    pretty(&Document { schema: 1, tool: Tool::this(), path, inspection })
+    pretty(&InspectDocument { schema: 1, tool: Tool::this(), path, inspection })
 }
 
 /// An inspection for a terminal.

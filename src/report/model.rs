@@ -11,18 +11,19 @@ use crate::check::{Finding, Severity};
 pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
-/// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 2).
+/// The report of one run. Serialised, it is the JSON contract (`schema` 2).
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Report {
     /// Version of this contract.
     pub schema: u32,
-    /// Which program wrote it.
+    /// The program that wrote the report.
     pub tool: Tool,
-    /// One entry for each checkpoint, in the order given.
+    /// One entry per checkpoint, in the order of the arguments; a merge has its donors, the plan and the result.
     pub checkpoints: Vec<CheckpointReport>,
-    /// What a merge did; absent for `check`.
+    /// The merge; null for `check`.
     pub merge: Option<MergeReport>,
-    /// Totals.
+    /// Totals over all checkpoints.
     pub summary: Summary,
 }
 
@@ -41,6 +42,7 @@ impl Report {
 
 /// Name and version of the program.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Tool {
     /// Always `ckpt-doctor`.
     pub name: &'static str,
@@ -56,37 +58,38 @@ impl Tool {
     }
 }
 
-/// The verdict over one checkpoint.
+/// The report of one checkpoint.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct CheckpointReport {
-    /// As the user named it.
+    /// The path, as the user wrote it.
     pub path: String,
-    /// What it is in this run, for a merge: `donor vision`, `planned`, `written`; absent for `check`.
+    /// Its role in a merge: `donor vision`, `planned`, `written`; missing for `check`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub role: Option<String>,
-    /// Architecture the load reports were predicted with.
+    /// The architecture of the predicted loads; null if it is unknown.
     pub architecture: Option<String>,
     /// `clean`, or the worst severity.
     pub verdict: String,
     /// Findings by severity.
     pub counts: Counts,
-    /// The settings file that was gone by.
+    /// The settings file that applied.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub settings: Option<String>,
-    /// Findings sorted by file, place and code.
+    /// Findings, sorted by file, place and code.
     pub findings: Vec<Finding>,
-    /// Findings that settings or a baseline accept; they are not counted.
+    /// Findings that settings or a baseline accept; `counts` does not include them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub suppressed: Vec<Suppressed>,
-    /// Predicted load reports, one for each loader; none when the architecture is unknown or there are no tensors.
+    /// Predicted load reports, one per loader; empty if the architecture is unknown or there are no tensors.
     pub loads: Vec<LoadReport>,
-    /// Findings whose fixes were made; `findings` are those that are left.
+    /// Findings whose fixes were applied; `findings` has the remaining ones.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub fixed: Vec<Fixed>,
-    /// Fixes that were tried and not kept.
+    /// Fixes that were tried and rolled back.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub withdrawn: Vec<Withdrawn>,
-    /// What the run was asked to do about findings; for renderers that offer fixes.
+    /// The fix options of the run, for renderers that offer fixes.
     #[serde(skip)]
     pub fixing: Option<Fixing>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
@@ -97,14 +100,15 @@ pub struct CheckpointReport {
     pub tensors: (usize, u64),
 }
 
-/// How many findings there are of each severity.
+/// The number of findings of each severity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Counts {
     /// Errors.
     pub error: usize,
     /// Warnings.
     pub warning: usize,
-    /// Notes.
+    /// Findings of severity info.
     pub info: usize,
 }
 
@@ -152,14 +156,15 @@ impl Counts {
 
 /// Totals over all checkpoints.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Summary {
-    /// Checkpoints looked at.
+    /// Number of checkpoints.
     pub checkpoints: usize,
     /// `clean`, or the worst severity.
     pub verdict: String,
     /// Findings by severity.
     pub counts: Counts,
-    /// Findings that are accepted, and not among the counts.
+    /// Number of suppressed findings; `counts` does not include them.
     #[serde(skip_serializing_if = "is_zero")]
     pub suppressed: usize,
 }

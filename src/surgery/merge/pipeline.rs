@@ -344,8 +344,8 @@ fn accompany(
     request: &Request,
     report: &dyn Fn(&Run) -> String,
 ) -> Result<(), PipelineError> {
-    let value = manifest::manifest(recipe, options, donors, drafted, request.hash)?;
-    let mut text = serde_json::to_string_pretty(&value).unwrap_or_default();
+    let manifest = manifest::manifest(recipe, options, donors, drafted, request.hash)?;
+    let mut text = serde_json::to_string_pretty(&manifest).unwrap_or_default();
     text.push('\n');
     let origin = "made by the merge";
     let add = |files: &mut Vec<PlannedFile>, name: &str, bytes: Vec<u8>| {
