@@ -112,6 +112,14 @@ fn examples_match_the_output() {
     assert!(found >= 5, "{found} pages with examples");
 }
 
+#[test]
+fn the_readme_shows_the_hook_that_init_writes() {
+    let read = |file: &str| fs::read_to_string(project().join(file)).unwrap();
+    let template = read("src/cli/init/pre-commit-config.yaml");
+    let (_comment, hook) = template.split_once('\n').unwrap();
+    assert!(read("README.md").contains(hook), "{hook}");
+}
+
 /// Links between pages lead to files that exist, and to headings of theirs.
 #[test]
 fn links_between_pages_lead_somewhere() {
