@@ -1,4 +1,4 @@
-//! The command line: what was typed, what that means, what is printed, which code the program ends with.
+//! The command line: arguments, settings, output and exit codes.
 
 mod args;
 mod baseline;
@@ -7,6 +7,7 @@ mod check;
 mod exit;
 mod expect;
 mod fix;
+mod hints;
 mod init;
 mod inspect;
 mod library;
@@ -31,7 +32,7 @@ fn interrupted(error: &anyhow::Error) -> bool {
 
 /// Runs the program.
 pub fn main() -> ExitCode {
-    let args::Cli { command, rules } = args::Cli::parse();
+    let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
     let result = match &command {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
         args::Command::Undo(args) => undo::run(args),

@@ -11,8 +11,6 @@ pub mod quantization;
 pub mod recipe;
 pub mod resemblance;
 pub mod rule;
-#[cfg(test)]
-mod schemas;
 pub mod selection;
 pub mod settings;
 pub mod source;

@@ -10,3 +10,6 @@ pub mod knowledge;
 pub mod merge;
 pub mod report;
 pub mod surgery;
+
+#[cfg(test)]
+mod schemas;

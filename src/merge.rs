@@ -9,7 +9,7 @@ mod donors;
 mod draft;
 mod error;
 mod files;
-mod manifest;
+pub(crate) mod manifest;
 mod options;
 mod plan;
 mod run;

@@ -40,7 +40,7 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
     }
 }
 
-/// The Rust in README.md compiles and runs.
+/// The Rust in docs/integrations.md compiles and runs.
 #[cfg(doctest)]
-#[doc = include_str!("../README.md")]
-struct Readme;
+#[doc = include_str!("../docs/integrations.md")]
+struct Examples;

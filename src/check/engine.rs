@@ -70,7 +70,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
             None => (ask(rule, &bench, &faults, &scope, architecture), false),
         };
         if stopped {
-            let why = "takes too many steps; let its loops go over less".to_owned();
+            let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
             outcome.unusable.push(Skipped { code: rule.code.clone(), why });
         }
         match found {
@@ -85,7 +85,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         }
     }
     let unselected = knowledge.rules.unselected.iter();
-    outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not chosen".to_owned() }));
+    outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
@@ -150,16 +150,16 @@ fn ask(
 ) -> Result<Vec<Finding>, String> {
     if !rule.applies.is_empty() && !architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a)) {
         let is = architecture.unwrap_or("unknown");
-        return Err(format!("about {}; the architecture is {is}", rule.applies.join(", ")));
+        return Err(format!("applies to {}; the architecture is {is}", rule.applies.join(", ")));
     }
     let cannot = |expression: &Expression, error: &EvalError| match variables::absent(bench.checkpoint, expression) {
-        Some(file) => format!("{file} is not there"),
-        None => format!("cannot be asked: {}", error.cause),
+        Some(file) => format!("{file} is missing"),
+        None => format!("cannot be evaluated: {}", error.cause),
     };
     if let Some(when) = &rule.when {
         match when.eval_bool(scope) {
             Ok(true) => {}
-            Ok(false) => return Err(format!("when is false: {when}")),
+            Ok(false) => return Err(format!("condition is false: {when}")),
             Err(error) => return Err(cannot(when, &error)),
         }
     }

@@ -10,6 +10,7 @@ pub use crate::knowledge::rule::Severity;
 
 /// Where a finding points: a file, a place in it, a tensor.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Location {
     /// File name within the checkpoint.
     pub file: Option<String>,
@@ -28,48 +29,51 @@ pub struct Location {
 
 /// One finding of one rule.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Finding {
     /// Rule code, `CFG004`.
     pub code: String,
     /// Rule name in kebab case; it states the fault.
     pub name: String,
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
     /// One sentence that names the cause, with the figures at hand.
     pub message: String,
-    /// Where; may be empty for the whole checkpoint.
+    /// Places; empty if the finding concerns the whole checkpoint.
     pub locations: Vec<Location>,
-    /// The figures the message was made from.
+    /// The figures behind the message.
     pub evidence: Map<String, Value>,
-    /// What can be done.
+    /// The fix, or the manual step.
     pub fix: Option<FixHint>,
 }
 
-/// A finding that is accepted, and not counted.
+/// A finding that settings or a baseline accept.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Suppressed {
-    /// What was found.
+    /// The finding.
     #[serde(flatten)]
     pub finding: Finding,
-    /// Why it is accepted.
+    /// The suppression that accepts it.
     pub accepted: Accepted,
 }
 
-/// Why a finding is not counted.
+/// The origin of a suppression.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Accepted {
-    /// Where that is written: `ckpt-doctor.json5: suppress[0]`, or the name of a baseline.
+    /// `ckpt-doctor.json5: suppress[0]`, or the name of a baseline.
     pub by: String,
-    /// The reason given there; none in a baseline.
+    /// The reason given there; missing for a baseline.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
 }
 
-/// A rule that was not asked of a checkpoint, or could not be.
+/// A rule that was skipped for a checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Skipped {
     /// Rule code.
     pub code: String,
-    /// Why.
+    /// The reason.
     pub why: String,
 }

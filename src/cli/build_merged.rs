@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, bail};
 use ckpt_doctor::check::Severity;
@@ -34,8 +34,8 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let run = merge::run(&request, &knowledge, &mut progress)?;
     let stage = run.record.stage;
     output::finish(&run.report(), &args.report, false).with_context(|| match stage {
-        Some(MergeStage::Written) => format!("{} is written; its report is not", run.record.out),
-        _ => "the report".to_owned(),
+        Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
+        _ => "the report could not be written".to_owned(),
     })?;
     // What matters is the result; findings on a donor that the merge repaired are told, not counted.
     Ok(match stage {
@@ -59,14 +59,15 @@ fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRe
         path.parent().unwrap_or(Path::new("")).clone_into(&mut base);
         recipe = file.recipe;
         for (role, dir) in &file.donors {
-            let dir = dir.as_str().with_context(|| format!("{}: donor {role} is not a path", path.display()))?;
-            donors.insert(role.clone(), base.join(dir));
+            let dir =
+                dir.as_str().with_context(|| format!("{}: donor {role}: the value must be a path", path.display()))?;
+            donors.insert(role.clone(), tidy(base.join(dir)));
         }
         for (name, value) in &file.options {
             let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
             options.insert(name.clone(), value);
         }
-        out = out.or_else(|| Some(base.join(file.out)));
+        out = out.or_else(|| Some(tidy(base.join(file.out))));
     }
     let short = [("vision", &args.vision), ("language", &args.language)];
     let typed = args.donor.iter().map(|(role, dir)| (role.clone(), PathBuf::from(dir)));
@@ -76,7 +77,7 @@ fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRe
         }
     }
     if donors.is_empty() {
-        bail!("no donors: give --vision DIR and --language DIR, or a merge file");
+        bail!("no donors given; pass --vision DIR and --language DIR, or a merge file");
     }
     // The command line has the last word over the file, but not over itself.
     let mut typed = BTreeMap::new();
@@ -87,8 +88,31 @@ fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRe
     }
     options.extend(typed);
     let recipe = recipe.map(|name| find_recipe(recipes, &name, &base)).transpose()?;
-    let out = out.context("no --out")?;
+    let out = out.context("no output directory given; pass --out DIR")?;
     Ok(MergeRequest { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
+}
+
+/// `fixtures/../merged` as `merged`, unless a symbolic link makes the two different places.
+fn tidy(path: PathBuf) -> PathBuf {
+    let mut short = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::ParentDir if matches!(short.components().next_back(), Some(Component::Normal(_))) => {
+                short.pop();
+            }
+            Component::CurDir => {}
+            other => short.push(other),
+        }
+    }
+    // The last component may be missing: it is the output directory.
+    let parent = |path: &Path| {
+        let parent = path.parent()?;
+        if parent.as_os_str().is_empty() { Path::new(".") } else { parent }.canonicalize().ok()
+    };
+    match (parent(&path), parent(&short)) {
+        (Some(long), Some(other)) if long == other && path.file_name() == short.file_name() => short,
+        _ => path,
+    }
 }
 
 /// A recipe by name, or from a file.
@@ -101,7 +125,7 @@ fn find_recipe(recipes: &[Recipe], name: &str, base: &Path) -> anyhow::Result<Re
         return Ok(Recipe::parse(&path.display().to_string(), &text(&path)?)?);
     }
     let names: Vec<&str> = recipes.iter().map(|r| r.recipe.as_str()).collect();
-    bail!("no recipe {name}; there are {}, or a path of a .json5 file", names.join(", "));
+    bail!("{name}: unknown recipe; pass one of {}, or the path of a .json5 file", names.join(", "));
 }
 
 fn text(path: &Path) -> anyhow::Result<String> {

@@ -87,7 +87,7 @@ fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     }
     let found = find_checkpoints(path);
     if found.is_empty() && path.is_dir() {
-        bail!("{}: no checkpoint there (no config.json, adapter_config.json, index or *.safetensors)", path.display());
+        bail!("{}: no checkpoint found (no config.json, adapter_config.json, index or *.safetensors)", path.display());
     }
     Ok(found)
 }

@@ -1,4 +1,4 @@
-//! `check --fix` and what belongs to it.
+//! `check --fix`, `--diff` and `--output`.
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -20,33 +20,33 @@ use super::output;
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
 
 impl FixArgs {
-    /// Whether anything is to be written.
+    /// Whether this run writes repairs.
     pub const fn writes(&self) -> bool {
         (self.fix || self.fix_only) && !self.diff
     }
 
-    /// Refuses what cannot be meant.
+    /// Rejects combinations of options that make no sense.
     pub fn refuse(&self, checkpoints: usize) -> anyhow::Result<()> {
         if self.output.is_some() && !self.writes() {
-            bail!("--output needs --fix");
+            bail!("--output requires --fix");
         }
         if self.output.is_some() && checkpoints > 1 {
-            bail!("--output takes one checkpoint, and there are {checkpoints}");
+            bail!("--output accepts one checkpoint, but {checkpoints} were found");
         }
         Ok(())
     }
 }
 
-/// Finishes or takes back what an earlier run was interrupted in, before the checkpoint is looked at.
+/// Finishes or rolls back a repair that was interrupted, before the checkpoint is checked.
 pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
     if args.writes() && args.output.is_none() {
         let done = match journal::recover(dir)? {
             None => return Ok(()),
             Some(Recovered::Finished) => "finished",
-            Some(Recovered::TakenBack) => "taken back",
+            Some(Recovered::TakenBack) => "rolled back",
         };
         let dir = escape(&dir.display().to_string(), 300);
-        output::note(&format!("{dir}: an interrupted repair is {done}"));
+        output::note(&format!("{dir}: {done} an interrupted repair"));
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! From what was typed and what settings files say to what is meant.
+//! Resolves command line and settings files to the options of each checkpoint.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -12,21 +12,21 @@ use ckpt_doctor::knowledge::settings::{Chain, nearest};
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
 
-/// What is meant for the checkpoints of one settings file.
+/// Resolved options for the checkpoints under one settings file.
 pub struct Resolved {
     /// The settings file, if there is one.
     pub file: Option<PathBuf>,
-    /// What the checks know, the settings included.
+    /// Rules, architectures and policy of the checks.
     pub knowledge: Knowledge,
     /// Versions to predict the load for.
     pub versions: Vec<String>,
-    /// Least severity that fails.
+    /// Lowest severity that fails.
     pub fail_on: Severity,
     /// The baseline.
     pub baseline: Option<PathBuf>,
 }
 
-/// What was typed. It has the last word over every settings file.
+/// Options of the command line. They override every settings file.
 #[derive(Default)]
 pub struct Typed {
     config: Option<PathBuf>,
@@ -39,7 +39,7 @@ pub struct Typed {
 }
 
 impl Typed {
-    /// Which settings and rules.
+    /// The options that all commands with settings share.
     pub fn new(settings: &SettingsArgs, rules: Option<&Path>) -> Self {
         Self {
             config: settings.config.clone(),
@@ -49,7 +49,7 @@ impl Typed {
         }
     }
 
-    /// As `check` has it.
+    /// The options of `check`.
     pub fn check(args: &CheckArgs, rules: Option<&Path>) -> Self {
         Self {
             choice: Choice {
@@ -77,7 +77,7 @@ impl SettingsResolver {
         Self { typed, resolved: BTreeMap::new(), told: BTreeSet::new() }
     }
 
-    /// What is meant for the checkpoint in this directory.
+    /// The options for the checkpoint in this directory.
     pub fn resolve(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
         let file = if self.typed.isolated {
             None
@@ -89,7 +89,9 @@ impl SettingsResolver {
                 && self.told.insert(passed_over.clone())
             {
                 let file = output::safe(&passed_over.display().to_string());
-                output::note(&format!("note: {file} lies in a checkpoint and is not used; --config {file} uses it"));
+                output::note(&format!(
+                    "note: {file} is inside a checkpoint and is ignored; pass --config {file} to use it"
+                ));
             }
             found.file
         };
@@ -101,7 +103,7 @@ impl SettingsResolver {
         Ok(resolved)
     }
 
-    /// Every settings file that was found, and what it means.
+    /// The options of every settings file found so far.
     pub fn all(&self) -> impl Iterator<Item = &Rc<Resolved>> {
         self.resolved.values()
     }

@@ -79,6 +79,9 @@ pub struct Scheme {
     /// What transformers says of an incomplete module, when it raises; `{tensor}` is the plain name.
     #[serde(default)]
     pub raises: Option<String>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// A value that shapes depend on.

@@ -46,6 +46,9 @@ pub struct Recipe {
     /// Sentences about what the merge decided that a person should know.
     #[serde(default)]
     pub notes: Vec<Note>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// A donor role.
@@ -382,4 +385,7 @@ pub struct MergeFile {
     pub options: Map<String, Value>,
     /// Directory to make.
     pub out: String,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }

@@ -71,6 +71,9 @@ pub struct Rule {
     /// The file it was read from, for a user's own rule.
     #[serde(skip)]
     pub origin: Option<String>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// The kinds of check. Adding a rule rarely needs another.

@@ -57,6 +57,9 @@ pub struct Settings {
     /// A baseline, written by `--write-baseline`: findings in it are not counted.
     #[serde(default)]
     pub baseline: Option<PathBuf>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// What is different in a place.

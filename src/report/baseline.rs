@@ -26,6 +26,9 @@ pub struct Baseline {
     schema: u32,
     /// By checkpoint, rule and message.
     findings: Vec<BaselineEntry>,
+    /// Path or URL of a JSON Schema, for editors; the program keeps it and ignores it.
+    #[serde(default, rename = "$schema", skip_serializing_if = "Option::is_none")]
+    for_editors: Option<String>,
 }
 
 /// One finding. All but the fingerprint is for people.
@@ -59,7 +62,7 @@ impl Baseline {
     pub fn from_reports<'r>(reports: impl Iterator<Item = &'r CheckpointReport>, folder: &Path) -> Self {
         let mut findings: Vec<BaselineEntry> = reports.flat_map(|report| entries(report, folder)).collect();
         findings.sort();
-        Self { schema: SCHEMA, findings }
+        Self { schema: SCHEMA, findings, for_editors: None }
     }
 
     /// Keeps of an older baseline what this one cannot speak of: other checkpoints, and rules that were not asked.
@@ -69,6 +72,7 @@ impl Baseline {
         self.findings.extend(older.findings.into_iter().filter(other));
         self.findings.sort();
         self.findings.dedup();
+        self.for_editors = older.for_editors;
     }
 
     /// The text of the file.

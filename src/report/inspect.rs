@@ -14,7 +14,8 @@ use crate::check::inspect::{Amount, ClassCandidate, Inspection};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
-struct InspectionJson<'a> {
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct InspectDocument<'a> {
     schema: u32,
     tool: ToolInfo,
     path: &'a str,
@@ -25,7 +26,7 @@ struct InspectionJson<'a> {
 /// The whole of an inspection as JSON (`schema` 1).
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection) -> String {
-    pretty(&InspectionJson { schema: 1, tool: ToolInfo::this(), path, inspection })
+    pretty(&InspectDocument { schema: 1, tool: ToolInfo::this(), path, inspection })
 }
 
 /// An inspection for a terminal.
@@ -51,7 +52,7 @@ pub fn full(path: &str, inspection: &Inspection, style: Style) -> String {
         values(&mut out, votes, inspection.config.is_some(), style);
     }
     if !inspection.proven.is_null() && (inspection.config.is_none() || outvoted(inspection)) {
-        let _ok = writeln!(out, "\n  {}", paint.strong("what the tensors show, as a start of a config.json"));
+        let _ok = writeln!(out, "\n  {}", paint.strong("config.json inferred from the tensors (incomplete)"));
         indented(&mut out, &pretty(&inspection.proven));
     }
     for note in &inspection.notes {
@@ -99,8 +100,8 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
             let _ok = write!(
                 out,
                 "\n  class by config: {} (model_type {})",
-                paint.strong(&or(&said.class, "not named")),
-                or(&said.model_type, "not named")
+                paint.strong(&or(&said.class, "none")),
+                or(&said.model_type, "none")
             );
             if let Some(version) = &said.transformers_version {
                 let _ok = write!(out, ", written by transformers {}", name(version));
@@ -112,10 +113,10 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
         }
     };
     let Some(best) = inspection.classes.first() else { return };
-    let fit = best.fit.map(|fit| format!("; with the values below it has {} of names and shapes", percent(fit)));
+    let fit = best.fit.map(|fit| format!(", {} of names and shapes with the values below", percent(fit)));
     let _ok = writeln!(
         out,
-        "  class by tensors: {} ({}), {} of names{}; known for transformers {}",
+        "  class by tensors: {} ({}): matches {} of names{}; known for transformers {}",
         paint.strong(&name(&best.class)),
         name(&best.architecture),
         percent(best.names),
@@ -127,7 +128,7 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
         let mut shown: Vec<String> =
             others.iter().take(style.cap).map(|c| format!("{} {}", name(&c.class), percent(c.names))).collect();
         shown.extend(more(others.len(), style.cap));
-        let _ok = writeln!(out, "    then {}", shown.join(", "));
+        let _ok = writeln!(out, "    next: {}", shown.join(", "));
     }
 }
 
@@ -146,25 +147,25 @@ fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
             ]
         })
         .collect();
-    let _ok = writeln!(out, "\n  config values by the votes of the tensors");
+    let _ok = writeln!(out, "\n  config values inferred from the tensors");
     let first = if has_config { "config" } else { "default" };
-    table(out, ["", first, "tensors say", "votes", "for example"], &rows, style);
+    table(out, ["", first, "tensors imply", "votes", "for example"], &rows, style);
     let (before, after) = (votes.before, votes.after);
     let fits = |f: crate::check::votes::Fit| {
-        format!("{} of {} stored, {} of another shape", f.found, f.expected, f.mismatched)
+        format!("{} of {} stored, {} with another shape", f.found, f.expected, f.mismatched)
     };
     let _ok = match votes.outvoted().count() {
-        0 => writeln!(out, "  no value is outvoted; tensors of the class: {}", fits(after)),
+        0 => writeln!(out, "  the tensors contradict no value; tensors of the class: {}", fits(after)),
         n => writeln!(
             out,
-            "  {} outvoted; tensors of the class: {}; with the voted values: {}",
+            "  the tensors contradict {}; tensors of the class: {}; with the inferred values: {}",
             plural(n, "value"),
             fits(before),
             fits(after)
         ),
     };
     for open in &votes.undecided {
-        let _ok = writeln!(out, "  not decided, only: {}", name(&open.constraint));
+        let _ok = writeln!(out, "  undetermined; only this is known: {}", name(&open.constraint));
     }
 }
 
@@ -177,7 +178,7 @@ fn config_value(vote: &Vote) -> String {
 
 fn tally(vote: &Vote) -> String {
     let all = vote.votes_for.saturating_add(vote.votes_against);
-    if all == 0 { "by absence".to_owned() } else { format!("{} of {all}", vote.votes_for) }
+    if all == 0 { "absence".to_owned() } else { format!("{} of {all}", vote.votes_for) }
 }
 
 fn indented(out: &mut String, text: &str) {

@@ -106,21 +106,21 @@ fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
         "\nPredicted load by {versions}: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"
     );
     if let Some(exception) = &load.raises {
-        let _ok = writeln!(out, "\nBefore any of these is reported, the loader raises: {}", text(&sentence(exception)));
+        let _ok = writeln!(out, "\nBefore it reports any of these, the loader raises: {}", text(&sentence(exception)));
     }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
-    groups(out, "Missing: the loader initialises them anew", &names(&load.missing), cap);
-    groups(out, "Unexpected: the loader ignores them", &names(&load.unexpected), cap);
+    groups(out, "Missing: the loader initialises these with random values", &names(&load.missing), cap);
+    groups(out, "Unexpected: the loader ignores these", &names(&load.unexpected), cap);
     if !load.mismatched.is_empty() {
         let rows: Vec<_> = format::mismatched(load)
             .into_iter()
             .map(|[tensor, stored, expected]| [code(&tensor), stored, expected])
             .collect();
-        let _ok = writeln!(out, "\nMismatched: the load raises");
+        let _ok = writeln!(out, "\nMismatched: the loader raises an exception");
         table(out, ["tensor", "stored", "expected"], &rows, cap);
     }
     for (reason, names) in format::silent(load) {
-        groups(out, &format!("Silent, reported by nobody: {}", text(&reason)), &names, cap);
+        groups(out, &format!("Silent, loaded without a warning: {}", text(&reason)), &names, cap);
     }
 }
 
@@ -152,8 +152,8 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
     }
     seams(out, merge, cap);
     merged_tensors(out, merge, cap);
-    sentences(out, "Repaired on the way", &merge.repairs, cap);
-    sentences(out, "To know", &merge.notes, usize::MAX);
+    sentences(out, "Repaired", &merge.repairs, cap);
+    sentences(out, "Notes", &merge.notes, usize::MAX);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
         let _ok = writeln!(out, "\n## Files");
@@ -173,13 +173,13 @@ fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
         let changed = merge.changed.iter();
         let row = changed
             .map(|c| [code(&name(&c.name)), c.transform.name().to_owned(), from(c.from.as_deref()), shape(&c.to)]);
-        table(out, ["not a copy", "how", "from", "to"], &row.collect::<Vec<_>>(), cap);
+        table(out, ["changed tensor", "how", "from", "to"], &row.collect::<Vec<_>>(), cap);
     }
     if !merge.dropped.is_empty() {
         let dropped = merge.dropped.iter();
         let row = dropped
             .map(|d| [text_name(&d.donor), code(&name(&d.pattern)), d.count.to_string(), text(&sentence(&d.why))]);
-        let _ok = writeln!(out, "\n## Left behind");
+        let _ok = writeln!(out, "\n## Dropped");
         table(out, ["donor", "tensors", "count", "why"], &row.collect::<Vec<_>>(), cap);
     }
 }
@@ -214,8 +214,8 @@ fn seams(out: &mut String, merge: &MergeReport, cap: usize) {
                 needed.map_or_else(String::new, shape),
             ]
         };
-        let tensor = seam.tensor.iter().map(|t| row("does not fit", t, seam.needed.as_deref()));
-        let rows: Vec<_> = tensor.chain(seam.meets.iter().map(|m| row("has to meet", m, None))).collect();
+        let tensor = seam.tensor.iter().map(|t| row("mismatch", t, seam.needed.as_deref()));
+        let rows: Vec<_> = tensor.chain(seam.meets.iter().map(|m| row("must match", m, None))).collect();
         if !rows.is_empty() {
             table(out, ["", "donor", "tensor", "shape", "needed"], &rows, cap);
         }

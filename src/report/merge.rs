@@ -9,32 +9,33 @@ use crate::surgery::plan::TensorTransform;
 
 /// The record of a merge.
 #[derive(Debug, Clone, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct MergeReport {
     /// Recipe name.
     pub recipe: String,
-    /// The stage it ended with; none while it runs, as in the report that is written into the result.
+    /// The stage it ended with; null while it runs, as in the report that is written into the result.
     pub stage: Option<MergeStage>,
-    /// Where the result is or would be.
+    /// The output directory.
     pub out: String,
-    /// Donor role to path.
+    /// Directories of the donors, by role.
     pub donors: BTreeMap<String, String>,
-    /// Options in force, defaults included.
+    /// Options in effect, defaults included.
     pub options: BTreeMap<String, String>,
-    /// Stages in the order they ran, with one line each.
+    /// The stages that ran, in order.
     pub stages: Vec<StageOutcome>,
-    /// Seams that do not fit; non-empty means nothing was written.
+    /// Seams that do not fit; if there are any, nothing was written.
     pub seams: Vec<Seam>,
-    /// Number of tensors by how their bytes are made.
+    /// Number of tensors by transform.
     pub transforms: BTreeMap<TensorTransform, usize>,
-    /// The tensors that are not plain copies.
+    /// Tensors that are not byte copies.
     pub changed: Vec<ChangedTensor>,
-    /// Donor tensors that were left behind, by donor role and pattern.
+    /// Donor tensors that the result does not contain, by role and pattern.
     pub dropped: Vec<Dropped>,
-    /// Repairs made on the way, one sentence each.
+    /// Repairs of donor documents, one sentence each.
     pub repairs: Vec<String>,
-    /// What a person should know of the result, one sentence each.
+    /// Notes about the result for its user, one sentence each.
     pub notes: Vec<String>,
-    /// Files of the result and where each came from.
+    /// Files of the result and their origin.
     pub files: Vec<MergedFile>,
     /// Tensors in the result.
     pub tensors: usize,
@@ -44,6 +45,7 @@ pub struct MergeReport {
 
 /// The stage that a merge ended with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum MergeStage {
     /// A donor has errors that the recipe does not tolerate; nothing was written.
@@ -60,6 +62,7 @@ pub enum MergeStage {
 
 /// What a checkpoint is in a merge. Reports spell it `donor vision`, `planned`, `written`.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[cfg_attr(test, derive(schemars::JsonSchema), schemars(with = "String"))]
 pub enum Role {
     /// A donor, by its role in the recipe.
     Donor(String),
@@ -87,60 +90,65 @@ impl Serialize for Role {
 
 /// One line about one stage of the pipeline.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct StageOutcome {
     /// Its name.
     pub name: String,
-    /// What came of it.
+    /// Its outcome.
     pub outcome: String,
 }
 
-/// A seam that does not fit: two parts that must agree, and do not.
+/// A seam that does not fit: two parts that must agree and do not.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Seam {
-    /// What has to agree, in one sentence.
+    /// The mismatch, in one sentence.
     pub message: String,
-    /// The part that does not fit: name and shape as stored.
+    /// The stored tensor that does not fit.
     pub tensor: Option<ShapedName>,
-    /// The part it has to meet: name and shape.
+    /// The tensor that it must match.
     pub meets: Option<ShapedName>,
-    /// Shape the result needs for `tensor`.
+    /// The shape that the result needs for `tensor`.
     pub needed: Option<Vec<u64>>,
-    /// Options that would solve it, as typed on the command line: `--set projector=pad`.
+    /// Options that resolve the mismatch: `--set projector=pad`.
     pub options: Vec<String>,
 }
 
 /// A name with a shape.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct ShapedName {
-    /// Donor role it comes from.
+    /// Role of the donor.
     pub donor: String,
-    /// Tensor name in that donor.
+    /// Name in the donor.
     pub name: String,
-    /// Its shape there.
+    /// Shape in the donor.
     pub shape: Vec<u64>,
 }
 
 /// A tensor of the result that is not a byte copy.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct ChangedTensor {
     /// Name in the result.
     pub name: String,
-    /// How its bytes are made.
+    /// The transform of its bytes.
     pub transform: TensorTransform,
-    /// Shape in the donor; absent when nothing was taken.
+    /// Shape in the donor; null if nothing was taken from it.
     pub from: Option<Vec<u64>>,
     /// Shape in the result.
     pub to: Vec<u64>,
 }
 
-/// Donor tensors that were left behind.
+/// Donor tensors that the result does not contain.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Dropped {
     /// Donor role.
     pub donor: String,
     /// Pattern of the recipe.
     pub pattern: String,
-    /// How many tensors it matched.
+    /// Number of tensors that it matches.
     pub count: usize,
     /// Why the recipe drops them.
     pub why: String,
@@ -148,9 +156,10 @@ pub struct Dropped {
 
 /// A file of the result.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct MergedFile {
     /// File name.
     pub name: String,
-    /// Where it came from.
+    /// Its origin.
     pub origin: String,
 }

@@ -13,18 +13,19 @@ use crate::check::load::LoadReport;
 use crate::check::{Finding, Severity};
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
-/// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 2).
+/// The report of one run. Serialised, it is the JSON contract (`schema` 2).
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Report {
     /// Version of this contract.
     pub schema: u32,
-    /// Which program wrote it.
+    /// The program that wrote the report.
     pub tool: ToolInfo,
-    /// One entry for each checkpoint, in the order given.
+    /// One entry per checkpoint, in the order of the arguments; a merge has its donors, the plan and the result.
     pub checkpoints: Vec<CheckpointReport>,
-    /// What a merge did; absent for `check`.
+    /// The merge; null for `check`.
     pub merge: Option<MergeReport>,
-    /// Totals.
+    /// Totals over all checkpoints.
     pub summary: Summary,
 }
 
@@ -43,6 +44,7 @@ impl Report {
 
 /// Name and version of the program.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct ToolInfo {
     /// Always `ckpt-doctor`.
     pub name: &'static str,
@@ -58,37 +60,38 @@ impl ToolInfo {
     }
 }
 
-/// The report on one checkpoint.
+/// The report of one checkpoint.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct CheckpointReport {
-    /// As the user named it.
+    /// The path, as the user wrote it.
     pub path: String,
-    /// What it is in a merge; absent for `check`.
+    /// Its role in a merge: `donor vision`, `planned`, `written`; missing for `check`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub role: Option<Role>,
-    /// Architecture the load reports were predicted with.
+    /// The architecture of the predicted loads; null if it is unknown.
     pub architecture: Option<String>,
     /// Clean, or the worst severity.
     pub verdict: Verdict,
     /// Findings by severity.
     pub counts: Counts,
-    /// The settings file that was gone by.
+    /// The settings file that applied.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub settings: Option<String>,
-    /// Findings sorted by file, place and code.
+    /// Findings, sorted by file, place and code.
     pub findings: Vec<Finding>,
-    /// Findings that settings or a baseline accept; they are not counted.
+    /// Findings that settings or a baseline accept; `counts` does not include them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub suppressed: Vec<Suppressed>,
-    /// Predicted load reports, one for each loader; none when the architecture is unknown or there are no tensors.
+    /// Predicted load reports, one per loader; empty if the architecture is unknown or there are no tensors.
     pub loads: Vec<LoadReport>,
-    /// Findings whose fixes were made; `findings` are those that are left.
+    /// Findings whose fixes were applied; `findings` has the remaining ones.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub fixed: Vec<Fixed>,
-    /// Fixes that were tried and not kept.
+    /// Fixes that were tried and rolled back.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub withdrawn: Vec<Withdrawn>,
-    /// What the run was asked to do about findings; for renderers that offer fixes.
+    /// The fix options of the run, for renderers that offer fixes.
     #[serde(skip)]
     pub fixing: Option<Fixing>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
@@ -101,6 +104,7 @@ pub struct CheckpointReport {
 
 /// The verdict over one checkpoint, or over all of a run: clean, or the worst severity of its findings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Verdict {
     /// No findings.
@@ -145,14 +149,15 @@ pub struct Fixing {
     pub made: bool,
 }
 
-/// How many findings there are of each severity.
+/// The number of findings of each severity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Counts {
     /// Errors.
     pub error: usize,
     /// Warnings.
     pub warning: usize,
-    /// Notes.
+    /// Findings of severity info.
     pub info: usize,
 }
 
@@ -197,14 +202,15 @@ impl Counts {
 
 /// Totals over all checkpoints.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Summary {
-    /// Checkpoints looked at.
+    /// Number of checkpoints.
     pub checkpoints: usize,
     /// Clean, or the worst severity.
     pub verdict: Verdict,
     /// Findings by severity.
     pub counts: Counts,
-    /// Findings that are accepted, and not among the counts.
+    /// Number of suppressed findings; `counts` does not include them.
     #[serde(skip_serializing_if = "is_zero")]
     pub suppressed: usize,
 }

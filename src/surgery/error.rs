@@ -1,4 +1,4 @@
-//! Why a checkpoint was not written, with the path, the operation, the figures and the next step.
+//! Errors while writing a checkpoint; each text ends with the next step.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -57,7 +57,7 @@ pub enum ApplyError {
         have: u64,
     },
     /// One file is larger than may be.
-    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that, or save in smaller shards", path = path.display())]
+    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that limit, or use smaller shards", path = path.display())]
     FileSize {
         /// The file.
         path: PathBuf,
@@ -67,7 +67,7 @@ pub enum ApplyError {
         limit: String,
     },
     /// A donor changed while it was read.
-    #[error("{path}: {reason} while it was being read; nothing was written; retry once nothing else is modifying it", path = path.display())]
+    #[error("{path}: {reason} while it was being read; nothing was written, retry once nothing else modifies it", path = path.display())]
     Changed {
         /// The donor's file.
         path: PathBuf,
@@ -88,7 +88,7 @@ pub enum ApplyError {
         error: io::Error,
     },
     /// Writing failed, and so did removing what was written until then.
-    #[error("{error}; {path} could not be removed ({why}), the next run that writes to the same place will try again", path = path.display())]
+    #[error("{error}; {path} could not be removed ({why}); the next run with the same target tries again", path = path.display())]
     Left {
         /// What went wrong first.
         error: Box<Self>,
@@ -98,7 +98,7 @@ pub enum ApplyError {
         why: io::Error,
     },
     /// The target has its name, and can neither be made durable nor be taken back.
-    #[error("{path}: is whole, but may not outlive a power failure, because the system failed to sync its name: {error}", path = path.display())]
+    #[error("{path}: is complete, but may not survive a power failure: syncing its parent directory failed: {error}", path = path.display())]
     Unsynced {
         /// The target.
         path: PathBuf,

@@ -96,6 +96,7 @@ pub enum TensorSource {
 
 /// How the bytes of a tensor are made: a [`TensorSource`] without the donor tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum TensorTransform {
     /// The donor's bytes as they are.

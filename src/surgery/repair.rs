@@ -16,31 +16,33 @@ use crate::checkpoint::Checkpoint;
 
 pub use planner::plan;
 
-/// A finding whose fix is made.
+/// A finding whose fix was applied.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Fixed {
     /// Code of the rule.
     pub code: String,
     /// Its name.
     pub name: String,
-    /// Where it was, if that was in a file.
+    /// File of the finding.
     pub file: Option<String>,
-    /// What was wrong.
+    /// Message of the finding.
     pub message: String,
     /// How safe the fix is.
     pub safety: Safety,
-    /// What was done.
+    /// What the fix did.
     pub title: String,
 }
 
-/// A fix that was tried and not kept.
+/// A fix that was tried and rolled back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Withdrawn {
     /// Code of the rule.
     pub code: String,
-    /// What it would have done.
+    /// What the fix would do.
     pub title: String,
-    /// Why it was not kept.
+    /// Why it was rolled back.
     pub reason: String,
 }
 

@@ -3,3 +3,4 @@
 mod check;
 mod expect;
 mod selection;
+mod usage;

@@ -2,6 +2,7 @@
 
 mod formats;
 mod samples;
+mod schemas;
 
 use ckpt_doctor::check::Location;
 use ckpt_doctor::check::load::{LoadReport, Mismatch};

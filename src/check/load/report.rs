@@ -4,6 +4,7 @@ use serde::Serialize;
 
 /// Lists of what a loader would say of the state dict; names are spelled as it spells them.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct LoadReport {
     /// Version of transformers that was read for this prediction: `4.47.0`.
     pub loader: String,
@@ -54,6 +55,7 @@ impl LoadReport {
 
 /// A tensor whose stored shape is not the expected one.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Mismatch {
     /// State-dict name.
     pub name: String,
@@ -65,6 +67,7 @@ pub struct Mismatch {
 
 /// A tensor that loads wrong without any message.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Silent {
     /// State-dict name.
     pub name: String,
@@ -77,6 +80,7 @@ pub struct Silent {
 
 /// Why a tensor loads wrong without any message. Ordered by name, as reports list them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum SilentReason {
     /// The index maps it and no shard contains it: it stays randomly initialised.

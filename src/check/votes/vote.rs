@@ -8,24 +8,25 @@ use serde_json::Value;
 use crate::checkpoint::pointer;
 use crate::knowledge::{Evidence, Expected};
 
-/// What the tensors say of one value of config.json.
+/// The votes on one value of config.json.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Vote {
     /// JSON pointer into config.json.
     pub pointer: String,
-    /// What the config says; the class's default where it is silent, null where that is too.
+    /// The value in the config; if the config lacks it, the default of the class; null without a default.
     pub config_value: Value,
-    /// Whether config.json itself says it.
+    /// Whether config.json contains the value.
     pub given: bool,
-    /// What the tensors say.
+    /// The value that the tensors imply.
     pub voted_value: Value,
-    /// Stored tensors whose name or shape follows from the voted value, and is so.
+    /// Number of stored tensors whose name or shape agrees with the voted value.
     #[serde(rename = "for")]
     pub votes_for: usize,
-    /// Stored tensors whose name or shape follows from it, and is otherwise.
+    /// Number of stored tensors whose name or shape disagrees with it.
     #[serde(rename = "against")]
     pub votes_against: usize,
-    /// A few of the tensors that speak for it.
+    /// Examples of tensors that agree with it.
     pub evidence: Vec<Witness>,
 }
 
@@ -37,12 +38,13 @@ impl Vote {
     }
 }
 
-/// A stored tensor that speaks for a value, under the class's name for it.
+/// A stored tensor that agrees with a value, under its name in the class.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Witness {
     /// Its name.
     pub tensor: String,
-    /// Its stored shape, where it is known.
+    /// Its stored shape; null if it is unknown.
     pub shape: Option<Vec<u64>>,
 }
 
@@ -56,25 +58,27 @@ impl fmt::Display for Witness {
     }
 }
 
-/// Values of which the tensors show only a product or a ratio.
+/// Config values of which the tensors determine only a product or a ratio.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Undecided {
     /// JSON pointers into config.json.
     pub pointers: Vec<String>,
-    /// What is sure: `head_dim * num_attention_heads = 4096`.
+    /// The known relation: `head_dim * num_attention_heads = 4096`.
     pub constraint: String,
 }
 
-/// How a class fits the stored tensors, before any loader's rules.
+/// The agreement of a class with the stored tensors, before the rules of a loader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Fit {
-    /// Tensors the class has; of those that share a storage, one is enough.
+    /// Tensors that the class expects; tied tensors count once.
     pub expected: usize,
     /// Of these, stored.
     pub found: usize,
     /// Of these, stored with another shape.
     pub mismatched: usize,
-    /// Tensors stored.
+    /// Stored tensors.
     pub stored: usize,
 }
 
@@ -114,10 +118,11 @@ impl Fit {
 
 /// The outcome of a vote.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Votes {
-    /// Every value that shapes the class and that the tensors decide, in the order of the config.
+    /// Every value that the tensors determine, in the order of the config.
     pub votes: Vec<Vote>,
-    /// What they leave open.
+    /// Values that they leave open.
     pub undecided: Vec<Undecided>,
     /// The config with the voted values in place.
     #[serde(skip)]
@@ -125,9 +130,9 @@ pub struct Votes {
     /// The same with the class's defaults filled in.
     #[serde(skip)]
     pub resolved: Value,
-    /// How the class fits with the values it was given.
+    /// The agreement with the values of the config.
     pub before: Fit,
-    /// How it fits with those that were voted for.
+    /// The agreement with the voted values.
     pub after: Fit,
     /// Whether the search stopped early because the model is large.
     #[serde(skip)]

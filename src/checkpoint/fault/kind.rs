@@ -18,6 +18,7 @@ macro_rules! fault_kinds {
     ($($source:ident { $($variant:ident = $name:literal,)* })*) => {
         /// A kind of fault. Rules in `rules/checks/` select faults by [`FaultKind::name`].
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[cfg_attr(test, derive(schemars::JsonSchema), schemars(rename_all = "kebab-case"))]
         pub enum FaultKind {
             $($(
                 #[doc = concat!("`", $name, "`")]

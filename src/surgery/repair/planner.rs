@@ -123,7 +123,7 @@ impl Planner<'_> {
 fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<String> {
     // Of findings that look alike some may go and some stay: the next round has those that stay.
     let stays = |f: &&Finding| count(after, |g| g.code == f.code) >= count(before, |g| g.code == f.code);
-    worse(before, after).or_else(|| made.iter().find(stays).map(|_| "it would not be rid of the finding".to_owned()))
+    worse(before, after).or_else(|| made.iter().find(stays).map(|_| "the finding would remain".to_owned()))
 }
 
 /// How many findings there are of a kind, those that are only counted included.
@@ -137,7 +137,7 @@ fn worse(before: &Outcome, after: &Outcome) -> Option<String> {
     let of = |outcome: &Outcome, code: &str| count(outcome, |f| f.severity == Severity::Error && f.code == code);
     let codes: BTreeSet<&str> = after.findings.iter().map(|f| f.code.as_str()).collect();
     let code = codes.into_iter().find(|code| of(after, code) > of(before, code))?;
-    Some(format!("it would bring about {code}"))
+    Some(format!("it would introduce {code}"))
 }
 
 fn fixed(finding: &Finding) -> Option<Fixed> {

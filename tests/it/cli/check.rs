@@ -106,7 +106,7 @@ fn exit_codes_follow_the_severity_asked_for() {
     let work = TempDir::new().unwrap();
     let nothing = doctor(&["check", work.path().to_str().unwrap()]);
     assert_eq!(nothing.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&nothing.stderr).contains("no checkpoint there"));
+    assert!(String::from_utf8_lossy(&nothing.stderr).contains("no checkpoint found"));
     assert_eq!(doctor(&["check", "/no/such/place"]).status.code(), Some(2));
     assert_eq!(doctor(&["check", vision, "--output-format", "tea"]).status.code(), Some(2));
 }

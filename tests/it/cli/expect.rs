@@ -41,13 +41,6 @@ fn a_config_is_printed_as_the_tensors_of_its_class() {
 }
 
 #[test]
-fn its_help_says_what_can_be_given() {
-    let (help, code) = expect(Path::new("."), &["--help"]);
-    assert_eq!(code, Some(0));
-    snapshot!("expect-help", help);
-}
-
-#[test]
 fn a_line_that_fails_does_not_stop_the_others() {
     let work = TempDir::new().unwrap();
     let mut broken = llama();
@@ -85,7 +78,7 @@ fn rules_of_a_folder_are_known_too() {
     let (wrong, code) = expect(dir, &["config.json", "--rules", "mine"]);
     assert_eq!(
         (code, wrong.as_str()),
-        (Some(2), "error: mine has neither architectures/*.json5 nor checks/**/*.json5\n")
+        (Some(2), "error: mine contains neither architectures/*.json5 nor checks/**/*.json5\n")
     );
     let file = |tensors: &str| {
         let text = format!(

@@ -107,7 +107,7 @@ fn settings_among_the_files_of_a_checkpoint_are_passed_over() {
     fs::create_dir(vla.join("inner")).unwrap();
     fs::copy(vla.join("config.json"), vla.join("inner/config.json")).unwrap();
     let inner = said(root, &["check", "models/vla/inner", "--output-format", "concise"]);
-    assert!(inner.contains("models/vla/ckpt-doctor.json5 lies in a checkpoint and is not used"), "{inner}");
+    assert!(inner.contains("models/vla/ckpt-doctor.json5 is inside a checkpoint and is ignored"), "{inner}");
 }
 
 #[test]
@@ -236,7 +236,7 @@ fn a_baseline_sets_aside_what_was_there() {
     let zoo = zoo();
     let root = zoo.path();
     let check = ["check", "models", "--output-format", "concise", "--fail-on", "warning", "--baseline", "known.json"];
-    assert!(said(root, &check).contains("--write-baseline writes it"));
+    assert!(said(root, &check).contains("--write-baseline creates it"));
     let mut shown = said(root, &[&check[..], &["--write-baseline"]].concat());
     shown.push_str(&fs::read_to_string(root.join("known.json")).unwrap());
     shown.push_str(&said(root, &check));
@@ -258,7 +258,7 @@ fn a_baseline_sets_aside_what_was_there() {
     assert_eq!(report["checkpoints"][0]["suppressed"].as_array().unwrap().len(), report["summary"]["suppressed"]);
     assert!(report["summary"]["suppressed"].as_u64() >= Some(3), "{report}");
     let none = said(root, &["check", "models", "--isolated", "--write-baseline"]);
-    assert!(none.contains("no baseline to write") && none.contains("exit 2"), "{none}");
+    assert!(none.contains("no baseline file given") && none.contains("exit 2"), "{none}");
     fs::write(root.join("known.json"), json!({ "schema": 2, "findings": [] }).to_string()).unwrap();
     assert!(said(root, &check).contains("a baseline of version 2; 1 is known here"));
 }
@@ -335,7 +335,7 @@ fn rules_of_ones_own_are_asked_listed_and_explained() {
                 ]
             )
             .lines()
-            .filter(|l| !l.contains("not chosen"))
+            .filter(|l| !l.contains("not selected"))
             .collect::<Vec<_>>()
             .join("\n")
         ));

@@ -78,8 +78,8 @@ fn a_copy_is_made_elsewhere() {
     assert_eq!(seen(&model), before);
     assert!(room.path().join("repaired/config.json").is_file());
     for (args, why) in [
-        (["check", "model", "--output", "other"].as_slice(), "--output needs --fix"),
-        (&["check", "model", "repaired", "--fix", "--output", "other"], "--output takes one checkpoint"),
+        (["check", "model", "--output", "other"].as_slice(), "--output requires --fix"),
+        (&["check", "model", "repaired", "--fix", "--output", "other"], "--output accepts one checkpoint"),
         (&["check", "model", "--fix", "--output", "repaired"], "files in it"),
         (&["check", "model", "--fix", "--output", "model/inside"], "lies inside"),
     ] {

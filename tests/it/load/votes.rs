@@ -120,7 +120,7 @@ fn without_a_config_class_and_values_are_found() {
 fn names_like_no_class_are_said_to_be() {
     let found = inspect(&bare(Map::from([("a.b".to_owned(), vec![2])])), &Library::embedded());
     assert_eq!((found.classes.len(), found.proven.is_null()), (0, true));
-    assert_eq!(found.notes, ["no class that is known here has names like these"]);
+    assert_eq!(found.notes, ["no known class has tensor names like these"]);
 }
 
 #[test]
@@ -174,7 +174,7 @@ fn copy(work: &TempDir, name: &str, change: impl FnOnce(&mut Value)) {
 /// Without the classes that come after the best: every new architecture file changes those.
 fn without_others(shown: &str, format: &str) -> String {
     if format == "full" {
-        let lines = shown.lines().filter(|line| !line.starts_with("    then "));
+        let lines = shown.lines().filter(|line| !line.starts_with("    next: "));
         return lines.collect::<Vec<_>>().join("\n");
     }
     let mut value: Value = serde_json::from_str(shown).unwrap();

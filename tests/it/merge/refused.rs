@@ -140,7 +140,7 @@ fn bad_requests_end_with_two_and_a_sentence() {
         (&["--set", "projector=fold"], "projector=fold is not one of pad, reinit, keep"),
         (&["--set", "shard-size=big"], "is not a size"),
         (&["--set", "alias=forward:os;rm"], "is not one of"),
-        (&["--recipe", "nonesuch"], "no recipe nonesuch"),
+        (&["--recipe", "nonesuch"], "nonesuch: unknown recipe"),
         (&["--recipe", "paligemma-llama"], "has to be paligemma"),
     ];
     for (more, reason) in cases {

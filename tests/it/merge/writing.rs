@@ -167,7 +167,7 @@ fn a_full_standard_error_is_no_panic() {
     // The report cannot be printed: what was written is there, and the message says so.
     let run = merge(work.path(), &out).stdout(full()).output().unwrap();
     assert_eq!(run.status.code(), Some(2));
-    assert!(text(&run).contains("is written; its report is not"), "{}", text(&run));
+    assert!(text(&run).contains("is written, but the report could not be"), "{}", text(&run));
     assert!(out.join("config.json").is_file());
 }
 
