@@ -1,4 +1,4 @@
-//! What a rule found: the unit every report is made of.
+//! Findings: what rules report, and load reports.
 
 use std::ops::Range;
 
@@ -29,7 +29,7 @@ pub struct Location {
 /// One finding of one rule.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Finding {
-    /// Rule code, `CFG004`.
+    /// Rule code, `IDX005`.
     pub code: String,
     /// Rule name in kebab case; it states the fault.
     pub name: String,
@@ -37,6 +37,9 @@ pub struct Finding {
     pub severity: Severity,
     /// One sentence that names the cause, with the figures at hand.
     pub message: String,
+    /// Further facts, one sentence each.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub details: Vec<String>,
     /// Where; may be empty for the whole checkpoint.
     pub locations: Vec<Location>,
     /// The figures the message was made from.

@@ -20,4 +20,4 @@ pub mod votes;
 pub use crate::knowledge::rule::Safety;
 pub use engine::{Knowledge, Outcome, check, check_for};
 pub use finding::{Finding, Location, Severity};
-pub use fix::{Edit, FixHint, renamed};
+pub use fix::{Edit, FixHint, clamped, renamed};

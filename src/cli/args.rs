@@ -118,7 +118,7 @@ pub enum ExpectFormat {
 /// Arguments of `explain`.
 #[derive(Debug, Args)]
 pub struct ExplainArgs {
-    /// Code or name: IDX005, shard-missing
+    /// Code, name or family: IDX005, shard-missing, IDX
     #[arg(value_name = "RULE")]
     pub rule: String,
     /// Which settings to go by.

@@ -21,8 +21,11 @@ mod words;
 use std::fmt;
 use std::str::FromStr;
 
+use model::CheckpointReport;
 pub use model::Report;
 pub use statistics::statistics;
+
+use crate::check::Finding;
 
 /// How a report is written down.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -129,6 +132,12 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
         Format::Sarif => ci::sarif::render(report),
         Format::Markdown => markdown::render(report, style.cap),
     }
+}
+
+/// Renders one finding of a checkpoint as [`Format::Full`] does, without the lines around it.
+#[must_use]
+pub fn render_finding(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
+    terminal::finding::render(finding, checkpoint, style)
 }
 
 /// The Rust in README.md compiles and runs.

@@ -4,8 +4,11 @@
 
 #![allow(
     clippy::arithmetic_side_effects,
+    clippy::cast_possible_truncation,
     clippy::expect_used,
+    clippy::format_push_string,
     clippy::indexing_slicing,
+    clippy::print_stdout,
     clippy::unwrap_used,
     reason = "a test that panics has failed, as it should"
 )]
@@ -22,6 +25,7 @@ mod house;
 mod load;
 mod merge;
 mod mutation;
+mod pages;
 mod readers;
 mod reports;
 mod rules;

@@ -8,7 +8,6 @@ mod base;
 mod change;
 pub mod data;
 pub mod invariants;
-pub mod keys;
 mod weights;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,7 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Knowledge, Outcome, check, policy};
+use ckpt_doctor::check::{Knowledge, Outcome, Safety, check, policy};
 use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::knowledge::Library;
 use ckpt_doctor::knowledge::processor::Processor;
@@ -25,6 +24,8 @@ use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, Policy, Source};
 use ckpt_doctor::knowledge::source;
+use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::{self, Style};
 use serde::Deserialize;
 
 pub use base::{BASES, copy};
@@ -86,6 +87,9 @@ pub struct Expect {
     /// How many findings of the rule; one when absent.
     #[serde(default)]
     pub count: Option<usize>,
+    /// Safety of the fix.
+    #[serde(default)]
+    pub fix: Option<Safety>,
 }
 
 /// A case and what was found.
@@ -94,6 +98,8 @@ pub struct Tried {
     pub outcome: Outcome,
     /// Codes found in the base alone.
     pub before: BTreeSet<String>,
+    /// The first finding of the case's own rule, as `check` prints it.
+    pub example: String,
 }
 
 impl Tried {
@@ -163,7 +169,7 @@ pub fn knowledge() -> Knowledge {
 }
 
 /// What is found in a directory under settings that lie in the folder above it.
-fn under(settings: &serde_json::Value, dir: &Path) -> Outcome {
+fn under(settings: &serde_json::Value, dir: &Path) -> (Arc<Checkpoint>, Outcome) {
     let mut knowledge = knowledge();
     let above = dir.parent().expect("a folder above");
     let source = Source::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
@@ -171,9 +177,9 @@ fn under(settings: &serde_json::Value, dir: &Path) -> Outcome {
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
     let mut outcome = check(&checkpoint, &knowledge);
-    let unused = policy::unused(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
+    let unused = policy::unused(&knowledge, &[(Arc::clone(&checkpoint), &outcome)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
-    outcome
+    (checkpoint, outcome)
 }
 
 /// Makes one of [`BASES`].
@@ -223,11 +229,25 @@ pub fn tried() -> &'static [Tried] {
 
 /// Opens and checks a directory.
 pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
+    open(dir, deep, knowledge).1
+}
+
+fn open(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let mut checkpoint = Checkpoint::open(dir).expect("a directory");
     if deep {
         checkpoint.read_contents();
     }
-    check(&Arc::new(checkpoint), knowledge)
+    let checkpoint = Arc::new(checkpoint);
+    let outcome = check(&checkpoint, knowledge);
+    (checkpoint, outcome)
+}
+
+/// The first finding of the rule as `check` prints it.
+fn example(code: &str, checkpoint: &Checkpoint, outcome: &Outcome) -> Option<String> {
+    let finding = outcome.findings.iter().find(|f| f.code == code)?;
+    let report = CheckpointReport::new("model", None, checkpoint, outcome);
+    let text = report::render_finding(finding, &report, Style { width: Some(100), ..Style::default() });
+    Some(text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n"))
 }
 
 /// A defect in one of the two models.
@@ -311,11 +331,12 @@ fn try_all() -> Vec<Tried> {
     let tried = on_every_case(&knowledge, |bases, case, made| {
         let codes = |dir: &PathBuf| look(dir, true, &knowledge).findings.into_iter().map(|f| f.code).collect();
         let before = before.get_or_init(|| bases.iter().map(|(name, dir)| (*name, codes(dir))).collect());
-        let outcome = match &case.settings {
+        let (checkpoint, outcome) = match &case.settings {
             Some(settings) => under(settings, made),
-            None => look(made, case.deep, &knowledge),
+            None => open(made, case.deep, &knowledge),
         };
-        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone() }
+        let example = case.code.as_ref().and_then(|code| example(code, &checkpoint, &outcome)).unwrap_or_default();
+        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), example }
     });
     tried.into_iter().map(|(_, tried)| tried).collect()
 }

@@ -20,6 +20,7 @@ pub(super) fn run(name: &str, site: &Site<'_>) -> Option<Vec<Edit>> {
     match name {
         "add-auto-class" => modules::add_auto_class(site),
         "add-imports" => modules::add_imports(site),
+        "clamp-infinity" => texts::clamp_infinity(site),
         "cut-nul-bytes" => texts::cut_nul_bytes(site),
         "drop-equal-key" => texts::drop_equal_key(site),
         "fill-token-holes" => tokens::fill_token_holes(site.checkpoint()),

@@ -179,7 +179,7 @@ impl Planner<'_> {
                 Made::All => made.push(finding.clone()),
                 Made::Later if !made.is_empty() => {}
                 // What changes nothing now, or stands in its own way, does so later too.
-                Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made here".to_owned()),
+                Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made".to_owned()),
             }
         }
         if made.is_empty() {
@@ -187,7 +187,7 @@ impl Planner<'_> {
         }
         let outcome = draft.finish().map(|()| (self.check)(draft.current()));
         let reason = match outcome {
-            None => "its edits do not fit together".to_owned(),
+            None => "its edits conflict".to_owned(),
             Some(outcome) => {
                 let Some(reason) = objection(&self.outcome, &outcome, &made) else {
                     (self.draft, self.outcome) = (draft, outcome);
@@ -212,7 +212,7 @@ impl Planner<'_> {
     fn withdraw(&mut self, finding: &Finding, reason: String) {
         let Some(fix) = &finding.fix else { return };
         self.barred.push(fix.edits.clone());
-        self.withdrawn.push(Withdrawn { code: finding.code.clone(), title: fix.title.clone(), reason });
+        self.withdrawn.push(Withdrawn { code: finding.code.clone(), title: fix.title().to_owned(), reason });
     }
 }
 
@@ -220,7 +220,7 @@ impl Planner<'_> {
 fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<String> {
     // Of findings that look alike some may go and some stay: the next round has those that stay.
     let stays = |f: &&Finding| count(after, |g| g.code == f.code) >= count(before, |g| g.code == f.code);
-    worse(before, after).or_else(|| made.iter().find(stays).map(|_| "it would not be rid of the finding".to_owned()))
+    worse(before, after).or_else(|| made.iter().find(stays).map(|_| "the finding would remain".to_owned()))
 }
 
 /// How many findings there are of a kind, those that are only counted included.
@@ -234,7 +234,7 @@ fn worse(before: &Outcome, after: &Outcome) -> Option<String> {
     let of = |outcome: &Outcome, code: &str| count(outcome, |f| f.severity == Severity::Error && f.code == code);
     let codes: BTreeSet<&str> = after.findings.iter().map(|f| f.code.as_str()).collect();
     let code = codes.into_iter().find(|code| of(after, code) > of(before, code))?;
-    Some(format!("it would bring about {code}"))
+    Some(format!("it would introduce {code}"))
 }
 
 fn fixed(finding: &Finding) -> Option<Fixed> {
@@ -245,6 +245,6 @@ fn fixed(finding: &Finding) -> Option<Fixed> {
         file: finding.locations.first().and_then(|l| l.file.clone()),
         message: finding.message.clone(),
         safety: fix.safety,
-        title: fix.title.clone(),
+        title: fix.title().to_owned(),
     })
 }

@@ -67,7 +67,7 @@ pub(super) fn of(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>
         Some(Change { artifact_location: artifact(path, file), replacements })
     };
     let changes: Option<Vec<Change>> = files.into_iter().map(change).collect();
-    let fix = |artifact_changes| Fix { description: text(&sentence(&hint.title)), artifact_changes };
+    let fix = |artifact_changes| Fix { description: text(&sentence(hint.title())), artifact_changes };
     changes.map(fix).into_iter().collect()
 }
 
