@@ -22,6 +22,6 @@ pub mod votes;
 pub use crate::knowledge::rule::Safety;
 pub use engine::{check, check_for};
 pub use finding::{Finding, Location, Severity};
-pub use fix::{Edit, FixHint, renamed};
+pub use fix::{Edit, FixHint, clamped, renamed};
 pub use outcome::Outcome;
 pub use suppressions::unused_suppressions;

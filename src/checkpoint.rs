@@ -41,7 +41,7 @@ pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
 pub use sniff::looks_like;
 pub(crate) use text::hex;
-pub use text::{escape, line_column};
+pub use text::{escape, file_size, line_column};
 pub use tokenizer::{Tokenizer, Vocabulary};
 
 /// Folder in a checkpoint where a repair keeps what it takes to undo it.

@@ -20,9 +20,12 @@ mod statistics;
 mod style;
 mod terminal;
 
+use model::CheckpointReport;
 pub use model::Report;
 pub use statistics::statistics;
 pub use style::{Format, Style, UnknownFormat};
+
+use crate::check::Finding;
 
 /// Writes a report down. Text that is not empty ends with a line break.
 #[must_use]
@@ -38,6 +41,12 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
         Format::Sarif => ci::sarif::render(report),
         Format::Markdown => markdown::render(report, style.cap),
     }
+}
+
+/// Renders one finding of a checkpoint as [`Format::Full`] does, without the lines around it.
+#[must_use]
+pub fn render_finding(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
+    terminal::finding::render(finding, checkpoint, style)
 }
 
 /// The Rust in docs/integrations.md compiles and runs.

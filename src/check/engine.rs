@@ -60,7 +60,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     });
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     scope.bind("loaders", &json!(loaders(config, versions)));
-    variables::bind_loads(&mut scope, outcome.loads.clone());
+    variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let bench = Bench::new(checkpoint);
     for rule in &knowledge.rules.rules {
@@ -209,7 +209,9 @@ fn from_faults(
         evidence.insert("count".to_owned(), json!(all.len()));
         let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, all.len())));
         let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
-        return vec![finding(rule, &fault_scope(scope, first, all.len()), places, evidence, fix)];
+        let mut inner = fault_scope(scope, first, all.len());
+        inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
+        return vec![finding(rule, &inner, places, evidence, fix)];
     }
     let mut out = Vec::new();
     // Of a kind that one file has too often the reader keeps some, and says with the last how many more there were.
@@ -242,20 +244,28 @@ fn from_faults(
     out
 }
 
-/// A fault's `kind` and details as variables, with `file`, `tensor` and `pointer` of its first place.
+/// The variables of a rule on faults, for one of `count` faults.
 fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'a> {
     let mut inner = scope.child();
-    let place = fault.places.first().cloned().unwrap_or_default();
-    inner.bind("kind", &json!(fault.kind));
-    inner.bind("file", &json!(place.file));
-    inner.bind("tensor", &json!(place.tensor));
-    inner.bind("pointer", &json!(place.pointer));
     inner.bind_int("count", count as u64);
-    for (name, value) in &fault.detail {
+    for (name, value) in &variables(fault) {
         inner.bind(name, value);
     }
     inner.bind("fault", &Value::Object(fault.detail.clone()));
     inner
+}
+
+/// Kind, first place and details of a fault, by the names that rules use.
+fn variables(fault: &Fault) -> Map<String, Value> {
+    let place = fault.places.first().cloned().unwrap_or_default();
+    let own = [
+        ("kind", json!(fault.kind)),
+        ("file", json!(place.file)),
+        ("tensor", json!(place.tensor)),
+        ("pointer", json!(place.pointer)),
+    ];
+    let own = own.into_iter().map(|(name, value)| (name.to_owned(), value));
+    own.chain(fault.detail.clone()).collect()
 }
 
 fn from_assert<'r>(
@@ -303,13 +313,13 @@ fn hint(rule: &Rule, bench: &Bench<'_>, fault: &Fault, scope: &Scope<'_>) -> Opt
 /// The fix of a finding that stands for several faults: all their edits, where each has some of the same safety.
 fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
     let (first, next) = (first?, next?);
-    let mut edits = Vec::new();
-    if first.safety == next.safety {
-        edits = first.edits;
-        let new: Vec<_> = next.edits.into_iter().filter(|edit| edits.last() != Some(edit)).collect();
-        edits.extend(new);
+    if first.safety != next.safety {
+        return Some(first.without_edits());
     }
-    Some(FixHint::new(first.safety, first.title, edits))
+    let FixHint { mut edits, .. } = first;
+    let new: Vec<_> = next.edits.into_iter().filter(|edit| edits.last() != Some(edit)).collect();
+    edits.extend(new);
+    Some(FixHint { edits, ..first })
 }
 
 fn finding(
@@ -324,6 +334,7 @@ fn finding(
         name: rule.name.clone(),
         severity: rule.severity,
         message: rule.message.render(scope),
+        details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
         locations,
         evidence,
         fix,

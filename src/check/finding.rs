@@ -1,4 +1,4 @@
-//! What a rule found: the unit every report is made of.
+//! Findings: what rules report, and load reports.
 
 use std::ops::Range;
 
@@ -31,7 +31,7 @@ pub struct Location {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Finding {
-    /// Rule code, `CFG004`.
+    /// Rule code, `IDX005`.
     pub code: String,
     /// Rule name in kebab case; it states the fault.
     pub name: String,
@@ -39,6 +39,9 @@ pub struct Finding {
     pub severity: Severity,
     /// One sentence that names the cause, with the figures at hand.
     pub message: String,
+    /// Further facts, one sentence each.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub details: Vec<String>,
     /// Places; empty if the finding concerns the whole checkpoint.
     pub locations: Vec<Location>,
     /// The figures behind the message.

@@ -35,6 +35,23 @@ pub fn all_read(checkpoint: &Checkpoint) -> bool {
     checkpoint.shards.values().all(readable) && named.into_iter().all(|name| checkpoint.shards.contains_key(name))
 }
 
+/// Whether nothing suggests that a tensor was lost: every shard that the index or the shards' own names count is present
+/// and was read, and every key of the index is in a shard.
+pub(super) fn is_complete(checkpoint: &Checkpoint) -> bool {
+    let map = checkpoint.index.as_ref().and_then(|index| checkpoint.document(&index.document)?.get("/weight_map"));
+    let listed = map.and_then(Value::as_object).into_iter().flat_map(|map| map.keys());
+    let held: BTreeSet<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+    let mut families: BTreeMap<(&str, u32), BTreeSet<u32>> = BTreeMap::new();
+    for (prefix, number, count) in shard_names(checkpoint).into_iter().filter_map(numbered) {
+        families.entry((prefix, count)).or_default().insert(number);
+    }
+    let whole = |count: u32, numbers: &BTreeSet<u32>| usize::try_from(count).is_ok_and(|count| numbers.len() >= count);
+    all_read(checkpoint)
+        && checkpoint.shards.values().all(|shard| shard.unreadable.is_empty())
+        && listed.into_iter().all(|name| held.contains(name.as_str()))
+        && families.iter().all(|((_, count), numbers)| whole(*count, numbers))
+}
+
 /// Which shard holds a tensor of that name; the first when there are several.
 pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
     let mut map: BTreeMap<&str, Vec<&str>> = BTreeMap::new();

@@ -123,7 +123,7 @@ pub enum ExpectFormat {
 /// Arguments of `explain`.
 #[derive(Debug, Args)]
 pub struct ExplainArgs {
-    /// Code or name of a rule: IDX005, shard-missing
+    /// Code, name or family: IDX005, shard-missing, IDX
     #[arg(value_name = "RULE")]
     pub rule: String,
     /// Settings file selection.

@@ -1,16 +1,27 @@
-//! Choosing rules by code, by the start of a code, or by name.
+//! Selection of rules by code, by the start of a code, or by name.
 
 use super::rule::{Rule, RuleSet, Severity};
 use super::source::nearest;
 
-/// A word that chooses no rule.
+/// A selector that matches no rule.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no rule has the code, family or name {word}{}", .similar.as_ref().map_or_else(String::new, |s| format!("; did you mean {s}?")))]
-pub struct UnknownRule {
-    /// The word.
-    pub word: String,
-    /// The code or name nearest to it, when one is near.
-    pub similar: Option<String>,
+pub enum UnknownRule {
+    /// The code or name was retired.
+    #[error("{word} is {now} now")]
+    Moved {
+        /// The selector.
+        word: String,
+        /// The current code or name.
+        now: String,
+    },
+    /// No rule has, or ever had, the code or name.
+    #[error("no rule has the code, family or name {word}{}", .similar.as_ref().map_or_else(String::new, |s| format!("; did you mean {s}?")))]
+    Unknown {
+        /// The selector.
+        word: String,
+        /// The most similar code or name, when one is similar.
+        similar: Option<String>,
+    },
 }
 
 /// How exactly `word` names the rule: the length of the code it gives; a name gives all of it.
@@ -78,9 +89,22 @@ impl RuleSet {
     }
 
     fn unknown(&self, word: &str) -> UnknownRule {
-        let words = self.all().flat_map(|r| [r.code.as_str(), r.name.as_str()]);
-        UnknownRule { word: word.to_owned(), similar: nearest(word, words).map(str::to_owned) }
+        let word = word.to_owned();
+        if let Some(now) = self.catalogue.current(&word) {
+            return UnknownRule::Moved { now: now.to_owned(), word };
+        }
+        let number = |code: &str| number(code).map(|(family, number)| (family.to_ascii_uppercase(), number));
+        let same_number = self.all().find(|r| number(&word).is_some() && number(&r.code) == number(&word));
+        let words = || self.all().flat_map(|r| [r.code.as_str(), r.name.as_str()]);
+        let similar = same_number.map(|r| r.code.as_str()).or_else(|| nearest(&word, words())).map(str::to_owned);
+        UnknownRule::Unknown { word, similar }
     }
+}
+
+/// Family and number of a code, however many zeros the number starts with.
+fn number(code: &str) -> Option<(&str, u32)> {
+    let (family, digits) = code.split_at_checked(code.find(|c: char| c.is_ascii_digit())?)?;
+    Some((family, digits.parse().ok()?))
 }
 
 /// Which rules one place, a settings file or the command line, turns on and off.
@@ -151,14 +175,18 @@ mod tests {
         rules.regrade(&[("JSN001", Severity::Info), ("JSN", Severity::Error)]).unwrap();
         let of = |code: &str| rules.find(code).unwrap().severity;
         assert_eq!((of("JSN001"), of("JSN003")), (Severity::Info, Severity::Error));
-        assert!(rules.clone().regrade(&[("JSN0O1", Severity::Info)]).unwrap_err().similar.is_some());
+        assert!(rules.clone().regrade(&[("JSN0O1", Severity::Info)]).unwrap_err().to_string().contains("did you mean"));
     }
 
     #[test]
     fn a_misspelt_word_is_answered_with_the_nearest() {
         let mut rules = RuleSet::embedded().unwrap();
-        assert_eq!(rules.find("shard-mising").unwrap_err().similar.as_deref(), Some("shard-missing"));
-        assert_eq!(rules.find("qqqq").unwrap_err().similar, None);
+        let error = |word: &str| rules.find(word).unwrap_err().to_string();
+        assert!(error("shard-mising").ends_with("; did you mean shard-missing?"));
+        assert!(error("JSN01").ends_with("; did you mean JSN001?"));
+        assert!(error("jsn1").ends_with("; did you mean JSN001?"));
+        assert_eq!(error("qqqq"), "no rule has the code, family or name qqqq");
+        assert_eq!(error("cfg003"), "cfg003 is VLA001 now");
         assert_eq!(rules.find("idx005").unwrap().name, "shard-missing");
         assert!(rules.find("IDX").is_err());
         // Also one that is not chosen is known.

@@ -5,6 +5,7 @@ use serde_json::{Map, Value, json};
 use super::context::Context;
 use super::draft::MergeDraft;
 use super::error::MergeError;
+use crate::check::clamped;
 use crate::check::tokens::OpenedTokenizer;
 use crate::checkpoint::{Document, FaultKind, Vocabulary, pointer};
 use crate::knowledge::recipe::{CODE_SWITCHES, DocumentEdit, DocumentSpec, GraftEdit, TokensForm};
@@ -84,32 +85,28 @@ fn plan_document(
     Ok(Some(MergedDocument { document, origin }))
 }
 
-/// Puts the recipe's value where the donor has `Infinity` or `NaN`: the result is strict JSON.
+/// Makes the infinities of a donor finite where the recipe allows it, as the fix of JSN001 does; the result is strict JSON.
 fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut MergeDraft) -> Result<(), MergeError> {
     let mut places = Vec::new();
     for fault in source.faults.iter().filter(|f| f.kind == FaultKind::NonFiniteNumber) {
         let Some(pointer) = fault.places.first().and_then(|p| p.pointer.as_deref()) else { continue };
-        let Some(stand_in) = &spec.non_finite else {
+        let literal = fault.detail.get("literal").and_then(Value::as_str).unwrap_or_default();
+        let Some(number) = clamped(literal).filter(|_| spec.clamp_infinity) else {
             return Err(MergeError::Donor(format!(
-                "{}{pointer} is not a finite number and the recipe has no stand-in for it; repair the donor first",
+                "{}{pointer} is {literal}, which JSON does not allow; replace it with a finite number in the donor",
                 spec.name
             )));
         };
-        let negative = fault.detail.get("literal").and_then(Value::as_str).is_some_and(|l| l.starts_with('-'));
         if let Some(slot) = value.pointer_mut(pointer) {
-            *slot = match stand_in.as_f64() {
-                Some(n) if negative => Value::from(-n),
-                _ => stand_in.clone(),
-            };
+            *slot = number;
             places.push(pointer.to_owned());
         }
     }
-    if let (Some(first), Some(stand_in)) = (places.first(), &spec.non_finite) {
+    if let Some(first) = places.first() {
         draft.repairs.push(format!(
-            "{}: {} number{} that strict JSON cannot say replaced by {stand_in}, the first at {first}",
+            "{}: {} replaced by the largest float32 of the same sign, the first at {first}",
             spec.name,
-            places.len(),
-            if places.len() == 1 { "" } else { "s" }
+            if places.len() == 1 { "1 infinity".to_owned() } else { format!("{} infinities", places.len()) }
         ));
     }
     Ok(())

@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 
-use super::format::{fix, sentence};
+use super::format::{advice, sentence};
 use super::model::{CheckpointReport, MergeReport, Report};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
@@ -78,7 +78,7 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
         message: sentence(&finding.message),
         locations: &finding.locations,
         fix: finding.fix.as_ref(),
-        help: finding.fix.as_ref().map(fix),
+        help: finding.fix.as_ref().map(|hint| advice(hint).join("; ")),
         fingerprint: of_finding(finding, &path, &role, seen),
     };
     let items = checkpoint.findings.iter().map(&mut item).collect();

@@ -1,25 +1,18 @@
-//! Formatting shared by the renderers: counts, sizes, shapes, evidence, and "and N more".
+//! Formatting shared by the renderers: counts, sizes, shapes, lists cut to "and N more".
 
 use std::collections::BTreeMap;
-
-use serde_json::Value;
 
 use super::collapse::{NameGroup, collapse};
 use super::model::{Counts, MergeReport, MergeStage, Report};
 use crate::check::load::{LoadReport, SilentReason};
-use crate::check::{Finding, FixHint, Location, Safety};
+use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
+pub use crate::checkpoint::file_size as bytes;
 
 /// Longest name shown, in characters.
 const NAME: usize = 160;
 /// Longest sentence shown, in characters.
 const SENTENCE: usize = 1_000;
-/// Longest evidence value shown, in characters.
-const VALUE: usize = 200;
-/// Most evidence values shown for one finding.
-const VALUES: usize = 8;
-/// Most items shown of a list within evidence.
-const ITEMS: usize = 6;
 
 /// A name from a checkpoint, safe to show.
 pub fn name(text: &str) -> String {
@@ -73,30 +66,6 @@ pub fn counts(counts: Counts) -> String {
         parts.push(format!("{} info", counts.info));
     }
     parts.join(", ")
-}
-
-/// A size in decimal units, three digits: `8.06 GB`.
-pub fn bytes(n: u64) -> String {
-    const UNITS: [(&str, u64); 5] = [
-        ("PB", 1_000_000_000_000_000),
-        ("TB", 1_000_000_000_000),
-        ("GB", 1_000_000_000),
-        ("MB", 1_000_000),
-        ("kB", 1_000),
-    ];
-    let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else {
-        return format!("{n} B");
-    };
-    let size = u128::from(size);
-    let hundredths = u128::from(n).saturating_mul(100).saturating_add(size / 2).checked_div(size).unwrap_or_default();
-    let (whole, rest) = (hundredths / 100, hundredths % 100);
-    if whole >= 100 {
-        format!("{whole} {unit}")
-    } else if whole >= 10 {
-        format!("{whole}.{} {unit}", rest / 10)
-    } else {
-        format!("{whole}.{rest:02} {unit}")
-    }
 }
 
 /// `[2304, 1152]`.
@@ -188,19 +157,9 @@ fn outcome(merge: &MergeReport) -> Option<String> {
     })
 }
 
-/// What the message leaves unsaid: `key = value` for each piece of evidence whose value it does not quote.
-pub fn evidence(finding: &Finding) -> Vec<String> {
-    let mut unsaid: Vec<String> = finding
-        .evidence
-        .iter()
-        .map(|(key, v)| (key, v, value(v)))
-        .filter(|(_, v, text)| !quotes(&finding.message, v.as_str().unwrap_or(text)))
-        .map(|(key, _, text)| format!("{} = {text}", name(key)))
-        .collect();
-    let rest = more(unsaid.len(), VALUES);
-    unsaid.truncate(VALUES);
-    unsaid.extend(rest);
-    unsaid
+/// The details of a finding, safe to show.
+pub fn details(finding: &Finding) -> Vec<String> {
+    finding.details.iter().map(|detail| sentence(detail)).collect()
 }
 
 /// The findings to show, at most `cap` of each code, and how many of which code are left out.
@@ -224,11 +183,11 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
 pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     let mut together: Vec<Finding> = Vec::new();
     for finding in findings {
-        let step = |f: &Finding| f.fix.as_ref().map(|fix| (fix.safety, fix.title.clone()));
+        let step = |f: &Finding| f.fix.as_ref().map(advice);
         let same = |last: &Finding| {
             (&last.code, last.severity, &last.message) == (&finding.code, finding.severity, &finding.message)
                 && step(last) == step(finding)
-                && evidence(last) == evidence(finding)
+                && last.details == finding.details
         };
         match together.last_mut() {
             Some(last) if same(last) => last.locations.extend(finding.locations.iter().cloned()),
@@ -261,38 +220,15 @@ pub fn more(total: usize, cap: usize) -> Option<String> {
     total.checked_sub(cap).filter(|n| *n > 0).map(|n| format!("and {n} more"))
 }
 
-/// The step a fix proposes, with what kind of fix it is when it is not a manual one.
-pub fn fix(hint: &FixHint) -> String {
-    let title = sentence(&hint.title);
-    if hint.safety == Safety::Manual { title } else { format!("{title} ({} fix)", hint.safety.name()) }
-}
-
-fn value(v: &Value) -> String {
-    match v {
-        Value::String(s) => escape(s, VALUE),
-        Value::Array(items) => {
-            let mut parts: Vec<String> = items.iter().take(ITEMS).map(value).collect();
-            parts.extend(more(items.len(), ITEMS));
-            let text = parts.join(", ");
-            if items.iter().all(Value::is_string) { text } else { format!("[{text}]") }
-        }
-        other => escape(&other.to_string(), VALUE),
-    }
-}
-
-/// Whether `message` holds `text` as a word of its own.
-fn quotes(message: &str, text: &str) -> bool {
-    let joins = |c: Option<char>| c.is_some_and(|c| c.is_alphanumeric() || c == '_');
-    !text.is_empty()
-        && message.match_indices(text).any(|(at, _)| {
-            let (before, after) = message.split_at(at);
-            !joins(before.chars().next_back()) && !joins(after.strip_prefix(text).and_then(|rest| rest.chars().next()))
-        })
+/// What the edits of a fix do, with their safety; then what a person should do.
+pub fn advice(hint: &FixHint) -> Vec<String> {
+    let title = hint.title.as_ref().map(|title| format!("{} ({} fix)", sentence(title), hint.safety.name()));
+    title.into_iter().chain(hint.help.as_deref().map(sentence)).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{bytes, quotes, wrap};
+    use super::{bytes, wrap};
 
     #[test]
     fn lines_are_broken_at_spaces_alone() {
@@ -305,12 +241,5 @@ mod tests {
     fn sizes_keep_three_digits() {
         let shown: Vec<String> = [0, 999, 1_000, 12_345, 999_999, 8_055_709_462, u64::MAX].map(bytes).into();
         assert_eq!(shown, ["0 B", "999 B", "1.00 kB", "12.3 kB", "1000 kB", "8.06 GB", "18446 PB"]);
-    }
-
-    #[test]
-    fn a_figure_inside_a_longer_one_is_not_quoted() {
-        assert!(quotes("7 heads do not divide 4096", "4096"));
-        assert!(!quotes("7 heads do not divide 4096", "40"));
-        assert!(!quotes("anything", ""));
     }
 }

@@ -4,7 +4,7 @@
 use std::fmt::Write as _;
 
 use super::collapse::{NameGroup, collapse};
-use super::format::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
+use super::format::{self, advice, bytes, capped, details, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
 use crate::check::load::LoadReport;
 use crate::check::{Finding, Location};
@@ -74,12 +74,11 @@ fn render_finding(out: &mut String, finding: &Finding) {
     for tensor in tensors(&finding.locations, PLACES) {
         let _ok = writeln!(out, "- tensor: {}", code(&tensor));
     }
-    let figures = evidence(finding);
-    if !figures.is_empty() {
-        let _ok = writeln!(out, "- note: {}", text(&figures.join("; ")));
+    for detail in details(finding) {
+        let _ok = writeln!(out, "- note: {}", text(&detail));
     }
-    if let Some(hint) = &finding.fix {
-        let _ok = writeln!(out, "- help: {}", text(&fix(hint)));
+    for step in finding.fix.iter().flat_map(advice) {
+        let _ok = writeln!(out, "- help: {}", text(&step));
     }
 }
 

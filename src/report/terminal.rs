@@ -1,6 +1,6 @@
 //! The report for people at a terminal: source excerpts, tables, one verdict line at the end.
 
-mod finding;
+pub(super) mod finding;
 pub(super) mod load;
 mod merge;
 pub(super) mod paint;

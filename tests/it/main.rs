@@ -25,6 +25,7 @@ mod house;
 mod load;
 mod merge;
 mod mutation;
+mod pages;
 mod readers;
 mod reports;
 mod rules;

@@ -1,6 +1,6 @@
 //! Every rule on every fixture: each case trips its own rule, and nobody else's unseen.
 
-mod failure_modes;
+pub mod failure_modes;
 mod seeded;
 
 use std::collections::BTreeSet;
@@ -45,6 +45,12 @@ fn mismatch(expect: &Expect, own: &[&Finding]) -> Option<String> {
         (
             at(&expect.says, &|f| f.message.contains(expect.says.as_deref().unwrap_or_default())),
             "the message says something else",
+        ),
+        (
+            at(&expect.fix.map(|safety| safety.name().to_owned()), &|f| {
+                f.fix.as_ref().map(|fix| fix.safety) == expect.fix
+            }),
+            "the fix has another safety",
         ),
     ];
     let reasons: Vec<&str> = wrong.iter().filter(|(wrong, _)| *wrong).map(|(_, reason)| *reason).collect();
@@ -110,7 +116,7 @@ fn messages_render_in_full() {
             // A fix may show JSON; a message never does.
             .filter(|f| {
                 broken(f, &f.message, &['?', '{', '}'])
-                    || f.fix.as_ref().is_some_and(|fix| broken(f, &fix.title, &['?']))
+                    || f.fix.as_ref().is_some_and(|fix| broken(f, fix.title(), &['?']))
             })
             .collect();
         (!bad.is_empty()).then(|| shown(&bad))

@@ -8,7 +8,6 @@ mod base;
 mod change;
 pub mod data;
 pub mod invariants;
-pub mod keys;
 mod weights;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,12 +16,14 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Outcome, check, unused_suppressions};
+use ckpt_doctor::check::{Outcome, Safety, check, unused_suppressions};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, SettingsSource};
 use ckpt_doctor::knowledge::{Knowledge, Library, source};
+use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::{self, Style};
 use serde::Deserialize;
 
 pub use base::{BASES, copy};
@@ -84,6 +85,9 @@ pub struct Expect {
     /// How many findings of the rule; one when absent.
     #[serde(default)]
     pub count: Option<usize>,
+    /// Safety of the fix.
+    #[serde(default)]
+    pub fix: Option<Safety>,
 }
 
 /// A case and what was found.
@@ -94,6 +98,8 @@ pub struct Tried {
     pub before: BTreeSet<String>,
     /// Kinds of the faults that readers and comparisons produced.
     pub kinds: BTreeSet<FaultKind>,
+    /// The first finding of the case's own rule, as `check` prints it.
+    pub example: String,
 }
 
 impl Tried {
@@ -158,7 +164,7 @@ pub fn knowledge() -> Knowledge {
 }
 
 /// What is found in a directory under settings that lie in the folder above it.
-fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> Outcome {
+fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let above = dir.parent().expect("a folder above");
     let source =
         SettingsSource::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
@@ -166,9 +172,9 @@ fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> 
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
     let mut outcome = check(&checkpoint, &knowledge);
-    let unused = unused_suppressions(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
+    let unused = unused_suppressions(&knowledge, &[(Arc::clone(&checkpoint), &outcome)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
-    outcome
+    (checkpoint, outcome)
 }
 
 /// Makes one of [`BASES`].
@@ -218,11 +224,25 @@ pub fn tried() -> &'static [Tried] {
 
 /// Opens and checks a directory.
 pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
+    open(dir, deep, knowledge).1
+}
+
+fn open(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let mut checkpoint = Checkpoint::open(dir).expect("a directory");
     if deep {
         checkpoint.read_contents();
     }
-    check(&Arc::new(checkpoint), knowledge)
+    let checkpoint = Arc::new(checkpoint);
+    let outcome = check(&checkpoint, knowledge);
+    (checkpoint, outcome)
+}
+
+/// The first finding of the rule as `check` prints it.
+fn example(code: &str, checkpoint: &Checkpoint, outcome: &Outcome) -> Option<String> {
+    let finding = outcome.findings.iter().find(|f| f.code == code)?;
+    let report = CheckpointReport::new("model", None, checkpoint, outcome);
+    let text = report::render_finding(finding, &report, Style { width: Some(100), ..Style::default() });
+    Some(text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n"))
 }
 
 /// A defect in one of the two models.
@@ -333,12 +353,13 @@ fn try_all() -> Vec<Tried> {
     let tried = on_every_case(&knowledge, |bases, case, made| {
         let codes = |dir: &PathBuf| look(dir, true, &knowledge).findings.into_iter().map(|f| f.code).collect();
         let before = before.get_or_init(|| bases.iter().map(|(name, dir)| (*name, codes(dir))).collect());
-        let mut outcome = match &case.settings {
+        let (checkpoint, mut outcome) = match &case.settings {
             Some(settings) => under(settings, made, with_kinds()),
-            None => look(made, case.deep, &observing),
+            None => open(made, case.deep, &observing),
         };
         let kinds = take_kinds(&mut outcome);
-        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds }
+        let example = case.code.as_ref().and_then(|code| example(code, &checkpoint, &outcome)).unwrap_or_default();
+        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds, example }
     });
     tried.into_iter().map(|(_, tried)| tried).collect()
 }

@@ -21,6 +21,7 @@ pub(super) fn run(repair: BuiltInRepair, site: &Site<'_>) -> Option<Vec<Edit>> {
     match repair {
         BuiltInRepair::AddAutoClass => modules::add_auto_class(site),
         BuiltInRepair::AddImports => modules::add_imports(site),
+        BuiltInRepair::ClampInfinity => texts::clamp_infinity(site),
         BuiltInRepair::CutNulBytes => texts::cut_nul_bytes(site),
         BuiltInRepair::DropEqualKey => texts::drop_equal_key(site),
         BuiltInRepair::FillTokenHoles => tokens::fill_token_holes(site.checkpoint()),

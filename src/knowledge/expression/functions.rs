@@ -5,11 +5,14 @@ use cel::common::value::Val;
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 use serde_json::Value;
 
-use super::scope::Scope;
+use super::scope::{Scope, plain};
 use super::steps;
+use crate::checkpoint::file_size;
 
 /// Longest list `range` makes.
 const RANGE_CAP: i64 = 100_000;
+/// Most items that `join` shows.
+const JOIN_CAP: usize = 5;
 
 type FunctionResult = Result<Value, String>;
 
@@ -40,6 +43,12 @@ fn register(scope: &mut Scope<'static>) {
     scope.function("range", range);
     scope.function("keys", keys);
     scope.function("zpad", zpad);
+    scope.function("join", join);
+    scope.function("plural", plural);
+    scope.function("filesize", |a| match a {
+        [n] => n.as_u64().map(|n| file_size(n).into()).ok_or_else(|| "filesize(n) takes a number of bytes".to_owned()),
+        _ => Err("filesize(n) takes one number".to_owned()),
+    });
     scope.function("glob", |a| match a {
         [Value::String(name), Value::String(pattern)] => Ok(glob(name, pattern).into()),
         _ => Err("glob(name, pattern) takes two strings".to_owned()),
@@ -125,6 +134,26 @@ fn zpad(arguments: &[Value]) -> FunctionResult {
             _ => Err("zpad(n, width) takes two integers from 0, the width up to 64".to_owned()),
         },
         _ => Err("zpad(n, width) takes two integers".to_owned()),
+    }
+}
+
+/// `join(list)`: `a, b, c`, or `a, b, c, d, e and 3 more`.
+fn join(arguments: &[Value]) -> FunctionResult {
+    let [Value::Array(items)] = arguments else { return Err("join(list) takes one list".to_owned()) };
+    let shown = items.iter().take(JOIN_CAP).map(plain).collect::<Vec<_>>().join(", ");
+    match items.len().checked_sub(JOIN_CAP) {
+        None | Some(0) => Ok(shown.into()),
+        Some(more) => Ok(format!("{shown} and {more} more").into()),
+    }
+}
+
+/// `plural(n, 'tensor')`: `1 tensor`, `2 tensors`.
+fn plural(arguments: &[Value]) -> FunctionResult {
+    match arguments {
+        [n, Value::String(noun)] if n.is_number() => {
+            Ok(format!("{n} {noun}{}", if n.as_u64() == Some(1) { "" } else { "s" }).into())
+        }
+        _ => Err("plural(n, noun) takes a number and a string".to_owned()),
     }
 }
 

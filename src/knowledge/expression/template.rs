@@ -25,7 +25,17 @@ impl Template {
     /// The text with `0` for every placeholder: the outline of a name.
     #[must_use]
     pub fn outline(&self) -> String {
-        self.pieces.iter().map(|piece| if let Piece::Text(text) = piece { text } else { "0" }).collect()
+        self.with_placeholders("0")
+    }
+
+    /// The text with `…` for every placeholder, for documentation.
+    #[must_use]
+    pub fn prose(&self) -> String {
+        self.with_placeholders("…")
+    }
+
+    fn with_placeholders(&self, placeholder: &str) -> String {
+        self.pieces.iter().map(|piece| if let Piece::Text(text) = piece { text } else { placeholder }).collect()
     }
 
     /// Parses `source`.

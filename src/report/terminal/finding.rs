@@ -8,7 +8,7 @@ use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer,
 use super::super::Style;
 use super::super::excerpt::{cut, near};
 use super::super::fixes::mark;
-use super::super::format::{evidence, fix, more, name, place, sentence, tensors, wrap};
+use super::super::format::{advice, details, more, name, place, sentence, tensors, wrap};
 use super::super::model::CheckpointReport;
 use crate::check::{Finding, Location, Severity};
 use crate::checkpoint::line_column;
@@ -41,12 +41,11 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
         group = group.element(note("tensor", text));
     }
     group = group.element(note("rule", name(&finding.name)));
-    let figures = evidence(finding);
-    if !figures.is_empty() {
-        group = group.element(note("note", figures.join("; ")));
+    for detail in details(finding) {
+        group = group.element(note("note", detail));
     }
-    if let Some(hint) = &finding.fix {
-        group = group.element(Level::HELP.message(wrap(&fix(hint), width)));
+    for step in finding.fix.iter().flat_map(advice) {
+        group = group.element(Level::HELP.message(wrap(&step, width)));
     }
     let renderer = if style.color { Renderer::styled() } else { Renderer::plain() };
     let mut text = renderer.term_width(style.width.unwrap_or(140)).render(&[group]);

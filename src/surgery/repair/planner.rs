@@ -82,7 +82,7 @@ impl Planner<'_> {
                 Made::All => made.push(finding.clone()),
                 Made::Later if !made.is_empty() => {}
                 // What changes nothing now, or stands in its own way, does so later too.
-                Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made here".to_owned()),
+                Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made".to_owned()),
             }
         }
         if made.is_empty() {
@@ -90,7 +90,7 @@ impl Planner<'_> {
         }
         let outcome = draft.finish().map(|()| (self.check)(draft.current()));
         let reason = match outcome {
-            None => "its edits do not fit together".to_owned(),
+            None => "its edits conflict".to_owned(),
             Some(outcome) => {
                 let Some(reason) = objection(&self.outcome, &outcome, &made) else {
                     (self.draft, self.outcome) = (draft, outcome);
@@ -115,7 +115,7 @@ impl Planner<'_> {
     fn withdraw(&mut self, finding: &Finding, reason: String) {
         let Some(fix) = &finding.fix else { return };
         self.barred.push(fix.edits.clone());
-        self.withdrawn.push(Withdrawn { code: finding.code.clone(), title: fix.title.clone(), reason });
+        self.withdrawn.push(Withdrawn { code: finding.code.clone(), title: fix.title().to_owned(), reason });
     }
 }
 
@@ -148,6 +148,6 @@ fn fixed(finding: &Finding) -> Option<Fixed> {
         file: finding.locations.first().and_then(|l| l.file.clone()),
         message: finding.message.clone(),
         safety: fix.safety,
-        title: fix.title.clone(),
+        title: fix.title().to_owned(),
     })
 }

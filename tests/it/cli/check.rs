@@ -157,7 +157,7 @@ fn rules_can_be_chosen_listed_and_explained() {
         findings.iter().map(|f| f["code"].as_str().unwrap().to_owned()).collect()
     };
     assert_eq!(codes(&["--select", "JSN"]), ["JSN001", "JSN001", "JSN001"]);
-    assert_eq!(codes(&["--ignore", "non-finite-number,PRC"]), Vec::<String>::new());
+    assert_eq!(codes(&["--ignore", "non-finite-number,VLA"]), Vec::<String>::new());
     let wrong = doctor(&["check", vision, "--ignore", "non-finite-numbr"]);
     assert_eq!(wrong.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&wrong.stderr).contains("did you mean non-finite-number?"));
@@ -168,7 +168,33 @@ fn rules_can_be_chosen_listed_and_explained() {
     let one = doctor(&["explain", "shard-missing"]);
     assert_eq!(one.status.code(), Some(0));
     snapshot!("cli-explain", String::from_utf8(one.stdout).unwrap());
-    assert_eq!(doctor(&["explain", "IDX999"]).status.code(), Some(2));
+    let family = doctor(&["explain", "idx"]);
+    let family = String::from_utf8(family.stdout).unwrap();
+    assert!(family.starts_with("IDX: The index and its shards\n\nIDX001 "), "{family}");
+    let words = ["IDX005", "error", "shard-missing", "a", "shard", "is", "missing"];
+    assert!(family.lines().any(|l| l.split_whitespace().eq(words)), "{family}");
+    for (word, hint) in [("IDX999", "no rule"), ("IDX05", "did you mean IDX005?"), ("CFG003", "CFG003 is VLA001 now")] {
+        for args in [["explain", word].as_slice(), &["check", vision, "--select", word]] {
+            let refused = doctor(args);
+            assert_eq!(refused.status.code(), Some(2), "{args:?}");
+            let error = String::from_utf8(refused.stderr).unwrap();
+            assert!(error.contains(hint), "{error}");
+        }
+    }
+}
+
+/// No page shows an expression of a template.
+#[test]
+fn every_rule_is_explained_with_an_example() {
+    let rules = ckpt_doctor::knowledge::rule::RuleSet::embedded().unwrap();
+    for rule in rules.all() {
+        let page = String::from_utf8(doctor(&["explain", &rule.code]).stdout).unwrap();
+        assert!(page.contains(&format!("\nExample\n  {}[{}]: ", rule.severity.name(), rule.code)), "{page}");
+        let texts = rule.fixes.iter().flat_map(|fix| [&fix.title, &fix.help]).flatten();
+        for expression in texts.chain([&rule.message]).flat_map(ckpt_doctor::knowledge::Template::expressions) {
+            assert!(!page.contains(&format!("{{{expression}}}")), "{page}");
+        }
+    }
 }
 
 #[test]
@@ -209,7 +235,7 @@ fn the_load_is_predicted_for_the_versions_asked_for() {
     assert_eq!(report["checkpoints"][0]["loads"], json!([]));
     let findings = report["checkpoints"][0]["findings"].as_array().unwrap();
     let unknown = findings.iter().find(|f| f["code"] == "ARC001").unwrap();
-    assert!(unknown["message"].as_str().unwrap().contains("not known here for transformers 5.23.0"));
+    assert!(unknown["message"].as_str().unwrap().contains(" under transformers 5.23.0;"));
 }
 
 /// Gemma 3 text inside PaliGemma: transformers 4.47.0 has no such model type, 5.23.0 has.

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// A folder with the tiny SpatialVLA under `models/vla`: three JSN001 in its `processor_config.json`, one PRC009.
+/// A folder with the tiny SpatialVLA under `models/vla`: three JSN001 in its `processor_config.json`, one VLA024.
 fn zoo() -> TempDir {
     let zoo = TempDir::new().unwrap();
     let to = zoo.path().join("models/vla");
@@ -61,17 +61,17 @@ const INFINITY: [&str; 3] = ["JSN001 warning"; 3];
 fn the_nearest_file_upward_decides_and_the_command_line_has_the_last_word() {
     let zoo = zoo();
     let root = zoo.path();
-    assert_eq!(found(root, &["--isolated"]).0, [&["PRC009 info"], &INFINITY[..]].concat());
-    settings(root, r#"{ select: ["PRC"], "fail-on": "info" }"#);
-    assert_eq!(found(root, &[]).0, ["PRC009 info"]);
+    assert_eq!(found(root, &["--isolated"]).0, [&["VLA024 info"], &INFINITY[..]].concat());
+    settings(root, r#"{ select: ["VLA"], "fail-on": "info" }"#);
+    assert_eq!(found(root, &[]).0, ["VLA024 info"]);
     assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
     assert_eq!(doctor(root, &["check", "models", "--fail-on", "error"]).status.code(), Some(0));
     assert_eq!(found(root, &["--extend-select", "JSN"]).0.len(), 4);
     assert_eq!(found(root, &["--select", "JSN"]).0, INFINITY);
-    assert_eq!(found(root, &["--isolated", "--ignore", "JSN"]).0, ["PRC009 info"]);
+    assert_eq!(found(root, &["--isolated", "--ignore", "JSN"]).0, ["VLA024 info"]);
     // A nearer file takes the place of the one above, which it may extend.
     settings(&root.join("models"), r#"{ severity: { "non-finite-number": "error" } }"#);
-    assert_eq!(found(root, &[]).0, [&["PRC009 info"], &["JSN001 error"; 3][..]].concat());
+    assert_eq!(found(root, &[]).0, [&["VLA024 info"], &["JSN001 error"; 3][..]].concat());
     settings(
         &root.join("models"),
         r#"{ extend: "../ckpt-doctor.json5", "extend-select": ["JSN001"], severity: { JSN: "error" } }"#,
@@ -98,8 +98,8 @@ fn the_nearest_file_upward_decides_and_the_command_line_has_the_last_word() {
 fn settings_among_the_files_of_a_checkpoint_are_passed_over() {
     let zoo = zoo();
     let (root, vla) = (zoo.path(), zoo.path().join("models/vla"));
-    settings(&vla, "{ ignore: ['JSN', 'PRC'] }");
-    settings(root, "{ ignore: ['PRC'] }");
+    settings(&vla, "{ ignore: ['JSN', 'VLA'] }");
+    settings(root, "{ ignore: ['VLA'] }");
     assert_eq!(found(root, &[]).0, INFINITY);
     snapshot!("selection-passed-over", said(root, &["check", "models", "--output-format", "concise"]));
     assert_eq!(found(root, &["--config", "models/vla/ckpt-doctor.json5"]).0, Vec::<String>::new());
@@ -118,15 +118,15 @@ fn places_have_rules_of_their_own() {
         settings(root, &format!("{{ 'per-path': {per_path} }}"));
         found(root, &[]).0
     };
-    assert_eq!(with("{ '**/processor_config.json': { ignore: ['JSN001'] } }"), ["PRC009 info"]);
-    assert_eq!(with("{ 'models': { ignore: ['JSN001', 'PRC'] } }"), Vec::<String>::new());
+    assert_eq!(with("{ '**/processor_config.json': { ignore: ['JSN001'] } }"), ["VLA024 info"]);
+    assert_eq!(with("{ 'models': { ignore: ['JSN001', 'VLA'] } }"), Vec::<String>::new());
     assert_eq!(
-        with("{ 'models/*': { ignore: ['JSN'], severity: { PRC009: 'error', PRC: 'info' } } }"),
-        ["PRC009 error"]
+        with("{ 'models/*': { ignore: ['JSN'], severity: { VLA024: 'error', VLA: 'info' } } }"),
+        ["VLA024 error"]
     );
     assert_eq!(
-        with("{ 'models/other': { ignore: ['JSN001', 'PRC'] }, 'm*': { severity: { PRC: 'warning' } } }")[0],
-        "PRC009 warning"
+        with("{ 'models/other': { ignore: ['JSN001', 'VLA'] }, 'm*': { severity: { VLA: 'warning' } } }")[0],
+        "VLA024 warning"
     );
     // `*` stays within a name, and a glob starts at the file's folder.
     assert_eq!(with("{ '*.json': { ignore: ['JSN'] }, 'vla': { ignore: ['JSN'] } }").len(), 4);
@@ -185,7 +185,7 @@ fn what_is_accepted_is_not_counted_and_says_why() {
     );
     assert_eq!(
         found(root, &[]),
-        (vec!["PRC009 info".to_owned(), "SUP001 warning".to_owned()], INFINITY.map(str::to_owned).to_vec())
+        (vec!["VLA024 info".to_owned(), "SUP001 warning".to_owned()], INFINITY.map(str::to_owned).to_vec())
     );
     snapshot!("selection-suppressed", said(root, &["check", "models"]));
     let json = doctor(root, &["check", "models", "--output-format", "json"]);
@@ -250,7 +250,7 @@ fn a_baseline_sets_aside_what_was_there() {
     shown.push_str(&said(root, &[&check[..], &["--select", "FIL", "--write-baseline"]].concat()));
     snapshot!("selection-baseline", shown);
     let codes = fs::read_to_string(root.join("known.json")).unwrap();
-    assert!(codes.contains("JSN001") && codes.contains("PRC009"), "{codes}");
+    assert!(codes.contains("JSN001") && codes.contains("VLA024"), "{codes}");
     // Wherever it is asked from, and by a setting.
     settings(root, "{ baseline: 'known.json' }");
     let from = doctor(&root.join("models"), &["check", "vla", "--output-format", "json"]);

@@ -190,8 +190,8 @@ impl Verdict {
             hold(own.iter().any(|f| names(f, at)), &format!("{code} does not name {at}"));
         }
         for finding in self.findings().filter(|f| f["severity"] != "info") {
-            let help = finding["fix"]["title"].as_str().unwrap_or_default();
-            hold(!help.is_empty(), &format!("{} says no next step", finding["code"]));
+            let step = ["title", "help"].into_iter().find_map(|key| finding["fix"][key].as_str()).unwrap_or_default();
+            hold(!step.is_empty(), &format!("{} has neither a fix nor help", finding["code"]));
         }
         complaints.extend(self.conduct());
         complaints

@@ -54,9 +54,9 @@ fn a_damaged_donor_stops_the_merge_and_says_why() {
         (
             "missing",
             |d| fs::remove_file(d.join("model-00002-of-00005.safetensors")).unwrap(),
-            &["model-00002-of-00005.safetensors", "not there"],
+            &["model-00002-of-00005.safetensors", "is missing"],
         ),
-        ("pointer", |_| {}, &["model-00003-of-00005.safetensors", "git-lfs pointer", "git lfs pull"]),
+        ("pointer", |_| {}, &["model-00003-of-00005.safetensors", "Git LFS pointer", "git lfs pull"]),
         (
             "fifo",
             |d| {
@@ -72,7 +72,7 @@ fn a_damaged_donor_stops_the_merge_and_says_why() {
                 let bytes = fs::read(&path).unwrap();
                 fs::write(&path, &bytes[..bytes.len() - 100]).unwrap();
             },
-            &["model-00004-of-00005.safetensors", "cut short", "100"],
+            &["model-00004-of-00005.safetensors", "truncated", "100"],
         ),
         ("broken-json", |d| fs::write(d.join("config.json"), "{\"model_type\": ").unwrap(), &["config.json"]),
     ];

@@ -34,7 +34,7 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
     }
 }
 
-/// A finding; the evidence is an object.
+/// A finding without details; the evidence is an object.
 pub fn finding(code: &str, name: &str, severity: Severity, message: &str, evidence: Value) -> Finding {
     let Value::Object(evidence) = evidence else { panic!("evidence is an object") };
     Finding {
@@ -42,6 +42,7 @@ pub fn finding(code: &str, name: &str, severity: Severity, message: &str, eviden
         name: name.to_owned(),
         severity,
         message: message.to_owned(),
+        details: Vec::new(),
         locations: Vec::new(),
         evidence,
         fix: None,
@@ -65,7 +66,8 @@ pub fn at(file: &str, source: &str, what: &str, nth: usize, pointer: &str) -> Lo
 
 #[allow(clippy::unnecessary_wraps, reason = "it fills an optional field")]
 pub fn fix(safety: Safety, title: &str) -> Option<FixHint> {
-    Some(FixHint { safety, title: title.to_owned(), edits: Vec::new() })
+    let fix = FixHint::new(safety, title, Vec::new());
+    Some(if safety == Safety::Manual { fix.without_edits() } else { fix })
 }
 
 pub fn clean() -> Report {
@@ -236,13 +238,10 @@ pub fn long_lists() -> Report {
             finding("IDX001", "shard-missing", Severity::Error, &format!("shard {n} is not there"), json!({ "n": n }))
         })
         .collect();
-    findings.push(finding(
-        "IDX009",
-        "names-differ",
-        Severity::Warning,
-        "names differ",
-        json!({ "names": (0..50).map(|n| format!("name-{n}")).collect::<Vec<_>>(), "dims": (0..50).collect::<Vec<_>>() }),
-    ));
+    let names: Vec<String> = (0..50).map(|n| format!("name-{n}")).collect();
+    let mut differ = finding("IDX009", "names-differ", Severity::Warning, "names differ", json!({ "names": names }));
+    differ.details = vec![names.join(", "), format!("the longest has {} characters", "name-49".len())];
+    findings.push(differ);
     let mut places = finding("DOC001", "duplicate-key", Severity::Warning, "9 keys occur twice", json!({}));
     places.locations = (0..9)
         .map(|n| Location {
@@ -287,6 +286,7 @@ pub fn hostile() -> Report {
             ..Location::default()
         },
     ];
+    one.details = vec![evil.clone(), HOSTILE.to_owned()];
     one.fix = fix(Safety::Manual, HOSTILE);
     let mut checkpoint = checkpoint(HOSTILE, vec![one], &[("config.json", &source)]);
     checkpoint.architecture = Some(HOSTILE.to_owned());

@@ -67,7 +67,7 @@ pub(super) fn fixes(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<s
         Some(SarifChange { artifact_location: artifact(path, file), replacements })
     };
     let changes: Option<Vec<SarifChange>> = files.into_iter().map(change).collect();
-    let fix = |artifact_changes| SarifFix { description: text(&sentence(&hint.title)), artifact_changes };
+    let fix = |artifact_changes| SarifFix { description: text(&sentence(hint.title())), artifact_changes };
     changes.map(fix).into_iter().collect()
 }
 
