@@ -64,7 +64,7 @@ impl<'n> Key<'n> {
             bare.split_once(&format!(".{word}."))
                 .is_some_and(|(_, rest)| word.contains("embedding") || rest.contains('.'))
         });
-        if named { Self::Foreign("the name of an adapter is in it") } else { Self::Whole(bare) }
+        if named { Self::Foreign("its name contains the name of an adapter") } else { Self::Whole(bare) }
     }
 }
 
@@ -81,8 +81,8 @@ mod tests {
             ("base_model.model.wte.lora_embedding_B", lora("wte", Role::EmbeddingB)),
             ("base_model.model.q.lora_magnitude_vector", lora("q", Role::Magnitude)),
             ("base_model.model.lm_head.weight", Key::Whole("lm_head.weight")),
-            ("base_model.model.q.lora_A.default.weight", Key::Foreign("the name of an adapter is in it")),
-            ("base_model.model.wte.lora_embedding_A.default", Key::Foreign("the name of an adapter is in it")),
+            ("base_model.model.q.lora_A.default.weight", Key::Foreign("its name contains the name of an adapter")),
+            ("base_model.model.wte.lora_embedding_A.default", Key::Foreign("its name contains the name of an adapter")),
             ("h.0.c_attn.lora_A.weight", Key::Foreign("it does not start with base_model.model.")),
         ] {
             assert_eq!(Key::parse(name), key, "{name}");
