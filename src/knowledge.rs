@@ -1,6 +1,7 @@
 //! Rules, architectures, processors, recipes and quantisation schemes, read from `rules/`, and their expressions.
 
 pub mod architecture;
+pub mod embeddings;
 pub mod evidence;
 pub mod expression;
 pub mod library;
@@ -21,6 +22,7 @@ pub use expression::{EvalError, Expression, Scope, Template};
 pub use library::Library;
 pub use loader::Loader;
 
+use embeddings::TokenEmbedding;
 use processor::Processor;
 use quantization::Scheme;
 use recipe::Recipe;
@@ -40,6 +42,8 @@ pub struct Knowledge {
     pub recipes: Vec<Recipe>,
     /// Quantisation schemes.
     pub schemes: Vec<Scheme>,
+    /// Names of token embeddings.
+    pub token_embedding: TokenEmbedding,
     /// Suppressions of a settings file.
     pub policy: Policy,
 }
@@ -64,6 +68,7 @@ impl Knowledge {
             processors: Processor::embedded()?,
             recipes: Recipe::embedded()?,
             schemes: Scheme::embedded()?,
+            token_embedding: TokenEmbedding::embedded()?,
             policy: Policy::default(),
         })
     }

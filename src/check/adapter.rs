@@ -107,7 +107,7 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
     let is_saved = |module: &&str| whole.iter().any(|name| format!(".{name}").contains(&format!(".{module}.")));
     if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
         let at = Place::file(CONFIG).pointer("/modules_to_save");
-        faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.join(", ")));
+        faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.clone()));
     }
 }
 

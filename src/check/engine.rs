@@ -12,18 +12,19 @@ use super::outcome::Outcome;
 use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule};
 use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
 
-/// Findings of one rule that are kept; the last one says how many more there are.
-const CAP: usize = 100;
+/// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
+const CAP: usize = 1000;
 
 /// Steps that a user's own rule may take over one checkpoint: elements its loops go over, and values they gather.
 const STEPS: u64 = 2_000_000;
 
-/// Places of one finding that are kept.
-const PLACES: usize = 20;
+/// Places of one finding that are kept, for the same reason.
+const PLACES: usize = 1000;
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
 #[must_use]
@@ -50,7 +51,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         ..Outcome::default()
     };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
-    let rows = embedding_rows(checkpoint);
+    let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
     faults.extend(tokens::faults(checkpoint, rows));
     let opened = outcome.architecture.as_deref().and_then(|name| {
         let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
@@ -124,20 +125,10 @@ fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
     )
 }
 
-/// Rows of the token embedding: what every token id has to stay below.
-fn embedding_rows(checkpoint: &Checkpoint) -> Option<u64> {
-    const NAMES: [&str; 5] = [
-        "embed_tokens.weight",
-        "transformer.wte.weight",
-        "word_embeddings.weight",
-        "gpt_neox.embed_in.weight",
-        "tok_embeddings.weight",
-    ];
-    checkpoint
-        .tensors()
-        .filter(|(_, t)| NAMES.iter().any(|n| t.name.ends_with(n)) && !t.name.contains("spatial_embed"))
-        .filter_map(|(_, t)| if t.shape.len() == 2 { t.shape.first().copied() } else { None })
-        .max()
+/// Rows of the largest token embedding, which every token id must stay below; `None` without one.
+fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option<u64> {
+    let embeddings = checkpoint.tensors().filter(|(_, t)| embedding.matches(&t.name, &t.shape));
+    embeddings.filter_map(|(_, t)| t.shape.first().copied()).max()
 }
 
 /// A rule's findings, or why it was not asked.
@@ -183,8 +174,7 @@ fn run<'r>(
     if more > 0 {
         findings.truncate(CAP);
         if let Some(last) = findings.last_mut() {
-            last.message = format!("{} (and {more} more of {})", last.message, rule.code);
-            last.evidence.insert("more".to_owned(), json!(more));
+            last.hidden = last.hidden.saturating_add(more as u64);
         }
     }
     Ok(findings)
@@ -205,28 +195,27 @@ fn from_faults(
         let all: Vec<&Fault> = matching.collect();
         let Some(first) = all.first() else { return Vec::new() };
         let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
+        let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
         let mut evidence = first.detail.clone();
-        evidence.insert("count".to_owned(), json!(all.len()));
-        let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, all.len())));
+        evidence.insert("count".to_owned(), json!(count));
+        let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, count)));
         let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
-        let mut inner = fault_scope(scope, first, all.len());
+        let mut inner = fault_scope(scope, first, count);
         inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
         return vec![finding(rule, &inner, places, evidence, fix)];
     }
     let mut out = Vec::new();
-    // Of a kind that one file has too often the reader keeps some, and says with the last how many more there were.
-    let unkept = |fault: &Fault| fault.detail.get("more").and_then(Value::as_u64).unwrap_or(0);
     let mut more = 0_u64;
     for fault in matching.by_ref().take(CAP) {
         let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
-        more = more.saturating_add(unkept(fault));
+        more = more.saturating_add(fault.hidden);
         let inner = fault_scope(scope, fault, 1);
         let fix = hint(rule, bench, fault, &inner);
         out.push(finding(rule, &inner, locate(&places), fault.detail.clone(), fix));
     }
     // The rest is only counted, and repaired with the last where each has a place of its own in a text.
     for fault in matching {
-        more = more.saturating_add(unkept(fault)).saturating_add(1);
+        more = more.saturating_add(fault.hidden).saturating_add(1);
         let last = out.last_mut().and_then(|last| last.fix.as_mut());
         if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
             && let Some(fix) = hint(rule, bench, fault, &fault_scope(scope, fault, 1))
@@ -235,19 +224,16 @@ fn from_faults(
             last.edits.extend(fix.edits);
         }
     }
-    if more > 0
-        && let Some(last) = out.last_mut()
-    {
-        last.message = format!("{} (and {more} more of {})", last.message, rule.code);
-        last.evidence.insert("more".to_owned(), json!(more));
+    if let Some(last) = out.last_mut() {
+        last.hidden = more;
     }
     out
 }
 
 /// The variables of a rule on faults, for one of `count` faults.
-fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'a> {
+fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: u64) -> Scope<'a> {
     let mut inner = scope.child();
-    inner.bind_int("count", count as u64);
+    inner.bind_int("count", count);
     for (name, value) in &variables(fault) {
         inner.bind(name, value);
     }
@@ -338,6 +324,7 @@ fn finding(
         locations,
         evidence,
         fix,
+        hidden: 0,
     }
 }
 

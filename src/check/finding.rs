@@ -48,6 +48,22 @@ pub struct Finding {
     pub evidence: Map<String, Value>,
     /// The fix, or the manual step.
     pub fix: Option<FixHint>,
+    /// Further findings of the rule that are counted and not listed, because one file or one checkpoint has too many.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub hidden: u64,
+}
+
+impl Finding {
+    /// The number of findings that it counts for: itself, and the hidden ones.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        usize::try_from(self.hidden).unwrap_or(usize::MAX).saturating_add(1)
+    }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
+const fn is_zero(n: &u64) -> bool {
+    *n == 0
 }
 
 /// A finding that settings or a baseline accept.

@@ -65,7 +65,7 @@ fn lacking(stack: &str, layers: &BTreeMap<u64, BTreeSet<&str>>) -> Vec<Fault> {
             let mut fault = Fault::new(FaultKind::LayerLacksTensor)
                 .with("layer", format!("{stack}{index}"))
                 .with("siblings", members.len())
-                .with("names", lost.join(", "))
+                .with("names", lost.clone())
                 .with("lacks", lost.len());
             fault.places = lost.iter().map(Place::tensor).collect();
             fault
@@ -83,7 +83,8 @@ mod tests {
 
     fn missing(names: &[String]) -> Vec<String> {
         let faults = faults(names.iter().map(String::as_str));
-        faults.iter().map(|f| f.detail.get("names").and_then(|n| n.as_str()).unwrap_or_default().to_owned()).collect()
+        let lists = faults.iter().filter_map(|f| f.detail.get("names")?.as_array());
+        lists.flatten().filter_map(|name| name.as_str()).map(str::to_owned).collect()
     }
 
     #[test]

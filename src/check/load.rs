@@ -16,17 +16,16 @@ mod v5;
 
 use std::collections::BTreeSet;
 
+use serde_json::{Value, json};
+
 use crate::checkpoint::{Fault, FaultKind, Place};
-use crate::knowledge::{Evidence, Expected, Loader};
+use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
 
 pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
 pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
 pub use target::{Target, targets};
-
-/// Names in the message of one fault.
-const NAMES_SHOWN: usize = 5;
 
 /// Predicts the lists of the loader that `expected` was built for.
 #[must_use]
@@ -46,6 +45,33 @@ pub fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
         Loader::V4_47_0 => v4::in_model(expected, stored),
         Loader::V5_23_0 => v5::in_model(expected, stored),
     }
+}
+
+/// The class that the loader builds from `config` for these tensors. [`Architecture::expect_given`] explains the errors.
+///
+/// A class that reads sizes from stored tensors finds them under the names that it has for them itself: the loader
+/// renames stored tensors, and `from_pretrained` accepts a checkpoint of the base model alone.
+///
+/// # Errors
+/// The reason why the class cannot be built from this config.
+pub fn build(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> Result<Expected, Refusal> {
+    let expected = architecture.expect_given(config, &stored.evidence())?;
+    if !architecture.reads_tensors() {
+        return Ok(expected);
+    }
+    architecture.expect_given(config, &spelled(&expected, stored))
+}
+
+/// The stored tensors for [`Architecture::expect_given`]: under the names of the class, and those that the class does not
+/// have under the base-model prefix too, because it may have them once it is built with them.
+pub(super) fn spelled(expected: &Expected, stored: &Stored) -> Evidence {
+    let named = in_model(expected, stored);
+    let prefix = format!("{}.", expected.base_model_prefix);
+    let is_stray = |name: &str| !expected.tensors.contains_key(name) && !name.starts_with(&prefix);
+    let strays =
+        named.iter().filter(|(name, _)| is_stray(name)).map(|(name, shape)| (format!("{prefix}{name}"), shape));
+    let all = named.iter().map(|(name, shape)| (name.to_owned(), shape)).chain(strays);
+    all.map(|(name, shape)| (name, shape.map(<[u64]>::to_vec))).collect()
 }
 
 /// Optional groups of which nothing is there.
@@ -79,8 +105,8 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
             [(FaultKind::MissingTensors, &report.missing), (FaultKind::UnexpectedTensors, &report.unexpected)]
         {
             if !names.is_empty() {
-                let mut fault = Fault::new(kind).with("count", names.len()).with("names", listed(names));
-                fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
+                let mut fault = Fault::new(kind).with("count", names.len()).with("names", json!(names));
+                fault.places = names.iter().map(Place::tensor).collect();
                 faults.push(fault);
             }
         }
@@ -89,9 +115,8 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
         let (empty, others): (Vec<&Mismatch>, Vec<&Mismatch>) = report.mismatched.iter().partition(is_empty);
         if !empty.is_empty() {
             let names: Vec<String> = empty.iter().map(|m| m.name.clone()).collect();
-            let mut fault =
-                Fault::new(FaultKind::EmptyTensors).with("count", names.len()).with("names", listed(&names));
-            fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
+            let mut fault = Fault::new(FaultKind::EmptyTensors).with("count", names.len()).with("names", json!(names));
+            fault.places = names.iter().map(Place::tensor).collect();
             faults.push(fault);
         }
         faults.extend(others.into_iter().map(|m| {
@@ -105,14 +130,6 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
         None => fault,
     };
     faults.into_iter().map(named).collect()
-}
-
-fn listed(names: &[String]) -> String {
-    let shown: Vec<&str> = names.iter().take(NAMES_SHOWN).map(String::as_str).collect();
-    match names.len().saturating_sub(shown.len()) {
-        0 => shown.join(", "),
-        more => format!("{} and {more} more", shown.join(", ")),
-    }
 }
 
 #[cfg(test)]

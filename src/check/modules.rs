@@ -243,7 +243,7 @@ fn imports(
             Fault::new(FaultKind::ModuleNeedsPackage)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
-                .with("packages", packages.into_iter().collect::<Vec<_>>().join(", ")),
+                .with("packages", packages.into_iter().collect::<Vec<_>>()),
         );
     }
     for name in absent {
@@ -261,7 +261,7 @@ fn imports(
             Fault::new(FaultKind::AliasMissesImport)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
-                .with("imports", names.join(", "))
+                .with("imports", names)
                 .with("target", entry.target.as_str()),
         );
     }

@@ -185,7 +185,7 @@ impl<'a> Quantised<'a> {
                         let carrier = scheme.endings().next().unwrap_or_default();
                         let names: Vec<String> = lacks.iter().map(|ending| tensor(ending)).collect();
                         let at = Place::tensor(tensor(carrier));
-                        faults.push(fault(FaultKind::QuantizedModuleIncomplete).at(at).with("lacks", names.join(", ")));
+                        faults.push(fault(FaultKind::QuantizedModuleIncomplete).at(at).with("lacks", names));
                     }
                     faults.extend(judged.misshapen(scheme).map(|(ending, stored, expected)| {
                         let at = Place::tensor(tensor(ending));

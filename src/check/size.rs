@@ -179,7 +179,6 @@ fn explain(
     stated: u64,
     width: u64,
 ) -> Vec<(String, Value)> {
-    let evidence = stored.evidence();
     let mut spent = 0_usize;
     let mut sizes = |pointer: &str, value: u64| -> Option<Vec<u64>> {
         if spent > BUDGET {
@@ -187,7 +186,7 @@ fn explain(
         }
         spent = spent.saturating_add(expected.tensors.len());
         let config = with(config, &expected.config, pointer, value.into());
-        let built = architecture.expect_given(&config, &evidence).ok()?;
+        let built = load::build(architecture, &config, stored).ok()?;
         let same = built.tensors.len() == expected.tensors.len()
             && built.tensors.keys().all(|name| expected.tensors.contains_key(name));
         Weighed::new(&built, &load::in_model(&built, stored)).filter(|_| same)?.sizes(width)

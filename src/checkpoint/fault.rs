@@ -21,13 +21,15 @@ pub struct Fault {
     pub places: Vec<Place>,
     /// Figures and names for the message, by the names the rule's message uses.
     pub detail: Map<String, Value>,
+    /// Further faults of this kind in this file, which are counted and not kept.
+    pub hidden: u64,
 }
 
 impl Fault {
     /// A fault of `kind` with no place and no detail yet.
     #[must_use]
     pub fn new(kind: FaultKind) -> Self {
-        Self { kind, places: Vec::new(), detail: Map::new() }
+        Self { kind, places: Vec::new(), detail: Map::new(), hidden: 0 }
     }
 
     /// Adds a place.
@@ -132,14 +134,14 @@ impl Faults {
         faults.into_iter().for_each(|fault| self.push(fault));
     }
 
-    /// The faults kept; the last of a kind that had too many says how many `more` there were.
+    /// The faults kept; the last of a kind that had too many counts the others as hidden.
     pub(crate) fn into_vec(mut self) -> Vec<Fault> {
         for (kind, (count, last)) in &self.seen {
             let more = count.saturating_sub(cap(*kind));
             if more > 0
                 && let Some(fault) = self.list.get_mut(*last)
             {
-                fault.detail.insert("more".to_owned(), more.into());
+                fault.hidden = more as u64;
             }
         }
         self.list

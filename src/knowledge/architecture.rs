@@ -59,6 +59,12 @@ impl<'l> Architecture<'l> {
         self.library.text(self.name()).is_some_and(|text| text.contains(key))
     }
 
+    /// Whether its file reads sizes from stored tensors, as classes do whose config does not name them.
+    #[must_use]
+    pub fn reads_tensors(&self) -> bool {
+        ["stored(", "stored_count(", "has_tensor("].iter().any(|function| self.speaks_of(function))
+    }
+
     /// The config that a search for one begins with when there is none.
     #[must_use]
     pub fn start(&self) -> Value {

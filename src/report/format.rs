@@ -168,6 +168,7 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
     let mut seen: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
     for finding in findings {
         let (kept, hidden) = seen.entry(&finding.code).or_default();
+        *hidden = hidden.saturating_add(usize::try_from(finding.hidden).unwrap_or(usize::MAX));
         if *kept < cap {
             *kept = kept.saturating_add(1);
             shown.push(finding);

@@ -165,7 +165,7 @@ impl Counts {
     /// Counts findings.
     #[must_use]
     pub fn new(findings: &[Finding]) -> Self {
-        let n = |s| findings.iter().filter(|f| f.severity == s).count();
+        let n = |s| findings.iter().filter(|f| f.severity == s).fold(0, |n: usize, f| n.saturating_add(f.count()));
         Self { error: n(Severity::Error), warning: n(Severity::Warning), info: n(Severity::Info) }
     }
 

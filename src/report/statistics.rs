@@ -26,9 +26,7 @@ pub fn statistics(report: &Report, format: Format) -> Option<String> {
     let mut counts: BTreeMap<(&str, Severity), (usize, &Finding)> = BTreeMap::new();
     for finding in report.checkpoints.iter().flat_map(|c| &c.findings) {
         let (count, _) = counts.entry((&finding.code, finding.severity)).or_insert((0, finding));
-        // The last of many says how many more there are.
-        let more = finding.evidence.get("more").and_then(serde_json::Value::as_u64).unwrap_or(0);
-        *count = count.saturating_add(1).saturating_add(usize::try_from(more).unwrap_or(usize::MAX));
+        *count = count.saturating_add(finding.count());
     }
     let mut lines: Vec<RuleCount<'_>> = counts
         .into_iter()

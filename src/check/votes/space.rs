@@ -23,7 +23,7 @@ const LIST: usize = 64;
 pub(super) struct Space<'a> {
     architecture: Architecture<'a>,
     files: &'a Stored,
-    /// Stored tensors, as the file spells them.
+    /// Stored tensors as [`load::build`] presents them to the class.
     evidence: Evidence,
     /// Stored tensors, as the class spells them.
     pub stored: Evidence,
@@ -48,6 +48,9 @@ impl<'a> Space<'a> {
         let stored = load::in_model(expected, self.files);
         let changed = !stored.iter().eq(self.stored.iter());
         if changed {
+            if self.architecture.reads_tensors() {
+                self.evidence = load::spelled(expected, self.files);
+            }
             self.numbered = Numbered::from_names(stored.iter().map(|(name, _)| name));
             self.stored = stored;
         }

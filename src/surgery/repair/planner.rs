@@ -127,9 +127,8 @@ fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<Stri
 }
 
 /// How many findings there are of a kind, those that are only counted included.
-fn count(outcome: &Outcome, kind: impl Fn(&Finding) -> bool) -> u64 {
-    let unshown = |f: &Finding| f.evidence.get("more").and_then(serde_json::Value::as_u64).unwrap_or(0);
-    outcome.findings.iter().filter(|f| kind(f)).fold(0, |n, f| n.saturating_add(1).saturating_add(unshown(f)))
+fn count(outcome: &Outcome, kind: impl Fn(&Finding) -> bool) -> usize {
+    outcome.findings.iter().filter(|f| kind(f)).fold(0, |n, f| n.saturating_add(f.count()))
 }
 
 /// The code of an error that there are more of than before.

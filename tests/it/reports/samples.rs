@@ -46,6 +46,7 @@ pub fn finding(code: &str, name: &str, severity: Severity, message: &str, eviden
         locations: Vec::new(),
         evidence,
         fix: None,
+        hidden: 0,
     }
 }
 

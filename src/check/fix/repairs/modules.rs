@@ -2,6 +2,8 @@
 
 use std::fmt::Write as _;
 
+use serde_json::Value;
+
 use crate::check::fix::{Edit, Site};
 use crate::check::modules::relative_modules;
 use crate::checkpoint::{Checkpoint, PythonModule};
@@ -13,7 +15,7 @@ pub(super) fn add_imports(site: &Site<'_>) -> Option<Vec<Edit>> {
     let module = site.checkpoint().modules.get(name)?;
     let text = module.text.as_deref()?;
     let mut lines = String::new();
-    for file in fault.detail.get("imports")?.as_str()?.split(", ") {
+    for file in fault.detail.get("imports")?.as_array()?.iter().filter_map(Value::as_str) {
         let stem = file.strip_suffix(".py")?;
         let imported = site.checkpoint().modules.get(file)?;
         // In a circle the import would find a module that is half made.
@@ -65,7 +67,7 @@ pub(super) fn add_auto_class(site: &Site<'_>) -> Option<Vec<Edit>> {
     let key = key.as_str()?;
     let wanted = |class: &crate::checkpoint::module::PythonClass| match key {
         "AutoConfig" => class.bases.iter().any(|base| base.rsplit('.').next() == Some("PretrainedConfig")),
-        "AutoModel" => config.pointer("/architectures/0").and_then(serde_json::Value::as_str) == Some(&*class.name),
+        "AutoModel" => config.pointer("/architectures/0").and_then(Value::as_str) == Some(&*class.name),
         _ => false,
     };
     let classes = site.checkpoint().modules.values().flat_map(|m| m.classes.iter().map(move |class| (m, class)));
