@@ -1,4 +1,4 @@
-//! Compares what is there with what should be; pure functions from a checkpoint to findings.
+//! Compares a checkpoint with the knowledge about its class; pure functions from a checkpoint to findings.
 
 pub mod adapter;
 pub mod engine;

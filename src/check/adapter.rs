@@ -19,7 +19,7 @@ use targets::Targets;
 /// The tensors of one module.
 type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
-/// Faults of the adapter in this directory; none when there is none.
+/// Faults of the adapter in this directory; none without an adapter.
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return Vec::new() };
@@ -36,7 +36,7 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
         }
         Some(_) => {}
     }
-    // What is wrong with a config that is no object the document says itself.
+    // A config that is not an object has a fault of its own.
     let Some(config) = adapter.config() else { return faults };
     let text = |key: &str| config.get(key).and_then(Value::as_str);
     let base = text("base_model_name_or_path").unwrap_or_default();

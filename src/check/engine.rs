@@ -20,7 +20,7 @@ use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
 /// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
 const CAP: usize = 1000;
 
-/// Steps that a user's own rule may take over one checkpoint: elements its loops go over, and values they gather.
+/// Steps that a user's rule may take for one checkpoint: elements that its loops visit, and values that they collect.
 const STEPS: u64 = 2_000_000;
 
 /// Places of one finding that are kept, for the same reason.
@@ -32,7 +32,7 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     check_for(checkpoint, knowledge, &[])
 }
 
-/// Runs every rule over a checkpoint, for these versions of transformers; for those of [`check`] when there are none.
+/// As [`check`], for these versions of transformers unless the list is empty.
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
@@ -65,7 +65,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let architecture = outcome.architecture.as_deref();
     let bench = Bench::new(checkpoint);
     for rule in &knowledge.rules.rules {
-        // Rules of the program are known to end; of a user's rule that is found out.
+        // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
             Some(_) => within(STEPS, || ask(rule, &bench, &faults, &scope, architecture)),
             None => (ask(rule, &bench, &faults, &scope, architecture), false),
@@ -93,7 +93,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome
 }
 
-/// What the rules that name these faults make of them, outside the checks of a checkpoint.
+/// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
     let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(asked);
@@ -104,7 +104,7 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
     findings
 }
 
-/// Versions of the loaders that the checkpoint has to load under.
+/// Versions of the loaders under which the checkpoint must load.
 fn loaders(config: Option<&Value>, versions: &[String]) -> Vec<&'static str> {
     let wrote = config.and_then(|c| c.get("transformers_version")).and_then(Value::as_str);
     match (versions, wrote) {
@@ -131,7 +131,7 @@ fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option
     embeddings.filter_map(|(_, t)| t.shape.first().copied()).max()
 }
 
-/// A rule's findings, or why it was not asked.
+/// The findings of a rule, or the reason why it was skipped.
 fn ask(
     rule: &Rule,
     bench: &Bench<'_>,
@@ -157,15 +157,15 @@ fn ask(
     run(rule, bench, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
-/// An expression that could not be evaluated, and why.
-type Unasked<'r> = (&'r Expression, EvalError);
+/// An expression that could not be evaluated, and the error.
+type Unevaluated<'r> = (&'r Expression, EvalError);
 
 fn run<'r>(
     rule: &'r Rule,
     bench: &Bench<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
-) -> Result<Vec<Finding>, Unasked<'r>> {
+) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let mut findings = match &rule.check {
         Check::Fault(check) => from_faults(rule, check, bench, faults, scope),
         Check::Assert(check) => from_assert(rule, check, bench, scope)?,
@@ -213,7 +213,7 @@ fn from_faults(
         let fix = hint(rule, bench, fault, &inner);
         out.push(finding(rule, &inner, locate(&places), fault.detail.clone(), fix));
     }
-    // The rest is only counted, and repaired with the last where each has a place of its own in a text.
+    // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
     for fault in matching {
         more = more.saturating_add(fault.hidden).saturating_add(1);
         let last = out.last_mut().and_then(|last| last.fix.as_mut());
@@ -259,7 +259,7 @@ fn from_assert<'r>(
     check: &'r Assert,
     bench: &Bench<'_>,
     scope: &Scope<'_>,
-) -> Result<Vec<Finding>, Unasked<'r>> {
+) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let Some(each) = &check.each else {
         let found = one_assert(rule, check, bench, scope).map_err(|error| (&check.that, error))?;
         return Ok(found.into_iter().collect());
@@ -272,7 +272,7 @@ fn from_assert<'r>(
     for item in items {
         let mut inner = scope.child();
         inner.bind("it", &item);
-        // A value that is not there cannot be wrong: whether it has to be there is another rule's question.
+        // A missing value cannot be wrong; another rule reports it when it is required.
         out.extend(one_assert(rule, check, bench, &inner).unwrap_or(None));
     }
     Ok(out)
@@ -296,7 +296,7 @@ fn hint(rule: &Rule, bench: &Bench<'_>, fault: &Fault, scope: &Scope<'_>) -> Opt
     fix::hint(&rule.fixes, &Site { bench, fault: Some(fault), scope })
 }
 
-/// The fix of a finding that stands for several faults: all their edits, where each has some of the same safety.
+/// The fix of a finding for several faults: all their edits, if they have the same safety.
 fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
     let (first, next) = (first?, next?);
     if first.safety != next.safety {
@@ -328,7 +328,7 @@ fn finding(
     }
 }
 
-/// Places as locations; [`pinpoint`] says where in their files they stand.
+/// Places as locations; [`pinpoint`] adds their lines and columns.
 fn locate(places: &[Place]) -> Vec<Location> {
     let location = |place: &Place| Location {
         file: place.file.clone(),
@@ -342,7 +342,7 @@ fn locate(places: &[Place]) -> Vec<Location> {
 
 /// Gives locations their line and column; a pointer that names no value points at the nearest parent.
 ///
-/// All at once, so that each text is read once, however many findings point into it.
+/// Takes all findings at once, so that each text is scanned once.
 fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
     let mut locators: BTreeMap<String, Option<Locator<'_>>> = BTreeMap::new();
     for location in findings.iter_mut().flat_map(|f| &mut f.locations) {
@@ -370,7 +370,7 @@ fn nearest(locator: &mut Locator<'_>, mut pointer: &str) -> Option<std::ops::Ran
             return Some(span);
         }
         pointer = pointer.rsplit_once('/')?.0;
-        // The whole document says nothing.
+        // The whole document is no place to point at.
         if pointer.is_empty() {
             return None;
         }

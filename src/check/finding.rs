@@ -37,7 +37,7 @@ pub struct Finding {
     pub name: String,
     /// Severity.
     pub severity: Severity,
-    /// One sentence that names the cause, with the figures at hand.
+    /// One sentence that names the cause, with figures.
     pub message: String,
     /// Further facts, one sentence each.
     #[serde(skip_serializing_if = "Vec::is_empty")]

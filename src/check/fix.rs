@@ -116,7 +116,7 @@ pub struct FixHint {
     /// What a person should do, as an imperative; always present without edits.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub help: Option<String>,
-    /// What `check --fix` does.
+    /// The changes that `check --fix` makes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub edits: Vec<Edit>,
 }

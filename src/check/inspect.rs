@@ -13,7 +13,7 @@ use crate::knowledge::{Architecture, Library, Loader};
 
 /// Classes that are named beside the best.
 const CANDIDATES: usize = 8;
-/// Classes with equally good names that are built to tell them apart by their defaults.
+/// Classes with equally good names that are built, to compare their defaults with the tensors.
 const BUILT: usize = 40;
 /// Model types that are tried for a part.
 const PARTS: usize = 6;
@@ -206,7 +206,7 @@ fn by_config<'l>(library: &'l Library, config: &Value, stored: &Stored) -> Optio
     loaders.into_iter().find_map(|loader| library.find(config, stored.names(), loader))
 }
 
-/// Puts first, of the classes whose names fit equally well, the one whose defaults are nearest to the tensors.
+/// Orders classes whose names fit equally well by how close their defaults are to the tensors.
 fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
     let Some(best) = alike.first().map(Resemblance::score) else { return };
     let tied = alike.iter().take(BUILT).take_while(|r| r.score() >= best).count();
@@ -260,7 +260,7 @@ fn parts(
             pointer::put(&mut config, &Value::Null, &pointer, model_type.into());
             config
         });
-        // The one that the composition takes when nothing is said comes first among equals.
+        // Among equals, the default of the composition comes first.
         let choices = std::iter::once(start.clone()).chain(choices);
         let best = choices.filter_map(|config| Some((distance(&config)?, config))).min_by_key(|(d, _)| *d);
         start = best.map_or(start, |(_, config)| config);

@@ -1,6 +1,5 @@
-//! The load report: what `from_pretrained` would say of a checkpoint's tensors, and what it would not.
-//!
-//! One prediction for each loader that is known, on names and shapes alone.
+//! Load reports: the lists that `from_pretrained` reports for a checkpoint, and the tensors that it loads incorrectly
+//! without a warning. One predictor for each known loader, from names and shapes alone.
 
 mod convert;
 mod difference;
@@ -74,17 +73,17 @@ pub(super) fn spelled(expected: &Expected, stored: &Stored) -> Evidence {
     all.map(|(name, shape)| (name, shape.map(<[u64]>::to_vec))).collect()
 }
 
-/// Optional groups of which nothing is there.
+/// Optional groups of which no tensor is stored.
 fn absent_groups(expected: &Expected, there: impl Fn(&str) -> bool) -> BTreeSet<&str> {
     let optional = || expected.tensors.iter().filter_map(|(name, t)| Some((name, t.optional.as_deref()?)));
     let present: BTreeSet<&str> = optional().filter(|(name, _)| there(name)).map(|(_, group)| group).collect();
     optional().map(|(_, group)| group).filter(|group| !present.contains(group)).collect()
 }
 
-/// Faults for the rules to judge: one for each cause, not one for each tensor.
+/// Faults of a load report, one for each cause.
 ///
-/// `indexed-but-absent` is not among them: comparing the index with the shards finds it without a class.
-/// `under` names the loader where several say different things.
+/// `indexed-but-absent` is not among them: the comparison of the index with the shards reports it without a class.
+/// `under` names the loader when loaders differ.
 #[must_use]
 pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     let mut faults = Vec::new();

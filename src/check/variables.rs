@@ -1,4 +1,4 @@
-//! What a rule's expressions see of a checkpoint.
+//! The variables and functions of a checkpoint for the expressions of rules.
 
 use std::sync::Arc;
 
@@ -23,7 +23,7 @@ const DOCUMENTS: [(&str, &str); 6] = [
     ("special_tokens", "special_tokens_map.json"),
 ];
 
-/// The first document that an expression asks about and that is not there, or has no value.
+/// The first document that an expression reads and that is missing or invalid.
 #[must_use]
 pub fn absent(checkpoint: &Checkpoint, expression: &Expression) -> Option<&'static str> {
     let asked = expression.variables();

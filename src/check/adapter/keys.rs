@@ -2,7 +2,7 @@
 
 use crate::checkpoint::adapter::PREFIX;
 
-/// What a tensor is to its module.
+/// The part that a tensor has in its module.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum MatrixRole {
     A,

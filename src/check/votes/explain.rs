@@ -10,18 +10,18 @@ use crate::check::load::{LoadReport, SilentReason};
 use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Architecture, Expected};
 
-/// Why a load report is as it is.
+/// The config values that cause what a load report lists.
 #[derive(Debug, Clone)]
 pub struct Explanation {
     /// The values of the config that stored tensors contradict, and that explain some of the report.
     pub votes: Vec<Vote>,
-    /// What the report would be if these were corrected.
+    /// The report after these were corrected.
     pub rest: LoadReport,
 }
 
-/// Explains a load report that is not clean by values of the config; `None` where that does not help.
+/// Explains a load report that is not clean by config values; `None` when no value explains any of it.
 ///
-/// Only what stored tensors say counts: where they are missing it is the config that may be right.
+/// Only stored tensors count: where they are missing, the config may be right.
 #[must_use]
 pub fn explain(
     architecture: Architecture<'_>,

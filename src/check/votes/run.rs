@@ -9,7 +9,7 @@ use super::vote::{Fit, Votes};
 use crate::check::load::Stored;
 use crate::knowledge::Architecture;
 
-/// Times the stored names are spelled anew after the config has changed.
+/// Most times the stored names are renamed again after the config has changed.
 const PASSES: usize = 3;
 
 /// Lets the stored tensors vote on the values of `config` for a class; `None` when the class cannot be built from it
@@ -28,7 +28,7 @@ pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Store
     for _ in 0..PASSES {
         let distance = state.distance;
         state = solve::solve(&space, state);
-        // What the loader renames depends on what the class has: more layers, more names that it knows.
+        // The loader renames keys that the class has, so a class with more layers renames more.
         let found = state.distance < distance && space.rename(&state.built);
         if !found {
             break;

@@ -16,7 +16,7 @@ const CANDIDATES: usize = 3;
 /// Values beyond this are not searched; it bounds the steps of the search too.
 const LARGEST: u64 = 1 << 32;
 
-/// A config, and what the class builds from it.
+/// A config, and the class built from it.
 #[derive(Clone)]
 pub(super) struct SearchState {
     pub config: Value,
@@ -56,7 +56,7 @@ impl SearchState {
     }
 }
 
-/// `config` with some values replaced; what is not there on the way is taken from `resolved`.
+/// `config` with some values replaced; missing parents are taken from `resolved`.
 pub(super) fn put_all(config: &Value, resolved: &Value, values: &[(String, Value)]) -> Value {
     let mut config = config.clone();
     for (pointer, value) in values {
@@ -215,7 +215,7 @@ fn candidates(space: &Space<'_>, key: &ProbedKey, state: &SearchState) -> Vec<Va
             let (_, mut tally) = by_dimensions(space, key, &state.built);
             merge(&mut tally, by_names(&space.numbered, key, &state.built));
             let mut values = most(tally, key.value.as_u64());
-            // Tensors that are there because the key has a value at all, and are not stored.
+            // Tensors that exist in the class only because the key has a value, and are not stored.
             let lost = |name: &String| {
                 key.built.tensors.get(name) != state.built.tensors.get(name) && !space.stored.contains(name)
             };

@@ -1,4 +1,4 @@
-//! The evidence: which tensors speak for the value of each key, which against it, and what none can decide.
+//! Counts, for each key, the tensors that agree with its value and those that disagree, and finds undetermined keys.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -22,7 +22,7 @@ pub(super) fn votes(
     given: &Value,
     said: &Value,
 ) -> (Vec<Vote>, Vec<Undecided>) {
-    // With computed values written out each value stands for itself: `head_dim` no longer follows `hidden_size`.
+    // With computed values written out, each value is independent: `head_dim` no longer follows `hidden_size`.
     let pinned = SearchState::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
     let state =
         &pinned.map_or_else(|| state.clone(), |pinned| SearchState { changed: state.changed.clone(), ..pinned });
@@ -52,7 +52,7 @@ fn vote(space: &Space<'_>, key: &ProbedKey, state: &SearchState, given: &Value, 
     let evidence = ballot.witnesses(space, &state.built, &key.value);
     let against: BTreeSet<&str> = ballot.differ.iter().map(|(name, _)| *name).collect();
     let agree: BTreeSet<&str> = ballot.agree.iter().map(|(name, _)| *name).filter(|n| !against.contains(n)).collect();
-    // A value that nobody changed follows from others: what it was before they changed is not what the config says.
+    // A value that the search did not change may follow from others, so its earlier value is not that of the config.
     let before = if state.changed.contains(&key.pointer) { said.pointer(&key.pointer) } else { Some(&key.value) };
     Vote {
         pointer: key.pointer.clone(),
@@ -73,7 +73,7 @@ struct Ballot<'e> {
 }
 
 impl<'e> Ballot<'e> {
-    /// What differs between the class as voted and the class with another value: the store agrees with one.
+    /// The differences between the class with the voted value and with another one; the stored tensors agree with one.
     ///
     /// A name that is not stored is no evidence: it may have been lost.
     fn count(&mut self, space: &'e Space<'_>, voted: &'e Expected, other: &Expected) {

@@ -140,7 +140,7 @@ pub struct Votes {
 }
 
 impl Votes {
-    /// Puts what a vote says into another config; a list it is an element of comes along whole.
+    /// Writes the voted value into another config; for an element of a list, the whole list.
     pub fn apply(&self, vote: &Vote, config: &mut Value) {
         let ends = vote.pointer.match_indices('/').map(|(at, _)| at).skip(1);
         let outer = ends.filter_map(|end| vote.pointer.get(..end));

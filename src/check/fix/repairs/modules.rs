@@ -8,7 +8,7 @@ use crate::check::fix::{Edit, Site};
 use crate::check::modules::relative_modules;
 use crate::checkpoint::{Checkpoint, PythonModule};
 
-/// Makes a module import by itself what its imports import, because transformers copies only that along.
+/// Adds to a module the imports of its imports, because transformers copies only files that it imports directly.
 pub(super) fn add_imports(site: &Site<'_>) -> Option<Vec<Edit>> {
     let fault = site.fault?;
     let name = fault.detail.get("module")?.as_str()?;
@@ -73,7 +73,7 @@ pub(super) fn add_auto_class(site: &Site<'_>) -> Option<Vec<Edit>> {
     let classes = site.checkpoint().modules.values().flat_map(|m| m.classes.iter().map(move |class| (m, class)));
     let mut found = classes.filter(|(_, class)| wanted(class));
     let (module, class) = found.next()?;
-    // Of two that would do nobody knows which.
+    // Two candidates are ambiguous.
     if found.next().is_some() {
         return None;
     }

@@ -28,7 +28,7 @@ pub(super) fn quote_string(site: &Site<'_>) -> Option<Vec<Edit>> {
     while let Some(c) = chars.next() {
         match c {
             '"' => quoted.push_str("\\\""),
-            // JSON knows every escape but this one.
+            // JSON has every escape but this one.
             '\\' => match chars.next()? {
                 '\'' => quoted.push('\''),
                 other => quoted.extend(['\\', other]),
