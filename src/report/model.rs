@@ -43,7 +43,7 @@ impl Report {
 }
 
 /// Name and version of the program.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct ToolInfo {
     /// Always `ckpt-doctor`.
