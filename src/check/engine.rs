@@ -150,7 +150,9 @@ fn ask(
     if let Some(when) = &rule.when {
         match when.eval_bool(scope) {
             Ok(true) => {}
-            Ok(false) => return Err(format!("condition is false: {when}")),
+            // The expression means something to the author of a rule only.
+            Ok(false) if rule.origin.is_some() => return Err(format!("condition is false: {when}")),
+            Ok(false) => return Err("the condition of the rule is false".to_owned()),
             Err(error) => return Err(cannot(when, &error)),
         }
     }
