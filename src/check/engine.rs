@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
-use super::load::Stored;
+use super::load::{self, Stored};
 use super::outcome::Outcome;
 use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
@@ -15,7 +15,7 @@ use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule};
-use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
+use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
 
 /// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
 const CAP: usize = 1000;
@@ -60,7 +60,9 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
-    scope.bind("loaders", &json!(loaders(config, versions)));
+    let targets = load::wanted(config, versions);
+    let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
+    scope.bind("loaders", &leading.collect());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let bench = Bench::new(checkpoint);
@@ -102,16 +104,6 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
         rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);
     findings
-}
-
-/// Versions of the loaders under which the checkpoint must load.
-fn loaders(config: Option<&Value>, versions: &[String]) -> Vec<&'static str> {
-    let wrote = config.and_then(|c| c.get("transformers_version")).and_then(Value::as_str);
-    match (versions, wrote) {
-        ([], None) => vec![Loader::NEWEST.version()],
-        ([], Some(version)) => vec![Loader::nearest(version).version()],
-        (asked, _) => asked.iter().map(|version| Loader::nearest(version).version()).collect(),
-    }
 }
 
 fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {

@@ -1,4 +1,4 @@
-//! What loads under one version of transformers and not under another.
+//! Checkpoints that load under one version of transformers but not under another.
 
 use super::LoadReport;
 use super::Stored;
@@ -10,7 +10,7 @@ use crate::knowledge::{Expected, Loader};
 pub struct Judged<'a> {
     /// The prediction.
     pub report: &'a LoadReport,
-    /// What the loader builds.
+    /// The class that the loader builds.
     pub expected: &'a Expected,
 }
 
@@ -46,7 +46,7 @@ fn named<'n>(fault: Fault, key: &str, names: impl Iterator<Item = &'n str>) -> F
     names.into_iter().fold(fault, |fault, name| fault.at(Place::tensor(name)))
 }
 
-/// The step in which the two versions differ, when it can be told.
+/// The step in which the two versions differ, if it is known; the rule puts it into words.
 fn reason(loads: &Expected, other: Judged<'_>, stored: &Stored) -> Option<&'static str> {
     let old_norms = |name: &str| name.contains("gamma") || name.contains("beta");
     let only_there = || {
@@ -57,15 +57,15 @@ fn reason(loads: &Expected, other: Judged<'_>, stored: &Stored) -> Option<&'stat
         None
     } else if stored.names().any(old_norms) {
         Some(match other.expected.loader {
-            Loader::V4_47_0 => "4.x renames gamma and beta in every name",
-            Loader::V5_23_0 => "5.x renames gamma and beta only after LayerNorm",
+            Loader::V4_47_0 => "gamma-renamed-everywhere",
+            Loader::V5_23_0 => "gamma-renamed-after-layer-norm",
         })
     } else if other.expected.loader == Loader::V4_47_0
         && stored.names().any(|name| loads.tensors.contains_key(name) && !other.expected.tensors.contains_key(name))
     {
-        Some("the names are those of 5.x, and 4.x converts none")
+        Some("names-of-5")
     } else if only_there() {
-        Some("the class has other tensors there")
+        Some("class-differs")
     } else {
         None
     }
