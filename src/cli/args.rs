@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use ckpt_doctor::check::Severity;
 use ckpt_doctor::knowledge::Loader;
-use ckpt_doctor::knowledge::loader::asked;
+use ckpt_doctor::knowledge::loader::parse_requirement;
 use ckpt_doctor::report::Format;
 use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -319,7 +319,7 @@ pub enum Color {
 
 /// The known loader nearest to the given version.
 fn parse_loader(text: &str) -> Result<Loader, String> {
-    asked(text).map(|version| Loader::nearest(&version))
+    parse_requirement(text).map(|version| Loader::nearest(&version))
 }
 
 /// Accepts the names of report formats, and lists them in the help.

@@ -85,10 +85,10 @@ impl SettingsResolver {
             Some(config.clone())
         } else {
             let found = nearest(checkpoint);
-            if let Some(passed_over) = found.passed_over
-                && self.told.insert(passed_over.clone())
+            if let Some(ignored) = found.ignored
+                && self.told.insert(ignored.clone())
             {
-                let file = output::safe(&passed_over.display().to_string());
+                let file = output::safe(&ignored.display().to_string());
                 output::note(&format!(
                     "note: {file} is inside a checkpoint and is ignored; pass --config {file} to use it"
                 ));
