@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_a_map_the_verdict_is_the_same() {
+    fn verification_is_the_same_without_a_map() {
         let header = br#"{"a":{"dtype":"U8","shape":[2],"data_offsets":[0,2]}}"#;
         let wrong = br#"{"a":{"dtype":"U8","shape":[3],"data_offsets":[0,2]}}"#;
         let mut whole = (header.len() as u64).to_le_bytes().to_vec();

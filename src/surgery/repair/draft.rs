@@ -333,7 +333,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fix_that_fails_leaves_nothing_behind() {
+    fn a_failed_fix_changes_nothing() {
         let dir = tempfile::tempdir().expect("a directory");
         std::fs::write(dir.path().join("config.json"), r#"{"a": 1, "b": 2}"#).expect("a file");
         let checkpoint = Arc::new(Checkpoint::open(dir.path()).expect("a checkpoint"));
