@@ -46,7 +46,7 @@ pub fn main() -> ExitCode {
     match result {
         Ok(code) => ExitCode::from(code),
         Err(error) => {
-            // Names in an error may come from a checkpoint: nothing of them may reach the terminal raw.
+            // Names in an error may come from a checkpoint, so they are escaped.
             let causes: Vec<String> = error.chain().map(|e| output::safe(&e.to_string())).collect();
             let causes = causes.join(": ");
             if interrupted(&error) {

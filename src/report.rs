@@ -1,6 +1,6 @@
-//! One report, many renderers. Nothing here loads, checks, writes or prints.
+//! Renders one report in several formats.
 //!
-//! [`render`] turns a [`Report`] into text; where that text goes is the caller's business.
+//! [`render`] turns a [`Report`] into text. Nothing here loads, checks, writes or prints; the caller outputs the text.
 
 pub mod baseline;
 mod build;
@@ -27,7 +27,7 @@ pub use style::{Format, Style, UnknownFormat};
 
 use crate::check::Finding;
 
-/// Writes a report down. Text that is not empty ends with a line break.
+/// Renders a report. Text that is not empty ends with a line break.
 #[must_use]
 pub fn render(report: &Report, format: Format, style: Style) -> String {
     match format {
@@ -43,13 +43,13 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
     }
 }
 
-/// Renders one finding of a checkpoint as [`Format::Full`] does, without the lines around it.
+/// Renders one finding of a checkpoint as in [`Format::Full`], without the lines around it.
 #[must_use]
 pub fn render_finding(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
     terminal::finding::render(finding, checkpoint, style)
 }
 
-/// The Rust in docs/integrations.md compiles and runs.
+/// Compiles and runs the Rust examples of docs/integrations.md.
 #[cfg(doctest)]
 #[doc = include_str!("../docs/integrations.md")]
 struct Examples;

@@ -1,4 +1,4 @@
-//! A fault is something observed to be wrong in a file, before any rule has judged it.
+//! A fault: a problem observed in a file, before any rule evaluates it.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -9,24 +9,23 @@ mod kind;
 
 pub use kind::{FaultKind, FaultSource};
 
-/// One observed fault: what kind, where, and the figures a message needs.
+/// One observed fault: its kind, its places and the figures for a message.
 ///
-/// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself carries no
-/// severity and no prose.
+/// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself has no severity and no text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fault {
-    /// The kind, by which rules select it.
+    /// The kind, by which rules select faults.
     pub kind: FaultKind,
-    /// Where it was seen, most important place first. May be empty: then it is the whole checkpoint.
+    /// The places, most important first. Empty means the whole checkpoint.
     pub places: Vec<Place>,
-    /// Figures and names for the message, by the names the rule's message uses.
+    /// Figures and names for the message, under the names that the rule's message uses.
     pub detail: Map<String, Value>,
     /// Further faults of this kind in this file, which are counted and not kept.
     pub hidden: u64,
 }
 
 impl Fault {
-    /// A fault of `kind` with no place and no detail yet.
+    /// A fault of `kind` without places or details.
     #[must_use]
     pub fn new(kind: FaultKind) -> Self {
         Self { kind, places: Vec::new(), detail: Map::new(), hidden: 0 }
@@ -67,7 +66,7 @@ impl Place {
         Self { file: Some(name.into()), ..Self::default() }
     }
 
-    /// A tensor, in no particular file.
+    /// A tensor, without a file.
     #[must_use]
     pub fn tensor(name: impl Into<String>) -> Self {
         Self { tensor: Some(name.into()), ..Self::default() }
@@ -95,13 +94,13 @@ impl Place {
     }
 }
 
-/// How many faults of one kind one file may have before the rest are only counted.
+/// Maximum number of faults of one kind in one file; further ones are only counted.
 pub(crate) const KIND_CAP: usize = 64;
 
-/// Non-finite numbers are repaired one by one, so far more of them are kept.
+/// Limit for non-finite numbers. Each one is repaired by an edit of its own, so the limit is higher.
 const NON_FINITE_CAP: usize = 4096;
 
-/// How many faults of this kind one file may have.
+/// Maximum number of faults of this kind in one file.
 const fn cap(kind: FaultKind) -> usize {
     match kind {
         FaultKind::NonFiniteNumber => NON_FINITE_CAP,
@@ -109,16 +108,16 @@ const fn cap(kind: FaultKind) -> usize {
     }
 }
 
-/// Collects the faults of one file, keeping at most a set number of each kind.
+/// Collects the faults of one file, up to a limit for each kind.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
     list: Vec<Fault>,
-    /// How many of each kind were seen, and where the last one kept stands in `list`.
+    /// By kind: number of faults, and the position in `list` of the last one kept.
     seen: BTreeMap<FaultKind, (usize, usize)>,
 }
 
 impl Faults {
-    /// Adds a fault, or only counts it when there are enough of its kind.
+    /// Adds a fault, or only counts it above the limit of its kind.
     pub(crate) fn push(&mut self, fault: Fault) {
         let cap = cap(fault.kind);
         let (count, last) = self.seen.entry(fault.kind).or_insert((0, 0));

@@ -1,11 +1,11 @@
-//! Strings and places from a checkpoint, made fit for people.
+//! Escapes strings of a checkpoint, and formats sizes and positions for messages.
 
 use std::fmt::Write as _;
 
 /// Makes a string from a checkpoint safe to print, in at most about `cap` characters.
 ///
-/// Control characters (ESC and line breaks included), bidirectional overrides and other invisible
-/// characters come out as `\u{..}`; what is cut off is marked with `…`.
+/// Control characters (ESC and line breaks included), bidirectional overrides and other invisible characters become
+/// `\u{..}`; `…` marks omitted text.
 #[must_use]
 pub fn escape(text: &str, cap: usize) -> String {
     let mut out = String::new();
@@ -63,7 +63,7 @@ pub fn file_size(n: u64) -> String {
 
 /// Line and column of a byte offset, both from 1; the column counts characters.
 ///
-/// An offset past the end means the end; one inside a character means that character.
+/// An offset past the end counts as the end; an offset inside a character counts as the start of that character.
 #[must_use]
 pub fn line_column(text: &str, offset: usize) -> (usize, usize) {
     let mut offset = offset.min(text.len());

@@ -37,7 +37,7 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
         _ => "the report could not be written".to_owned(),
     })?;
-    // What matters is the result; findings on a donor that the merge repaired are told, not counted.
+    // Only the result counts: errors of a donor that the merge repaired are reported, but do not fail the run.
     Ok(match stage {
         Some(MergeStage::Written | MergeStage::DryRun) if args.report.exit_zero || !result_fails(&run, args) => CLEAN,
         _ => FINDINGS,
@@ -73,17 +73,17 @@ fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRe
     let typed = args.donor.iter().map(|(role, dir)| (role.clone(), PathBuf::from(dir)));
     for (role, dir) in typed.chain(short.into_iter().filter_map(|(r, d)| Some((r.to_owned(), d.clone()?)))) {
         if donors.insert(role.clone(), dir).is_some() {
-            bail!("donor {role} is given twice");
+            bail!("donor {role} is given more than once");
         }
     }
     if donors.is_empty() {
         bail!("no donors given; pass --vision DIR and --language DIR, or a merge file");
     }
-    // The command line has the last word over the file, but not over itself.
+    // Options of the command line override those of the file; duplicate options on the command line are errors.
     let mut typed = BTreeMap::new();
     for (name, value) in &args.set {
         if typed.insert(name.clone(), value.clone()).is_some() {
-            bail!("option {name} is given twice");
+            bail!("option {name} is given more than once");
         }
     }
     options.extend(typed);
@@ -92,7 +92,7 @@ fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRe
     Ok(MergeRequest { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
 }
 
-/// `fixtures/../merged` as `merged`, unless a symbolic link makes the two different places.
+/// Normalises `fixtures/../merged` to `merged`, unless a symbolic link makes them different places.
 fn tidy(path: PathBuf) -> PathBuf {
     let mut short = PathBuf::new();
     for part in path.components() {

@@ -25,16 +25,16 @@ struct Record {
 }
 
 /// A config, and the name of its source in messages.
-struct Asked {
+struct Input {
     source: String,
     record: Result<Record, String>,
 }
 
-/// The expected tensors of a config, or why there are none.
+/// The expected tensors of a config, or the reason for the failure.
 struct Answer {
     source: String,
     loader: Loader,
-    built: Result<Expected, String>,
+    expected: Result<Expected, String>,
 }
 
 /// Runs `expect`.
@@ -42,9 +42,9 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let library = library::with(rules)?;
     let mut failed = false;
     let mut list = Vec::new();
-    let mut answer = |asked: Asked| -> anyhow::Result<()> {
-        let answer = build(&library, asked, args.loader);
-        failed |= answer.built.is_err();
+    let mut answer = |input: Input| -> anyhow::Result<()> {
+        let answer = build(&library, input, args.loader);
+        failed |= answer.expected.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),
             ExpectFormat::Jsonl => output::print(&format!("{}\n", object(&answer))),
@@ -66,15 +66,15 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(if failed { FINDINGS } else { CLEAN })
 }
 
-/// A config.json, or a directory's.
-fn one(path: &Path) -> anyhow::Result<Asked> {
+/// Reads a config.json, or the one in a directory.
+fn one(path: &Path) -> anyhow::Result<Input> {
     let file = if path.is_dir() { path.join("config.json") } else { path.to_owned() };
     let record = parse(&read_capped(&file, JSON_CAP)?).map(|config| Record { config, class: None });
-    Ok(Asked { source: path.display().to_string(), record })
+    Ok(Input { source: path.display().to_string(), record })
 }
 
-/// The configs of a file of records, one after the other: such a file may be larger than memory.
-fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) -> anyhow::Result<()> {
+/// Reads the configs of a JSONL file one at a time, because such a file may be larger than memory.
+fn each_line(path: &Path, answer: &mut impl FnMut(Input) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let mut lines = BufReader::new(open_regular(path, u64::MAX)?.file);
     for number in 1_usize.. {
         let mut line = Vec::new();
@@ -87,19 +87,19 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) 
             }
             _ if line.trim_ascii().is_empty() => {}
             _ => {
-                // Python writes infinities that are not JSON: those take the longer way.
+                // Python writes infinities, which are not JSON; the lenient parser accepts them.
                 let record = serde_json::from_slice(&line).or_else(|strict| {
                     serde_json::from_value(parse(&line)?)
                         .map_err(|_| format!("not a JSON object with a \"config\": {strict}"))
                 });
-                answer(Asked { source, record })?;
+                answer(Input { source, record })?;
             }
         }
     }
     Ok(())
 }
 
-/// Parses a config as `check` does: lenient about what Python writes.
+/// Parses a config as `check` does, with the extensions of Python's JSON.
 fn parse(bytes: &[u8]) -> Result<Value, String> {
     let document = Document::parse("config.json", bytes);
     document.value.ok_or_else(|| {
@@ -108,11 +108,11 @@ fn parse(bytes: &[u8]) -> Result<Value, String> {
     })
 }
 
-fn build(library: &Library, asked: Asked, loader: Option<Loader>) -> Answer {
-    let Asked { source, record } = asked;
+fn build(library: &Library, input: Input, loader: Option<Loader>) -> Answer {
+    let Input { source, record } = input;
     let config = record.as_ref().map_or(&Value::Null, |r| &r.config);
     let loader = loader.unwrap_or_else(|| Loader::of_config(config));
-    let built = record.and_then(|Record { config, class }| {
+    let expected = record.and_then(|Record { config, class }| {
         let found = match &class {
             Some(class) => library.class(class, loader),
             None => library.find(&config, [], loader),
@@ -135,16 +135,16 @@ fn build(library: &Library, asked: Asked, loader: Option<Loader>) -> Answer {
         let architecture = found.ok_or_else(unknown)?;
         architecture.expect(&config).map_err(|refusal| format!("{}: {refusal}", architecture.class()))
     });
-    Answer { source, loader, built }
+    Answer { source, loader, expected }
 }
 
-/// Longest text of a checkpoint in a line of output.
+/// Maximum length of a text from a checkpoint in a line of output, in characters.
 const CAP: usize = 1000;
 
 fn text(answer: &Answer) -> String {
     let mut out = String::new();
     let source = escape(&answer.source, CAP);
-    match &answer.built {
+    match &answer.expected {
         Err(reason) => {
             let _ok = writeln!(out, "{source}: error: {}", escape(reason, CAP));
         }
@@ -170,7 +170,7 @@ fn text(answer: &Answer) -> String {
 }
 
 fn object(answer: &Answer) -> Value {
-    match &answer.built {
+    match &answer.expected {
         Err(reason) => json!({ "source": answer.source, "loader": answer.loader.version(), "error": reason }),
         Ok(e) => json!({
             "source": answer.source,
@@ -190,7 +190,7 @@ fn object(answer: &Answer) -> Value {
     }
 }
 
-/// Names that share a storage, each group in the order of the state dict.
+/// Tensor names that share a storage, each group in the order of the state dict.
 fn tied(expected: &Expected) -> Vec<Vec<&str>> {
     let mut groups: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (name, tensor) in &expected.tensors {
@@ -209,7 +209,7 @@ fn tied(expected: &Expected) -> Vec<Vec<&str>> {
     whole
 }
 
-/// The end of a chain of ties.
+/// The last tensor of a chain of ties.
 fn source_of<'e>(expected: &'e Expected, name: &'e str) -> &'e str {
     let mut at = name;
     for _ in 0..8 {

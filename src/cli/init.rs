@@ -18,10 +18,10 @@ pub fn run(args: &InitArgs) -> anyhow::Result<u8> {
     if args.pre_commit {
         files.push((args.dir.join(".pre-commit-config.yaml"), HOOKS));
     }
-    // Checked before the first write, so that either all files are written or none.
+    // Checked before the first write, so that all files are written or none.
     for (file, _) in &files {
         if file.symlink_metadata().is_ok() {
-            bail!("{} exists already; nothing was written", file.display());
+            bail!("{} already exists; nothing was written", file.display());
         }
     }
     for (file, text) in &files {

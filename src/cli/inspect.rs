@@ -35,7 +35,7 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(CLEAN)
 }
 
-/// A shard without a config and an index beside it, as a checkpoint of its own.
+/// Opens a shard as a checkpoint of its own, if it has no config and no index beside it.
 fn alone(path: &Path) -> Option<Checkpoint> {
     if !path.is_file() || path.extension().is_none_or(|e| e != "safetensors") {
         return None;

@@ -46,19 +46,19 @@ pub fn style(color: Color) -> Style {
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        // The reader closed the pipe, as `head` does: no error.
+        // The reader closed the pipe, as `head` does. This is not an error.
         Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         other => other.context("writing to standard output"),
     }
 }
 
-/// Writes a report to the file that the user named.
+/// Writes a report to a file given by the user.
 #[expect(clippy::disallowed_methods, reason = "a report, not a checkpoint")]
 pub fn write(file: &Path, text: &str) -> std::io::Result<()> {
     fs::write(file, text)
 }
 
-/// A line that may quote a checkpoint, safe to show.
+/// Escapes a line that may quote a checkpoint for display.
 pub fn safe(line: &str) -> String {
     ckpt_doctor::checkpoint::escape(line, 4000)
 }
@@ -68,7 +68,7 @@ pub fn create(file: &Path, text: &str) -> std::io::Result<()> {
     fs::OpenOptions::new().write(true).create_new(true).open(file)?.write_all(text.as_bytes())
 }
 
-/// Columns of the terminal.
+/// Width of the terminal in columns.
 fn columns() -> Option<usize> {
     let size = rustix::termios::tcgetwinsize(std::io::stdout()).ok()?;
     (size.ws_col > 0).then_some(usize::from(size.ws_col))

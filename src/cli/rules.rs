@@ -39,7 +39,7 @@ fn table<'r, const N: usize>(rows: impl Iterator<Item = [&'r str; N]>) -> String
     table.lines().fold(String::new(), |text, line| text + line.trim() + "\n")
 }
 
-/// Title and rules of a family; `None` when the word is not the letters of a family.
+/// Title and rules of a family; `None` if `word` is not a family.
 fn family(rules: &RuleSet, word: &str) -> Option<String> {
     let word = word.to_ascii_uppercase();
     let is_member = |rule: &&Rule| rule.code.trim_end_matches(|c: char| c.is_ascii_digit()) == word;
@@ -84,8 +84,8 @@ fn texts(fix: &Fix) -> impl Iterator<Item = String> {
 
 const fn safety(safety: Safety) -> &'static str {
     match safety {
-        Safety::Safe => "safe, made by --fix",
-        Safety::Unsafe => "unsafe, made by --fix --unsafe-fixes",
+        Safety::Safe => "safe, applied by --fix",
+        Safety::Unsafe => "unsafe, applied by --fix --unsafe-fixes",
         Safety::Manual => "manual",
     }
 }

@@ -9,18 +9,18 @@ use ckpt_doctor::knowledge::rule::RuleSet;
 
 use super::output;
 
-/// Longest reason, in characters; `explain` shows a condition in full.
+/// Maximum length of a reason, in characters; `explain` prints whole conditions.
 const REASON: usize = 100;
 
 /// Prints why each skipped rule was skipped; rules with the same reason share a line.
-pub fn say(dir: &Path, outcome: &Outcome, rules: &RuleSet) {
+pub fn print(dir: &Path, outcome: &Outcome, rules: &RuleSet) {
     let mut reasons: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for skipped in &outcome.skipped {
         reasons.entry(&skipped.why).or_default().push(&skipped.code);
     }
     let all: Vec<&str> = rules.all().map(|rule| rule.code.as_str()).collect();
     output::note(&output::safe(&format!(
-        "{}: {} of {} rules skipped",
+        "{}: {} of {} rules were skipped",
         dir.display(),
         outcome.skipped.len(),
         all.len()
@@ -30,12 +30,12 @@ pub fn say(dir: &Path, outcome: &Outcome, rules: &RuleSet) {
     }
 }
 
-/// The codes, sorted, and a family by its name where all of it is among them.
+/// The codes, sorted; a family whose rules are all among them is printed as one name.
 fn named<'c>(mut codes: Vec<&'c str>, all: &[&str]) -> Vec<&'c str> {
     codes.sort_unstable();
     let whole = |family: &str| {
-        let of = |list: &[&str]| list.iter().filter(|code| family_of(code) == family).count();
-        of(&codes) > 1 && of(&codes) == of(all)
+        let count = |list: &[&str]| list.iter().filter(|code| family_of(code) == family).count();
+        count(&codes) > 1 && count(&codes) == count(all)
     };
     let mut names: Vec<&str> = Vec::new();
     for code in &codes {

@@ -1,11 +1,11 @@
-//! The loaders whose behaviour is known: versions of transformers that were read and run.
+//! The known loaders: versions of transformers whose behaviour was read and run.
 
 use std::fmt;
 
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-/// A version of transformers that architectures and load reports speak for.
+/// A version of transformers for which loads are predicted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Loader {
     /// transformers 4.47.0, for all of 4.x.
@@ -15,13 +15,13 @@ pub enum Loader {
 }
 
 impl Loader {
-    /// All of them, oldest first.
+    /// All loaders, oldest first.
     pub const ALL: [Self; 2] = [Self::V4_47_0, Self::V5_23_0];
 
-    /// The newest one.
+    /// The newest loader.
     pub const NEWEST: Self = Self::V5_23_0;
 
-    /// Its version number.
+    /// Version number.
     #[must_use]
     pub const fn version(self) -> &'static str {
         match self {
@@ -30,7 +30,7 @@ impl Loader {
         }
     }
 
-    /// The first number of its version.
+    /// Major version.
     #[must_use]
     pub const fn major(self) -> u64 {
         match self {
@@ -39,8 +39,8 @@ impl Loader {
         }
     }
 
-    /// The known loader nearest to a version: of the same major version; the oldest or newest for what lies outside.
-    /// A text that does not start with a number names no version, and means the newest.
+    /// The known loader nearest to a version: of the same major version; the oldest or newest for versions outside the
+    /// range. The newest if the text does not start with a number.
     #[must_use]
     pub fn nearest(version: &str) -> Self {
         let digits = version.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default();
@@ -50,7 +50,7 @@ impl Loader {
         }
     }
 
-    /// The known loader nearest to the version that wrote this config.json; the newest when it does not say.
+    /// The known loader nearest to the version that wrote this config.json; the newest if the config has no version.
     #[must_use]
     pub fn of_config(config: &Value) -> Self {
         config.get("transformers_version").and_then(Value::as_str).map_or(Self::NEWEST, Self::nearest)
@@ -63,30 +63,33 @@ impl fmt::Display for Loader {
     }
 }
 
-/// A data file may name the version that its author read; the nearest known one stands for it.
+/// Data files state the version that their author read; it is mapped to the nearest known loader.
 impl<'de> Deserialize<'de> for Loader {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let version = String::deserialize(deserializer)?;
         if version.starts_with(|c: char| c.is_ascii_digit()) {
             Ok(Self::nearest(&version))
         } else {
-            Err(serde::de::Error::custom(format!("`{version}` is no version of transformers")))
+            Err(serde::de::Error::custom(format!("`{version}` is not a version of transformers")))
         }
     }
 }
 
-/// `transformers==4.51.3`: the version, as Python packages have it. Which loader stands for it is the checker's business.
+/// Parses `transformers==4.51.3` and returns the version; [`Loader::nearest`] maps it to a loader.
 ///
 /// # Errors
-/// Says how a version is written.
-pub fn asked(text: &str) -> Result<String, String> {
+/// The expected form, with the known versions.
+pub fn parse_requirement(text: &str) -> Result<String, String> {
     let version = text.strip_prefix("transformers==").unwrap_or_default();
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
     if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
         return Ok(version.to_owned());
     }
     let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
-    Err(format!("write it as transformers==VERSION; known are {}, others are judged as the nearest", known.join(", ")))
+    Err(format!(
+        "expected transformers==VERSION; known versions are {}, others are predicted as the nearest one",
+        known.join(", ")
+    ))
 }
 
 #[cfg(test)]

@@ -62,7 +62,7 @@ impl Processor {
     /// The built-in processors.
     ///
     /// # Errors
-    /// [`DataError`]; the house tests see to it that there is none.
+    /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("processors").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }

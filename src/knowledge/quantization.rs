@@ -1,7 +1,7 @@
-//! Quantisation schemes: how a weight is stored when it is not stored plainly; one file each in `rules/quantization/`.
+//! Quantisation schemes: how a quantised weight is stored; one file each in `rules/quantization/`.
 //!
-//! A scheme wraps the plain template of a class and is never a template of its own: in place of one plain tensor
-//! stand a few others, whose names and shapes follow from the plain one's.
+//! A scheme transforms the plain template of a class and has no template of its own. It replaces each plain tensor with
+//! others, whose names and shapes follow from the plain one.
 
 mod applied;
 mod declared;
@@ -120,20 +120,20 @@ pub struct StoredPart {
 }
 
 impl Scheme {
-    /// The schemes inside the program.
+    /// The built-in schemes.
     ///
     /// # Errors
-    /// [`DataError`]; the house tests see to it that there is none.
+    /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("quantization").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 
-    /// Endings of its tensors, in order.
+    /// Name endings of its tensors, in order.
     pub fn endings(&self) -> impl Iterator<Item = &str> {
         self.tensors.iter().map(|part| part.name.as_str())
     }
 
-    /// Whether values are stored under the plain name.
+    /// Whether the values are stored under the plain name.
     #[must_use]
     pub fn keeps_name(&self) -> bool {
         self.tensors.first().is_some_and(|part| part.name == self.plain)

@@ -334,10 +334,10 @@ pub struct Note {
     pub say: Template,
 }
 
-/// Keys that make a loader fetch or run code; no merge carries them from a donor's config.
+/// Config keys that make a loader download or run code; no merge copies them from a donor.
 ///
-/// `trust_remote_code`: CVE-2026-5241. `_attn_implementation_internal` and its kin: CVE-2026-4372.
-/// A recipe that needs an `auto_map` writes its own.
+/// `trust_remote_code`: CVE-2026-5241. `_attn_implementation_internal` and related keys: CVE-2026-4372. A recipe that
+/// needs an `auto_map` writes its own.
 pub const CODE_SWITCHES: &[&str] = &[
     "auto_map",
     "custom_pipelines",
@@ -356,7 +356,7 @@ impl Recipe {
     /// Parses a recipe.
     ///
     /// # Errors
-    /// [`DataError`] with the place.
+    /// [`DataError`] with the position.
     pub fn parse(path: &str, text: &str) -> Result<Self, DataError> {
         source::parse(path, text)
     }
@@ -364,7 +364,7 @@ impl Recipe {
     /// The built-in recipes, by name.
     ///
     /// # Errors
-    /// [`DataError`]; the house tests see to it that there is none.
+    /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("recipes").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }

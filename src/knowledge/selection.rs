@@ -7,7 +7,7 @@ use super::source::nearest;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum UnknownRule {
     /// The code or name was retired.
-    #[error("{word} is {now} now")]
+    #[error("{word} is now {now}")]
     Moved {
         /// The selector.
         word: String,
@@ -24,7 +24,7 @@ pub enum UnknownRule {
     },
 }
 
-/// How exactly `word` names the rule: the length of the code it gives; a name gives all of it.
+/// Specificity of a selector for the rule: the length of the matched code; a name counts as the whole code.
 fn specificity(word: &str, rule: &Rule) -> Option<usize> {
     if word == rule.name {
         return Some(rule.code.len());
@@ -37,19 +37,20 @@ impl RuleSet {
     /// The rule of this code or name.
     ///
     /// # Errors
-    /// [`UnknownRule`], with the nearest one there is.
+    /// [`UnknownRule`], with the nearest code or name.
     pub fn find(&self, word: &str) -> Result<&Rule, UnknownRule> {
         let whole = |r: &&Rule| word == r.name || word.eq_ignore_ascii_case(&r.code);
         self.all().find(whole).ok_or_else(|| self.unknown(word))
     }
 
-    /// Keeps the rules that these choices, from the weakest to the last word, leave on. Without any, all are on.
+    /// Applies the choices in order of increasing precedence and keeps the enabled rules. Without choices, all rules
+    /// are enabled.
     ///
-    /// A choice that selects starts anew; one that does not changes what those before it left. Within a choice the
-    /// longer word wins where two name a rule, and `ignore` when they are equal, as in ruff.
+    /// A choice with `select` discards the choices before it; one without modifies their result. Within a choice, the
+    /// longer selector wins if two match a rule, and `ignore` wins a tie, as in ruff.
     ///
     /// # Errors
-    /// [`UnknownRule`] for a word that names no rule.
+    /// [`UnknownRule`] for a selector without a match.
     pub fn choose(&mut self, choices: &[Choice]) -> Result<(), UnknownRule> {
         for word in choices.iter().flat_map(Choice::words) {
             self.codes(word)?;
@@ -61,10 +62,10 @@ impl RuleSet {
         Ok(())
     }
 
-    /// Gives rules other severities; of two words that name a rule the longer one wins, of equal ones the later.
+    /// Changes severities of rules; if two selectors match a rule, the longer one wins, and the later one wins a tie.
     ///
     /// # Errors
-    /// [`UnknownRule`] for a word that names no rule.
+    /// [`UnknownRule`] for a selector without a match.
     pub fn regrade(&mut self, words: &[(&str, Severity)]) -> Result<(), UnknownRule> {
         for (word, _) in words {
             self.codes(word)?;
@@ -78,10 +79,10 @@ impl RuleSet {
         Ok(())
     }
 
-    /// The codes of the rules that a word names, chosen or not.
+    /// The codes of the rules that a selector matches, enabled or not.
     ///
     /// # Errors
-    /// [`UnknownRule`] when there is none.
+    /// [`UnknownRule`] for a selector without a match.
     pub fn codes(&self, word: &str) -> Result<Vec<String>, UnknownRule> {
         let named = self.all().filter(|r| specificity(word, r).is_some());
         let codes: Vec<String> = named.map(|r| r.code.clone()).collect();
@@ -101,20 +102,20 @@ impl RuleSet {
     }
 }
 
-/// Family and number of a code, however many zeros the number starts with.
+/// Family and number of a code; leading zeros of the number do not count.
 fn number(code: &str) -> Option<(&str, u32)> {
     let (family, digits) = code.split_at_checked(code.find(|c: char| c.is_ascii_digit())?)?;
     Some((family, digits.parse().ok()?))
 }
 
-/// Which rules one place, a settings file or the command line, turns on and off.
+/// Rules enabled and disabled by one source: a settings file or the command line.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Choice {
-    /// Only these, when it is given.
+    /// Enable only these rules.
     pub select: Option<Vec<String>>,
-    /// These as well.
+    /// Enable these rules as well.
     pub extend_select: Vec<String>,
-    /// Not these.
+    /// Disable these rules.
     pub ignore: Vec<String>,
 }
 
@@ -123,7 +124,7 @@ impl Choice {
         self.select.iter().flatten().chain(&self.extend_select).chain(&self.ignore)
     }
 
-    /// Whether the rule is on, when this choice says so.
+    /// Whether this choice enables or disables the rule; `None` when it does neither.
     fn says(&self, rule: &Rule) -> Option<bool> {
         let wanted = self.select.iter().flatten().chain(&self.extend_select);
         let wanted = wanted.filter_map(|w| specificity(w, rule)).max();
@@ -151,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longer_word_wins() {
+    fn the_longer_selector_wins() {
         let one = |select: &[&str], ignore: &[&str]| codes(&[choice(Some(select), &[], ignore)]);
         assert_eq!(one(&["JSN001"], &[]), ["JSN001"]);
         assert_eq!(one(&["non-finite-number"], &["JSN"]), ["JSN001"]);
@@ -162,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_choice_has_the_last_word() {
+    fn a_later_choice_takes_precedence() {
         let file = choice(Some(&["IDX005", "IDX006", "JSN001"]), &[], &["IDX006"]);
         assert_eq!(codes(std::slice::from_ref(&file)), ["IDX005", "JSN001"]);
         assert_eq!(codes(&[file.clone(), choice(None, &["IDX006"], &["JSN"])]), ["IDX005", "IDX006"]);
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn severities_follow_the_longer_word() {
+    fn severities_follow_the_longer_selector() {
         let mut rules = RuleSet::embedded().unwrap();
         rules.regrade(&[("JSN001", Severity::Info), ("JSN", Severity::Error)]).unwrap();
         let of = |code: &str| rules.find(code).unwrap().severity;
@@ -179,17 +180,17 @@ mod tests {
     }
 
     #[test]
-    fn a_misspelt_word_is_answered_with_the_nearest() {
+    fn an_unknown_selector_suggests_the_nearest() {
         let mut rules = RuleSet::embedded().unwrap();
         let error = |word: &str| rules.find(word).unwrap_err().to_string();
         assert!(error("shard-mising").ends_with("; did you mean shard-missing?"));
         assert!(error("JSN01").ends_with("; did you mean JSN001?"));
         assert!(error("jsn1").ends_with("; did you mean JSN001?"));
         assert_eq!(error("qqqq"), "no rule has the code, family or name qqqq");
-        assert_eq!(error("cfg003"), "cfg003 is VLA001 now");
+        assert_eq!(error("cfg003"), "cfg003 is now VLA001");
         assert_eq!(rules.find("idx005").unwrap().name, "shard-missing");
         assert!(rules.find("IDX").is_err());
-        // Also one that is not chosen is known.
+        // Disabled rules are found as well.
         rules.choose(&[choice(Some(&["JSN"]), &[], &[])]).unwrap();
         assert!(rules.find("IDX005").is_ok() && rules.codes("IDX").is_ok());
     }

@@ -1,4 +1,4 @@
-//! Settings: which rules are asked, how bad their findings are, and what is accepted, as a `ckpt-doctor.json5` says.
+//! Settings from `ckpt-doctor.json5`: selected rules, severities and suppressions.
 
 mod chain;
 mod find;
@@ -90,23 +90,23 @@ pub struct Suppress {
     pub reason: String,
 }
 
-/// A settings file that was read.
+/// A parsed settings file.
 #[derive(Debug, Clone)]
 pub struct SettingsSource {
-    /// As messages name it.
+    /// The name used in messages.
     pub name: String,
-    /// Its folder, absolute.
+    /// Folder of the file, absolute.
     pub dir: PathBuf,
-    /// What it says.
+    /// The parsed settings.
     pub settings: Settings,
     text: String,
 }
 
 impl SettingsSource {
-    /// Settings from their text, as if it were a file in `dir`; `name` is for messages.
+    /// Parses settings from text, as a file in `dir`; `name` is used in messages.
     ///
     /// # Errors
-    /// Says what is wrong with `text`, and where.
+    /// [`DataError`] with the position in `text`.
     pub fn parse(name: &str, dir: &Path, text: &str) -> Result<Self, DataError> {
         let settings = source::parse(name, text)?;
         Ok(Self { name: name.to_owned(), dir: absolute(dir), settings, text: text.to_owned() })
@@ -119,7 +119,7 @@ impl SettingsSource {
         Self::parse(&name, absolute(path).parent().unwrap_or(path), &text)
     }
 
-    /// An error about a word of this file.
+    /// An error about the value `word` in this file.
     pub(super) fn wrong(&self, word: &str, reason: String) -> DataError {
         DataError::about(&self.name, &self.text, word, reason)
     }

@@ -6,14 +6,14 @@ use super::format::{name, plural, sentence};
 use super::model::{CheckpointReport, Fixing, Report};
 use crate::check::{Finding, Safety};
 
-/// `[*] `, as in ruff, for a finding that `--fix` would fix.
+/// `[*] `, as in ruff, for a finding that `--fix` can fix.
 pub(super) fn mark(finding: &Finding, fixing: Option<Fixing>) -> &'static str {
     let permitted = |fixing: Fixing| finding.fix.as_ref().is_some_and(|fix| fix.is_permitted(fixing.unsafe_fixes));
     // After `--fix`, fixes of remaining findings were tried and withdrawn; `section` lists them.
     if fixing.is_some_and(|fixing| !fixing.made && permitted(fixing)) { "[*] " } else { "" }
 }
 
-/// The fixes that were made in a checkpoint, and those that were withdrawn.
+/// The fixes applied to a checkpoint, and those that were rolled back.
 pub(super) fn section(checkpoint: &CheckpointReport) -> String {
     let mut out = String::new();
     for (many, (code, file, title)) in
@@ -29,7 +29,7 @@ pub(super) fn section(checkpoint: &CheckpointReport) -> String {
     out
 }
 
-/// Groups equal lines, with their number.
+/// Groups equal lines, with the size of each group.
 fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
     let mut counted: Vec<(usize, T)> = Vec::new();
     for line in lines {
@@ -42,7 +42,7 @@ fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
     counted.into_iter().map(|(n, line)| (many(n), line)).collect()
 }
 
-/// The number of fixes that were made or can be made; `None` when there are none.
+/// The number of fixes that were applied or can be applied; `None` without fixes.
 pub(super) fn closing(report: &Report) -> Option<String> {
     let fixing = report.checkpoints.iter().find_map(|c| c.fixing)?;
     let fixes = || report.checkpoints.iter().flat_map(|c| &c.findings).filter_map(|f| f.fix.as_ref());
@@ -64,7 +64,7 @@ pub(super) fn closing(report: &Report) -> Option<String> {
     }
 }
 
-/// The fixes that were made, for `--fix-only`.
+/// The fixes that were applied, for `--fix-only`.
 #[must_use]
 pub fn made(checkpoints: &[CheckpointReport]) -> String {
     let mut out = String::new();
@@ -77,7 +77,7 @@ pub fn made(checkpoints: &[CheckpointReport]) -> String {
     out
 }
 
-/// The number of fixes that `--diff` shows.
+/// The number of fixes shown by `--diff`.
 #[must_use]
 pub fn would(fixed: usize, files: usize) -> String {
     match fixed {

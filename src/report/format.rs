@@ -1,4 +1,4 @@
-//! Formatting shared by the renderers: counts, sizes, shapes, lists cut to "and N more".
+//! Formatting shared by the renderers: counts, sizes, shapes, and lists cut to "and N more".
 
 use std::collections::BTreeMap;
 
@@ -9,27 +9,27 @@ use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
 pub use crate::checkpoint::file_size as bytes;
 
-/// Longest name shown, in characters.
+/// Maximum length of a name, in characters.
 const NAME: usize = 160;
-/// Longest sentence shown, in characters.
+/// Maximum length of a sentence, in characters.
 const SENTENCE: usize = 1_000;
 
-/// A name from a checkpoint, safe to show.
+/// A name from a checkpoint, escaped for display.
 pub fn name(text: &str) -> String {
     escape(text, NAME)
 }
 
-/// A sentence that may quote a checkpoint, safe to show.
+/// A sentence that may quote a checkpoint, escaped for display.
 pub fn sentence(text: &str) -> String {
     escape(text, SENTENCE)
 }
 
-/// Whether a character steers a terminal, or hides or reorders text.
+/// Whether a character controls a terminal, or hides or reorders text.
 pub fn hostile(c: char) -> bool {
     c.is_control() || (!c.is_ascii() && !escape(c.encode_utf8(&mut [0; 4]), 1).starts_with(c))
 }
 
-/// Breaks text at spaces so that lines stay below `width` characters where words allow it.
+/// Breaks text at spaces into lines shorter than `width` characters, except for longer words.
 pub fn wrap(text: &str, width: Option<usize>) -> String {
     let Some(width) = width else { return text.to_owned() };
     let mut out = String::new();
@@ -53,7 +53,7 @@ pub fn plural(n: usize, noun: &str) -> String {
     if n == 1 { format!("1 {noun}") } else { format!("{n} {noun}s") }
 }
 
-/// `2 errors, 1 warning, 3 info`; empty when there is nothing to count.
+/// `2 errors, 1 warning, 3 info`; empty without findings.
 pub fn counts(counts: Counts) -> String {
     let mut parts = Vec::new();
     if counts.error > 0 {
@@ -76,7 +76,7 @@ pub fn shape(dims: &[u64]) -> String {
     format!("[{}]", parts.join(", "))
 }
 
-/// `path/file`, or what there is of it.
+/// `path/file`, or `path` without a file.
 pub fn place(path: &str, location: Option<&Location>) -> String {
     match location.and_then(|l| l.file.as_deref()) {
         Some(file) if path.is_empty() || path == "." => name(file),
@@ -85,7 +85,7 @@ pub fn place(path: &str, location: Option<&Location>) -> String {
     }
 }
 
-/// The tensors among locations, numbered ones collapsed, at most `cap` lines and how many more.
+/// The tensors among locations, with numbered names collapsed; at most `cap` lines, then the number of further ones.
 pub fn tensors(locations: &[Location], cap: usize) -> Vec<String> {
     let groups = collapse(locations.iter().filter_map(|l| l.tensor.as_deref()));
     let mut lines: Vec<String> = groups.iter().take(cap).map(|g| name(&g.pattern)).collect();
@@ -93,7 +93,7 @@ pub fn tensors(locations: &[Location], cap: usize) -> Vec<String> {
     lines
 }
 
-/// Name pattern, stored and expected shape of the tensors that do not match; alike ones together.
+/// Name pattern, stored shape and expected shape of mismatched tensors, grouped by shapes.
 pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
     let mut alike: BTreeMap<(&[u64], &[u64]), Vec<&str>> = BTreeMap::new();
     for m in &load.mismatched {
@@ -105,7 +105,7 @@ pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
     rows.collect()
 }
 
-/// Silent tensors by reason, in words.
+/// Tensors that load incorrectly without a message, grouped by reason.
 pub fn silent(load: &LoadReport) -> Vec<(String, Vec<NameGroup>)> {
     let mut reasons: BTreeMap<SilentReason, Vec<&str>> = BTreeMap::new();
     for one in &load.silent {
@@ -114,10 +114,10 @@ pub fn silent(load: &LoadReport) -> Vec<(String, Vec<NameGroup>)> {
     reasons.into_iter().map(|(reason, names)| (silence(reason).to_owned(), collapse(names))).collect()
 }
 
-/// Why a tensor loads wrong without a message, in words.
+/// Describes a reason.
 const fn silence(reason: SilentReason) -> &'static str {
     match reason {
-        SilentReason::IndexedButAbsent => "in the index and in no shard, so it stays randomly initialised",
+        SilentReason::IndexedButAbsent => "in the index, but in no shard, so it stays randomly initialised",
         SilentReason::PrefixHijack => {
             "one stray key with the base-model prefix, so every tensor is randomly initialised"
         }
@@ -125,7 +125,7 @@ const fn silence(reason: SilentReason) -> &'static str {
     }
 }
 
-/// The verdict over everything, as sentences without the last full stop.
+/// The verdict of a run, without the final full stop.
 pub fn summary(report: &Report) -> String {
     let found = counts(report.summary.counts);
     let checkpoints = plural(report.summary.checkpoints, "checkpoint");
@@ -142,7 +142,7 @@ pub fn summary(report: &Report) -> String {
     }
 }
 
-/// How a merge ended; `None` in the report that is written with the result.
+/// Describes the end of a merge; `None` in the report that is written into the result.
 fn outcome(merge: &MergeReport) -> Option<String> {
     let size = || format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
     Some(match merge.stage? {
@@ -150,19 +150,19 @@ fn outcome(merge: &MergeReport) -> Option<String> {
             let verb = if merge.seams.len() == 1 { "does" } else { "do" };
             format!("Nothing written: {} {verb} not fit", plural(merge.seams.len(), "seam"))
         }
-        MergeStage::Donors => "Nothing written: a donor is not sound".to_owned(),
-        MergeStage::Planned => "Nothing written: the planned checkpoint is not sound".to_owned(),
-        MergeStage::DryRun => format!("Nothing written, as asked: {} planned", size()),
+        MergeStage::Donors => "Nothing written: a donor has errors".to_owned(),
+        MergeStage::Planned => "Nothing written: the planned checkpoint has errors".to_owned(),
+        MergeStage::DryRun => format!("Nothing written (--dry-run): {} planned", size()),
         MergeStage::Written => format!("Written: {}", size()),
     })
 }
 
-/// The details of a finding, safe to show.
+/// The details of a finding, escaped for display.
 pub fn details(finding: &Finding) -> Vec<String> {
     finding.details.iter().map(|detail| sentence(detail)).collect()
 }
 
-/// The findings to show, at most `cap` of each code, and how many of which code are left out.
+/// At most `cap` findings of each code, and the number of omitted findings by code.
 pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, usize)>) {
     let mut shown = Vec::new();
     let mut seen: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
@@ -180,7 +180,7 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
     (shown, hidden.collect())
 }
 
-/// Findings that say the same of several places, as one each.
+/// Merges consecutive findings that differ only in their places.
 pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     let mut together: Vec<Finding> = Vec::new();
     for finding in findings {
@@ -198,7 +198,7 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     together
 }
 
-/// Load reports of which the loaders say the same, together.
+/// Groups load reports with the same content.
 pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
     let mut together: Vec<Vec<&LoadReport>> = Vec::new();
     for load in loads {
@@ -210,18 +210,18 @@ pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
     together
 }
 
-/// `transformers 4.51.3 (judged as 4.47.0) and 5.23.0`.
+/// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
 pub fn versions(loaders: &[&LoadReport]) -> String {
     let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
     format!("transformers {}", versions.join(" and "))
 }
 
-/// `and 3 more`, when a list of `total` is cut at `cap`.
+/// `and 3 more`, for a list of `total` items cut at `cap`.
 pub fn more(total: usize, cap: usize) -> Option<String> {
     total.checked_sub(cap).filter(|n| *n > 0).map(|n| format!("and {n} more"))
 }
 
-/// What the edits of a fix do, with their safety; then what a person should do.
+/// The edits of a fix with their safety, then the advice for a person.
 pub fn advice(hint: &FixHint) -> Vec<String> {
     let title = hint.title.as_ref().map(|title| format!("{} ({} fix)", sentence(title), hint.safety.name()));
     title.into_iter().chain(hint.help.as_deref().map(sentence)).collect()

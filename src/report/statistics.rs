@@ -1,4 +1,4 @@
-//! How often each rule spoke, instead of what it said.
+//! Counts the findings of each rule.
 
 use std::collections::BTreeMap;
 
@@ -19,8 +19,8 @@ struct RuleCount<'a> {
     fix: Option<&'a str>,
 }
 
-/// A line for each rule, the most frequent first: a table for `full` and `concise`, an array for `json`. The other formats
-/// have no place for it.
+/// One line per rule, the most frequent first: a table for `full` and `concise`, an array for `json`. `None` for the
+/// other formats.
 #[must_use]
 pub fn statistics(report: &Report, format: Format) -> Option<String> {
     let mut counts: BTreeMap<(&str, Severity), (usize, &Finding)> = BTreeMap::new();

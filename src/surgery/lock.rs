@@ -1,7 +1,7 @@
-//! The lock on a directory that one run at a time may work in: a file in it that says who does.
+//! A lock on a directory for a single run: a file that contains the process of the run.
 //!
-//! The kernel frees it, whatever ends the run. It is on a file and not on the directory, because NFS locks only what
-//! is open for writing.
+//! The kernel releases the lock when the process ends. A file is locked instead of the directory, because NFS only
+//! locks files that are open for writing.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write};
@@ -14,19 +14,19 @@ use super::error::{ApplyError, io_at};
 use super::system::{custom, retry};
 use crate::checkpoint::open::read_capped;
 
-/// What came of asking for a lock.
+/// Result of locking.
 pub(super) enum Lock {
-    /// This run has it.
+    /// This run has the lock.
     Ours(File),
-    /// Another run has it: what that one says of itself.
+    /// Another run has the lock; its process, from the file.
     Theirs(String),
-    /// The file or its directory went away meanwhile, with the run that had it.
+    /// The file or its directory was removed by the run that had it.
     Gone,
-    /// There are no locks on this file system; Lustre, for one, may be mounted so.
+    /// The file system does not support locks; Lustre, for one, may be mounted without.
     Unknown(File),
 }
 
-/// Asks for the lock on the file `path`, which is made when it is not there.
+/// Locks the file `path`; creates it when missing.
 ///
 /// # Errors
 /// [`ApplyError::Io`].
@@ -46,13 +46,13 @@ pub(super) fn take(path: &Path) -> Result<Lock, ApplyError> {
             Err(TryLockError::Error(e)) => return Err(io_at(path, "locking")(e)),
         }
     }
-    let held = file.metadata().map_err(io_at(path, "looking at"))?;
-    // A run that ended between our open and our lock has removed it: what we hold then has no name any more.
+    let held = file.metadata().map_err(io_at(path, "reading metadata"))?;
+    // A run that ended between opening and locking has removed the file, so this lock is on a deleted file.
     let same = fs::symlink_metadata(path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
     Ok(if same { Lock::Ours(file) } else { Lock::Gone })
 }
 
-/// Writes into the locked file who works here.
+/// Writes the process of this run into the locked file.
 pub(super) fn sign(file: &mut File) -> io::Result<()> {
     let host = rustix::system::uname();
     let signature = format!("process {} on {}", std::process::id(), host.nodename().to_string_lossy());

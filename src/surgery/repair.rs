@@ -1,7 +1,7 @@
-//! Fixes become one repair: planned on the checkpoint in memory, judged by the same rules, written once.
+//! Combines fixes into one repair: planned on the checkpoint in memory, checked by the same rules, written once.
 //!
-//! Fixes are made in rounds, as in ruff: those that do not touch one another together, then the rules are asked again,
-//! until nothing is left to do. A fix that does not help, or that brings about an error of another kind, is withdrawn.
+//! Fixes are applied in rounds, as in ruff: fixes that do not overlap are applied together, then the rules run again,
+//! until no fix is left. A fix is withdrawn when its finding remains, or when it introduces another error.
 
 mod draft;
 mod planner;
@@ -28,7 +28,7 @@ pub struct Fixed {
     pub file: Option<String>,
     /// Message of the finding.
     pub message: String,
-    /// How safe the fix is.
+    /// Safety of the fix.
     pub safety: Safety,
     /// What the fix did.
     pub title: String,
@@ -49,23 +49,23 @@ pub struct Withdrawn {
 /// A file that the repair changes.
 #[derive(Debug, Clone)]
 pub struct Change {
-    /// Its name.
+    /// File name.
     pub name: String,
-    /// What it will hold.
+    /// New content.
     pub new: Content,
 }
 
-/// What a changed file will hold.
+/// New content of a changed file.
 #[derive(Debug, Clone)]
 pub enum Content {
     /// Text.
     Text(Arc<str>),
-    /// Tensors of the original under another header.
+    /// Tensors of the original under a new header.
     Shard(PlannedShard),
 }
 
 impl Content {
-    /// Bytes it takes.
+    /// Number of bytes.
     #[must_use]
     pub fn len(&self) -> u64 {
         match self {
@@ -74,32 +74,32 @@ impl Content {
         }
     }
 
-    /// Whether it holds nothing.
+    /// Whether the content is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// What a repair would do, and what comes of it.
+/// A planned repair and its result.
 #[derive(Debug, Clone)]
 pub struct Repair {
-    /// The checkpoint as it is.
+    /// The checkpoint before the repair.
     pub original: Arc<Checkpoint>,
-    /// As it will be.
+    /// The checkpoint after the repair.
     pub planned: Arc<Checkpoint>,
-    /// What the rules say of it as it will be.
+    /// Result of checking the repaired checkpoint.
     pub outcome: Outcome,
-    /// The findings whose fixes are made.
+    /// Findings with applied fixes.
     pub fixed: Vec<Fixed>,
-    /// Fixes that were tried and not kept.
+    /// Fixes that were tried and rolled back.
     pub withdrawn: Vec<Withdrawn>,
     /// The files that change, by name.
     pub changes: Vec<Change>,
 }
 
 impl Repair {
-    /// Bytes of each file that is to be written.
+    /// Size of each file to write.
     pub(super) fn sizes(&self) -> Vec<u64> {
         self.changes.iter().map(|change| change.new.len()).collect()
     }

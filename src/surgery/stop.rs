@@ -1,4 +1,4 @@
-//! The signal that asks a run to stop.
+//! Stops a run on a signal.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -15,7 +15,7 @@ pub fn stop_on(signal: Arc<AtomicUsize>) {
     SIGNAL.get_or_init(|| signal);
 }
 
-/// Fails when the run has been asked to stop.
+/// Fails when a signal arrived.
 pub(super) fn interrupted() -> Result<(), ApplyError> {
     match SIGNAL.get() {
         Some(signal) if signal.load(Ordering::Relaxed) != 0 => Err(ApplyError::Interrupted),

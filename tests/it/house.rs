@@ -1,4 +1,4 @@
-//! Checks of rule files, fixtures and sources that need no checkpoint.
+//! Conventions of rule files, fixtures and sources, checked without a checkpoint.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -37,20 +37,20 @@ fn embedded_rules_are_those_on_disk() {
 }
 
 #[test]
-fn a_rule_lies_where_its_code_says() {
+fn rule_files_are_in_the_folder_of_their_family() {
     let mut wrong = Vec::new();
     for (path, text) in texts("rules/checks") {
         let rule: Rule = source::parse(&path, &text).unwrap_or_else(|e| panic!("{e}"));
         let family = rule.code.get(..3).unwrap_or_default().to_lowercase();
         if path != format!("rules/checks/{family}/{}.json5", rule.code) {
-            wrong.push(format!("{path} holds {}", rule.code));
+            wrong.push(format!("{path} contains {}", rule.code));
         }
     }
     none(&wrong);
 }
 
 #[test]
-fn rules_are_written_alike() {
+fn rules_follow_the_conventions() {
     let code = Regex::new(r"^[A-Z]{3}\d{3}$").expect("a pattern");
     let name = Regex::new(r"^[a-z][a-z0-9]*(-[a-z0-9]+)+$").expect("a pattern");
     let advice = Regex::new(r"\b(or|unless)\b|;").expect("a pattern");
@@ -76,7 +76,7 @@ fn rules_are_written_alike() {
         for title in rule.fixes.iter().filter_map(|fix| fix.title.as_ref()) {
             hold(!advice.is_match(title.source()), "a title states what the edits do: no `or`, `unless` or `;`");
         }
-        // Only information may need no action.
+        // A finding of severity info may need no action.
         hold(!rule.fixes.is_empty() || rule.severity == Severity::Info, "a rule above info has a fix or help");
     }
     none(&wrong);
@@ -86,7 +86,7 @@ fn first_word(text: &str) -> &str {
     text.split(|c: char| !c.is_alphanumeric()).next().unwrap_or_default()
 }
 
-/// Whether a text may start with an imperative: a small word that is no article and has no ending of another form.
+/// Whether a text may start with an imperative: a lower-case word that is neither an article nor another verb form.
 fn is_imperative(text: &str) -> bool {
     let word = first_word(text);
     let inflected = (word.ends_with('s') && !word.ends_with("ss")) || word.ends_with("ed") || word.ends_with("ing");
@@ -98,26 +98,26 @@ fn one_line(text: &str) -> bool {
     !text.trim().is_empty() && text.trim() == text && !text.contains('\n')
 }
 
-/// A capital may start a name (`AutoConfig`, `JSON`), never an ordinary word.
+/// A capital letter may start a name (`AutoConfig`, `JSON`), but not an ordinary word.
 fn starts_low(message: &str) -> bool {
     let word = first_word(message);
     !word.starts_with(char::is_uppercase) || word.chars().skip(1).any(char::is_uppercase)
 }
 
-/// Codes and names are never used twice: what was retired names its successor, and stays retired.
+/// Codes and names are never reused: a retired one maps to its successor.
 #[test]
-fn what_was_retired_stays_retired() {
+fn retired_codes_stay_retired() {
     let rules = rules();
     let taken: BTreeSet<&str> = rules.rules.iter().flat_map(|r| [r.code.as_str(), r.name.as_str()]).collect();
     let catalogue = catalogue();
-    let moved =
+    let wrong =
         catalogue.moved.iter().filter(|(old, new)| taken.contains(old.as_str()) || !taken.contains(new.as_str()));
-    none(&moved.map(|(old, new)| format!("rules/catalogue.json5: {old} to {new}")).collect::<Vec<_>>());
+    none(&wrong.map(|(old, new)| format!("rules/catalogue.json5: {old} to {new}")).collect::<Vec<_>>());
 }
 
 /// `tools/new-rule` takes the next free number, and its stub is a rule with a fixture.
 #[test]
-fn a_stub_of_a_rule_parses() {
+fn the_stub_of_a_rule_parses() {
     let work = tempfile::tempdir().expect("a directory");
     let room = work.path();
     fs::create_dir_all(room.join("rules")).expect("a directory");
@@ -141,7 +141,7 @@ fn a_stub_of_a_rule_parses() {
     assert!(room.join(format!("fixtures/rules/{code}/vocabulary-is-imaginary.json5")).is_file());
     let log = fs::read_to_string(room.join("CHANGELOG.md")).expect("text");
     assert!(log.contains(&format!("- {code} (vocabulary-is-imaginary)")), "{log}");
-    // A name that is used or retired is refused.
+    // A used or retired name is refused.
     assert!(!run("vocabulary-is-imaginary").status.success() && !run("token-twice").status.success());
 }
 
@@ -165,7 +165,7 @@ fn every_rule_has_a_fixture_and_every_fixture_a_rule() {
 }
 
 #[test]
-fn every_kind_of_fault_is_named_by_some_rule() {
+fn every_kind_of_fault_has_a_rule() {
     let rules = rules();
     let fault_checks = rules.rules.iter().filter_map(|r| if let Check::Fault(f) = &r.check { Some(f) } else { None });
     let named: BTreeSet<FaultKind> = fault_checks.flat_map(|f| &f.kinds).copied().collect();
@@ -175,7 +175,7 @@ fn every_kind_of_fault_is_named_by_some_rule() {
 
 #[test]
 fn other_data_files_parse() {
-    // With all their expressions, which the program compiles when it needs them.
+    // All their expressions are compiled here; the program compiles them at their first evaluation.
     for (path, text) in texts("rules/processors") {
         source::parse::<Processor>(&path, &text).unwrap_or_else(|e| panic!("{e}"));
     }
@@ -196,7 +196,7 @@ fn other_data_files_parse() {
         schemes += 1;
     }
     assert_eq!(Scheme::embedded().unwrap_or_else(|e| panic!("{e}")).len(), schemes);
-    // An architecture parses when it is first asked for.
+    // The program parses an architecture when it first uses it.
     let library = Library::embedded();
     let names: Vec<&str> = library.names().collect();
     assert_eq!(names.len(), texts("rules/architectures").len());
@@ -213,18 +213,18 @@ fn other_data_files_parse() {
     }
 }
 
-/// Rooms from left to right: data moves this way, and nobody imports from a room further right.
-const ROOMS: [&str; 7] = ["checkpoint", "knowledge", "check", "surgery", "report", "merge", "cli"];
+/// Stages from first to last: no stage imports from a later one.
+const STAGES: [&str; 7] = ["checkpoint", "knowledge", "check", "surgery", "report", "merge", "cli"];
 
 #[test]
-fn nobody_imports_from_a_room_further_right() {
+fn no_stage_imports_from_a_later_one() {
     let import = Regex::new(r"\b(?:crate|ckpt_doctor)::([a-z_]+)").expect("a pattern");
     let mut wrong = Vec::new();
     for (path, text) in sources() {
         let Some(room) = path.split('/').nth(1).map(|r| r.trim_end_matches(".rs")) else { continue };
-        let Some(own) = ROOMS.iter().position(|r| *r == room) else { continue };
+        let Some(own) = STAGES.iter().position(|r| *r == room) else { continue };
         for found in import.captures_iter(&without_tests(&text)) {
-            if ROOMS.iter().position(|r| *r == &found[1]).is_some_and(|other| other > own) {
+            if STAGES.iter().position(|r| *r == &found[1]).is_some_and(|other| other > own) {
                 wrong.push(format!("{path} imports from {}", &found[1]));
             }
         }
@@ -232,15 +232,15 @@ fn nobody_imports_from_a_room_further_right() {
     none(&wrong);
 }
 
-/// The text before `#[cfg(test)]`, without comments: tests may look over a wall.
+/// The text before `#[cfg(test)]`, without comments: tests may use later stages.
 fn without_tests(text: &str) -> String {
     let code = text.split("#[cfg(test)]").next().unwrap_or_default();
     code.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n")
 }
 
-/// Clippy denies what can panic on strange input; no source lifts that, and memory is touched by hand in one file.
+/// Clippy denies operations that can panic. No source allows them, and only one file has unsafe code.
 #[test]
-fn no_source_takes_liberties() {
+fn no_source_allows_panics_or_unsafe_code() {
     let lifted =
         Regex::new(r"(?:allow|expect)\([^)]*clippy::(?:unwrap_used|expect_used|indexing_slicing|arithmetic_\w+)")
             .expect("a pattern");
@@ -262,7 +262,7 @@ fn no_source_takes_liberties() {
     }
 }
 
-/// Nothing in the repository's fixtures is heavier than text has to be.
+/// Fixtures are text, and small.
 #[test]
 fn fixtures_are_small() {
     let size = |folder: &str| -> u64 {
@@ -281,9 +281,9 @@ fn every_built_in_repair_is_used_by_some_rule() {
     none(&BuiltInRepair::ALL.iter().filter(|r| !used(r)).map(|r| format!("{r:?}")).collect::<Vec<_>>());
 }
 
-/// Every folder of fixtures is described where its reader looks first.
+/// The README of the fixtures describes every folder.
 #[test]
-fn no_folder_of_fixtures_is_forgotten() {
+fn every_folder_of_fixtures_is_described() {
     let known = ["bases", "donors", "rules", "sound"];
     let folders = fs::read_dir(project().join("fixtures")).expect("a folder").map(|e| e.expect("an entry").path());
     let unknown: Vec<String> = folders

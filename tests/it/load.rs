@@ -1,4 +1,4 @@
-//! Architectures, predicted loads and config values, against records of the real loaders.
+//! Architectures, predicted loads and config values, compared with records of the real loaders.
 
 mod architectures;
 mod recorded_all;

@@ -1,6 +1,6 @@
 //! All integration tests, in one binary: it links the library once.
 //!
-//! `cargo test --test it merge::` runs one area. `tests/README.md` says what each is about.
+//! `cargo test --test it merge::` runs one area. `tests/README.md` describes the areas.
 
 #![allow(
     clippy::arithmetic_side_effects,
@@ -10,7 +10,7 @@
     clippy::indexing_slicing,
     clippy::print_stdout,
     clippy::unwrap_used,
-    reason = "a test that panics has failed, as it should"
+    reason = "a panic fails the test"
 )]
 #![allow(clippy::disallowed_methods, reason = "tests read the project's files and write temporary directories")]
 

@@ -16,7 +16,7 @@ use crate::support::{project, rules, tried};
 
 const GENERATED: &str = "<!-- Generated: `CKPT_DOCTOR_WRITE=1 cargo test --test it pages::` writes this file. -->";
 
-/// Compares a file with what it should hold, or writes it when asked to.
+/// Compares a file with its generated content; writes it when `CKPT_DOCTOR_WRITE` is set.
 #[track_caller]
 fn fresh(path: &str, text: &str) {
     let file = project().join(path);
@@ -27,7 +27,7 @@ fn fresh(path: &str, text: &str) {
     assert!(written == text, "{path} is stale: run `CKPT_DOCTOR_WRITE=1 cargo test --test it pages::` and commit it");
 }
 
-/// The catalogue on disk, so that a change needs no compilation.
+/// The catalogue on disk, so that changes need no compilation.
 pub fn catalogue() -> Catalogue {
     let path = "rules/catalogue.json5";
     source::parse(path, &fs::read_to_string(project().join(path)).expect("text")).unwrap_or_else(|e| panic!("{e}"))
@@ -99,8 +99,8 @@ const fn severity(severity: Severity) -> &'static str {
 
 const fn safety(safety: Safety) -> &'static str {
     match safety {
-        Safety::Safe => "safe, made by `--fix`",
-        Safety::Unsafe => "unsafe, made by `--fix --unsafe-fixes`",
+        Safety::Safe => "safe, applied by `--fix`",
+        Safety::Unsafe => "unsafe, applied by `--fix --unsafe-fixes`",
         Safety::Manual => "manual",
     }
 }
@@ -111,7 +111,7 @@ fn safeties(rule: &Rule) -> String {
     names.join(", ")
 }
 
-/// What the edits do, or else what a person should do; then the advice that comes with edits.
+/// The edits of a fix, or without edits the advice; then the advice in addition to edits.
 fn advice(fix: &Fix) -> (String, Option<String>) {
     let mut texts = [&fix.title, &fix.help].into_iter().flatten().map(|t| markdown(&t.prose()));
     (texts.next().unwrap_or_default(), texts.next())
@@ -175,7 +175,7 @@ fn the_page_of_rules_is_fresh() {
     fresh("docs/rules.md", &page);
 }
 
-/// The schemas whose files people write, in the order of the page.
+/// The schemas of files that people write, in page order.
 const SCHEMAS: [(&str, &str); 6] = [
     ("rule", "Keys of a rule"),
     ("architecture", "Keys of an architecture"),

@@ -1,4 +1,5 @@
-//! Every rule on every fixture: each case trips its own rule, and nobody else's unseen.
+//! Every rule on every fixture: each case is reported by its own rule, and the snapshot records findings of other
+//! rules.
 
 pub mod failure_modes;
 mod seeded;
@@ -58,13 +59,13 @@ fn mismatch(expect: &Expect, own: &[&Finding]) -> Option<String> {
 }
 
 #[test]
-fn each_case_trips_its_rule() {
+fn each_case_is_reported_by_its_rule() {
     let wrong = failures(|t| mismatch(t.case.expect.as_ref()?, &t.own()));
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
 #[test]
-fn each_rule_is_silent_on_the_base_of_its_case() {
+fn no_rule_reports_the_base_of_its_case() {
     let wrong = failures(|t| {
         let code = t.case.code.as_ref()?;
         t.before.contains(code).then(|| "the base trips the rule already".to_owned())
@@ -73,7 +74,7 @@ fn each_rule_is_silent_on_the_base_of_its_case() {
 }
 
 #[test]
-fn sound_checkpoints_trip_nothing_above_info() {
+fn sound_checkpoints_have_no_finding_above_info() {
     let wrong = failures(|t| {
         let loud: Vec<&Finding> = t.outcome.findings.iter().filter(|f| f.severity > Severity::Info).collect();
         (t.case.code.is_none() && !loud.is_empty()).then(|| shown(&loud))
@@ -81,7 +82,7 @@ fn sound_checkpoints_trip_nothing_above_info() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// Their tensors stand for those of the class, and the report says so.
+/// The tensors of a quantised checkpoint replace those of the class, so the predicted load is clean.
 #[test]
 fn quantised_checkpoints_load_clean() {
     let quantised = |t: &&Tried| t.case.name.starts_with("sound/quantized-");
@@ -103,7 +104,7 @@ fn is_clean(load: &LoadReport) -> bool {
 
 #[test]
 fn messages_render_in_full() {
-    // What was found may itself hold such characters: the loader's own sentence, the start of a file.
+    // Quotations may contain such characters: the loader's own sentence, the start of a file.
     let quoted =
         |f: &Finding, c: char| f.evidence.values().filter_map(|v| v.as_str()).map(|v| v.matches(c).count()).sum();
     let broken = |f: &Finding, text: &str, of: &[char]| {
@@ -113,7 +114,7 @@ fn messages_render_in_full() {
         let own = t.own();
         let bad: Vec<&Finding> = own
             .into_iter()
-            // A fix may show JSON; a message never does.
+            // A fix may contain JSON; a message never does.
             .filter(|f| {
                 broken(f, &f.message, &['?', '{', '}'])
                     || f.fix.as_ref().is_some_and(|fix| broken(f, fix.title(), &['?']))
@@ -124,7 +125,7 @@ fn messages_render_in_full() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// The donor as published checkpoints are: three `Infinity` and nothing else.
+/// The donor has the same faults as the published checkpoints: three `Infinity`.
 #[test]
 fn the_donor_has_three_infinities() {
     let donor = crate::support::project().join("fixtures/donors/spatialvla-tiny");
@@ -157,7 +158,7 @@ fn every_kind_of_a_comparison_is_produced_by_some_case() {
     assert!(never.is_empty(), "{never:?}");
 }
 
-/// Every rule on every case. A rule that starts to speak elsewhere shows up here.
+/// Every rule on every case. The snapshot shows new findings on cases of other rules.
 #[test]
 fn cross_fire() {
     let mut matrix = String::new();

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Predicted load reports against loads made on the spot, of classes and configs that no other test has seen.
+"""Predicted load reports, compared with new loads of classes and configs that no other test uses.
 
     fresh.py RECORDER PYTHON... [--classes N] [--seed S]
 
 Each PYTHON has one version of transformers. RECORDER is a script that writes, with `--out FILE.jsonl.gz --only REGEX
---seed S`, a record for each class, as recorded.py reads them. The classes are drawn from those shipped for that version; the seed,
-printed first, says which, and the configs and changes made of them.
+--seed S`, a record for each class in the format of recorded.py. The classes are drawn from those shipped for that version.
+The seed, printed first, determines the classes, their configs and the changes.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from derive.table import provenance  # noqa: E402
 
 
 def record(recorder, python, names, seed, work):
-    """A file of records of these classes, made by that interpreter's version."""
+    """Records of these classes, written by the transformers of that interpreter."""
     out = Path(work) / f"{re.sub('[^A-Za-z0-9]', '-', python)}.jsonl.gz"
     only = f"^(?:{'|'.join(map(re.escape, names))})$"
     command = [python, recorder, "--out", out, "--only", only, "--seed", str(seed), "--n", "1", "--n-other", "1", "--mutations", "5"]
@@ -34,8 +34,8 @@ def record(recorder, python, names, seed, work):
 
 
 def version_of(python):
-    asked = "import importlib.metadata as m; print(m.version('transformers'))"
-    return subprocess.run([python, "-c", asked], capture_output=True, text=True, check=True).stdout.strip()
+    script = "import importlib.metadata as m; print(m.version('transformers'))"
+    return subprocess.run([python, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
 
 
 def main():
@@ -51,8 +51,8 @@ def main():
 
     def judge(case, entry):
         what, each, _, load = case
-        told, why = agreement(each, entry, load) or (False, "no prediction")
-        shares.count(what, each, told, why)
+        agrees, why = agreement(each, entry, load) or (False, "no prediction")
+        shares.count(what, each, agrees, why)
 
     shipped, _ = provenance()
     with workplace() as work:
@@ -60,7 +60,7 @@ def main():
             version = version_of(python)
             names = random.Random(a.seed).sample(sorted(shipped[version]), a.classes)
             records = list(read(record(a.recorder, python, names, a.seed, work)))
-            # Some classes are in no mapping that the recorder walks.
+            # Some classes are in none of the mappings that the recorder uses.
             print(f"{version}: {len(records)} of {len(names)} classes recorded")
             tally.expect(len(records) >= 0.7 * len(names), f"{version}: too few records")
             hold((load for where, each in records for load in loads(where, each)), judge)

@@ -1,4 +1,4 @@
-"""SpatialVLA's model class around the language model that `text_config` names.
+"""SpatialVLA's model class with the language model of `text_config`.
 
 SpatialVLA builds a Gemma 2 unless a language model is passed to it; this class passes one. Tensor names, the forward
 pass and the hook after loading are those of SpatialVLA.

@@ -1,4 +1,4 @@
-//! The kinds of fault: one list, in which a kind has its name and the stage that produces it.
+//! The kinds of fault: one list with the name of each kind and the stage that produces it.
 
 use std::fmt;
 
@@ -30,7 +30,7 @@ macro_rules! fault_kinds {
             /// Every kind: those of the readers first, each group sorted by name.
             pub const ALL: &[Self] = &[$($(Self::$variant,)*)*];
 
-            /// The name that rules and reports use: `header-not-json`.
+            /// The name in rules and reports: `header-not-json`.
             #[must_use]
             pub const fn name(self) -> &'static str {
                 match self {
@@ -191,7 +191,7 @@ fault_kinds! {
 }
 
 impl FaultKind {
-    /// The kind of this name; `None` when there is none.
+    /// The kind of this name; `None` for an unknown name.
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|kind| kind.name() == name)

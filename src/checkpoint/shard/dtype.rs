@@ -1,4 +1,4 @@
-//! Element types of the format.
+//! Element types of the safetensors format.
 
 use std::fmt;
 
@@ -34,7 +34,7 @@ pub enum Dtype {
 }
 
 impl Dtype {
-    /// All element types, in the format's alignment order (narrowest first).
+    /// All element types, in the alignment order of the format (narrowest first).
     pub const ALL: [Self; 22] = [
         Self::BOOL,
         Self::F4,
@@ -80,13 +80,13 @@ impl Dtype {
         }
     }
 
-    /// The type of this spelling; the format is case-sensitive.
+    /// The type with this name; case-sensitive, like the format.
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|d| d.name() == name)
     }
 
-    /// The format's spelling.
+    /// The name in the format.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {

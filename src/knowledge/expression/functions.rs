@@ -1,4 +1,4 @@
-//! Functions of the data files that CEL does not have.
+//! Functions for the expressions of data files, in addition to those of CEL.
 
 use cel::common::types::{CelNull, CelString};
 use cel::common::value::Val;
@@ -9,9 +9,9 @@ use super::scope::{Scope, plain};
 use super::steps;
 use crate::checkpoint::file_size;
 
-/// Longest list `range` makes.
+/// Maximum length of a list from `range`.
 const RANGE_CAP: i64 = 100_000;
-/// Most items that `join` shows.
+/// Maximum number of items that `join` prints.
 const JOIN_CAP: usize = 5;
 
 type FunctionResult = Result<Value, String>;
@@ -67,7 +67,7 @@ fn pow(arguments: &[Value]) -> FunctionResult {
     base.checked_pow(exponent).map(Value::from).ok_or_else(|| format!("{base}^{exponent} overflows"))
 }
 
-/// The whole part of an integer's square root.
+/// The integer part of an integer's square root.
 fn isqrt(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n] => {
@@ -93,7 +93,7 @@ fn round(arguments: &[Value], to: fn(f64) -> f64) -> FunctionResult {
         [Value::Number(n)] if n.is_i64() => Ok(Value::Number(n.clone())),
         [Value::Number(n)] => {
             let rounded = n.as_f64().map_or(f64::NAN, to);
-            // 2^53: beyond it a double is no longer exact, and no size is that large.
+            // Up to 2^53 a double is exact, and no size is larger.
             if rounded.abs() <= 9_007_199_254_740_992.0 {
                 #[expect(clippy::cast_possible_truncation, reason = "whole and within 2^53")]
                 let whole = rounded as i64;

@@ -36,7 +36,7 @@ fn evaluates_to_json() {
 }
 
 #[test]
-fn whatever_cannot_be_computed_is_an_error() {
+fn invalid_operations_are_errors() {
     for source in [
         "c.hidden / c.zero",
         "c.hidden % c.zero",
@@ -115,23 +115,23 @@ fn templates_render_in_a_sentence() {
 }
 
 #[test]
-fn a_text_that_is_no_expression_is_a_serde_error_with_its_place() {
+fn an_invalid_expression_is_a_serde_error_with_its_place() {
     #[derive(serde::Deserialize, Debug)]
     #[serde(deny_unknown_fields)]
     struct File {
         when: Expression,
     }
     let text = "{\n  when: \"c.hidden +\",\n}";
-    let error = compiled_at_once(|| json5::from_str::<File>(text)).expect_err("no operand");
+    let error = compile_eagerly(|| json5::from_str::<File>(text)).expect_err("no operand");
     assert!(error.to_string().contains("`c.hidden +` is not an expression"), "{error}");
-    // Otherwise it fails where it is used.
-    let lazy = json5::from_str::<File>(text).expect("not looked at yet");
+    // Compiled lazily, it fails at the first evaluation.
+    let lazy = json5::from_str::<File>(text).expect("not compiled yet");
     let error = lazy.when.eval(&Scope::new()).expect_err("no operand");
     assert!(error.to_string().starts_with("`c.hidden +`: column"), "{error}");
 }
 
 #[test]
-fn simple_expressions_mean_what_they_mean_in_cel() {
+fn simple_expressions_evaluate_as_in_cel() {
     let mut scope = Scope::new();
     scope.bind("c", &json!({ "n": 7, "sub": { "x": [1, 2], "y": null }, "text": "abc" }));
     scope.bind_int("i", 3);

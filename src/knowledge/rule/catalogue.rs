@@ -7,7 +7,7 @@ use serde::Deserialize;
 use super::super::ordered::ordered;
 use super::super::source::{self, DataError};
 
-/// `rules/catalogue.json5`: the families of rules, and what became of retired codes and names.
+/// `rules/catalogue.json5`: the families of rules, and the replacements of retired codes and names.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Catalogue {

@@ -1,4 +1,4 @@
-//! One finding, with the places it points at.
+//! Renders one finding with its places.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -13,9 +13,9 @@ use super::super::model::CheckpointReport;
 use crate::check::{Finding, Location, Severity};
 use crate::checkpoint::line_column;
 
-/// Most places shown for one finding.
+/// Maximum number of places shown for one finding.
 const PLACES: usize = 6;
-/// Columns that stand before the text of a note, with room for line numbers of four digits.
+/// Columns before the text of a note, with room for line numbers of four digits.
 const INDENT: usize = 16;
 
 pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
@@ -52,17 +52,17 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
     for (wrong, right) in shown.iter().filter_map(|one| one.column.as_ref()) {
         text = text.replacen(wrong, right, 1);
     }
-    // Without a line number to align with, arrows and notes would stand at the left margin.
+    // Without line numbers for alignment, arrows and notes would start at the left margin.
     if shown.iter().all(|one| !one.excerpt) { text.replace('\n', "\n ") } else { text }
 }
 
-/// One place: the locations that share an excerpt, or one location without any.
+/// One place: locations that share an excerpt, or a single location without one.
 struct FilePlaces<'a> {
     locations: Vec<&'a Location>,
     source: Option<&'a str>,
 }
 
-/// Locations in their order, neighbours in one file together, a file without a span once.
+/// Groups locations in order: neighbours in one file together, and a file without a span once.
 fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<FilePlaces<'a>> {
     let mut places: Vec<FilePlaces<'a>> = Vec::new();
     let mut bare = BTreeSet::new();
@@ -90,12 +90,12 @@ fn shares(place: &FilePlaces<'_>, location: &Location) -> bool {
     }
 }
 
-/// What a place comes to.
+/// A rendered place.
 struct Shown {
     elements: Vec<Element<'static>>,
-    /// Whether an excerpt is among them.
+    /// Whether it contains an excerpt.
     excerpt: bool,
-    /// `path:line:column` as it will come out and as it has to be, where a line was cut at the left.
+    /// `path:line:column` as rendered and as corrected, if a line was cut at the left.
     column: Option<(String, String)>,
 }
 

@@ -8,17 +8,17 @@ use super::{Change, Content, Fixed, Repair, Withdrawn};
 use crate::check::{Edit, Finding, Outcome, Severity};
 use crate::checkpoint::Checkpoint;
 
-/// Most rounds. A repair takes two or three; what takes more goes in circles.
+/// Maximum number of rounds. A repair takes two or three; more indicate a cycle.
 const ROUNDS: usize = 32;
 
-/// How far an attempt came.
+/// Result of an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Settled {
-    /// No fix could be made.
+    /// No fix could be applied.
     Nothing,
-    /// Some are made and kept.
+    /// Some fixes are applied and kept.
     Kept,
-    /// One is barred for good.
+    /// One fix is withdrawn for good.
     Barred,
 }
 
@@ -28,13 +28,13 @@ struct Planner<'a> {
     outcome: Outcome,
     fixed: Vec<Fixed>,
     withdrawn: Vec<Withdrawn>,
-    /// Edits that are not tried again.
+    /// Edits of withdrawn fixes, which are not tried again.
     barred: Vec<Vec<Edit>>,
 }
 
-/// Plans the repair of a checkpoint: all safe fixes, and the unsafe ones too if they are asked for.
+/// Plans the repair of a checkpoint: all safe fixes, and with `unsafe_fixes` also the unsafe ones.
 ///
-/// `check` judges a checkpoint, with the rules that were chosen; `outcome` is what it says of this one.
+/// `check` runs the selected rules on a checkpoint; `outcome` is their result for this one.
 #[must_use]
 pub fn plan(
     checkpoint: &Arc<Checkpoint>,
@@ -49,7 +49,7 @@ pub fn plan(
         match planner.settle(&planner.open(unsafe_fixes)) {
             Settled::Nothing => break,
             Settled::Kept => rounds = rounds.saturating_add(1),
-            // There are no more of these than findings.
+            // At most as often as there are findings.
             Settled::Barred => {}
         }
     }
@@ -64,7 +64,7 @@ pub fn plan(
 }
 
 impl Planner<'_> {
-    /// The findings whose fixes may be tried, in the order of the report.
+    /// The findings with fixes to try, in report order.
     fn open(&self, unsafe_fixes: bool) -> Vec<Finding> {
         let permitted = |f: &&Finding| {
             f.fix.as_ref().is_some_and(|fix| fix.is_permitted(unsafe_fixes) && !self.barred.contains(&fix.edits))
@@ -72,7 +72,7 @@ impl Planner<'_> {
         self.outcome.findings.iter().filter(permitted).cloned().collect()
     }
 
-    /// Makes as many of these fixes as get along with one another.
+    /// Applies as many of these fixes as do not conflict.
     fn settle(&mut self, findings: &[Finding]) -> Settled {
         let mut draft = self.draft.clone();
         let mut made: Vec<Finding> = Vec::new();
@@ -81,7 +81,7 @@ impl Planner<'_> {
             match draft.make(&fix.edits) {
                 Made::All => made.push(finding.clone()),
                 Made::Later if !made.is_empty() => {}
-                // What changes nothing now, or stands in its own way, does so later too.
+                // Edits that change nothing now, or conflict with each other, do so in later rounds too.
                 Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made".to_owned()),
             }
         }
@@ -104,7 +104,7 @@ impl Planner<'_> {
             self.withdraw(one, reason);
             return Settled::Barred;
         }
-        // Half of them at a time, until the one that does harm stands alone.
+        // Bisects the fixes until the harmful one is alone.
         let (first, second) = made.split_at(made.len() / 2);
         match self.settle(first) {
             Settled::Nothing => self.settle(second),
@@ -119,23 +119,23 @@ impl Planner<'_> {
     }
 }
 
-/// Why these fixes cannot be kept together.
+/// The reason for not keeping these fixes together.
 fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<String> {
-    // Of findings that look alike some may go and some stay: the next round has those that stay.
+    // Of several findings of one rule, some may be fixed and others remain: the next round handles the rest.
     let stays = |f: &&Finding| count(after, |g| g.code == f.code) >= count(before, |g| g.code == f.code);
     worse(before, after).or_else(|| made.iter().find(stays).map(|_| "the finding would remain".to_owned()))
 }
 
-/// How many findings there are of a kind, those that are only counted included.
+/// Number of findings of a kind, including those that are only counted.
 fn count(outcome: &Outcome, kind: impl Fn(&Finding) -> bool) -> usize {
     outcome.findings.iter().filter(|f| kind(f)).fold(0, |n, f| n.saturating_add(f.count()))
 }
 
-/// The code of an error that there are more of than before.
+/// The rule of an error that occurs more often than before.
 fn worse(before: &Outcome, after: &Outcome) -> Option<String> {
-    let of = |outcome: &Outcome, code: &str| count(outcome, |f| f.severity == Severity::Error && f.code == code);
+    let errors = |outcome: &Outcome, code: &str| count(outcome, |f| f.severity == Severity::Error && f.code == code);
     let codes: BTreeSet<&str> = after.findings.iter().map(|f| f.code.as_str()).collect();
-    let code = codes.into_iter().find(|code| of(after, code) > of(before, code))?;
+    let code = codes.into_iter().find(|code| errors(after, code) > errors(before, code))?;
     Some(format!("it would introduce {code}"))
 }
 

@@ -1,4 +1,4 @@
-//! `check` from the outside: which directories, which places, which exit code.
+//! `check` from the outside: directories, places, exit codes.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 #[test]
-fn infinity_and_missing_modules_are_named_with_their_places() {
+fn infinity_and_missing_modules_are_reported_with_their_places() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("spatialvla-tiny");
     copy(&donor("spatialvla-tiny"), &dir);
@@ -69,7 +69,7 @@ fn infinity_and_missing_modules_are_named_with_their_places() {
 }
 
 #[test]
-fn directories_are_searched_and_files_mean_their_checkpoint() {
+fn directories_are_searched_and_files_stand_for_their_checkpoint() {
     let work = TempDir::new().unwrap();
     let zoo = work.path().join("zoo");
     copy(&donor("llava3d-tiny"), &zoo.join("a"));
@@ -84,7 +84,7 @@ fn directories_are_searched_and_files_mean_their_checkpoint() {
     // pre-commit passes files, several of one checkpoint.
     let (config, index) = (a.join("config.json"), a.join("model.safetensors.index.json"));
     assert_eq!(paths(&[config.to_str().unwrap(), index.to_str().unwrap()]), names(&[&a]));
-    // Beside those of other checkpoints, of none, and one that the commit deletes.
+    // Together with files of other checkpoints, of none, and one that the commit deletes.
     let (readme, gone) = (zoo.join("README.md"), b.join("model-00001-of-00002.safetensors"));
     fs::write(&readme, "").unwrap();
     let mixed = [readme.to_str().unwrap(), config.to_str().unwrap(), gone.to_str().unwrap()];
@@ -94,11 +94,11 @@ fn directories_are_searched_and_files_mean_their_checkpoint() {
 }
 
 #[test]
-fn exit_codes_follow_the_severity_asked_for() {
+fn exit_codes_follow_fail_on() {
     let vision = donor("spatialvla-tiny");
     let vision = vision.to_str().unwrap();
     let code = |args: &[&str]| doctor(&[&["check", vision], args].concat()).status.code();
-    // The published oddities are warnings: below the default of errors.
+    // The known faults of the published checkpoint are warnings: below the default of errors.
     assert_eq!(code(&[]), Some(0));
     assert_eq!(code(&["--fail-on", "warning"]), Some(1));
     assert_eq!(code(&["--fail-on", "info"]), Some(1));
@@ -130,7 +130,7 @@ fn reports_can_be_written_beside_the_terminal() {
 }
 
 #[test]
-fn a_fifo_does_not_hang_and_hostile_names_do_not_reach_the_terminal() {
+fn a_fifo_does_not_block_and_hostile_names_are_escaped() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("c");
     copy(&donor("llava3d-tiny"), &dir);
@@ -183,7 +183,7 @@ fn rules_can_be_chosen_listed_and_explained() {
     }
 }
 
-/// No page shows an expression of a template.
+/// No page contains an expression of a template.
 #[test]
 fn every_rule_is_explained_with_an_example() {
     let rules = ckpt_doctor::knowledge::rule::RuleSet::embedded().unwrap();
@@ -198,11 +198,11 @@ fn every_rule_is_explained_with_an_example() {
 }
 
 #[test]
-fn the_load_is_predicted_for_the_versions_asked_for() {
+fn the_load_is_predicted_for_the_given_versions() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("llama");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/bases/llama"), &dir);
-    // A file of one tensor: what matters is who speaks, not what is missing.
+    // A file with one tensor: only the versions in the report matter.
     let header = br#"{"model.norm.weight":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}"#;
     let bytes = [&(header.len() as u64).to_le_bytes()[..], header, &[0; 4]].concat();
     fs::write(dir.join("model.safetensors"), bytes).unwrap();
@@ -220,15 +220,15 @@ fn the_load_is_predicted_for_the_versions_asked_for() {
 
     let shown = doctor(&[&["check", dir.to_str().unwrap()], &both[..]].concat());
     let shown = String::from_utf8(shown.stdout).unwrap();
-    assert!(shown.contains("predicted load by transformers 5.1.0 (judged as 5.23.0) and 4.47.0:"), "{shown}");
+    assert!(shown.contains("predicted load by transformers 5.1.0 (predicted as 5.23.0) and 4.47.0:"), "{shown}");
 
     for wrong in ["5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
         let output = doctor(&["check", dir.to_str().unwrap(), "--for", wrong]);
         assert_eq!(output.status.code(), Some(2), "{wrong}");
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert!(said.contains("known are 4.47.0, 5.23.0"), "{said}");
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert!(errors.contains("known versions are 4.47.0, 5.23.0"), "{errors}");
     }
-    // A class of custom code that was read for one version only.
+    // A class of custom code, known for one version only.
     let spatialvla = donor("spatialvla-tiny");
     let (_, report) =
         report(&["check", spatialvla.to_str().unwrap(), "--for", "transformers==5.23.0", "--output-format", "json"]);
@@ -238,9 +238,9 @@ fn the_load_is_predicted_for_the_versions_asked_for() {
     assert!(unknown["message"].as_str().unwrap().contains(" under transformers 5.23.0;"));
 }
 
-/// Gemma 3 text inside PaliGemma: transformers 4.47.0 has no such model type, 5.23.0 has.
+/// Gemma 3 text inside PaliGemma: the model type exists in transformers 5.23.0, but not in 4.47.0.
 #[test]
-fn a_part_that_only_another_loader_knows_is_judged_as_that_one_builds_it() {
+fn a_part_of_another_loader_is_built_as_by_that_loader() {
     let dir = tempfile::tempdir().unwrap();
     let config = json!({
         "architectures": ["PaliGemmaForConditionalGeneration"], "model_type": "paligemma", "transformers_version": "4.57.0",

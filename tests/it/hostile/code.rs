@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::{Case, bounded, case};
 
 const MODULE: &str = "modeling_x.py";
-/// Everything that a module can do while it is imported.
+/// Everything that a module can do during import.
 const PAYLOAD: &str = "import os, subprocess, urllib.request\nopen('../pwned', 'w').write('x')\nos.system('touch ../pwned')\n\
     subprocess.run(['sh', '-c', 'touch ../pwned'])\nclass XModel:\n    def __init_subclass__(cls):\n        exec('1')\n";
 
@@ -15,7 +15,7 @@ pub fn cases() -> Vec<Case> {
     [payloads(), switches(), auto_maps(), exhausting()].into_iter().flatten().collect()
 }
 
-/// X1: nothing is run.
+/// X1: no code runs.
 fn payloads() -> Vec<Case> {
     vec![
         bounded("X1", "a module with a payload", |d| {
@@ -43,7 +43,7 @@ fn payloads() -> Vec<Case> {
     ]
 }
 
-/// X2: keys that make a loader fetch or run code.
+/// X2: config keys that make a loader download or run code.
 fn switches() -> Vec<Case> {
     let set = |key: &'static str, value: Value| {
         case("X2", key, "SEC001", "config.json", move |d| d.set(&format!("/{key}"), &value))
@@ -57,7 +57,7 @@ fn switches() -> Vec<Case> {
     ]
 }
 
-/// X3: strings of `auto_map`, which are paths.
+/// X3: strings of `auto_map`, used as paths.
 fn auto_maps() -> Vec<Case> {
     let of = |name: &str, codes, value: Value| {
         case("X3", name, codes, "config.json", move |d| d.set("/auto_map", &json!({ "AutoModelForCausalLM": value })))

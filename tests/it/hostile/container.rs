@@ -3,7 +3,7 @@
 use super::place::{SHARD, entry, file, header, nested};
 use super::{Case, case, clean};
 
-/// A whole shard of one tensor `a` of four bytes.
+/// A whole shard with one tensor `a` of four bytes.
 fn plain() -> Vec<u8> {
     file(header(&entry("a", "F32", "[1]", 0, 4)), 4)
 }
@@ -17,7 +17,7 @@ pub fn cases() -> Vec<Case> {
     [lengths(), sizes(), twice(), layout(), types(), text(), metadata(), names()].into_iter().flatten().collect()
 }
 
-/// C1: what the first eight bytes say.
+/// C1: the header length in the first eight bytes.
 fn lengths() -> Vec<Case> {
     let stated = |name: &str, bytes: Vec<u8>| case("C1", name, "SAF001", SHARD, move |d| d.shard(&bytes));
     let mut swapped = plain();
@@ -92,7 +92,7 @@ fn sizes() -> Vec<Case> {
     ]
 }
 
-/// C4: one name, two meanings.
+/// C4: duplicate names.
 fn twice() -> Vec<Case> {
     let a = entry("a", "F32", "[1]", 0, 4);
     let two = |name: &str, other: String| {
@@ -125,7 +125,7 @@ fn twice() -> Vec<Case> {
     ]
 }
 
-/// C5, C6, C7: bytes of several tensors, of none, and that are not there.
+/// C5, C6, C7: overlapping bytes, holes and missing bytes.
 fn layout() -> Vec<Case> {
     let of = |row, name: &str, code, at, entries: String, data| {
         case(row, name, code, at, move |d| d.tensors(&entries, data))
@@ -200,7 +200,7 @@ fn types() -> Vec<Case> {
     ]
 }
 
-/// C10, C12: what the header is made of.
+/// C10, C12: the text of the header.
 fn text() -> Vec<Case> {
     let around = |name: &str, before: &'static str, after: &'static str| {
         case("C10", name, "SAF005", SHARD, move |d| {
@@ -259,7 +259,7 @@ fn metadata() -> Vec<Case> {
     ]
 }
 
-/// C13: names that make trouble where they are shown or used.
+/// C13: names that cause problems in output or as paths.
 fn names() -> Vec<Case> {
     let named = |name: &str, spelling: &str| {
         let entry = entry(spelling, "U8", "[1]", 0, 1);

@@ -55,7 +55,7 @@ fn depth() -> Vec<Case> {
     ]
 }
 
-/// J2: nesting under a key that nobody reads.
+/// J2: nesting under a key that no reader uses.
 fn ignored() -> Vec<Case> {
     let under = |name: &str, file: &'static str, depth| {
         case("J2", name, "JSN009", file, move |d| {
@@ -147,7 +147,7 @@ fn encodings() -> Vec<Case> {
     ]
 }
 
-/// J5: equal keys.
+/// J5: duplicate keys.
 fn doubles() -> Vec<Case> {
     let is = |name: &str, at, text: &str| config("J5", name, "JSN002", at, text);
     vec![
@@ -164,7 +164,7 @@ fn doubles() -> Vec<Case> {
     ]
 }
 
-/// What hands do to JSON, and what is left of a merge.
+/// Slips of hand-written JSON, and markers of a merge.
 fn slips() -> Vec<Case> {
     let is = |name: &str, code, text: &str| config("J3", name, code, CONFIG, text);
     vec![
@@ -182,7 +182,7 @@ fn slips() -> Vec<Case> {
     ]
 }
 
-/// J8: what does not fit into memory.
+/// J8: documents that do not fit into memory.
 fn size() -> Vec<Case> {
     let sparse = |name: &'static str| {
         case("J8", format!("6 GiB {name}"), "FIL003", name, move |d| {

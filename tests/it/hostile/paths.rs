@@ -1,4 +1,4 @@
-//! Rows P: the index, and every string that could become a path.
+//! Rows P: the index, and all strings used as paths.
 
 use super::place::{Dir, INDEX, SHARD, entry, file, header, numbered};
 use super::{Case, case, clean};
@@ -10,7 +10,7 @@ pub fn cases() -> Vec<Case> {
     [strings(), links(), shards(), sizes(), doubles(), many()].into_iter().flatten().collect()
 }
 
-/// P1: values of `weight_map` that are no plain names. Those that lead somewhere lead to files that are watched.
+/// P1: values of `weight_map` that are not plain names. Existing targets are watched.
 fn strings() -> Vec<Case> {
     let to = |name: &str, path: &str| {
         let members = format!(r#"{SOUND}, "c": "{path}""#);
@@ -83,7 +83,7 @@ fn links() -> Vec<Case> {
     ]
 }
 
-/// A snapshot of the hub cache: nothing but links to blobs.
+/// A snapshot of the hub cache, which consists of links to blobs.
 pub fn hub_cache(d: &Dir) {
     d.small();
     let blobs = d.root.join("../blobs");
@@ -96,7 +96,7 @@ pub fn hub_cache(d: &Dir) {
     }
 }
 
-/// P3, P4, P5, P8: which shards there are.
+/// P3, P4, P5, P8: missing and additional shards.
 fn shards() -> Vec<Case> {
     let map = |row, name: &str, code, at, members: &'static str| case(row, name, code, at, move |d| d.map(members));
     let one = || file(header(&entry("a", "U8", "[4]", 0, 4)), 4);
@@ -184,7 +184,7 @@ fn sizes() -> Vec<Case> {
     ]
 }
 
-/// P7: keys twice, and an index that is none.
+/// P7: duplicate keys, and an invalid index.
 fn doubles() -> Vec<Case> {
     let is = |name: &str, code, text: String| case("P7", name, code, INDEX, move |d| d.index(&text));
     let meta = r#""metadata": {"total_size": 8}"#;

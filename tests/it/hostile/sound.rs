@@ -1,4 +1,4 @@
-//! Rows C14, C15 and F13: odd, and right.
+//! Rows C14, C15 and F13: unusual but valid.
 
 use ckpt_doctor::checkpoint::Dtype;
 

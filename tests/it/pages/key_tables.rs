@@ -6,12 +6,12 @@ use serde_json::{Map, Value};
 
 use super::markdown;
 
-/// A table for the root of a schema, and one for each of its definitions.
+/// One table for the root of a schema, and one for each of its definitions.
 pub fn tables(schema: &Value) -> String {
     let tables = Tables(&schema["$defs"]);
     let mut out = tables.section("", schema);
     for (name, definition) in schema["$defs"].as_object().into_iter().flatten() {
-        // Named strings are explained once, above the tables; a choice of forms by its parts.
+        // Named strings are explained above the tables; a union is described by its variants.
         if definition["type"] != "string" && definition.get("anyOf").is_none() {
             out.push_str(&tables.section(name, definition));
         }
@@ -19,7 +19,7 @@ pub fn tables(schema: &Value) -> String {
     out
 }
 
-/// The definitions that a schema refers to.
+/// The definitions that a schema references.
 struct Tables<'s>(&'s Value);
 
 impl Tables<'_> {
@@ -47,7 +47,7 @@ impl Tables<'_> {
         out
     }
 
-    /// A form with one key, whose value may be an object that is described in place.
+    /// A variant with one key, whose value may be an object described in place.
     fn variant(&self, out: &mut String, properties: &Map<String, Value>, form: &Value) {
         for (key, value) in properties {
             let described = if text(value).is_empty() { form } else { value };
@@ -66,7 +66,7 @@ impl Tables<'_> {
         }
     }
 
-    /// The kind of value in words: `list of template`.
+    /// The type of a value in words: `list of template`.
     fn kind(&self, schema: &Value) -> String {
         if let Some(name) = schema["$ref"].as_str().and_then(|path| path.strip_prefix("#/$defs/")) {
             let choice = self.0.get(name).filter(|definition| definition.get("anyOf").is_some());

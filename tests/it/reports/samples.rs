@@ -1,4 +1,4 @@
-//! Reports made by hand.
+//! Hand-written reports.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -34,7 +34,7 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
     }
 }
 
-/// A finding without details; the evidence is an object.
+/// A finding without details; `evidence` is an object.
 pub fn finding(code: &str, name: &str, severity: Severity, message: &str, evidence: Value) -> Finding {
     let Value::Object(evidence) = evidence else { panic!("evidence is an object") };
     Finding {
@@ -50,7 +50,7 @@ pub fn finding(code: &str, name: &str, severity: Severity, message: &str, eviden
     }
 }
 
-/// Where `what` stands in `source`, the `nth` time (from 0).
+/// The position of `what` in `source`, the `nth` occurrence (from 0).
 pub fn at(file: &str, source: &str, what: &str, nth: usize, pointer: &str) -> Location {
     let (start, _) = source.match_indices(what).nth(nth).expect("the sample holds it");
     let before = &source[..start];
@@ -100,7 +100,7 @@ const PROCESSOR: &str = r#"{
 const CONFIG: &str =
     "{\n  \"model_type\": \"spatialvla\",\n  \"image_token_index\": -200,\n\t\"projection_dim\": 2048\n}\n";
 
-/// Each severity, with and without a place, and every kind of load difference.
+/// Every severity, with and without a place, and every kind of load difference.
 pub fn findings() -> Report {
     let mut infinity = finding(
         "DOC007",
@@ -176,7 +176,7 @@ pub fn findings() -> Report {
     let all = vec![twin("a.json"), twin("b.json"), no_span, ids, unmapped, module, infinity, nowhere];
     let mut checkpoint =
         checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
-    // A newer loader that reads all but one of these the same way.
+    // A newer loader with the same result, except for one tensor.
     let newer = LoadReport { loader: "5.23.0".to_owned(), stands_for: None, raises: None, silent: vec![], ..load() };
     checkpoint.loads = vec![load(), newer];
     Report::new(vec![checkpoint], None)
@@ -208,7 +208,7 @@ fn load() -> LoadReport {
     }
 }
 
-/// More of everything than anyone wants to read.
+/// A document with multi-byte characters, and fixes of each kind of text edit.
 /// A document whose lines hold characters of several bytes, and fixes of each kind that is text.
 pub fn fixable() -> Report {
     const ODD: &str = "{\n  \"größe\": NaN, \"rope_theta\": -1,\n  \"字\": {\"trust_remote_code\": true}\n}\n";
@@ -264,7 +264,7 @@ pub fn long_lists() -> Report {
     Report::new(vec![checkpoint], None)
 }
 
-/// A string that tries every trick on every format.
+/// A string with special characters of every format.
 pub const HOSTILE: &str =
     "a\u{1b}[2J\u{9b}31m\u{202e}txt\n# h | `b` <img src=x onerror=alert(1)> [l](javascript:x) **b** \u{7}@all\u{2028}";
 

@@ -27,7 +27,7 @@ struct Modes {
 pub struct Mode {
     #[serde(rename = "mode")]
     pub name: String,
-    /// Codes of the rules that report it.
+    /// Codes of the rules that report the failure.
     #[serde(default)]
     pub rules: Vec<String>,
     /// Names of cases below `fixtures/rules`.
@@ -35,7 +35,7 @@ pub struct Mode {
     /// Rules whose warnings may remain after the repair.
     #[serde(default)]
     left: Vec<String>,
-    /// The part of the failure that a directory does not show.
+    /// The part of the failure that files do not show.
     #[serde(default)]
     pub unseen: String,
 }
@@ -66,7 +66,7 @@ fn shown(findings: &[Finding]) -> String {
     out
 }
 
-/// Takes one case through all of it; the error says where it went wrong.
+/// Checks, repairs and undoes one case; the error names the failed step.
 fn round_trip(code: &str, left: &[String], dir: &Path, knowledge: &Knowledge) -> Result<(), String> {
     let before = files(dir);
     let (checkpoint, broken) = looked(dir, knowledge);
