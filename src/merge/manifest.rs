@@ -93,7 +93,7 @@ pub(crate) struct DonorTensor {
 /// The manifest of a planned merge. With `all_bytes` whole shards are hashed, otherwise only their headers.
 /// The manifest of a planned merge. With `all_bytes`, whole shards are hashed, otherwise only their headers.
 /// # Errors
-/// When a donor's file cannot be read, or a signal asked to stop.
+/// When a donor's file cannot be read, or a signal arrived.
 pub(super) fn manifest(
     recipe: &Recipe,
     options: &Options,

@@ -54,7 +54,7 @@ pub enum MergeStage {
     Seam,
     /// The planned checkpoint has errors; nothing was written.
     Planned,
-    /// The plan is sound, and `--dry-run` asked for no more.
+    /// The plan has no errors, and `--dry-run` ended the merge.
     DryRun,
     /// The result was written.
     Written,

@@ -140,7 +140,7 @@ impl From<Severity> for Verdict {
     }
 }
 
-/// What the run was asked to do about findings.
+/// Fix options of the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fixing {
     /// Whether unsafe fixes count as well.

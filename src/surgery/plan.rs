@@ -1,7 +1,7 @@
 //! A plan: every file and tensor of a checkpoint to be written, with their sources.
 //!
-//! Making a plan reads no tensor bytes: tensors are byte ranges of donors. [`Plan::preview`] turns a plan into a
-//! [`Checkpoint`], so that the same rules check it before it is written.
+//! Making a plan reads no tensor bytes: tensors are byte ranges of donors. A merge turns its plan into a checkpoint
+//! ([`PlannedShard::preview`]), so that the same rules check it before it is written.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -263,7 +263,7 @@ impl Plan {
 ///
 /// A tensor starts a new shard when it would exceed the limit of the current one; a single shard is named
 /// `model.safetensors`. Within a shard, wider types come first, then names in order, as the safetensors crate writes
-/// them. Source: `split_state_dict_into_shards_factory` in huggingface_hub.
+/// them. Source: `split_state_dict_into_shards_factory` in `huggingface_hub`.
 #[must_use]
 pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard> {
     let mut groups: Vec<Vec<PlannedTensor>> = Vec::new();

@@ -78,8 +78,8 @@ impl Staging {
             // Without lock support, only the run that created the directory may use it.
             Ok(Lock::Unknown(lock)) if made => lock,
             Ok(Lock::Unknown(_)) => {
-                let reason = "is there, and without locks on this file system nobody can tell whether a run is still \
-                              writing; remove it if none is";
+                let reason = "exists, and this file system has no locks that would show whether a run is still writing; \
+                              remove it if no run is";
                 return Err(ApplyError::Target { path: path.to_owned(), reason: reason.to_owned() });
             }
             Err(error) => {

@@ -10,7 +10,7 @@ static SIGNAL: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
 
 /// Makes every run that writes clean up and fail with [`ApplyError::Interrupted`] once `signal` is not 0.
 ///
-/// The command line calls this once, with the number that its signal handlers set; later calls change nothing.
+/// The command line calls this once, with the variable that its signal handlers set; later calls have no effect.
 pub fn stop_on(signal: Arc<AtomicUsize>) {
     SIGNAL.get_or_init(|| signal);
 }

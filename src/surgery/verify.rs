@@ -19,7 +19,10 @@ use safetensors::tensor::Metadata;
 /// # Errors
 /// When the file cannot be read, or when the crate refuses it.
 /// When the file cannot be read, or the crate refuses it.
-#[expect(unsafe_code, reason = "mapping a file is unsafe because others may change it; nobody else has this one")]
+#[expect(
+    unsafe_code,
+    reason = "mapping a file is unsafe because others may change it; this one is in a locked directory"
+)]
 pub fn accepted_by_safetensors(file: &File) -> io::Result<()> {
     // SAFETY: the caller has just written this file into a directory it has locked; it is not changed while mapped.
     let map = unsafe { Mmap::map(file) };

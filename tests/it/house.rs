@@ -188,7 +188,7 @@ fn other_data_files_parse() {
     for (path, text) in texts("rules/quantization") {
         let scheme = source::parse::<Scheme>(&path, &text).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(path, format!("rules/quantization/{}.json5", scheme.scheme), "a scheme has the name of its file");
-        assert!(!scheme.summary.is_empty() && !scheme.sources.is_empty(), "{path} says what it is and who says so");
+        assert!(!scheme.summary.is_empty() && !scheme.sources.is_empty(), "{path} has a summary and sources");
         for part in &scheme.tensors {
             let known = part.dtypes.iter().all(|dtype| Dtype::from_name(dtype).is_some());
             assert!(known && !part.dtypes.is_empty(), "{path}: types of {:?}", part.name);
@@ -209,7 +209,7 @@ fn other_data_files_parse() {
     assert_eq!(read.names().count(), names.len(), "an architecture has the name of its file");
     for name in names {
         let (summary, sources) = library.about(name).unwrap_or_else(|| panic!("{name}"));
-        assert!(!summary.is_empty() && !sources.is_empty(), "{name} says what it is and who says so");
+        assert!(!summary.is_empty() && !sources.is_empty(), "{name} has a summary and sources");
     }
 }
 

@@ -43,10 +43,7 @@ fn mismatch(expect: &Expect, own: &[&Finding]) -> Option<String> {
         (at(&expect.tensor, &|f| any(f, &|l| l.tensor == expect.tensor)), "the tensor is not named"),
         (at(&expect.pointer, &|f| any(f, &|l| l.pointer == expect.pointer)), "the pointer is not named"),
         (expect.line.is_some() && !own.iter().any(|f| any(f, &|l| l.line == expect.line)), "the line is not named"),
-        (
-            at(&expect.says, &|f| f.message.contains(expect.says.as_deref().unwrap_or_default())),
-            "the message says something else",
-        ),
+        (at(&expect.says, &|f| f.message.contains(expect.says.as_deref().unwrap_or_default())), "the message differs"),
         (
             at(&expect.fix.map(|safety| safety.name().to_owned()), &|f| {
                 f.fix.as_ref().map(|fix| fix.safety) == expect.fix

@@ -5,7 +5,7 @@ use std::fmt;
 /// Element types of the safetensors format, as of safetensors 0.8 (22 of them).
 ///
 /// Source: `safetensors::Dtype` in safetensors 0.8.0.
-#[allow(missing_docs, reason = "each name says all there is")]
+#[allow(missing_docs, reason = "the names are those of the format")]
 #[allow(non_camel_case_types, reason = "the names are the format's own spelling")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Dtype {

@@ -10,7 +10,7 @@ use crate::surgery::error::RepairError;
 /// Outcome of the recovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Recovered {
-    /// It is complete now.
+    /// The repair was completed.
     Finished,
     /// The checkpoint is in its state before the repair.
     RolledBack,

@@ -173,7 +173,7 @@ fn rules_can_be_chosen_listed_and_explained() {
     assert!(family.starts_with("IDX: The index and its shards\n\nIDX001 "), "{family}");
     let words = ["IDX005", "error", "shard-missing", "a", "shard", "is", "missing"];
     assert!(family.lines().any(|l| l.split_whitespace().eq(words)), "{family}");
-    for (word, hint) in [("IDX999", "no rule"), ("IDX05", "did you mean IDX005?"), ("CFG003", "CFG003 is VLA001 now")] {
+    for (word, hint) in [("IDX999", "no rule"), ("IDX05", "did you mean IDX005?"), ("CFG003", "CFG003 is now VLA001")] {
         for args in [["explain", word].as_slice(), &["check", vision, "--select", word]] {
             let refused = doctor(args);
             assert_eq!(refused.status.code(), Some(2), "{args:?}");
@@ -220,7 +220,7 @@ fn the_load_is_predicted_for_the_given_versions() {
 
     let shown = doctor(&[&["check", dir.to_str().unwrap()], &both[..]].concat());
     let shown = String::from_utf8(shown.stdout).unwrap();
-    assert!(shown.contains("predicted load by transformers 5.1.0 (predicted as 5.23.0) and 4.47.0:"), "{shown}");
+    assert!(shown.contains("predicted load by transformers 5.1.0 (judged as 5.23.0) and 4.47.0:"), "{shown}");
 
     for wrong in ["5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
         let output = doctor(&["check", dir.to_str().unwrap(), "--for", wrong]);

@@ -35,7 +35,7 @@ fn a_config_is_printed_as_the_tensors_of_its_class() {
     snapshot!("expect-json", json);
     let (wrong, code) = expect(dir, &["tiny", "--for", "5.9.1"]);
     assert_eq!(code, Some(2));
-    assert!(wrong.contains("write it as transformers==VERSION"), "{wrong}");
+    assert!(wrong.contains("expected transformers==VERSION"), "{wrong}");
     let (wrong, code) = expect(dir, &["nothing"]);
     assert_eq!((code, wrong.as_str()), (Some(2), "error: nothing does not exist\n"));
 }

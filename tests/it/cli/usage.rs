@@ -37,6 +37,8 @@ fn commands_of_other_tools_get_a_tip() {
     }
     let errors = String::from_utf8(doctor(project(), &["chekc"]).stderr).unwrap();
     assert!(errors.contains("similar subcommand exists: 'check'"), "{errors}");
+    let errors = String::from_utf8(doctor(project(), &["check", "--fxi"]).stderr).unwrap();
+    assert!(errors.contains("similar argument exists: '--fix'\n"), "{errors}");
 }
 
 /// The record of a dry run.

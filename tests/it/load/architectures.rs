@@ -121,22 +121,22 @@ fn hostile_configs_are_refused_with_a_message() {
         config.as_object_mut().expect("object").extend(patch.as_object().expect("object").clone());
         Library::embedded().find(&config, [], Loader::V4_47_0).expect("llama").expect(&config)
     };
-    for (patch, says) in [
+    for (patch, message) in [
         (json!({ "num_hidden_layers": 2_147_483_648_u64 }), "more than 60000 tensors"),
         (json!({ "num_hidden_layers": 199_999 }), "more than 60000 tensors"),
         (json!({ "num_attention_heads": 0 }), "num_attention_heads is 0"),
         (json!({ "num_attention_heads": null }), "num_attention_heads"),
-        (json!({ "hidden_size": -1 }), "size of 0 to 2^53"),
+        (json!({ "hidden_size": -1 }), "integer from 0 to 2^53"),
         (json!({ "hidden_size": "4096" }), "hidden_size"),
         (
             json!({ "hidden_size": 9_223_372_036_854_775_807_i64, "head_dim": 128, "num_attention_heads": 1 }),
-            "size of 0 to 2^53",
+            "integer from 0 to 2^53",
         ),
         (json!({ "num_key_value_heads": 9_223_372_036_854_775_807_i64 }), "verflow"),
-        (json!({ "vocab_size": 1e300 }), "size of 0 to 2^53"),
+        (json!({ "vocab_size": 1e300 }), "integer from 0 to 2^53"),
     ] {
         let refusal = llama(patch.clone()).expect_err(&patch.to_string()).to_string();
-        assert!(refusal.contains(says), "{patch}: {refusal}");
+        assert!(refusal.contains(message), "{patch}: {refusal}");
     }
     assert!(Library::embedded().architecture("llama").expect("llama").expect(&json!([1])).is_err());
 }

@@ -104,7 +104,7 @@ fn a_donor_document_with_a_duplicate_key_is_refused() {
     let out = work.path().join("out");
     let run = merge(&donor("spatialvla-tiny"), &language, &out, &[]);
     assert_eq!(run.status.code(), Some(2), "{}", text(&run));
-    for word in ["language", "config.json", "rms_norm_eps", "twice"] {
+    for word in ["language", "config.json", "rms_norm_eps", "duplicate key"] {
         assert!(text(&run).contains(word), "{word}: {}", text(&run));
     }
     assert_eq!(names(work.path()), ["language"]);

@@ -68,7 +68,7 @@ fn a_donor_inside_the_staging_directory_is_refused() {
     command.arg("--language").arg(donor("llava3d-tiny")).arg("--out").arg(work.path().join("out"));
     let run = command.output().unwrap();
     assert_eq!(run.status.code(), Some(2), "{}", text(&run));
-    assert!(text(&run).contains("holds a donor"), "{}", text(&run));
+    assert!(text(&run).contains("contains a donor"), "{}", text(&run));
     assert_eq!(names(&staging.join("content")), names(&donor("spatialvla-tiny")));
 }
 

@@ -54,7 +54,11 @@ fn cases() -> Vec<Case> {
             &[FaultKind::ContentsUnread],
             faults(|dir| write(&dir.join(NAME), &[1; 64]), cut),
         ),
-        Case::new("another content than the cache says", &[FaultKind::ContentHashDiffers], faults(cached, |_| ())),
+        Case::new(
+            "content that differs from its name in the cache",
+            &[FaultKind::ContentHashDiffers],
+            faults(cached, |_| ()),
+        ),
     ]
 }
 

@@ -137,8 +137,8 @@ fn junit_counts_match_its_cases() {
         for suite in &suites {
             let cases: Vec<_> = suite.children().filter(|n| n.has_tag_name("testcase")).collect();
             let with = |tag: &str| cases.iter().filter(|c| c.children().any(|n| n.has_tag_name(tag))).count();
-            let says = |attribute: &str| suite.attribute(attribute).unwrap().parse::<usize>().unwrap();
-            assert_eq!((says("tests"), says("failures")), (cases.len(), with("failure")), "{name}");
+            let value = |attribute: &str| suite.attribute(attribute).unwrap().parse::<usize>().unwrap();
+            assert_eq!((value("tests"), value("failures")), (cases.len(), with("failure")), "{name}");
             assert!(!cases.is_empty(), "{name}");
             reported += with("failure") + with("skipped");
         }

@@ -229,7 +229,7 @@ pub fn fixable() -> Report {
 
     let mut header = finding("SAF009", "no-format", Severity::Error, "no shard names its format", json!({}));
     let edits = vec![Edit::Header { file: "model.safetensors".to_owned() }];
-    header.fix = Some(FixHint::new(Safety::Safe, "write the header anew", edits));
+    header.fix = Some(FixHint::new(Safety::Safe, "rewrite the header", edits));
     Report::new(vec![checkpoint("models/odd", vec![literal, value, header], &[("config.json", ODD)])], None)
 }
 

@@ -23,7 +23,7 @@ fn mismatch(seeded: &Seeded, loud: &[&Finding]) -> Option<String> {
         return Some(format!("{} is silent", seeded.code));
     }
     if !own.iter().all(|f| f.message.contains(&seeded.says)) {
-        return Some(format!("{} says something else than {:?}", seeded.code, seeded.says));
+        return Some(format!("the message of {} lacks {:?}", seeded.code, seeded.says));
     }
     if own.len() != seeded.count {
         return Some(format!("{} findings of {}, not {}", own.len(), seeded.code, seeded.count));

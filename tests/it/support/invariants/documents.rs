@@ -36,7 +36,7 @@ pub fn hold(name: &str, bytes: &[u8]) -> Document {
                 assert_eq!(document.value.as_ref(), Some(&strict));
             }
         }
-        Err(error) => assert!(grave.is_some(), "nothing found, and serde_json says {error}"),
+        Err(error) => assert!(grave.is_some(), "no fault found, but serde_json reports {error}"),
     }
     places_are_found_again(&document);
     document
@@ -74,7 +74,7 @@ pub fn index(bytes: &[u8]) {
     assert!(left == 0 || reported);
     if let Some(total) = index.total_bytes() {
         let float = index.total_size.as_ref().and_then(Value::as_f64).expect("a number");
-        #[allow(clippy::cast_precision_loss, reason = "the float is no more precise")]
+        #[allow(clippy::cast_precision_loss, reason = "the float is not more precise")]
         let close = (float - total as f64).abs() <= float * 1e-9;
         assert!(close, "{float} and {total}");
     }

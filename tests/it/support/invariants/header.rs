@@ -12,7 +12,7 @@ pub const NAME: &str = "model.safetensors";
 
 /// Faults of shards that the crate accepts, each with its reason.
 pub const OPENS_ALL_THE_SAME: &[(FaultKind, &str)] = &[
-    (FaultKind::NoFormatMetadata, "transformers 4 asks for `format`; the container does not"),
+    (FaultKind::NoFormatMetadata, "transformers 4 requires `format`; the container does not"),
     (FaultKind::OddTensorName, "names that make trouble on a terminal or as a path are valid strings"),
     (FaultKind::MetadataNull, "serde reads null as an absent `__metadata__`"),
 ];
@@ -59,7 +59,7 @@ pub fn hold(bytes: &[u8]) {
                 }
             }
         }
-        Err(error) => assert!(!grave.is_empty(), "nothing found, and the crate says {error}"),
+        Err(error) => assert!(!grave.is_empty(), "no fault found, but the crate reports {error}"),
     }
 }
 
