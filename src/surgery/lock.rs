@@ -17,13 +17,24 @@ use crate::checkpoint::open::read_capped;
 /// Result of locking.
 pub(super) enum Lock {
     /// This run has the lock.
-    Ours(File),
+    Ours(LockFile),
     /// Another run has the lock; its process, from the file.
     Theirs(String),
     /// The file or its directory was removed by the run that had it.
     Gone,
     /// The file system does not support locks; Lustre, for one, may be mounted without.
-    Unknown(File),
+    Unknown(LockFile),
+}
+
+/// An open lock file. It is unlocked explicitly when it is dropped: a child process that is being started holds a copy of
+/// the descriptor until it runs its program, and would keep the lock for that time.
+pub(super) struct LockFile(File);
+
+impl Drop for LockFile {
+    fn drop(&mut self) {
+        // An error would only mean that the file system has no locks.
+        let _unlocked = self.0.unlock();
+    }
 }
 
 /// Locks the file `path`; creates it when missing.
@@ -42,18 +53,20 @@ pub(super) fn take(path: &Path) -> Result<Lock, ApplyError> {
             Ok(()) => break,
             Err(TryLockError::WouldBlock) => return Ok(Lock::Theirs(holder(path))),
             Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Interrupted => {}
-            Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => return Ok(Lock::Unknown(file)),
+            Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
+                return Ok(Lock::Unknown(LockFile(file)));
+            }
             Err(TryLockError::Error(e)) => return Err(io_at(path, "locking")(e)),
         }
     }
     let held = file.metadata().map_err(io_at(path, "reading metadata"))?;
     // A run that ended between opening and locking has removed the file, so this lock is on a deleted file.
     let same = fs::symlink_metadata(path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
-    Ok(if same { Lock::Ours(file) } else { Lock::Gone })
+    Ok(if same { Lock::Ours(LockFile(file)) } else { Lock::Gone })
 }
 
 /// Writes the process of this run into the locked file.
-pub(super) fn sign(file: &mut File) -> io::Result<()> {
+pub(super) fn sign(LockFile(file): &mut LockFile) -> io::Result<()> {
     let host = rustix::system::uname();
     let signature = format!("process {} on {}", std::process::id(), host.nodename().to_string_lossy());
     retry(|| file.set_len(0))?;

@@ -6,13 +6,13 @@
 //! that name without the marker is user data and is not touched.
 #![expect(clippy::disallowed_methods, reason = "this module and apply.rs are where checkpoints are written")]
 
-use std::fs::{self, File};
+use std::fs;
 use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::error::{ApplyError, io_at};
-use super::lock::{self, Lock};
+use super::lock::{self, Lock, LockFile};
 pub(super) use super::system::sync_dir;
 use super::system::{names, remove_dir, remove_dir_all, remove_file, retry};
 
@@ -31,7 +31,7 @@ pub(super) fn staging_path(out: &Path) -> PathBuf {
 pub(super) struct Staging {
     path: PathBuf,
     content: PathBuf,
-    lock: File,
+    lock: LockFile,
     /// The marker is removed, so the directory must not be touched any more.
     over: bool,
 }

@@ -1,7 +1,7 @@
 //! The locked folder `.ckpt-doctor` of a checkpoint.
 #![expect(clippy::disallowed_methods, reason = "surgery is where checkpoints are written")]
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ use super::record::Journal;
 use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
-use crate::surgery::lock::{self, Lock};
+use crate::surgery::lock::{self, Lock, LockFile};
 use crate::surgery::system::{self, create, look, retry, sync_dir, with_figures};
 
 /// Excludes the folder from version control, as caches of other tools do.
@@ -31,7 +31,7 @@ pub(super) const VERSION: u32 = 1;
 pub(super) struct Folder {
     pub(super) root: PathBuf,
     path: PathBuf,
-    _lock: File,
+    _lock: LockFile,
 }
 
 impl Folder {
