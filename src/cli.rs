@@ -20,9 +20,10 @@ mod undo;
 
 use std::process::ExitCode;
 
-use ckpt_doctor::merge::PipelineError;
-use ckpt_doctor::surgery::{ApplyError, RepairError};
 use clap::Parser;
+
+use crate::merge::PipelineError;
+use crate::surgery::{ApplyError, RepairError};
 
 /// Whether a signal ended the run.
 fn interrupted(error: &anyhow::Error) -> bool {

@@ -16,8 +16,6 @@ mod read;
 pub use locate::Locator;
 use locate::value_at;
 
-pub use super::text::line_column;
-
 /// A JSON file of a checkpoint.
 #[derive(Debug, Clone, Default)]
 pub struct Document {

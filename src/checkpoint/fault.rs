@@ -7,7 +7,9 @@ use serde_json::{Map, Value};
 
 mod kind;
 
-pub use kind::{FaultKind, FaultSource};
+pub use kind::FaultKind;
+#[cfg(feature = "internals")]
+pub use kind::FaultSource;
 
 /// One observed fault: what kind, where, and the figures a message needs.
 ///

@@ -3,11 +3,10 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use ckpt_doctor::check::Outcome;
-use ckpt_doctor::checkpoint::escape;
-use ckpt_doctor::knowledge::rule::RuleSet;
-
 use super::output;
+use crate::check::Outcome;
+use crate::checkpoint::escape;
+use crate::knowledge::rule::RuleSet;
 
 /// Longest reason, in characters; `explain` shows a condition in full.
 const REASON: usize = 100;

@@ -10,7 +10,7 @@ mod scope;
 mod steps;
 mod template;
 
-pub use compiled::{EvalError, Expression, ParseError};
+pub use compiled::{EvalError, Expression};
 pub(crate) use compiled::{compiled_at_once, compiled_when_needed};
 pub(crate) use functions::glob;
 pub use scope::Scope;

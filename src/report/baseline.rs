@@ -83,14 +83,8 @@ impl Baseline {
 
     /// How many findings it has.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.findings.len()
-    }
-
-    /// Whether it has none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.findings.is_empty()
     }
 
     /// Sets the findings aside that are in it; returns those in it that are gone from this checkpoint, of the rules that

@@ -149,14 +149,8 @@ impl PlannedTensor {
     /// Shapes of a plan come from checked headers and bounded architectures; one whose product
     /// overflows is counted as the largest size there is, which no disk has room for.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         byte_len(self.dtype, &self.shape).unwrap_or(u64::MAX)
-    }
-
-    /// Whether it has no bytes.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 }
 
@@ -236,15 +230,9 @@ impl PlannedShard {
 impl Plan {
     /// Bytes the result takes.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         let files = self.files.iter().fold(0_u64, |n, f| n.saturating_add(f.bytes.len() as u64));
         self.shards.iter().fold(files, |n, s| n.saturating_add(s.file_len()))
-    }
-
-    /// Whether there is nothing to write.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.files.is_empty() && self.shards.is_empty()
     }
 
     /// All tensors, shard by shard.

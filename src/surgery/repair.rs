@@ -67,17 +67,11 @@ pub enum Content {
 impl Content {
     /// Bytes it takes.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         match self {
             Self::Text(text) => text.len() as u64,
             Self::Shard(shard) => shard.file_len(),
         }
-    }
-
-    /// Whether it holds nothing.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 }
 
@@ -86,8 +80,6 @@ impl Content {
 pub struct Repair {
     /// The checkpoint as it is.
     pub original: Arc<Checkpoint>,
-    /// As it will be.
-    pub planned: Arc<Checkpoint>,
     /// What the rules say of it as it will be.
     pub outcome: Outcome,
     /// The findings whose fixes are made.

@@ -5,6 +5,7 @@ use std::fmt;
 use serde::{Serialize, Serializer};
 
 /// The stage that produces faults of a kind.
+#[cfg(feature = "internals")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FaultSource {
     /// The readers in `checkpoint`, from one file.
@@ -39,6 +40,7 @@ macro_rules! fault_kinds {
             }
 
             /// The stage that produces faults of this kind.
+            #[cfg(feature = "internals")]
             #[must_use]
             pub const fn source(self) -> FaultSource {
                 match self {

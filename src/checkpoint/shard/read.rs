@@ -20,16 +20,20 @@ impl Shard {
     /// wrong becomes a fault.
     #[must_use]
     pub fn read(dir: &Path, name: &str) -> Self {
-        read(dir, name)
+        match open_regular(&dir.join(name), u64::MAX) {
+            Ok(opened) => read(name, &opened),
+            Err(error) => Self::unread(name, error.fault(name)),
+        }
+    }
+
+    /// Reads the header of an open file. Never fails: what is wrong becomes a fault.
+    pub(crate) fn read_opened(name: &str, opened: &Opened) -> Self {
+        read(name, opened)
     }
 }
 
-fn read(dir: &Path, name: &str) -> Shard {
-    let opened = match open_regular(&dir.join(name), u64::MAX) {
-        Ok(opened) => opened,
-        Err(error) => return Shard::unread(name, error.fault(name)),
-    };
-    let head = match read_head(&opened) {
+fn read(name: &str, opened: &Opened) -> Shard {
+    let head = match read_head(opened) {
         Ok(head) => head,
         Err(error) => {
             let fault = Fault::new(FaultKind::UnreadableFile).at(Place::file(name)).with("reason", error.to_string());
@@ -37,8 +41,8 @@ fn read(dir: &Path, name: &str) -> Shard {
         }
     };
     let mut shard = Shard::parse(name, opened.identity.size, &head);
-    name_trailing_bytes(&mut shard, &opened);
-    shard.faults.extend(unwritten_tail(&shard, &opened));
+    name_trailing_bytes(&mut shard, opened);
+    shard.faults.extend(unwritten_tail(&shard, opened));
     shard
 }
 

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Deserializer};
 
-use super::compiled::{EvalError, Expression, ParseError, compiled_at_once};
+use super::compiled::{EvalError, Expression, ParseError};
 use super::scope::{Scope, plain};
 
 /// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
@@ -42,8 +42,9 @@ impl Template {
     ///
     /// # Errors
     /// When a brace has no partner, or a placeholder is not an expression.
+    #[cfg(any(test, feature = "internals"))]
     pub fn parse(source: &str) -> Result<Self, ParseError> {
-        compiled_at_once(|| Self::written(source))
+        super::compiled_at_once(|| Self::written(source))
     }
 
     fn written(source: &str) -> Result<Self, ParseError> {
@@ -89,6 +90,7 @@ impl Template {
     }
 
     /// The expressions in its placeholders, in order.
+    #[cfg(any(test, feature = "internals"))]
     pub fn expressions(&self) -> impl Iterator<Item = &Expression> {
         self.pieces.iter().filter_map(|piece| match piece {
             Piece::Value(expression) => Some(expression),
