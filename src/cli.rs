@@ -32,6 +32,7 @@ fn interrupted(error: &anyhow::Error) -> bool {
 }
 
 /// Runs the program.
+#[must_use]
 pub fn main() -> ExitCode {
     let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
     let result = match &command {

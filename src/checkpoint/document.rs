@@ -13,6 +13,7 @@ mod explain;
 mod locate;
 mod read;
 
+use edit::{Splice, spliced};
 pub use locate::Locator;
 use locate::value_at;
 

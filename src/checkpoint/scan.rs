@@ -4,7 +4,7 @@
 //! iterative and bounded in depth, so no nesting can exhaust the stack, and it knows the few slips
 //! people make by hand, so the slip that makes a document readable *is* the cause.
 //! `serde_json` could not serve: it keeps the last of two equal keys without a word, has no byte
-//! ranges, and (with `arbitrary_precision`) turns a crafted object into a number.
+//! ranges, and rounds integers of more than 64 bits.
 
 use std::ops::Range;
 

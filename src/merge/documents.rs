@@ -79,7 +79,17 @@ fn plan_document(
         Some(d) if d.value.as_ref() == Some(&value) && d.faults.is_empty() => {
             return Ok(Some(MergedDocument { document: d.clone(), origin: format!("{role} donor, unchanged") }));
         }
-        _ => Document::from_value(&spec.name, value),
+        _ => {
+            // Later edits lie over earlier ones: the spelling of a graft goes before that of the document it is in.
+            let grafts = spec.edits.iter().rev().filter_map(|edit| match edit {
+                DocumentEdit::Graft(graft) => Some((donor_config(context, graft)?, graft.at.as_str())),
+                _ => None,
+            });
+            let copies = grafts.chain(source.map(|source| (source, "")));
+            copies.fold(Document::from_value(&spec.name, value), |document, (copied, at)| {
+                document.with_numbers_of(copied, at)
+            })
+        }
     };
     let origin = if source.is_some() { format!("{role} donor, edited") } else { "made by the recipe".to_owned() };
     Ok(Some(MergedDocument { document, origin }))
@@ -223,8 +233,13 @@ fn unambiguous(document: &Document, role: &str) -> Result<(), MergeError> {
     })
 }
 
+/// The config.json of a graft's donor.
+fn donor_config<'c>(context: &Context<'c>, graft: &GraftEdit) -> Option<&'c Document> {
+    context.donors.iter().find(|d| d.role == graft.from)?.checkpoint.document("config.json")
+}
+
 fn grafted(context: &Context<'_>, graft: &GraftEdit) -> Result<Value, MergeError> {
-    let document = context.donor(&graft.from).and_then(|d| d.checkpoint.document("config.json"));
+    let document = donor_config(context, graft);
     if let Some(document) = document {
         unambiguous(document, &graft.from)?;
     }

@@ -94,10 +94,11 @@ pub enum TensorSource {
     },
 }
 
-/// How the bytes of a tensor are made: a [`TensorSource`] without the donor tensor.
+/// How the bytes of a tensor are made from those of a donor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum TensorTransform {
     /// The donor's bytes as they are.
     Copy,

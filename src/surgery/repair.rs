@@ -19,6 +19,7 @@ pub use planner::plan;
 /// A finding whose fix was applied.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Fixed {
     /// Code of the rule.
     pub code: String,
@@ -37,6 +38,7 @@ pub struct Fixed {
 /// A fix that was tried and rolled back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Withdrawn {
     /// Code of the rule.
     pub code: String,

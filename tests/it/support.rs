@@ -145,7 +145,8 @@ pub fn files(folder: &Path, ending: &str) -> Vec<PathBuf> {
 /// The rules as they are on disk, so that one can be tried without compiling.
 pub fn rules() -> RuleSet {
     let texts = texts("rules/checks");
-    RuleSet::default().and_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
+    RuleSet::default()
+        .and_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
         .unwrap_or_else(|e| panic!("{e}"))
 }
 

@@ -20,6 +20,7 @@ macro_rules! fault_kinds {
         /// A kind of fault. Rules in `rules/checks/` select faults by [`FaultKind::name`].
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[cfg_attr(test, derive(schemars::JsonSchema), schemars(rename_all = "kebab-case"))]
+        #[non_exhaustive]
         pub enum FaultKind {
             $($(
                 #[doc = concat!("`", $name, "`")]
@@ -195,7 +196,7 @@ fault_kinds! {
 impl FaultKind {
     /// The kind of this name; `None` when there is none.
     #[must_use]
-    pub fn from_name(name: &str) -> Option<Self> {
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|kind| kind.name() == name)
     }
 }

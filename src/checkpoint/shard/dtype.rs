@@ -8,6 +8,7 @@ use std::fmt;
 #[allow(missing_docs, reason = "each name says all there is")]
 #[allow(non_camel_case_types, reason = "the names are the format's own spelling")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub enum Dtype {
     BOOL,
     F4,

@@ -18,6 +18,7 @@ const SAMPLE: u64 = 4096;
 impl Shard {
     /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: what is
     /// wrong becomes a fault.
+    #[doc(hidden)]
     #[must_use]
     pub fn read(dir: &Path, name: &str) -> Self {
         match open_regular(&dir.join(name), u64::MAX) {

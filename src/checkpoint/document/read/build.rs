@@ -157,12 +157,23 @@ impl ValueBuilder {
     }
 }
 
-/// A number as written; null when no reader could hold it.
-fn number(literal: &str) -> Value {
+/// A number as an integer or a double, whichever holds it; null when no reader could hold it.
+pub(super) fn number(literal: &str) -> Value {
     if is_huge(literal) {
         return Value::Null;
     }
-    literal.parse::<Number>().map_or(Value::Null, Value::Number)
+    let double = || Number::from_f64(literal.parse().ok()?);
+    integer(literal).or_else(double).map_or(Value::Null, Value::Number)
+}
+
+/// The integer, if 64 bits hold it.
+fn integer(literal: &str) -> Option<Number> {
+    literal.parse::<u64>().map(Number::from).or_else(|_| literal.parse::<i64>().map(Number::from)).ok()
+}
+
+/// Whether the literal is an integer that only its text holds exactly.
+pub(super) fn is_long_integer(literal: &str) -> bool {
+    !literal.contains(['.', 'e', 'E']) && integer(literal).is_none()
 }
 
 /// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
