@@ -33,13 +33,14 @@ pub use discover::{find_checkpoints, is_checkpoint, owner};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
 pub use entry::{Entry, EntryKind};
-pub use fault::{Fault, FaultKind, FaultSource, Place};
+#[cfg(feature = "internals")]
+pub use fault::FaultSource;
+pub use fault::{Fault, FaultKind, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::PythonModule;
 pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
-pub use sniff::looks_like;
 pub(crate) use text::hex;
 pub use text::{escape, file_size, line_column};
 pub use tokenizer::{Tokenizer, Vocabulary};

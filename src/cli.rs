@@ -20,9 +20,10 @@ mod undo;
 
 use std::process::ExitCode;
 
-use ckpt_doctor::merge::PipelineError;
-use ckpt_doctor::surgery::{ApplyError, RepairError};
 use clap::Parser;
+
+use crate::merge::PipelineError;
+use crate::surgery::{ApplyError, RepairError};
 
 /// Whether a signal ended the run.
 fn interrupted(error: &anyhow::Error) -> bool {
@@ -31,6 +32,7 @@ fn interrupted(error: &anyhow::Error) -> bool {
 }
 
 /// Runs the program.
+#[must_use]
 pub fn main() -> ExitCode {
     let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
     let result = match &command {

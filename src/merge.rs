@@ -9,6 +9,7 @@ mod documents;
 mod donors;
 mod draft;
 mod error;
+mod file;
 mod files;
 pub(crate) mod manifest;
 mod options;
@@ -18,8 +19,9 @@ mod tensors;
 
 use std::path::Path;
 
-pub use error::{MergeError, PipelineError};
-pub use run::{CheckedCheckpoint, MergeRequest, MergeRun};
+pub use error::PipelineError;
+pub use file::{ResolvedMergeFile, find_recipe};
+pub use run::{MergeRequest, MergeRun};
 
 use context::{Donor, Options};
 use draft::MergeDraft;
@@ -28,8 +30,8 @@ use run::count;
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
+use crate::report::markdown;
 use crate::report::model::{MergeStage, MergedFile, Role};
-use crate::report::{Format, Style, render};
 use crate::surgery::plan::PlannedFile;
 use crate::surgery::{apply, check_target};
 
@@ -116,7 +118,7 @@ fn add_manifest(
     for name in [manifest::NAME, REPORT] {
         run.record.files.push(MergedFile { name: name.to_owned(), origin: origin.clone() });
     }
-    let report = render(&run.portable_report(), Format::Markdown, Style { cap: 1000, ..Style::default() });
+    let report = markdown::render(&run.portable_report(), 1000);
     for (name, text) in [(manifest::NAME, text), (REPORT, report)] {
         let file = PlannedFile { name: name.to_owned(), bytes: text.into_bytes().into(), origin: origin.clone() };
         draft.plan.files.insert(0, file);

@@ -2,32 +2,56 @@
 //!
 //! [`render`] turns a [`Report`] into text. Nothing here loads, checks, writes or prints; the caller outputs the text.
 
+#[cfg(feature = "cli")]
 pub mod baseline;
 mod build;
+#[cfg(feature = "cli")]
 mod ci;
 mod collapse;
+#[cfg(feature = "cli")]
 mod concise;
+#[cfg(feature = "cli")]
 pub mod diff;
+#[cfg(feature = "cli")]
 mod excerpt;
+#[cfg(feature = "cli")]
 pub mod fixes;
 mod format;
+#[cfg(feature = "cli")]
 pub mod inspect;
 mod json;
-mod markdown;
+pub(crate) mod markdown;
 mod merge;
 pub mod model;
+#[cfg(feature = "cli")]
 mod statistics;
+#[cfg(feature = "cli")]
 mod style;
+#[cfg(feature = "cli")]
 mod terminal;
 
-use model::CheckpointReport;
 pub use model::Report;
+#[cfg(feature = "cli")]
 pub use statistics::statistics;
+#[cfg(feature = "cli")]
 pub use style::{Format, Style, UnknownFormat};
 
-use crate::check::Finding;
+impl Report {
+    /// The report as JSON; `schemas/report.schema.json` describes it.
+    #[must_use]
+    pub fn to_json(&self) -> String {
+        json::render(self)
+    }
+
+    /// The report as Markdown. Lists are cut after 20 items.
+    #[must_use]
+    pub fn to_markdown(&self) -> String {
+        markdown::render(self, 20)
+    }
+}
 
 /// Renders a report. Text that is not empty ends with a line break.
+#[cfg(feature = "cli")]
 #[must_use]
 pub fn render(report: &Report, format: Format, style: Style) -> String {
     match format {
@@ -44,8 +68,9 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
 }
 
 /// Renders one finding of a checkpoint as in [`Format::Full`], without the lines around it.
+#[cfg(all(feature = "cli", feature = "internals"))]
 #[must_use]
-pub fn render_finding(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
+pub fn render_finding(finding: &crate::check::Finding, checkpoint: &model::CheckpointReport, style: Style) -> String {
     terminal::finding::render(finding, checkpoint, style)
 }
 

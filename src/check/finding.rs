@@ -11,6 +11,7 @@ pub use crate::knowledge::rule::Severity;
 /// Where a finding points: a file, a place in it, a tensor.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Location {
     /// File name within the checkpoint.
     pub file: Option<String>,
@@ -30,6 +31,7 @@ pub struct Location {
 /// One finding of one rule.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Finding {
     /// Rule code, `IDX005`.
     pub code: String,

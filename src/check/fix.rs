@@ -16,6 +16,7 @@ mod repairs;
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Edit {
     /// Replaces bytes of a document or module.
     Splice {
@@ -77,7 +78,7 @@ pub enum Edit {
 impl Edit {
     /// The text file that the edit changes in place; `None` for edits that write whole files.
     #[must_use]
-    pub const fn text_file(&self) -> Option<&String> {
+    pub(crate) const fn text_file(&self) -> Option<&String> {
         match self {
             Self::Splice { file, .. } | Self::Set { file, .. } | Self::Remove { file, .. } => Some(file),
             _ => None,
@@ -107,6 +108,7 @@ pub fn renamed(prefixes: &[(String, String)], name: &str) -> Option<String> {
 /// The resolved fix of a finding.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct FixHint {
     /// Safety of the edits; `manual` without edits.
     pub safety: Safety,
@@ -130,7 +132,7 @@ impl FixHint {
 
     /// Advice without edits.
     #[must_use]
-    pub fn manual(help: impl Into<String>) -> Self {
+    pub(crate) fn manual(help: impl Into<String>) -> Self {
         Self { safety: Safety::Manual, title: None, help: Some(help.into()), edits: Vec::new() }
     }
 
@@ -148,7 +150,7 @@ impl FixHint {
 
     /// Whether `check --fix` makes this fix: safe ones always, unsafe ones with `--unsafe-fixes`.
     #[must_use]
-    pub fn is_permitted(&self, unsafe_fixes: bool) -> bool {
+    pub(crate) fn is_permitted(&self, unsafe_fixes: bool) -> bool {
         match self.safety {
             Safety::Safe => true,
             Safety::Unsafe => unsafe_fixes,

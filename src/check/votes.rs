@@ -19,7 +19,7 @@ use serde_json::Value;
 pub use self::explain::{Explanation, explain, fault};
 pub use self::run::vote;
 pub(super) use self::space::{leaves, with};
-pub use self::vote::{Fit, Undecided, Vote, Votes, Witness};
+pub use self::vote::{Fit, Vote, Votes};
 
 /// The `model_type` of every config inside a config.
 #[must_use]

@@ -13,10 +13,9 @@ mod explain;
 mod locate;
 mod read;
 
+use edit::{Splice, spliced};
 pub use locate::Locator;
 use locate::value_at;
-
-pub use super::text::line_column;
 
 /// A JSON file of a checkpoint.
 #[derive(Debug, Clone, Default)]

@@ -7,12 +7,15 @@ use serde_json::{Map, Value};
 
 mod kind;
 
-pub use kind::{FaultKind, FaultSource};
+pub use kind::FaultKind;
+#[cfg(feature = "internals")]
+pub use kind::FaultSource;
 
 /// One observed fault: its kind, its places and the figures for a message.
 ///
 /// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself has no severity and no text.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Fault {
     /// The kind, by which rules select faults.
     pub kind: FaultKind,
@@ -27,20 +30,20 @@ pub struct Fault {
 impl Fault {
     /// A fault of `kind` without places or details.
     #[must_use]
-    pub fn new(kind: FaultKind) -> Self {
+    pub(crate) fn new(kind: FaultKind) -> Self {
         Self { kind, places: Vec::new(), detail: Map::new(), hidden: 0 }
     }
 
     /// Adds a place.
     #[must_use]
-    pub fn at(mut self, place: Place) -> Self {
+    pub(crate) fn at(mut self, place: Place) -> Self {
         self.places.push(place);
         self
     }
 
     /// Adds a named detail.
     #[must_use]
-    pub fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
+    pub(crate) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
         self.detail.insert(name.to_owned(), value.into());
         self
     }
@@ -48,6 +51,7 @@ impl Fault {
 
 /// A place in a checkpoint: a file, and optionally a byte range, a JSON pointer or a tensor in it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[non_exhaustive]
 pub struct Place {
     /// File name within the checkpoint directory, unescaped.
     pub file: Option<String>,
@@ -62,33 +66,33 @@ pub struct Place {
 impl Place {
     /// The whole of a file.
     #[must_use]
-    pub fn file(name: impl Into<String>) -> Self {
+    pub(crate) fn file(name: impl Into<String>) -> Self {
         Self { file: Some(name.into()), ..Self::default() }
     }
 
     /// A tensor, without a file.
     #[must_use]
-    pub fn tensor(name: impl Into<String>) -> Self {
+    pub(crate) fn tensor(name: impl Into<String>) -> Self {
         Self { tensor: Some(name.into()), ..Self::default() }
     }
 
     /// Narrows to a byte range.
     #[must_use]
-    pub fn span(mut self, span: Range<usize>) -> Self {
+    pub(crate) fn span(mut self, span: Range<usize>) -> Self {
         self.span = Some(span);
         self
     }
 
     /// Narrows to a JSON pointer.
     #[must_use]
-    pub fn pointer(mut self, pointer: impl Into<String>) -> Self {
+    pub(crate) fn pointer(mut self, pointer: impl Into<String>) -> Self {
         self.pointer = Some(pointer.into());
         self
     }
 
     /// Narrows to a tensor.
     #[must_use]
-    pub fn in_tensor(mut self, tensor: impl Into<String>) -> Self {
+    pub(crate) fn in_tensor(mut self, tensor: impl Into<String>) -> Self {
         self.tensor = Some(tensor.into());
         self
     }

@@ -3,8 +3,7 @@
 //! Documents, shard headers and [`Locator`](super::document::Locator) use the same scanner. It is iterative and limits
 //! the depth, so nesting cannot exhaust the stack. The lenient mode accepts a few common slips of hand-written JSON and
 //! records them, so that a fault can name the cause of a syntax error. `serde_json` is not used: it silently keeps the
-//! last of two duplicate keys, has no byte ranges, and (with `arbitrary_precision`) turns a crafted object into a
-//! number.
+//! last of two duplicate keys, has no byte ranges, and rounds integers of more than 64 bits.
 
 use std::ops::Range;
 

@@ -50,6 +50,7 @@ impl Tensor {
 
 /// One safetensors file: its header and its faults.
 #[derive(Debug, Clone, Default)]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Shard {
     /// File name within the checkpoint.
     pub name: String,
@@ -74,7 +75,7 @@ pub struct Shard {
 impl Shard {
     /// A shard that could not be read at all.
     #[must_use]
-    pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
+    pub(crate) fn unread(name: impl Into<String>, fault: Fault) -> Self {
         Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
     }
 
@@ -86,7 +87,7 @@ impl Shard {
 
     /// The place that covers the whole file.
     #[must_use]
-    pub fn place(&self) -> Place {
+    pub(crate) fn place(&self) -> Place {
         Place::file(self.name.clone())
     }
 }

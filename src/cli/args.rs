@@ -2,12 +2,13 @@
 
 use std::path::PathBuf;
 
-use ckpt_doctor::check::Severity;
-use ckpt_doctor::knowledge::Loader;
-use ckpt_doctor::knowledge::loader::parse_requirement;
-use ckpt_doctor::report::Format;
 use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
+
+use crate::check::Severity;
+use crate::knowledge::Loader;
+use crate::knowledge::loader::parse_requirement;
+use crate::report::Format;
 
 /// Validates, repairs and merges model checkpoint directories by reading their files; nothing of a model is run.
 #[derive(Debug, Parser)]
@@ -335,7 +336,7 @@ fn formats() -> impl clap::builder::TypedValueParser<Value = Format> {
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {
-    word.parse().map_err(|e: ckpt_doctor::report::UnknownFormat| e.to_string())
+    word.parse().map_err(|e: crate::report::UnknownFormat| e.to_string())
 }
 
 fn parse_pair(text: &str) -> Result<(String, String), String> {

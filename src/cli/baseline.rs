@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::checkpoint::open::{JSON_CAP, read_capped};
-use ckpt_doctor::report::baseline::Baseline;
-use ckpt_doctor::report::model::CheckpointReport;
 
 use super::output;
 use super::settings::Resolved;
+use crate::checkpoint::open::{JSON_CAP, read_capped};
+use crate::report::baseline::Baseline;
+use crate::report::model::CheckpointReport;
 
 /// Maximum number of findings listed that no longer occur.
 const NAMED: usize = 10;

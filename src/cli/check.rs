@@ -6,15 +6,15 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::{Outcome, check_for, unused_suppressions};
-use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints, owner};
-use ckpt_doctor::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
-use ckpt_doctor::report::{Report, fixes};
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FINDINGS};
 use super::settings::{Resolved, SettingsResolver, Typed};
 use super::{baseline, fix, output, signals, unasked};
+use crate::check::{Outcome, check_for, unused_suppressions};
+use crate::checkpoint::{Checkpoint, find_checkpoints, owner};
+use crate::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
+use crate::report::{Report, fixes};
 
 /// A checkpoint, the result of checking it and the settings it was checked under.
 struct Checked {

@@ -6,15 +6,15 @@ use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::checkpoint::open::{JSON_CAP, open_regular, read_capped};
-use ckpt_doctor::checkpoint::{Document, escape};
-use ckpt_doctor::knowledge::{Expected, Library, Loader};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::args::{ExpectArgs, ExpectFormat};
 use super::exit::{CLEAN, FINDINGS};
 use super::{library, output};
+use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped};
+use crate::checkpoint::{Document, escape};
+use crate::knowledge::{Expected, Library, Loader};
 
 /// One line of `@FILE`; other keys are ignored.
 #[derive(Deserialize)]

@@ -5,16 +5,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::bail;
-use ckpt_doctor::check::Outcome;
-use ckpt_doctor::checkpoint::{Checkpoint, escape};
-use ckpt_doctor::report::model::{Fixed, Withdrawn};
-use ckpt_doctor::report::{diff, fixes};
-use ckpt_doctor::surgery::journal::{self, Recovered};
-use ckpt_doctor::surgery::repair::{Repair, plan};
-use ckpt_doctor::surgery::{ApplyError, RepairError, overlay};
 
 use super::args::FixArgs;
 use super::output;
+use crate::check::Outcome;
+use crate::checkpoint::{Checkpoint, escape};
+use crate::report::model::{Fixed, Withdrawn};
+use crate::report::{diff, fixes};
+use crate::surgery::journal::{self, Recovered};
+use crate::surgery::repair::{Repair, plan};
+use crate::surgery::{ApplyError, RepairError, overlay};
 
 /// Checks a checkpoint with the selected rules.
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;

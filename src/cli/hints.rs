@@ -1,6 +1,6 @@
 //! Hints for mistyped options, and for subcommands that people know from other tools.
 
-use ckpt_doctor::knowledge::source::nearest;
+use crate::knowledge::source::nearest;
 use clap::CommandFactory as _;
 use clap::error::{ContextKind, ContextValue, Error, ErrorKind};
 

@@ -1,11 +1,11 @@
 //! `init`.
 
 use anyhow::{Context, bail};
-use ckpt_doctor::knowledge::settings::FILE;
 
 use super::args::InitArgs;
 use super::exit::CLEAN;
 use super::output;
+use crate::knowledge::settings::FILE;
 
 /// The settings file: every key with its default, commented out.
 const SETTINGS: &str = include_str!("init/ckpt-doctor.json5");

@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::inspect::inspect;
-use ckpt_doctor::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
-use ckpt_doctor::report::inspect as report;
 
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output};
+use crate::check::inspect::inspect;
+use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
+use crate::report::inspect as report;
 
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {

@@ -4,9 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use ckpt_doctor::checkpoint::open::{MODULE_CAP, read_capped};
-use ckpt_doctor::knowledge::Library;
-use ckpt_doctor::knowledge::rule::RuleSet;
+
+use crate::checkpoint::open::{MODULE_CAP, read_capped};
+use crate::knowledge::Library;
+use crate::knowledge::rule::RuleSet;
 
 /// Maximum depth of folders in a directory of rules.
 const MAX_DEPTH: usize = 8;

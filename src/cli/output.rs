@@ -5,9 +5,9 @@ use std::io::{IsTerminal, Write};
 use std::path::Path;
 
 use anyhow::Context;
-use ckpt_doctor::report::{Format, Report, Style, render, statistics};
 
 use super::args::{Color, ReportArgs};
+use crate::report::{Format, Report, Style, render, statistics};
 
 /// Prints a line to standard error. A failure (full disk, closed pipe) is ignored; `eprintln` would panic.
 pub fn note(line: &str) {
@@ -60,7 +60,7 @@ pub fn write(file: &Path, text: &str) -> std::io::Result<()> {
 
 /// Escapes a line that may quote a checkpoint for display.
 pub fn safe(line: &str) -> String {
-    ckpt_doctor::checkpoint::escape(line, 4000)
+    crate::checkpoint::escape(line, 4000)
 }
 
 /// Writes a new file; fails if it exists.

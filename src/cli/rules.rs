@@ -3,14 +3,14 @@
 use std::fmt::{self, Write};
 use std::path::Path;
 
-use ckpt_doctor::knowledge::Template;
-use ckpt_doctor::knowledge::rule::{Fix, Rule, RuleSet, Safety, example};
 use comfy_table::{Table, presets};
 
 use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
 use super::settings::{SettingsResolver, Typed};
+use crate::knowledge::Template;
+use crate::knowledge::rule::{Fix, Rule, RuleSet, Safety, example};
 
 /// Runs `rules`: lists the selected rules.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {

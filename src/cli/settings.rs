@@ -4,13 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use ckpt_doctor::check::Severity;
-use ckpt_doctor::knowledge::Knowledge;
-use ckpt_doctor::knowledge::selection::Choice;
-use ckpt_doctor::knowledge::settings::{Chain, nearest};
-
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
+use crate::check::Severity;
+use crate::knowledge::Knowledge;
+use crate::knowledge::selection::Choice;
+use crate::knowledge::settings::{Chain, nearest};
 
 /// Resolved options for the checkpoints under one settings file.
 pub struct Resolved {

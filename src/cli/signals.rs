@@ -4,10 +4,11 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock};
 
 use anyhow::Context;
-use ckpt_doctor::checkpoint::open::read_capped;
-use ckpt_doctor::surgery::stop_on;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 use signal_hook::flag;
+
+use crate::checkpoint::open::read_capped;
+use crate::surgery::stop_on;
 
 /// The signal that should stop the program; 0 before a signal arrived.
 static SIGNAL: LazyLock<Arc<AtomicUsize>> = LazyLock::new(Arc::default);

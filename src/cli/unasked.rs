@@ -3,11 +3,10 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use ckpt_doctor::check::Outcome;
-use ckpt_doctor::checkpoint::escape;
-use ckpt_doctor::knowledge::rule::RuleSet;
-
 use super::output;
+use crate::check::Outcome;
+use crate::checkpoint::escape;
+use crate::knowledge::rule::RuleSet;
 
 /// Maximum length of a reason, in characters; `explain` prints whole conditions.
 const REASON: usize = 100;

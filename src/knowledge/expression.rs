@@ -10,7 +10,7 @@ mod scope;
 mod steps;
 mod template;
 
-pub use compiled::{EvalError, Expression, ParseError};
+pub use compiled::{EvalError, Expression};
 pub(crate) use compiled::{compile_eagerly, compile_lazily};
 pub(crate) use functions::glob;
 pub use scope::Scope;

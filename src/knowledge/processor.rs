@@ -23,6 +23,7 @@ pub struct Processor {
     pub add: Vec<TokenRun>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 

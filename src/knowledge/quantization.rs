@@ -30,6 +30,7 @@ pub struct Scheme {
     /// Usual name of the scheme, for messages.
     pub summary: String,
     /// Sources of the facts.
+    #[allow(dead_code, reason = "for readers of the file")]
     pub sources: Vec<String>,
     /// Condition on the config for this scheme.
     pub when: Expression,
@@ -82,6 +83,7 @@ pub struct Scheme {
     pub raises: Option<String>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 

@@ -48,6 +48,7 @@ pub struct Recipe {
     pub notes: Vec<Note>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
@@ -79,6 +80,7 @@ pub struct OptionSpec {
     /// Name of the option on the command line.
     pub name: String,
     /// Effect of the option.
+    #[allow(dead_code, reason = "for readers of the file")]
     pub help: String,
     /// Allowed values; a value that ends in `:` takes any text after the colon. Empty for a size such as `5GB`.
     #[serde(default)]
@@ -387,5 +389,6 @@ pub struct MergeFile {
     pub out: String,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }

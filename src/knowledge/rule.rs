@@ -79,6 +79,7 @@ pub struct Rule {
     pub origin: Option<String>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
@@ -182,18 +183,10 @@ impl RuleSet {
             .with(source::embedded("checks").into_iter().map(parse))
     }
 
-    /// Parses rules from pairs of path and text.
-    ///
-    /// # Errors
-    /// [`DataError`] for a malformed rule, a duplicate code or name, or an unknown kind of fault.
-    pub fn from_files<'a>(files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
-        Self::default().and_files(files)
-    }
-
     /// Adds rules parsed from pairs of path and text.
     ///
     /// # Errors
-    /// As [`Self::from_files`], also for a code or name that these rules already have.
+    /// [`DataError`] for a malformed rule, a duplicate code or name, or an unknown kind of fault.
     pub fn and_files<'a>(self, files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
         self.with(files.into_iter().map(|(path, text)| {
             let rule: Rule = source::parse(&path, text)?;

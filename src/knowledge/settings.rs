@@ -13,7 +13,7 @@ use super::rule::Severity;
 use super::source::{self, DataError};
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
 pub use chain::Chain;
-pub use find::{FILE, Nearest, absolute, nearest};
+pub use find::{FILE, absolute, nearest};
 pub use policy::{Policy, Suppression};
 
 /// A settings file. Paths in it are relative to its folder.
@@ -59,6 +59,7 @@ pub struct Settings {
     pub baseline: Option<PathBuf>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 

@@ -84,14 +84,8 @@ impl Baseline {
 
     /// Number of findings.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.findings.len()
-    }
-
-    /// Whether the baseline has no findings.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.findings.is_empty()
     }
 
     /// Moves findings that the baseline contains to the suppressed ones. Returns findings of the baseline that the

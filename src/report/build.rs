@@ -9,6 +9,7 @@ use crate::checkpoint::Checkpoint;
 
 impl CheckpointReport {
     /// The report on one checkpoint, with the path as given by the user.
+    #[doc(hidden)]
     #[must_use]
     pub fn new(path: impl Into<String>, role: Option<Role>, checkpoint: &Checkpoint, outcome: &Outcome) -> Self {
         let counts = Counts::new(&outcome.findings);
@@ -42,7 +43,7 @@ impl CheckpointReport {
     }
 
     /// Suppresses findings for which `accepted` returns a reason; they are no longer counted.
-    pub fn accept(&mut self, accepted: impl Fn(usize, &Finding) -> Option<Accepted>) {
+    pub(crate) fn accept(&mut self, accepted: impl Fn(usize, &Finding) -> Option<Accepted>) {
         for (number, finding) in std::mem::take(&mut self.findings).into_iter().enumerate() {
             match accepted(number, &finding) {
                 Some(accepted) => self.suppressed.push(Suppressed { finding, accepted }),

@@ -13,5 +13,5 @@ mod undo;
 mod write;
 
 pub use recover::{Recovered, recover};
-pub use undo::{Undone, undo};
+pub use undo::undo;
 pub use write::write;

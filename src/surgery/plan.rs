@@ -94,10 +94,11 @@ pub enum TensorSource {
     },
 }
 
-/// How the bytes of a tensor are made: a [`TensorSource`] without the donor tensor.
+/// How the bytes of a tensor are made from those of a donor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum TensorTransform {
     /// The donor's bytes as they are.
     Copy,
@@ -149,14 +150,8 @@ impl PlannedTensor {
     /// Shapes of a plan come from checked headers and architectures with limits; an overflow is counted as the largest
     /// size, which no disk can hold.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         byte_len(self.dtype, &self.shape).unwrap_or(u64::MAX)
-    }
-
-    /// Whether the tensor has no bytes.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 }
 
@@ -236,15 +231,9 @@ impl PlannedShard {
 impl Plan {
     /// Number of bytes of all files.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         let files = self.files.iter().fold(0_u64, |n, f| n.saturating_add(f.bytes.len() as u64));
         self.shards.iter().fold(files, |n, s| n.saturating_add(s.file_len()))
-    }
-
-    /// Whether the plan has no files.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.files.is_empty() && self.shards.is_empty()
     }
 
     /// All tensors, shard by shard.

@@ -19,6 +19,7 @@ pub use planner::plan;
 /// A finding whose fix was applied.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Fixed {
     /// Code of the rule.
     pub code: String,
@@ -37,6 +38,7 @@ pub struct Fixed {
 /// A fix that was tried and rolled back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Withdrawn {
     /// Code of the rule.
     pub code: String,
@@ -67,17 +69,11 @@ pub enum Content {
 impl Content {
     /// Number of bytes.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         match self {
             Self::Text(text) => text.len() as u64,
             Self::Shard(shard) => shard.file_len(),
         }
-    }
-
-    /// Whether the content is empty.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 }
 
@@ -86,8 +82,6 @@ impl Content {
 pub struct Repair {
     /// The checkpoint before the repair.
     pub original: Arc<Checkpoint>,
-    /// The checkpoint after the repair.
-    pub planned: Arc<Checkpoint>,
     /// Result of checking the repaired checkpoint.
     pub outcome: Outcome,
     /// Findings with applied fixes.

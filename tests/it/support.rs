@@ -145,7 +145,8 @@ pub fn files(folder: &Path, ending: &str) -> Vec<PathBuf> {
 /// The rules on disk, so that a change needs no compilation.
 pub fn rules() -> RuleSet {
     let texts = texts("rules/checks");
-    RuleSet::from_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
+    RuleSet::default()
+        .and_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
         .unwrap_or_else(|e| panic!("{e}"))
 }
 
@@ -343,7 +344,13 @@ fn with_kinds() -> Knowledge {
 fn take_kinds(outcome: &mut Outcome) -> BTreeSet<FaultKind> {
     let (kinds, findings) = outcome.findings.drain(..).partition(|f| f.code.starts_with(KIND));
     outcome.findings = findings;
-    let kind = |f: Finding| FaultKind::from_name(&f.message).unwrap_or_else(|| panic!("{} is a kind", f.message));
+    let kind = |f: Finding| {
+        FaultKind::ALL
+            .iter()
+            .copied()
+            .find(|kind| kind.name() == f.message)
+            .unwrap_or_else(|| panic!("{} is a kind", f.message))
+    };
     Vec::into_iter(kinds).map(kind).collect()
 }
 

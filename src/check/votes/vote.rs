@@ -110,6 +110,7 @@ impl Fit {
     }
 
     /// Whether every name and shape agrees.
+    #[cfg(any(test, feature = "internals"))]
     #[must_use]
     pub const fn is_exact(&self) -> bool {
         self.found == self.expected && self.found == self.stored && self.mismatched == 0

@@ -15,6 +15,7 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 
 mod build;
 mod duplicates;
+mod spelling;
 
 use build::{ValueBuilder, is_huge};
 use duplicates::Duplicates;

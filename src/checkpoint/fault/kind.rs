@@ -5,6 +5,7 @@ use std::fmt;
 use serde::{Serialize, Serializer};
 
 /// The stage that produces faults of a kind.
+#[cfg(feature = "internals")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FaultSource {
     /// The readers in `checkpoint`, from one file.
@@ -19,6 +20,7 @@ macro_rules! fault_kinds {
         /// A kind of fault. Rules in `rules/checks/` select faults by [`FaultKind::name`].
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[cfg_attr(test, derive(schemars::JsonSchema), schemars(rename_all = "kebab-case"))]
+        #[non_exhaustive]
         pub enum FaultKind {
             $($(
                 #[doc = concat!("`", $name, "`")]
@@ -39,6 +41,7 @@ macro_rules! fault_kinds {
             }
 
             /// The stage that produces faults of this kind.
+            #[cfg(feature = "internals")]
             #[must_use]
             pub const fn source(self) -> FaultSource {
                 match self {
@@ -193,7 +196,7 @@ fault_kinds! {
 impl FaultKind {
     /// The kind of this name; `None` for an unknown name.
     #[must_use]
-    pub fn from_name(name: &str) -> Option<Self> {
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|kind| kind.name() == name)
     }
 }

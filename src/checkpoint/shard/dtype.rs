@@ -8,6 +8,7 @@ use std::fmt;
 #[allow(missing_docs, reason = "the names are those of the format")]
 #[allow(non_camel_case_types, reason = "the names are the format's own spelling")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub enum Dtype {
     BOOL,
     F4,

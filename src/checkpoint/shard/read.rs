@@ -18,18 +18,23 @@ const SAMPLE: u64 = 4096;
 impl Shard {
     /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: every problem
     /// becomes a fault.
+    #[doc(hidden)]
     #[must_use]
     pub fn read(dir: &Path, name: &str) -> Self {
-        read(dir, name)
+        match open_regular(&dir.join(name), u64::MAX) {
+            Ok(opened) => read(name, &opened),
+            Err(error) => Self::unread(name, error.fault(name)),
+        }
+    }
+
+    /// Reads the header of an open file. Never fails: what is wrong becomes a fault.
+    pub(crate) fn read_opened(name: &str, opened: &Opened) -> Self {
+        read(name, opened)
     }
 }
 
-fn read(dir: &Path, name: &str) -> Shard {
-    let opened = match open_regular(&dir.join(name), u64::MAX) {
-        Ok(opened) => opened,
-        Err(error) => return Shard::unread(name, error.fault(name)),
-    };
-    let head = match read_head(&opened) {
+fn read(name: &str, opened: &Opened) -> Shard {
+    let head = match read_head(opened) {
         Ok(head) => head,
         Err(error) => {
             let fault = Fault::new(FaultKind::UnreadableFile).at(Place::file(name)).with("reason", error.to_string());
@@ -37,8 +42,8 @@ fn read(dir: &Path, name: &str) -> Shard {
         }
     };
     let mut shard = Shard::parse(name, opened.identity.size, &head);
-    name_trailing_bytes(&mut shard, &opened);
-    shard.faults.extend(unwritten_tail(&shard, &opened));
+    name_trailing_bytes(&mut shard, opened);
+    shard.faults.extend(unwritten_tail(&shard, opened));
     shard
 }
 

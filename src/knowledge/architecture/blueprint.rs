@@ -23,11 +23,13 @@ pub(crate) struct Blueprint {
     /// Its name, the file's stem.
     pub architecture: String,
     /// One line on what it is.
+    #[expect(dead_code, reason = "for readers of the file")]
     pub summary: String,
     /// `model_type` values of the config class.
     #[serde(default)]
     pub model_types: Vec<String>,
     /// Where the facts come from.
+    #[expect(dead_code, reason = "for readers of the file")]
     pub sources: Vec<String>,
     /// Loaders the file speaks for.
     pub loaders: Vec<Loader>,

@@ -55,17 +55,6 @@ impl Scope<'static> {
         });
     }
 
-    /// Adds a function without arguments.
-    ///
-    /// # Panics
-    /// When `name` is one of CEL's own functions.
-    pub fn function0(&mut self, name: &str, f: impl Fn() -> Value + Send + Sync + 'static) {
-        self.function(name, move |arguments| match arguments {
-            [] => Ok(f()),
-            _ => Err("no arguments expected".to_owned()),
-        });
-    }
-
     /// Adds a function of two strings.
     ///
     /// # Panics

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Deserializer};
 
-use super::compiled::{EvalError, Expression, ParseError, compile_eagerly};
+use super::compiled::{EvalError, Expression, ParseError};
 use super::scope::{Scope, plain};
 
 /// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
@@ -42,8 +42,9 @@ impl Template {
     ///
     /// # Errors
     /// When a brace is unmatched, or a placeholder is not an expression.
+    #[cfg(any(test, feature = "internals"))]
     pub fn parse(source: &str) -> Result<Self, ParseError> {
-        compile_eagerly(|| Self::from_data_file(source))
+        super::compile_eagerly(|| Self::from_data_file(source))
     }
 
     fn from_data_file(source: &str) -> Result<Self, ParseError> {
@@ -89,6 +90,7 @@ impl Template {
     }
 
     /// The expressions of its placeholders, in order.
+    #[cfg(any(test, feature = "internals"))]
     pub fn expressions(&self) -> impl Iterator<Item = &Expression> {
         self.pieces.iter().filter_map(|piece| match piece {
             Piece::Value(expression) => Some(expression),

@@ -154,6 +154,7 @@ pub enum BuiltInRepair {
     WriteHeader,
 }
 
+#[cfg(feature = "internals")]
 impl BuiltInRepair {
     /// Every repair, in the order of their names.
     pub const ALL: &[Self] = &[

@@ -269,7 +269,11 @@ impl RepairDraft {
         root.insert("metadata".to_owned(), Value::Object(metadata));
         let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k, Value::String(v))).collect();
         root.insert("weight_map".to_owned(), Value::Object(map));
-        let text = Document::from_value(file, Value::Object(root)).text?;
+        let mut new = Document::from_value(file, Value::Object(root));
+        if let Some(old) = self.current.document(file) {
+            new = new.with_numbers_of(old, "");
+        }
+        let text = new.text?;
         self.write(file, &text)
     }
 

@@ -54,13 +54,12 @@ pub fn plan(
         }
     }
     let Planner { draft, outcome, fixed, withdrawn, .. } = planner;
-    let planned = Arc::clone(draft.current());
     let texts = draft.texts.into_iter().map(|(name, text)| Change { name, new: Content::Text(text) });
     let shards =
         draft.shards.into_iter().map(|(name, shard)| Change { name, new: Content::Shard(Arc::unwrap_or_clone(shard)) });
     let mut changes: Vec<Change> = shards.chain(texts).collect();
     changes.sort_by(|a, b| a.name.cmp(&b.name));
-    Repair { original: Arc::clone(checkpoint), planned, outcome, fixed, withdrawn, changes }
+    Repair { original: Arc::clone(checkpoint), outcome, fixed, withdrawn, changes }
 }
 
 impl Planner<'_> {

@@ -3,6 +3,7 @@
 use ckpt_doctor::knowledge::{Evidence, Expected, Library, Loader};
 use serde_json::{Value, json};
 
+use super::total_bytes;
 use crate::support::data::{Map, config, map, records};
 
 fn expect(config: &Value, stored: &Map) -> Expected {
@@ -34,7 +35,7 @@ fn assert_predicted(config: &Value, name: &str, tensors: usize, bytes: u64) {
     for evidence in [&Map::new(), &stored] {
         let expected = expect(config, evidence);
         assert_same(&shapes(&expected), &stored, name);
-        assert_eq!((expected.tensors.len(), expected.total_bytes(2)), (tensors, Some(bytes)), "{name}");
+        assert_eq!((expected.tensors.len(), total_bytes(&expected, 2)), (tensors, Some(bytes)), "{name}");
     }
 }
 
@@ -74,7 +75,7 @@ fn a_language_model_without_its_vision_tower_is_complete() {
     let mut expected = expect(&config, &stored);
     expected.drop_absent_groups(|name| stored.contains_key(name));
     assert_same(&shapes(&expected), &stored, "without the tower");
-    assert_eq!((expected.tensors.len(), expected.total_bytes(2)), (307, Some(13_554_513_920)));
+    assert_eq!((expected.tensors.len(), total_bytes(&expected, 2)), (307, Some(13_554_513_920)));
 }
 
 #[test]
@@ -138,7 +139,7 @@ fn hostile_configs_are_refused_with_a_message() {
         let refusal = llama(patch.clone()).expect_err(&patch.to_string()).to_string();
         assert!(refusal.contains(message), "{patch}: {refusal}");
     }
-    assert!(Library::embedded().architecture("llama").expect("llama").expect(&json!([1])).is_err());
+    assert!(Library::embedded().class("LlamaForCausalLM", Loader::NEWEST).expect("llama").expect(&json!([1])).is_err());
 }
 
 #[test]
@@ -196,7 +197,7 @@ fn a_user_adds_an_architecture_or_replaces_one() {
     let endless = r#"{ architecture: "m", summary: "", sources: [], loaders: ["4.47.0"],
         classes: [{ class: "M", tensors: { "": { part: { class: "M" } } } }] }"#;
     library.add("m.json5", endless).expect("parses");
-    let refused = library.architecture("m").expect("added").expect(&json!({})).expect_err("a part of itself");
+    let refused = library.class("M", Loader::V4_47_0).expect("added").expect(&json!({})).expect_err("a part of itself");
     assert_eq!(refused.to_string(), "parts are nested more than 8 deep");
     let error = library.add("mlp.json5", &text.replace("bias", "bais")).expect_err("misspelt");
     assert!(error.to_string().contains("bais"), "{error}");

@@ -8,6 +8,7 @@ use std::collections::BTreeSet;
 use ckpt_doctor::knowledge::{Expected, Library, Loader};
 use serde_json::{Value, json};
 
+use super::total_bytes;
 use crate::support::data::{Map, Record, records};
 
 /// Decoders of transformers that a part may have and that the library lacks.
@@ -159,7 +160,7 @@ fn published_indexes_have_the_bytes_that_follow_from_the_config() {
         ("MolmoForCausalLM", "/vocab_size", json!(152_064), 2 * 8_021_025_280),
     ] {
         let expected = expect(&record(class, pointer, &value).config);
-        assert_eq!(expected.total_bytes(2), Some(total), "{class} {value}");
+        assert_eq!(total_bytes(&expected, 2), Some(total), "{class} {value}");
     }
 }
 

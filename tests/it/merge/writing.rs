@@ -33,6 +33,28 @@ fn the_current_directory_is_a_target_when_it_is_empty() {
     assert_eq!(names(work.path()), ["here"]);
 }
 
+/// Numbers that no 64 bits hold as they are written, in a document that a merge edits and in one that it grafts.
+#[test]
+fn numbers_are_written_as_the_donors_spell_them() {
+    let work = TempDir::new().unwrap();
+    let mut numbers = Vec::new();
+    for (name, value) in [("spatialvla-tiny", "1000000000000000019884624838656"), ("llava3d-tiny", "1.50E-07")] {
+        let place = work.path().join(name);
+        copy(&donor(name), &place);
+        let config = fs::read_to_string(place.join("config.json")).unwrap();
+        let key = name.replace('-', "_");
+        fs::write(place.join("config.json"), config.replacen('{', &format!("{{\"{key}\": {value},"), 1)).unwrap();
+        numbers.push(format!("\"{key}\": {value},"));
+    }
+    let run = merge(work.path(), Path::new("out")).output().unwrap();
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let config = fs::read_to_string(work.path().join("out/config.json")).unwrap();
+    for number in numbers.iter().chain([&"\"rms_norm_eps\": 1e-05".to_owned(), &"\"batch_norm_eps\": 1e-05".to_owned()])
+    {
+        assert!(config.contains(number), "{number} in {config}");
+    }
+}
+
 #[test]
 fn a_link_to_a_donor_is_detected() {
     let work = TempDir::new().unwrap();

@@ -157,12 +157,23 @@ impl ValueBuilder {
     }
 }
 
-/// A number as written; null when no reader could represent it.
-fn number(literal: &str) -> Value {
+/// A number as an integer or a double, whichever represents it; null when neither does.
+pub(super) fn number(literal: &str) -> Value {
     if is_huge(literal) {
         return Value::Null;
     }
-    literal.parse::<Number>().map_or(Value::Null, Value::Number)
+    let double = || Number::from_f64(literal.parse().ok()?);
+    integer(literal).or_else(double).map_or(Value::Null, Value::Number)
+}
+
+/// The integer, if 64 bits hold it.
+fn integer(literal: &str) -> Option<Number> {
+    literal.parse::<u64>().map(Number::from).or_else(|_| literal.parse::<i64>().map(Number::from)).ok()
+}
+
+/// Whether the literal is an integer that only its text holds exactly.
+pub(super) fn is_long_integer(literal: &str) -> bool {
+    !literal.contains(['.', 'e', 'E']) && integer(literal).is_none()
 }
 
 /// Whether JSON readers cannot represent the number: Python refuses integers of more than [`MAX_DIGITS`] digits, and a

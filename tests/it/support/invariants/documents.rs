@@ -26,20 +26,38 @@ pub fn hold(name: &str, bytes: &[u8]) -> Document {
     match serde_json::from_slice::<Value>(bytes) {
         Ok(strict) => {
             assert!(grave.is_none(), "serde_json reads it: {grave:?}");
-            // With `arbitrary_precision`, an object with a private key of the crate is parsed as a number.
-            let private = text.is_some_and(|text| text.contains("$serde_json::private"));
             let unlike = [FaultKind::HugeNumber, FaultKind::JsonTooManyValues]
                 .iter()
                 .any(|kind| super::has(&document.faults, *kind));
-            let same = document.left_out.is_empty() && !private && !unlike;
+            let same = document.left_out.is_empty() && !unlike;
             if same {
-                assert_eq!(document.value.as_ref(), Some(&strict));
+                assert!(document.value.as_ref().is_some_and(|value| is_same(value, &strict)), "{document:?} {strict}");
             }
         }
-        Err(error) => assert!(grave.is_some(), "no fault found, but serde_json reports {error}"),
+        Err(error) => {
+            let huge = super::has(&document.faults, FaultKind::HugeNumber);
+            assert!(grave.is_some() || huge, "nothing found, and serde_json says {error}");
+        }
     }
     places_are_found_again(&document);
     document
+}
+
+/// Whether two values are equal, but for the last bit of a double: `serde_json` reads doubles less exactly without its
+/// feature `float_roundtrip`, and an integer of zero with a sign as a double.
+fn is_same(ours: &Value, theirs: &Value) -> bool {
+    match (ours, theirs) {
+        (Value::Number(a), Value::Number(b)) => {
+            let (x, y) = (a.as_f64().unwrap_or(f64::NAN), b.as_f64().unwrap_or(f64::NAN));
+            let close = (x - y).abs() <= x.abs() * f64::EPSILON + f64::MIN_POSITIVE;
+            a == b || close && (a.is_f64() == b.is_f64() || x == 0.0)
+        }
+        (Value::Array(a), Value::Array(b)) => a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b)),
+        (Value::Object(a), Value::Object(b)) => {
+            a.len() == b.len() && a.iter().all(|(key, a)| b.get(key).is_some_and(|b| is_same(a, b)))
+        }
+        _ => ours == theirs,
+    }
 }
 
 /// The pointer of a place gives the value that its span covers.
