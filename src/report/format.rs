@@ -1,6 +1,6 @@
 //! Formatting shared by the renderers: counts, sizes, shapes, and lists cut to "and N more".
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::collapse::{NameGroup, collapse};
 use super::model::{Counts, MergeReport, MergeStage, Report};
@@ -85,9 +85,15 @@ pub fn place(path: &str, location: Option<&Location>) -> String {
     }
 }
 
-/// The tensors among locations, with numbered names collapsed; at most `cap` lines, then the number of further ones.
-pub fn tensors(locations: &[Location], cap: usize) -> Vec<String> {
-    let groups = collapse(locations.iter().filter_map(|l| l.tensor.as_deref()));
+/// The tensors of a finding, with numbered names collapsed; at most `cap` lines, then the number of further ones. None when
+/// the message names all of them.
+pub fn tensors(message: &str, locations: &[Location], cap: usize) -> Vec<String> {
+    let names: Vec<&str> = locations.iter().filter_map(|l| l.tensor.as_deref()).collect();
+    let words: BTreeSet<&str> = message.split([' ', ',', ';', ':']).collect();
+    if names.iter().all(|name| words.contains(name)) {
+        return Vec::new();
+    }
+    let groups = collapse(names);
     let mut lines: Vec<String> = groups.iter().take(cap).map(|g| name(&g.pattern)).collect();
     lines.extend(more(groups.len(), cap));
     lines

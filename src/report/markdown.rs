@@ -71,7 +71,7 @@ fn render_finding(out: &mut String, finding: &Finding) {
     if let Some(more) = more(places.len(), PLACES) {
         let _ok = writeln!(out, "- {more}");
     }
-    for tensor in tensors(&finding.locations, PLACES) {
+    for tensor in tensors(&finding.message, &finding.locations, PLACES) {
         let _ok = writeln!(out, "- tensor: {}", code(&tensor));
     }
     for detail in details(finding) {

@@ -66,7 +66,7 @@ fn description(group: &Group<'_>, item: &Item<'_>) -> String {
     if let Some(more) = more(places.len(), PLACES) {
         let _infallible = write!(out, "\n{more}");
     }
-    for tensor in tensors(item.locations, PLACES) {
+    for tensor in tensors(&item.message, item.locations, PLACES) {
         let _infallible = write!(out, "\ntensor {tensor}");
     }
     if let Some(help) = &item.help {

@@ -37,7 +37,7 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
     if let Some(more) = more(places.len(), PLACES) {
         group = group.element(note("places", more));
     }
-    for text in tensors(&finding.locations, PLACES) {
+    for text in tensors(&finding.message, &finding.locations, PLACES) {
         group = group.element(note("tensor", text));
     }
     group = group.element(note("rule", name(&finding.name)));
