@@ -216,7 +216,7 @@ pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
     together
 }
 
-/// `transformers 4.51.3 (judged as 4.47.0) and 5.23.0`.
+/// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
 pub fn versions(loaders: &[&LoadReport]) -> String {
     let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
     format!("transformers {}", versions.join(" and "))

@@ -46,10 +46,10 @@ impl LoadReport {
         said(self) == said(other)
     }
 
-    /// The version it is for: `5.23.0`, or `4.51.3 (judged as 4.47.0)`.
+    /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.
     #[must_use]
     pub fn version(&self) -> String {
-        let version = |asked: &String| format!("{asked} (judged as {})", self.loader);
+        let version = |asked: &String| format!("{asked} (predicted as {})", self.loader);
         self.stands_for.as_ref().map_or_else(|| self.loader.clone(), version)
     }
 }

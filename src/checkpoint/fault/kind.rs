@@ -196,7 +196,7 @@ fault_kinds! {
 impl FaultKind {
     /// The kind of this name; `None` for an unknown name.
     #[must_use]
-    pub(crate) fn from_name(name: &str) -> Option<Self> {
+    pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|kind| kind.name() == name)
     }
 }
