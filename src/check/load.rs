@@ -24,7 +24,7 @@ pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
 pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
-pub(super) use target::wanted;
+pub(super) use target::{of_run, wanted};
 pub use target::{Target, targets};
 
 /// Predicts the lists of the loader that `expected` was built for.

@@ -122,6 +122,22 @@ fn messages_render_in_full() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// Every effect is rendered, and a finding that is an error has an effect or its rule a harm.
+#[test]
+fn errors_state_their_effects() {
+    let rules = crate::support::rules();
+    let harmful = |f: &Finding| rules.find(&f.code).is_ok_and(|rule| rule.harm.is_some());
+    let wrong = failures(|t| {
+        // Settings of the case may change severities.
+        let findings = || t.outcome.findings.iter().filter(|_| t.case.settings.is_none());
+        let bare = findings().filter(|f| f.severity == Severity::Error && f.effects.is_empty() && !harmful(f));
+        let broken = findings().filter(|f| f.effects.iter().any(|e| e.text.is_empty() || e.text.contains('?')));
+        let bad: Vec<&Finding> = bare.chain(broken).collect();
+        (!bad.is_empty()).then(|| format!("{}\n{:?}", shown(&bad), bad.iter().map(|f| &f.effects).collect::<Vec<_>>()))
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
 /// The donor has the same faults as the published checkpoints: three `Infinity`.
 #[test]
 fn the_donor_has_three_infinities() {

@@ -69,7 +69,8 @@ pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault
         if let Err(Refusal::Impossible(reasons)) = &one.class {
             let fault = Fault::new(FaultKind::ConfigIncomputable)
                 .at(Place::file("config.json"))
-                .with("architecture", one.architecture.name());
+                .with("architecture", one.architecture.name())
+                .under(one.target.loader.version());
             faults.push(fault.with("reason", reasons.first().map_or("", String::as_str)));
         }
     }

@@ -43,6 +43,7 @@ pub fn finding(code: &str, name: &str, severity: Severity, message: &str, eviden
         severity,
         message: message.to_owned(),
         details: Vec::new(),
+        effects: Vec::new(),
         locations: Vec::new(),
         evidence,
         fix: None,
