@@ -72,10 +72,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     scope.bind("loaders", &leading.collect());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
-    let context = Context {
-        bench: Bench::new(checkpoint),
-        targets: load::of_run(config, versions, judged.targets),
-    };
+    let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
     for rule in &knowledge.rules.rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
@@ -146,10 +143,11 @@ fn ask(
         let is = architecture.unwrap_or("unknown");
         return Err(format!("applies to {}; the architecture is {is}", rule.applies.join(", ")));
     }
-    let cannot = |expression: &Expression, error: &EvalError| match variables::absent(context.bench.checkpoint, expression) {
-        Some(file) => format!("{file} is missing"),
-        None => format!("cannot be evaluated: {}", error.cause),
-    };
+    let cannot =
+        |expression: &Expression, error: &EvalError| match variables::absent(context.bench.checkpoint, expression) {
+            Some(file) => format!("{file} is missing"),
+            None => format!("cannot be evaluated: {}", error.cause),
+        };
     if let Some(when) = &rule.when {
         match when.eval_bool(scope) {
             Ok(true) => {}
@@ -289,7 +287,12 @@ fn from_assert<'r>(
     Ok(out)
 }
 
-fn one_assert(rule: &Rule, check: &Assert, context: &Context<'_>, scope: &Scope<'_>) -> Result<Option<Finding>, EvalError> {
+fn one_assert(
+    rule: &Rule,
+    check: &Assert,
+    context: &Context<'_>,
+    scope: &Scope<'_>,
+) -> Result<Option<Finding>, EvalError> {
     if check.that.eval_bool(scope)? {
         return Ok(None);
     }

@@ -24,8 +24,8 @@ pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
 pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
-pub(super) use target::{of_run, wanted};
 pub use target::{Target, targets};
+pub(super) use target::{of_run, wanted};
 
 /// Predicts the lists of the loader that `expected` was built for.
 #[must_use]

@@ -9,8 +9,8 @@ use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
 use super::settings::{SettingsResolver, Typed};
-use crate::knowledge::{Loader, Template};
 use crate::knowledge::rule::{Fix, Object, Rule, RuleSet, Safety, example};
+use crate::knowledge::{Loader, Template};
 
 /// Runs `rules`: lists the selected rules.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -46,8 +46,9 @@ fn family(rules: &RuleSet, word: &str) -> Option<String> {
     let members: Vec<&Rule> = rules.all().filter(is_member).collect();
     let title = rules.catalogue.families.iter().find(|(family, _)| *family == word);
     let title = title.map(|(_, title)| format!(": {title}")).unwrap_or_default();
-    let rows =
-        members.iter().map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name, &rule.summary].map(AsRef::as_ref));
+    let rows = members
+        .iter()
+        .map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name, &rule.summary].map(AsRef::as_ref));
     (!members.is_empty()).then(|| format!("{word}{title}\n\n{}", table(rows)))
 }
 

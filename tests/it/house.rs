@@ -78,7 +78,10 @@ fn rules_follow_the_conventions() {
             hold(!advice.is_match(title.source()), "a title states what the edits do: no `or`, `unless` or `;`");
         }
         // A finding of severity info may need no action.
-        hold(!rule.fixes.is_empty() || rule.highest_severity() == Severity::Info, "a rule above info has a fix or help");
+        hold(
+            !rule.fixes.is_empty() || rule.highest_severity() == Severity::Info,
+            "a rule above info has a fix or help",
+        );
     }
     none(&wrong);
 }

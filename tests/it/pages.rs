@@ -127,7 +127,8 @@ fn loaders_of(effect: &Effect) -> String {
 }
 
 fn rule_page(rule: &Rule, example: &str) -> String {
-    let mut page = format!("### {} {}\n\n**What it reports** ({}): ", rule.code, rule.name, severity(rule.highest_severity()));
+    let mut page =
+        format!("### {} {}\n\n**What it reports** ({}): ", rule.code, rule.name, severity(rule.highest_severity()));
     let _ = writeln!(page, "{}", markdown(&rule.summary));
     let _ = writeln!(page, "\n**Why it matters:** {}", markdown(&rule.why));
     if !rule.applies.is_empty() {
@@ -172,8 +173,8 @@ fn the_page_of_rules_is_fresh() {
          {count} rules. `ckpt-doctor explain CODE` prints a section of this page, and `ckpt-doctor explain FAMILY` lists a \
          family.\n\n\
          | severity | meaning |\n|---|---|\n\
-         | error | a loader that must open the checkpoint raises or loads it incorrectly, or the fault is a harm |\n\
-         | warning | probably unintended, or only another loader raises or loads it incorrectly |\n\
+         | error | a loader that must open the checkpoint raises or loads it incorrectly, or content is damaged, or security is at risk |\n\
+         | warning | only another loader raises or loads it incorrectly, or probably unintended |\n\
          | info | worth knowing; needs no action |\n\n\
          | fix | meaning |\n|---|---|\n\
          | safe | restores bookkeeping: every tensor and every value that a loader reads stays, and no trace of a loss is erased |\n\
@@ -253,7 +254,8 @@ fn the_lists_of_decisions_are_fresh() {
     for (_, title, rules) in families() {
         let _ = writeln!(list, "\n**{title}**\n");
         for rule in rules {
-            let _ = writeln!(list, "- {} ({}, {})", markdown(&rule.summary), rule.code, severity(rule.highest_severity()));
+            let _ =
+                writeln!(list, "- {} ({}, {})", markdown(&rule.summary), rule.code, severity(rule.highest_severity()));
         }
     }
     let page = fs::read_to_string(project().join("docs/decisions.md")).expect("text");

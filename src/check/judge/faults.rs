@@ -18,8 +18,9 @@ pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Vec<Fa
     faults.extend(total_size(inputs, loads));
     faults.extend(tensors(loads, inputs.stored).into_iter().map(|fault| compare_tied(inputs.checkpoint, fault)));
     faults.extend(distinct_votes(loads).iter().map(|vote| {
-        let has_vote =
-            |load: &&ExplainedLoad<'_>| load.votes().is_some_and(|votes| votes.iter().any(|v| v.pointer == vote.pointer));
+        let has_vote = |load: &&ExplainedLoad<'_>| {
+            load.votes().is_some_and(|votes| votes.iter().any(|v| v.pointer == vote.pointer))
+        };
         loads.iter().filter(has_vote).map(ExplainedLoad::loader).fold(votes::fault(vote), Fault::under)
     }));
     faults
