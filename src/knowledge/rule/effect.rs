@@ -15,7 +15,7 @@ pub enum Object {
     Tokenizer,
     /// `AutoProcessor.from_pretrained`.
     Processor,
-    /// `generate`, by generation_config.json.
+    /// `generate`, by `generation_config.json`.
     Generation,
     /// `PeftModel.from_pretrained`.
     Adapter,
@@ -31,6 +31,15 @@ impl Object {
             Self::Processor => "processor",
             Self::Generation => "generation",
             Self::Adapter => "adapter",
+        }
+    }
+
+    /// The object whose class a Python module defines, by the names that transformers gives such modules.
+    fn importing(module: &str) -> Self {
+        match module {
+            _ if module.starts_with("tokenization") => Self::Tokenizer,
+            _ if module.starts_with("processing") || module.starts_with("image_processing") => Self::Processor,
+            _ => Self::Model,
         }
     }
 
@@ -66,6 +75,7 @@ impl Object {
             _ if file.starts_with("adapter_model.") => Some(Self::Adapter),
             _ if TOKENIZER.contains(&file) => Some(Self::Tokenizer),
             _ if PROCESSOR.contains(&file) => Some(Self::Processor),
+            _ if file.ends_with(".py") => Some(Self::importing(file)),
             _ => is_weights.then_some(Self::Model),
         }
     }
@@ -260,6 +270,9 @@ mod tests {
             ("generation_config.json", Some(Object::Generation)),
             ("tokenizer.json", Some(Object::Tokenizer)),
             ("chat_template.json", Some(Object::Processor)),
+            ("modeling_x.py", Some(Object::Model)),
+            ("image_processing_x.py", Some(Object::Processor)),
+            ("tokenization_x.py", Some(Object::Tokenizer)),
             ("README.md", None),
             ("quantize_config.json", None),
         ] {

@@ -189,7 +189,9 @@ fn every_rule_is_explained_with_an_example() {
     let rules = ckpt_doctor::knowledge::rule::RuleSet::embedded().unwrap();
     for rule in rules.all() {
         let page = String::from_utf8(doctor(&["explain", &rule.code]).stdout).unwrap();
-        assert!(page.contains(&format!("\nExample\n  {}[{}]: ", rule.highest_severity().name(), rule.code)), "{page}");
+        // The finding of the example can have a lower severity than others of its rule.
+        let example = ["info", "warning", "error"].map(|level| format!("\nExample\n  {level}[{}]: ", rule.code));
+        assert!(example.iter().any(|start| page.contains(start)), "{page}");
         let texts = rule.fixes.iter().flat_map(|fix| [&fix.title, &fix.help]).flatten();
         for expression in texts.chain([&rule.message]).flat_map(ckpt_doctor::knowledge::Template::expressions) {
             assert!(!page.contains(&format!("{{{expression}}}")), "{page}");
