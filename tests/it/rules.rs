@@ -8,9 +8,9 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use crate::support::{Expect, Tried, tried};
-use ckpt_doctor::check::check;
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::check::{check, check_for};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, FaultSource};
 
 fn failures(of: impl Fn(&Tried) -> Option<String>) -> Vec<String> {
@@ -137,6 +137,31 @@ fn errors_state_their_effects() {
         (!bad.is_empty()).then(|| format!("{}\n{:?}", shown(&bad), bad.iter().map(|f| &f.effects).collect::<Vec<_>>()))
     });
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The severity of one fault follows the loaders of the run: `--for`, or the version that wrote config.json.
+#[test]
+fn severity_follows_the_loaders_of_the_run() {
+    let room = tempfile::tempdir().expect("a directory");
+    let drop = r#"{ header_drop: { file: "model.safetensors", at: "/__metadata__" } }"#;
+    let found = |dir: &std::path::Path, versions: &[&str]| {
+        let versions: Vec<String> = versions.iter().map(|v| (*v).to_owned()).collect();
+        let checkpoint = Checkpoint::open(dir).expect("a checkpoint").into();
+        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &versions);
+        let finding = outcome.findings.into_iter().find(|f| f.code == "SAF009").expect("SAF009");
+        let loaders = finding.effects.into_iter().map(|e| (e.loader, e.stands_for));
+        (finding.severity, loaders.collect::<Vec<_>>())
+    };
+    let own = |stands_for: Option<&str>| vec![("4.47.0".to_owned(), stands_for.map(str::to_owned))];
+    let dir = crate::support::made("llama", &format!("[{drop}]"), room.path());
+    for (versions, severity, effects) in [
+        (&[] as &[&str], Severity::Error, own(None)),
+        (&["5.23.0"], Severity::Info, Vec::new()),
+        (&["5.23.0", "4.50.1"], Severity::Error, own(Some("4.50.1"))),
+        (&["4.57.6"], Severity::Info, Vec::new()),
+    ] {
+        assert_eq!(found(&dir, versions), (severity, effects), "{versions:?}");
+    }
 }
 
 /// The donor has the same faults as the published checkpoints: three `Infinity`.
