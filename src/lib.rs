@@ -1,8 +1,8 @@
 //! Validates, repairs and merges model checkpoint directories from their files alone.
 //!
-//! [`Checker`] checks a checkpoint directory without Python and without reading tensor data, and predicts what
-//! transformers reports when it loads the checkpoint. [`Merge`] builds one checkpoint from several. [`Shard`] reads the
-//! header of one safetensors file.
+//! [`Checker`] checks a checkpoint directory, without Python, and predicts what transformers reports when it loads the
+//! checkpoint. [`Merge`] builds one checkpoint from several. [`Shard::read_header`] reads the header of one safetensors
+//! file.
 //!
 //! ```
 //! use ckpt_doctor::{Checker, Severity};
