@@ -24,7 +24,7 @@
 //!   with `default-features = false`.
 //! - `internals`: makes all modules public for the tests of this crate. It is not covered by semantic versioning.
 
-// Each module is one stage, and data moves from the first to the last: `checkpoint` reads files, `knowledge` holds rules
+// Each module is one stage, and data moves from the first to the last: `checkpoint` reads files, `knowledge` parses rules
 // and architectures, `check` compares the two, `surgery` plans and writes changes, `report` renders, `merge` runs all of
 // these to build one checkpoint from several. `api` and `cli` run them for a user. No module imports from a later one.
 

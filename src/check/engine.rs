@@ -69,8 +69,8 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     for rule in &knowledge.rules.rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
-            Some(_) => within(STEPS, || ask(rule, &bench, &faults, &scope, architecture)),
-            None => (ask(rule, &bench, &faults, &scope, architecture), false),
+            Some(_) => within(STEPS, || evaluate(rule, &bench, &faults, &scope, architecture)),
+            None => (evaluate(rule, &bench, &faults, &scope, architecture), false),
         };
         if stopped {
             let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
@@ -97,8 +97,8 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 
 /// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
-    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
-    let rules = knowledge.rules.rules.iter().filter(asked);
+    let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
+    let rules = knowledge.rules.rules.iter().filter(named);
     let bench = Bench::new(checkpoint);
     let mut findings: Vec<Finding> =
         rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect();
@@ -124,7 +124,7 @@ fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option
 }
 
 /// The findings of a rule, or the reason why it was skipped.
-fn ask(
+fn evaluate(
     rule: &Rule,
     bench: &Bench<'_>,
     faults: &[Fault],
