@@ -15,7 +15,8 @@ mod output;
 mod rules;
 mod settings;
 mod signals;
-mod unasked;
+mod skipped;
+
 mod undo;
 
 use std::process::ExitCode;

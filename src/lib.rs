@@ -1,8 +1,8 @@
 //! Validates, repairs and merges model checkpoint directories from their files alone.
 //!
-//! [`Checker`] checks a checkpoint directory without Python and without reading tensor data, and predicts what
-//! transformers reports when it loads the checkpoint. [`Merge`] builds one checkpoint from several. [`Shard`] reads the
-//! header of one safetensors file.
+//! [`Checker`] checks a checkpoint directory, without Python, and predicts what transformers reports when it loads the
+//! checkpoint. [`Merge`] builds one checkpoint from several. [`Shard::read_header`] reads the header of one safetensors
+//! file.
 //!
 //! ```
 //! use ckpt_doctor::{Checker, Severity};
@@ -24,7 +24,7 @@
 //!   with `default-features = false`.
 //! - `internals`: makes all modules public for the tests of this crate. It is not covered by semantic versioning.
 
-// Each module is one stage, and data moves from the first to the last: `checkpoint` reads files, `knowledge` holds rules
+// Each module is one stage, and data moves from the first to the last: `checkpoint` reads files, `knowledge` parses rules
 // and architectures, `check` compares the two, `surgery` plans and writes changes, `report` renders, `merge` runs all of
 // these to build one checkpoint from several. `api` and `cli` run them for a user. No module imports from a later one.
 

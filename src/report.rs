@@ -57,7 +57,7 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
     match format {
         Format::Full => terminal::render(report, style),
         Format::Concise => concise::render(report, style.cap),
-        Format::Json => json::render(report),
+        Format::Json => report.to_json(),
         Format::Jsonl => json::lines(report),
         Format::Github => ci::github::render(report),
         Format::Gitlab => ci::gitlab::render(report),

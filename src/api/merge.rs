@@ -84,7 +84,7 @@ impl Merge {
     /// # Errors
     /// Any [`Error`] but [`Error::Version`] and [`Error::Reopen`].
     pub fn plan(&self) -> Result<Report, Error> {
-        self.run_until_write(true)
+        self.start(true)
     }
 
     /// Runs the merge: the result is written under a temporary name, renamed when it is complete, and checked again.
@@ -96,10 +96,10 @@ impl Merge {
     /// # Errors
     /// Any [`Error`] but [`Error::Version`].
     pub fn run(&self) -> Result<Report, Error> {
-        self.run_until_write(false)
+        self.start(false)
     }
 
-    fn run_until_write(&self, dry_run: bool) -> Result<Report, Error> {
+    fn start(&self, dry_run: bool) -> Result<Report, Error> {
         let knowledge = knowledge()?;
         let ResolvedMergeFile { recipe, base, donors, options, out } = self.parts.clone();
         let recipe = recipe.map(|name| find_recipe(&knowledge.recipes, &name, &base)).transpose()?;

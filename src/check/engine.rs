@@ -76,8 +76,8 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     for rule in &knowledge.rules.rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
-            Some(_) => within(STEPS, || ask(rule, &context, &faults, &scope, architecture)),
-            None => (ask(rule, &context, &faults, &scope, architecture), false),
+            Some(_) => within(STEPS, || evaluate(rule, &context, &faults, &scope, architecture)),
+            None => (evaluate(rule, &context, &faults, &scope, architecture), false),
         };
         if stopped {
             let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
@@ -104,8 +104,8 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 
 /// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
-    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
-    let rules = knowledge.rules.rules.iter().filter(asked);
+    let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
+    let rules = knowledge.rules.rules.iter().filter(named);
     // Without a loader: these faults concern no load.
     let context = Context { bench: Bench::new(checkpoint), targets: Vec::new() };
     let mut findings: Vec<Finding> =
@@ -132,7 +132,7 @@ fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option
 }
 
 /// The findings of a rule, or the reason why it was skipped.
-fn ask(
+fn evaluate(
     rule: &Rule,
     context: &Context<'_>,
     faults: &[Fault],

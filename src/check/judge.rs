@@ -72,8 +72,8 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let targets = classes.iter().map(|one| one.target.clone()).collect();
     let mut faults = classes::faults(&inputs, &classes);
     let loads = explain::explain(&inputs, predict::predict(&inputs, classes));
-    faults.extend(faults::faults(&inputs, &loads));
     let votes = explain::distinct_votes(&loads);
+    faults.extend(faults::faults(&inputs, &loads, &votes));
     let config = loads.first().map_or(Value::Null, |load| load.prediction.expected.config.clone());
     let loads: Vec<LoadReport> =
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();

@@ -10,7 +10,7 @@ use anyhow::{Context, bail};
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FINDINGS};
 use super::settings::{Resolved, SettingsResolver, Typed};
-use super::{baseline, fix, output, signals, unasked};
+use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::{Checkpoint, find_checkpoints, owner};
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
@@ -72,7 +72,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     output::finish(&Report::new(reports, None), &args.report, args.statistics)?;
     if args.verbose {
         for l in &looked {
-            unasked::print(&l.dir, &l.outcome, &l.by.knowledge.rules);
+            skipped::print(&l.dir, &l.outcome, &l.by.knowledge.rules);
         }
     }
     Ok(if fixed || failed && !args.report.exit_zero { FINDINGS } else { CLEAN })

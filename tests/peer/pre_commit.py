@@ -78,14 +78,16 @@ def main(files, room):
     expect(commit(repo, "broken", ok=False), "Failed", "error[", "model-00009-of-00009.safetensors")
     if git("rev-parse", "HEAD", cwd=repo) != head:
         sys.exit("the commit was accepted although the model is broken")
-    if "--fix " in run(DOCTOR, "check", "--help", cwd=repo):
-        configure(repo, source, rev, "ckpt-doctor-system", ["--fix"])
-        expect(commit(repo, "broken", ok=False), "files were modified by this hook")
-        commit(repo, "repaired by the hook")
-        configure(repo, source, rev, "ckpt-doctor-system")
-        print("a broken index is repaired by --fix in the hook")
-    else:
-        index.write_text(sound)
+    # A tensor under the wrong shard is what --fix repairs.
+    wrong = json.loads(sound)
+    shards = sorted(set(wrong["weight_map"].values()))
+    wrong["weight_map"][name] = next(shard for shard in shards if shard != wrong["weight_map"][name])
+    index.write_text(json.dumps(wrong, indent=2))
+    configure(repo, source, rev, "ckpt-doctor-system", ["--fix"])
+    expect(commit(repo, "wrong", ok=False), "files were modified by this hook", "fixed IDX008")
+    commit(repo, "repaired by the hook")
+    configure(repo, source, rev, "ckpt-doctor-system")
+    print("a wrong index is repaired by --fix in the hook")
     run("git", "checkout", "-q", "HEAD", "--", ".", cwd=repo)
     print("a commit with a broken model is refused")
 

@@ -3,21 +3,23 @@
 use serde_json::Value;
 
 use super::Inputs;
-use super::explain::{ExplainedLoad, distinct_votes};
+use super::explain::ExplainedLoad;
 use super::predict::{quantised, same_bytes};
 use crate::check::load::{self, Judged, LoadReport, Stored};
-use crate::check::{quantization, size, votes};
+use crate::check::votes::{self, Vote};
+use crate::check::{quantization, size};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 
-/// Faults of the loads: prefixes, quantised modules, the size in the index, tensors, config values.
-pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Vec<Fault> {
+/// Faults of the loads: prefixes, quantised modules, the size in the index, tensors, and config values that the stored
+/// tensors contradict.
+pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[Vote]) -> Vec<Fault> {
     let mut faults: Vec<Fault> = loads.iter().flat_map(prefixes).collect();
     let without_class = if loads.is_empty() { quantised(inputs, None) } else { None };
     let modules = loads.first().and_then(|load| load.prediction.quantised.as_ref()).or(without_class.as_ref());
     faults.extend(quantization::faults(inputs.checkpoint, &inputs.scheme, modules));
     faults.extend(total_size(inputs, loads));
     faults.extend(tensors(loads, inputs.stored).into_iter().map(|fault| compare_tied(inputs.checkpoint, fault)));
-    faults.extend(distinct_votes(loads).iter().map(|vote| {
+    faults.extend(votes.iter().map(|vote| {
         let has_vote = |load: &&ExplainedLoad<'_>| {
             load.votes().is_some_and(|votes| votes.iter().any(|v| v.pointer == vote.pointer))
         };

@@ -136,7 +136,7 @@ fn a_config_value_explains_the_tensors_that_follow_from_it() {
     let votes = explain::distinct_votes(&loads);
     let [vote] = votes.as_slice() else { panic!("{votes:?}") };
     assert_eq!((vote.pointer.as_str(), &vote.voted_value), ("/num_hidden_layers", &json!(2)));
-    assert_eq!(kinds(&faults::faults(&inputs, &loads)), [FaultKind::ConfigOutvoted]);
+    assert_eq!(kinds(&faults::faults(&inputs, &loads, &votes)), [FaultKind::ConfigOutvoted]);
 }
 
 #[test]

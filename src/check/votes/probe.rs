@@ -43,8 +43,18 @@ pub(super) struct ProbedKey {
 
 /// The values that names or shapes depend on, found by changing many at once and splitting where something changed.
 pub(super) fn keys(space: &Space<'_>, config: &Value, base: &Expected) -> Vec<ProbedKey> {
+    keys_among(space, config, base, space.shaping(&base.config))
+}
+
+/// As [`keys`], of the values at these pointers only.
+pub(super) fn keys_among(
+    space: &Space<'_>,
+    config: &Value,
+    base: &Expected,
+    pointers: impl IntoIterator<Item = String>,
+) -> Vec<ProbedKey> {
     let mut kinds: BTreeMap<u8, Vec<(String, Value, Value)>> = BTreeMap::new();
-    for pointer in space.shaping(&base.config) {
+    for pointer in pointers {
         let Some(value) = base.config.pointer(&pointer) else { continue };
         let Some(other) = other(value) else { continue };
         let kind = match value {

@@ -19,7 +19,7 @@ pub fn vote(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> 
     run(architecture, config, stored, false)
 }
 
-/// As [`vote`]; with `changed`, values are only counted if one had to change.
+/// As [`vote`]; with `changed`, only votes on the values that had to change.
 pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Stored, changed: bool) -> Option<Votes> {
     let mut space = Space::new(architecture, stored);
     let mut state = SearchState::new(&mut space, config.clone())?;
@@ -35,8 +35,8 @@ pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Store
         }
         state.distance = space.distance(&state.built);
     }
-    let (votes, undecided) = if changed && state.changed.is_empty() {
-        (Vec::new(), Vec::new())
+    let (votes, undecided) = if changed {
+        (tally::votes_on_changes(&space, &state, config, &said), Vec::new())
     } else {
         tally::votes(&space, &state, config, &said)
     };

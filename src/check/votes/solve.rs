@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use super::probe::{ProbedKey, Tally, by_dimensions, by_names, dimensions, keys, stored_dimension};
+use super::probe::{ProbedKey, Tally, by_dimensions, by_names, dimensions, keys, keys_among, stored_dimension};
 use super::space::{Space, with};
 use crate::checkpoint::pointer;
 use crate::knowledge::Expected;
@@ -125,7 +125,12 @@ pub(super) fn solve(space: &Space<'_>, start: SearchState) -> SearchState {
         }
         let found = keys(space, &state.config, &state.built);
         state = directly(space, &found, state);
-        let found = if state.distance < before { keys(space, &state.config, &state.built) } else { found };
+        let found = if state.distance < before {
+            // The next round looks for others that now matter.
+            keys_among(space, &state.config, &state.built, found.into_iter().map(|key| key.pointer))
+        } else {
+            found
+        };
         state = one_by_one(space, &found, state);
         if state.distance >= before {
             break;

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::probe::{ProbedKey, dimensions, keys, stored_dimension};
+use super::probe::{ProbedKey, dimensions, keys, keys_among, stored_dimension};
 use super::solve::SearchState;
 use super::space::{Space, with};
 use super::vote::{Undecided, Vote, Witness};
@@ -13,7 +13,21 @@ use crate::knowledge::Expected;
 /// Tensors named for one vote.
 const WITNESSES: usize = 3;
 
-/// The votes on every value that shapes the class.
+/// The votes on the values that the search changed.
+pub(super) fn votes_on_changes(space: &Space<'_>, state: &SearchState, given: &Value, said: &Value) -> Vec<Vote> {
+    let state = &pinned(space, state);
+    let keys = keys_among(space, &state.config, &state.built, state.changed.iter().cloned());
+    keys.iter().map(|key| vote(space, key, state, given, said)).collect()
+}
+
+/// The state with computed values written out, so that each value is independent: `head_dim` no longer follows
+/// `hidden_size`.
+fn pinned(space: &Space<'_>, state: &SearchState) -> SearchState {
+    let pinned = SearchState::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
+    pinned.map_or_else(|| state.clone(), |pinned| SearchState { changed: state.changed.clone(), ..pinned })
+}
+
+/// The votes on every value that shapes the class, and the values that no tensor decides.
 ///
 /// `said` is the config as it was given with defaults filled in, `given` that without them.
 pub(super) fn votes(
@@ -22,10 +36,7 @@ pub(super) fn votes(
     given: &Value,
     said: &Value,
 ) -> (Vec<Vote>, Vec<Undecided>) {
-    // With computed values written out, each value is independent: `head_dim` no longer follows `hidden_size`.
-    let pinned = SearchState::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
-    let state =
-        &pinned.map_or_else(|| state.clone(), |pinned| SearchState { changed: state.changed.clone(), ..pinned });
+    let state = &pinned(space, state);
     let keys = keys(space, &state.config, &state.built);
     let undecided = undecided(&keys, state);
     let loose: BTreeSet<&str> = undecided.iter().flat_map(|u| &u.pointers).map(String::as_str).collect();

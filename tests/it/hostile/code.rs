@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
+use super::run::large;
 use super::{Case, bounded, case};
 
 const MODULE: &str = "modeling_x.py";
@@ -81,7 +82,7 @@ fn auto_maps() -> Vec<Case> {
         of("a megabyte", "AUT001", json!(format!("{}.X", "m".repeat(200)))),
         case("X3", "auto_map a string", "AUT003", "config.json", |d| d.set("/auto_map", &json!("modeling_x.X"))),
         case("X3", "ninety thousand entries", "AUT003 AUT004", "config.json", |d| {
-            let entries = (0..90_000).map(|i| (format!("Auto{i}"), json!(format!("../evil{i}.X"))));
+            let entries = (0..large(90_000)).map(|i| (format!("Auto{i}"), json!(format!("../evil{i}.X"))));
             d.set("/auto_map", &Value::Object(entries.collect()));
         }),
         case("X3", "a module that is a FIFO", "FIL001", MODULE, |d| {

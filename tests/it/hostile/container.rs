@@ -1,6 +1,7 @@
 //! Rows C: the safetensors container.
 
 use super::place::{SHARD, entry, file, header, nested};
+use super::run::large;
 use super::{Case, case, clean};
 
 /// A whole shard with one tensor `a` of four bytes.
@@ -281,7 +282,8 @@ fn names() -> Vec<Case> {
             d.tensors(&entry("a\u{202e}b\u{200b}c\u{e0041}", "U8", "[1]", 0, 1), 1);
         }),
         case("C13", "a hundred thousand escape codes", "SAF020", SHARD, |d| {
-            let entries: Vec<_> = (0..100_000).map(|i| entry(&format!(r"\u001b[{i}m"), "U8", "[0]", 0, 0)).collect();
+            let entries: Vec<_> =
+                (0..large(100_000)).map(|i| entry(&format!(r"\u001b[{i}m"), "U8", "[0]", 0, 0)).collect();
             d.tensors(&entries.join(","), 0);
         }),
     ]

@@ -1,6 +1,7 @@
 //! Rows J1 to J6 and J8: documents as text.
 
 use super::place::{Dir, INDEX, nested};
+use super::run::large;
 use super::{Case, bounded, case, clean};
 
 const CONFIG: &str = "config.json";
@@ -244,6 +245,8 @@ fn size() -> Vec<Case> {
             d.llama();
             d.put("vocab.txt", "\n".repeat(30_000_000));
         }),
-        bounded("J8", "60 MB of spaces", |d| d.config(format!("{{{}\"model_type\":\"x\"}}", " ".repeat(60_000_000)))),
+        bounded("J8", "60 MB of spaces", |d| {
+            d.config(format!("{{{}\"model_type\":\"x\"}}", " ".repeat(large(60_000_000))));
+        }),
     ]
 }

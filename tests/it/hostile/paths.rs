@@ -1,6 +1,7 @@
 //! Rows P: the index, and all strings used as paths.
 
 use super::place::{Dir, INDEX, SHARD, entry, file, header, numbered};
+use super::run::large;
 use super::{Case, case, clean};
 
 /// The two members of a sound `weight_map`.
@@ -205,7 +206,7 @@ fn doubles() -> Vec<Case> {
 /// P9: a hundred thousand findings.
 fn many() -> Vec<Case> {
     let members = |value: fn(usize) -> String| {
-        let members = (0..100_000).map(|i| format!(r#""t{i}": "{}""#, value(i)));
+        let members = (0..large(100_000)).map(|i| format!(r#""t{i}": "{}""#, value(i)));
         members.collect::<Vec<_>>().join(", ")
     };
     let of = |name: &str, code, value: fn(usize) -> String| {

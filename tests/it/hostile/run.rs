@@ -107,6 +107,12 @@ pub fn optimised() -> Option<OsString> {
     std::env::var_os("CKPT_DOCTOR_OPTIMISED")
 }
 
+/// The size of a large case: as given for an optimised program, and a tenth for the test build, which reads ten times
+/// slower. The verdicts are the same.
+pub fn large(size: usize) -> usize {
+    if optimised().is_some() { size } else { size / 10 }
+}
+
 /// The exit status; `None` if the run did not end. The shell sets the limits and is replaced by the program.
 fn run(args: &[&OsStr], checkpoints: u64, out: &Path, report: &Path, programs: &Path) -> Option<ExitStatus> {
     let optimised = optimised();

@@ -5,6 +5,7 @@ use std::os::unix::ffi::OsStrExt as _;
 use std::os::unix::net::UnixListener;
 
 use super::place::{Dir, INDEX, SHARD, entry, file, header};
+use super::run::large;
 use super::{Case, bounded, case, clean};
 
 pub fn cases() -> Vec<Case> {
@@ -87,7 +88,7 @@ fn names() -> Vec<Case> {
         }),
         bounded("F4", "twenty thousand files", |d| {
             d.small();
-            for i in 0..20_000 {
+            for i in 0..large(20_000) {
                 d.put(&format!("{i}.txt"), "");
             }
         }),

@@ -8,7 +8,7 @@ use crate::check::Outcome;
 use crate::checkpoint::escape;
 use crate::knowledge::rule::RuleSet;
 
-/// Maximum length of a reason, in characters; `explain` prints whole conditions.
+/// Maximum length of a reason, in characters: that of a rule of the user ends with its condition.
 const REASON: usize = 100;
 
 /// Prints why each skipped rule was skipped; rules with the same reason share a line.
