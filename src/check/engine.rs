@@ -9,6 +9,7 @@ use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, Stored, Target};
 use super::outcome::Outcome;
+use super::verdict::Basis;
 use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
@@ -98,6 +99,15 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects).filter_map(|effect| effect.object);
+    let basis = Basis {
+        checkpoint,
+        findings: &outcome.findings,
+        loads: &outcome.loads,
+        unpredicted: &judged.unpredicted,
+        unjudged: &unjudged.collect(),
+    };
+    outcome.verdicts = basis.verdicts(&context.targets);
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
 }
