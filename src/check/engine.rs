@@ -71,6 +71,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let targets = load::wanted(config, versions);
     let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
     scope.bind("loaders", &leading.collect());
+    scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };

@@ -81,7 +81,7 @@ pub struct PredictedLoad {
     pub verdict: LoadVerdict,
     /// The objects that the checkpoint offers, the worst first.
     pub objects: Vec<ObjectVerdict>,
-    /// The state dict compared with the class; null when it was not.
+    /// The state dict compared with the class; null when it was not. Without shards, the names of the index are compared.
     pub tensors: Option<LoadReport>,
 }
 
@@ -143,6 +143,11 @@ impl Basis<'_> {
         targets.iter().map(verdict).collect()
     }
 
+    /// Whether any tensor was read; the names of an index alone tell nothing of a load.
+    fn was_read(&self) -> bool {
+        self.checkpoint.tensors().next().is_some()
+    }
+
     fn report(&self, loader: &str) -> Option<&LoadReport> {
         self.loads.iter().find(|report| report.loader == loader)
     }
@@ -191,8 +196,12 @@ impl Basis<'_> {
         if self.checkpoint.config().is_none() {
             return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));
         }
-        if let Some(report) = self.report(loader) {
-            return of_report(report);
+        match self.report(loader) {
+            Some(_) if !self.was_read() => {
+                return (LoadVerdict::NotPredicted, Some("no tensor was read".to_owned()));
+            }
+            Some(report) => return of_report(report),
+            None => {}
         }
         let known = self.unpredicted.iter().find(|(of, _)| *of == loader).map(|(_, why)| why.clone());
         (LoadVerdict::NotPredicted, Some(known.unwrap_or_else(|| "its class is unknown".to_owned())))

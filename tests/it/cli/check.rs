@@ -254,7 +254,7 @@ fn a_part_of_another_loader_is_built_as_by_that_loader() {
     fs::write(dir.path().join("model.safetensors.index.json"), index.to_string()).unwrap();
     let path = dir.path().to_str().unwrap();
     let loads = |more: &[&str]| {
-        let (_, report) = report(&[&["check", path, "--output-format", "json"], more].concat());
+        let (_, report) = report(&[&["check", path, "--metadata-only", "--output-format", "json"], more].concat());
         let found = report["checkpoints"][0].clone();
         let codes = found["findings"].as_array().unwrap().iter().map(|f| f["code"].as_str().unwrap().to_owned());
         (
@@ -262,7 +262,7 @@ fn a_part_of_another_loader_is_built_as_by_that_loader() {
                 .as_array()
                 .unwrap()
                 .iter()
-                .filter(|load| !load["tensors"].is_null())
+                .filter(|load| load["objects"][0]["why"] == "no tensor was read")
                 .map(|load| load["loader"].clone())
                 .collect::<Vec<_>>(),
             codes.collect::<Vec<_>>(),
