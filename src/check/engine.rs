@@ -5,16 +5,17 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, Location, Skipped};
+use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
-use super::load::{self, Stored};
+use super::load::{self, Stored, Target};
 use super::outcome::Outcome;
+use super::verdict::Basis;
 use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
-use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule};
+use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Object, Rule};
 use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
 
 /// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
@@ -25,6 +26,13 @@ const STEPS: u64 = 2_000_000;
 
 /// Places of one finding that are kept, for the same reason.
 const PLACES: usize = 1000;
+
+/// What every rule of a run sees.
+struct Context<'a> {
+    bench: Bench<'a>,
+    /// The versions of transformers of the run.
+    targets: Vec<Target>,
+}
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
 #[must_use]
@@ -63,14 +71,15 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let targets = load::wanted(config, versions);
     let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
     scope.bind("loaders", &leading.collect());
+    scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
-    let bench = Bench::new(checkpoint);
+    let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
     for rule in &knowledge.rules.rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
-            Some(_) => within(STEPS, || evaluate(rule, &bench, &faults, &scope, architecture)),
-            None => (evaluate(rule, &bench, &faults, &scope, architecture), false),
+            Some(_) => within(STEPS, || evaluate(rule, &context, &faults, &scope, architecture)),
+            None => (evaluate(rule, &context, &faults, &scope, architecture), false),
         };
         if stopped {
             let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
@@ -91,6 +100,15 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects).filter_map(|effect| effect.object);
+    let basis = Basis {
+        checkpoint,
+        findings: &outcome.findings,
+        loads: &outcome.loads,
+        unpredicted: &judged.unpredicted,
+        unjudged: &unjudged.collect(),
+    };
+    outcome.verdicts = basis.verdicts(&context.targets);
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
 }
@@ -99,9 +117,10 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
     let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(named);
-    let bench = Bench::new(checkpoint);
+    // Without a loader: these faults concern no load.
+    let context = Context { bench: Bench::new(checkpoint), targets: Vec::new() };
     let mut findings: Vec<Finding> =
-        rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect();
+        rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);
     findings
 }
@@ -126,7 +145,7 @@ fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option
 /// The findings of a rule, or the reason why it was skipped.
 fn evaluate(
     rule: &Rule,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
     architecture: Option<&str>,
@@ -135,10 +154,11 @@ fn evaluate(
         let is = architecture.unwrap_or("unknown");
         return Err(format!("applies to {}; the architecture is {is}", rule.applies.join(", ")));
     }
-    let cannot = |expression: &Expression, error: &EvalError| match variables::absent(bench.checkpoint, expression) {
-        Some(file) => format!("{file} is missing"),
-        None => format!("cannot be evaluated: {}", error.cause),
-    };
+    let cannot =
+        |expression: &Expression, error: &EvalError| match variables::absent(context.bench.checkpoint, expression) {
+            Some(file) => format!("{file} is missing"),
+            None => format!("cannot be evaluated: {}", error.cause),
+        };
     if let Some(when) = &rule.when {
         match when.eval_bool(scope) {
             Ok(true) => {}
@@ -148,7 +168,7 @@ fn evaluate(
             Err(error) => return Err(cannot(when, &error)),
         }
     }
-    run(rule, bench, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
+    run(rule, context, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
 /// An expression that could not be evaluated, and the error.
@@ -156,13 +176,13 @@ type Unevaluated<'r> = (&'r Expression, EvalError);
 
 fn run<'r>(
     rule: &'r Rule,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let mut findings = match &rule.check {
-        Check::Fault(check) => from_faults(rule, check, bench, faults, scope),
-        Check::Assert(check) => from_assert(rule, check, bench, scope)?,
+        Check::Fault(check) => from_faults(rule, check, context, faults, scope),
+        Check::Assert(check) => from_assert(rule, check, context, scope)?,
     };
     let more = findings.len().saturating_sub(CAP);
     if more > 0 {
@@ -177,7 +197,7 @@ fn run<'r>(
 fn from_faults(
     rule: &Rule,
     check: &FaultCheck,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Vec<Finding> {
@@ -192,11 +212,15 @@ fn from_faults(
         let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
         let mut evidence = first.detail.clone();
         evidence.insert("count".to_owned(), json!(count));
-        let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, count)));
+        let fix = all.iter().map(|f| hint(rule, context, f, &fault_scope(scope, f, count)));
         let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
         let mut inner = fault_scope(scope, first, count);
         inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
-        return vec![finding(rule, &inner, places, evidence, fix)];
+        let mut caused = Caused::default();
+        for fault in all.iter().take(PLACES) {
+            caused.add(rule, &context.targets, &fault.loaders, &fault_scope(scope, fault, count));
+        }
+        return vec![finding(rule, &inner, caused, places, evidence, fix)];
     }
     let mut out = Vec::new();
     let mut more = 0_u64;
@@ -204,15 +228,17 @@ fn from_faults(
         let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
         more = more.saturating_add(fault.hidden);
         let inner = fault_scope(scope, fault, 1);
-        let fix = hint(rule, bench, fault, &inner);
-        out.push(finding(rule, &inner, locate(&places), fault.detail.clone(), fix));
+        let fix = hint(rule, context, fault, &inner);
+        let mut caused = Caused::default();
+        caused.add(rule, &context.targets, &fault.loaders, &inner);
+        out.push(finding(rule, &inner, caused, locate(&places), fault.detail.clone(), fix));
     }
     // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
     for fault in matching {
         more = more.saturating_add(fault.hidden).saturating_add(1);
         let last = out.last_mut().and_then(|last| last.fix.as_mut());
         if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
-            && let Some(fix) = hint(rule, bench, fault, &fault_scope(scope, fault, 1))
+            && let Some(fix) = hint(rule, context, fault, &fault_scope(scope, fault, 1))
             && fix.safety == last.safety
         {
             last.edits.extend(fix.edits);
@@ -251,11 +277,11 @@ fn variables(fault: &Fault) -> Map<String, Value> {
 fn from_assert<'r>(
     rule: &'r Rule,
     check: &'r Assert,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let Some(each) = &check.each else {
-        let found = one_assert(rule, check, bench, scope).map_err(|error| (&check.that, error))?;
+        let found = one_assert(rule, check, context, scope).map_err(|error| (&check.that, error))?;
         return Ok(found.into_iter().collect());
     };
     let items = match each.eval(scope).map_err(|error| (each, error))? {
@@ -267,18 +293,25 @@ fn from_assert<'r>(
         let mut inner = scope.child();
         inner.bind("it", &item);
         // A missing value cannot be wrong; another rule reports it when it is required.
-        out.extend(one_assert(rule, check, bench, &inner).unwrap_or(None));
+        out.extend(one_assert(rule, check, context, &inner).unwrap_or(None));
     }
     Ok(out)
 }
 
-fn one_assert(rule: &Rule, check: &Assert, bench: &Bench<'_>, scope: &Scope<'_>) -> Result<Option<Finding>, EvalError> {
+fn one_assert(
+    rule: &Rule,
+    check: &Assert,
+    context: &Context<'_>,
+    scope: &Scope<'_>,
+) -> Result<Option<Finding>, EvalError> {
     if check.that.eval_bool(scope)? {
         return Ok(None);
     }
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
-    let fix = fix::hint(&rule.fixes, &Site { bench, fault: None, scope });
-    Ok(Some(finding(rule, scope, locate(&places), Map::new(), fix)))
+    let fix = fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: None, scope });
+    let mut caused = Caused::default();
+    caused.add(rule, &context.targets, &[], scope);
+    Ok(Some(finding(rule, scope, caused, locate(&places), Map::new(), fix)))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {
@@ -286,8 +319,8 @@ fn place(at: &At, scope: &Scope<'_>) -> Place {
     Place { file: render(&at.file), span: None, pointer: render(&at.pointer), tensor: render(&at.tensor) }
 }
 
-fn hint(rule: &Rule, bench: &Bench<'_>, fault: &Fault, scope: &Scope<'_>) -> Option<FixHint> {
-    fix::hint(&rule.fixes, &Site { bench, fault: Some(fault), scope })
+fn hint(rule: &Rule, context: &Context<'_>, fault: &Fault, scope: &Scope<'_>) -> Option<FixHint> {
+    fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: Some(fault), scope })
 }
 
 /// The fix of a finding for several faults: all their edits, if they have the same safety.
@@ -305,6 +338,7 @@ fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
 fn finding(
     rule: &Rule,
     scope: &Scope<'_>,
+    caused: Caused,
     locations: Vec<Location>,
     evidence: Map<String, Value>,
     fix: Option<FixHint>,
@@ -312,13 +346,56 @@ fn finding(
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity: rule.severity,
+        severity: rule.severity_given(caused.leading, !caused.effects.is_empty()),
         message: rule.message.render(scope),
         details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
+        effects: caused.effects,
         locations,
         evidence,
         fix,
         hidden: 0,
+    }
+}
+
+/// The effects of one finding.
+#[derive(Default)]
+struct Caused {
+    /// One effect for each object, loader and consequence.
+    effects: Vec<FindingEffect>,
+    /// Whether a leading loader has one.
+    leading: bool,
+}
+
+impl Caused {
+    /// Adds the effects of `rule` under the loaders of a fault; all of the run if `loaders` is empty.
+    fn add(&mut self, rule: &Rule, targets: &[Target], loaders: &[&str], scope: &Scope<'_>) {
+        for effect in &rule.effects {
+            let holds = |when: &Expression| when.eval_bool(scope).unwrap_or(false);
+            if !effect.when.as_ref().is_none_or(holds) {
+                continue;
+            }
+            let file = scope.get("file");
+            let reader = || Object::reading(file.as_ref()?.as_str()?);
+            let Some(object) = effect.object.or_else(reader) else { continue };
+            for target in targets {
+                let loader = target.loader.version();
+                let is_meant = loaders.is_empty() || loaders.contains(&loader);
+                let same = |e: &FindingEffect| {
+                    (e.object, e.outcome, e.loader.as_str()) == (object, effect.consequence, loader)
+                };
+                if !is_meant || !effect.loaders.contains(target.version()) || self.effects.iter().any(same) {
+                    continue;
+                }
+                self.leading |= target.leads;
+                self.effects.push(FindingEffect {
+                    object,
+                    loader: loader.to_owned(),
+                    stands_for: target.stands_for.clone(),
+                    outcome: effect.consequence,
+                    text: effect.text.render(scope),
+                });
+            }
+        }
     }
 }
 

@@ -6,7 +6,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::fix::FixHint;
-pub use crate::knowledge::rule::Severity;
+pub use crate::knowledge::rule::{Consequence, Object, Severity};
 
 /// Where a finding points: a file, a place in it, a tensor.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
@@ -44,6 +44,9 @@ pub struct Finding {
     /// Further facts, one sentence each.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub details: Vec<String>,
+    /// What loaders of the run do because of it, the leading ones first.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub effects: Vec<FindingEffect>,
     /// Places; empty if the finding concerns the whole checkpoint.
     pub locations: Vec<Location>,
     /// The figures behind the message.
@@ -66,6 +69,24 @@ impl Finding {
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
 const fn is_zero(n: &u64) -> bool {
     *n == 0
+}
+
+/// What one loader does with one object because of a finding.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct FindingEffect {
+    /// The object that fails.
+    pub object: Object,
+    /// Version of transformers that was read for this effect: `4.47.0`.
+    pub loader: String,
+    /// The version that the user named, or that wrote config.json, when `loader` stands for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stands_for: Option<String>,
+    /// How the object fails.
+    pub outcome: Consequence,
+    /// The exception with its message, or what becomes wrong.
+    pub text: String,
 }
 
 /// A finding that settings or a baseline accept.

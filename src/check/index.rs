@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, adapter, pointer};
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
@@ -299,7 +299,22 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     if names.is_empty() && checkpoint.has_file("config.json") {
         return weights_elsewhere(checkpoint).into_iter().collect();
     }
-    Vec::new()
+    unread_weights(checkpoint, &names).into_iter().collect()
+}
+
+/// For a model of transformers whose shards all have names that no loader reads: no weights, with these names.
+fn unread_weights(checkpoint: &Checkpoint, names: &[&str]) -> Option<Fault> {
+    let config = checkpoint.config()?;
+    let is_model = config.get("model_type").is_some() || config.get("architectures").is_some();
+    // Directories of adapters and of other libraries have names of their own.
+    let is_other = checkpoint.has_file(adapter::CONFIG) || config.get("_class_name").is_some();
+    let is_read = |name: &&str| matches!(*name, "pytorch_model.bin" | "pytorch_model.bin.index.json");
+    let has_pickle = checkpoint.entries.keys().any(|name| is_read(&name.as_str()));
+    if !is_model || is_other || has_pickle || names.is_empty() {
+        return None;
+    }
+    let fault = Fault::new(FaultKind::NoWeights).with("unread", names.to_vec());
+    Some(names.iter().fold(fault, |fault, name| fault.at(Place::file(*name))))
 }
 
 /// For numbered shards without an index: the index, and the numbers that are missing.

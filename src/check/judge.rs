@@ -17,7 +17,7 @@ mod tests;
 
 use serde_json::Value;
 
-use super::load::{LoadReport, Stored};
+use super::load::{LoadReport, Stored, Target};
 use super::votes::Vote;
 use crate::checkpoint::{Checkpoint, Fault};
 use crate::knowledge::Knowledge;
@@ -32,6 +32,10 @@ pub struct Judgement {
     pub config: Value,
     /// A report for each loader.
     pub loads: Vec<LoadReport>,
+    /// The versions of transformers that have the class.
+    pub targets: Vec<Target>,
+    /// For each other loader that was tried, why its load is not predicted.
+    pub unpredicted: Vec<(&'static str, String)>,
     /// Faults for the rules.
     pub faults: Vec<Fault>,
     /// Config values that stored tensors contradict.
@@ -67,6 +71,8 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let targets = classes::resolve_targets(&inputs);
     let architecture = targets.first().map(|target| target.architecture.name().to_owned());
     let classes = classes::build_classes(&inputs, targets);
+    let targets = classes.iter().map(|one| one.target.clone()).collect();
+    let unpredicted = classes::unpredicted(&inputs, &classes);
     let mut faults = classes::faults(&inputs, &classes);
     let loads = explain::explain(&inputs, predict::predict(&inputs, classes));
     let votes = explain::distinct_votes(&loads);
@@ -75,5 +81,5 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let loads: Vec<LoadReport> =
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();
     faults.extend(faults::undeclared_scheme(&inputs, &loads));
-    Judgement { architecture, config, loads, faults, votes }
+    Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
 }

@@ -22,10 +22,11 @@ use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
 
 pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
+pub(crate) use report::version;
 pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
-pub(super) use target::wanted;
 pub use target::{Target, targets};
+pub(super) use target::{of_run, wanted};
 
 /// Predicts the lists of the loader that `expected` was built for.
 #[must_use]

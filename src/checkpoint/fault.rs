@@ -23,6 +23,8 @@ pub struct Fault {
     pub places: Vec<Place>,
     /// Figures and names for the message, under the names that the rule's message uses.
     pub detail: Map<String, Value>,
+    /// Versions of the loaders whose predicted load has the fault; empty for a fault of the checkpoint itself.
+    pub loaders: Vec<&'static str>,
     /// Further faults of this kind in this file, which are counted and not kept.
     pub hidden: u64,
 }
@@ -31,13 +33,20 @@ impl Fault {
     /// A fault of `kind` without places or details.
     #[must_use]
     pub(crate) fn new(kind: FaultKind) -> Self {
-        Self { kind, places: Vec::new(), detail: Map::new(), hidden: 0 }
+        Self { kind, places: Vec::new(), detail: Map::new(), loaders: Vec::new(), hidden: 0 }
     }
 
     /// Adds a place.
     #[must_use]
     pub(crate) fn at(mut self, place: Place) -> Self {
         self.places.push(place);
+        self
+    }
+
+    /// Adds the version of a loader whose predicted load has the fault.
+    #[must_use]
+    pub(crate) fn under(mut self, loader: &'static str) -> Self {
+        self.loaders.push(loader);
         self
     }
 

@@ -9,13 +9,13 @@ use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
 use super::settings::{SettingsResolver, Typed};
-use crate::knowledge::Template;
-use crate::knowledge::rule::{Fix, Rule, RuleSet, Safety, example};
+use crate::knowledge::rule::{Fix, Object, Rule, RuleSet, Safety, example};
+use crate::knowledge::{Loader, Template};
 
 /// Runs `rules`: lists the selected rules.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let here = SettingsResolver::new(Typed::new(args, rules)).resolve(Path::new("."))?;
-    let rows = here.knowledge.rules.rules.iter().map(|rule| [&rule.code, rule.severity.name(), &rule.name]);
+    let rows = here.knowledge.rules.rules.iter().map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name]);
     output::print(&table(rows))?;
     Ok(CLEAN)
 }
@@ -46,14 +46,15 @@ fn family(rules: &RuleSet, word: &str) -> Option<String> {
     let members: Vec<&Rule> = rules.all().filter(is_member).collect();
     let title = rules.catalogue.families.iter().find(|(family, _)| *family == word);
     let title = title.map(|(_, title)| format!(": {title}")).unwrap_or_default();
-    let rows =
-        members.iter().map(|rule| [&rule.code, rule.severity.name(), &rule.name, &rule.summary].map(AsRef::as_ref));
+    let rows = members
+        .iter()
+        .map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name, &rule.summary].map(AsRef::as_ref));
     (!members.is_empty()).then(|| format!("{word}{title}\n\n{}", table(rows)))
 }
 
 fn page(rule: &Rule) -> Result<String, fmt::Error> {
     let mut out = String::new();
-    writeln!(out, "{} {} ({})\n", rule.code, rule.name, rule.severity.name())?;
+    writeln!(out, "{} {} ({})\n", rule.code, rule.name, rule.highest_severity().name())?;
     writeln!(out, "What it reports\n  {}\n", rule.summary)?;
     writeln!(out, "Why it matters\n  {}", rule.why)?;
     if !rule.applies.is_empty() {
@@ -62,6 +63,12 @@ fn page(rule: &Rule) -> Result<String, fmt::Error> {
     match example(&rule.code).filter(|_| rule.origin.is_none()) {
         Some(example) => writeln!(out, "\nExample\n  {}", example.replace('\n', "\n  "))?,
         None => writeln!(out, "\nMessage\n  {}", rule.message.prose())?,
+    }
+    if let Some(harm) = rule.harm {
+        writeln!(out, "\nHarm\n  {}", harm.name())?;
+    }
+    if !rule.effects.is_empty() {
+        writeln!(out, "\nEffects\n  {}", effects(rule).trim_end().replace('\n', "\n  "))?;
     }
     for fix in &rule.fixes {
         writeln!(out, "\nFix ({})", safety(fix.safety))?;
@@ -76,6 +83,24 @@ fn page(rule: &Rule) -> Result<String, fmt::Error> {
         writeln!(out, "\nReferences\n  {}", rule.references.join("\n  "))?;
     }
     Ok(out)
+}
+
+/// The effects of a rule, with a column for each known loader.
+fn effects(rule: &Rule) -> String {
+    let header = ["object"].into_iter().chain(Loader::ALL.map(Loader::version)).chain(["what happens"]);
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.add_row(header);
+    for effect in &rule.effects {
+        let under = |loader: Loader| {
+            if effect.loaders.contains(loader.version()) { effect.consequence.name() } else { "-" }
+        };
+        let happens = effect.text.prose();
+        let happens = if effect.when.is_some() { format!("{happens} (in some cases)") } else { happens };
+        let object = effect.object.map_or("by file", Object::name);
+        table.add_row([object].into_iter().chain(Loader::ALL.map(under)).chain([happens.as_str()]));
+    }
+    table.lines().fold(String::new(), |text, line| text + line.trim() + "\n")
 }
 
 fn texts(fix: &Fix) -> impl Iterator<Item = String> {

@@ -4,16 +4,18 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 mod catalogue;
+mod effect;
 mod fix;
 
 pub use catalogue::{Catalogue, example};
+pub use effect::{Consequence, Effect, Harm, Object};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template};
 use super::source::{self, DataError};
 use crate::checkpoint::FaultKind;
 
-/// Severity of a rule and of all its findings.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
@@ -47,8 +49,17 @@ pub struct Rule {
     pub code: String,
     /// The fault in kebab case: `shard-missing`.
     pub name: String,
-    /// Severity of every finding of this rule.
-    pub severity: Severity,
+    /// Severity of a finding without effect; required for a rule without `effects` and `harm`, else info when missing.
+    #[serde(default)]
+    pub severity: Option<Severity>,
+    /// What loaders do with such a checkpoint. A finding is an error when a loader that the user named or that wrote the
+    /// checkpoint has an effect, and a warning when only another loader has one.
+    #[serde(default)]
+    #[cfg_attr(test, schemars(with = "Vec<effect::EffectKeys>"))]
+    pub effects: Vec<Effect>,
+    /// Harm of the fault besides what loaders do; every finding is an error.
+    #[serde(default)]
+    pub harm: Option<Harm>,
     /// What is wrong, as one line.
     pub summary: String,
     /// The consequence, in whole sentences: what a loader does.
@@ -77,10 +88,33 @@ pub struct Rule {
     /// Path of the file, for a rule from `--rules`.
     #[serde(skip)]
     pub origin: Option<String>,
+    /// Severity that settings give every finding.
+    #[serde(skip)]
+    pub regraded: Option<Severity>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
     #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
+}
+
+impl Rule {
+    /// Severity of a finding, by whether a leading loader and whether any loader of the run has an effect.
+    #[must_use]
+    pub fn severity_given(&self, leading: bool, any: bool) -> Severity {
+        let stated = self.severity.unwrap_or(Severity::Info);
+        self.regraded.unwrap_or(match (self.harm, leading, any) {
+            (Some(_), ..) | (None, true, _) => stated.max(Severity::Error),
+            (None, false, true) => stated.max(Severity::Warning),
+            (None, false, false) => stated,
+        })
+    }
+
+    /// The highest severity that a finding of this rule can have.
+    #[must_use]
+    pub fn highest_severity(&self) -> Severity {
+        let any = !self.effects.is_empty();
+        self.severity_given(any, any)
+    }
 }
 
 /// What a rule checks.
@@ -127,7 +161,8 @@ pub struct FaultCheck {
 /// - `chat_templates`: templates by file;
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
-/// - `loaders`: versions of transformers to check for.
+/// - `loaders`: versions of transformers to check for;
+/// - `metadata_only`: weights may be missing.
 ///
 /// Functions are `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, and `stays_random(tensor)`:
 /// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
@@ -209,6 +244,9 @@ impl RuleSet {
                     rule.code
                 ));
             }
+            if rule.severity.is_none() && rule.effects.is_empty() && rule.harm.is_none() {
+                return wrong(format!("{} needs a `severity`, `effects` or a `harm`", rule.code));
+            }
             for fix in &rule.fixes {
                 if let Err(reason) = fix.check() {
                     return wrong(reason);
@@ -243,4 +281,40 @@ fn fault_kinds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<FaultKi
         })
     };
     names.iter().map(kind).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rule(keys: &str) -> Result<Rule, DataError> {
+        let text = format!(
+            "{{ code: 'ABC001', name: 'a-b', summary: 's', why: 'w', check: {{ assert: {{ that: 'true' }} }}, message: 'm', {keys} }}"
+        );
+        let set = RuleSet::default().and_files([("ABC001.json5".to_owned(), text.as_str())])?;
+        Ok(set.find("ABC001").cloned().unwrap_or_else(|e| panic!("{e}")))
+    }
+
+    #[test]
+    fn severity_follows_from_effects() {
+        use Severity::{Error, Info, Warning};
+        let effect = "effects: [{ on: 'model', raises: 'KeyError' }]";
+        for (keys, leading, other, none) in [
+            (effect.to_owned(), Error, Warning, Info),
+            (format!("severity: 'warning', {effect}"), Error, Warning, Warning),
+            ("severity: 'warning'".to_owned(), Error, Warning, Warning),
+            ("severity: 'info'".to_owned(), Error, Warning, Info),
+            ("harm: 'integrity'".to_owned(), Error, Error, Error),
+            (format!("harm: 'security', {effect}"), Error, Error, Error),
+        ] {
+            let rule = rule(&keys).unwrap();
+            let found = [(true, true), (false, true), (false, false)].map(|(l, any)| rule.severity_given(l, any));
+            assert_eq!(found, [leading, other, none], "{keys}");
+            let regraded = Rule { regraded: Some(Info), ..rule };
+            assert_eq!(regraded.severity_given(true, true), Info, "{keys}");
+        }
+        assert_eq!(rule(effect).unwrap().highest_severity(), Error);
+        assert_eq!(rule("severity: 'warning'").unwrap().highest_severity(), Warning);
+        assert!(rule("").unwrap_err().to_string().contains("needs a `severity`"));
+    }
 }

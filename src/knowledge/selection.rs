@@ -73,7 +73,7 @@ impl RuleSet {
         for rule in &mut self.rules {
             let graded = words.iter().filter_map(|(word, to)| Some((specificity(word, rule)?, *to)));
             if let Some((_, severity)) = graded.max_by_key(|(exactness, _)| *exactness) {
-                rule.severity = severity;
+                rule.regraded = Some(severity);
             }
         }
         Ok(())
@@ -174,7 +174,7 @@ mod tests {
     fn severities_follow_the_longer_selector() {
         let mut rules = RuleSet::embedded().unwrap();
         rules.regrade(&[("JSN001", Severity::Info), ("JSN", Severity::Error)]).unwrap();
-        let of = |code: &str| rules.find(code).unwrap().severity;
+        let of = |code: &str| rules.find(code).unwrap().highest_severity();
         assert_eq!((of("JSN001"), of("JSN003")), (Severity::Info, Severity::Error));
         assert!(rules.clone().regrade(&[("JSN0O1", Severity::Info)]).unwrap_err().to_string().contains("did you mean"));
     }

@@ -8,7 +8,7 @@ pub(super) mod paint;
 use std::fmt::Write as _;
 
 use self::paint::Paint;
-use super::format::{agreeing, alike, bytes, capped, counts, name, plural, summary};
+use super::format::{agreeing, alike, bytes, capped, counts, headline, name, objects, plural, summary};
 use super::model::{CheckpointReport, Report};
 use super::{Style, fixes};
 
@@ -23,8 +23,8 @@ pub fn render(report: &Report, style: Style) -> String {
         } else {
             findings(&mut out, checkpoint, style);
             out.push_str(&fixes::section(checkpoint));
-            for loaders in agreeing(&checkpoint.loads) {
-                load::render(&mut out, &loaders, style);
+            for (load, loaders) in agreeing(&checkpoint.loads) {
+                load::render(&mut out, load, &loaders, style);
             }
         }
         out.push('\n');
@@ -47,16 +47,19 @@ fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
         && (&above.path, &above.findings, &above.loads) == (&checkpoint.path, &checkpoint.findings, &checkpoint.loads)
 }
 
-/// `fixtures/vision (donor vision): spatialvla, 690 tensors, 1.23 MB, clean`
+/// `fixtures/vision (donor vision): loads with transformers 4.47.0`, then `spatialvla, 690 tensors, 1.23 MB, clean`, and a
+/// line for each object that does not load.
 fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     out.push_str(&paint.strong(&name(&checkpoint.path)));
     if let Some(role) = &checkpoint.role {
         let _ok = write!(out, " ({})", name(&role.to_string()));
     }
+    if !checkpoint.loads.is_empty() {
+        let _ok = write!(out, ": {}", paint.strong(&headline(&checkpoint.loads)));
+    }
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
-    let _ok = write!(out, ": {architecture}");
     let (tensors, size) = checkpoint.tensors;
-    let _ok = write!(out, ", {}, {}", plural(tensors, "tensor"), bytes(size));
+    let _ok = write!(out, "\n  {architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
@@ -65,6 +68,9 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     let notes: Vec<String> = settings.into_iter().chain(suppressed).collect();
     if !notes.is_empty() {
         let _ok = writeln!(out, "  {}", paint.quiet(&notes.join(", ")));
+    }
+    for line in objects(&checkpoint.loads) {
+        let _ok = writeln!(out, "  {}", paint.quiet(&line));
     }
 }
 

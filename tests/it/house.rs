@@ -11,7 +11,7 @@ use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::quantization::Scheme;
 use ckpt_doctor::knowledge::recipe::Recipe;
 use ckpt_doctor::knowledge::rule::{BuiltInRepair, Check, EditSpec, Rule, RuleSet, Severity};
-use ckpt_doctor::knowledge::{Library, source};
+use ckpt_doctor::knowledge::{Library, Loader, source};
 use regex::Regex;
 use serde_json::Value;
 
@@ -78,7 +78,28 @@ fn rules_follow_the_conventions() {
             hold(!advice.is_match(title.source()), "a title states what the edits do: no `or`, `unless` or `;`");
         }
         // A finding of severity info may need no action.
-        hold(!rule.fixes.is_empty() || rule.severity == Severity::Info, "a rule above info has a fix or help");
+        hold(
+            !rule.fixes.is_empty() || rule.highest_severity() == Severity::Info,
+            "a rule above info has a fix or help",
+        );
+    }
+    none(&wrong);
+}
+
+/// An error states what a loader does, or which harm it stands for.
+#[test]
+fn every_error_has_an_effect_or_a_harm() {
+    let mut wrong = Vec::new();
+    for rule in rules().rules {
+        if rule.severity == Some(Severity::Error) {
+            wrong.push(format!("{} has the severity error: state `effects` or a `harm`", rule.code));
+        }
+        for effect in &rule.effects {
+            let text = effect.text.source();
+            if !one_line(text) || !Loader::ALL.iter().any(|loader| effect.loaders.contains(loader.version())) {
+                wrong.push(format!("{}: an effect has one line and a known loader: {text}", rule.code));
+            }
+        }
     }
     none(&wrong);
 }

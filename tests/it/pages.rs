@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 
-use ckpt_doctor::knowledge::rule::{Catalogue, Fix, Rule, Safety, Severity};
+use ckpt_doctor::knowledge::Loader;
+use ckpt_doctor::knowledge::rule::{Catalogue, Effect, Fix, Object, Rule, Safety, Severity};
 use ckpt_doctor::knowledge::source;
 use serde_json::Value;
 
@@ -117,12 +118,35 @@ fn advice(fix: &Fix) -> (String, Option<String>) {
     (texts.next().unwrap_or_default(), texts.next())
 }
 
+/// The consequence under each known loader, as cells.
+fn loaders_of(effect: &Effect) -> String {
+    let cell = |loader: Loader| {
+        if effect.loaders.contains(loader.version()) { effect.consequence.name() } else { "-" }
+    };
+    Loader::ALL.map(cell).join(" | ")
+}
+
 fn rule_page(rule: &Rule, example: &str) -> String {
-    let mut page = format!("### {} {}\n\n**What it reports** ({}): ", rule.code, rule.name, severity(rule.severity));
+    let mut page =
+        format!("### {} {}\n\n**What it reports** ({}): ", rule.code, rule.name, severity(rule.highest_severity()));
     let _ = writeln!(page, "{}", markdown(&rule.summary));
     let _ = writeln!(page, "\n**Why it matters:** {}", markdown(&rule.why));
     if !rule.applies.is_empty() {
         let _ = writeln!(page, "\n**Applies to:** {}", rule.applies.join(", "));
+    }
+    if let Some(harm) = rule.harm {
+        let _ = writeln!(page, "\n**Harm:** {}", harm.name());
+    }
+    if !rule.effects.is_empty() {
+        let loaders = Loader::ALL.map(Loader::version);
+        let _ = writeln!(page, "\n| object | {} | what happens |\n|---|---|---|---|", loaders.join(" | "));
+    }
+    for effect in &rule.effects {
+        let under = loaders_of(effect);
+        let object = effect.object.map_or("by file", Object::name);
+        let case = if effect.when.is_some() { " (in some cases)" } else { "" };
+        let text = markdown(&effect.text.prose()).replace('|', "\\|");
+        let _ = writeln!(page, "| {object} | {under} | {text}{case} |");
     }
     let _ = writeln!(page, "\n**Example**\n\n```text\n{example}\n```");
     for fix in &rule.fixes {
@@ -149,8 +173,8 @@ fn the_page_of_rules_is_fresh() {
          {count} rules. `ckpt-doctor explain CODE` prints a section of this page, and `ckpt-doctor explain FAMILY` lists a \
          family.\n\n\
          | severity | meaning |\n|---|---|\n\
-         | error | fails to load, or loads wrong values |\n\
-         | warning | probably unintended, or breaks later |\n\
+         | error | a loader that must open the checkpoint raises or loads it incorrectly, or content is damaged, or security is at risk |\n\
+         | warning | only another loader raises or loads it incorrectly, or probably unintended |\n\
          | info | worth knowing; needs no action |\n\n\
          | fix | meaning |\n|---|---|\n\
          | safe | restores bookkeeping: every tensor and every value that a loader reads stays, and no trace of a loss is erased |\n\
@@ -165,7 +189,7 @@ fn the_page_of_rules_is_fresh() {
         for rule in rules {
             let anchor = format!("{}-{}", rule.code.to_lowercase(), rule.name);
             let summary = markdown(&rule.summary).replace('|', "\\|");
-            let (code, name, severity) = (&rule.code, &rule.name, severity(rule.severity));
+            let (code, name, severity) = (&rule.code, &rule.name, severity(rule.highest_severity()));
             let _ = writeln!(page, "| [{code}](#{anchor}) | {name} | {severity} | {summary} | {} |", safeties(rule));
         }
         for rule in rules {
@@ -230,7 +254,8 @@ fn the_lists_of_decisions_are_fresh() {
     for (_, title, rules) in families() {
         let _ = writeln!(list, "\n**{title}**\n");
         for rule in rules {
-            let _ = writeln!(list, "- {} ({}, {})", markdown(&rule.summary), rule.code, severity(rule.severity));
+            let _ =
+                writeln!(list, "- {} ({}, {})", markdown(&rule.summary), rule.code, severity(rule.highest_severity()));
         }
     }
     let page = fs::read_to_string(project().join("docs/decisions.md")).expect("text");

@@ -8,9 +8,10 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use crate::support::{Expect, Tried, tried};
-use ckpt_doctor::check::check;
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::check::verdict::LoadVerdict;
+use ckpt_doctor::check::{check, check_for};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, FaultSource};
 
 fn failures(of: impl Fn(&Tried) -> Option<String>) -> Vec<String> {
@@ -99,14 +100,15 @@ fn is_clean(load: &LoadReport) -> bool {
     names && load.mismatched.is_empty() && load.silent.is_empty() && load.raises.is_none()
 }
 
+/// Whether a text is empty or contains a character that only a failed template has. Quotations of evidence may contain
+/// such characters: the loader's own sentence, the start of a file.
+fn broken(finding: &Finding, text: &str, of: &[char]) -> bool {
+    let quoted = |c: char| finding.evidence.values().filter_map(|v| v.as_str()).map(|v| v.matches(c).count()).sum();
+    text.trim().is_empty() || of.iter().any(|c| text.matches(*c).count() > quoted(*c))
+}
+
 #[test]
 fn messages_render_in_full() {
-    // Quotations may contain such characters: the loader's own sentence, the start of a file.
-    let quoted =
-        |f: &Finding, c: char| f.evidence.values().filter_map(|v| v.as_str()).map(|v| v.matches(c).count()).sum();
-    let broken = |f: &Finding, text: &str, of: &[char]| {
-        text.trim().is_empty() || of.iter().any(|c| text.matches(*c).count() > quoted(f, *c))
-    };
     let wrong = failures(|t| {
         let own = t.own();
         let bad: Vec<&Finding> = own
@@ -120,6 +122,74 @@ fn messages_render_in_full() {
         (!bad.is_empty()).then(|| shown(&bad))
     });
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Verdicts, findings and the exit code agree: a verdict rests on findings, and an error on a verdict or a harm.
+#[test]
+fn verdicts_rest_on_findings() {
+    let rules = crate::support::rules();
+    let wrong = failures(|t| {
+        let mut bad = Vec::new();
+        for load in &t.outcome.verdicts {
+            for object in &load.objects {
+                if object.verdict > LoadVerdict::NotPredicted && object.findings.is_empty() {
+                    bad.push(format!("{} {object:?}", load.loader));
+                }
+                if object.verdict != LoadVerdict::Loads && object.why.as_deref().is_none_or(str::is_empty) {
+                    bad.push(format!("{} has no reason: {object:?}", load.loader));
+                }
+            }
+        }
+        let errors = t.outcome.findings.iter().filter(|f| f.severity == Severity::Error);
+        for finding in errors.filter(|f| rules.find(&f.code).is_ok_and(|rule| rule.harm.is_none())) {
+            if t.outcome.verdicts.iter().all(|load| load.verdict <= LoadVerdict::NotPredicted) {
+                bad.push(format!("{} is an error, and every verdict is better", finding.code));
+            }
+        }
+        (!bad.is_empty()).then(|| bad.join("\n    "))
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Every effect is rendered, and a finding that is an error has an effect or its rule a harm.
+#[test]
+fn errors_state_their_effects() {
+    let rules = crate::support::rules();
+    let harmful = |f: &Finding| rules.find(&f.code).is_ok_and(|rule| rule.harm.is_some());
+    let wrong = failures(|t| {
+        // Settings of the case may change severities.
+        let findings = || t.outcome.findings.iter().filter(|_| t.case.settings.is_none());
+        let bare = findings().filter(|f| f.severity == Severity::Error && f.effects.is_empty() && !harmful(f));
+        let broken = findings().filter(|f| f.effects.iter().any(|e| broken(f, &e.text, &['?', '{', '}'])));
+        let bad: Vec<&Finding> = bare.chain(broken).collect();
+        (!bad.is_empty()).then(|| format!("{}\n{:?}", shown(&bad), bad.iter().map(|f| &f.effects).collect::<Vec<_>>()))
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The severity of one fault follows the loaders of the run: `--for`, or the version that wrote config.json.
+#[test]
+fn severity_follows_the_loaders_of_the_run() {
+    let room = tempfile::tempdir().expect("a directory");
+    let drop = r#"{ header_drop: { file: "model.safetensors", at: "/__metadata__" } }"#;
+    let found = |dir: &std::path::Path, versions: &[&str]| {
+        let versions: Vec<String> = versions.iter().map(|v| (*v).to_owned()).collect();
+        let checkpoint = Checkpoint::open(dir).expect("a checkpoint").into();
+        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &versions);
+        let finding = outcome.findings.into_iter().find(|f| f.code == "SAF009").expect("SAF009");
+        let loaders = finding.effects.into_iter().map(|e| (e.loader, e.stands_for));
+        (finding.severity, loaders.collect::<Vec<_>>())
+    };
+    let own = |stands_for: Option<&str>| vec![("4.47.0".to_owned(), stands_for.map(str::to_owned))];
+    let dir = crate::support::made("llama", &format!("[{drop}]"), room.path());
+    for (versions, severity, effects) in [
+        (&[] as &[&str], Severity::Error, own(None)),
+        (&["5.23.0"], Severity::Info, Vec::new()),
+        (&["5.23.0", "4.50.1"], Severity::Error, own(Some("4.50.1"))),
+        (&["4.57.6"], Severity::Info, Vec::new()),
+    ] {
+        assert_eq!(found(&dir, versions), (severity, effects), "{versions:?}");
+    }
 }
 
 /// The donor has the same faults as the published checkpoints: three `Infinity`.

@@ -60,7 +60,7 @@ pub struct Case {
     pub deep: bool,
     /// Settings for the check.
     #[serde(default)]
-    settings: Option<serde_json::Value>,
+    pub settings: Option<serde_json::Value>,
     /// The expected finding; `None` for a sound case.
     #[serde(default)]
     pub expect: Option<Expect>,

@@ -57,6 +57,16 @@ fn is_unknown(built: &[BuiltClass<'_>]) -> bool {
     built.iter().all(|one| !one.target.leads || matches!(one.class, Err(Refusal::UnknownPart(_))))
 }
 
+/// For each loader that has the class, why no report of it is made; used where there is none.
+pub(super) fn unpredicted(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<(&'static str, String)> {
+    let why = |one: &BuiltClass<'_>| match &one.class {
+        Err(refusal) => refusal.to_string(),
+        Ok(_) if inputs.stored.is_empty() => "no tensor was read".to_owned(),
+        Ok(_) => "the layout of its quantised tensors is unknown".to_owned(),
+    };
+    built.iter().map(|one| (one.target.loader.version(), why(one))).collect()
+}
+
 /// Faults of classes that are unknown or cannot be built from this config.
 pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
     let mut faults = unknown(inputs, built);
@@ -69,7 +79,8 @@ pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault
         if let Err(Refusal::Impossible(reasons)) = &one.class {
             let fault = Fault::new(FaultKind::ConfigIncomputable)
                 .at(Place::file("config.json"))
-                .with("architecture", one.architecture.name());
+                .with("architecture", one.architecture.name())
+                .under(one.target.loader.version());
             faults.push(fault.with("reason", reasons.first().map_or("", String::as_str)));
         }
     }

@@ -17,6 +17,16 @@ pub(super) struct ExplainedLoad<'a> {
 }
 
 impl ExplainedLoad<'_> {
+    /// Version of the loader.
+    pub(super) const fn loader(&self) -> &'static str {
+        self.prediction.target.loader.version()
+    }
+
+    /// The config values that explain the report.
+    pub(super) fn votes(&self) -> Option<&[Vote]> {
+        self.explanation.as_ref().map(|explained| explained.votes.as_slice())
+    }
+
     /// The part of the report that has no known cause.
     pub(super) fn unexplained(&self) -> Option<&LoadReport> {
         self.explanation.as_ref().map(|explained| &explained.rest).or(self.prediction.report.as_ref())

@@ -28,6 +28,7 @@ pub fn difference(loads: Judged<'_>, other: Judged<'_>, stored: &Stored) -> Opti
     }
     let fault =
         Fault::new(FaultKind::LoadsDiffer).with("loads", loads.report.version()).with("loader", report.version());
+    let fault = fault.under(other.expected.loader.version());
     let mut fault = match &report.raises {
         Some(exception) => fault.with("raises", exception.as_str()),
         None if missing.is_empty() => named(fault, "mismatched", report.mismatched.iter().map(|m| m.name.as_str())),

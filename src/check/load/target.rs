@@ -16,6 +16,12 @@ pub struct Target {
 }
 
 impl Target {
+    /// The version that is judged: the one that the loader stands for, or else its own.
+    #[must_use]
+    pub fn version(&self) -> &str {
+        self.stands_for.as_deref().unwrap_or(self.loader.version())
+    }
+
     fn new(version: &str, leads: bool) -> Self {
         let loader = Loader::nearest(version);
         Self { loader, stands_for: (version != loader.version()).then(|| version.to_owned()), leads }
@@ -44,6 +50,21 @@ pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<
             targets.push(target);
         }
     }
+    targets
+}
+
+/// The targets of a run: the [`wanted`] ones, as the prediction of loads changed them.
+///
+/// A loader that does not have the class still reads the documents, so it stays.
+pub(in crate::check) fn of_run(config: Option<&Value>, named: &[String], predicted: Vec<Target>) -> Vec<Target> {
+    let mut targets = wanted(config, named);
+    for target in predicted {
+        match targets.iter_mut().find(|t| t.loader == target.loader) {
+            Some(same) => *same = target,
+            None => targets.push(target),
+        }
+    }
+    targets.sort_by_key(|target| !target.leads);
     targets
 }
 
