@@ -8,7 +8,7 @@ pub(super) mod paint;
 use std::fmt::Write as _;
 
 use self::paint::Paint;
-use super::format::{agreeing, alike, bytes, capped, counts, headline, name, objects, plural, summary};
+use super::format::{agreeing, alike, bytes, capped, counts, headline, name, objects, plural, summary, wrap};
 use super::model::{CheckpointReport, Report};
 use super::{Style, fixes};
 
@@ -17,7 +17,7 @@ pub fn render(report: &Report, style: Style) -> String {
     let mut out = String::new();
     let mut above: Option<&CheckpointReport> = None;
     for checkpoint in &report.checkpoints {
-        header(&mut out, checkpoint, paint);
+        header(&mut out, checkpoint, style);
         if above.is_some_and(|a| repeats(a, checkpoint)) {
             let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
         } else {
@@ -49,7 +49,8 @@ fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
 
 /// `fixtures/vision (donor vision): loads with transformers 4.47.0`, then `spatialvla, 690 tensors, 1.23 MB, clean`, and a
 /// line for each object that does not load.
-fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
+fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
+    let paint = Paint(style.color);
     out.push_str(&paint.strong(&name(&checkpoint.path)));
     if let Some(role) = &checkpoint.role {
         let _ok = write!(out, " ({})", name(&role.to_string()));
@@ -70,7 +71,11 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
         let _ok = writeln!(out, "  {}", paint.quiet(&notes.join(", ")));
     }
     for line in objects(&checkpoint.loads) {
-        let _ok = writeln!(out, "  {}", paint.quiet(&line));
+        let width = style.width.map(|width| width.saturating_sub(4).max(40));
+        for (n, part) in wrap(&line, width).lines().enumerate() {
+            let indent = if n == 0 { "  " } else { "    " };
+            let _ok = writeln!(out, "{indent}{}", paint.quiet(part));
+        }
     }
 }
 

@@ -48,12 +48,6 @@ impl Chain {
         self.last(|s| s.settings.fail_on)
     }
 
-    /// Whether weights may be missing.
-    #[must_use]
-    pub fn metadata_only(&self) -> Option<bool> {
-        self.last(|s| s.settings.metadata_only)
-    }
-
     /// Folder with the user's rules.
     #[must_use]
     pub fn rules(&self) -> Option<PathBuf> {
