@@ -100,7 +100,9 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
-    let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects).filter_map(|effect| effect.object);
+    // An effect without an object is on the one that reads the file of the fault, which may be any.
+    let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects);
+    let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
     let basis = Basis {
         checkpoint,
         findings: &outcome.findings,

@@ -302,18 +302,20 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     unread_weights(checkpoint, &names).into_iter().collect()
 }
 
-/// For a model of transformers whose shards all have names that no loader reads: no weights, with these names.
+/// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
+fn is_model(checkpoint: &Checkpoint) -> bool {
+    let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
+    (has("model_type") || has("architectures")) && !has("_class_name") && !checkpoint.has_file(adapter::CONFIG)
+}
+
+/// For a model whose shards all have names that no loader reads: no weights, with these names.
 fn unread_weights(checkpoint: &Checkpoint, names: &[&str]) -> Option<Fault> {
-    let config = checkpoint.config()?;
-    let is_model = config.get("model_type").is_some() || config.get("architectures").is_some();
-    // Directories of adapters and of other libraries have names of their own.
-    let is_other = checkpoint.has_file(adapter::CONFIG) || config.get("_class_name").is_some();
     let is_read = |name: &&str| matches!(*name, "pytorch_model.bin" | "pytorch_model.bin.index.json");
     let has_pickle = checkpoint.entries.keys().any(|name| is_read(&name.as_str()));
-    if !is_model || is_other || has_pickle || names.is_empty() {
+    if !is_model(checkpoint) || has_pickle || names.is_empty() {
         return None;
     }
-    let fault = Fault::new(FaultKind::NoWeights).with("unread", names.to_vec());
+    let fault = Fault::new(FaultKind::NoWeights).with("model", true).with("unread", names.to_vec());
     Some(names.iter().fold(fault, |fault, name| fault.at(Place::file(*name))))
 }
 
@@ -345,7 +347,7 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
     match pickle {
         Some(name) => Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name))),
         None if checkpoint.faults.iter().any(is_reported) => None,
-        None => Some(Fault::new(FaultKind::NoWeights)),
+        None => Some(Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint))),
     }
 }
 

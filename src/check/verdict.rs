@@ -86,7 +86,8 @@ pub struct PredictedLoad {
 }
 
 impl PredictedLoad {
-    /// The load of a model alone, by its load report.
+    /// The load of a model alone, by its load report; for tests of the renderers.
+    #[cfg(feature = "internals")]
     #[must_use]
     pub fn of_model(report: LoadReport) -> Self {
         let (verdict, why) = of_report(&report);
@@ -187,9 +188,6 @@ impl Basis<'_> {
 
     /// The verdict on an object without the effects of findings.
     fn alone(&self, object: Object, loader: &str) -> (LoadVerdict, Option<String>) {
-        if self.unjudged.contains(&object) {
-            return (LoadVerdict::NotPredicted, Some("rules that judge it are not selected".to_owned()));
-        }
         if object != Object::Model {
             return (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
         }
@@ -200,7 +198,13 @@ impl Basis<'_> {
             Some(_) if !self.was_read() => {
                 return (LoadVerdict::NotPredicted, Some("no tensor was read".to_owned()));
             }
-            Some(report) => return of_report(report),
+            Some(report) => {
+                let (verdict, why) = of_report(report);
+                if verdict == LoadVerdict::Loads && self.unjudged.contains(&object) {
+                    return (LoadVerdict::NotPredicted, Some("rules that judge it are not selected".to_owned()));
+                }
+                return (verdict, why);
+            }
             None => {}
         }
         let known = self.unpredicted.iter().find(|(of, _)| *of == loader).map(|(_, why)| why.clone());
@@ -242,9 +246,7 @@ fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
 /// The objects that a user of this directory can open.
 fn offered(checkpoint: &Checkpoint) -> Vec<Object> {
     let has = |object: Object| checkpoint.entries.keys().any(|name| Object::reading(name) == Some(object));
-    let others = [Object::Tokenizer, Object::Processor, Object::Generation, Object::Adapter];
-    let others: Vec<Object> = others.into_iter().filter(|object| has(*object)).collect();
+    let found: Vec<Object> = Object::ALL.into_iter().filter(|object| has(*object)).collect();
     // A directory with nothing to open was meant to be a model.
-    let model = has(Object::Model) || others.is_empty();
-    model.then_some(Object::Model).into_iter().chain(others).collect()
+    if found.is_empty() { vec![Object::Model] } else { found }
 }

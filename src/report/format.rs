@@ -225,7 +225,8 @@ pub fn versions(loaders: &[&PredictedLoad]) -> String {
     format!("transformers {}", versions.join(" and "))
 }
 
-/// The verdicts in one line, the worst first: `raises with transformers 5.23.0; loads with 4.47.0`.
+/// The verdicts in one line, the worst first and those that are not predicted last: `raises with transformers 5.23.0; loads
+/// with 4.47.0`.
 pub fn headline(loads: &[PredictedLoad]) -> String {
     let order = [LoadVerdict::Raises, LoadVerdict::LoadsWrong, LoadVerdict::Loads, LoadVerdict::NotPredicted];
     let mut parts: Vec<String> = Vec::new();
