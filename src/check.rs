@@ -9,6 +9,7 @@ pub mod inspect;
 pub mod judge;
 pub mod layers;
 pub mod load;
+mod model_type;
 pub mod modules;
 mod outcome;
 mod policy;

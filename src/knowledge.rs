@@ -6,6 +6,7 @@ pub mod evidence;
 pub mod expression;
 pub mod library;
 pub mod loader;
+pub mod model_types;
 mod ordered;
 pub mod processor;
 pub mod quantization;
@@ -23,6 +24,7 @@ pub use library::Library;
 pub use loader::Loader;
 
 use embeddings::TokenEmbedding;
+use model_types::ModelTypes;
 use processor::Processor;
 use quantization::Scheme;
 use recipe::Recipe;
@@ -42,6 +44,8 @@ pub struct Knowledge {
     pub recipes: Vec<Recipe>,
     /// Quantisation schemes.
     pub schemes: Vec<Scheme>,
+    /// Model types that transformers knows.
+    pub model_types: ModelTypes,
     /// Names of token embeddings.
     pub token_embedding: TokenEmbedding,
     /// Severities and suppressions of a settings file for single findings.
@@ -68,6 +72,7 @@ impl Knowledge {
             processors: Processor::embedded()?,
             recipes: Recipe::embedded()?,
             schemes: Scheme::embedded()?,
+            model_types: ModelTypes::embedded()?,
             token_embedding: TokenEmbedding::embedded()?,
             policy: Policy::default(),
         })

@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, adapter, pointer};
+use super::model_type::is_model;
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, pointer};
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
@@ -300,12 +301,6 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
         return weights_elsewhere(checkpoint).into_iter().collect();
     }
     unread_weights(checkpoint, &names).into_iter().collect()
-}
-
-/// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
-fn is_model(checkpoint: &Checkpoint) -> bool {
-    let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
-    (has("model_type") || has("architectures")) && !has("_class_name") && !checkpoint.has_file(adapter::CONFIG)
 }
 
 /// For a model whose shards all have names that no loader reads: no weights, with these names.

@@ -95,6 +95,20 @@ impl Library {
         Some(Architecture::new(self, file, class, loader))
     }
 
+    /// Whether a file describes this model type, under any loader.
+    #[must_use]
+    pub fn describes(&self, model_type: &str) -> bool {
+        self.all_of_model_type(model_type).next().is_some()
+    }
+
+    /// The model type of the class of this name; `None` for an unknown class, or when several have it.
+    #[must_use]
+    pub fn model_type_of(&self, class: &str) -> Option<&str> {
+        let files = self.files_at(self.index().with_class(class));
+        let mut types = files.filter(|f| f.classes.iter().any(|c| c.name == class)).flat_map(|file| &file.model_types);
+        types.next().filter(|first| types.all(|other| other == *first)).map(String::as_str)
+    }
+
     /// Stem and text of every file, unparsed.
     pub(super) fn texts(&self) -> impl Iterator<Item = (&str, &[u8])> {
         self.files.iter().map(|file| (file.stem.as_str(), file.text.as_bytes()))

@@ -57,6 +57,13 @@ impl Loader {
     }
 }
 
+/// The leading numbers of a version, which order versions: 5, 0, 0 of `5.0.0rc1`.
+#[must_use]
+pub fn version_numbers(version: &str) -> Vec<u64> {
+    let digits = |part: &str| part.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default().parse().ok();
+    version.split('.').map_while(digits).collect()
+}
+
 impl fmt::Display for Loader {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.version())

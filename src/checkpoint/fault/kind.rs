@@ -158,6 +158,8 @@ fault_kinds! {
         LoadsDiffer = "loads-differ",
         MismatchedTensor = "mismatched-tensor",
         MissingTensors = "missing-tensors",
+        ModelTypeMissing = "model-type-missing",
+        ModelTypeUnknown = "model-type-unknown",
         ModuleNeedsPackage = "module-needs-package",
         NamesMoved = "names-moved",
         NoWeights = "no-weights",

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::super::expression::{Expression, Template};
+use super::super::loader::version_numbers;
 
 /// What a loader opens from a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -215,7 +216,7 @@ impl LoaderRange {
     /// Whether a version such as `4.51.3` or `5.0.0rc1` is in the range.
     #[must_use]
     pub fn contains(&self, version: &str) -> bool {
-        let version = numbers(version);
+        let version = version_numbers(version);
         let is_less = |bound: &[u64]| {
             let length = bound.len().max(version.len());
             let padded = |numbers: &[u64]| -> Vec<u64> {
@@ -225,12 +226,6 @@ impl LoaderRange {
         };
         self.from.as_deref().is_none_or(|from| !is_less(from)) && self.below.as_deref().is_none_or(is_less)
     }
-}
-
-/// The leading numbers of a version: 5, 0, 0 of `5.0.0rc1`.
-fn numbers(version: &str) -> Vec<u64> {
-    let digits = |part: &str| part.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default().parse().ok();
-    version.split('.').map_while(digits).collect()
 }
 
 impl<'de> Deserialize<'de> for LoaderRange {

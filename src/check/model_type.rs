@@ -1,0 +1,81 @@
+//! How `AutoConfig` takes the class of config.json: by `model_type`.
+//!
+//! Source: `AutoConfig.from_pretrained` of transformers 4.47.0, 4.57.6 and 5.23.0. Code of the directory
+//! (`auto_map.AutoConfig`) is preferred to the mapping.
+
+use serde_json::Value;
+
+use super::load::Target;
+use crate::checkpoint::adapter;
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use crate::knowledge::Knowledge;
+
+/// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
+pub(super) fn is_model(checkpoint: &Checkpoint) -> bool {
+    let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
+    (has("model_type") || has("architectures")) && !has("_class_name") && !checkpoint.has_file(adapter::CONFIG)
+}
+
+/// Faults of `model_type`, each under the loaders that raise. Called by the engine with the targets of the run.
+pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[Target]) -> Vec<Fault> {
+    let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
+        return Vec::new();
+    };
+    let class = config.pointer("/architectures/0").and_then(Value::as_str);
+    let of_class = class.and_then(|class| knowledge.library.model_type_of(class));
+    let fault = match config.get("model_type") {
+        Some(value) => unknown(knowledge, value, targets),
+        None => missing(checkpoint, knowledge, of_class, targets),
+    };
+    let with_class = |fault: Fault| match (class, of_class) {
+        (Some(class), Some(model_type)) => fault.with("class", class).with("of_class", model_type),
+        _ => fault,
+    };
+    fault.into_iter().map(with_class).collect()
+}
+
+/// Whether the config class is code beside the weights or in another repository.
+fn has_code(config: &Value) -> bool {
+    config.pointer("/auto_map/AutoConfig").is_some()
+}
+
+/// The fault of a `model_type` that loaders lack. Types that only an architecture file describes belong to packages that
+/// register them, such as that of LLaVA-3D.
+fn unknown(knowledge: &Knowledge, value: &Value, targets: &[Target]) -> Option<Fault> {
+    let types = &knowledge.model_types;
+    let name = value.as_str().unwrap_or_default();
+    if !types.contains(name) && knowledge.library.describes(name) {
+        return None;
+    }
+    let lacking: Vec<&Target> = targets.iter().filter(|target| types.lacks(target.version(), name)).collect();
+    if lacking.is_empty() {
+        return None;
+    }
+    let versions: Vec<&str> = lacking.iter().map(|target| target.version()).collect();
+    let place = Place::file("config.json").pointer("/model_type");
+    let fault =
+        Fault::new(FaultKind::ModelTypeUnknown).at(place).with("model_type", value.clone()).with("versions", versions);
+    let fault = types.similar(name).into_iter().fold(fault, |fault, similar| fault.with("similar", similar));
+    Some(lacking.into_iter().map(|target| target.loader.version()).fold(fault, Fault::under))
+}
+
+/// The fault of a config without `model_type`. transformers 4 takes a type that occurs in the path; only the last
+/// component is known here.
+fn missing(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    of_class: Option<&str>,
+    targets: &[Target],
+) -> Option<Fault> {
+    let directory = checkpoint.root.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let old = targets.iter().find(|target| target.loader.major() < 5);
+    let guess = old.and_then(|target| knowledge.model_types.in_name(target.version(), &directory));
+    let raising = targets.iter().filter(|t| t.loader.major() >= 5 || guess.is_none() || guess != of_class);
+    let raising: Vec<_> = raising.map(|target| target.loader.version()).collect();
+    if raising.is_empty() {
+        return None;
+    }
+    let fault = Fault::new(FaultKind::ModelTypeMissing).at(Place::file("config.json")).with("directory", directory);
+    let fault = guess.into_iter().fold(fault, |fault, guess| fault.with("guess", guess));
+    Some(raising.into_iter().fold(fault, Fault::under))
+}
