@@ -2,6 +2,7 @@
 
 pub mod adapter;
 pub mod engine;
+mod exceptions;
 pub mod finding;
 pub mod fix;
 pub mod index;
@@ -14,6 +15,7 @@ pub mod modules;
 mod outcome;
 mod policy;
 pub mod quantization;
+mod refusals;
 pub mod size;
 mod suppressions;
 pub mod tokens;

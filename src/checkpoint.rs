@@ -216,6 +216,13 @@ impl Checkpoint {
         mapped.into_iter().chain(self.shards.values()).find_map(|s| Some((s, s.tensors.get(of(s)?)?)))
     }
 
+    /// A few bytes of this tensor, to tell it from another; `None` when they cannot be read.
+    #[must_use]
+    pub fn sample(&self, name: &str) -> Option<Vec<u8>> {
+        let (shard, tensor) = self.tensor(name)?;
+        contents::sample(&self.root, shard, tensor)
+    }
+
     /// Faults of the directory, then of documents, index, shards, modules and tokenizer; by file name within each
     /// group.
     pub fn all_faults(&self) -> impl Iterator<Item = &Fault> {

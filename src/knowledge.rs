@@ -6,11 +6,12 @@ pub mod evidence;
 pub mod expression;
 pub mod library;
 pub mod loader;
-pub mod model_types;
+pub mod names;
 mod ordered;
 pub mod processor;
 pub mod quantization;
 pub mod recipe;
+pub mod refusals;
 pub mod resemblance;
 pub mod rule;
 pub mod selection;
@@ -24,10 +25,11 @@ pub use library::Library;
 pub use loader::Loader;
 
 use embeddings::TokenEmbedding;
-use model_types::ModelTypes;
+use names::LoaderNames;
 use processor::Processor;
 use quantization::Scheme;
 use recipe::Recipe;
+use refusals::Refusals;
 use rule::RuleSet;
 use settings::Policy;
 use source::DataError;
@@ -44,8 +46,10 @@ pub struct Knowledge {
     pub recipes: Vec<Recipe>,
     /// Quantisation schemes.
     pub schemes: Vec<Scheme>,
-    /// Model types that transformers knows.
-    pub model_types: ModelTypes,
+    /// Names that transformers accepts in config.json.
+    pub names: LoaderNames,
+    /// Values of config.json that classes refuse.
+    pub refusals: Refusals,
     /// Names of token embeddings.
     pub token_embedding: TokenEmbedding,
     /// Severities and suppressions of a settings file for single findings.
@@ -72,7 +76,8 @@ impl Knowledge {
             processors: Processor::embedded()?,
             recipes: Recipe::embedded()?,
             schemes: Scheme::embedded()?,
-            model_types: ModelTypes::embedded()?,
+            names: LoaderNames::embedded()?,
+            refusals: Refusals::embedded(),
             token_embedding: TokenEmbedding::embedded()?,
             policy: Policy::default(),
         })

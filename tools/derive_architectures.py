@@ -57,11 +57,16 @@ def add_table(commands):
     p.set_defaults(run="derive.table")
 
 
+def add_accepts(commands):
+    p = commands.add_parser("accepts", help="try what classes and config classes refuse; write rules/refused")
+    p.set_defaults(run="derive.accepts")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
     commands = parser.add_subparsers(required=True)
-    for add in (add_sample, add_fit, add_conversions, add_write, add_verify, add_table):
+    for add in (add_sample, add_fit, add_conversions, add_write, add_verify, add_table, add_accepts):
         add(commands)
     for sub in set(commands.choices.values()):                # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)

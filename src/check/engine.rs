@@ -10,7 +10,7 @@ use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, Stored, Target};
 use super::outcome::Outcome;
 use super::verdict::Basis;
-use super::{adapter, index, judge, model_type, modules, policy, tokens, variables};
+use super::{adapter, index, judge, model_type, modules, policy, refusals, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
@@ -75,7 +75,9 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
-    faults.extend(model_type::faults(checkpoint, knowledge, &context.targets));
+    let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
+    faults.extend(model_type::faults(checkpoint, knowledge, &context.targets, &unknown));
+    faults.extend(refusals::faults(checkpoint, knowledge, &context.targets));
     for rule in &knowledge.rules.rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {

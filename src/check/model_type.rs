@@ -9,6 +9,7 @@ use super::load::Target;
 use crate::checkpoint::adapter;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Knowledge;
+use crate::knowledge::names::NameKind;
 
 /// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
 pub(super) fn is_model(checkpoint: &Checkpoint) -> bool {
@@ -16,46 +17,72 @@ pub(super) fn is_model(checkpoint: &Checkpoint) -> bool {
     (has("model_type") || has("architectures")) && !has("_class_name") && !checkpoint.has_file(adapter::CONFIG)
 }
 
-/// Faults of `model_type`, each under the loaders that raise. Called by the engine with the targets of the run.
-pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[Target]) -> Vec<Fault> {
+/// The place of the `model_type` that a class selects a part by, of the fault that the part is unknown.
+pub(super) fn place_of_part(fault: &Fault) -> Option<Place> {
+    let is_part = fault.kind == FaultKind::UnknownArchitecture && fault.detail.contains_key("part");
+    fault.places.first().filter(|_| is_part).cloned()
+}
+
+/// Faults of `model_type`, each under the loaders that raise. Called by the engine with the targets of the run, and the
+/// places of the types of parts that no description has.
+pub(super) fn faults(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    targets: &[Target],
+    parts: &[Place],
+) -> Vec<Fault> {
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
         return Vec::new();
     };
+    // Names in a document of another encoding are not those that a loader would read.
+    let document = checkpoint.document("config.json");
+    let is_encoded = |f: &Fault| matches!(f.kind, FaultKind::WrongEncoding | FaultKind::InvalidUtf8);
+    if document.is_some_and(|document| document.faults.iter().any(is_encoded)) {
+        return Vec::new();
+    }
     let class = config.pointer("/architectures/0").and_then(Value::as_str);
     let of_class = class.and_then(|class| knowledge.library.model_type_of(class));
+    let place = Place::file("config.json").pointer("/model_type");
     let fault = match config.get("model_type") {
-        Some(value) => unknown(knowledge, value, targets),
+        Some(value) => unknown(knowledge, value, place, targets),
         None => missing(checkpoint, knowledge, of_class, targets),
     };
     let with_class = |fault: Fault| match (class, of_class) {
         (Some(class), Some(model_type)) => fault.with("class", class).with("of_class", model_type),
         _ => fault,
     };
-    fault.into_iter().map(with_class).collect()
+    let of_part = |place: &Place| {
+        let value = config.pointer(place.pointer.as_deref()?)?;
+        Some(unknown(knowledge, value, place.clone(), targets)?.with("part", true))
+    };
+    fault.into_iter().map(with_class).chain(parts.iter().filter_map(of_part)).collect()
 }
 
 /// Whether the config class is code beside the weights or in another repository.
-fn has_code(config: &Value) -> bool {
+pub(super) fn has_code(config: &Value) -> bool {
     config.pointer("/auto_map/AutoConfig").is_some()
 }
 
 /// The fault of a `model_type` that loaders lack. Types that only an architecture file describes belong to packages that
 /// register them, such as that of LLaVA-3D.
-fn unknown(knowledge: &Knowledge, value: &Value, targets: &[Target]) -> Option<Fault> {
-    let types = &knowledge.model_types;
+fn unknown(knowledge: &Knowledge, value: &Value, place: Place, targets: &[Target]) -> Option<Fault> {
+    let names = &knowledge.names;
     let name = value.as_str().unwrap_or_default();
-    if !types.contains(name) && knowledge.library.describes(name) {
+    if !names.contains(NameKind::ModelType, name) && knowledge.library.describes(name) {
         return None;
     }
-    let lacking: Vec<&Target> = targets.iter().filter(|target| types.lacks(target.version(), name)).collect();
+    let lacking: Vec<&Target> =
+        targets.iter().filter(|target| names.lacks(target.version(), NameKind::ModelType, name)).collect();
     if lacking.is_empty() {
         return None;
     }
     let versions: Vec<&str> = lacking.iter().map(|target| target.version()).collect();
-    let place = Place::file("config.json").pointer("/model_type");
     let fault =
         Fault::new(FaultKind::ModelTypeUnknown).at(place).with("model_type", value.clone()).with("versions", versions);
-    let fault = types.similar(name).into_iter().fold(fault, |fault, similar| fault.with("similar", similar));
+    let fault = names
+        .similar(NameKind::ModelType, name)
+        .into_iter()
+        .fold(fault, |fault, similar| fault.with("similar", similar));
     Some(lacking.into_iter().map(|target| target.loader.version()).fold(fault, Fault::under))
 }
 
@@ -69,7 +96,7 @@ fn missing(
 ) -> Option<Fault> {
     let directory = checkpoint.root.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let old = targets.iter().find(|target| target.loader.major() < 5);
-    let guess = old.and_then(|target| knowledge.model_types.in_name(target.version(), &directory));
+    let guess = old.and_then(|target| knowledge.names.model_type_in(target.version(), &directory));
     let raising = targets.iter().filter(|t| t.loader.major() >= 5 || guess.is_none() || guess != of_class);
     let raising: Vec<_> = raising.map(|target| target.loader.version()).collect();
     if raising.is_empty() {

@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
-use super::{index, modules};
+use super::{exceptions, index, modules};
 use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
 use crate::knowledge::{Expression, Scope};
 
@@ -79,6 +79,11 @@ pub fn scope(
     scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
     let here = Arc::clone(checkpoint);
     scope.function1("has_file", move |name| json!(here.has_file(name)));
+    scope.function2("json_error", |file, reason| json!(exceptions::unparsed(file, reason)));
+    scope.function1("utf8_error", |file| json!(exceptions::undecoded(file)));
+    scope.function1("python_type", |found| json!(exceptions::python_type(found)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("is_parsed", move |file| json!(exceptions::is_parsed(&here, file)));
     let here = Arc::clone(checkpoint);
     scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));
     scope

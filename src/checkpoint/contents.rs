@@ -52,6 +52,28 @@ impl Contents {
     }
 }
 
+/// Bytes of each of the blocks of a [`sample`].
+const SAMPLE: u64 = 4096;
+
+/// The first, middle and last bytes of a tensor, to tell tensors apart without reading them; `None` when the file does not
+/// have them, as for a planned shard.
+pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<u8>> {
+    let opened = open_regular(&root.join(&shard.name), u64::MAX).ok()?;
+    if shard.unread || opened.identity.size != shard.file_len {
+        return None;
+    }
+    let length = tensor.len().min(SAMPLE);
+    let last = tensor.len().checked_sub(length)?;
+    let start = shard.data_start.checked_add(tensor.begin)?;
+    let mut bytes = Vec::new();
+    for at in [0, last / 2, last] {
+        let mut block = vec![0; usize::try_from(length).ok()?];
+        opened.file.read_exact_at(&mut block, start.checked_add(at)?).ok()?;
+        bytes.append(&mut block);
+    }
+    Some(bytes)
+}
+
 /// State of reading one shard.
 struct ContentsReader<'s> {
     shard: &'s Shard,

@@ -164,7 +164,8 @@ pub struct FaultCheck {
 /// - `loaders`: versions of transformers to check for;
 /// - `metadata_only`: weights may be missing.
 ///
-/// Functions are `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, and `stays_random(tensor)`:
+/// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
+/// loaders; `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, and `stays_random(tensor)`:
 /// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
 /// `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
 ///

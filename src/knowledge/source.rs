@@ -126,6 +126,12 @@ pub fn nearest<'w>(word: &str, known: impl IntoIterator<Item = &'w str>) -> Opti
     best.filter(|(likeness, _)| *likeness > NEAR).map(|(_, word)| word)
 }
 
+/// The files directly in `rules/<folder>`, by their names.
+pub fn files(folder: &str) -> impl Iterator<Item = (&'static str, &'static str)> {
+    let files = RULES.get_dir(folder).into_iter().flat_map(Dir::files);
+    files.filter_map(|file| Some((file.path().file_name()?.to_str()?, file.contents_utf8()?)))
+}
+
 /// The `.json5` files below `rules/<folder>`, in path order.
 #[must_use]
 pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {

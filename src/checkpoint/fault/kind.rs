@@ -169,6 +169,8 @@ fault_kinds! {
         QuantizeConfigDisagrees = "quantize-config-disagrees",
         QuantizedConfigPlainTensors = "quantized-config-plain-tensors",
         QuantizedDtypeWrong = "quantized-dtype-wrong",
+        QuantMethodMissing = "quant-method-missing",
+        QuantMethodUnknown = "quant-method-unknown",
         QuantizedForAnotherLoader = "quantized-for-another-loader",
         QuantizedModuleIncomplete = "quantized-module-incomplete",
         QuantizedShapeWrong = "quantized-shape-wrong",
@@ -192,6 +194,7 @@ fault_kinds! {
         UnexpectedTensors = "unexpected-tensors",
         UnknownArchitecture = "unknown-architecture",
         UnknownQuantization = "unknown-quantization",
+        ValueRefused = "value-refused",
     }
 }
 

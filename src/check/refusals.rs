@@ -1,0 +1,224 @@
+//! Values of config.json that a loader refuses: it raises while it builds the config or the class.
+
+use serde_json::{Map, Value};
+
+use super::load::Target;
+use super::model_type::{has_code, is_model};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, pointer};
+use crate::knowledge::Knowledge;
+use crate::knowledge::loader::version_numbers;
+use crate::knowledge::names::NameKind;
+use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
+use crate::knowledge::refusals::ClassRefusals;
+
+/// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
+const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
+
+/// A value that a loader refuses.
+struct Refusal {
+    pointer: String,
+    value: Value,
+    /// Why, after the key and the value.
+    because: String,
+    /// The exception.
+    raises: String,
+    /// A known name that was probably meant.
+    similar: Option<String>,
+}
+
+/// Faults of refused values, each under the loaders that raise. Called by the engine with the targets of the run.
+pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[Target]) -> Vec<Fault> {
+    let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
+        return Vec::new();
+    };
+    let mut faults: Vec<Fault> = Vec::new();
+    for target in targets {
+        let mut found = of_class(knowledge, config, target.version());
+        found.extend(of_fields(knowledge, config, target.version(), ""));
+        found.extend(dtype(knowledge, config, target.version()));
+        for refusal in found {
+            let loader = target.loader.version();
+            let same = faults.iter_mut().find(|fault| {
+                let place = fault.places.first().and_then(|place| place.pointer.as_deref());
+                place == Some(&refusal.pointer)
+                    && fault.detail.get("raises") == Some(&Value::from(refusal.raises.as_str()))
+            });
+            match same {
+                Some(fault) => fault.loaders.push(loader),
+                None => faults.push(refusal.fault().under(loader)),
+            }
+        }
+    }
+    faults.extend(quantisation(knowledge, config, targets));
+    faults
+}
+
+impl Refusal {
+    fn fault(self) -> Fault {
+        let key = self.pointer.trim_start_matches('/').replace('/', ".");
+        let fault = Fault::new(FaultKind::ValueRefused)
+            .at(Place::file("config.json").pointer(self.pointer))
+            .with("key", key)
+            .with("value", self.value)
+            .with("because", self.because)
+            .with("raises", self.raises);
+        self.similar.into_iter().fold(fault, |fault, similar| fault.with("similar", similar))
+    }
+}
+
+/// Values that the model class refuses.
+fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal> {
+    let class = config.pointer("/architectures/0").and_then(Value::as_str);
+    let Some(refused) = class.and_then(|class| knowledge.refusals.of_class(version, class)) else { return Vec::new() };
+    let ClassRefusals { activation, padding, rope_type, rope_factor } = &refused;
+    let mut found = Vec::new();
+    for key in activation {
+        let pointer = format!("/{key}");
+        let Some(name) = config.pointer(&pointer).and_then(Value::as_str) else { continue };
+        if knowledge.names.lacks(version, NameKind::Activation, name) {
+            let similar = knowledge.names.similar(NameKind::Activation, name).map(str::to_owned);
+            let because = "which is no activation function".to_owned();
+            let raises = format!("KeyError: '{name}'");
+            found.push(Refusal { pointer, value: name.into(), because, raises, similar });
+        }
+    }
+    for key in padding {
+        let pointer = format!("/{key}");
+        let rows = config.pointer(&format!("{}/vocab_size", parent(&pointer))).and_then(Value::as_u64);
+        let Some((id, rows)) = config.pointer(&pointer).and_then(Value::as_u64).zip(rows) else { continue };
+        if id >= rows {
+            let because = format!("but the embedding has vocab_size {rows} rows");
+            let raises = "AssertionError: Padding_idx must be within num_embeddings".to_owned();
+            found.push(Refusal { pointer, value: id.into(), because, raises, similar: None });
+        }
+    }
+    for key in rope_type {
+        let of_key = ropes(config, key).into_iter();
+        found.extend(of_key.filter_map(|(pointer, rope)| unknown_rope(knowledge, version, &pointer, rope)));
+    }
+    for key in rope_factor {
+        found.extend(ropes(config, key).into_iter().filter_map(|(pointer, rope)| rope_without_factor(pointer, rope)));
+    }
+    found
+}
+
+/// The rope parameters under the key of the version, or under the other one, which transformers 5 reads as well.
+fn ropes<'c>(config: &'c Value, key: &str) -> Vec<(String, &'c Map<String, Value>)> {
+    let parent = parent(&format!("/{key}")).to_owned();
+    let old = (!key.ends_with("rope_scaling")).then(|| format!("{parent}/rope_scaling"));
+    let pointers = std::iter::once(format!("/{key}")).chain(old);
+    let objects = pointers.filter_map(|pointer| Some((config.pointer(&pointer)?.as_object()?, pointer)));
+    // Parameters by kind of layer are objects of objects.
+    let plain = objects.filter(|(rope, _)| !rope.values().any(Value::is_object));
+    plain.map(|(rope, pointer)| (pointer, rope)).collect()
+}
+
+/// The key and name of a rope type.
+fn rope_type(rope: &Map<String, Value>) -> Option<(&'static str, &str)> {
+    let named = |key: &'static str| Some((key, rope.get(key)?.as_str()?));
+    named("rope_type").or_else(|| named("type"))
+}
+
+fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<String, Value>) -> Option<Refusal> {
+    let (key, name) = rope_type(rope)?;
+    knowledge.names.lacks(version, NameKind::RopeType, name).then(|| Refusal {
+        pointer: format!("{pointer}/{key}"),
+        value: name.into(),
+        because: "which is no type of rope".to_owned(),
+        raises: format!("KeyError: '{name}'"),
+        similar: knowledge.names.similar(NameKind::RopeType, name).map(str::to_owned),
+    })
+}
+
+fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Refusal> {
+    let (_, name) = rope_type(rope)?;
+    let is_refused = ROPE_WITH_FACTOR.contains(&name) && !rope.contains_key("factor");
+    is_refused.then(|| Refusal {
+        value: Value::Object(rope.clone()),
+        because: format!("and rope type {name} needs a factor"),
+        raises: format!("KeyError: Missing required keys for 'rope_type'='{name}': {{'factor'}}"),
+        similar: None,
+        pointer,
+    })
+}
+
+/// Values whose JSON type the config class refuses, in the config at `at` and in its parts that name their model type.
+fn of_fields(knowledge: &Knowledge, config: &Value, version: &str, at: &str) -> Vec<Refusal> {
+    let Some(map) = config.as_object() else { return Vec::new() };
+    let Some(model_type) = map.get("model_type").and_then(Value::as_str) else { return Vec::new() };
+    let mut found = Vec::new();
+    for (kinds, keys) in knowledge.refusals.of_fields(version, model_type) {
+        for key in keys {
+            let Some(value) = map.get(&key) else { continue };
+            if kinds.split(' ').any(|kind| kind == json_type(value)) {
+                found.push(Refusal {
+                    pointer: pointer::join(at, &key),
+                    value: value.clone(),
+                    because: format!("and {model_type} takes no {} there", json_type(value)),
+                    raises: format!("StrictDataclassFieldValidationError: Validation error for field '{key}'"),
+                    similar: None,
+                });
+            }
+        }
+    }
+    let parts = map.iter().filter(|(key, value)| key.ends_with("_config") && value.is_object());
+    found.extend(parts.flat_map(|(key, part)| of_fields(knowledge, part, version, &pointer::join(at, key))));
+    found
+}
+
+/// A dtype that torch does not have. Versions since 4.56 prefer `dtype` to `torch_dtype`.
+fn dtype(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Refusal> {
+    let named = |key: &'static str| Some((key, config.get(key)?.as_str()?));
+    let newer = if version_numbers(version) >= vec![4, 56] { named("dtype") } else { None };
+    let (key, name) = newer.or_else(|| named("torch_dtype"))?;
+    knowledge.names.lacks(version, NameKind::Dtype, name).then(|| Refusal {
+        pointer: format!("/{key}"),
+        value: name.into(),
+        because: "which is no dtype of torch".to_owned(),
+        raises: format!("AttributeError: module 'torch' has no attribute '{name}'"),
+        similar: knowledge.names.similar(NameKind::Dtype, name.trim_start_matches("torch.")).map(str::to_owned),
+    })
+}
+
+/// The JSON type of a value, with the two kinds of numbers that Python tells apart.
+fn json_type(value: &Value) -> &'static str {
+    match value {
+        Value::Null => "null",
+        Value::Bool(_) => "boolean",
+        Value::Number(number) if number.is_f64() => "fraction",
+        Value::Number(_) => "integer",
+        Value::String(_) => "string",
+        Value::Array(_) => "array",
+        Value::Object(_) => "object",
+    }
+}
+
+/// A quantisation block without `quant_method`, or with one that transformers 4 does not know; transformers 5 loads the
+/// latter as plain weights. Schemes of other programs are reported by the rules of quantised weights.
+fn quantisation(knowledge: &Knowledge, config: &Value, targets: &[Target]) -> Option<Fault> {
+    let (pointer, block) = block(config).filter(|(pointer, _)| *pointer == "/quantization_config")?;
+    let is_set = |key| block.get(key).and_then(Value::as_bool) == Some(true);
+    let is_other = matches!(declared_scheme(config, &knowledge.schemes), DeclaredScheme::Known(scheme) if scheme.scheme().loaded_by.is_some());
+    if is_set("load_in_8bit") || is_set("load_in_4bit") || is_other {
+        return None;
+    }
+    let place = Place::file("config.json").pointer(pointer);
+    let method = block.get("quant_method").and_then(Value::as_str);
+    let raises = |target: &&Target| {
+        let lacks = |method| knowledge.names.lacks(target.version(), NameKind::QuantMethod, method);
+        method.is_none_or(|method| target.loader.major() < 5 && lacks(method))
+    };
+    let raising: Vec<&Target> = targets.iter().filter(raises).collect();
+    let fault = match method {
+        Some(method) => Fault::new(FaultKind::QuantMethodUnknown).at(place).with("method", method),
+        None => Fault::new(FaultKind::QuantMethodMissing).at(place),
+    };
+    let versions: Vec<&str> = raising.iter().map(|target| target.version()).collect();
+    let fault = fault.with("versions", versions);
+    (!raising.is_empty()).then(|| raising.into_iter().map(|target| target.loader.version()).fold(fault, Fault::under))
+}
+
+/// The pointer of the object that has this one as a key.
+fn parent(pointer: &str) -> &str {
+    pointer.rsplit_once('/').map_or("", |(parent, _)| parent)
+}

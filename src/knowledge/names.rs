@@ -1,0 +1,137 @@
+//! The names that versions of transformers accept in config.json.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Deserialize;
+
+use super::loader::version_numbers;
+use super::source::{self, DataError};
+
+/// The names of one version.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Lists {
+    activations: BTreeSet<String>,
+    dtypes: BTreeSet<String>,
+    model_types: BTreeSet<String>,
+    quantization: BTreeSet<String>,
+    rope_types: BTreeSet<String>,
+}
+
+/// A list of names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NameKind {
+    /// `ACT2FN`: activation functions.
+    Activation,
+    /// Names of `torch.dtype` in torch.
+    Dtype,
+    /// `CONFIG_MAPPING`: model types.
+    ModelType,
+    /// `AUTO_QUANTIZATION_CONFIG_MAPPING`: values of `quant_method`.
+    QuantMethod,
+    /// `ROPE_INIT_FUNCTIONS`: values of `rope_type`.
+    RopeType,
+}
+
+impl Lists {
+    const fn of(&self, kind: NameKind) -> &BTreeSet<String> {
+        match kind {
+            NameKind::Activation => &self.activations,
+            NameKind::Dtype => &self.dtypes,
+            NameKind::ModelType => &self.model_types,
+            NameKind::QuantMethod => &self.quantization,
+            NameKind::RopeType => &self.rope_types,
+        }
+    }
+}
+
+/// `rules/names.json`: the names by version of transformers; `tools/loader_names.py` writes it.
+#[derive(Debug, Clone, Default)]
+pub struct LoaderNames {
+    versions: BTreeMap<Vec<u64>, Lists>,
+}
+
+impl LoaderNames {
+    /// The built-in lists.
+    ///
+    /// # Errors
+    /// [`DataError`] when the file is malformed; every test that checks a checkpoint parses it.
+    pub fn embedded() -> Result<Self, DataError> {
+        let file = "names.json";
+        let lists: BTreeMap<String, Lists> = serde_json::from_str(source::text(file).unwrap_or_default())
+            .map_err(|error| DataError::new(&format!("rules/{file}"), error.to_string()))?;
+        Ok(Self { versions: lists.into_iter().map(|(version, lists)| (version_numbers(&version), lists)).collect() })
+    }
+
+    /// Whether `version` certainly does not know the name: neither the next newer known version nor the next older one
+    /// does. Versions newer than all known ones may know any name.
+    #[must_use]
+    pub fn lacks(&self, version: &str, kind: NameKind, name: &str) -> bool {
+        let numbers = version_numbers(version);
+        let newer = self.versions.range(numbers.clone()..).next();
+        let older = self.versions.range(..=numbers).next_back();
+        newer.is_some_and(|(_, lists)| !lists.of(kind).contains(name))
+            && older.is_none_or(|(_, lists)| !lists.of(kind).contains(name))
+    }
+
+    /// Whether any known version knows the name.
+    #[must_use]
+    pub fn contains(&self, kind: NameKind, name: &str) -> bool {
+        self.versions.values().any(|lists| lists.of(kind).contains(name))
+    }
+
+    /// The model type that transformers 4 takes from a directory's name when config.json has none: the longest one in it.
+    #[must_use]
+    pub fn model_type_in(&self, version: &str, directory: &str) -> Option<&str> {
+        let (_, lists) = self.versions.range(version_numbers(version)..).next()?;
+        let found = lists.model_types.iter().filter(|name| directory.contains(name.as_str()));
+        found.max_by_key(|name| name.len()).map(String::as_str)
+    }
+
+    /// The known name that `name` is a misspelling of: another separator or case, or a letter.
+    #[must_use]
+    pub fn similar(&self, kind: NameKind, name: &str) -> Option<&str> {
+        let plain = |name: &str| name.to_ascii_lowercase().replace(['-', '.', ' '], "_");
+        let all: BTreeSet<&str> = self.versions.values().flat_map(|lists| lists.of(kind)).map(String::as_str).collect();
+        let likeness = |other: &str| strsim::damerau_levenshtein(&plain(other), &plain(name));
+        let best = all.into_iter().map(|other| (likeness(other), other)).min()?;
+        // Names of versions such as qwen2 and qwen3 differ in one letter.
+        let digits = |name: &str| name.chars().filter(char::is_ascii_digit).collect::<String>();
+        let is_close = best.0 == 0 || best.0 == 1 && name.len() >= 5 && digits(best.1) == digits(name);
+        is_close.then_some(best.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_is_lacking_only_where_both_neighbours_lack_it() {
+        let names = LoaderNames::embedded().unwrap();
+        for (version, model_type, lacks) in [
+            ("4.47.0", "llama", false),
+            ("4.47.0", "qwen3", true),
+            ("4.51.3", "qwen3", false),
+            ("4.57.6", "qwen3", false),
+            ("4.40.0", "bora_moe", true),
+            ("4.51.3", "bora_moe", true),
+            ("5.23.0", "bora_moe", true),
+            ("5.24.0", "bora_moe", false),
+            ("main", "llama", false),
+        ] {
+            assert_eq!(names.lacks(version, NameKind::ModelType, model_type), lacks, "{version} {model_type}");
+        }
+    }
+
+    #[test]
+    fn misspelt_types_have_a_similar_one() {
+        let names = LoaderNames::embedded().unwrap();
+        assert_eq!(names.similar(NameKind::ModelType, "llava-onevision"), Some("llava_onevision"));
+        assert_eq!(names.similar(NameKind::ModelType, "Llama"), Some("llama"));
+        assert_eq!(names.similar(NameKind::ModelType, "qwen9"), None);
+        assert_eq!(names.similar(NameKind::ModelType, "bora_moe"), None);
+        assert_eq!(names.model_type_in("4.47.0", "my-roberta-base"), Some("roberta"));
+        assert_eq!(names.model_type_in("4.47.0", "model"), None);
+    }
+}

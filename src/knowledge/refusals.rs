@@ -1,0 +1,88 @@
+//! Values of config.json that classes refuse.
+
+use std::collections::BTreeMap;
+
+use memchr::memmem;
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+use super::source;
+
+/// What one model class refuses, by pointers without the first slash; an unused list is empty.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case", default)]
+pub struct ClassRefusals {
+    /// Keys of activation functions: an unknown name raises `KeyError`.
+    pub activation: Vec<String>,
+    /// Keys of padding ids: an id beyond `vocab_size` beside it raises `AssertionError`.
+    pub padding: Vec<String>,
+    /// Keys of rope parameters: an unknown type raises `KeyError`.
+    pub rope_type: Vec<String>,
+    /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
+    pub rope_factor: Vec<String>,
+}
+
+/// `rules/refused/<version>.json`, which `tools/derive_architectures.py accepts` writes by trying every class. An entry is
+/// one line, and only the lines that a check needs are parsed.
+#[derive(Debug, Clone, Default)]
+pub struct Refusals {
+    versions: BTreeMap<&'static str, &'static str>,
+}
+
+impl Refusals {
+    /// The built-in files.
+    #[must_use]
+    pub fn embedded() -> Self {
+        let files = source::files("refused");
+        Self { versions: files.filter_map(|(name, text)| Some((name.strip_suffix(".json")?, text))).collect() }
+    }
+
+    /// What the model class refuses under this version; `None` for other versions and unknown classes.
+    #[must_use]
+    pub fn of_class(&self, version: &str, class: &str) -> Option<ClassRefusals> {
+        self.entry(version, "classes", class)
+    }
+
+    /// The JSON types that keys of a config class refuse under this version, as `string integer`, with the keys.
+    #[must_use]
+    pub fn of_fields(&self, version: &str, model_type: &str) -> BTreeMap<String, Vec<String>> {
+        self.entry(version, "fields", model_type).unwrap_or_default()
+    }
+
+    fn entry<T: DeserializeOwned>(&self, version: &str, part: &str, name: &str) -> Option<T> {
+        let text = self.versions.get(version)?;
+        let from = |text: &'static str, needle: &str| {
+            let at = memmem::find(text.as_bytes(), needle.as_bytes())?;
+            text.get(at.checked_add(needle.len())?..)
+        };
+        let part = from(text, &format!("\n\"{part}\": {{"))?;
+        let line = from(part, &format!("\n{}: ", serde_json::Value::from(name)))?.lines().next()?;
+        serde_json::from_str(line.strip_suffix(',').unwrap_or(line)).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_line_is_read_as_the_document_has_it() {
+        let refusals = Refusals::embedded();
+        assert!(refusals.versions.len() >= 3);
+        for (version, text) in &refusals.versions {
+            let document: serde_json::Value = serde_json::from_str(text).unwrap();
+            for (class, entry) in document["classes"].as_object().unwrap() {
+                let expected: ClassRefusals = serde_json::from_value(entry.clone()).unwrap();
+                assert_eq!(refusals.of_class(version, class), Some(expected), "{version} {class}");
+            }
+            for (model_type, entry) in document["fields"].as_object().unwrap() {
+                assert_eq!(
+                    serde_json::json!(refusals.of_fields(version, model_type)),
+                    *entry,
+                    "{version} {model_type}"
+                );
+            }
+        }
+        assert_eq!(refusals.of_class("4.47.0", "llama"), None);
+    }
+}

@@ -1,0 +1,58 @@
+#!/usr/bin/env python3
+"""Write the names that the transformers at hand accepts in config.json to rules/names.json. For maintainers.
+
+    python tools/loader_names.py            # replace the lists of this version
+    python tools/loader_names.py --check    # fail if the lists of this version differ
+"""
+import json
+import sys
+from pathlib import Path
+
+import torch
+import transformers
+from transformers.activations import ACT2FN
+from transformers.modeling_rope_utils import ROPE_INIT_FUNCTIONS
+from transformers.models.auto.configuration_auto import CONFIG_MAPPING_NAMES
+from transformers.quantizers.auto import AUTO_QUANTIZATION_CONFIG_MAPPING
+
+FILE = Path(__file__).resolve().parents[1] / "rules" / "names.json"
+
+
+def main():
+    known = json.loads(FILE.read_text()) if FILE.exists() else {}
+    version = transformers.__version__
+    lists = {
+        "activations": sorted(ACT2FN),
+        "dtypes": sorted(name for name, value in vars(torch).items() if isinstance(value, torch.dtype)),
+        "model_types": sorted(CONFIG_MAPPING_NAMES),
+        "quantization": sorted(AUTO_QUANTIZATION_CONFIG_MAPPING),
+        # `default` has no function of its own in transformers 5, which all the same takes it.
+        "rope_types": sorted({*ROPE_INIT_FUNCTIONS, "default"}),
+    }
+    if "--check" in sys.argv[1:]:
+        differing = sorted(name for name in lists if known.get(version, {}).get(name) != lists[name])
+        print(f"transformers {version}: {', '.join(f'{len(v)} {k}' for k, v in lists.items())}; differing: {differing or 'none'}")
+        return 1 if differing else 0
+    known[version] = lists
+    FILE.write_text("{\n" + ",\n".join(f"  {json.dumps(v)}: {{\n{listed(known[v])}\n  }}" for v in sorted(known)) + "\n}\n")
+    print(f"{FILE.name}: names of transformers {version}")
+    return 0
+
+
+def listed(lists):
+    return ",\n".join(f"    {json.dumps(name)}: [\n{wrapped(names)}\n    ]" for name, names in lists.items())
+
+
+def wrapped(names, width=118):
+    """JSON strings in lines of at most `width` columns."""
+    lines = ["     "]
+    for at, name in enumerate(names):
+        item = f" {json.dumps(name)}" + ("," if at + 1 < len(names) else "")
+        if len(lines[-1]) + len(item) > width:
+            lines.append("     ")
+        lines[-1] += item
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
