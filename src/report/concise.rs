@@ -2,14 +2,18 @@
 
 use std::fmt::Write as _;
 
+use super::Style;
 use super::fixes::mark;
-use super::format::{capped, headline, more, name, place, sentence};
+use super::format::{capped, headline, more, name, place, sentence, worst_first};
 use super::model::{CheckpointReport, Report};
 
-pub fn render(report: &Report, cap: usize) -> String {
+pub fn render(report: &Report, style: Style) -> String {
+    let cap = style.cap;
     let mut out = String::new();
-    for checkpoint in &report.checkpoints {
-        findings(&mut out, checkpoint, cap);
+    for checkpoint in worst_first(report) {
+        if !style.quiet || !checkpoint.is_quiet() {
+            findings(&mut out, checkpoint, cap);
+        }
     }
     if let Some(merge) = &report.merge {
         for seam in merge.seams.iter().take(cap) {
