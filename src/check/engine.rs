@@ -356,6 +356,7 @@ fn finding(
         evidence,
         fix,
         hidden: 0,
+        note: rule.note,
     }
 }
 

@@ -51,9 +51,9 @@ impl CheckpointReport {
         }
     }
 
-    /// Whether nothing about it is printed with `--quiet`: it has no findings, and nothing was fixed.
+    /// Whether nothing about it is printed with `--quiet`: it has no findings but notes, and nothing was fixed.
     pub(crate) fn is_quiet(&self) -> bool {
-        self.findings.is_empty() && self.fixed.is_empty() && self.withdrawn.is_empty()
+        self.findings.iter().all(Finding::is_note) && self.fixed.is_empty() && self.withdrawn.is_empty()
     }
 
     /// Removes findings below this severity; they stay in `counts`. Returns their number.

@@ -35,7 +35,8 @@ fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         let _ok = writeln!(out, "{}: {}", name(&checkpoint.path), headline(&checkpoint.loads));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in shown {
+    let (notes, findings): (Vec<_>, Vec<_>) = shown.into_iter().partition(|finding| finding.is_note());
+    for finding in notes.into_iter().chain(findings) {
         let location = finding.locations.first();
         out.push_str(&place(&checkpoint.path, location));
         if let Some(line) = location.and_then(|l| l.line) {

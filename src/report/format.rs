@@ -190,6 +190,12 @@ pub fn details(finding: &Finding) -> Vec<String> {
     finding.details.iter().map(|detail| sentence(detail)).collect()
 }
 
+/// The findings for the header of a checkpoint, one line each: `info[ARC001]: unknown class …`.
+pub fn notes(checkpoint: &CheckpointReport) -> Vec<String> {
+    let notes = checkpoint.findings.iter().filter(|finding| finding.is_note());
+    notes.map(|note| format!("{}[{}]: {}", note.severity.name(), name(&note.code), sentence(&note.message))).collect()
+}
+
 /// At most `cap` findings of each code, and the number of omitted findings by code.
 pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, usize)>) {
     let mut shown = Vec::new();

@@ -70,7 +70,8 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         let _ok = writeln!(out, "\nVerdict: {}", text(&format::headline(&checkpoint.loads)));
     }
     let _ok = writeln!(out, "\n{architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
-    let objects = format::objects(&checkpoint.loads);
+    let mut objects = format::objects(&checkpoint.loads);
+    objects.extend(format::notes(checkpoint));
     if !objects.is_empty() {
         out.push('\n');
     }
@@ -81,7 +82,7 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in format::alike(shown) {
+    for finding in format::alike(shown.into_iter().filter(|finding| !finding.is_note()).collect()) {
         render_finding(out, &finding);
     }
     for (code, n) in hidden {

@@ -10,11 +10,12 @@ use std::fmt::Write as _;
 
 use self::paint::Paint;
 use super::format::{
-    agreeing, alike, bytes, capped, counts, headline, name, objects, plural, summary, worst_first, wrap,
+    agreeing, alike, bytes, capped, counts, headline, name, notes, objects, plural, summary, worst_first, wrap,
 };
 use super::model::{CheckpointReport, Report};
 use super::overview::Overview;
 use super::{Style, fixes};
+use crate::check::Finding;
 
 pub fn render(report: &Report, style: Style) -> String {
     let paint = Paint(style.color);
@@ -78,11 +79,11 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
     let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
     let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
-    let notes: Vec<String> = settings.into_iter().chain(suppressed).collect();
-    if !notes.is_empty() {
-        let _ok = writeln!(out, "  {}", paint.quiet(&notes.join(", ")));
+    let policy: Vec<String> = settings.into_iter().chain(suppressed).collect();
+    if !policy.is_empty() {
+        let _ok = writeln!(out, "  {}", paint.quiet(&policy.join(", ")));
     }
-    for line in objects(&checkpoint.loads) {
+    for line in objects(&checkpoint.loads).into_iter().chain(notes(checkpoint)) {
         let width = style.width.map(|width| width.saturating_sub(4).max(40));
         for (n, part) in wrap(&line, width).lines().enumerate() {
             let indent = if n == 0 { "  " } else { "    " };
@@ -93,6 +94,8 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
 
 fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     let (shown, hidden) = capped(&checkpoint.findings, style.cap);
+    let shown: Vec<&Finding> = shown.into_iter().filter(|finding| !finding.is_note()).collect();
+    let is_empty = shown.is_empty() && hidden.is_empty();
     for finding in alike(shown) {
         out.push('\n');
         out.push_str(&finding::render(&finding, checkpoint, style));
@@ -101,7 +104,7 @@ fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", name(code));
     }
-    if !checkpoint.findings.is_empty() {
+    if !is_empty {
         out.push('\n');
     }
 }
