@@ -24,21 +24,21 @@ pub fn targets(paths: &[PathBuf], quiet: bool) -> Targets {
     let mut outside: Vec<&Path> = Vec::new();
     for path in paths {
         let found = find_checkpoints(path);
+        for (folder, error) in &found.unlisted {
+            let reason = format!("cannot be listed: {error}");
+            targets.unchecked.push(UncheckedPath { path: folder.display().to_string(), reason });
+        }
         if let Some(reason) = nothing(path, &found) {
             // pre-commit passes all files of a commit; those outside of checkpoints are no reason to fail.
             if path.is_file() && found.foreign.is_empty() {
                 outside.push(path);
-            } else {
+            } else if found.unlisted.is_empty() || !found.foreign.is_empty() {
                 targets.unchecked.push(UncheckedPath { path: path.display().to_string(), reason });
             }
             continue;
         }
         if !found.foreign.is_empty() && !quiet {
             output::note(&output::safe(&format!("note: {}: {}", path.display(), unread(path, &found))));
-        }
-        for (folder, error) in found.unlisted {
-            let reason = format!("cannot be listed: {error}");
-            targets.unchecked.push(UncheckedPath { path: folder.display().to_string(), reason });
         }
         // pre-commit passes several files of one checkpoint; it is checked once.
         let new = found.checkpoints.into_iter();
@@ -78,7 +78,7 @@ fn unread(path: &Path, found: &Found) -> String {
         let file = if below.as_os_str().is_empty() { Path::new(path.file_name().unwrap_or_default()) } else { below };
         match files.count.saturating_sub(1) {
             0 => format!("{} is {format}, which is not read", file.display()),
-            n => format!("{} and {n} more like it: {format}, which is not read", file.display()),
+            n => format!("{} (and {n} more) is {format}, which is not read", file.display()),
         }
     };
     found.foreign.iter().map(sentence).collect::<Vec<_>>().join("; ")

@@ -153,10 +153,7 @@ fn paths_that_cannot_be_checked_do_not_lose_the_other_reports() {
     let zoo = doctor(&["check", root.to_str().unwrap(), "--exit-zero"]);
     assert_eq!(zoo.status.code(), Some(0));
     let notes = String::from_utf8(zoo.stderr).unwrap();
-    assert!(
-        notes.starts_with("note: ") && notes.contains("two/a.onnx and 1 more like it: ONNX, which is not"),
-        "{notes}"
-    );
+    assert!(notes.starts_with("note: ") && notes.contains("two/a.onnx (and 1 more) is ONNX, which is not"), "{notes}");
 }
 
 /// Root may list every folder, so this needs a user who may not.
