@@ -29,7 +29,7 @@ pub mod text;
 pub mod tokenizer;
 
 pub use contents::Contents;
-pub use discover::{find_checkpoints, is_checkpoint, owner};
+pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
 pub use entry::{Entry, EntryKind};

@@ -12,6 +12,7 @@ mod init;
 mod inspect;
 mod library;
 mod output;
+mod paths;
 mod rules;
 mod settings;
 mod signals;
@@ -32,6 +33,12 @@ fn interrupted(error: &anyhow::Error) -> bool {
         || matches!(error.downcast_ref(), Some(PipelineError::Apply(ApplyError::Interrupted)))
 }
 
+/// The causes of an error, escaped: names in it may come from a checkpoint.
+fn causes(error: &anyhow::Error) -> String {
+    let causes: Vec<String> = error.chain().map(|e| output::safe(&e.to_string())).collect();
+    causes.join(": ")
+}
+
 /// Runs the program.
 #[must_use]
 pub fn main() -> ExitCode {
@@ -49,9 +56,7 @@ pub fn main() -> ExitCode {
     match result {
         Ok(code) => ExitCode::from(code),
         Err(error) => {
-            // Names in an error may come from a checkpoint, so they are escaped.
-            let causes: Vec<String> = error.chain().map(|e| output::safe(&e.to_string())).collect();
-            let causes = causes.join(": ");
+            let causes = causes(&error);
             if interrupted(&error) {
                 output::note(&causes);
                 ExitCode::from(signals::exit_code())

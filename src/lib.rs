@@ -74,7 +74,7 @@ pub use check::{Edit, Finding, FixHint, Location, Safety, Severity};
 pub use checkpoint::{Dtype, Fault, FaultKind, Place, Shard, Tensor};
 pub use report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, Fixed, MergeReport, MergeStage, MergedFile, Report, Role, Seam,
-    ShapedName, StageOutcome, Summary, ToolInfo, Verdict, Withdrawn,
+    ShapedName, StageOutcome, Summary, ToolInfo, UncheckedPath, Verdict, Withdrawn,
 };
 pub use surgery::plan::TensorTransform;
 

@@ -23,6 +23,7 @@ mod json;
 pub(crate) mod markdown;
 mod merge;
 pub mod model;
+mod overview;
 #[cfg(feature = "cli")]
 mod statistics;
 #[cfg(feature = "cli")]
@@ -56,7 +57,7 @@ impl Report {
 pub fn render(report: &Report, format: Format, style: Style) -> String {
     match format {
         Format::Full => terminal::render(report, style),
-        Format::Concise => concise::render(report, style.cap),
+        Format::Concise => concise::render(report, style),
         Format::Json => report.to_json(),
         Format::Jsonl => json::lines(report),
         Format::Github => ci::github::render(report),

@@ -359,6 +359,7 @@ fn finding(
         evidence,
         fix,
         hidden: 0,
+        note: rule.note,
     }
 }
 

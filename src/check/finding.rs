@@ -56,9 +56,18 @@ pub struct Finding {
     /// Further findings of the rule that are counted and not listed, because one file or one checkpoint has too many.
     #[serde(skip_serializing_if = "is_zero")]
     pub hidden: u64,
+    /// Whether the rule is a note, see [`Self::is_note`].
+    #[serde(skip)]
+    pub note: bool,
 }
 
 impl Finding {
+    /// Whether it states what was not checked, and no effect or setting made it more than information. Formats for people
+    /// print it in the header of the checkpoint.
+    pub(crate) fn is_note(&self) -> bool {
+        self.note && self.severity == Severity::Info
+    }
+
     /// The number of findings that it counts for: itself, and the hidden ones.
     #[must_use]
     pub fn count(&self) -> usize {

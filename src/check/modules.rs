@@ -211,7 +211,30 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
             imports(checkpoint, &entries, entry, module, &mut faults);
         }
     }
-    faults
+    once_per_module(faults)
+}
+
+/// Reports a missing module once, at the entry that names it: the fault there lists the modules that import it, in
+/// `importers`, and the faults of these imports are dropped.
+fn once_per_module(faults: Vec<Fault>) -> Vec<Fault> {
+    let text = |fault: &Fault, key: &str| fault.detail.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
+    let named = |kind| faults.iter().filter(move |fault| fault.kind == kind);
+    let missing: BTreeSet<String> = named(FaultKind::AutoMapModuleMissing).map(|f| text(f, "module")).collect();
+    let imports: BTreeSet<(String, String)> =
+        named(FaultKind::RelativeImportMissing).map(|f| (text(f, "imported"), text(f, "module"))).collect();
+    let kept = faults
+        .into_iter()
+        .filter(|fault| fault.kind != FaultKind::RelativeImportMissing || !missing.contains(&text(fault, "imported")));
+    kept.map(|fault| {
+        if fault.kind != FaultKind::AutoMapModuleMissing {
+            return fault;
+        }
+        let module = text(&fault, "module");
+        let importers =
+            imports.iter().filter(|(imported, _)| *imported == module).map(|(_, importer)| importer.clone());
+        fault.with("importers", importers.collect::<Vec<_>>())
+    })
+    .collect()
 }
 
 fn imports(

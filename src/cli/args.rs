@@ -150,7 +150,7 @@ pub struct ReportArgs {
     pub report: Vec<(Format, PathBuf)>,
     /// Lowest severity that makes the exit code 1 [default: error]
     #[arg(long, value_name = "SEVERITY")]
-    pub fail_on: Option<FailOn>,
+    pub fail_on: Option<SeverityName>,
     /// Exit with 0 even if there are findings
     #[arg(long)]
     pub exit_zero: bool,
@@ -175,7 +175,8 @@ pub struct BaselineArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "Exit codes:\n  0  no findings at or above --fail-on\n  \
 1  findings at or above --fail-on; with --diff, a fix would change something\n  \
-2  the check could not run: no checkpoint found, unreadable file, or wrong argument")]
+2  a path could not be checked (missing, without a checkpoint, unreadable), or wrong argument; the other paths are \
+reported, and 2 takes precedence over 1")]
 #[expect(clippy::struct_excessive_bools, reason = "one for each flag of the command")]
 pub struct CheckArgs {
     /// Checkpoint directories, directories that contain checkpoints, or files of checkpoints
@@ -215,6 +216,12 @@ pub struct CheckArgs {
     /// Count the findings of each rule instead of showing them (formats full, concise and json)
     #[arg(long, help_heading = "Output")]
     pub statistics: bool,
+    /// Lowest severity that is reported; the exit code depends on --fail-on alone [default: info]
+    #[arg(long, value_name = "SEVERITY", help_heading = "Output")]
+    pub min_severity: Option<SeverityName>,
+    /// Print findings only: neither the table, checkpoints without findings nor the summary (formats full and concise)
+    #[arg(short, long, help_heading = "Output", conflicts_with_all = ["statistics", "verbose"])]
+    pub quiet: bool,
     /// Explain why each skipped rule was skipped
     #[arg(short, long, help_heading = "Output")]
     pub verbose: bool,
@@ -262,7 +269,8 @@ pub struct UndoArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "Without --recipe, the architectures of the donors determine the recipe.\n\n\
 Exit codes:\n  0  the merged checkpoint is written (or, with --dry-run, planned) without findings at or above --fail-on\n  \
-1  a donor or a seam stopped the merge, or the result has findings\n  2  the merge could not be attempted")]
+1  the merged checkpoint is written (or planned), and has findings at or above --fail-on\n  \
+2  the merge was refused because of a donor, a seam or the plan, or it failed, or wrong argument")]
 pub struct BuildMergedArgs {
     /// A merge file (JSON5) with the recipe, donors, options and output directory
     #[arg(value_name = "MERGE_FILE", conflicts_with_all = ["recipe", "donor", "vision", "language"])]
@@ -296,10 +304,10 @@ pub struct BuildMergedArgs {
     pub report: ReportArgs,
 }
 
-/// Lowest severity that fails.
+/// Severity as an argument.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum FailOn {
-    /// Any finding
+pub enum SeverityName {
+    /// All findings
     Info,
     /// Warnings and errors
     Warning,
@@ -307,7 +315,7 @@ pub enum FailOn {
     Error,
 }
 
-impl FailOn {
+impl SeverityName {
     /// The severity of this name.
     pub const fn severity(self) -> Severity {
         match self {

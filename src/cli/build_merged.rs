@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use super::args::{BuildMergedArgs, FailOn};
-use super::exit::{CLEAN, FINDINGS};
+use super::args::{BuildMergedArgs, SeverityName};
+use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::{library, output, signals};
 use crate::check::Severity;
 use crate::knowledge::Knowledge;
@@ -32,19 +32,20 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     };
     let run = merge::run(&request, &knowledge, &mut progress)?;
     let stage = run.record.stage;
-    output::finish(&run.report(), &args.report, false).with_context(|| match stage {
+    output::finish(&run.report(), &args.report, false, false).with_context(|| match stage {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
         _ => "the report could not be written".to_owned(),
     })?;
     // Only the result counts: errors of a donor that the merge repaired are reported, but do not fail the run.
     Ok(match stage {
         Some(MergeStage::Written | MergeStage::DryRun) if args.report.exit_zero || !result_fails(&run, args) => CLEAN,
-        _ => FINDINGS,
+        Some(MergeStage::Written | MergeStage::DryRun) => FINDINGS,
+        _ => FAILED,
     })
 }
 
 fn result_fails(run: &MergeRun, args: &BuildMergedArgs) -> bool {
-    let least = args.report.fail_on.map_or(Severity::Error, FailOn::severity);
+    let least = args.report.fail_on.map_or(Severity::Error, SeverityName::severity);
     let result = run.checked.iter().rfind(|c| !matches!(c.role, Role::Donor(_)));
     result.is_some_and(|c| c.outcome.findings.iter().any(|f| f.severity >= least))
 }

@@ -1,19 +1,19 @@
 //! `check`.
 
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::sync::Arc;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 
 use super::args::CheckArgs;
-use super::exit::{CLEAN, FINDINGS};
+use super::exit::{CLEAN, FAILED, FINDINGS};
+use super::paths::{self, Targets};
 use super::settings::{Resolved, SettingsResolver, Typed};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
-use crate::checkpoint::{Checkpoint, find_checkpoints, owner};
-use crate::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
+use crate::checkpoint::Checkpoint;
+use crate::report::model::{CheckpointReport, Fixed, Fixing, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
 
 /// A checkpoint, the result of checking it and the settings it was checked under.
@@ -29,28 +29,46 @@ struct Checked {
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut settings = SettingsResolver::new(Typed::check(args, rules));
-    let mut seen = BTreeSet::new();
-    let mut dirs = Vec::new();
-    for path in &args.paths {
-        for dir in directories(path)? {
-            // pre-commit passes several files of one checkpoint; it is checked once.
-            if !seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone())) {
-                continue;
-            }
-            dirs.push(dir);
-        }
-    }
+    let Targets { dirs, mut unchecked } = paths::targets(&args.paths, args.quiet);
     args.fix.refuse(dirs.len())?;
     if args.fix.writes() {
         signals::install()?;
     }
-    let mut looked = dirs.into_iter().map(|dir| look(dir, args, &mut settings)).collect::<anyhow::Result<Vec<_>>>()?;
+    let mut looked = Vec::new();
+    for dir in dirs {
+        let by = settings.resolve(&dir)?;
+        let path = dir.display().to_string();
+        let checked = match look(dir, args, by) {
+            Ok(checked) => {
+                refuse_unusable(&checked)?;
+                repaired(checked, args)
+            }
+            failed => failed,
+        };
+        match checked {
+            Ok(checked) => looked.push(checked),
+            Err(error) if super::interrupted(&error) => return Err(error),
+            // The other checkpoints are still checked.
+            Err(error) => unchecked.push(UncheckedPath { path, reason: super::causes(&error) }),
+        }
+    }
+    for path in &unchecked {
+        output::note(&output::safe(&format!("error: {}: {}", path.path, path.reason)));
+    }
+    let exit = |found: bool| match (unchecked.is_empty(), found) {
+        (false, _) => FAILED,
+        (true, true) => FINDINGS,
+        (true, false) => CLEAN,
+    };
     if args.fix.diff {
         let changes = looked.iter().map(|l| fix::show(&args.fix, &l.dir, &l.checkpoint, &l.outcome, &check_by(&l.by)));
         let changes = changes.sum::<anyhow::Result<usize>>()?;
-        return Ok(if changes > 0 { FINDINGS } else { CLEAN });
+        return Ok(exit(changes > 0));
     }
-    report_unused_suppressions(&mut looked, &settings, &args.paths);
+    // A suppression in a path that was not checked may still suppress something.
+    let is_checked = |path: &&PathBuf| !unchecked.iter().any(|u| Path::new(&u.path).starts_with(path));
+    let searched: Vec<PathBuf> = args.paths.iter().filter(is_checked).cloned().collect();
+    report_unused_suppressions(&mut looked, &settings, &searched);
     let reports = looked.iter().map(|l| {
         let mut report = CheckpointReport::new(l.dir.display().to_string(), None, &l.checkpoint, &l.outcome);
         report.settings = l.by.file.as_ref().map(|file| file.display().to_string());
@@ -62,34 +80,23 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let fixed = args.fix.exit_non_zero_on_fix && reports.iter().any(|r| !r.fixed.is_empty());
     if args.fix.fix_only {
         output::print(&fixes::made(&reports))?;
-        return Ok(if fixed { FINDINGS } else { CLEAN });
+        return Ok(exit(fixed));
     }
     let by: Vec<Rc<Resolved>> = looked.iter().map(|l| Rc::clone(&l.by)).collect();
     baseline::apply_baselines(&mut reports, &by, args.baseline.write_baseline)?;
     let fails =
         |(report, by): (&CheckpointReport, &Rc<Resolved>)| report.counts.worst().is_some_and(|w| w >= by.fail_on);
     let failed = reports.iter().zip(&by).any(fails);
-    output::finish(&Report::new(reports, None), &args.report, args.statistics)?;
+    let code = exit(fixed || failed && !args.report.exit_zero);
+    let hidden = reports.iter_mut().zip(&by).map(|(report, by)| report.hide_below(by.min_severity)).sum();
+    let report = Report::new(reports, None).with_unchecked(unchecked).with_hidden(hidden);
+    output::finish(&report, &args.report, args.statistics, args.quiet)?;
     if args.verbose {
         for l in &looked {
             skipped::print(&l.dir, &l.outcome, &l.by.knowledge.rules);
         }
     }
-    Ok(if fixed || failed && !args.report.exit_zero { FINDINGS } else { CLEAN })
-}
-
-/// The checkpoints for a path. A file may belong to no checkpoint: pre-commit passes all files of a commit. A deleted
-/// file stands for the checkpoint that contained it.
-fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    if !path.exists() {
-        let Some(owner) = owner(path) else { bail!("{}: no such file or directory", path.display()) };
-        return Ok(vec![owner]);
-    }
-    let found = find_checkpoints(path);
-    if found.is_empty() && path.is_dir() {
-        bail!("{}: no checkpoint found (no config.json, adapter_config.json, index or *.safetensors)", path.display());
-    }
-    Ok(found)
+    Ok(code)
 }
 
 /// Checks a checkpoint under its settings.
@@ -97,27 +104,37 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
     |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
 }
 
-fn look(dir: PathBuf, args: &CheckArgs, settings: &mut SettingsResolver) -> anyhow::Result<Checked> {
-    let by = settings.resolve(&dir)?;
-    let open = |dir: &Path| {
-        let mut checkpoint = Checkpoint::open(dir).with_context(|| dir.display().to_string())?;
-        if args.deep {
-            checkpoint.read_contents();
-        }
-        Ok(Arc::new(checkpoint))
-    };
+fn open(dir: &Path, args: &CheckArgs) -> anyhow::Result<Arc<Checkpoint>> {
+    let mut checkpoint = Checkpoint::open(dir)?;
+    if args.deep {
+        checkpoint.read_contents();
+    }
+    Ok(Arc::new(checkpoint))
+}
+
+/// Reads and checks a checkpoint.
+fn look(dir: PathBuf, args: &CheckArgs, by: Rc<Resolved>) -> anyhow::Result<Checked> {
     fix::recover(&args.fix, &dir)?;
-    let checkpoint = open(&dir)?;
+    let checkpoint = open(&dir, args)?;
     let outcome = check_by(&by)(&checkpoint);
-    if let Some(rule) = outcome.unusable.first() {
-        let origin = by.knowledge.rules.find(&rule.code)?.origin.as_deref().unwrap_or_default();
-        bail!("{origin}: {} on {}: {}", rule.code, dir.display(), rule.why);
-    }
+    Ok(Checked { dir, checkpoint, outcome, by, repaired: Default::default() })
+}
+
+/// Fails when a rule of the user cannot be used.
+fn refuse_unusable(checked: &Checked) -> anyhow::Result<()> {
+    let Some(rule) = checked.outcome.unusable.first() else { return Ok(()) };
+    let origin = checked.by.knowledge.rules.find(&rule.code)?.origin.as_deref().unwrap_or_default();
+    bail!("{origin}: {} on {}: {}", rule.code, checked.dir.display(), rule.why);
+}
+
+/// Applies the fixes, if the arguments ask for it.
+fn repaired(checked: Checked, args: &CheckArgs) -> anyhow::Result<Checked> {
     if !args.fix.writes() {
-        return Ok(Checked { dir, checkpoint, outcome, by, repaired: Default::default() });
+        return Ok(checked);
     }
+    let Checked { dir, checkpoint, outcome, by, .. } = checked;
     let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } =
-        fix::repair(&args.fix, dir, &checkpoint, outcome, &open, &check_by(&by))?;
+        fix::repair(&args.fix, dir, &checkpoint, outcome, &|dir| open(dir, args), &check_by(&by))?;
     Ok(Checked { dir, checkpoint, outcome, by, repaired: (fixed, withdrawn) })
 }
 

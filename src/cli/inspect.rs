@@ -6,7 +6,7 @@ use anyhow::{Context, bail};
 
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
-use super::{library, output};
+use super::{library, output, paths};
 use crate::check::inspect::inspect;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::report::inspect as report;
@@ -21,8 +21,12 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         shard
     } else {
         let found = find_checkpoints(path);
-        let [dir] = found.as_slice() else {
-            bail!("{}: contains {} checkpoints; pass one of them, or a .safetensors file", path.display(), found.len());
+        let [dir] = found.checkpoints.as_slice() else {
+            if let Some(reason) = paths::nothing(path, &found) {
+                bail!("{}: {reason}", path.display());
+            }
+            let count = found.checkpoints.len();
+            bail!("{}: contains {count} checkpoints; pass one of them, or a .safetensors file", path.display());
         };
         Checkpoint::open(dir).with_context(|| dir.display().to_string())?
     };

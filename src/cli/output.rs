@@ -14,14 +14,14 @@ pub fn note(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// Prints the report or its statistics, and writes the files of `--report`.
-pub fn finish(report: &Report, args: &ReportArgs, counted: bool) -> anyhow::Result<()> {
+/// Prints the report or its statistics, and writes the files of `--report`, which are never `quiet`.
+pub fn finish(report: &Report, args: &ReportArgs, counted: bool, quiet: bool) -> anyhow::Result<()> {
     let text = if counted {
         let format = args.output_format;
         statistics(report, format)
             .with_context(|| format!("--statistics supports the formats full, concise and json, not {format}"))?
     } else {
-        render(report, args.output_format, style(args.color))
+        render(report, args.output_format, Style { quiet, ..style(args.color) })
     };
     for (format, file) in &args.report {
         let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };

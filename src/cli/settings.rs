@@ -21,6 +21,8 @@ pub struct Resolved {
     pub versions: Vec<String>,
     /// Lowest severity that fails.
     pub fail_on: Severity,
+    /// Lowest severity that is reported.
+    pub min_severity: Severity,
     /// The baseline.
     pub baseline: Option<PathBuf>,
 }
@@ -34,6 +36,7 @@ pub struct Typed {
     choice: Choice,
     versions: Vec<String>,
     fail_on: Option<Severity>,
+    min_severity: Option<Severity>,
     metadata_only: bool,
     baseline: Option<PathBuf>,
 }
@@ -58,7 +61,8 @@ impl Typed {
                 ignore: args.ignore.clone(),
             },
             versions: args.versions.clone(),
-            fail_on: args.report.fail_on.map(super::args::FailOn::severity),
+            fail_on: args.report.fail_on.map(super::args::SeverityName::severity),
+            min_severity: args.min_severity.map(super::args::SeverityName::severity),
             metadata_only: args.metadata_only,
             baseline: args.baseline.baseline.clone(),
             ..Self::new(&args.settings, rules)
@@ -122,6 +126,7 @@ impl SettingsResolver {
             knowledge: Knowledge { policy, ..Knowledge::with(rules, library)? },
             versions,
             fail_on: typed.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
+            min_severity: typed.min_severity.or_else(|| chain.min_severity()).unwrap_or(Severity::Info),
             baseline: typed.baseline.clone().or_else(|| chain.baseline()),
             file,
         })

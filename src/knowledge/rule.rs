@@ -52,6 +52,10 @@ pub struct Rule {
     /// Severity of a finding without effect; required for a rule without `effects` and `harm`, else info when missing.
     #[serde(default)]
     pub severity: Option<Severity>,
+    /// Whether a finding of severity info states what was not checked, and is no problem: `full`, `concise` and `markdown`
+    /// print it in the header of the checkpoint.
+    #[serde(default)]
+    pub note: bool,
     /// What loaders do with such a checkpoint. A finding is an error when a loader that the user named or that wrote the
     /// checkpoint has an effect, and a warning when only another loader has one.
     #[serde(default)]

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::model::{CheckpointReport, Counts, Role};
 use crate::check::finding::{Accepted, Suppressed};
-use crate::check::{Edit, Finding, Outcome};
+use crate::check::{Edit, Finding, Outcome, Severity};
 use crate::checkpoint::Checkpoint;
 
 impl CheckpointReport {
@@ -23,23 +23,44 @@ impl CheckpointReport {
                 sources.insert(file.clone(), text);
             }
         }
-        let bytes = checkpoint.tensors().fold(0_u64, |n, (_, t)| n.saturating_add(t.len()));
+        let (mut parameters, mut bytes) = (0_u64, 0_u64);
+        for (_, tensor) in checkpoint.tensors() {
+            let elements = tensor.shape.iter().fold(1_u64, |n, dim| n.saturating_mul(*dim));
+            parameters = parameters.saturating_add(elements);
+            bytes = bytes.saturating_add(tensor.len());
+        }
+        let text = |pointer: &str| checkpoint.config()?.pointer(pointer)?.as_str().map(str::to_owned);
         Self {
             path: path.into(),
             role,
+            class: text("/architectures/0").or_else(|| text("/_class_name")),
             architecture: outcome.architecture.clone(),
+            tensors: checkpoint.tensors().count(),
+            parameters,
+            bytes,
             verdict: counts.verdict(),
             counts,
             settings: None,
-            findings: outcome.findings.clone(),
+            findings: by_severity(&outcome.findings),
             suppressed: outcome.suppressed.clone(),
             loads: outcome.verdicts.clone(),
             fixed: Vec::new(),
             withdrawn: Vec::new(),
             fixing: None,
             sources,
-            tensors: (checkpoint.tensors().count(), bytes),
         }
+    }
+
+    /// Whether nothing about it is printed with `--quiet`: it has no findings but notes, and nothing was fixed.
+    pub(crate) fn is_quiet(&self) -> bool {
+        self.findings.iter().all(Finding::is_note) && self.fixed.is_empty() && self.withdrawn.is_empty()
+    }
+
+    /// Removes findings below this severity; they stay in `counts`. Returns their number.
+    pub(crate) fn hide_below(&mut self, least: Severity) -> usize {
+        let all = self.findings.iter().map(Finding::count).fold(0, usize::saturating_add);
+        self.findings.retain(|finding| finding.severity >= least);
+        all.saturating_sub(self.findings.iter().map(Finding::count).fold(0, usize::saturating_add))
     }
 
     /// Suppresses findings for which `accepted` returns a reason; they are no longer counted.
@@ -53,4 +74,11 @@ impl CheckpointReport {
         self.counts = Counts::new(&self.findings);
         self.verdict = self.counts.verdict();
     }
+}
+
+/// The findings with errors first, then warnings, then information; otherwise in their order.
+fn by_severity(findings: &[Finding]) -> Vec<Finding> {
+    let mut sorted = findings.to_vec();
+    sorted.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
+    sorted
 }

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use sha2::{Digest as _, Sha256};
 
 use super::format::{advice, headline, sentence};
-use super::model::{CheckpointReport, MergeReport, Report};
+use super::model::{CheckpointReport, MergeReport, Report, UncheckedPath};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
 use crate::checkpoint::hex;
@@ -22,7 +22,7 @@ use crate::checkpoint::hex;
 /// Longest path in a report, in characters; the limit of Linux.
 const PATH: usize = 4_096;
 
-/// The findings on one checkpoint, or the seams of a merge.
+/// The findings on one checkpoint, the seams of a merge, or a path that could not be checked.
 pub struct Group<'a> {
     /// The checkpoint or merge, with its role in a merge.
     pub title: String,
@@ -41,9 +41,12 @@ pub struct Group<'a> {
 /// Rule code of a seam.
 pub const SEAM: &str = "seam";
 
-/// A finding, or a seam mismatch.
+/// Rule code of a path that could not be checked.
+pub const UNCHECKED: &str = "unchecked";
+
+/// A finding, a seam mismatch, or a path that could not be checked.
 pub struct Item<'a> {
-    /// Rule code; [`SEAM`] for a seam.
+    /// Rule code; [`SEAM`] for a seam, [`UNCHECKED`] for a path.
     pub code: &'a str,
     /// Rule name.
     pub name: &'a str,
@@ -61,11 +64,12 @@ pub struct Item<'a> {
     pub fingerprint: String,
 }
 
-/// All findings and seams: one group for each checkpoint, and one for a merge.
+/// All items of a report: one group for each checkpoint, for a merge, and for each path that could not be checked.
 pub fn groups(report: &Report) -> Vec<Group<'_>> {
     let mut seen = BTreeMap::new();
     let mut groups: Vec<Group<'_>> = report.checkpoints.iter().map(|c| findings(c, &mut seen)).collect();
     groups.extend(report.merge.as_ref().map(|m| seams(m, &mut seen)));
+    groups.extend(report.unchecked.iter().map(|u| unchecked(u, &mut seen)));
     groups
 }
 
@@ -118,6 +122,28 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         headline: String::new(),
         sources: None,
         items,
+        suppressed: Vec::new(),
+    }
+}
+
+fn unchecked<'a>(unchecked: &UncheckedPath, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
+    let path = tidy(&unchecked.path);
+    let item = Item {
+        code: UNCHECKED,
+        name: "path-not-checked",
+        severity: Severity::Error,
+        message: sentence(&unchecked.reason),
+        locations: &[],
+        fix: None,
+        help: None,
+        fingerprint: fingerprint(&[&path, UNCHECKED], seen),
+    };
+    Group {
+        title: path.clone(),
+        path,
+        headline: String::new(),
+        sources: None,
+        items: vec![item],
         suppressed: Vec::new(),
     }
 }

@@ -2,14 +2,18 @@
 
 use std::fmt::Write as _;
 
+use super::Style;
 use super::fixes::mark;
-use super::format::{capped, headline, more, name, place, sentence};
+use super::format::{capped, headline, more, name, place, sentence, worst_first};
 use super::model::{CheckpointReport, Report};
 
-pub fn render(report: &Report, cap: usize) -> String {
+pub fn render(report: &Report, style: Style) -> String {
+    let cap = style.cap;
     let mut out = String::new();
-    for checkpoint in &report.checkpoints {
-        findings(&mut out, checkpoint, cap);
+    for checkpoint in worst_first(report) {
+        if !style.quiet || !checkpoint.is_quiet() {
+            findings(&mut out, checkpoint, cap);
+        }
     }
     if let Some(merge) = &report.merge {
         for seam in merge.seams.iter().take(cap) {
@@ -31,7 +35,8 @@ fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         let _ok = writeln!(out, "{}: {}", name(&checkpoint.path), headline(&checkpoint.loads));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in shown {
+    let (notes, findings): (Vec<_>, Vec<_>) = shown.into_iter().partition(|finding| finding.is_note());
+    for finding in notes.into_iter().chain(findings) {
         let location = finding.locations.first();
         out.push_str(&place(&checkpoint.path, location));
         if let Some(line) = location.and_then(|l| l.line) {

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::collapse::{NameGroup, collapse};
-use super::model::{Counts, MergeReport, MergeStage, Report};
+use super::model::{CheckpointReport, Counts, MergeReport, MergeStage, Report};
 use crate::check::finding::Object;
 use crate::check::load::{LoadReport, SilentReason};
 use crate::check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad};
@@ -53,6 +53,14 @@ pub fn wrap(text: &str, width: Option<usize>) -> String {
 /// `1 shard`, `2 shards`.
 pub fn plural(n: usize, noun: &str) -> String {
     if n == 1 { format!("1 {noun}") } else { format!("{n} {noun}s") }
+}
+
+/// A number with two decimals in the first unit that it reaches: `7.08 billion`.
+pub fn scaled(n: u64, units: [(&str, u64); 3]) -> String {
+    let Some((unit, size)) = units.into_iter().find(|(_, size)| n >= *size) else { return n.to_string() };
+    let hundredths = u128::from(n).saturating_mul(100).checked_div(u128::from(size)).unwrap_or_default();
+    let (whole, rest) = (hundredths / 100, hundredths % 100);
+    format!("{whole}.{rest:02}{unit}")
 }
 
 /// `2 errors, 1 warning, 3 info`; empty without findings.
@@ -141,8 +149,20 @@ pub fn summary(report: &Report) -> String {
         0 => checkpoints,
         n => format!("{checkpoints}, {n} suppressed"),
     };
+    let checkpoints = match report.summary.hidden {
+        0 => checkpoints,
+        n => format!("{checkpoints}, {n} hidden by --min-severity"),
+    };
+    let checkpoints = match report.summary.unchecked {
+        0 => checkpoints,
+        n => format!("{checkpoints}; {} could not be checked", plural(n, "path")),
+    };
     let outcome = report.merge.as_ref().and_then(outcome);
     match (outcome, found.is_empty()) {
+        (None, true) if report.summary.checkpoints == 0 && report.merge.is_none() => {
+            format!("Nothing was checked: {checkpoints}")
+        }
+        (None, true) if report.summary.unchecked > 0 => format!("Found nothing in {checkpoints}"),
         (None, true) => format!("All clean: {checkpoints}"),
         (None, false) => format!("Found {found} in {checkpoints}"),
         (Some(outcome), true) => outcome,
@@ -168,6 +188,12 @@ fn outcome(merge: &MergeReport) -> Option<String> {
 /// The details of a finding, escaped for display.
 pub fn details(finding: &Finding) -> Vec<String> {
     finding.details.iter().map(|detail| sentence(detail)).collect()
+}
+
+/// The findings for the header of a checkpoint, one line each: `info[ARC001]: unknown class …`.
+pub fn notes(checkpoint: &CheckpointReport) -> Vec<String> {
+    let notes = checkpoint.findings.iter().filter(|finding| finding.is_note());
+    notes.map(|note| format!("{}[{}]: {}", note.severity.name(), name(&note.code), sentence(&note.message))).collect()
 }
 
 /// At most `cap` findings of each code, and the number of omitted findings by code.
@@ -204,6 +230,19 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
         }
     }
     together
+}
+
+/// The checkpoints in the order of the formats for people: the worst first, by severity, verdict and number of findings. The
+/// checkpoints of a merge stay in the order of its stages.
+pub fn worst_first(report: &Report) -> Vec<&CheckpointReport> {
+    let mut sorted: Vec<&CheckpointReport> = report.checkpoints.iter().collect();
+    if report.merge.is_none() {
+        sorted.sort_by_key(|c| {
+            let load = c.loads.iter().map(|load| load.verdict).max();
+            std::cmp::Reverse((c.verdict, load, c.counts.error, c.counts.warning, c.counts.info))
+        });
+    }
+    sorted
 }
 
 /// The predicted load reports that differ, each with its loaders.

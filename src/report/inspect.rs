@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::Style;
-use super::format::{bytes, more, name, plural, sentence};
+use super::format::{bytes, more, name, plural, scaled, sentence};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
@@ -195,11 +195,7 @@ fn percent(share: f64) -> String {
 
 /// `7.08 billion`.
 fn count(n: u64) -> String {
-    const UNITS: [(&str, u64); 3] = [("billion", 1_000_000_000), ("million", 1_000_000), ("thousand", 1_000)];
-    let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else { return n.to_string() };
-    let hundredths = u128::from(n).saturating_mul(100).checked_div(u128::from(size)).unwrap_or_default();
-    let (whole, rest) = (hundredths / 100, hundredths % 100);
-    format!("{whole}.{rest:02} {unit}")
+    scaled(n, [(" billion", 1_000_000_000), (" million", 1_000_000), (" thousand", 1_000)])
 }
 
 #[cfg(test)]

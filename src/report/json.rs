@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::Report;
 use super::format::hostile;
-use super::model::{Role, Summary, ToolInfo};
+use super::model::{Role, Summary, ToolInfo, UncheckedPath};
 
 pub fn render(report: &Report) -> String {
     pretty(report)
@@ -19,7 +19,7 @@ pub fn pretty<T: Serialize>(value: &T) -> String {
 
 /// One predicted load or finding per line, with the summary last.
 ///
-/// Every line is an object whose `type` is `load`, `finding`, `seam` or `summary`. The other keys are those of the JSON
+/// Every line is an object whose `type` is `load`, `finding`, `seam`, `unchecked` or `summary`. The other keys are those of the JSON
 /// contract.
 pub fn lines(report: &Report) -> String {
     let mut lines = Vec::new();
@@ -34,6 +34,10 @@ pub fn lines(report: &Report) -> String {
         let line = |seam| JsonLine { r#type: LineKind::Seam, path: &merge.out, role: None, content: seam };
         lines.extend(merge.seams.iter().map(|s| written(serde_json::to_string(&line(s)))));
     }
+    for unchecked in &report.unchecked {
+        let line = UncheckedLine { r#type: LineKind::Unchecked, content: unchecked };
+        lines.push(written(serde_json::to_string(&line)));
+    }
     let summary =
         SummaryLine { r#type: LineKind::Summary, schema: report.schema, tool: &report.tool, summary: &report.summary };
     lines.push(written(serde_json::to_string(&summary)));
@@ -47,6 +51,7 @@ enum LineKind {
     Load,
     Finding,
     Seam,
+    Unchecked,
     Summary,
 }
 
@@ -59,6 +64,13 @@ struct JsonLine<'a, T> {
     role: Option<&'a Role>,
     #[serde(flatten)]
     content: &'a T,
+}
+
+#[derive(Serialize)]
+struct UncheckedLine<'a> {
+    r#type: LineKind,
+    #[serde(flatten)]
+    content: &'a UncheckedPath,
 }
 
 #[derive(Serialize)]

@@ -6,8 +6,9 @@ use std::fmt::Write as _;
 use super::collapse::{NameGroup, collapse};
 use super::format::{self, advice, bytes, capped, details, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
+use super::overview::Overview;
 use crate::check::load::LoadReport;
-use crate::check::verdict::PredictedLoad;
+use crate::check::verdict::{LoadVerdict, PredictedLoad};
 use crate::check::{Finding, Location};
 
 pub fn render(report: &Report, cap: usize) -> String {
@@ -17,12 +18,44 @@ pub fn render(report: &Report, cap: usize) -> String {
     } else {
         out.push_str("# Checkpoint report\n");
     }
-    for checkpoint in &report.checkpoints {
+    if let Some(overview) = Overview::new(report) {
+        checkpoints(&mut out, &overview);
+    }
+    if !report.unchecked.is_empty() {
+        let _ok = writeln!(out, "\n## Not checked\n");
+        for path in &report.unchecked {
+            let _ok = writeln!(out, "- {}: {}", code(&name(&path.path)), text(&sentence(&path.reason)));
+        }
+    }
+    for checkpoint in format::worst_first(report) {
         section(&mut out, checkpoint, cap);
     }
     let _ok = writeln!(out, "\n---\n\nVerdict: **{}**. {}.", report.summary.verdict.name(), summary(report));
     let _ok = writeln!(out, "\n{} {}", report.tool.name, report.tool.version);
     out
+}
+
+/// The table of several checkpoints.
+fn checkpoints(out: &mut String, overview: &Overview<'_>) {
+    let loaders = overview.loaders.iter().map(|loader| format!("transformers {}", text_name(loader)));
+    let mut header: Vec<String> = ["model", "class", "parameters", "size"].map(str::to_owned).into();
+    header.extend(loaders);
+    header.extend(["errors", "warnings"].map(str::to_owned));
+    let _ok = writeln!(out, "\n| {} |\n|{}", header.join(" | "), " --- |".repeat(header.len()));
+    for row in &overview.rows {
+        let checkpoint = row.checkpoint;
+        let known = |text: String| if checkpoint.tensors > 0 { text } else { "-".to_owned() };
+        let mut cells = vec![
+            code(&name(&checkpoint.path)),
+            row.class().map_or_else(|| "-".to_owned(), text_name),
+            known(checkpoint.parameters.to_string()),
+            known(bytes(checkpoint.bytes)),
+        ];
+        cells.extend(row.verdicts.iter().map(|verdict| verdict.map_or("", LoadVerdict::name).to_owned()));
+        cells.extend([checkpoint.counts.error, checkpoint.counts.warning].map(|n| n.to_string()));
+        let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+        let _ok = writeln!(out, "| {} |", cells.join(" | "));
+    }
 }
 
 fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
@@ -31,14 +64,14 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         None => code(&name(&checkpoint.path)),
     };
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
-    let (tensors, size) = checkpoint.tensors;
     let verdict = checkpoint.verdict.name();
     let _ok = writeln!(out, "\n## {title}: {verdict}");
     if !checkpoint.loads.is_empty() {
         let _ok = writeln!(out, "\nVerdict: {}", text(&format::headline(&checkpoint.loads)));
     }
-    let _ok = writeln!(out, "\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
-    let objects = format::objects(&checkpoint.loads);
+    let _ok = writeln!(out, "\n{architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
+    let mut objects = format::objects(&checkpoint.loads);
+    objects.extend(format::notes(checkpoint));
     if !objects.is_empty() {
         out.push('\n');
     }
@@ -49,7 +82,7 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in format::alike(shown) {
+    for finding in format::alike(shown.into_iter().filter(|finding| !finding.is_note()).collect()) {
         render_finding(out, &finding);
     }
     for (code, n) in hidden {

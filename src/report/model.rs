@@ -26,6 +26,9 @@ pub struct Report {
     pub checkpoints: Vec<CheckpointReport>,
     /// The merge; null for `check`.
     pub merge: Option<MergeReport>,
+    /// Paths that could not be checked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub unchecked: Vec<UncheckedPath>,
     /// Totals over all checkpoints.
     pub summary: Summary,
 }
@@ -38,9 +41,45 @@ impl Report {
         let seams = merge.as_ref().is_some_and(|m| !m.seams.is_empty());
         let verdict = if seams { Verdict::Error } else { counts.verdict() };
         let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
-        let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed };
-        Self { schema: 3, tool: ToolInfo::this(), checkpoints, merge, summary }
+        let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed, unchecked: 0, hidden: 0 };
+        Self { schema: 3, tool: ToolInfo::this(), checkpoints, merge, unchecked: Vec::new(), summary }.graded()
     }
+
+    /// Adds the paths that could not be checked; without findings of severity error, they determine the verdict.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn with_unchecked(mut self, unchecked: Vec<UncheckedPath>) -> Self {
+        self.summary.unchecked = unchecked.len();
+        self.unchecked = unchecked;
+        self.graded()
+    }
+
+    /// Sets the number of findings that `--min-severity` removed from `findings`.
+    #[must_use]
+    pub(crate) const fn with_hidden(mut self, hidden: usize) -> Self {
+        self.summary.hidden = hidden;
+        self
+    }
+
+    /// Sets the verdict of a check that checked nothing, or not everything: it is never clean.
+    fn graded(mut self) -> Self {
+        let is_partial = !self.unchecked.is_empty() || (self.checkpoints.is_empty() && self.merge.is_none());
+        if is_partial && self.summary.verdict != Verdict::Error {
+            self.summary.verdict = Verdict::NotChecked;
+        }
+        self
+    }
+}
+
+/// A path that could not be checked.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct UncheckedPath {
+    /// The path, as the user wrote it, or a folder below it.
+    pub path: String,
+    /// Why it could not be checked: it is missing, contains no checkpoint, or cannot be read.
+    pub reason: String,
 }
 
 /// Name and version of the program.
@@ -72,8 +111,16 @@ pub struct CheckpointReport {
     /// Its role in a merge: `donor vision`, `planned`, `written`; missing for `check`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub role: Option<Role>,
+    /// The class that config.json names: the first of `architectures`, or `_class_name` of diffusers.
+    pub class: Option<String>,
     /// The architecture of the predicted loads; null if it is unknown.
     pub architecture: Option<String>,
+    /// Number of tensors in the shards.
+    pub tensors: usize,
+    /// Their elements as stored; a quantised tensor may hold several parameters in one.
+    pub parameters: u64,
+    /// Their bytes.
+    pub bytes: u64,
     /// Clean, or the worst severity.
     pub verdict: Verdict,
     /// Findings by severity.
@@ -81,7 +128,7 @@ pub struct CheckpointReport {
     /// The settings file that applied.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub settings: Option<String>,
-    /// Findings, sorted by file, place and code.
+    /// Findings, sorted by severity (errors first), file, place and code.
     pub findings: Vec<Finding>,
     /// Findings that settings or a baseline accept; `counts` does not include them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -100,15 +147,12 @@ pub struct CheckpointReport {
     /// Text of the documents findings point into, by file name; for renderers that show source.
     #[serde(skip)]
     pub sources: BTreeMap<String, Arc<str>>,
-    /// Tensors seen, and their bytes.
-    #[serde(skip)]
-    pub tensors: (usize, u64),
 }
 
 /// The verdict over one checkpoint, or over all of a run: clean, or the worst severity of its findings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 pub enum Verdict {
     /// No findings.
     Clean,
@@ -116,6 +160,8 @@ pub enum Verdict {
     Info,
     /// Warnings at most.
     Warning,
+    /// For a run without errors: a path could not be checked, or no checkpoint was found.
+    NotChecked,
     /// Errors.
     Error,
 }
@@ -128,6 +174,7 @@ impl Verdict {
             Self::Clean => "clean",
             Self::Info => "info",
             Self::Warning => "warning",
+            Self::NotChecked => "not checked",
             Self::Error => "error",
         }
     }
@@ -217,6 +264,12 @@ pub struct Summary {
     /// Number of suppressed findings; `counts` does not include them.
     #[serde(skip_serializing_if = "is_zero")]
     pub suppressed: usize,
+    /// Number of paths that could not be checked.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub unchecked: usize,
+    /// Number of findings below `--min-severity`, which are in `counts` and not in `findings`.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub hidden: usize,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands fields by reference")]

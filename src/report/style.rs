@@ -86,10 +86,12 @@ pub struct Style {
     pub width: Option<usize>,
     /// Maximum length of a list; further items become "and N more".
     pub cap: usize,
+    /// Whether to print findings only: no table, no checkpoints without findings, no summary (`full` and `concise`).
+    pub quiet: bool,
 }
 
 impl Default for Style {
     fn default() -> Self {
-        Self { color: false, width: None, cap: 20 }
+        Self { color: false, width: None, cap: 20, quiet: false }
     }
 }

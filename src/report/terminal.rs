@@ -3,20 +3,31 @@
 pub(super) mod finding;
 pub(super) mod load;
 mod merge;
+mod overview;
 pub(super) mod paint;
 
 use std::fmt::Write as _;
 
 use self::paint::Paint;
-use super::format::{agreeing, alike, bytes, capped, counts, headline, name, objects, plural, summary, wrap};
+use super::format::{
+    agreeing, alike, bytes, capped, counts, headline, name, notes, objects, plural, summary, worst_first, wrap,
+};
 use super::model::{CheckpointReport, Report};
+use super::overview::Overview;
 use super::{Style, fixes};
+use crate::check::Finding;
 
 pub fn render(report: &Report, style: Style) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
+    if let Some(overview) = Overview::new(report).filter(|_| !style.quiet) {
+        overview::render(&mut out, &overview, style);
+    }
     let mut above: Option<&CheckpointReport> = None;
-    for checkpoint in &report.checkpoints {
+    for checkpoint in worst_first(report) {
+        if style.quiet && checkpoint.is_quiet() {
+            continue;
+        }
         header(&mut out, checkpoint, style);
         if above.is_some_and(|a| repeats(a, checkpoint)) {
             let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
@@ -34,7 +45,10 @@ pub fn render(report: &Report, style: Style) -> String {
         merge::render(&mut out, merge, style);
         out.push('\n');
     }
-    let _ok = writeln!(out, "{}", paint.verdict(report.summary.verdict, &summary(report)));
+    if style.quiet {
+        return out;
+    }
+    let _ok = writeln!(out, "{}", paint.verdict(report.summary.verdict, &wrap(&summary(report), style.width)));
     if let Some(closing) = fixes::closing(report) {
         let _ok = writeln!(out, "{closing}");
     }
@@ -59,18 +73,17 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
         let _ok = write!(out, ": {}", paint.strong(&headline(&checkpoint.loads)));
     }
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
-    let (tensors, size) = checkpoint.tensors;
-    let _ok = write!(out, "\n  {architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
+    let _ok = write!(out, "\n  {architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
     let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
     let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
-    let notes: Vec<String> = settings.into_iter().chain(suppressed).collect();
-    if !notes.is_empty() {
-        let _ok = writeln!(out, "  {}", paint.quiet(&notes.join(", ")));
+    let policy: Vec<String> = settings.into_iter().chain(suppressed).collect();
+    if !policy.is_empty() {
+        let _ok = writeln!(out, "  {}", paint.quiet(&policy.join(", ")));
     }
-    for line in objects(&checkpoint.loads) {
+    for line in objects(&checkpoint.loads).into_iter().chain(notes(checkpoint)) {
         let width = style.width.map(|width| width.saturating_sub(4).max(40));
         for (n, part) in wrap(&line, width).lines().enumerate() {
             let indent = if n == 0 { "  " } else { "    " };
@@ -81,6 +94,8 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
 
 fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     let (shown, hidden) = capped(&checkpoint.findings, style.cap);
+    let shown: Vec<&Finding> = shown.into_iter().filter(|finding| !finding.is_note()).collect();
+    let is_empty = shown.is_empty() && hidden.is_empty();
     for finding in alike(shown) {
         out.push('\n');
         out.push_str(&finding::render(&finding, checkpoint, style));
@@ -89,7 +104,7 @@ fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", name(code));
     }
-    if !checkpoint.findings.is_empty() {
+    if !is_empty {
         out.push('\n');
     }
 }

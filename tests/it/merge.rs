@@ -194,7 +194,7 @@ fn every_combination_of_options_merges_clean_or_stops_at_a_seam() {
                                 merged += 1;
                                 fs::remove_dir_all(&out).unwrap();
                             } else {
-                                assert_eq!(run.status.code(), Some(1), "{options:?}\n{}", text(&run));
+                                assert_eq!(run.status.code(), Some(2), "{options:?}\n{}", text(&run));
                                 assert_eq!(report["merge"]["stage"], "seam", "{options:?}");
                                 assert!(
                                     !report["merge"]["seams"][0]["options"].as_array().unwrap().is_empty(),
@@ -221,7 +221,7 @@ fn forwarding_aliases_need_no_modules_of_the_donor() {
     }
     let out = work.path().join("out");
     let refused = merge(&vision, &donor("llava3d-tiny"), &out, &[]);
-    assert_eq!(refused.status.code(), Some(1), "{}", text(&refused));
+    assert_eq!(refused.status.code(), Some(2), "{}", text(&refused));
     assert!(text(&refused).contains("configuration_spatialvla.py") && !out.exists(), "{}", text(&refused));
     let code = donor("spatialvla-tiny");
     let lent = format!("code={}", code.display());

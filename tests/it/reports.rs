@@ -11,7 +11,7 @@ use ckpt_doctor::report::{Format, Report, Style, render};
 
 use proptest::prelude::*;
 
-const PLAIN: Style = Style { color: false, width: Some(100), cap: 8 };
+const PLAIN: Style = Style { color: false, width: Some(100), cap: 8, quiet: false };
 
 fn show(report: &Report, format: Format) -> String {
     render(report, format, PLAIN)
@@ -32,6 +32,26 @@ fn clean() {
 #[test]
 fn findings() {
     snapshots("findings", &samples::findings());
+}
+
+#[test]
+fn several_checkpoints() {
+    snapshots("zoo", &samples::zoo());
+    for width in [80, 120] {
+        let shown = render(&samples::zoo(), Format::Full, Style { width: Some(width), ..PLAIN });
+        let table: Vec<&str> = shown.lines().take_while(|line| !line.is_empty()).collect();
+        assert!(table.iter().all(|line| line.chars().count() <= width), "{shown}");
+        snapshot!(format!("report-zoo-table-{width}"), table.join("\n"));
+    }
+}
+
+#[test]
+fn quiet_reports_contain_findings_only() {
+    for format in [Format::Full, Format::Concise] {
+        let quiet = Style { quiet: true, ..PLAIN };
+        snapshot!(format!("report-quiet-{format}"), render(&samples::zoo(), format, quiet));
+        assert_eq!(render(&samples::clean(), format, quiet), "");
+    }
 }
 
 #[test]
@@ -149,7 +169,7 @@ proptest! {
         checkpoint.loads = vec![PredictedLoad::of_model(LoadReport { missing: names.clone(), unexpected: names, mismatched, ..LoadReport::default() })];
         for format in Format::ALL {
             for color in [false, true] {
-                let shown = render(&report, format, Style { color, width: Some(width), cap });
+                let shown = render(&report, format, Style { color, width: Some(width), cap, quiet: false });
                 prop_assert!(shown.is_empty() || shown.ends_with('\n'));
             }
         }

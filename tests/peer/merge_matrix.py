@@ -157,7 +157,7 @@ def main():
             code, stdout, stderr = build(donors, out, choice)
             output = (stdout + stderr)[-1500:]
             if to_blame:
-                ok = tally.equal(code, 1, f"{what}: exit code")
+                ok = tally.equal(code, 2, f"{what}: exit code")
                 ok &= tally.expect(not out.exists(), f"{what}: refused, but something was written")
                 ok &= tally.expect(any(f"{name}=" in stdout + stderr for name in to_blame),
                                    f"{what}: the refusal names no setting of {to_blame}", output)

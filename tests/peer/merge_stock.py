@@ -135,7 +135,7 @@ def main():
         out = work / "merged-seam"
         code, stdout, stderr = merge(work / "paligemma", work / "llama-wide", out)
         output = stdout + stderr
-        tally.equal(code, 1, "widths differ: exit code")
+        tally.equal(code, 2, "widths differ: exit code")
         tally.expect(not out.exists(), "widths differ: a target was written")
         for word in ("multi_modal_projector.linear.weight", "64", "96", "projector=pad"):
             tally.expect(word in output, f"widths differ: the message lacks {word}", output[-2000:])

@@ -168,9 +168,13 @@ def wrong_home(weight_map):
     weight_map[NORM] = next(file for file in files if file != weight_map[NORM])
 
 
-def dangling(d):
-    (d.path / SINGLE).unlink()
-    (d.path / SINGLE).symlink_to("../blobs/0123456789abcdef")
+def dangling(file):
+    def apply(d):
+        path = d.path / file if file else d.shards()[1]
+        path.unlink()
+        path.symlink_to("../blobs/0123456789abcdef")
+
+    return apply
 
 
 def a_directory(d):
@@ -215,7 +219,11 @@ ROWS = {
     "offsets-overlap": ("llama", header(overlap)),
     "weights-are-html": ("llama", lambda d: d.write(SINGLE, "<!doctype html><html><body>Not Found</body></html>")),
     "no-format-metadata": ("llama", header(format_dropped)),
-    "dangling-link": ("llama", dangling),
+    "dangling-link": ("llama", dangling(SINGLE)),
+    "dangling-link-to-a-shard": ("sharded", dangling("")),
+    "dangling-link-to-the-index": ("sharded", dangling(INDEX)),
+    "dangling-link-to-the-config": ("llama", dangling("config.json")),
+    "dangling-link-to-the-tokenizer": ("llama", dangling("tokenizer.json")),
     "weights-are-a-directory": ("llama", a_directory),
     # The index.
     "index-is-no-json": ("sharded", lambda d: d.write(INDEX, '{"weight_map": {')),

@@ -48,6 +48,12 @@ impl Chain {
         self.last(|s| s.settings.fail_on)
     }
 
+    /// Lowest severity that is reported.
+    #[must_use]
+    pub fn min_severity(&self) -> Option<Severity> {
+        self.last(|s| s.settings.min_severity)
+    }
+
     /// Folder with the user's rules.
     #[must_use]
     pub fn rules(&self) -> Option<PathBuf> {

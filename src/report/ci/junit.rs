@@ -1,13 +1,13 @@
 //! `JUnit` XML: a test suite for each checkpoint, a test case for each finding.
 //!
 //! Errors and warnings are failures; findings of severity info are skipped tests. A checkpoint without findings is one
-//! passed test. Times are omitted, because none are measured.
+//! passed test; a path that could not be checked is a test with an error. Times are omitted, because none are measured.
 
 use std::fmt::Write as _;
 
 use quick_junit::{NonSuccessKind, Property, TestCase, TestCaseStatus, TestSuite};
 
-use super::{Group, Item, PATH, file, groups, spot};
+use super::{Group, Item, PATH, UNCHECKED, file, groups, spot};
 use crate::check::Severity;
 use crate::checkpoint::escape;
 use crate::report::Report;
@@ -44,6 +44,7 @@ pub fn render(report: &Report) -> String {
 
 fn case(group: &Group<'_>, item: &Item<'_>) -> TestCase {
     let mut status = match item.severity {
+        _ if item.code == UNCHECKED => TestCaseStatus::non_success(NonSuccessKind::Error),
         Severity::Error | Severity::Warning => TestCaseStatus::non_success(NonSuccessKind::Failure),
         Severity::Info => TestCaseStatus::skipped(),
     };

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{Group, Item, SEAM, file, groups};
+use super::{Group, Item, SEAM, UNCHECKED, file, groups};
 use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
 use crate::report::format::{name, sentence};
@@ -176,7 +176,7 @@ const fn level(severity: Severity) -> &'static str {
 }
 
 fn rule(id: String, item: &Item<'_>) -> SarifRule {
-    let why = if item.code == SEAM {
+    let why = if [SEAM, UNCHECKED].contains(&item.code) {
         String::new()
     } else {
         format!("`ckpt-doctor explain {id}` explains its meaning and the next step.")

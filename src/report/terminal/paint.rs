@@ -29,7 +29,7 @@ impl Paint {
         let color = match verdict {
             Verdict::Clean => AnsiColor::Green,
             Verdict::Info => AnsiColor::BrightBlue,
-            Verdict::Warning => AnsiColor::Yellow,
+            Verdict::Warning | Verdict::NotChecked => AnsiColor::Yellow,
             Verdict::Error => AnsiColor::BrightRed,
         };
         self.with(color.on_default().effects(Effects::BOLD), text)

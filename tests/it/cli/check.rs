@@ -90,7 +90,144 @@ fn directories_are_searched_and_files_stand_for_their_checkpoint() {
     let mixed = [readme.to_str().unwrap(), config.to_str().unwrap(), gone.to_str().unwrap()];
     assert_eq!(paths(&mixed), names(&[&a, &b]));
     assert_eq!(paths(&mixed[..1]), Vec::<String>::new());
-    assert_eq!(doctor(&["check", mixed[0]]).status.code(), Some(0));
+    let outside = doctor(&["check", mixed[0], mixed[0]]);
+    assert_eq!(outside.status.code(), Some(0));
+    let shown = String::from_utf8(outside.stdout).unwrap();
+    assert_eq!(shown, "Nothing was checked: 0 checkpoints\n");
+    let notes = String::from_utf8(outside.stderr).unwrap();
+    assert!(notes.contains("README.md: the file belongs to no checkpoint (and 1 more files)"), "{notes}");
+}
+
+/// A copy of a donor without its config.json.
+fn broken(dir: &Path) {
+    copy(&donor("llava3d-tiny"), dir);
+    fs::remove_file(dir.join("config.json")).unwrap();
+}
+
+#[test]
+fn paths_that_cannot_be_checked_do_not_lose_the_other_reports() {
+    let work = TempDir::new().unwrap();
+    let root = work.path();
+    copy(&donor("llava3d-tiny"), &root.join("a"));
+    broken(&root.join("z"));
+    fs::create_dir_all(root.join("empty")).unwrap();
+    for file in ["gguf/llama-3-8b-Q4_K_M.gguf", "zero/global_step500/states.pt", "two/a.onnx", "two/b.onnx", "two/c.h5"]
+    {
+        fs::create_dir_all(root.join(file).parent().unwrap()).unwrap();
+        fs::write(root.join(file), "").unwrap();
+    }
+    let args = [
+        "check",
+        "a",
+        "missing",
+        "empty",
+        "gguf/llama-3-8b-Q4_K_M.gguf",
+        "gguf",
+        "zero",
+        "two",
+        "z",
+        "--output-format",
+    ];
+    let run = |format: &str| {
+        let output =
+            Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).arg(format).current_dir(root).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{format}");
+        (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap())
+    };
+    let (json, errors) = run("json");
+    snapshot!("cli-unchecked", errors);
+    let report: Value = serde_json::from_str(&json).unwrap();
+    let paths: Vec<&Value> = report["checkpoints"].as_array().unwrap().iter().map(|c| &c["path"]).collect();
+    assert_eq!(paths, ["a", "z"]);
+    let unchecked: Vec<&Value> = report["unchecked"].as_array().unwrap().iter().map(|u| &u["path"]).collect();
+    assert_eq!(unchecked, ["missing", "empty", "gguf/llama-3-8b-Q4_K_M.gguf", "gguf", "zero", "two"]);
+    assert_eq!((&report["summary"]["unchecked"], &report["summary"]["verdict"]), (&json!(6), &json!("error")));
+    for format in ["full", "concise", "jsonl", "github", "gitlab", "junit", "sarif", "markdown"] {
+        let (shown, _) = run(format);
+        assert!(shown.contains("FIL009"), "{format}: {shown}");
+        let names = shown.contains("llama-3-8b-Q4_K_M.gguf is GGUF, which is not read");
+        assert_eq!(names, !["full", "concise"].contains(&format), "{format}: {shown}");
+    }
+    assert!(run("full").0.ends_with("in 2 checkpoints; 6 paths could not be checked\n"));
+    // Weights that are not read beside a checkpoint are named, and are no reason to fail.
+    let zoo = doctor(&["check", root.to_str().unwrap(), "--exit-zero"]);
+    assert_eq!(zoo.status.code(), Some(0));
+    let notes = String::from_utf8(zoo.stderr).unwrap();
+    assert!(notes.starts_with("note: ") && notes.contains("two/a.onnx (and 1 more) is ONNX, which is not"), "{notes}");
+}
+
+/// Root may list every folder, so this needs a user who may not.
+#[test]
+fn a_folder_that_cannot_be_listed_is_not_clean() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let work = TempDir::new().unwrap();
+    let closed = work.path().join("closed");
+    copy(&donor("llava3d-tiny"), &work.path().join("a"));
+    fs::create_dir(&closed).unwrap();
+    fs::set_permissions(&closed, fs::Permissions::from_mode(0o000)).unwrap();
+    let is_listed = fs::read_dir(&closed).is_ok();
+    let run = doctor(&["check", work.path().to_str().unwrap()]);
+    fs::set_permissions(&closed, fs::Permissions::from_mode(0o700)).unwrap();
+    assert_eq!(run.status.code(), Some(if is_listed { 0 } else { 2 }));
+    assert_eq!(String::from_utf8_lossy(&run.stderr).contains("closed: cannot be listed"), !is_listed);
+}
+
+#[test]
+fn each_exit_code_has_its_meaning() {
+    let work = TempDir::new().unwrap();
+    let root = work.path();
+    let (sound, bad) = (donor("llava3d-tiny"), root.join("bad"));
+    broken(&bad);
+    let gguf = root.join("x.gguf");
+    fs::write(&gguf, "").unwrap();
+    let (sound, bad, gguf) = (sound.to_str().unwrap(), bad.to_str().unwrap(), gguf.to_str().unwrap());
+    let code = |args: &[&str]| doctor(&[&["check"], args].concat()).status.code().unwrap();
+    assert_eq!(code(&[sound]), 0);
+    assert_eq!(code(&[bad]), 1);
+    assert_eq!(code(&[sound, bad]), 1);
+    assert_eq!(code(&[bad, "--exit-zero"]), 0);
+    // Could not be checked: alone, beside findings, and although findings do not count.
+    assert_eq!(code(&[gguf]), 2);
+    assert_eq!(code(&[sound, gguf]), 2);
+    assert_eq!(code(&[bad, gguf]), 2);
+    assert_eq!(code(&[bad, gguf, "--exit-zero"]), 2);
+    assert_eq!(code(&[sound, gguf, "--diff"]), 2);
+    // Wrong arguments.
+    assert_eq!(code(&[sound, "--no-such-option"]), 2);
+    assert_eq!(code(&[sound, "--select", "XYZ"]), 2);
+    assert_eq!(code(&[sound, "-q", "--statistics"]), 2);
+    let shown = String::from_utf8(doctor(&["check", gguf]).stdout).unwrap();
+    assert_eq!(shown, "Nothing was checked: 0 checkpoints; 1 path could not be checked\n");
+    let (_, report) = report(&["check", gguf, "--output-format", "json"]);
+    assert_eq!(report["summary"]["verdict"], "not-checked");
+}
+
+#[test]
+fn severities_can_be_hidden_without_changing_the_exit_code() {
+    let vision = donor("spatialvla-tiny");
+    let vision = vision.to_str().unwrap();
+    let run = |args: &[&str]| {
+        let (code, report) = report(&[&["check", vision, "--output-format", "json"], args].concat());
+        let found = report["checkpoints"][0]["findings"].as_array().unwrap().clone();
+        let codes: Vec<String> = found.iter().map(|f| f["code"].as_str().unwrap().to_owned()).collect();
+        (code.unwrap(), codes, report["summary"]["hidden"].as_u64(), report["summary"]["counts"].clone())
+    };
+    let counts = json!({ "error": 0, "warning": 3, "info": 1 });
+    assert_eq!(
+        run(&[]),
+        (0, ["JSN001", "JSN001", "JSN001", "VLA024"].map(str::to_owned).to_vec(), None, counts.clone())
+    );
+    let warnings = ["JSN001"; 3].map(str::to_owned).to_vec();
+    assert_eq!(run(&["--min-severity", "warning"]), (0, warnings, Some(1), counts.clone()));
+    let strict = ["--min-severity", "error", "--fail-on", "warning"];
+    assert_eq!(run(&strict), (1, Vec::new(), Some(4), counts));
+    let shown = doctor(&["check", vision, "--min-severity", "error"]);
+    let shown = String::from_utf8(shown.stdout).unwrap();
+    assert!(shown.ends_with("Found 3 warnings, 1 info in 1 checkpoint, 4 hidden by --min-severity\n"), "{shown}");
+    for format in ["full", "concise"] {
+        let quiet = doctor(&["check", vision, "-q", "--min-severity", "error", "--output-format", format]);
+        assert_eq!(String::from_utf8(quiet.stdout).unwrap(), "", "{format}");
+    }
 }
 
 #[test]

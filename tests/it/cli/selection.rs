@@ -61,17 +61,22 @@ const INFINITY: [&str; 3] = ["JSN001 warning"; 3];
 fn the_nearest_settings_file_applies_and_the_command_line_overrides_it() {
     let zoo = zoo();
     let root = zoo.path();
-    assert_eq!(found(root, &["--isolated"]).0, [&["VLA024 info"], &INFINITY[..]].concat());
+    assert_eq!(found(root, &["--isolated"]).0, [&INFINITY[..], &["VLA024 info"]].concat());
     settings(root, r#"{ select: ["VLA"], "fail-on": "info" }"#);
     assert_eq!(found(root, &[]).0, ["VLA024 info"]);
     assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
     assert_eq!(doctor(root, &["check", "models", "--fail-on", "error"]).status.code(), Some(0));
+    settings(root, r#"{ select: ["VLA"], "fail-on": "info", "min-severity": "warning" }"#);
+    assert_eq!(found(root, &[]).0, Vec::<String>::new());
+    assert_eq!(found(root, &["--min-severity", "info"]).0, ["VLA024 info"]);
+    assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
+    settings(root, r#"{ select: ["VLA"], "fail-on": "info" }"#);
     assert_eq!(found(root, &["--extend-select", "JSN"]).0.len(), 4);
     assert_eq!(found(root, &["--select", "JSN"]).0, INFINITY);
     assert_eq!(found(root, &["--isolated", "--ignore", "JSN"]).0, ["VLA024 info"]);
     // A nearer file replaces the one above, unless it extends it.
     settings(&root.join("models"), r#"{ severity: { "non-finite-number": "error" } }"#);
-    assert_eq!(found(root, &[]).0, [&["VLA024 info"], &["JSN001 error"; 3][..]].concat());
+    assert_eq!(found(root, &[]).0, [&["JSN001 error"; 3][..], &["VLA024 info"]].concat());
     settings(
         &root.join("models"),
         r#"{ extend: "../ckpt-doctor.json5", "extend-select": ["JSN001"], severity: { JSN: "error" } }"#,
@@ -89,7 +94,7 @@ fn the_nearest_settings_file_applies_and_the_command_line_overrides_it() {
         r#"{ "per-path": { "../models/vla": { severity: { JSN001: "error" } } } }"#,
     )
     .unwrap();
-    assert_eq!(found(root, &["--config", "ci/strict.json5"]).0[1], "JSN001 error");
+    assert_eq!(found(root, &["--config", "ci/strict.json5"]).0[0], "JSN001 error");
     let both = doctor(root, &["check", "models", "--config", "ci/strict.json5", "--isolated"]);
     assert_eq!(both.status.code(), Some(2));
 }
@@ -186,7 +191,7 @@ fn suppressed_findings_are_not_counted_and_have_a_reason() {
     );
     assert_eq!(
         found(root, &[]),
-        (vec!["VLA024 info".to_owned(), "SUP001 warning".to_owned()], INFINITY.map(str::to_owned).to_vec())
+        (vec!["SUP001 warning".to_owned(), "VLA024 info".to_owned()], INFINITY.map(str::to_owned).to_vec())
     );
     snapshot!("selection-suppressed", transcript(root, &["check", "models"]));
     let json = doctor(root, &["check", "models", "--output-format", "json"]);

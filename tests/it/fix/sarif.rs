@@ -54,7 +54,7 @@ fn compared(dir: &Path, knowledge: &Knowledge) -> Vec<String> {
     for finding in &outcome.findings {
         let one = Outcome { findings: vec![finding.clone()], ..Outcome::default() };
         let report = Report::new(vec![CheckpointReport::new("model", None, &checkpoint, &one)], None);
-        let log = render(&report, Format::Sarif, Style { color: false, width: None, cap: 8 });
+        let log = render(&report, Format::Sarif, Style { cap: 8, ..Style::default() });
         let log: Value = serde_json::from_str(&log).expect("JSON");
         let Some(fixes) = log["runs"][0]["results"][0]["fixes"].as_array() else { continue };
         let [fix] = fixes.as_slice() else { panic!("{}: {} fixes", finding.code, fixes.len()) };

@@ -201,18 +201,62 @@ fn checkpoints_are_found_below_a_folder_and_around_a_file() {
         fs::write(root.join(path), "{}").unwrap();
     }
     symlink(root, root.join("d/loop")).unwrap();
-    assert_eq!(find_checkpoints(root), [root.join("a"), root.join("b/c")]);
-    assert_eq!(find_checkpoints(&root.join("a/config.json")), [root.join("a")]);
+    let found = |path: &Path| find_checkpoints(path).checkpoints;
+    assert_eq!(found(root), [root.join("a"), root.join("b/c")]);
+    assert_eq!(found(&root.join("a/config.json")), [root.join("a")]);
     // The nearest checkpoint above, in the same work tree; a file in another folder belongs to none.
-    assert_eq!(find_checkpoints(&root.join("b/c/onnx/config.json")), [root.join("b/c/onnx")]);
+    assert_eq!(found(&root.join("b/c/onnx/config.json")), [root.join("b/c/onnx")]);
     fs::create_dir(root.join("a/extra")).unwrap();
     fs::write(root.join("a/extra/notes.txt"), "").unwrap();
-    assert_eq!(find_checkpoints(&root.join("a/extra/notes.txt")), [root.join("a")]);
-    assert_eq!(find_checkpoints(&root.join("d/notes.txt")), Vec::<std::path::PathBuf>::new());
+    assert_eq!(found(&root.join("a/extra/notes.txt")), [root.join("a")]);
+    assert_eq!(found(&root.join("d/notes.txt")), Vec::<std::path::PathBuf>::new());
     fs::create_dir(root.join("a/extra/.git")).unwrap();
-    assert_eq!(find_checkpoints(&root.join("a/extra/notes.txt")), Vec::<std::path::PathBuf>::new());
-    assert_eq!(find_checkpoints(&root.join("d")), Vec::<std::path::PathBuf>::new());
-    assert_eq!(find_checkpoints(&root.join("gone")), [root.join("gone")]);
+    assert_eq!(found(&root.join("a/extra/notes.txt")), Vec::<std::path::PathBuf>::new());
+    assert_eq!(found(&root.join("d")), Vec::<std::path::PathBuf>::new());
+    assert_eq!(found(&root.join("gone")), Vec::<std::path::PathBuf>::new());
+    assert_eq!(found(&root.join("a/gone.json")), [root.join("a")]);
+}
+
+#[test]
+fn weights_that_are_not_read_are_named() {
+    let dir = TempDir::new().unwrap();
+    let root = dir.path();
+    let files = [
+        "gguf/b.gguf",
+        "gguf/a.gguf",
+        "zero/global_step500/mp_rank_00_model_states.pt",
+        "fsdp/__0_0.distcp",
+        "model.onnx",
+        "flax_model.msgpack",
+        "tf_model.h5",
+        "old/consolidated.00.pth",
+        "old/pytorch_model.bin",
+        "old/data.bin",
+        "checkpoint/config.json",
+        "checkpoint/model.onnx",
+    ];
+    for path in files {
+        fs::create_dir_all(root.join(path).parent().unwrap()).unwrap();
+        fs::write(root.join(path), "{}").unwrap();
+    }
+    let found = find_checkpoints(root);
+    assert_eq!(found.checkpoints, [root.join("checkpoint")]);
+    let foreign: Vec<_> = found.foreign.iter().map(|(format, files)| (*format, &*files.first, files.count)).collect();
+    assert_eq!(
+        foreign,
+        [
+            ("Flax msgpack", &*root.join("flax_model.msgpack"), 1),
+            ("GGUF", &root.join("gguf/a.gguf"), 2),
+            ("ONNX", &root.join("model.onnx"), 1),
+            ("TensorFlow HDF5", &root.join("tf_model.h5"), 1),
+            ("a DeepSpeed checkpoint", &root.join("zero/global_step500"), 1),
+            ("a PyTorch pickle", &root.join("old/consolidated.00.pth"), 2),
+            ("a part of an FSDP checkpoint", &root.join("fsdp/__0_0.distcp"), 1),
+        ]
+    );
+    // A file stands for the checkpoint around it.
+    assert!(find_checkpoints(&root.join("checkpoint/model.onnx")).foreign.is_empty());
+    assert_eq!(find_checkpoints(&root.join("gguf/b.gguf")).foreign["GGUF"].first, root.join("gguf/b.gguf"));
 }
 
 #[test]

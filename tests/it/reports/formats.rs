@@ -9,9 +9,11 @@ use serde_json::{Value, json};
 use super::{samples, show};
 
 /// Every sample, with its number of findings and seams.
-fn all() -> [(&'static str, Report, usize); 7] {
+fn all() -> [(&'static str, Report, usize); 8] {
     [
         ("clean", samples::clean(), 0),
+        // Seven findings, and a path that could not be checked.
+        ("zoo", samples::zoo(), 8),
         ("findings", samples::findings(), 8),
         ("fixable", samples::fixable(), 3),
         ("long", samples::long_lists(), 42),
@@ -134,7 +136,8 @@ fn junit_counts_match_its_cases() {
         let root = xml.root_element();
         assert_eq!(root.tag_name().name(), "testsuites");
         let suites: Vec<_> = root.children().filter(|n| n.has_tag_name("testsuite")).collect();
-        assert_eq!(suites.len(), report.checkpoints.len() + usize::from(report.merge.is_some()), "{name}");
+        let groups = report.checkpoints.len() + usize::from(report.merge.is_some()) + report.unchecked.len();
+        assert_eq!(suites.len(), groups, "{name}");
         let mut reported = 0;
         for suite in &suites {
             let cases: Vec<_> = suite.children().filter(|n| n.has_tag_name("testcase")).collect();
@@ -142,7 +145,7 @@ fn junit_counts_match_its_cases() {
             let value = |attribute: &str| suite.attribute(attribute).unwrap().parse::<usize>().unwrap();
             assert_eq!((value("tests"), value("failures")), (cases.len(), with("failure")), "{name}");
             assert!(!cases.is_empty(), "{name}");
-            reported += with("failure") + with("skipped");
+            reported += with("failure") + with("skipped") + with("error");
         }
         assert_eq!(reported, count, "{name}");
     }

@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ckpt_doctor::check::load::{LoadReport, Mismatch, Silent, SilentReason};
-use ckpt_doctor::check::verdict::PredictedLoad;
+use ckpt_doctor::check::verdict::{LoadVerdict, PredictedLoad};
 use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName,
-    StageOutcome,
+    StageOutcome, UncheckedPath,
 };
 use ckpt_doctor::surgery::plan::TensorTransform;
 use serde_json::{Map, Value, json};
@@ -20,7 +20,11 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
     CheckpointReport {
         path: path.to_owned(),
         role: None,
+        class: Some("SpatialVLAForConditionalGeneration".to_owned()),
         architecture: Some("spatialvla".to_owned()),
+        tensors: 690,
+        parameters: 8_030_261_248,
+        bytes: 1_234_567,
         verdict: counts.verdict(),
         counts,
         settings: None,
@@ -28,7 +32,6 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
         suppressed: vec![],
         loads: vec![],
         sources: sources.iter().map(|(file, text)| ((*file).to_owned(), Arc::from(*text))).collect(),
-        tensors: (690, 1_234_567),
         fixed: Vec::new(),
         withdrawn: Vec::new(),
         fixing: None,
@@ -49,6 +52,7 @@ pub fn finding(code: &str, name: &str, severity: Severity, message: &str, eviden
         evidence,
         fix: None,
         hidden: 0,
+        note: false,
     }
 }
 
@@ -78,8 +82,44 @@ pub fn clean() -> Report {
     let load = |loader: &str| LoadReport { loader: loader.to_owned(), ..LoadReport::default() };
     one.loads = ["4.47.0", "5.23.0"].map(|loader| PredictedLoad::of_model(load(loader))).into();
     let mut other = checkpoint("models/unknown", vec![], &[]);
-    other.architecture = None;
+    (other.class, other.architecture) = (None, None);
     Report::new(vec![one, other], None)
+}
+
+/// Checkpoints of each kind in path order, and a path that could not be checked.
+pub fn zoo() -> Report {
+    let load = |loader: &str, verdict| PredictedLoad {
+        verdict,
+        objects: Vec::new(),
+        ..PredictedLoad::of_model(LoadReport { loader: loader.to_owned(), ..LoadReport::default() })
+    };
+    let found = |severity| finding("CFG001", "odd-value", severity, "a value is odd", json!({}));
+    let one = |path: &str, class: &str, severities: &[Severity], loads: &[PredictedLoad]| {
+        let mut one = checkpoint(path, severities.iter().map(|severity| found(*severity)).collect(), &[]);
+        (one.class, one.loads) = (Some(class.to_owned()), loads.to_vec());
+        one
+    };
+    let llama = "LlamaForCausalLM";
+    let loads = [load("4.47.0", LoadVerdict::Loads), load("5.23.0", LoadVerdict::Loads)];
+    let wrong = [load("4.47.0", LoadVerdict::LoadsWrong), load("5.23.0", LoadVerdict::NotPredicted)];
+    let raises = [load("5.23.0", LoadVerdict::Raises)];
+    let mut config = one("models/without-weights", "Qwen2_5_VLForConditionalGeneration", &[Severity::Info], &[]);
+    (config.tensors, config.parameters, config.bytes) = (0, 0, 0);
+    config.findings[0].note = true;
+    let checkpoints = vec![
+        one("models/a|sound", llama, &[], &loads),
+        one("models/b-wrong", llama, &[Severity::Error, Severity::Error, Severity::Warning], &wrong),
+        one(
+            "models/mistralai/Mixtral-8x22B-Instruct-v0.1-a-fine-tune-with-a-long-name",
+            llama,
+            &[Severity::Error],
+            &raises,
+        ),
+        one("models/d-warned", llama, &[Severity::Warning, Severity::Info], &loads),
+        config,
+    ];
+    let reason = "nothing to check: llama-3-8b-Q4_K_M.gguf is GGUF, which is not read".to_owned();
+    Report::new(checkpoints, None).with_unchecked(vec![UncheckedPath { path: "models/gguf".to_owned(), reason }])
 }
 
 const PROCESSOR: &str = r#"{

@@ -1,0 +1,56 @@
+//! The rows of the table of a run over several checkpoints.
+
+use std::collections::BTreeMap;
+
+use super::format::worst_first;
+use super::model::{CheckpointReport, Report};
+use crate::check::verdict::LoadVerdict;
+
+/// The table of a run over several checkpoints; `full` and `markdown` start with it.
+pub struct Overview<'a> {
+    /// Versions of transformers of the run, ascending: the loaders that were modelled.
+    pub loaders: Vec<&'a str>,
+    /// One row per checkpoint, the worst first.
+    pub rows: Vec<OverviewRow<'a>>,
+}
+
+/// One checkpoint of the table.
+pub struct OverviewRow<'a> {
+    /// The checkpoint.
+    pub checkpoint: &'a CheckpointReport,
+    /// The verdict of each loader of the table; `None` when the checkpoint was not checked for it.
+    pub verdicts: Vec<Option<LoadVerdict>>,
+}
+
+impl<'a> Overview<'a> {
+    /// The table of a report; `None` for a merge or a single checkpoint.
+    pub fn new(report: &'a Report) -> Option<Self> {
+        if report.merge.is_some() || report.checkpoints.len() < 2 {
+            return None;
+        }
+        let loads = report.checkpoints.iter().flat_map(|c| &c.loads);
+        let loaders: BTreeMap<Vec<u64>, &str> = loads.map(|load| (version(&load.loader), &*load.loader)).collect();
+        let loaders: Vec<&str> = loaders.into_values().collect();
+        let verdict = |checkpoint: &CheckpointReport, loader: &str| {
+            checkpoint.loads.iter().filter(|load| load.loader == loader).map(|load| load.verdict).max()
+        };
+        let row = |checkpoint| OverviewRow {
+            checkpoint,
+            verdicts: loaders.iter().map(|loader| verdict(checkpoint, loader)).collect(),
+        };
+        let rows = worst_first(report).into_iter().map(row).collect();
+        Some(Self { loaders, rows })
+    }
+}
+
+impl<'a> OverviewRow<'a> {
+    /// The class that config.json names, or else the architecture.
+    pub fn class(&self) -> Option<&'a str> {
+        self.checkpoint.class.as_deref().or(self.checkpoint.architecture.as_deref())
+    }
+}
+
+/// The numbers of a version, for sorting.
+fn version(text: &str) -> Vec<u64> {
+    text.split('.').map(|part| part.parse().unwrap_or(0)).collect()
+}
