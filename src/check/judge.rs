@@ -12,7 +12,7 @@ use super::votes::{self, Explanation, Vote};
 use super::{index, layers, size};
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::quantization::{Said, said};
-use crate::knowledge::{Architecture, Expected, Library, Loader, Refusal, UnknownPart};
+use crate::knowledge::{Architecture, Expected, Library, Refusal, UnknownPart};
 
 /// The outcome for all loaders.
 #[derive(Debug, Default)]
@@ -111,6 +111,12 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                     .at(Place::file("config.json"))
                     .with("architecture", architecture.name())
                     .with("reason", reasons.first().map_or("", String::as_str)),
+            ),
+            Err(refusal @ Refusal::Raises(_)) if target.leads => faults.push(
+                Fault::new("config-incomputable")
+                    .at(Place::file("config.json"))
+                    .with("architecture", architecture.name())
+                    .with("reason", refusal.to_string()),
             ),
             // Nobody asked what a version makes of it that cannot build the class; what is not known is told already.
             Err(_) => {}
@@ -228,7 +234,7 @@ fn load_faults(candidates: &[Candidate<'_>], stored: &Stored) -> Vec<Fault> {
 
 /// Whether no loader that counts says what the model is: not even that it cannot be.
 fn in_doubt(built: &[Built<'_>]) -> bool {
-    built.iter().all(|(target, _, expected)| !target.leads || matches!(expected, Err(Refusal::UnknownPart(_))))
+    built.iter().all(|(target, _, expected)| !target.leads || matches!(expected, Err(Refusal::UnknownPart(_) | Refusal::NotCovered(_))))
 }
 
 /// Lets another loader lead where the one that should does not know a part, unless somebody asked for it.
@@ -266,7 +272,7 @@ fn unknown(config: &Value, built: &[Built<'_>], versions: &[String]) -> Vec<Faul
         return in_doubt(built).then(|| fault(built.iter().find_map(part).as_ref())).into_iter().collect();
     }
     let of_version = |version: &String| {
-        let found = built.iter().find(|(target, ..)| target.loader == Loader::nearest(version));
+        let found = built.iter().find(|(target, ..)| target.versions.contains(version));
         let fault = match found {
             Some(found) => fault(Some(&part(found)?)),
             None => fault(None),

@@ -3,7 +3,6 @@
 use std::path::PathBuf;
 
 use ckpt_doctor::check::Severity;
-use ckpt_doctor::knowledge::Loader;
 use ckpt_doctor::knowledge::loader::asked;
 use ckpt_doctor::report::Format;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -72,10 +71,10 @@ pub struct ExpectArgs {
     /// class, where it is not the config's own, in its `class`)
     #[arg(value_name = "CONFIG|DIR|@FILE", required = true)]
     pub configs: Vec<String>,
-    /// The version that builds it, as transformers==4.47.0; the nearest known one stands for it, and without this the
-    /// one nearest to what the config names
-    #[arg(long = "for", value_name = "LOADER", value_parser = parse_loader)]
-    pub loader: Option<Loader>,
+    /// The version that builds it, as 4.57.3 or transformers==4.57.3; the nearest known one that has the class stands for
+    /// it, and without this the one nearest to what the config names
+    #[arg(long = "for", value_name = "LOADER", value_parser = asked)]
+    pub version: Option<String>,
     /// text: a tensor a line; json: a list; jsonl: an object a line for each config, and those that fail say why
     #[arg(long, value_name = "FMT", default_value = "text")]
     pub output_format: ExpectFormat,
@@ -300,11 +299,6 @@ pub enum Color {
     Always,
     /// Never.
     Never,
-}
-
-/// The loader that stands for the version.
-fn parse_loader(text: &str) -> Result<Loader, String> {
-    asked(text).map(|version| Loader::nearest(&version))
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {

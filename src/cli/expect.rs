@@ -32,7 +32,8 @@ struct Asked {
 /// What came of it.
 struct Answer {
     source: String,
-    loader: Loader,
+    /// The loader that was asked, or the version for which none was found.
+    loader: String,
     built: Result<Expected, String>,
 }
 
@@ -42,7 +43,7 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut failed = false;
     let mut list = Vec::new();
     let mut answer = |asked: Asked| -> anyhow::Result<()> {
-        let answer = build(&library, asked, args.loader);
+        let answer = build(&library, asked, args.version.as_deref());
         failed |= answer.built.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),
@@ -106,28 +107,31 @@ fn parse(bytes: &[u8]) -> Result<Value, String> {
     })
 }
 
-fn build(library: &Library, asked: Asked, loader: Option<Loader>) -> Answer {
+/// `version`: what `--for` asked for; without it, the version that wrote the config, or the newest.
+fn build(library: &Library, asked: Asked, version: Option<&str>) -> Answer {
     let Asked { source, record } = asked;
-    let config = record.as_ref().map_or(&Value::Null, |r| &r.config);
-    let loader = loader.unwrap_or_else(|| Loader::of_config(config));
-    let built = record.and_then(|Record { config, class }| {
+    let written = record.as_ref().ok().and_then(|r| r.config.get("transformers_version")).and_then(Value::as_str);
+    let version = version.or(written).unwrap_or_else(|| Loader::NEWEST.version()).to_owned();
+    let mut answer = Answer { source, loader: version.clone(), built: Err(String::new()) };
+    answer.built = record.and_then(|Record { config, class }| {
         let found = match &class {
-            Some(class) => library.class(class, loader),
-            None => library.find(&config, [], loader),
+            Some(class) => library.class_under(&version, class),
+            None => library.stands_for(&version, &config, &[]),
         };
         let unknown = || {
             let class = class.as_deref().or_else(|| config.pointer("/architectures/0")?.as_str());
             let model_type = config.get("model_type").and_then(Value::as_str);
             format!(
-                "no architecture is known for class {} and model type {} under transformers {loader}",
+                "no architecture is known for class {} and model type {} under transformers {version}",
                 class.unwrap_or("none"),
                 model_type.unwrap_or("none")
             )
         };
-        let architecture = found.ok_or_else(unknown)?;
+        let (loader, architecture) = found.ok_or_else(unknown)?;
+        loader.version().clone_into(&mut answer.loader);
         architecture.expect(&config).map_err(|refusal| format!("{}: {refusal}", architecture.class()))
     });
-    Answer { source, loader, built }
+    answer
 }
 
 /// Longest text of a checkpoint in a line of output.
@@ -163,10 +167,10 @@ fn text(answer: &Answer) -> String {
 
 fn object(answer: &Answer) -> Value {
     match &answer.built {
-        Err(reason) => json!({ "source": answer.source, "loader": answer.loader.version(), "error": reason }),
+        Err(reason) => json!({ "source": answer.source, "loader": answer.loader, "error": reason }),
         Ok(e) => json!({
             "source": answer.source,
-            "loader": answer.loader.version(),
+            "loader": answer.loader,
             "architecture": e.architecture,
             "class": e.class,
             "model_type": e.model_type,
@@ -178,6 +182,7 @@ fn object(answer: &Answer) -> Value {
             "ignore_missing": e.ignore_missing,
             "ignore_unexpected": e.ignore_unexpected,
             "conversions": e.conversions,
+            "not_predicted": e.doubts.iter().map(ToString::to_string).collect::<Vec<_>>(),
         }),
     }
 }

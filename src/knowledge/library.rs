@@ -111,6 +111,23 @@ impl Library {
         Some(Architecture::new(self, file, class, loader))
     }
 
+    /// The known loader that stands for a version of transformers for one checkpoint, with the class it builds.
+    ///
+    /// A known version stands for itself alone. For any other it is the nearest one that has the class: `check` and
+    /// `expect` both ask here. `None` where none has it.
+    #[must_use]
+    pub fn stands_for(&self, version: &str, config: &Value, names: &[&str]) -> Option<(Loader, Architecture<'_>)> {
+        let built = |loader: Loader| Some((loader, self.find(config, names.iter().copied(), loader)?));
+        Loader::of_version(version).into_iter().find_map(built)
+    }
+
+    /// As [`Self::stands_for`], for a class by its name.
+    #[must_use]
+    pub fn class_under(&self, version: &str, name: &str) -> Option<(Loader, Architecture<'_>)> {
+        let built = |loader: Loader| Some((loader, self.class(name, loader)?));
+        Loader::of_version(version).into_iter().find_map(built)
+    }
+
     /// Stem and text of every file, unparsed.
     pub(super) fn texts(&self) -> impl Iterator<Item = (&str, &[u8])> {
         self.files.iter().map(|file| (file.stem.as_str(), file.text.as_bytes()))

@@ -58,10 +58,11 @@ fn reason(loads: &Expected, other: Judged<'_>, stored: &Stored) -> Option<&'stat
         None
     } else if stored.names().any(old_norms) {
         Some(match other.expected.loader {
-            Loader::V4_47_0 => "4.x renames gamma and beta in every name",
+            Loader::V4_47_0 => "4.47 renames gamma and beta in every name",
+            Loader::V4_57_6 => "4.57 renames gamma and beta only after LayerNorm",
             Loader::V5_23_0 => "5.x renames gamma and beta only after LayerNorm",
         })
-    } else if other.expected.loader == Loader::V4_47_0
+    } else if other.expected.loader.major() == 4
         && stored.names().any(|name| loads.tensors.contains_key(name) && !other.expected.tensors.contains_key(name))
     {
         Some("the names are those of 5.x, and 4.x converts none")

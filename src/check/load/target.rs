@@ -11,14 +11,16 @@ pub struct Target {
     pub loader: Loader,
     /// The version, where it is not the loader's own.
     pub stands_for: Option<String>,
+    /// All versions that it was asked for.
+    pub versions: Vec<String>,
     /// Whether the checkpoint has to load there; where it does not, that it loads elsewhere is what counts.
     pub leads: bool,
 }
 
 impl Target {
-    fn new(version: &str, leads: bool) -> Self {
-        let loader = Loader::nearest(version);
-        Self { loader, stands_for: (version != loader.version()).then(|| version.to_owned()), leads }
+    fn new(loader: Loader, version: &str, leads: bool) -> Self {
+        let stands_for = (version != loader.version()).then(|| version.to_owned());
+        Self { loader, stands_for, versions: vec![version.to_owned()], leads }
     }
 
     /// Makes it the one that counts, in place of the loader of `version`, which does not know the class.
@@ -40,24 +42,24 @@ pub fn targets<'l>(
     asked: &[String],
 ) -> Vec<(Target, Architecture<'l>)> {
     let version = config.get("transformers_version").and_then(Value::as_str);
-    let mut wanted: Vec<Target> = Vec::new();
     let versions: Vec<(&str, bool)> = match (asked, version) {
         ([], Some(version)) => vec![(version, true), (Loader::NEWEST.version(), false)],
         ([], None) => vec![(Loader::NEWEST.version(), true)],
         (asked, _) => asked.iter().map(|version| (version.as_str(), true)).collect(),
     };
+    let mut known: Vec<(Target, Architecture<'l>)> = Vec::new();
     for (version, leads) in versions {
-        let target = Target::new(version, leads);
-        if !wanted.iter().any(|t| t.loader == target.loader) {
-            wanted.push(target);
+        let Some((loader, architecture)) = library.stands_for(version, config, names) else { continue };
+        match known.iter_mut().find(|(target, _)| target.loader == loader) {
+            Some((target, _)) => target.versions.push(version.to_owned()),
+            None => known.push((Target::new(loader, version, leads), architecture)),
         }
     }
-    let built = |target: Target| Some((target.clone(), library.find(config, names.iter().copied(), target.loader)?));
-    let mut known: Vec<_> = wanted.into_iter().filter_map(built).collect();
     if asked.is_empty() && !known.iter().any(|(target, _)| target.leads) {
         if known.is_empty() {
-            let mut others = Loader::ALL.into_iter().map(|loader| Target { loader, stands_for: None, leads: true });
-            known.extend(others.find_map(built));
+            let built = |loader| Some((loader, library.find(config, names.iter().copied(), loader)?));
+            let other = Loader::ALL.into_iter().find_map(built);
+            known.extend(other.map(|(loader, class)| (Target::new(loader, loader.version(), true), class)));
         }
         if let Some((target, _)) = known.first_mut() {
             target.lead(version);

@@ -1,0 +1,94 @@
+//! What the description of a class does not cover.
+
+use std::fmt;
+
+use serde_json::{Map, Value};
+
+use super::blueprint::{Blueprint, ConfigClass};
+use super::resolve::DEPTH_CAP;
+use crate::knowledge::{Library, Loader};
+
+/// Why nothing can be predicted of a class with a config, though both are known.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Doubt {
+    /// The class's source reads a key that no sample of the derivation varied, and the config gives it another value
+    /// than all samples had. The key as a pointer: `/text_config/head_dim`.
+    UnreadKey(String),
+    /// A corner that the description leaves out, in words.
+    Corner(String),
+    /// A key is null that no sample had so, though its class gives it a value of its own. The key as a pointer.
+    Null(String),
+}
+
+/// The keys of a config, and of those in it, that the source reads and the description knows nothing of.
+///
+/// Called with the config as it is written. A key whose value is the one that all samples had is covered.
+pub(super) fn unread_keys(
+    library: &Library,
+    file: &Blueprint,
+    loader: Loader,
+    config: &Map<String, Value>,
+) -> Vec<Doubt> {
+    let mut found = Vec::new();
+    let unread = |class: &ConfigClass, key: &str, value: &Value| {
+        class.unvaried.get(key).is_some_and(|assumed| value != assumed)
+    };
+    walk(library, file, loader, config, &mut Vec::new(), &mut |class, config, path| {
+        let keys = config.iter().filter(|(key, value)| unread(class, key, value)).map(|(key, _)| key);
+        found.extend(keys.map(|key| Doubt::UnreadKey(pointer(path, key))));
+    });
+    found
+}
+
+/// The keys of a config, and of those in it, that are null where the class has a value of its own.
+///
+/// Called for a config that the description failed on: a class may well take the null, as one that does not read it.
+pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config: &Map<String, Value>) -> Vec<Doubt> {
+    let mut found = Vec::new();
+    walk(library, file, loader, config, &mut Vec::new(), &mut |class, config, path| {
+        let own = |key: &str| class.defaults.get(key).is_some_and(|value| !value.is_null());
+        let keys = config.iter().filter(|(key, value)| value.is_null() && own(key)).map(|(key, _)| key);
+        found.extend(keys.map(|key| Doubt::Null(pointer(path, key))));
+    });
+    found
+}
+
+fn pointer(path: &[&str], key: &str) -> String {
+    path.iter().copied().chain([key]).map(|step| format!("/{step}")).collect()
+}
+
+fn walk<'c>(
+    library: &Library,
+    file: &Blueprint,
+    loader: Loader,
+    config: &'c Map<String, Value>,
+    path: &mut Vec<&'c str>,
+    look: &mut impl FnMut(&ConfigClass, &Map<String, Value>, &[&str]),
+) {
+    let class = file.config(loader);
+    look(class, config, path);
+    if path.len() >= DEPTH_CAP {
+        return;
+    }
+    for (key, spec) in &class.configs {
+        let Some((key, Value::Object(sub))) = config.get_key_value(key) else { continue };
+        let model_type = sub.get("model_type").and_then(Value::as_str).or(spec.model_type.as_deref());
+        let inner = model_type.and_then(|t| library.of_model_type(t, loader)).filter(|f| !std::ptr::eq(*f, file));
+        if let Some(inner) = inner {
+            path.push(key);
+            walk(library, inner, loader, sub, path, look);
+            path.pop();
+        }
+    }
+}
+
+/// `/head_dim is read by the class and not described`.
+impl fmt::Display for Doubt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::UnreadKey(pointer) => write!(f, "{pointer} is read by the class, and what it does is not known here"),
+            Self::Corner(why) => f.write_str(why),
+            Self::Null(pointer) => write!(f, "{pointer} is null, and what the class makes of that is not known here"),
+        }
+    }
+}
