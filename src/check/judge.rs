@@ -234,7 +234,9 @@ fn load_faults(candidates: &[Candidate<'_>], stored: &Stored) -> Vec<Fault> {
 
 /// Whether no loader that counts says what the model is: not even that it cannot be.
 fn in_doubt(built: &[Built<'_>]) -> bool {
-    built.iter().all(|(target, _, expected)| !target.leads || matches!(expected, Err(Refusal::UnknownPart(_) | Refusal::NotCovered(_))))
+    built.iter().all(|(target, _, expected)| {
+        !target.leads || matches!(expected, Err(Refusal::UnknownPart(_) | Refusal::NotCovered(_)))
+    })
 }
 
 /// Lets another loader lead where the one that should does not know a part, unless somebody asked for it.

@@ -4,6 +4,7 @@ mod blueprint;
 mod build;
 mod conversions;
 mod doubt;
+mod field_type;
 pub(crate) mod member;
 mod refusal;
 mod resolve;

@@ -122,7 +122,10 @@ pub fn asked(text: &str) -> Result<String, String> {
         return Ok(version.to_owned());
     }
     let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
-    Err(format!("write it as VERSION or transformers==VERSION; known are {}, others are judged as the nearest", known.join(", ")))
+    Err(format!(
+        "write it as VERSION or transformers==VERSION; known are {}, others are judged as the nearest",
+        known.join(", ")
+    ))
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ def record(model_type, config_class, raws):
     words = configs.compared_words(*sources.texts(config_class))
     out = {"model_type": model_type, "config_class": config_class.__name__, "static": flatten(static), "sub": {}, "samples": [],
            "attribute_map": dict(getattr(config_class, "attribute_map", None) or {}), "inside": getattr(config_class, "base_config_key", "") or None,
-           "popped": sources.popped(config_class), "reads": sources.config_reads(config_class), "bases": [], "rows": [], "literals": {}}
+           "popped": sources.popped(config_class), "reads": sources.config_reads(config_class), "bases": [], "rows": [], "literals": {}, "types": sources.field_types(config_class)}
     for k, v in sorted(configs.subconfigs(static).items()):
         own = None
         try:
@@ -175,10 +175,10 @@ def outcome(out, config_class, raw):
             config = config_class(**marked(raw))
         except Exception:
             config = None
-    if config is None:                                        # some want plain values
-        config = config_class(**copied(raw))
     for text in record.literals:
         out["literals"].setdefault(re.sub(r"@\d+_(\d+)", r"@\1", text), True)
+    if config is None:                                        # some want plain values
+        config = config_class(**copied(raw))
     made = {}
     walk(config, "", made)
     return made

@@ -43,7 +43,7 @@ def flatten(config, prefix="", out=None):
         if k in ("id2label", "label2id"):
             if k == "id2label" and isinstance(v, dict):
                 out[prefix + "num_labels"] = len(v)
-        elif not isinstance(k, str) or k.startswith("_"):
+        elif not isinstance(k, str) or k.startswith("_") or not k.isidentifier():
             continue
         elif isinstance(v, dict):
             if (len(v) < 80 or "model_type" in v) and not k.startswith("task_specific"):

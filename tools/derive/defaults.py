@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from . import conditions, evaluate, store, vectors
+from . import conditions, evaluate, refusals, store, vectors
 from .conditions import quoted
 from .keys import NOISE
 from .vectors import Column
@@ -94,7 +94,19 @@ def derive(root, document):
     for key, sub in sorted(subs.items()):
         result["configs"][key] = of_sub(root, document, key, sub, rows, known)
     result["computed"] = ordered(result["computed"])
+    result["types"] = document.get("types", {})
+    result["refuses"] = refusals.found([r.flat for r in rows], raised(document), document["literals"])
     return result
+
+
+def raised(document):
+    """The configs with which the class raised, flat, and how."""
+    out = []
+    for r in document["rows"]:
+        if "error" in r:
+            raw = {k: v for k, v in document["bases"][r["base"]]["raw"].items() if k not in r["without"]}
+            out.append((Row({**raw, **r["with"]}, {}, r["kind"], r["key"]).flat, r["error"]))
+    return out
 
 
 class Unexplained(Exception):

@@ -15,7 +15,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TRANSFORMERS_VERBOSITY", "critical")
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
-from . import catalogue, config_sample, configs, sources, store  # noqa: E402
+from . import catalogue, config_sample, configs, sources, store, trace  # noqa: E402
 from .build import TooSlow, build, without_initialisation  # noqa: E402
 from .catalogue import VERSION  # noqa: E402
 from .configs import alternatives, copied, flatten  # noqa: E402
@@ -162,20 +162,50 @@ def derived_of(root, model_type):
     return computed, [k for k in told["reads"] if k not in computed and not NOISE.search(k)]
 
 
-def draw(root, name, seed):
-    about = store.load(root, name).about
-    cls = catalogue.find_class(name)
-    config_class = next(c for c in {type(None), cls.config_class, catalogue.config_class(about["model_type"])} if c and c.__name__ == about["config_class"])
-    about["derived"], about["sources"] = derived_of(root, about["model_type"])
-
+def raws_for(cls, config_class, model_type, seed, count):
+    """Small random configs that the class can be built from, with numbers of labels where it has some."""
     def works(raw):
         build(cls, config_class(**copied(raw)))
-    drawer = Drawer(cls, config_class, about, seed)
+    name = cls.__name__
     rng = random.Random(f"labels/{seed}/{name}")
-    raws = config_sample.base_raws(about["model_type"], config_class, works, 12, f"{seed}/{name}")
+    raws = config_sample.base_raws(model_type, config_class, works, count, f"{seed}/{name}")
     if re.search("Classification|MultipleChoice|Segmentation|Detection", name):
         raws = [{**copied(r), "num_labels": rng.randint(1, 7)} if rng.random() < .7 else r for r in raws]
+    return raws
+
+
+def class_of(name, about):
+    """A model class and the config class it was sampled with."""
+    cls = catalogue.find_class(name)
+    return cls, next(c for c in (cls.config_class, catalogue.config_class(about["model_type"])) if c and c.__name__ == about["config_class"])
+
+
+def draw(root, name, seed):
+    about = store.load(root, name).about
+    cls, config_class = class_of(name, about)
+    about["derived"], about["sources"] = derived_of(root, about["model_type"])
+    drawer = Drawer(cls, config_class, about, seed)
+    raws = raws_for(cls, config_class, about["model_type"], seed, 12)
     return drawer.all(raws) if raws else []
+
+
+def asked_now(cls, seed, count=6):
+    """As `draw`, of a class that nothing is known of but itself: for tests that keep no samples."""
+    config_class = cls.config_class
+    raws = raws_for(cls, config_class, config_class.model_type, seed, count)
+    if not raws:
+        return []
+    absent = {}
+    for raw in raws[:2]:
+        config = config_class(**copied(raw))
+        with trace.following() as record:
+            trace.mark(config)
+            build(cls, config)
+        absent.update(record.absent)
+    told = config_sample.record(config_class.model_type, config_class, raws[:2])
+    computed = config_sample.computed_keys(told)
+    about = {"traced": {"absent": absent}, "derived": sorted(computed), "sources": [k for k in told["reads"] if k not in computed and not NOISE.search(k)]}
+    return Drawer(cls, config_class, about, seed).all(raws)
 
 
 def cross(root, name, seed, cache):
@@ -186,24 +216,31 @@ def cross(root, name, seed, cache):
         if folder.name == VERSION or not path.exists() or not (root / "samples" / f"{name}.json.gz").exists():
             continue
         about = store.load(root, name).about
-        cls = catalogue.find_class(name)
-        config_class = next(c for c in (cls.config_class, catalogue.config_class(about["model_type"])) if c and c.__name__ == about["config_class"])
-        drawer = Drawer(cls, config_class, about, seed)
+        cls, config_class = class_of(name, about)
         theirs = [r["config"] for r in store.read(path) if r["kind"] in ("full", "thinned") and "error" not in r]
-        for config in theirs[:2] + theirs[-1:]:
-            if config.get("model_type") in (None, about["model_type"]):
-                try:
-                    rows.append(drawer.record(config, f"of {folder.name}"))
-                except (TooSlow, MemoryError):
-                    continue
-                except Exception as e:
-                    rows.append({"config": config, "kind": f"of {folder.name}", "error": f"{type(e).__name__}: {e}"[:300]})
+        rows += files_of(Drawer(cls, config_class, about, seed), about["model_type"], theirs[:2] + theirs[-1:], folder.name)
+    return rows
+
+
+def files_of(drawer, model_type, configs_there, version):
+    """What the class makes of configs that another version saved."""
+    rows = []
+    for config in configs_there:
+        if config.get("model_type") not in (None, model_type):
+            continue
+        try:
+            rows.append(drawer.record(config, f"of {version}"))
+        except (TooSlow, MemoryError):
+            continue
+        except Exception as e:
+            rows.append({"config": config, "kind": f"of {version}", "error": f"{type(e).__name__}: {e}"[:300]})
     return rows
 
 
 def work(root, names, args):
     resource.setrlimit(resource.RLIMIT_DATA, (5 << 30, 5 << 30))
     without_initialisation()
+    trace.install()
     folder = "others" if args.others else "unseen"
     for name in names:
         (root / "current").write_text(name)

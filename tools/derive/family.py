@@ -149,7 +149,7 @@ class Version:
             out.configs[path.stem] = load(path)
         for path in sorted((folder / "fit").glob("*.json")):
             raw = load(path)
-            for key in ("tensors", "buffers", "parts"):
+            for key in ("tensors", "buffers", "parts", "refuses"):
                 raw[key] = tidied(raw.get(key) or [])
             if raw.get("unexplained"):
                 what = raw["unexplained"][0]
@@ -159,6 +159,7 @@ class Version:
                 out.reasons.pop(raw["class"], None)
         for config in out.configs.values():
             config["computed"] = [[k, tidied(text), mode] for k, text, mode in config["computed"]]
+            config["refuses"] = tidied(config.get("refuses") or [])
         return out
 
     @property

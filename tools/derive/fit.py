@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import conditions, defaults, evaluate, parts, store, told, vectors
+from . import conditions, defaults, evaluate, parts, refusals, store, told, vectors
 from .conditions import Literal, quoted
 from .keys import HEADS, LAYERS, NOISE, WIDTH
 from .lists import of_list
@@ -54,6 +54,10 @@ class Fitter:
 
     def influence(self, values):
         """Keys whose change changed a value (values: {sample number: value}), those changed on purpose first."""
+        keys = self.influences(values)
+        return [k for k in keys if all(part.isidentifier() for part in k.split("."))]
+
+    def influences(self, values):
         direct, implied = collections.Counter(), collections.Counter()
         for s in self.samples:
             p = s.parent
@@ -608,6 +612,10 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
                 raise Unexplained("too many indices")
             done.append((first[pattern], lettered(pattern), fitter.template(pattern, per, shapes), per))
         except Unexplained as e:
+            counted_up = strided(fitter, pattern, per, shapes)
+            if counted_up:
+                done += [(first[pattern] + n, name, entry, {}) for n, (name, entry) in enumerate(counted_up)]
+                continue
             smaller = split(pattern, per)
             if not smaller:
                 bad.append([lettered(pattern), *str(e).partition(": ")[::2]])
@@ -617,6 +625,65 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
                 queue.append(q)
     done.sort(key=lambda d: (d[0], d[1]))
     return done, bad
+
+
+def strided(fitter, pattern, per, shapes):
+    """[(name, entry)] for indices that a constructor counts up across kinds of layers: `layers.{3 * i + 1}`. None where the
+    numbers follow no rule. The first and the last one may be layers of their own."""
+    if pattern.count("{}") != 1:
+        return None
+    numbers = {n: sorted(ix[0] for ix in d) for n, d in per.items()}
+    if any(len(v) < 2 for v in numbers.values()) or all(v == list(range(len(v))) for v in numbers.values()):
+        return None
+    cuts = [[slice(None)], [slice(None, -1), slice(-1, None)], [slice(0, 1), slice(1, None)], [slice(0, 1), slice(1, -1), slice(-1, None)]]
+    for cut in cuts:
+        try:
+            out = [strided_part(fitter, pattern, {n: v[piece] for n, v in numbers.items()}, per, shapes) for piece in cut]
+        except Unexplained:
+            continue
+        return out
+    return None
+
+
+def in_runs(numbers):
+    """{sample: [[numbers that follow each other], …]} where all runs of a sample are of one length, or None."""
+    out = {}
+    for n, vs in numbers.items():
+        runs = []
+        for v in vs:
+            if runs and v == runs[-1][-1] + 1:
+                runs[-1].append(v)
+            else:
+                runs.append([v])
+        if len({len(r) for r in runs}) != 1 or len(runs) < 2:
+            return None
+        out[n] = runs
+    return out if any(len(runs[0]) > 1 for runs in out.values()) else None
+
+
+def strided_part(fitter, pattern, numbers, per, shapes):
+    runs = in_runs(numbers)
+    if runs is not None:                                      # a loop in a loop
+        inner = {n: {(a, b): per[n][v,] for a, r in enumerate(rs) for b, v in enumerate(r)} for n, rs in runs.items()}
+        rows = [(n, (a, b)) for n, rs in sorted(runs.items()) for a, r in enumerate(rs) for b in range(len(r))]
+        targets = tuple(v for _, rs in sorted(runs.items()) for r in rs for v in r)
+        text = fitter.number("number", rows, targets, {n: tuple(vs) for n, vs in numbers.items()}, 2, 1)
+        entry = fitter.template_over(pattern.replace("{}", "{}.{}"), inner, shapes, [(n, ()) for n in sorted(inner)])
+        return pattern.replace("{}", "{" + text.replace('"', "'") + "}"), entry
+    inner = {n: {(k,): per[n][v,] for k, v in enumerate(vs)} for n, vs in numbers.items() if vs}
+    if not inner:
+        raise Unexplained("nothing left")
+    single = all(len(vs) == 1 for vs in numbers.values())
+    rows = [(n, (k,)) for n, vs in sorted(numbers.items()) for k in range(len(vs))]
+    values = {n: tuple(vs) for n, vs in numbers.items()}
+    targets = tuple(v for n, vs in sorted(numbers.items()) for v in vs)
+    if single:
+        text = fitter.number("number", [(n, ()) for n, _ in rows], targets, values, 0, 1)
+        entry = fitter.template_over(pattern.replace("{}", "0"), {n: {(): d[0,]} for n, d in inner.items()}, shapes, [(n, ()) for n in sorted(inner)])
+    else:
+        text = fitter.number("number", rows, targets, values, 1, 1)
+        entry = fitter.template_over(pattern, inner, shapes, [(n, ()) for n in sorted(inner)])
+    return pattern.replace("{}", "{" + text.replace('"', "'") + "}" if not text.isdigit() else text), entry
 
 
 def fit_class(root, name, known):
@@ -636,7 +703,7 @@ def fit_class(root, name, known):
     templates = []
     persistent = {n for s in samples for n in s.persistent}
     for _, pattern, entry, per in done:
-        if any(n in persistent for n in some_names(re.sub(r"\{\w\}", "{}", pattern), per)):
+        if per and any(n in persistent for n in some_names(re.sub(r"\{\w\}", "{}", pattern), per)):
             entry["persistent_buffer"] = True
         templates.append([pattern, entry])
     bad += parts.fit_ties(fitter, samples, done, inside, about)
@@ -649,7 +716,8 @@ def fit_class(root, name, known):
               "parts": found.entries(fitter, samples, bad), "tensors": templates, "buffers": [[p, e] for _, p, e, _ in buffers],
               "unexplained": bad, "unexplained_buffers": bad_buffers,
               "varied": about.get("varied", []), "source_reads": about.get("source_reads", []), "absent": (about.get("traced") or {}).get("absent", {}),
-              "key_mapping": about.get("key_mapping", [])}
+              "key_mapping": about.get("key_mapping", []),
+              "refuses": refusals.found([s.flat for s in data.samples], about.get("raised", []), (about.get("traced") or {}).get("literals", []))}
     return result
 
 

@@ -46,6 +46,12 @@ class Traced:
         self.reads |= record.reads.keys()
         self.absent.update({k: v for k, v in record.absent.items() if k not in self.absent})
         self.opaque |= record.opaque
+        self.compared(record)
+        self.counts.update(dict.fromkeys(SITE.sub(r"@\2", t) for t in record.counts))
+        for name, texts in trace.dimensions(model).items():
+            self.dimensions(name, texts)
+
+    def compared(self, record):
         for text in [*record.literals, *record.counts]:
             for value, place in SITE.findall(text):
                 values = self.sites.setdefault(place, [])
@@ -54,15 +60,15 @@ class Traced:
         for text in record.literals:
             if len(self.literals) < 600:
                 self.literals.setdefault(SITE.sub(r"@\2", text), True)
-        self.counts.update(dict.fromkeys(SITE.sub(r"@\2", t) for t in record.counts))
-        for name, texts in trace.dimensions(model).items():
-            pattern, indices = skeleton(name)
-            per = self.dims.setdefault(pattern, {})
-            for k, text in enumerate(texts):
-                if text is not None:
-                    rows = per.setdefault(k, {}).setdefault(NUMBER.sub("#", text), [])
-                    if len(rows) < 3 and [list(indices), text] not in rows:
-                        rows.append([list(indices), text])
+
+    def dimensions(self, name, texts):
+        pattern, indices = skeleton(name)
+        per = self.dims.setdefault(pattern, {})
+        for k, text in enumerate(texts):
+            if text is not None:
+                rows = per.setdefault(k, {}).setdefault(NUMBER.sub("#", text), [])
+                if len(rows) < 3 and [list(indices), text] not in rows:
+                    rows.append([list(indices), text])
 
     def packed(self):
         dims = {p: {k: [r for rows in list(kinds.values())[:12] for r in rows] for k, kinds in per.items()} for p, per in self.dims.items()}
@@ -84,7 +90,7 @@ class Sampler:
         self.rng = random.Random(f"sample/{cls.__name__}")
         self.raws, self.known, self.facts = raws, known, None
         self.effective, self.values, self.parts = {}, {}, {}
-        self.traced, self.varied, self.first = Traced(), set(), {}
+        self.traced, self.varied, self.first, self.raised = Traced(), set(), {}, []
 
     # -- one instantiation
 
@@ -93,7 +99,7 @@ class Sampler:
         mark = json.dumps(raw, sort_keys=True, default=str)
         if mark in self.seen:
             return None
-        self.seen[mark] = None
+        self.seen[mark] = flat = None
         try:
             config = self.config_class(**copied(raw))
             flat = flatten(config)
@@ -107,6 +113,8 @@ class Sampler:
         except Exception as e:
             note = f"{type(e).__name__}: {e}"[:120]
             self.errors[note] = self.errors.get(note, 0) + 1
+            if flat is not None and len(self.raised) < 80 and not isinstance(e, TooSlow):
+                self.raised.append([flat, f"{type(e).__name__}: {e}"[:200]])
             return None
         self.varied.add(key)
         self.spent += b.modules
@@ -133,6 +141,7 @@ class Sampler:
         except (MemoryError, TooSlow):
             raise
         except Exception:
+            self.traced.compared(record)
             return build(self.cls, config, self.device), None
         self.traced.add(record, b.instance)
         configs.other_names(followed, "", self.traced.names)
@@ -456,7 +465,7 @@ def packed(sampler, extra):
         rows.append(row)
     largest = max(sampler.samples, key=lambda s: len(s["tensors"]))
     extra = {**extra, "traced": sampler.traced.packed(), "varied": sorted(k for k in sampler.varied if k),
-             "source_reads": sources.model_reads(sampler.cls)}
+             "source_reads": sources.model_reads(sampler.cls), "raised": sampler.raised}
     return {"class": sampler.cls.__name__, **extra, **sampler.facts, "device": sampler.device, "samples": rows, "names": names,
             "order": [at(n) for n in largest["tensors"]], "errors": dict(sorted(sampler.errors.items(), key=lambda kv: -kv[1])[:8])}
 

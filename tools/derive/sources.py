@@ -5,6 +5,8 @@ import inspect
 import re
 import sys
 import textwrap
+import types
+import typing
 
 from .configs import CONFIG_BASE
 
@@ -79,6 +81,49 @@ def module_reads(module):
         for statement in function.body:
             reads.visit(statement)
     return frozenset(reads.keys)
+
+
+PLAIN = {int: "int", float: "float", bool: "bool", str: "str", type(None): "null", list: "list", dict: "object"}
+
+
+def field_types(config_class):
+    """{key: what transformers 5 lets it be, in JSON's words}: `int|null`, `list[int]|null`, `"a"|"b"`; keys of one class."""
+    if not hasattr(config_class, "__dataclass_fields__"):
+        return {}
+    try:
+        hints = typing.get_type_hints(config_class)
+    except Exception:                                         # a name that only a type checker knows
+        return {}
+    out = {}
+    for key in config_class.__dataclass_fields__:
+        if key in CONFIG_BASE.__annotations__ or key.startswith("_"):
+            continue
+        text = told_type(hints.get(key))
+        if text is not None:
+            out[key] = text
+    return out
+
+
+def told_type(hint):
+    """A type in JSON's words; None for one that cannot be told, or that takes everything."""
+    if hint in PLAIN:
+        return PLAIN[hint]
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        parts = [told_type(a) for a in args]
+        return None if None in parts else "|".join(dict.fromkeys(p for part in parts for p in part.split("|") if p)) or None
+    if origin is list:
+        inner = told_type(args[0])
+        return "list" if inner is None else f"list[{inner}]" if "[" not in inner else "list"
+    if origin is tuple:
+        return ""                                             # JSON has none
+    if origin is dict:
+        return "object"
+    if origin is typing.Literal and all(isinstance(a, str) for a in args):
+        return "|".join(f"'{a}'" for a in args)
+    if isinstance(hint, type) and (issubclass(hint, (CONFIG_BASE, dict)) or typing.is_typeddict(hint)):
+        return "object"
+    return None
 
 
 class SelfReads(ast.NodeVisitor):

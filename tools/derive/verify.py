@@ -29,7 +29,7 @@ class Program:
             file.writelines(json.dumps({"class": name, "config": config}) + "\n" for name, config in asked)
             file.flush()
             done = subprocess.run(
-                [self.binary, "expect", "--rules", rules, "--for", version, "--output-format", "jsonl", f"@{file.name}"],
+                [self.binary, "expect", *(["--rules", rules] if rules else []), "--for", f"transformers=={version}", "--output-format", "jsonl", f"@{file.name}"],
                 stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, check=False,
             )
         lines = done.stdout.splitlines()

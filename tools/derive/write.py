@@ -3,14 +3,15 @@ import re
 from pathlib import Path
 
 from . import json5
+from .cel import paths
 from .family import Version, first, load, used_keys
 from .mended import MENDED, REFUSED
 from .merge import Apart, Border, merged, share
 from .naming import name_all
 from .tree import Clash, layout, nest
 
-FIELDS = ("auto", "inside", "aliases", "defaults", "computed", "unvaried", "configs")
-FILLED = ("aliases", "defaults", "unvaried")
+FIELDS = ("auto", "inside", "aliases", "defaults", "computed", "unvaried", "types", "refuses", "configs")
+FILLED = ("aliases", "defaults", "unvaried", "types")
 MARK = re.compile(r"^  derived: ", re.MULTILINE)
 
 
@@ -112,7 +113,7 @@ class Writer:
         sides = [self.config_side(v, model_type) for v in present]
         for field in FIELDS:
             values = [side.get(field) or {} for side in sides]
-            if field == "inside":
+            if field in ("inside", "refuses"):
                 if values[-1] and all(value == values[-1] for value in values):
                     common[field] = values[-1]
                 else:
@@ -156,6 +157,8 @@ class Writer:
                          and k not in v.aliases(model_type) and computed.get(k, ("", ""))[1] != "unless_given"},
             "computed": {k: text if mode == "filled" else {mode: text} for k, (text, mode) in computed.items() if k in used},
             "unvaried": v.unvaried(model_type, used),
+            "types": by_type(v.configs.get(model_type, {}).get("types") or {}),
+            "refuses": [r for r in v.configs.get(model_type, {}).get("refuses", ()) if set(tops(r["when"])) <= used],
             "configs": {k: self.sub_config(v, model_type, k, spec) for k, spec in sorted(configs.items()) if k in used},
         }
 
@@ -213,7 +216,7 @@ class Writer:
 
     def shared_entry(self, name, have):
         newest, last = have[-1]
-        heads = [(self.head(v, fit), self.ignored(v, fit), self.corners[v.version].get(name)) for v, fit in have]
+        heads = [(self.head(v, fit), self.ignored(v, fit), self.refusals(v, fit), self.corners[v.version].get(name)) for v, fit in have]
         if any(h != heads[0] for h in heads):
             self.apart[name] = "other prefix, patterns or corners"
             return None
@@ -233,6 +236,11 @@ class Writer:
                 raise
             self.apart[name] = str(e)
             return None
+
+    def refusals(self, v, fit):
+        """What the class raises with, where it asks for nothing that its tensors do not."""
+        used = self.used[v.version].get(fit.raw["model_type"], set())
+        return [r for r in fit.raw.get("refuses") or () if set(tops(r["when"])) <= used]
 
     def differs(self, name):
         """Whether the versions say different things of a class."""
@@ -268,6 +276,8 @@ class Writer:
         out.update({k: told for k, told in self.ignored(v, fit).items() if told})
         if mapping:
             out["key_mapping"] = mapping
+        if self.refusals(v, fit):
+            out["refuses"] = self.refusals(v, fit)
         if self.corners[v.version].get(fit.name):
             out["not_predicted_when"] = self.corners[v.version][fit.name]
         out["tensors"] = nest(self.shippable(v, items), self.marks(v, fit))
@@ -354,6 +364,19 @@ def order_of(fits):
         inner = [c for p in fits[name].raw["parts"] if not p.get("config") for c in p["classes"].values() if c in fits and c not in seen and c != name]
         return 1 + max((depth(c, (*seen, name)) for c in inner), default=0)
     return sorted(fits, key=lambda n: (depth(n), n))
+
+
+def by_type(types):
+    """{type: its keys in one text}."""
+    out = {}
+    for key, told in sorted(types.items()):
+        out.setdefault(told, []).append(key)
+    return {told: " ".join(keys) for told, keys in sorted(out.items())}
+
+
+def tops(text):
+    """The keys of the config itself that an expression reads."""
+    return [path.split(".")[0] for path in paths(text)]
 
 
 def listed(words):

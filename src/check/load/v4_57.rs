@@ -39,8 +39,7 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         // Whatever they are renamed to.
         unexpected.extend(stored.names().filter(|key| !starts(key, &expected.base_model_prefix)).map(str::to_owned));
     }
-    let mut unexpected: Vec<String> =
-        unexpected.into_iter().filter(|name| !expected.buffers.contains(name)).collect();
+    let mut unexpected: Vec<String> = unexpected.into_iter().filter(|name| !expected.buffers.contains(name)).collect();
 
     let mut silent = Vec::new();
     for group in tied_groups(expected) {
@@ -48,7 +47,8 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         if group.iter().any(|name| file.contains_key(*name)) {
             missing.retain(|name| !group.contains(&name.as_str()));
         }
-        let kept: Vec<&str> = group.iter().filter_map(|name| file.get(*name).copied()).filter(|k| !stored.is_absent(k)).collect();
+        let kept: Vec<&str> =
+            group.iter().filter_map(|name| file.get(*name).copied()).filter(|k| !stored.is_absent(k)).collect();
         let by = kept.first().map(|name| (*name).to_owned());
         let over = |name: &str| Silent { name: name.to_owned(), reason: "tied-over".to_owned(), by: by.clone() };
         silent.extend(kept.into_iter().skip(1).map(over));
@@ -61,7 +61,8 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     }
     if renaming.prefix == Prefix::Added {
         let prefix = format!("{}.", expected.base_model_prefix);
-        unexpected = unexpected.into_iter().map(|name| name.strip_prefix(&prefix).map_or(name.clone(), str::to_owned)).collect();
+        unexpected =
+            unexpected.into_iter().map(|name| name.strip_prefix(&prefix).map_or(name.clone(), str::to_owned)).collect();
     }
     for name in stored.absent().filter(|name| matches!(renaming.name(name), Renamed::Is(n) if in_model(&n))) {
         silent.push(Silent { name: name.to_owned(), reason: "indexed-but-absent".to_owned(), by: None });

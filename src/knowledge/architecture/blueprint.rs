@@ -8,6 +8,7 @@ use serde::de::IgnoredAny;
 use serde_json::{Map, Value};
 
 use super::conversions::Rows;
+use super::field_type::FieldType;
 use super::member::Member;
 use crate::knowledge::ordered::ordered;
 use crate::knowledge::{Expression, Loader, Scope, Template};
@@ -59,6 +60,9 @@ pub(crate) struct Blueprint {
     /// Keys that the classes' source reads and no sample varied, with the value that all samples had.
     #[serde(default)]
     unvaried: Map<String, Value>,
+    /// What the config class lets its keys be, with the names of the keys: `"int|null": "head_dim pad_token_id"`.
+    #[serde(default)]
+    types: BTreeMap<FieldType, String>,
     /// Configs with which the loader raises while it reads them.
     #[serde(default)]
     refuses: Vec<Refuses>,
@@ -115,6 +119,9 @@ pub(crate) struct ConfigClass {
     /// As in the file.
     #[serde(default)]
     pub unvaried: Map<String, Value>,
+    /// As in the file.
+    #[serde(default)]
+    pub types: BTreeMap<FieldType, String>,
     /// As in the file.
     #[serde(default)]
     pub refuses: Vec<Refuses>,
@@ -316,6 +323,7 @@ impl Blueprint {
             aliases: self.aliases.clone(),
             inside: self.inside.clone(),
             unvaried: self.unvaried.clone(),
+            types: self.types.clone(),
             refuses: self.refuses.clone(),
             configs: self.configs.clone(),
         };
@@ -324,6 +332,7 @@ impl Blueprint {
             config.defaults.extend(other.defaults.clone());
             config.aliases.extend(other.aliases.clone());
             config.unvaried.extend(other.unvaried.clone());
+            config.types.extend(other.types.clone());
             config.refuses.extend(other.refuses.iter().cloned());
             if other.inside.is_some() {
                 config.inside.clone_from(&other.inside);

@@ -42,7 +42,9 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
             let mut expected = builder.expected;
             match loader {
                 Loader::V4_47_0 => {}
-                Loader::V4_57_6 => expected.conversions = class.key_mapping.iter().map(conversions::key_mapping).collect(),
+                Loader::V4_57_6 => {
+                    expected.conversions = class.key_mapping.iter().map(conversions::key_mapping).collect()
+                }
                 Loader::V5_23_0 => {
                     expected.conversions = conversions::collect(library, &builder.modules, &class.base_model_prefix);
                 }
@@ -60,16 +62,16 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
             })
         }
         // A default that looks into a sub-config nobody knows fails before the part is reached.
-        Err(Refusal::Impossible(reasons)) => Err(match resolver.unknown_sub_config(file, written) {
-            Some(part) => Refusal::UnknownPart(part),
-            None => {
-                // What is not covered may be what it failed on.
-                let mut doubts = builder.expected.doubts;
-                doubts.extend(unread_keys(library, file, loader, written));
-                doubts.extend(nulls(library, file, loader, written));
-                if doubts.is_empty() { Refusal::Impossible(reasons) } else { Refusal::NotCovered(doubts) }
+        Err(Refusal::Impossible(reasons)) => {
+            if let Some(part) = resolver.unknown_sub_config(file, written) {
+                return Err(Refusal::UnknownPart(part));
             }
-        }),
+            // What is not covered may be what it failed on.
+            let mut doubts = builder.expected.doubts;
+            doubts.extend(unread_keys(library, file, loader, written));
+            doubts.extend(nulls(library, file, loader, written));
+            Err(if doubts.is_empty() { Refusal::Impossible(reasons) } else { Refusal::NotCovered(doubts) })
+        }
         Err(unknown) => Err(unknown),
     }
 }
@@ -85,8 +87,9 @@ fn own_config<'c>(file: &Blueprint, loader: Loader, config: &'c Map<String, Valu
     let is_mine = |named: &str| file.model_types.iter().any(|t| t == named);
     match model_type(config) {
         Some(named) if !is_mine(named) => {
-            let inner = config.values().filter_map(Value::as_object).filter(|sub| model_type(sub).is_some_and(is_mine));
-            inner.last().unwrap_or(config)
+            let mut inner =
+                config.values().filter_map(Value::as_object).filter(|sub| model_type(sub).is_some_and(is_mine));
+            inner.next_back().unwrap_or(config)
         }
         _ => config,
     }

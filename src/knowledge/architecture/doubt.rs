@@ -30,9 +30,8 @@ pub(super) fn unread_keys(
     config: &Map<String, Value>,
 ) -> Vec<Doubt> {
     let mut found = Vec::new();
-    let unread = |class: &ConfigClass, key: &str, value: &Value| {
-        class.unvaried.get(key).is_some_and(|assumed| value != assumed)
-    };
+    let unread =
+        |class: &ConfigClass, key: &str, value: &Value| class.unvaried.get(key).is_some_and(|assumed| value != assumed);
     walk(library, file, loader, config, &mut Vec::new(), &mut |class, config, path| {
         let keys = config.iter().filter(|(key, value)| unread(class, key, value)).map(|(key, _)| key);
         found.extend(keys.map(|key| Doubt::UnreadKey(pointer(path, key))));
@@ -54,7 +53,7 @@ pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config:
 }
 
 fn pointer(path: &[&str], key: &str) -> String {
-    path.iter().copied().chain([key]).map(|step| format!("/{step}")).collect()
+    path.iter().copied().chain([key]).fold(String::new(), |whole, step| whole + "/" + step)
 }
 
 fn walk<'c>(

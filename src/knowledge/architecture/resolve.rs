@@ -13,6 +13,9 @@ use crate::knowledge::{Expression, Library, Loader, Scope};
 /// Depth of configs within configs, and of parts within parts.
 pub(super) const DEPTH_CAP: usize = 8;
 
+/// What transformers 5 says of a value of another type than the field's.
+const FIELD: &str = "StrictDataclassFieldValidationError: Validation error";
+
 /// What configs are resolved with.
 #[derive(Clone, Copy)]
 pub(super) struct Resolver<'a> {
@@ -36,6 +39,15 @@ impl Resolver<'_> {
             return Err(Refusal::impossible(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
         let class = file.config(self.loader);
+        for (told, keys) in &class.types {
+            for key in keys.split(' ') {
+                let names = class.aliases.iter().filter(|(_, k)| k.name() == key).map(|(alias, _)| alias.as_str());
+                let wrong = names.chain([key]).filter_map(|name| config.get(name)).find(|value| !told.takes(value));
+                if wrong.is_some() {
+                    return Err(Refusal::Raises(format!("{FIELD} for field '{key}'")));
+                }
+            }
+        }
         // What stands under another name: written over the key before others are computed, or when they are.
         let mut late: Vec<(&str, Value)> = Vec::new();
         for (alias, key) in &class.aliases {
