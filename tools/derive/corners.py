@@ -1,30 +1,48 @@
-"""A class that is right but for one corner of its configs ships with that corner named, and says nothing there."""
+"""A class that is right but for one corner of its configs ships with that corner named, and nothing is predicted there."""
+import itertools
+
 from .conditions import quoted
-from .keys import NOISE
+from .keys import HEADS, KV_HEADS, LAYERS, NOISE, WIDTH
+
+MOST = 3                                                     # corners of one class
 
 
 def found(v, name, records, outcomes, named, enough):
-    """{"when", "why"} of the smallest condition that all configs it was wrong about fulfil, and that leaves enough; or None."""
+    """{"when", "why"} of a condition that configs it was wrong about fulfil, and that leaves enough; or None.
+
+    Of all conditions it is the one that covers the most wrong configs, then the one that loses the fewest right ones."""
     rows = [(r["flat"], o) for r, o in zip(records, outcomes) if "flat" in r and o != "not predicted" and not o.startswith(("raises", "builds"))]
     wrong = [flat for flat, o in rows if o != "exact"]
     right = [flat for flat, o in rows if o == "exact"]
-    if not wrong or len(named) > 2:
+    if not wrong or len(named) >= MOST or len(wrong) > len(right):
         return None
     default = v.configs.get(v.model_type(name), {}).get("defaults", {})
     best = None
-    for key in sorted(set().union(*wrong)):
-        leaf = key.split(".")[-1]
-        if NOISE.search(leaf) or leaf in ("num_labels", "model_type"):
-            continue
-        for text, holds in asked(key, wrong[0].get(key), default.get(key)):
-            if all(holds(flat) for flat in wrong):
-                left = sum(not holds(flat) for flat in right)
-                if left >= enough and (best is None or left > best[0]):
-                    best = (left, text, key)
+    for text, key, holds in candidates(wrong[0], default):
+        covered = sum(map(holds, wrong))
+        left = sum(not holds(flat) for flat in right)
+        if left >= enough and (best is None or (covered, left) > best[0]):
+            best = ((covered, left), text, key)
     if best is None:
         return None
     _, text, key = best
-    return {"when": text, "why": f"what {key} does when {text.replace('c.', '', 1)} is not described"}
+    return {"when": text, "why": f"what {key} does when {text.replace('c.', '')} is not described"}
+
+
+def candidates(flat, default):
+    """(condition, what it is about, its truth in a config) that a config fulfils."""
+    keys = [k for k in sorted(flat) if not NOISE.search(k.split(".")[-1]) and k.split(".")[-1] not in ("num_labels", "model_type") and not k.startswith("_")]
+    for key in keys:
+        for text, holds in asked(key, flat[key], default.get(key)):
+            yield text, key, holds
+    sizes = [k for k in keys if positive(flat[k]) and (WIDTH.search(k) or HEADS.search(k) or KV_HEADS.search(k) or LAYERS.search(k))]
+    for a, b in itertools.permutations(sizes, 2):
+        if a.rpartition(".")[0] == b.rpartition(".")[0] and HEADS.search(b) and WIDTH.search(a) and flat[a] % flat[b]:
+            yield f"c.{a} % c.{b} != 0", a, lambda f, a=a, b=b: positive(f.get(a)) and positive(f.get(b)) and f[a] % f[b] != 0
+
+
+def positive(value):
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 def asked(key, value, default):

@@ -463,7 +463,9 @@ def written_over(key, prefix, rows, known):
         if all(t and not [x for x in KEY.findall(t) if not x.startswith(prefix)] for t in texts):
             continue
         try:
-            out[k] = "=" + explain(prefix + k, mine, known, identity=True)
+            text = explain(prefix + k, mine, known, identity=True)
         except Unexplained:
             continue
+        if any(not x.startswith(prefix) for x in KEY.findall(text)) or not KEY.findall(text):
+            out[k] = "=" + text
     return out

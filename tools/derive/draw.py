@@ -259,9 +259,9 @@ def work(root, names, args):
 def main(args):
     root = args.cache / VERSION
     folder = "others" if args.others else "unseen"
-    fitted = sorted(p.stem for p in (root / "fit").glob("*.json"))
+    sampled = sorted(p.name.removesuffix(".json.gz") for p in (root / "samples").glob("*.json.gz"))
     while True:
-        todo = [n for n in fitted if (not args.only or re.search(args.only, n)) and not (root / folder / str(args.seed) / f"{n}.json.gz").exists()]
+        todo = [n for n in sampled if (not args.only or re.search(args.only, n)) and not (root / folder / str(args.seed) / f"{n}.json.gz").exists()]
         if not todo:
             return 0
         pid = os.fork()

@@ -266,8 +266,8 @@ def expressions(items):
         yield from (text for text in (item.when, item.tied_when, *(item.shape or ()), *(count for _, count in item.repeat)) if text)
 
 
-def used_keys(version, classes):
-    """{model_type: keys} that the templates of the classes read, with what those keys are computed from."""
+def used_keys(version, classes, corners=None):
+    """{model_type: keys} that the templates and the corners of the classes read, with what those keys are computed from."""
     used = defaultdict(set)
 
     def read(model_type, path):
@@ -298,6 +298,9 @@ def used_keys(version, classes):
         model_type = fit.raw["model_type"]
         for text in expressions(fit.items):
             for path in paths(text):
+                read(model_type, path)
+        for corner in (corners or {}).get(name, ()):
+            for path in paths(corner["when"]):
                 read(model_type, path)
         for item in fit.parts:
             if item.part.get("config"):

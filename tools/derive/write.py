@@ -49,7 +49,7 @@ class Writer:
 
     def files(self):
         """{stem: text} of all families."""
-        used = [used_keys(v, self.ships[v.version]) for v in self.versions]
+        used = [used_keys(v, self.ships[v.version], self.corners[v.version]) for v in self.versions]
         # A version that knows a config class knows all its keys: entries may be shared between versions.
         self.used = {v.version: {t: set().union(*(u.get(t, ()) for u in used)) for t in mine} for v, mine in zip(self.versions, used)}
         model_types = {t for used in self.used.values() for t in used}
