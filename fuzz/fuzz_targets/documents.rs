@@ -2,9 +2,9 @@
 
 #![no_main]
 
-#[path = "../../tests/laws/mod.rs"]
-mod laws;
+#[path = "../../tests/it/support/invariants.rs"]
+mod invariants;
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| {
-    laws::documents::hold("config.json", data);
+    invariants::documents::hold("config.json", data);
 });

@@ -6,8 +6,8 @@
 
 #![no_main]
 
-#[path = "../../tests/laws/mod.rs"]
-mod laws;
+#[path = "../../tests/it/support/invariants.rs"]
+mod invariants;
 
 use std::cell::RefCell;
 
@@ -24,7 +24,7 @@ thread_local! {
 fuzz_target!(|data: &[u8]| {
     let Some((mode, rest)) = data.split_first() else { return };
     if *mode == 255 {
-        return laws::header::hold(rest);
+        return invariants::header::hold(rest);
     }
     FILE.with_borrow_mut(|file| {
         let header = 8 + rest.len();
@@ -35,9 +35,9 @@ fuzz_target!(|data: &[u8]| {
         file[8..header].copy_from_slice(rest);
         let mut region = u64::from(*mode);
         if region == 0 {
-            let shard = Shard::parse(laws::header::NAME, header as u64, &file[..header]);
+            let shard = Shard::parse(invariants::header::NAME, header as u64, &file[..header]);
             region = shard.tensors.iter().map(|t| t.end).max().unwrap_or(0).min(MOST);
         }
-        laws::header::hold(&file[..header + region as usize]);
+        invariants::header::hold(&file[..header + region as usize]);
     });
 });

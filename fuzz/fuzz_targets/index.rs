@@ -2,7 +2,7 @@
 
 #![no_main]
 
-#[path = "../../tests/laws/mod.rs"]
-mod laws;
+#[path = "../../tests/it/support/invariants.rs"]
+mod invariants;
 
-libfuzzer_sys::fuzz_target!(|data: &[u8]| laws::documents::index(data));
+libfuzzer_sys::fuzz_target!(|data: &[u8]| invariants::documents::index(data));

@@ -2,7 +2,7 @@
 
 #![no_main]
 
-#[path = "../../tests/laws/mod.rs"]
-mod laws;
+#[path = "../../tests/it/support/invariants.rs"]
+mod invariants;
 
-libfuzzer_sys::fuzz_target!(|data: &[u8]| laws::module::hold(data));
+libfuzzer_sys::fuzz_target!(|data: &[u8]| invariants::module::hold(data));

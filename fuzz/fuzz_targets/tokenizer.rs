@@ -2,8 +2,8 @@
 
 #![no_main]
 
-#[path = "../../tests/laws/mod.rs"]
-mod laws;
+#[path = "../../tests/it/support/invariants.rs"]
+mod invariants;
 
 use libfuzzer_sys::fuzz_target;
 
@@ -21,7 +21,7 @@ fuzz_target!(|data: &[u8]| {
     let Some((first, rest)) = data.split_first() else { return };
     if *first == 0 {
         // A protocol buffer may hold any byte.
-        return laws::documents::tokenizer(&[("tokenizer.model", rest)]);
+        return invariants::documents::tokenizer(&[("tokenizer.model", rest)]);
     }
     let mut files = Vec::with_capacity(4);
     for part in data.split(|b| *b == 0xff).take(4) {
@@ -29,5 +29,5 @@ fuzz_target!(|data: &[u8]| {
             files.push((FILES[usize::from(*which) % FILES.len()], bytes));
         }
     }
-    laws::documents::tokenizer(&files);
+    invariants::documents::tokenizer(&files);
 });

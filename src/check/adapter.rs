@@ -12,27 +12,27 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 
 use crate::checkpoint::adapter::{Adapter, CONFIG};
-use crate::checkpoint::{Checkpoint, Fault, Place, Tensor};
-use keys::{Key, Role};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
+use keys::{AdapterKey, MatrixRole};
 use targets::Targets;
 
 /// The tensors of one module.
-type Module<'c> = BTreeMap<Role, &'c Tensor>;
+type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
 /// Faults of the adapter in this directory; none when there is none.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let Some(adapter) = Adapter::of(checkpoint) else { return Vec::new() };
+pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return Vec::new() };
     let mut faults = Vec::new();
     // AdapterHub's library gives its own, other files the same name.
     if adapter.config().is_some_and(|config| config.get("peft_type").is_none() && config.get("model_class").is_some()) {
         let at = Place::file(CONFIG).pointer("/model_class");
-        return vec![Fault::new("adapter-type-unchecked").at(at).with("peft_type", "AdapterHub")];
+        return vec![Fault::new(FaultKind::AdapterTypeUnchecked).at(at).with("peft_type", "AdapterHub")];
     }
     match adapter.file() {
-        None => faults.push(Fault::new("adapter-weights-missing").at(Place::file(CONFIG))),
+        None => faults.push(Fault::new(FaultKind::AdapterWeightsMissing).at(Place::file(CONFIG))),
         Some(file) if !file.ends_with(".safetensors") => {
-            faults.push(Fault::new("pickle-weights").at(Place::file(file)));
+            faults.push(Fault::new(FaultKind::PickleWeights).at(Place::file(file)));
         }
         Some(_) => {}
     }
@@ -42,22 +42,23 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
     let base = text("base_model_name_or_path").unwrap_or_default();
     if is_path(base) {
         let at = Place::file(CONFIG).pointer("/base_model_name_or_path");
-        faults.push(Fault::new("adapter-base-is-a-path").at(at).with("base", base));
+        faults.push(Fault::new(FaultKind::AdapterBaseIsAPath).at(at).with("base", base));
     }
     let kind = text("peft_type").unwrap_or_default();
     if kind != "LORA" {
         let at = Place::file(CONFIG).pointer("/peft_type");
-        let fault = Fault::new(if kind.is_empty() { "adapter-type-missing" } else { "adapter-type-unchecked" });
+        let fault =
+            Fault::new(if kind.is_empty() { FaultKind::AdapterTypeMissing } else { FaultKind::AdapterTypeUnchecked });
         faults.push(fault.at(at).with("peft_type", kind));
         return faults;
     }
     let base = if base.is_empty() { "a base model it does not name" } else { base };
-    let about = Fault::new("adapter-of-a-model").at(Place::file(CONFIG).pointer("/base_model_name_or_path"));
+    let about = Fault::new(FaultKind::AdapterOfAModel).at(Place::file(CONFIG).pointer("/base_model_name_or_path"));
     faults.push(about.with("base", base).with("rank", config.get("r").cloned().unwrap_or_default()));
     let rank = config.get("r");
     if rank.is_some_and(|r| r.as_u64().is_none_or(|r| r == 0)) {
         let at = Place::file(CONFIG).pointer("/r");
-        faults.push(Fault::new("adapter-rank-unusable").at(at).with("rank", rank.cloned().unwrap_or_default()));
+        faults.push(Fault::new(FaultKind::AdapterRankUnusable).at(at).with("rank", rank.cloned().unwrap_or_default()));
     }
     if let Some(tensors) = adapter.tensors() {
         lora(config, tensors, &mut faults);
@@ -72,49 +73,56 @@ fn is_path(base: &str) -> bool {
 }
 
 fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
-    let mut modules: BTreeMap<&str, Module<'_>> = BTreeMap::new();
+    let mut modules: BTreeMap<&str, AdapterModule<'_>> = BTreeMap::new();
     let mut whole: BTreeSet<&str> = BTreeSet::new();
     for tensor in tensors {
-        match Key::parse(&tensor.name) {
-            Key::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
-            Key::Whole(name) => drop(whole.insert(name)),
-            Key::Foreign(reason) => {
-                let fault = Fault::new("adapter-key-unread").at(Place::tensor(&*tensor.name));
+        match AdapterKey::parse(&tensor.name) {
+            AdapterKey::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
+            AdapterKey::Whole(name) => drop(whole.insert(name)),
+            AdapterKey::Foreign(reason) => {
+                let fault = Fault::new(FaultKind::AdapterKeyUnread).at(Place::tensor(&*tensor.name));
                 faults.push(fault.with("tensor", tensor.name.as_str()).with("reason", reason));
             }
         }
     }
-    let targets = Targets::of(config);
-    let vectors = modules.values().filter(|module| module.contains_key(&Role::Magnitude)).count();
+    let targets = Targets::from_config(config);
+    let vectors = modules.values().filter(|module| module.contains_key(&MatrixRole::Magnitude)).count();
     let alike = vectors == 0 || vectors == modules.len();
     let trained = if targets.is_uniform() { trained_rank(&modules) } else { None };
     for (name, module) in &modules {
         pairs(name, module, &targets, trained, faults);
-        let magnitude = module.get(&Role::Magnitude);
+        let magnitude = module.get(&MatrixRole::Magnitude);
         if magnitude.is_some() != targets.dora {
             let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
-            let fault = Fault::new("adapter-dora-disagrees").at(at).with("module", *name);
+            let fault = Fault::new(FaultKind::AdapterDoraDisagrees).at(at).with("module", *name);
             faults.push(fault.with("stored", magnitude.is_some()).with("alike", alike));
         }
     }
     untargeted(config, &modules, &targets, faults);
-    if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == "adapter-key-unread") {
-        faults.push(Fault::new("adapter-without-matrices").at(Place::file(CONFIG)));
+    if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == FaultKind::AdapterKeyUnread) {
+        faults.push(Fault::new(FaultKind::AdapterWithoutMatrices).at(Place::file(CONFIG)));
     }
     // PEFT lists `classifier` and `score` for every sequence classification, and a model has one of them: only a file
     // with none of the list has lost something. It matches the last segments of a module's name.
     let is_saved = |module: &&str| whole.iter().any(|name| format!(".{name}").contains(&format!(".{module}.")));
     if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
         let at = Place::file(CONFIG).pointer("/modules_to_save");
-        faults.push(Fault::new("adapter-module-not-saved").at(at).with("modules", targets.saved.join(", ")));
+        faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.join(", ")));
     }
 }
 
 /// One fault for all modules that have matrices and get none, with the list that would name them.
-fn untargeted(config: &Value, modules: &BTreeMap<&str, Module<'_>>, targets: &Targets<'_>, faults: &mut Vec<Fault>) {
-    let left_out: Vec<(&&str, &Module<'_>)> = modules.iter().filter(|(name, _)| !targets.may_cover(name)).collect();
+fn untargeted(
+    config: &Value,
+    modules: &BTreeMap<&str, AdapterModule<'_>>,
+    targets: &Targets<'_>,
+    faults: &mut Vec<Fault>,
+) {
+    let left_out: Vec<(&&str, &AdapterModule<'_>)> =
+        modules.iter().filter(|(name, _)| !targets.may_cover(name)).collect();
     let Some((first, _)) = left_out.first() else { return };
-    let mut fault = Fault::new("adapter-module-untargeted").with("module", **first).with("count", left_out.len());
+    let mut fault =
+        Fault::new(FaultKind::AdapterModuleUntargeted).with("module", **first).with("count", left_out.len());
     fault.places = left_out.iter().filter_map(|(_, m)| Some(Place::tensor(&*m.values().next()?.name))).collect();
     let narrowed = ["exclude_modules", "layers_to_transform", "layers_pattern"];
     let is_plain = narrowed.iter().all(|key| config.get(key).is_none_or(Value::is_null));
@@ -126,10 +134,11 @@ fn untargeted(config: &Value, modules: &BTreeMap<&str, Module<'_>>, targets: &Ta
 }
 
 /// The two matrices of a module, as weights and as embeddings.
-const PAIRS: [(Role, Role); 2] = [(Role::A, Role::B), (Role::EmbeddingA, Role::EmbeddingB)];
+const PAIRS: [(MatrixRole, MatrixRole); 2] =
+    [(MatrixRole::A, MatrixRole::B), (MatrixRole::EmbeddingA, MatrixRole::EmbeddingB)];
 
 /// The rank of every pair, when all have the same.
-fn trained_rank(modules: &BTreeMap<&str, Module<'_>>) -> Option<u64> {
+fn trained_rank(modules: &BTreeMap<&str, AdapterModule<'_>>) -> Option<u64> {
     let pairs = modules.values().flat_map(|m| PAIRS.iter().filter_map(|(a, b)| Some((m.get(a)?, m.get(b)?))));
     let ranks: Option<BTreeSet<u64>> = pairs
         .map(|(a, b)| {
@@ -142,7 +151,7 @@ fn trained_rank(modules: &BTreeMap<&str, Module<'_>>) -> Option<u64> {
 }
 
 /// `lora_A [r, in]` and `lora_B [out, r]` of one module, of one rank, and that of the config.
-fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, trained: Option<u64>, faults: &mut Vec<Fault>) {
+fn pairs(name: &str, module: &AdapterModule<'_>, targets: &Targets<'_>, trained: Option<u64>, faults: &mut Vec<Fault>) {
     for (down, up) in PAIRS {
         let (a, b) = match (module.get(&down), module.get(&up)) {
             (None, None) => continue,
@@ -150,30 +159,30 @@ fn pairs(name: &str, module: &Module<'_>, targets: &Targets<'_>, trained: Option
             (one, other) => {
                 let at = Place::tensor(one.or(other).map_or("", |t| t.name.as_str()));
                 let lacks = if one.is_none() { down } else { up };
-                let fault = Fault::new("adapter-pair-incomplete").at(at).with("module", name);
+                let fault = Fault::new(FaultKind::AdapterPairIncomplete).at(at).with("module", name);
                 faults.push(fault.with("lacks", lacks.word()));
                 continue;
             }
         };
         let (Some(&rank), Some(&other)) = (a.shape.first(), b.shape.get(1)) else {
-            let fault = Fault::new("adapter-rank-disagrees").at(Place::tensor(&*a.name)).with("module", name);
+            let fault = Fault::new(FaultKind::AdapterRankDisagrees).at(Place::tensor(&*a.name)).with("module", name);
             faults.push(fault.with("a", a.shape.clone()).with("b", b.shape.clone()).with("rank", Value::Null));
             continue;
         };
         let expected = targets.rank(name);
         if rank != other || expected.is_some_and(|expected| expected != rank) {
-            let fault = Fault::new("adapter-rank-disagrees").at(Place::tensor(&*a.name)).with("module", name);
+            let fault = Fault::new(FaultKind::AdapterRankDisagrees).at(Place::tensor(&*a.name)).with("module", name);
             let fault = fault.with("a", a.shape.clone()).with("b", b.shape.clone());
             let fault = fault.with("rank", expected.map_or(Value::Null, Value::from));
             faults.push(trained.into_iter().fold(fault, |fault, trained| fault.with("trained", trained)));
         }
-        if down == Role::A
-            && let Some(magnitude) = module.get(&Role::Magnitude)
+        if down == MatrixRole::A
+            && let Some(magnitude) = module.get(&MatrixRole::Magnitude)
             && let (Some(out), Some(values)) =
                 (b.shape.first(), magnitude.shape.iter().copied().reduce(u64::saturating_mul))
             && *out != values
         {
-            let fault = Fault::new("adapter-magnitude-misshapen").at(Place::tensor(&*magnitude.name));
+            let fault = Fault::new(FaultKind::AdapterMagnitudeMisshapen).at(Place::tensor(&*magnitude.name));
             faults.push(fault.with("module", name).with("stored", magnitude.shape.clone()).with("expected", *out));
         }
     }

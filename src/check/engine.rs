@@ -5,18 +5,16 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, LoadReport, Location, Skipped, Suppressed};
+use super::finding::{Finding, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::Stored;
-use super::votes::Vote;
-use super::{adapter, facts, index, judge, modules, policy, tokens};
+use super::outcome::Outcome;
+use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::expression::within;
-use crate::knowledge::processor::Processor;
-use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule, RuleSet};
-use crate::knowledge::settings::Policy;
-use crate::knowledge::{EvalError, Expression, Library, Loader, Scope};
+use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule};
+use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
 
 /// Findings of one rule that are kept; the last one says how many more there are.
 const CAP: usize = 100;
@@ -26,55 +24,6 @@ const STEPS: u64 = 2_000_000;
 
 /// Places of one finding that are kept.
 const PLACES: usize = 20;
-
-/// What checking a checkpoint gave.
-#[derive(Debug, Clone, Default)]
-pub struct Outcome {
-    /// Architecture the load reports were predicted with.
-    pub architecture: Option<String>,
-    /// Sorted by file, place and code.
-    pub findings: Vec<Finding>,
-    /// One for each loader that was asked; none when the architecture is unknown or there are no weights to speak of.
-    pub loads: Vec<LoadReport>,
-    /// The config with the class's defaults filled in; null when the architecture is unknown.
-    pub config: Value,
-    /// Values of config.json that stored tensors contradict.
-    pub votes: Vec<Vote>,
-    /// Findings that settings accept, in the order of the others.
-    pub suppressed: Vec<Suppressed>,
-    /// Rules that did not apply, or were not chosen.
-    pub skipped: Vec<Skipped>,
-    /// Rules of the user's own that cannot be used, and why: they take more steps than a rule may, or name what there is
-    /// not.
-    pub unusable: Vec<Skipped>,
-}
-
-/// What a checker knows: rules, architectures, processors; and what becomes of its findings.
-pub struct Knowledge {
-    /// Rules.
-    pub rules: RuleSet,
-    /// Architectures.
-    pub library: Library,
-    /// Processors.
-    pub processors: Vec<Processor>,
-    /// What settings say of single findings.
-    pub policy: Policy,
-}
-
-impl Knowledge {
-    /// What is inside the program.
-    ///
-    /// # Errors
-    /// A data file that is not right; the house tests see to it that there is none.
-    pub fn embedded() -> Result<Self, crate::knowledge::source::DataError> {
-        Ok(Self {
-            rules: RuleSet::embedded()?,
-            library: Library::embedded(),
-            processors: Processor::embedded()?,
-            policy: Policy::default(),
-        })
-    }
-}
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
 #[must_use]
@@ -86,10 +35,10 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
-    faults.extend(index::compare(checkpoint));
-    faults.extend(modules::compare(checkpoint));
-    faults.extend(adapter::compare(checkpoint));
-    let judged = judge::judge(checkpoint, &knowledge.library, versions, &Stored::of(checkpoint));
+    faults.extend(index::faults(checkpoint));
+    faults.extend(modules::faults(checkpoint));
+    faults.extend(adapter::faults(checkpoint));
+    let judged = judge::judge(checkpoint, knowledge, versions, &Stored::of(checkpoint));
     faults.extend(judged.faults);
     let config = checkpoint.config();
     let mut outcome = Outcome {
@@ -102,16 +51,16 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint);
-    faults.extend(tokens::compare(checkpoint, rows));
+    faults.extend(tokens::faults(checkpoint, rows));
     let opened = outcome.architecture.as_deref().and_then(|name| {
         let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
         let config =
             checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
-    let mut scope = facts::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
+    let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     scope.bind("loaders", &json!(loaders(config, versions)));
-    facts::bind_loads(&mut scope, outcome.loads.clone());
+    variables::bind_loads(&mut scope, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let bench = Bench::new(checkpoint);
     for rule in &knowledge.rules.rules {
@@ -121,7 +70,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
             None => (ask(rule, &bench, &faults, &scope, architecture), false),
         };
         if stopped {
-            let why = "takes too many steps; let its loops go over less".to_owned();
+            let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
             outcome.unusable.push(Skipped { code: rule.code.clone(), why });
         }
         match found {
@@ -136,16 +85,16 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         }
     }
     let unselected = knowledge.rules.unselected.iter();
-    outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not chosen".to_owned() }));
+    outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
-    policy::apply(&knowledge.policy, checkpoint, &mut outcome);
+    policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
 }
 
 /// What the rules that name these faults make of them, outside the checks of a checkpoint.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
-    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if f.kinds.iter().any(|k| faults.iter().any(|f| f.kind == k)));
+    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(asked);
     let bench = Bench::new(checkpoint);
     let mut findings: Vec<Finding> =
@@ -201,16 +150,16 @@ fn ask(
 ) -> Result<Vec<Finding>, String> {
     if !rule.applies.is_empty() && !architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a)) {
         let is = architecture.unwrap_or("unknown");
-        return Err(format!("about {}; the architecture is {is}", rule.applies.join(", ")));
+        return Err(format!("applies to {}; the architecture is {is}", rule.applies.join(", ")));
     }
-    let cannot = |expression: &Expression, error: &EvalError| match facts::absent(bench.checkpoint, expression) {
-        Some(file) => format!("{file} is not there"),
-        None => format!("cannot be asked: {}", error.cause),
+    let cannot = |expression: &Expression, error: &EvalError| match variables::absent(bench.checkpoint, expression) {
+        Some(file) => format!("{file} is missing"),
+        None => format!("cannot be evaluated: {}", error.cause),
     };
     if let Some(when) = &rule.when {
         match when.eval_bool(scope) {
             Ok(true) => {}
-            Ok(false) => return Err(format!("when is false: {when}")),
+            Ok(false) => return Err(format!("condition is false: {when}")),
             Err(error) => return Err(cannot(when, &error)),
         }
     }
@@ -250,7 +199,7 @@ fn from_faults(
 ) -> Vec<Finding> {
     let mut matching = faults
         .iter()
-        .filter(|f| check.kinds.iter().any(|k| k == f.kind))
+        .filter(|f| check.kinds.contains(&f.kind))
         .filter(|f| check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false)));
     if check.group {
         let all: Vec<&Fault> = matching.collect();

@@ -14,6 +14,7 @@ mod repairs;
 
 /// One change to a checkpoint. The edits of a fix are made together or not at all.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Edit {
     /// Puts text in place of bytes of a document or module.
@@ -91,6 +92,7 @@ pub fn renamed(prefixes: &[(String, String)], name: &str) -> Option<String> {
 
 /// What can be done about a finding.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct FixHint {
     /// How safe it is.
     pub safety: Safety,
@@ -212,7 +214,7 @@ fn made(specs: &[EditSpec], site: &Site<'_>) -> Option<Vec<Edit>> {
                 }
                 edits.push(Edit::Write { file, text });
             }
-            EditSpec::Repair(name) => edits.extend(repairs::run(name, site)?),
+            EditSpec::Repair(repair) => edits.extend(repairs::run(*repair, site)?),
         }
     }
     Some(edits)

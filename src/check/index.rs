@@ -5,26 +5,27 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::checkpoint::{Checkpoint, Fault, Place, Shard};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, pointer};
 
 /// The file that, when it is there, a loader takes without looking at an index.
 const SINGLE: &str = "model.safetensors";
 
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
 pub(super) fn readable(shard: &Shard) -> bool {
-    const UNREADABLE: [&str; 10] = [
-        "lfs-pointer",
-        "not-safetensors",
-        "empty-file",
-        "file-too-short",
-        "header-length-out-of-range",
-        "header-too-large",
-        "header-not-utf8",
-        "header-not-json",
-        "header-too-deep",
-        "unreadable-file",
+    const UNREADABLE: [FaultKind; 11] = [
+        FaultKind::LfsPointer,
+        FaultKind::NotSafetensors,
+        FaultKind::EmptyFile,
+        FaultKind::FileTooShort,
+        FaultKind::HeaderLengthOutOfRange,
+        FaultKind::HeaderTooLarge,
+        FaultKind::HeaderNotUtf8,
+        FaultKind::HeaderNotJson,
+        FaultKind::HeaderTooDeep,
+        FaultKind::UnreadableFile,
+        FaultKind::NotARegularFile,
     ];
-    !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind) || f.kind == "not-a-regular-file")
+    !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind))
 }
 
 /// Whether every shard is there and its header could be read, so that a tensor that is not seen is not there.
@@ -49,13 +50,11 @@ pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
 
 /// Faults between index, shards and file names.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let mut faults = Vec::new();
+pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     match &checkpoint.index {
-        Some(_) => with_index(checkpoint, &mut faults),
-        None => without_index(checkpoint, &mut faults),
+        Some(index) => IndexComparison::new(checkpoint, index).map_or_else(Vec::new, |comparison| comparison.faults()),
+        None => without_index(checkpoint),
     }
-    faults
 }
 
 /// An index that states more bytes of tensors than its shards have, when git-lfs pointers say how large these are.
@@ -68,7 +67,7 @@ fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item 
     }
     let size = |name| entry(name).map(|e| e.lfs.as_ref().map_or(e.size, |pointer| pointer.size));
     let sum = shards.clone().try_fold(0_u64, |sum, name| Some(sum.saturating_add(size(name)?)))?;
-    let fault = Fault::new("lfs-sizes-below-total")
+    let fault = Fault::new(FaultKind::LfsSizesBelowTotal)
         .at(Place::file(&index.document).pointer("/metadata/total_size"))
         .with("stated", stated)
         .with("sum", sum)
@@ -96,165 +95,169 @@ pub fn first_absent_shard(checkpoint: &Checkpoint) -> Option<&str> {
     named.find(|name| some && !is_there(name)).map(String::as_str)
 }
 
-fn with_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
-    let Some(index) = &checkpoint.index else { return };
-    // An index that could not be understood says nothing of what is not in it.
-    if index.weight_map.is_empty() {
-        return;
+/// An index and what it is compared with.
+struct IndexComparison<'c> {
+    checkpoint: &'c Checkpoint,
+    index: &'c Index,
+    /// Files that the index names: how many tensors it maps to each, and the first of them.
+    referenced: BTreeMap<&'c str, (usize, &'c str)>,
+    /// The shards that hold each tensor.
+    holders: BTreeMap<&'c str, Vec<&'c str>>,
+    lookalikes: Lookalikes<'c>,
+    /// Whether the header of every shard that the index names was read.
+    all_read: bool,
+}
+
+impl<'c> IndexComparison<'c> {
+    /// `None` for an index without entries: it tells nothing of what is not in it.
+    fn new(checkpoint: &'c Checkpoint, index: &'c Index) -> Option<Self> {
+        let mut referenced: BTreeMap<&str, (usize, &str)> = BTreeMap::new();
+        for (tensor, file) in &index.weight_map {
+            let (count, _) = referenced.entry(file).or_insert((0, tensor));
+            *count = count.saturating_add(1);
+        }
+        let all_read = referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(readable));
+        let (holders, lookalikes) = (by_tensor(checkpoint), Lookalikes::new(checkpoint));
+        let comparison = Self { checkpoint, index, referenced, holders, lookalikes, all_read };
+        (!index.weight_map.is_empty()).then_some(comparison)
     }
-    let mut referenced: Referenced<'_> = BTreeMap::new();
-    for (tensor, file) in &index.weight_map {
-        let (count, _) = referenced.entry(file).or_insert((0, tensor));
-        *count = count.saturating_add(1);
+
+    fn faults(&self) -> Vec<Fault> {
+        let mut faults: Vec<Fault> =
+            pointers_below_total(self.checkpoint, self.referenced.keys().copied()).into_iter().collect();
+        faults.extend(self.absent_shards());
+        faults.extend(self.pickles());
+        faults.extend(self.misplaced_entries());
+        faults.extend(self.tensors_without_entry());
+        faults.extend(self.stray_shards());
+        faults.extend(self.total_size());
+        faults
     }
-    faults.extend(pointers_below_total(checkpoint, referenced.keys().copied()));
-    let is_there = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
-    let absent: Vec<_> =
-        referenced.iter().filter(|(name, _)| !is_there(name)).map(|(n, (c, t))| (*n, *c, *t)).collect();
-    let lookalikes = Lookalikes::of(checkpoint);
-    let all_absent = absent.len() == referenced.len();
-    if all_absent {
-        let first = absent.first().map_or("", |(name, ..)| *name);
-        faults.push(
-            Fault::new("all-shards-absent")
+
+    /// Shards that the index names and that are missing.
+    fn absent_shards(&self) -> Vec<Fault> {
+        let Self { checkpoint, index, referenced, .. } = self;
+        let exists = |name: &str| checkpoint.has_file(name) || checkpoint.shards.contains_key(name);
+        let absent: Vec<_> =
+            referenced.iter().filter(|(name, _)| !exists(name)).map(|(n, (c, t))| (*n, *c, *t)).collect();
+        if absent.len() == referenced.len() {
+            let fault = Fault::new(FaultKind::AllShardsAbsent)
                 .at(Place::file(&index.document))
                 .with("count", absent.len())
                 .with("tensors", index.weight_map.len())
-                .with("first", first),
-        );
-    } else {
-        for (name, tensors, first) in absent {
-            let pointer = Some(pointer_to(first));
-            let fault = match lookalikes.get(name) {
-                Some(s) => {
-                    let by = if name.eq_ignore_ascii_case(s) { "case" } else { "Unicode normalisation" };
-                    Fault::new("shard-name-differs-in-case").with("similar", s).with("by", by)
+                .with("first", absent.first().map_or("", |(name, ..)| *name));
+            return vec![fault];
+        }
+        let fault = |(name, tensors, first)| {
+            let fault = match self.lookalikes.get(name) {
+                Some(similar) => {
+                    let by = if name.eq_ignore_ascii_case(similar) { "case" } else { "Unicode normalisation" };
+                    Fault::new(FaultKind::ShardNameDiffersInCase).with("similar", similar).with("by", by)
                 }
-                None => Fault::new("shard-missing"),
+                None => Fault::new(FaultKind::ShardMissing),
             };
-            let place = Place { file: Some(index.document.clone()), pointer, ..Place::default() };
-            faults.push(fault.at(place).with("shard", name).with("tensors", tensors));
-        }
+            let place = Place::file(&index.document).pointer(pointer_to(first));
+            fault.at(place).with("shard", name).with("tensors", tensors)
+        };
+        absent.into_iter().map(fault).collect()
     }
-    let is_pickle = |name: &&&str| index.is_of_pickles() && checkpoint.has_file(name) && !is_pointer(checkpoint, name);
-    if let Some(name) = referenced.keys().find(is_pickle) {
-        faults.push(Fault::new("pickle-weights").at(Place::file(*name)));
-    }
-    let holders = by_tensor(checkpoint);
-    // A name may lie in a shard that cannot be read: then nothing is known of it.
-    let all_read = referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(readable));
-    let unreadable: BTreeSet<&str> =
-        checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
-    for (tensor, said) in &index.weight_map {
-        let Some(shard) = checkpoint.shards.get(said).filter(|s| readable(s)) else { continue };
-        let held = holders.get(tensor.as_str());
-        let unreadable = held.is_none() && unreadable.contains(tensor.as_str());
-        if held.is_some_and(|h| h.contains(&shard.name.as_str())) || unreadable {
-            continue;
-        }
-        let place = Place::file(&index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
-        if let Some(other) = held.and_then(|h| h.first()) {
-            faults
-                .push(Fault::new("index-names-other-shard").at(place).with("said", said.as_str()).with("held", *other));
-        } else if all_read {
-            faults.push(Fault::new("index-key-nowhere").at(place).with("said", said.as_str()));
-        }
-    }
-    // Entries that name no file are the reader's fault to report.
-    let unusable: BTreeSet<&str> =
-        index.faults.iter().flat_map(|f| &f.places).filter_map(|place| place.tensor.as_deref()).collect();
-    for (tensor, shards) in &holders {
-        let mapped: Vec<&&str> = shards.iter().filter(|s| referenced.contains_key(**s)).collect();
-        if unusable.contains(tensor) {
-            continue;
-        }
-        if !index.weight_map.contains_key(*tensor) {
-            if let Some(shard) = mapped.first() {
-                let place = Place::file(**shard).in_tensor(*tensor);
-                faults.push(Fault::new("shard-tensor-not-in-index").at(place).with("index", index.document.as_str()));
-            }
-        } else if let (Some(first), Some(second)) = (mapped.first(), mapped.get(1)) {
-            let place = Place::file(**first).in_tensor(*tensor);
-            let kept = index.weight_map.get(*tensor).map_or("", String::as_str);
-            faults.push(Fault::new("tensor-in-two-shards").at(place).with("other", **second).with("kept", kept));
-        }
-    }
-    strays(checkpoint, &referenced, &holders, faults);
-    // The size of an entry that could not be read is not known.
-    if all_read && referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(|s| s.unreadable.is_empty())) {
-        total_size(checkpoint, &referenced, faults);
-    }
-}
 
-/// Safetensors files that the index does not mention.
-fn strays(
-    checkpoint: &Checkpoint,
-    referenced: &Referenced<'_>,
-    holders: &BTreeMap<&str, Vec<&str>>,
-    faults: &mut Vec<Fault>,
-) {
-    let Some(index) = &checkpoint.index else { return };
-    let mut shared: BTreeMap<&str, u64> = BTreeMap::new();
-    for (tensor, shards) in holders {
-        if index.weight_map.contains_key(*tensor) {
-            for shard in shards {
-                let n = shared.entry(shard).or_default();
-                *n = n.saturating_add(1);
+    /// The first pickle file of an index of pickles.
+    fn pickles(&self) -> Option<Fault> {
+        let checkpoint = self.checkpoint;
+        let is_pickle = |name: &&&str| checkpoint.has_file(name) && !is_pointer(checkpoint, name);
+        let name = self.referenced.keys().find(is_pickle).filter(|_| self.index.is_of_pickles())?;
+        Some(Fault::new(FaultKind::PickleWeights).at(Place::file(*name)))
+    }
+
+    /// Entries whose tensor is in another shard than the index maps it to, or in none.
+    fn misplaced_entries(&self) -> Vec<Fault> {
+        let shards = &self.checkpoint.shards;
+        let unreadable: BTreeSet<&str> = shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
+        let mut faults = Vec::new();
+        for (tensor, said) in &self.index.weight_map {
+            let Some(shard) = shards.get(said).filter(|s| readable(s)) else { continue };
+            let held = self.holders.get(tensor.as_str());
+            let unreadable = held.is_none() && unreadable.contains(tensor.as_str());
+            if held.is_some_and(|h| h.contains(&shard.name.as_str())) || unreadable {
+                continue;
+            }
+            let place = Place::file(&self.index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
+            if let Some(other) = held.and_then(|h| h.first()) {
+                let fault = Fault::new(FaultKind::IndexNamesOtherShard).at(place);
+                faults.push(fault.with("said", said.as_str()).with("held", *other));
+            } else if self.all_read {
+                // Otherwise the tensor may be in a shard whose header could not be read.
+                faults.push(Fault::new(FaultKind::IndexKeyNowhere).at(place).with("said", said.as_str()));
             }
         }
+        faults
     }
-    let lookalikes = Lookalikes::of(checkpoint);
-    let missed: BTreeSet<&str> = referenced.keys().filter_map(|name| lookalikes.get(name)).collect();
-    for name in shard_names(checkpoint) {
-        // Under a name that differs in case only it is missing already.
-        if referenced.contains_key(name) || missed.contains(name) {
-            continue;
-        }
-        let twice = shared.get(name).copied().unwrap_or_default();
-        if name == SINGLE {
-            faults.push(
-                Fault::new("single-file-beside-index")
-                    .at(Place::file(name))
-                    .with("index", index.document.as_str())
-                    .with("twice", twice),
-            );
-        } else if twice > 0 || numbered(name).is_some() {
-            faults.push(
-                Fault::new("stray-shard")
-                    .at(Place::file(name))
-                    .with("index", index.document.as_str())
-                    .with("twice", twice),
-            );
-        }
-    }
-}
 
-fn total_size(checkpoint: &Checkpoint, referenced: &Referenced<'_>, faults: &mut Vec<Fault>) {
-    let Some(index) = &checkpoint.index else { return };
-    let Some(stated) = index.total_size.as_ref().and_then(whole) else { return };
-    let actual = referenced
-        .keys()
-        .filter_map(|n| checkpoint.shards.get(*n))
-        .flat_map(|s| &s.tensors)
-        .fold(0_u64, |n, t| n.saturating_add(t.len()));
-    if stated != actual {
-        faults.push(
-            Fault::new("total-size-wrong")
-                .at(Place::file(&index.document).pointer("/metadata/total_size"))
-                .with("stated", stated)
-                .with("actual", actual),
-        );
+    /// Tensors of the named shards that the index does not map, or that two of these shards hold.
+    fn tensors_without_entry(&self) -> Vec<Fault> {
+        // Entries that name no file are the reader's fault to report.
+        let places = self.index.faults.iter().flat_map(|f| &f.places);
+        let unusable: BTreeSet<&str> = places.filter_map(|place| place.tensor.as_deref()).collect();
+        let mut faults = Vec::new();
+        for (tensor, shards) in self.holders.iter().filter(|(tensor, _)| !unusable.contains(*tensor)) {
+            let mut mapped = shards.iter().filter(|s| self.referenced.contains_key(**s));
+            let Some(first) = mapped.next() else { continue };
+            let place = Place::file(*first).in_tensor(*tensor);
+            match (self.index.weight_map.get(*tensor), mapped.next()) {
+                (None, _) => {
+                    let fault = Fault::new(FaultKind::ShardTensorNotInIndex).at(place);
+                    faults.push(fault.with("index", self.index.document.as_str()));
+                }
+                (Some(kept), Some(second)) => {
+                    let fault = Fault::new(FaultKind::TensorInTwoShards).at(place);
+                    faults.push(fault.with("other", *second).with("kept", kept.as_str()));
+                }
+                (Some(_), None) => {}
+            }
+        }
+        faults
     }
-}
 
-/// A byte count; transformers wrote it as a float for years.
-fn whole(value: &Value) -> Option<u64> {
-    if let Some(n) = value.as_u64() {
-        return Some(n);
+    /// Safetensors files that the index does not name.
+    fn stray_shards(&self) -> Vec<Fault> {
+        let mut shared: BTreeMap<&str, u64> = BTreeMap::new();
+        let mapped = self.holders.iter().filter(|(tensor, _)| self.index.weight_map.contains_key(**tensor));
+        for shard in mapped.flat_map(|(_, shards)| shards) {
+            let count = shared.entry(shard).or_default();
+            *count = count.saturating_add(1);
+        }
+        // Under a name that differs in case only a shard is missing already.
+        let missed: BTreeSet<&str> = self.referenced.keys().filter_map(|name| self.lookalikes.get(name)).collect();
+        let fault = |name: &str| {
+            let twice = shared.get(name).copied().unwrap_or_default();
+            let kind = match name {
+                SINGLE => FaultKind::SingleFileBesideIndex,
+                _ if twice > 0 || numbered(name).is_some() => FaultKind::StrayShard,
+                _ => return None,
+            };
+            let fault = Fault::new(kind).at(Place::file(name)).with("index", self.index.document.as_str());
+            Some(fault.with("twice", twice))
+        };
+        let strays = shard_names(self.checkpoint).into_iter();
+        strays.filter(|name| !self.referenced.contains_key(name) && !missed.contains(name)).filter_map(fault).collect()
     }
-    let n = value.as_f64()?;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole, not negative and within 2^53")]
-    (n.fract() == 0.0 && (0.0..9e15).contains(&n)).then_some(n as u64)
+
+    /// A `total_size` that is not the size of the shards; unknown while an entry of one could not be read.
+    fn total_size(&self) -> Option<Fault> {
+        let mut shards = self.referenced.keys().filter_map(|name| self.checkpoint.shards.get(*name));
+        if !self.all_read || !shards.clone().all(|shard| shard.unreadable.is_empty()) {
+            return None;
+        }
+        let stated = self.index.total_bytes()?;
+        let size = |sum: u64, shard: &Shard| shard.tensors.iter().fold(sum, |sum, t| sum.saturating_add(t.len()));
+        let actual = shards.by_ref().fold(0, size);
+        let fault = Fault::new(FaultKind::TotalSizeWrong)
+            .at(Place::file(&self.index.document).pointer("/metadata/total_size"))
+            .with("stated", stated)
+            .with("actual", actual);
+        (stated != actual).then_some(fault)
+    }
 }
 
 /// Number and count of `model-00001-of-00002.safetensors`.
@@ -265,49 +268,52 @@ pub(super) fn numbered(name: &str) -> Option<(&str, u32, u32)> {
     Some((prefix, number.parse().ok()?, count.parse().ok()?))
 }
 
-fn without_index(checkpoint: &Checkpoint, faults: &mut Vec<Fault>) {
+/// Faults of a checkpoint that has no index.
+fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     let names = shard_names(checkpoint);
     if names.contains(&SINGLE) {
-        return;
+        return Vec::new();
     }
     let numbers: Vec<(&str, u32, u32)> = names.iter().filter_map(|n| numbered(n)).collect();
     if let Some((prefix, _, count)) = numbers.first().copied() {
-        faults.push(
-            Fault::new("index-missing")
-                .with("shards", numbers.len())
-                .with("index", format!("{prefix}.safetensors.index.json")),
-        );
         let present: BTreeSet<u32> = numbers.iter().map(|n| n.1).collect();
-        // Numbering from 00000 loads too; only then is number `count` not expected. `count` is a name's word: bounded.
-        let first = u32::from(!present.contains(&0));
-        let last = if first == 0 { count.saturating_sub(1) } else { count };
-        for n in (first..=last.min(10_000)).filter(|n| !present.contains(n)) {
-            let name = format!("{prefix}-{n:05}-of-{count:05}.safetensors");
-            faults.push(
-                Fault::new("shard-missing")
-                    .at(Place::file(&name))
-                    .with("shard", name.as_str())
-                    .with("tensors", Value::Null),
-            );
-        }
-        return;
+        return missing_index(prefix, count, numbers.len(), &present);
     }
     if names.is_empty() && checkpoint.has_file("config.json") {
-        let pickle = checkpoint.entries.keys().find(|n| {
-            let named =
-                (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt");
-            named && !is_pointer(checkpoint, n)
-        });
-        let is_told = |f: &Fault| {
-            f.kind == "lfs-pointer" && f.places.iter().any(|p| p.file.as_deref().is_some_and(|n| n.ends_with(".bin")))
-        };
-        if pickle.is_none() && checkpoint.faults.iter().any(is_told) {
-            return;
-        }
-        faults.push(match pickle {
-            Some(name) => Fault::new("pickle-weights").at(Place::file(name)),
-            None => Fault::new("no-weights"),
-        });
+        return weights_elsewhere(checkpoint).into_iter().collect();
+    }
+    Vec::new()
+}
+
+/// For numbered shards without an index: the index, and the numbers that are missing.
+fn missing_index(prefix: &str, count: u32, shards: usize, present: &BTreeSet<u32>) -> Vec<Fault> {
+    let index = Fault::new(FaultKind::IndexMissing)
+        .with("shards", shards)
+        .with("index", format!("{prefix}.safetensors.index.json"));
+    // Numbering from 00000 loads too; only then is number `count` not expected. `count` is a name's word: bounded.
+    let first = u32::from(!present.contains(&0));
+    let last = if first == 0 { count.saturating_sub(1) } else { count };
+    let missing = (first..=last.min(10_000)).filter(|n| !present.contains(n)).map(|n| {
+        let name = format!("{prefix}-{n:05}-of-{count:05}.safetensors");
+        let fault = Fault::new(FaultKind::ShardMissing).at(Place::file(&name));
+        fault.with("shard", name.as_str()).with("tensors", Value::Null)
+    });
+    std::iter::once(index).chain(missing).collect()
+}
+
+/// For a config without shards: pickled weights, or none at all.
+fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
+    let is_pickle =
+        |n: &str| (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt");
+    let pickle = checkpoint.entries.keys().find(|n| is_pickle(n) && !is_pointer(checkpoint, n));
+    let is_reported = |f: &Fault| {
+        let names = || f.places.iter().filter_map(|p| p.file.as_deref());
+        f.kind == FaultKind::LfsPointer && names().any(|n| n.ends_with(".bin"))
+    };
+    match pickle {
+        Some(name) => Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name))),
+        None if checkpoint.faults.iter().any(is_reported) => None,
+        None => Some(Fault::new(FaultKind::NoWeights)),
     }
 }
 
@@ -321,14 +327,11 @@ pub(super) fn similar<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<&'c 
     checkpoint.shards.keys().map(String::as_str).find(|s| *s != name && folded(s) == folded(name))
 }
 
-/// Files that the index names: how many tensors it says are there, and the first of them.
-type Referenced<'i> = BTreeMap<&'i str, (usize, &'i str)>;
-
 /// Shards by what is left of their names where case and composition of characters are ignored.
 struct Lookalikes<'c>(BTreeMap<String, Vec<&'c str>>);
 
 impl<'c> Lookalikes<'c> {
-    fn of(checkpoint: &'c Checkpoint) -> Self {
+    fn new(checkpoint: &'c Checkpoint) -> Self {
         let mut names: BTreeMap<String, Vec<&str>> = BTreeMap::new();
         for name in checkpoint.shards.keys() {
             names.entry(folded(name)).or_default().push(name);
@@ -348,5 +351,5 @@ fn folded(name: &str) -> String {
 }
 
 fn pointer_to(tensor: &str) -> String {
-    format!("/weight_map/{}", tensor.replace('~', "~0").replace('/', "~1"))
+    pointer::join("/weight_map", tensor)
 }

@@ -1,4 +1,4 @@
-//! What a checkpoint is: counted, and with the class and the config that its tensors ask for.
+//! The summary of a checkpoint: amounts, and the class and config values that its tensors imply.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -7,7 +7,7 @@ use serde_json::{Map, Value};
 
 use super::load::{self, Stored};
 use super::votes::{self, Fit, Votes, vote};
-use crate::checkpoint::{Checkpoint, Tensor};
+use crate::checkpoint::{Checkpoint, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
 use crate::knowledge::{Architecture, Library, Loader};
 
@@ -20,31 +20,33 @@ const PARTS: usize = 6;
 /// Share of the parameters beyond which a module is shown by its parts.
 const LARGE: (u64, u64) = (9, 10);
 
-/// All there is to say of a checkpoint at a glance.
+/// The summary of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Inspection {
-    /// Files of the directory, by name.
+    /// Files of the directory, sorted by name.
     pub files: Vec<InspectedFile>,
     /// All tensors together.
     pub tensors: Amount,
-    /// By element type, most bytes first.
+    /// Tensors by element type.
     pub dtypes: BTreeMap<String, Amount>,
-    /// By the outer parts of their names, in the order of names.
+    /// Tensors by the outer parts of their names.
     pub modules: BTreeMap<String, Amount>,
-    /// What config.json says of itself; absent without one.
-    pub config: Option<Said>,
-    /// Classes that the names fit, best first; the class of the config stands first where it is known.
-    pub classes: Vec<Candidate>,
-    /// What the tensors say of the values of the config, for the first of `classes`.
+    /// The identity that config.json declares; null without a config.json.
+    pub config: Option<ConfigSummary>,
+    /// Classes that match the tensor names, best first; the class of the config is first if it is known.
+    pub classes: Vec<ClassCandidate>,
+    /// Config values that the tensors imply, for the first of `classes`.
     pub votes: Option<Votes>,
-    /// A config.json that says what the tensors show, and nothing else; null when no class fits.
+    /// A config.json with only the values that the tensors imply; null if no class matches.
     pub proven: Value,
-    /// Why something is left out.
+    /// Why parts of the summary are missing.
     pub notes: Vec<String>,
 }
 
-/// Tensors, their elements and their bytes.
+/// A number of tensors, with their elements and bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Amount {
     /// Tensors.
     pub tensors: usize,
@@ -65,19 +67,21 @@ impl Amount {
 
 /// A file of the directory.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct InspectedFile {
     /// Its name.
     pub name: String,
     /// Its bytes.
     pub bytes: u64,
-    /// Tensors in it, for a shard.
+    /// Number of its tensors, for a shard.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tensors: Option<usize>,
 }
 
-/// What config.json says of itself.
+/// The identity that config.json declares.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
-pub struct Said {
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct ConfigSummary {
     /// The first of `architectures`.
     pub class: Option<String>,
     /// `model_type`.
@@ -88,23 +92,24 @@ pub struct Said {
     pub quantization: Option<String>,
 }
 
-/// A class that may have written these tensors.
+/// A class that matches the tensor names.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Candidate {
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct ClassCandidate {
     /// Its name.
     pub class: String,
-    /// The file in `rules/architectures/` that knows it.
+    /// Its architecture: the name of a file in `rules/architectures/`.
     pub architecture: String,
-    /// The loaders that are known to build it.
+    /// Versions of transformers for which the class is known.
     pub loaders: Vec<String>,
-    /// Share of names that both sides agree on, from 0 to 1.
+    /// Share of names that class and checkpoint have in common, from 0 to 1.
     pub names: f64,
-    /// Share of names and shapes they agree on once the values are voted for; only of those that were tried.
+    /// Share of names and shapes in common with the implied config values; missing for classes that were not built.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fit: Option<f64>,
 }
 
-/// Looks at a checkpoint; reads nothing beside what [`Checkpoint::open`] has read.
+/// Summarises a checkpoint. Reads no file: [`Checkpoint::open`] has read what is needed.
 #[must_use]
 pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
     let mut tensors = Amount::default();
@@ -123,7 +128,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         tensors,
         dtypes,
         modules: modules(checkpoint, tensors),
-        config: checkpoint.config().map(said),
+        config: checkpoint.config().map(config_summary),
         classes: Vec::new(),
         votes: None,
         proven: Value::Null,
@@ -135,7 +140,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         stored = Stored::from_shapes(shapes.collect());
     }
     if stored.is_empty() {
-        inspection.notes.push("no tensors: nothing votes on the config".to_owned());
+        inspection.notes.push("no tensors: config values cannot be inferred".to_owned());
         return inspection;
     }
     judge(&mut inspection, checkpoint.config(), &stored, library);
@@ -152,10 +157,10 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
     }
     let best = named.or_else(|| alike.first().map(|r| r.architecture));
     let Some(best) = best else {
-        inspection.notes.push("no class that is known here has names like these".to_owned());
+        inspection.notes.push("no known class has tensor names like these".to_owned());
         return;
     };
-    let mut classes: Vec<Candidate> = Vec::new();
+    let mut classes: Vec<ClassCandidate> = Vec::new();
     for r in &alike {
         if classes.len() < CANDIDATES && classes.iter().all(|c| c.class != r.architecture.class()) {
             classes.push(candidate(library, r.architecture, Some(r)));
@@ -166,7 +171,7 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
     }
     let quantised = config.is_some_and(|c| c.get("quantization_config").is_some_and(Value::is_object));
     if quantised {
-        inspection.notes.push("quantised: shapes are those of packed tensors and do not vote".to_owned());
+        inspection.notes.push("quantised: the shapes of packed tensors do not imply config values".to_owned());
         inspection.classes = classes;
         return;
     }
@@ -180,13 +185,13 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
                 first.fit = Some(votes.after.score());
             }
             if votes.exhausted {
-                inspection.notes.push("the model is large: the search for values stopped early".to_owned());
+                inspection.notes.push("the model is large: the search for config values stopped early".to_owned());
             }
             inspection.proven = proven(best, &votes, named.is_some());
             inspection.votes = Some(votes);
         }
         None => inspection.notes.push(format!(
-            "{} cannot be built {}: its values were not voted on",
+            "{} cannot be built {}: config values cannot be inferred",
             best.class(),
             if named.is_some() { "from config.json" } else { "without a config" }
         )),
@@ -209,17 +214,17 @@ fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
     let Some(tied) = alike.get_mut(..tied) else { return };
     tied.sort_by_cached_key(|r| {
         let expected = r.architecture.expect_given(&r.architecture.start(), &evidence);
-        let fit = expected.map(|e| Fit::of(&e, &load::in_model(&e, stored)));
+        let fit = expected.map(|e| Fit::new(&e, &load::in_model(&e, stored)));
         fit.map_or(usize::MAX, |fit| {
             fit.expected.saturating_add(fit.stored).saturating_sub(fit.found).saturating_add(fit.mismatched)
         })
     });
 }
 
-fn candidate(library: &Library, architecture: Architecture<'_>, alike: Option<&Resemblance<'_>>) -> Candidate {
+fn candidate(library: &Library, architecture: Architecture<'_>, alike: Option<&Resemblance<'_>>) -> ClassCandidate {
     let class = architecture.class();
     let known = Loader::ALL.into_iter().filter(|loader| library.class(class, *loader).is_some());
-    Candidate {
+    ClassCandidate {
         class: class.to_owned(),
         architecture: architecture.name().to_owned(),
         loaders: known.map(|loader| loader.to_string()).collect(),
@@ -239,7 +244,7 @@ fn parts(
     let evidence = stored.evidence();
     let distance = |config: &Value| {
         let expected = whole.expect_given(config, &evidence).ok()?;
-        let fit = Fit::of(&expected, &load::in_model(&expected, stored));
+        let fit = Fit::new(&expected, &load::in_model(&expected, stored));
         Some(fit.expected.saturating_add(fit.stored).saturating_sub(fit.found.saturating_mul(2)))
     };
     for (prefix, config) in alike.into_iter().flat_map(|r| &r.parts) {
@@ -253,7 +258,7 @@ fn parts(
         let types = alike.iter().filter_map(|r| r.architecture.model_type()).filter(|t| tried.insert(*t));
         let choices = types.take(PARTS).map(|model_type| {
             let mut config = start.clone();
-            votes::put(&mut config, &pointer, model_type.into());
+            pointer::put(&mut config, &Value::Null, &pointer, model_type.into());
             config
         });
         // The one that the composition takes when nothing is said comes first among equals.
@@ -275,18 +280,18 @@ fn proven(architecture: Architecture<'_>, votes: &Votes, given: bool) -> Value {
     }
     let mut config = Value::Object(config);
     for (pointer, model_type) in votes::model_types(&votes.config) {
-        votes::put(&mut config, &pointer, model_type);
+        pointer::put(&mut config, &Value::Null, &pointer, model_type);
     }
     let open: BTreeSet<&String> = votes.undecided.iter().flat_map(|u| &u.pointers).filter(|_| !given).collect();
     for vote in votes.votes.iter().filter(|v| v.votes_for >= v.votes_against && !open.contains(&v.pointer)) {
-        votes.put(&mut config, vote);
+        votes.apply(vote, &mut config);
     }
     config
 }
 
-fn said(config: &Value) -> Said {
+fn config_summary(config: &Value) -> ConfigSummary {
     let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).map(str::to_owned);
-    Said {
+    ConfigSummary {
         class: text("/architectures/0"),
         model_type: text("/model_type"),
         transformers_version: text("/transformers_version"),

@@ -5,14 +5,14 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use super::finding::LoadReport;
+use super::load::LoadReport;
 use super::load::{self, Judged, Moved, Stored, Target};
 use super::quantization::{self, Quantised};
 use super::votes::{self, Explanation, Vote};
 use super::{index, layers, size};
-use crate::checkpoint::{Checkpoint, Fault, Place};
-use crate::knowledge::quantization::{Said, said};
-use crate::knowledge::{Architecture, Expected, Library, Refusal, UnknownPart};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use crate::knowledge::quantization::{DeclaredScheme, declared_scheme};
+use crate::knowledge::{Architecture, Doubt, Expected, Knowledge, Refusal};
 
 /// The outcome for all loaders.
 #[derive(Debug, Default)]
@@ -52,38 +52,39 @@ impl Candidate<'_> {
 
 /// Asks the loaders for these versions; without any, that of the version that wrote config.json and the newest.
 #[must_use]
-pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], stored: &Stored) -> Judgement {
+pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String], stored: &Stored) -> Judgement {
     let Some(config) = checkpoint.config() else { return Judgement::default() };
     let names: Vec<&str> = stored.names().collect();
-    let targets = load::targets(library, config, &names, versions);
+    let targets = load::targets(&knowledge.library, config, &names, versions);
     let architecture = targets.first().map(|(_, architecture)| architecture.name().to_owned());
-    let said = said(config);
+    let said = declared_scheme(config, &knowledge.schemes);
     let quantise = |expected: Option<&Expected>| match &said {
-        Said::Known(applied) => Some(Quantised::new(applied, expected, checkpoint, stored)),
+        DeclaredScheme::Known(applied) => Some(Quantised::new(applied, expected, checkpoint, stored)),
         _ => None,
     };
     let evidence = stored.evidence();
     // How a version unpacks weights that another one packed is not known.
-    let asked = targets.into_iter().filter(|(target, _)| target.leads || matches!(said, Said::Plain));
-    let built = asked.map(|(target, class)| (target, class, class.expect_given(config, &evidence))).collect();
+    let asked = targets.into_iter().filter(|(target, _)| target.leads || matches!(said, DeclaredScheme::Plain));
+    let expected = |class: Architecture<'_>| class.expect_given(config, &evidence).and_then(|e| covered(e, stored));
+    let built = asked.map(|(target, class)| (target, class, expected(class))).collect();
     let built = leading(built, config, versions);
     let mut faults: Vec<Fault> = unknown(config, &built, versions);
     if in_doubt(&built) {
         // A known class says more of its layers than they do of one another.
-        faults.extend(layers::compare(stored.names()));
+        faults.extend(layers::faults(stored.names()));
     }
     let mut candidates: Vec<Candidate<'_>> = Vec::new();
-    let (is_plain, mut sized) = (matches!(said, Said::Plain), None);
+    let (is_plain, mut sized) = (matches!(said, DeclaredScheme::Plain), None);
     for (target, architecture, expected) in built {
         match expected {
             Ok(expected) => {
                 let quantised = quantise(Some(&expected));
                 // How a scheme that is not known stores what cannot be guessed.
-                let comparable = !matches!(said, Said::Unknown(_)) && !stored.is_empty();
+                let comparable = !matches!(said, DeclaredScheme::Unknown(_)) && !stored.is_empty();
                 let report = comparable.then(|| predicted(checkpoint, &target, &expected, quantised.as_ref(), stored));
                 let report = report.flatten();
                 // A quantised tensor has the shape that its scheme packs it into, and does not vote.
-                let voting = report.as_ref().filter(|_| target.leads && matches!(said, Said::Plain));
+                let voting = report.as_ref().filter(|_| target.leads && matches!(said, DeclaredScheme::Plain));
                 // Under another prefix they are of no use to any loader, and still say what the config should.
                 let moved = voting.and_then(|report| load::moved(&expected, stored, report));
                 let explained = voting.and_then(|report| {
@@ -102,18 +103,18 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
                     rest: finished(checkpoint, &target, rest),
                 });
                 if let Some(report) = report.as_ref().filter(|_| sized.is_none() && target.leads && is_plain) {
-                    sized = size::compare(checkpoint, architecture, config, &expected, stored, report);
+                    sized = size::fault(checkpoint, architecture, config, &expected, stored, report);
                 }
                 candidates.push(Candidate { target, expected, quantised, report, explained });
             }
             Err(Refusal::Impossible(reasons)) if target.leads => faults.push(
-                Fault::new("config-incomputable")
+                Fault::new(FaultKind::ConfigIncomputable)
                     .at(Place::file("config.json"))
                     .with("architecture", architecture.name())
                     .with("reason", reasons.first().map_or("", String::as_str)),
             ),
             Err(refusal @ Refusal::Raises(_)) if target.leads => faults.push(
-                Fault::new("config-incomputable")
+                Fault::new(FaultKind::ConfigIncomputable)
                     .at(Place::file("config.json"))
                     .with("architecture", architecture.name())
                     .with("reason", refusal.to_string()),
@@ -133,7 +134,7 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
             return fault;
         };
         match same_bytes(checkpoint, tensor, by) {
-            Some(false) => Fault { kind: "tied-over-another", ..fault },
+            Some(false) => Fault { kind: FaultKind::TiedOverAnother, ..fault },
             _ => fault,
         }
     }));
@@ -147,8 +148,8 @@ pub fn judge(checkpoint: &Checkpoint, library: &Library, versions: &[String], st
     let resolved = candidates.first().map_or(Value::Null, |c| c.expected.config.clone());
     let loads: Vec<LoadReport> = candidates.into_iter().filter_map(|c| completed(c, checkpoint)).collect();
     let explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
-    if matches!(said, Said::Plain) && !explained {
-        faults.extend(quantization::undeclared(stored.names()));
+    if matches!(said, DeclaredScheme::Plain) && !explained {
+        faults.extend(quantization::undeclared(&knowledge.schemes, stored.names()));
     }
     Judgement { architecture, config: resolved, loads, faults, votes }
 }
@@ -175,7 +176,7 @@ fn finished(checkpoint: &Checkpoint, target: &Target, mut report: LoadReport) ->
         checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
     report.missing.retain(|name| !unreadable.contains(name.as_str()));
     // A shape that no bytes can have is the container's fault to report.
-    let impossible = |f: &&Fault| matches!(f.kind, "shape-overflow" | "sub-byte-misaligned");
+    let impossible = |f: &&Fault| matches!(f.kind, FaultKind::ShapeOverflow | FaultKind::SubByteMisaligned);
     let faults = checkpoint.shards.values().flat_map(|s| &s.faults).filter(impossible);
     let impossible: BTreeSet<&str> = faults.flat_map(|f| &f.places).filter_map(|p| p.tensor.as_deref()).collect();
     report.mismatched.retain(|m| !impossible.contains(m.name.as_str()));
@@ -239,6 +240,16 @@ fn in_doubt(built: &[Built<'_>]) -> bool {
     })
 }
 
+/// The expected tensors, unless the checkpoint differs from them and the description does not cover this config: then the
+/// difference may be the description's.
+fn covered(expected: Expected, stored: &Stored) -> Result<Expected, Refusal> {
+    let is_clean = |report: LoadReport| report.is_whole() && report.unexpected.is_empty();
+    if expected.doubts.is_empty() || is_clean(load::predict(&expected, stored)) {
+        return Ok(expected);
+    }
+    Err(Refusal::NotCovered(expected.doubts))
+}
+
 /// Lets another loader lead where the one that should does not know a part, unless somebody asked for it.
 fn leading<'l>(mut built: Vec<Built<'l>>, config: &Value, versions: &[String]) -> Vec<Built<'l>> {
     if versions.is_empty() && in_doubt(&built) {
@@ -255,28 +266,32 @@ fn leading<'l>(mut built: Vec<Built<'l>>, config: &Value, versions: &[String]) -
 fn unknown(config: &Value, built: &[Built<'_>], versions: &[String]) -> Vec<Fault> {
     let text = |key: &str| config.get(key).and_then(Value::as_str).unwrap_or("none").to_owned();
     let class = config.pointer("/architectures/0").and_then(Value::as_str).unwrap_or("none").to_owned();
-    let fault = |part: Option<&UnknownPart>| {
-        let pointer = match part {
-            Some(part) if !part.config.is_empty() => format!("/{}/model_type", part.config.replace('.', "/")),
-            _ => "/model_type".to_owned(),
-        };
-        let fault = Fault::new("unknown-architecture")
+    let fault = |gap: Option<(String, String)>| {
+        let (pointer, part) = gap.map_or_else(|| ("/model_type".to_owned(), None), |(at, part)| (at, Some(part)));
+        let fault = Fault::new(FaultKind::UnknownArchitecture)
             .at(Place::file("config.json").pointer(pointer))
             .with("model_type", text("model_type"))
             .with("class", class.as_str());
-        part.into_iter().fold(fault, |fault, part| fault.with("part", part.to_string()))
+        part.into_iter().fold(fault, |fault, part| fault.with("part", part))
     };
-    let part = |built: &Built<'_>| match &built.2 {
-        Err(Refusal::UnknownPart(part)) => Some(part.clone()),
+    let gap = |built: &Built<'_>| match &built.2 {
+        Err(Refusal::UnknownPart(part)) if part.config.is_empty() => Some(("/model_type".to_owned(), part.to_string())),
+        Err(Refusal::UnknownPart(part)) => {
+            Some((format!("/{}/model_type", part.config.replace('.', "/")), part.to_string()))
+        }
+        Err(refusal @ Refusal::NotCovered(doubts)) => {
+            let pointer = doubts.iter().find_map(Doubt::pointer).unwrap_or("/model_type");
+            Some((pointer.to_owned(), refusal.to_string()))
+        }
         _ => None,
     };
     if versions.is_empty() {
-        return in_doubt(built).then(|| fault(built.iter().find_map(part).as_ref())).into_iter().collect();
+        return in_doubt(built).then(|| fault(built.iter().find_map(gap))).into_iter().collect();
     }
     let of_version = |version: &String| {
         let found = built.iter().find(|(target, ..)| target.versions.contains(version));
         let fault = match found {
-            Some(found) => fault(Some(&part(found)?)),
+            Some(found) => fault(Some(gap(found)?)),
             None => fault(None),
         };
         Some(fault.with("under", format!("transformers {version}")))

@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Layers a stack must have before its majority says anything.
 const STACK: usize = 6;
@@ -19,7 +19,7 @@ const CAP: usize = 20;
 
 /// A fault for each layer that lacks what its siblings have.
 #[must_use]
-pub fn compare<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Fault> {
+pub fn faults<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Fault> {
     // "model.layers." -> 7 -> what layer 7 holds.
     let mut stacks: BTreeMap<&str, BTreeMap<u64, BTreeSet<&str>>> = BTreeMap::new();
     for name in names {
@@ -62,7 +62,7 @@ fn lacking(stack: &str, layers: &BTreeMap<u64, BTreeSet<&str>>) -> Vec<Fault> {
     odd.iter()
         .map(|(index, held)| {
             let lost: Vec<String> = usual.difference(held).map(|rest| format!("{stack}{index}.{rest}")).collect();
-            let mut fault = Fault::new("layer-lacks-tensor")
+            let mut fault = Fault::new(FaultKind::LayerLacksTensor)
                 .with("layer", format!("{stack}{index}"))
                 .with("siblings", members.len())
                 .with("names", lost.join(", "))
@@ -75,29 +75,29 @@ fn lacking(stack: &str, layers: &BTreeMap<u64, BTreeSet<&str>>) -> Vec<Fault> {
 
 #[cfg(test)]
 mod tests {
-    use super::compare;
+    use super::faults;
 
     fn stack(layers: u64, held: impl Fn(u64) -> Vec<&'static str>) -> Vec<String> {
         (0..layers).flat_map(|i| held(i).into_iter().map(move |rest| format!("h.{i}.{rest}"))).collect()
     }
 
-    fn said(names: &[String]) -> Vec<String> {
-        let faults = compare(names.iter().map(String::as_str));
+    fn missing(names: &[String]) -> Vec<String> {
+        let faults = faults(names.iter().map(String::as_str));
         faults.iter().map(|f| f.detail.get("names").and_then(|n| n.as_str()).unwrap_or_default().to_owned()).collect()
     }
 
     #[test]
     fn one_layer_that_lacks_a_tensor_is_named() {
         let names = stack(12, |i| if i == 5 { vec!["a.weight"] } else { vec!["a.weight", "b.weight"] });
-        assert_eq!(said(&names), ["h.5.b.weight"]);
+        assert_eq!(missing(&names), ["h.5.b.weight"]);
     }
 
     #[test]
     fn layers_of_two_kinds_are_by_design() {
         // Every third, the first, too few to tell, and one that has something else instead.
-        assert!(said(&stack(12, |i| if i % 3 == 0 { vec!["a"] } else { vec!["a", "b"] })).is_empty());
-        assert!(said(&stack(12, |i| if i == 0 { vec!["mlp"] } else { vec!["gate", "mlp", "up"] })).is_empty());
-        assert!(said(&stack(4, |i| if i == 2 { vec!["a"] } else { vec!["a", "b"] })).is_empty());
-        assert!(said(&stack(12, |i| if i == 5 { vec!["a", "c"] } else { vec!["a", "b"] })).is_empty());
+        assert!(missing(&stack(12, |i| if i % 3 == 0 { vec!["a"] } else { vec!["a", "b"] })).is_empty());
+        assert!(missing(&stack(12, |i| if i == 0 { vec!["mlp"] } else { vec!["gate", "mlp", "up"] })).is_empty());
+        assert!(missing(&stack(4, |i| if i == 2 { vec!["a"] } else { vec!["a", "b"] })).is_empty());
+        assert!(missing(&stack(12, |i| if i == 5 { vec!["a", "c"] } else { vec!["a", "b"] })).is_empty());
     }
 }

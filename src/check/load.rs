@@ -8,6 +8,7 @@ mod keys;
 mod moved;
 mod pattern;
 mod rename;
+mod report;
 mod stored;
 mod target;
 mod v4;
@@ -16,12 +17,12 @@ mod v5;
 
 use std::collections::BTreeSet;
 
-use super::finding::{LoadReport, Mismatch};
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Evidence, Expected, Loader};
 
 pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
+pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
 pub use target::{Target, targets};
 
@@ -64,19 +65,22 @@ fn absent_groups(expected: &Expected, there: impl Fn(&str) -> bool) -> BTreeSet<
 #[must_use]
 pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     let mut faults = Vec::new();
-    for kind in ["prefix-hijack", "tied-over"] {
-        let silent = report.silent.iter().filter(|s| s.reason == kind);
+    let causes = [(SilentReason::PrefixHijack, FaultKind::PrefixHijack), (SilentReason::TiedOver, FaultKind::TiedOver)];
+    for (reason, kind) in causes {
+        let silent = report.silent.iter().filter(|s| s.reason == reason);
         faults.extend(silent.map(|s| {
             let fault = Fault::new(kind).at(Place::tensor(&*s.name)).with("tensor", s.name.as_str());
             s.by.iter().fold(fault, |fault, by| fault.at(Place::tensor(by)).with("by", by.as_str()))
         }));
     }
     if let Some(reason) = &report.raises {
-        faults.push(Fault::new("load-raises").with("reason", reason.as_str()));
+        faults.push(Fault::new(FaultKind::LoadRaises).with("reason", reason.as_str()));
     }
     // A hijack is the cause of everything else: the lists repeat it a thousand times.
-    if !report.silent.iter().any(|s| s.reason == "prefix-hijack") {
-        for (kind, names) in [("missing-tensors", &report.missing), ("unexpected-tensors", &report.unexpected)] {
+    if !report.silent.iter().any(|s| s.reason == SilentReason::PrefixHijack) {
+        for (kind, names) in
+            [(FaultKind::MissingTensors, &report.missing), (FaultKind::UnexpectedTensors, &report.unexpected)]
+        {
             if !names.is_empty() {
                 let mut fault = Fault::new(kind).with("count", names.len()).with("names", listed(names));
                 fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
@@ -88,12 +92,14 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
         let (empty, others): (Vec<&Mismatch>, Vec<&Mismatch>) = report.mismatched.iter().partition(is_empty);
         if !empty.is_empty() {
             let names: Vec<String> = empty.iter().map(|m| m.name.clone()).collect();
-            let mut fault = Fault::new("empty-tensors").with("count", names.len()).with("names", listed(&names));
+            let mut fault =
+                Fault::new(FaultKind::EmptyTensors).with("count", names.len()).with("names", listed(&names));
             fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
             faults.push(fault);
         }
         faults.extend(others.into_iter().map(|m| {
-            let fault = Fault::new("mismatched-tensor").at(Place::tensor(&*m.name)).with("tensor", m.name.as_str());
+            let fault =
+                Fault::new(FaultKind::MismatchedTensor).at(Place::tensor(&*m.name)).with("tensor", m.name.as_str());
             fault.with("stored", m.stored.clone()).with("expected", m.expected.clone())
         }));
     }

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Fault, Module, Place, is_plain_file_name};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, PythonModule, is_plain_file_name, pointer};
 
 /// An `auto_map` entry: where it stands and what it says.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Entry {
+pub struct AutoMapEntry {
     /// Document.
     pub file: String,
     /// JSON pointer of the string.
@@ -21,7 +21,7 @@ pub struct Entry {
     pub nested: bool,
 }
 
-impl Entry {
+impl AutoMapEntry {
     /// Module and class of a well-formed local entry.
     #[must_use]
     pub fn parts(&self) -> Option<(&str, &str)> {
@@ -40,83 +40,90 @@ const MAX_ENTRIES: usize = 1_000;
 
 /// Every `auto_map` entry of a checkpoint, outer ones first.
 #[must_use]
-pub fn entries(checkpoint: &Checkpoint) -> Vec<Entry> {
+pub fn entries(checkpoint: &Checkpoint) -> Vec<AutoMapEntry> {
     read(checkpoint).0
 }
 
-/// Every entry, and a fault for each that is none.
-fn read(checkpoint: &Checkpoint) -> (Vec<Entry>, Vec<Fault>) {
-    let mut out = Vec::new();
-    let mut faults = Vec::new();
+/// Every entry, and a fault for each that is malformed.
+fn read(checkpoint: &Checkpoint) -> (Vec<AutoMapEntry>, Vec<Fault>) {
+    let mut maps = AutoMaps::default();
     for name in DOCUMENTS {
         let Some(value) = checkpoint.document(name).and_then(|d| d.value.as_ref()) else { continue };
         let mut pending = vec![(String::new(), value, 0_usize)];
         while let Some((pointer, value, depth)) = pending.pop() {
             let Value::Object(map) = value else { continue };
-            let mut malformed = |pointer: String, key: &str, found: &Value| {
-                // Strings have been escaped where they are shown; anything else is told by its kind.
-                let target = match found {
-                    Value::Array(_) => "a list".to_owned(),
-                    Value::Object(_) => "an object".to_owned(),
-                    other => other.to_string(),
-                };
-                let fault = Fault::new("auto-map-malformed").at(Place::file(name).pointer(pointer));
-                faults.push(fault.with("key", key).with("target", target).with("dots", 0));
-            };
-            match map.get("auto_map") {
-                None | Some(Value::Null | Value::Object(_)) => {}
-                Some(other) => malformed(format!("{pointer}/auto_map"), "itself", other),
-            }
-            if let Some(Value::Object(auto_map)) = map.get("auto_map") {
-                if auto_map.len() > MAX_ENTRIES {
-                    malformed(format!("{pointer}/auto_map"), "itself", &Value::Object(serde_json::Map::new()));
-                }
-                for (key, target) in auto_map.iter().take(MAX_ENTRIES) {
-                    let base = format!("{pointer}/auto_map/{}", escape(key));
-                    let mut push = |pointer: String, target: &str| {
-                        let entry = Entry {
-                            file: name.to_owned(),
-                            pointer,
-                            key: key.clone(),
-                            target: target.to_owned(),
-                            nested: depth > 0,
-                        };
-                        out.push(entry);
-                    };
-                    match target {
-                        Value::String(s) => push(base, s),
-                        // Slow and fast tokenizer; null for none.
-                        Value::Array(items) => {
-                            for (i, item) in items.iter().enumerate().take(MAX_ENTRIES) {
-                                match item {
-                                    Value::String(s) => push(format!("{base}/{i}"), s),
-                                    Value::Null => {}
-                                    other => malformed(format!("{base}/{i}"), key, other),
-                                }
-                            }
-                        }
-                        Value::Null => {}
-                        other => malformed(base, key, other),
-                    }
-                }
+            if let Some(auto_map) = map.get("auto_map") {
+                maps.read(name, &format!("{pointer}/auto_map"), auto_map, depth > 0);
             }
             // Sub-configs lie one or two levels down; statistics and vocabularies are not searched.
             if depth < 2 {
                 let inner = map.iter().filter(|(k, v)| v.is_object() && k.ends_with("config"));
-                pending.extend(inner.map(|(k, v)| (format!("{pointer}/{}", escape(k)), v, depth.saturating_add(1))));
+                pending.extend(inner.map(|(k, v)| (pointer::join(&pointer, k), v, depth.saturating_add(1))));
             }
         }
     }
-    (out, faults)
+    (maps.entries, maps.faults)
 }
 
-fn escape(key: &str) -> String {
-    key.replace('~', "~0").replace('/', "~1")
+/// The `auto_map`s read so far.
+#[derive(Default)]
+struct AutoMaps {
+    entries: Vec<AutoMapEntry>,
+    faults: Vec<Fault>,
+}
+
+impl AutoMaps {
+    /// Reads the value of `auto_map` at `pointer` of a document.
+    fn read(&mut self, file: &str, pointer: &str, auto_map: &Value, nested: bool) {
+        let map = match auto_map {
+            Value::Null => return,
+            Value::Object(map) => map,
+            other => return self.malformed(file, pointer.to_owned(), "itself", other),
+        };
+        if map.len() > MAX_ENTRIES {
+            self.malformed(file, pointer.to_owned(), "itself", auto_map);
+        }
+        for (key, target) in map.iter().take(MAX_ENTRIES) {
+            let base = pointer::join(pointer, key);
+            // A list has the slow and the fast tokenizer; null for none.
+            let targets = match target {
+                Value::Array(items) => {
+                    let items = items.iter().enumerate().take(MAX_ENTRIES);
+                    items.map(|(i, item)| (format!("{base}/{i}"), item)).collect()
+                }
+                one => vec![(base, one)],
+            };
+            for (pointer, target) in targets {
+                match target {
+                    Value::Null => {}
+                    Value::String(target) => self.entries.push(AutoMapEntry {
+                        file: file.to_owned(),
+                        pointer,
+                        key: key.clone(),
+                        target: target.clone(),
+                        nested,
+                    }),
+                    other => self.malformed(file, pointer, key, other),
+                }
+            }
+        }
+    }
+
+    fn malformed(&mut self, file: &str, pointer: String, key: &str, found: &Value) {
+        // Strings have been escaped where they are shown; anything else is told by its kind.
+        let target = match found {
+            Value::Array(_) => "a list".to_owned(),
+            Value::Object(_) => "an object".to_owned(),
+            other => other.to_string(),
+        };
+        let fault = Fault::new(FaultKind::AutoMapMalformed).at(Place::file(file).pointer(pointer));
+        self.faults.push(fault.with("key", key).with("target", target).with("dots", 0));
+    }
 }
 
 /// A repository on the hub that the files name: where other entries take their code from, or the model that this one was
 /// made from.
-fn origin(checkpoint: &Checkpoint, entries: &[Entry]) -> Option<String> {
+fn origin(checkpoint: &Checkpoint, entries: &[AutoMapEntry]) -> Option<String> {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     let is_part = |part: &str| part.starts_with(|c: char| c.is_ascii_alphanumeric()) && part.chars().all(is_plain);
     let is_id = |id: &&str| id.split_once('/').is_some_and(|(owner, model)| is_part(owner) && is_part(model));
@@ -126,13 +133,13 @@ fn origin(checkpoint: &Checkpoint, entries: &[Entry]) -> Option<String> {
 }
 
 /// Modules beside this one that it imports.
-pub fn relative_modules(module: &Module) -> BTreeSet<String> {
+pub fn relative_modules(module: &PythonModule) -> BTreeSet<String> {
     let beside = module.relative_imports.iter().filter(|i| i.level == 1 && !i.module.is_empty());
     beside.filter_map(|i| i.module.split('.').next()).map(str::to_owned).collect()
 }
 
 /// A module and everything it imports relatively, itself first; and whether all of it is there.
-fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a Module>)> {
+fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a PythonModule>)> {
     let mut seen: BTreeSet<String> = BTreeSet::from([root.to_owned()]);
     let mut pending = vec![root.to_owned()];
     let mut out = Vec::new();
@@ -158,7 +165,7 @@ fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
 
 /// Faults of every `auto_map` entry.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let (entries, mut faults) = read(checkpoint);
     let origin = origin(checkpoint, &entries);
     let mut roots: BTreeSet<&str> = BTreeSet::new();
@@ -174,20 +181,20 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             target.contains(['/', '\\']) || target.starts_with('.') || !is_plain_file_name(&format!("{module}.py"))
         };
         if let Some((repository, target)) = entry.target.split_once("--") {
-            let kind = if unsafe_path(target) { "auto-map-unsafe-path" } else { "auto-map-remote" };
+            let kind = if unsafe_path(target) { FaultKind::AutoMapUnsafePath } else { FaultKind::AutoMapRemote };
             faults.push(fault(kind).with("repository", repository));
             continue;
         }
         if unsafe_path(&entry.target) {
-            faults.push(fault("auto-map-unsafe-path"));
+            faults.push(fault(FaultKind::AutoMapUnsafePath));
             continue;
         }
         let Some((module, class)) = entry.parts() else {
-            faults.push(fault("auto-map-malformed").with("dots", entry.target.matches('.').count()));
+            faults.push(fault(FaultKind::AutoMapMalformed).with("dots", entry.target.matches('.').count()));
             continue;
         };
         let Some(parsed) = checkpoint.modules.get(&format!("{module}.py")) else {
-            let kind = if entry.nested { "auto-map-nested-missing" } else { "auto-map-module-missing" };
+            let kind = if entry.nested { FaultKind::AutoMapNestedMissing } else { FaultKind::AutoMapModuleMissing };
             // Stop at one entry a module: the second says nothing new.
             if entry.nested || roots.insert(module) {
                 let fault = fault(kind).with("module", format!("{module}.py"));
@@ -196,7 +203,9 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
             continue;
         };
         if !entry.nested && parsed.defines(class) == Some(false) {
-            faults.push(fault("auto-map-class-missing").with("module", format!("{module}.py")).with("class", class));
+            faults.push(
+                fault(FaultKind::AutoMapClassMissing).with("module", format!("{module}.py")).with("class", class),
+            );
         }
         if !entry.nested && roots.insert(module) {
             imports(checkpoint, &entries, entry, module, &mut faults);
@@ -205,7 +214,13 @@ pub fn compare(checkpoint: &Checkpoint) -> Vec<Fault> {
     faults
 }
 
-fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str, faults: &mut Vec<Fault>) {
+fn imports(
+    checkpoint: &Checkpoint,
+    entries: &[AutoMapEntry],
+    entry: &AutoMapEntry,
+    root: &str,
+    faults: &mut Vec<Fault>,
+) {
     // The config is always opened first, into the same folder of the module cache.
     let mut at_hand = copied(checkpoint, root);
     for config in entries.iter().filter(|e| e.key == "AutoConfig" && !e.nested && e.key != entry.key) {
@@ -225,7 +240,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
     let packages = needed_packages(checkpoint, root);
     if !packages.is_empty() {
         faults.push(
-            Fault::new("module-needs-package")
+            Fault::new(FaultKind::ModuleNeedsPackage)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
                 .with("packages", packages.into_iter().collect::<Vec<_>>().join(", ")),
@@ -233,7 +248,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
     }
     for name in absent {
         faults.push(
-            Fault::new("relative-import-missing")
+            Fault::new(FaultKind::RelativeImportMissing)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
                 .with("imported", format!("{name}.py"))
@@ -243,7 +258,7 @@ fn imports(checkpoint: &Checkpoint, entries: &[Entry], entry: &Entry, root: &str
     if !missing.is_empty() {
         let names: Vec<String> = missing.into_iter().map(|n| format!("{n}.py")).collect();
         faults.push(
-            Fault::new("alias-misses-import")
+            Fault::new(FaultKind::AliasMissesImport)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
                 .with("imports", names.join(", "))

@@ -1,15 +1,12 @@
-//! What becomes of findings by the settings: other severities, silence, and what is accepted.
+//! Applies settings to findings: severities, ignored rules, suppressions.
 
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
-
-use super::engine::{self, Knowledge, Outcome};
-use super::finding::{Accepted, Finding, Suppressed};
-use crate::checkpoint::{Checkpoint, Fault};
-use crate::knowledge::settings::{Policy, Suppression, absolute};
+use super::finding::{Accepted, Suppressed};
+use super::outcome::Outcome;
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::settings::Policy;
 
 /// Regrades findings and sets those aside that are accepted.
-pub(super) fn apply(policy: &Policy, checkpoint: &Checkpoint, outcome: &mut Outcome) {
+pub(super) fn apply_policy(policy: &Policy, checkpoint: &Checkpoint, outcome: &mut Outcome) {
     if policy.is_empty() {
         return;
     }
@@ -31,41 +28,4 @@ pub(super) fn apply(policy: &Policy, checkpoint: &Checkpoint, outcome: &mut Outc
             None => outcome.findings.push(finding),
         }
     }
-}
-
-/// A finding for each suppression that had nothing to suppress, and which of the checkpoints to report it of.
-///
-/// Nothing is said of a suppression when a checkpoint that it is about may not have been looked at: `searched` are the
-/// directories in which all were. Nor of one whose rules were not asked.
-#[must_use]
-pub fn unused(
-    knowledge: &Knowledge,
-    looked: &[(Arc<Checkpoint>, &Outcome)],
-    searched: &[PathBuf],
-) -> Vec<(usize, Finding)> {
-    let mut found = Vec::new();
-    for suppression in &knowledge.policy.suppressions {
-        let asked = knowledge.rules.rules.iter().any(|r| suppression.codes.contains(&r.code));
-        let used = |outcome: &Outcome| outcome.suppressed.iter().any(|s| s.accepted.by == suppression.written);
-        let roots = looked.iter().map(|(checkpoint, _)| checkpoint.root.as_path());
-        if !asked || looked.iter().any(|(_, o)| used(o)) || !is_covered(suppression, roots, searched) {
-            continue;
-        }
-        let concerned = |c: &Checkpoint| suppression.concerns(&c.root, c.entries.keys().map(String::as_str));
-        let at = looked.iter().position(|(checkpoint, _)| concerned(checkpoint)).unwrap_or(0);
-        let Some((checkpoint, _)) = looked.get(at) else { continue };
-        let fault = Fault::new("suppression-unused")
-            .with("rule", suppression.rule.as_str())
-            .with("path", suppression.path.as_deref().unwrap_or(""))
-            .with("written", suppression.written.as_str())
-            .with("reason", suppression.reason.as_str());
-        found.extend(engine::report(knowledge, checkpoint, &[fault]).into_iter().map(|finding| (at, finding)));
-    }
-    found
-}
-
-/// Whether every checkpoint that a suppression is about was looked at.
-fn is_covered<'p>(suppression: &Suppression, mut roots: impl Iterator<Item = &'p Path>, searched: &[PathBuf]) -> bool {
-    let base = suppression.base();
-    roots.any(|root| base.starts_with(absolute(root))) || searched.iter().any(|dir| base.starts_with(absolute(dir)))
 }

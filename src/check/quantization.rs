@@ -5,29 +5,29 @@
 //! the wrapping alone is said of the stored tensors, with or without a known class.
 
 mod config;
-mod judge;
 mod module;
+mod shapes;
 mod skipped;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::finding::{LoadReport, Mismatch};
 use super::load::Stored;
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use super::load::{LoadReport, Mismatch};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 use crate::knowledge::expression::glob;
-use crate::knowledge::quantization::{Applied, Said, Scheme};
-use judge::{Judge, Judged, State};
-use module::{Tensors, kind};
-use skipped::Skipped;
+use crate::knowledge::quantization::{AppliedScheme, DeclaredScheme, Scheme};
+use module::{TensorLookup, kind};
+use shapes::{ModuleShapes, ModuleState, QuantizedModule, plain_of};
+use skipped::SkippedModules;
 
 pub use config::undeclared;
 
 /// What can be said of a config's scheme, and of the tensors that it is about.
 #[must_use]
-pub fn faults(checkpoint: &Checkpoint, said: &Said, quantised: Option<&Quantised<'_>>) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint, declared: &DeclaredScheme<'_>, quantised: Option<&Quantised<'_>>) -> Vec<Fault> {
     let mut faults = config::disagreements(checkpoint);
-    if let (Said::Unknown(method), Some(config)) = (said, checkpoint.config()) {
+    if let (DeclaredScheme::Unknown(method), Some(config)) = (declared, checkpoint.config()) {
         faults.push(config::unknown(method, config));
     }
     faults.extend(quantised.into_iter().flat_map(Quantised::faults));
@@ -36,11 +36,11 @@ pub fn faults(checkpoint: &Checkpoint, said: &Said, quantised: Option<&Quantised
 
 /// The quantised modules of a checkpoint whose config says how they are stored.
 pub struct Quantised<'a> {
-    applied: &'a Applied,
-    modules: Vec<Judged<'a>>,
+    applied: &'a AppliedScheme<'a>,
+    modules: Vec<QuantizedModule<'a>>,
     /// Kinds of module (names with their numbers taken out) of which at least one is quantised.
     kinds: BTreeSet<String>,
-    skipped: Skipped<'a>,
+    skipped: SkippedModules<'a>,
     /// Parameters that would explain the shapes where those of the config do not: `bits 8`.
     fits: Option<String>,
     has_weights: bool,
@@ -50,22 +50,22 @@ impl<'a> Quantised<'a> {
     /// Looks at the stored tensors; plain shapes come from the class where it is known.
     #[must_use]
     pub fn new(
-        applied: &'a Applied,
+        applied: &'a AppliedScheme<'a>,
         expected: Option<&Expected>,
         checkpoint: &'a Checkpoint,
         stored: &'a Stored,
     ) -> Self {
         let scheme = applied.scheme();
-        let tensors = Tensors::of(checkpoint, stored);
-        let skipped = Skipped::of(applied);
-        let judge = Judge { applied, expected, skipped: &skipped };
+        let tensors = TensorLookup::new(checkpoint, stored);
+        let skipped = SkippedModules::new(applied);
+        let shapes = ModuleShapes { applied, expected, skipped: &skipped };
         let found = module::group(scheme, &tensors, |name| plain_of(expected, name).is_some());
-        let (mut modules, fits) = judge.judge(found);
+        let (mut modules, fits) = shapes.compare(found);
         let kinds = modules.iter().map(|m| kind(m.module.name)).collect();
         if applied.all_alike() {
             let quantised: BTreeSet<&str> = modules.iter().map(|m| m.module.name).collect();
             let plain = module::left_plain(scheme, &tensors, &kinds, &quantised, &skipped);
-            modules.extend(plain.into_iter().map(|module| judge.left_plain(module)));
+            modules.extend(plain.into_iter().map(|module| shapes.left_plain(module)));
         }
         Self { applied, modules, kinds, skipped, fits, has_weights: !stored.is_empty() }
     }
@@ -77,11 +77,11 @@ impl<'a> Quantised<'a> {
         let mut taken: BTreeSet<String> =
             stored.names().filter(|n| scheme.ignored.iter().any(|g| glob(n, g))).map(str::to_owned).collect();
         let mut added: BTreeMap<String, Option<Vec<u64>>> = BTreeMap::new();
-        for judged in self.modules.iter().filter(|m| m.state != State::Plain) {
+        for judged in self.modules.iter().filter(|m| m.state != ModuleState::Plain) {
             let name = judged.module.name;
             let held = judged.module.endings(scheme).into_iter().map(|ending| format!("{name}{ending}"));
             // The loader takes what is packed in a plain module's place for what it is named.
-            if judged.state == State::Skipped {
+            if judged.state == ModuleState::Skipped {
                 let held: BTreeSet<String> = held.collect();
                 taken.retain(|name| !held.contains(name));
                 continue;
@@ -130,10 +130,10 @@ impl<'a> Quantised<'a> {
     /// Apart from [`Self::spelled`], because [`Self::faults`] speak of these already.
     pub fn complete(&self, report: &mut LoadReport) {
         let scheme = self.applied.scheme();
-        for judged in self.modules.iter().filter(|m| m.state != State::Skipped) {
+        for judged in self.modules.iter().filter(|m| m.state != ModuleState::Skipped) {
             let name = judged.module.name;
             report.missing.extend(judged.lacks(scheme).map(|ending| format!("{name}{ending}")));
-            if judged.state == State::Plain && !scheme.keeps_name() {
+            if judged.state == ModuleState::Plain && !scheme.keeps_name() {
                 report.unexpected.push(format!("{name}{}", scheme.plain));
             }
             let misshapen = judged.misshapen(scheme).filter(|_| judged.of_class);
@@ -158,41 +158,43 @@ impl<'a> Quantised<'a> {
         let mut faults = Vec::new();
         if let Some(program) = &scheme.loaded_by {
             let at = Place::file("config.json").pointer("/quantization");
-            let fault = Fault::new("quantized-for-another-loader").at(at).with("scheme", scheme.summary.as_str());
+            let fault = Fault::new(FaultKind::QuantizedForAnotherLoader).at(at).with("scheme", scheme.summary.as_str());
             faults.push(fault.with("program", program.as_str()));
         }
         if self.modules.is_empty() && self.has_weights && !scheme.plain_too {
             let at = Place::file("config.json").pointer(self.applied.pointer());
-            faults.push(Fault::new("quantized-config-plain-tensors").at(at).with("scheme", scheme.summary.as_str()));
+            faults.push(
+                Fault::new(FaultKind::QuantizedConfigPlainTensors).at(at).with("scheme", scheme.summary.as_str()),
+            );
         }
         for judged in &self.modules {
             let name = judged.module.name;
             let tensor = |ending: &str| format!("{name}{ending}");
             let fault = |kind| Fault::new(kind).with("scheme", scheme.summary.as_str()).with("module", name);
             match judged.state {
-                State::Skipped => {
+                ModuleState::Skipped => {
                     let carrier = scheme.endings().next().unwrap_or_default();
-                    faults.push(fault("quantized-though-skipped").at(Place::tensor(tensor(carrier))));
+                    faults.push(fault(FaultKind::QuantizedThoughSkipped).at(Place::tensor(tensor(carrier))));
                 }
-                State::Plain => {
-                    faults.push(fault("plain-though-quantized").at(Place::tensor(tensor(&scheme.plain))));
+                ModuleState::Plain => {
+                    faults.push(fault(FaultKind::PlainThoughQuantized).at(Place::tensor(tensor(&scheme.plain))));
                 }
-                State::Quantised => {
+                ModuleState::Quantised => {
                     let lacks: Vec<&str> = judged.lacks(scheme).collect();
                     if !lacks.is_empty() {
                         let carrier = scheme.endings().next().unwrap_or_default();
                         let names: Vec<String> = lacks.iter().map(|ending| tensor(ending)).collect();
                         let at = Place::tensor(tensor(carrier));
-                        faults.push(fault("quantized-module-incomplete").at(at).with("lacks", names.join(", ")));
+                        faults.push(fault(FaultKind::QuantizedModuleIncomplete).at(at).with("lacks", names.join(", ")));
                     }
                     faults.extend(judged.misshapen(scheme).map(|(ending, stored, expected)| {
                         let at = Place::tensor(tensor(ending));
-                        let fault = fault("quantized-shape-wrong").at(at).with("stored", stored.to_vec());
+                        let fault = fault(FaultKind::QuantizedShapeWrong).at(at).with("stored", stored.to_vec());
                         fault.with("expected", expected.to_vec()).with("fits", self.fits.as_deref().unwrap_or_default())
                     }));
                     faults.extend(mistyped(scheme, judged).map(|(ending, dtype, allowed)| {
                         let at = Place::tensor(tensor(ending));
-                        fault("quantized-dtype-wrong").at(at).with("dtype", dtype).with("allowed", allowed)
+                        fault(FaultKind::QuantizedDtypeWrong).at(at).with("dtype", dtype).with("allowed", allowed)
                     }));
                 }
             }
@@ -201,29 +203,22 @@ impl<'a> Quantised<'a> {
     }
 
     /// Modules of which the loader does not find all it needs.
-    fn incomplete(&self) -> impl Iterator<Item = &Judged<'a>> {
+    fn incomplete(&self) -> impl Iterator<Item = &QuantizedModule<'a>> {
         let scheme = self.applied.scheme();
-        self.modules.iter().filter(move |m| m.state != State::Skipped && m.lacks(scheme).next().is_some())
+        self.modules.iter().filter(move |m| m.state != ModuleState::Skipped && m.lacks(scheme).next().is_some())
     }
 }
 
 /// Tensors of a module whose element type is none of those the scheme writes: ending, type, those allowed.
-fn mistyped<'s>(scheme: &'s Scheme, judged: &'s Judged<'_>) -> impl Iterator<Item = (&'s str, &'static str, String)> {
+fn mistyped<'s>(
+    scheme: &'s Scheme,
+    judged: &'s QuantizedModule<'_>,
+) -> impl Iterator<Item = (&'s str, &'static str, String)> {
     scheme.tensors.iter().zip(&judged.module.held).filter_map(|(part, held)| {
         let dtype = held.as_ref()?.dtype?.name();
         let allowed = part.dtypes.iter().any(|d| d == dtype);
         (!allowed).then(|| (part.name.as_str(), dtype, part.dtypes.join(" or ")))
     })
-}
-
-/// The shape of a class's tensor of this name, with or without the prefix of its base model.
-fn plain_of<'e>(expected: Option<&'e Expected>, name: &str) -> Option<&'e [u64]> {
-    let expected = expected?;
-    let bare = || name.strip_prefix(&expected.base_model_prefix)?.strip_prefix('.');
-    let tensor = expected.tensors.get(name);
-    let tensor = tensor.or_else(|| expected.tensors.get(bare()?));
-    let tensor = tensor.or_else(|| expected.tensors.get(&format!("{}.{name}", expected.base_model_prefix)));
-    Some(&tensor?.shape)
 }
 
 #[cfg(test)]

@@ -7,10 +7,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::finding::LoadReport;
+use super::load::LoadReport;
 use super::load::{self, Stored};
 use super::votes::{leaves, with};
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::{Architecture, Evidence, Expected};
 
 /// Tensors that may be built while values are tried.
@@ -24,7 +24,7 @@ const FLOATS: (u64, u64) = (2, 4);
 
 /// Compares the size in the index with that of the class, where no shard tells and every name is as it should be.
 #[must_use]
-pub fn compare(
+pub fn fault(
     checkpoint: &Checkpoint,
     architecture: Architecture<'_>,
     config: &Value,
@@ -40,7 +40,7 @@ pub fn compare(
     }
     let width = width(config)?;
     let here = load::in_model(expected, stored);
-    let weighed = Weighed::of(expected, &here)?;
+    let weighed = Weighed::new(expected, &here)?;
     let sizes = weighed.sizes(width)?;
     let foreign = here.iter().any(|(name, _)| !expected.tensors.contains_key(name));
     // Buffers that some versions save and others do not have are of any size.
@@ -57,7 +57,7 @@ pub fn compare(
     if values.is_empty() && (least..=most).contains(&stated) {
         return None;
     }
-    let mut fault = Fault::new("total-size-not-of-class")
+    let mut fault = Fault::new(FaultKind::TotalSizeNotOfClass)
         .at(Place::file(&index.document).pointer("/metadata/total_size"))
         .with("stated", stated)
         .with("computed", *sizes.first()?)
@@ -105,7 +105,7 @@ struct Weighed<'e> {
 }
 
 impl<'e> Weighed<'e> {
-    fn of(expected: &'e Expected, here: &Evidence) -> Option<Self> {
+    fn new(expected: &'e Expected, here: &Evidence) -> Option<Self> {
         let mut weighed = Self { floats: Vec::new(), integers: 0, copies: (0, 0) };
         let aliases = || expected.tensors.iter().filter_map(|(name, t)| Some((name, t, t.tied_to.as_deref()?)));
         let shared: BTreeSet<&str> = aliases().filter(|(name, ..)| here.contains(name)).map(|(_, _, to)| to).collect();
@@ -190,9 +190,9 @@ fn explain(
         let built = architecture.expect_given(&config, &evidence).ok()?;
         let same = built.tensors.len() == expected.tensors.len()
             && built.tensors.keys().all(|name| expected.tensors.contains_key(name));
-        Weighed::of(&built, &load::in_model(&built, stored)).filter(|_| same)?.sizes(width)
+        Weighed::new(&built, &load::in_model(&built, stored)).filter(|_| same)?.sizes(width)
     };
-    let Some(now) = Weighed::of(expected, &load::in_model(expected, stored)).and_then(|w| w.sizes(width)) else {
+    let Some(now) = Weighed::new(expected, &load::in_model(expected, stored)).and_then(|w| w.sizes(width)) else {
         return Vec::new();
     };
     let mut found = Vec::new();
@@ -213,25 +213,31 @@ fn explain(
         if probe.as_ref() == Some(&now) {
             continue;
         }
-        let mut candidates: BTreeSet<u64> = (1..=5_u32)
-            .flat_map(|n| [value.checked_shl(n), value.checked_shr(n).filter(|v| v.checked_shl(n) == Some(value))])
-            .flatten()
-            .filter(|v| *v > 0)
-            .collect();
-        // Most sizes are linear in most values.
-        for (at, twice) in now.iter().zip(probe.iter().flatten()) {
-            let step = i128::from(*twice).saturating_sub(i128::from(*at));
-            let missing = i128::from(stated).saturating_sub(i128::from(*at)).saturating_mul(i128::from(value));
-            let whole = missing.checked_rem(step) == Some(0);
-            let moved = missing.checked_div(step).filter(|_| whole).map(|n| n.saturating_add(i128::from(value)));
-            candidates.extend(moved.and_then(|v| u64::try_from(v).ok()).filter(|v| *v > 0));
-        }
+        let candidates = candidates(value, stated, &now, probe.as_deref().unwrap_or_default());
         let fits = candidates.into_iter().find(|v| sizes(&pointer, *v).is_some_and(|sizes| sizes.contains(&stated)));
         if let Some(value) = fits {
             found.push((pointer, value.into()));
         }
     }
     found
+}
+
+/// Values worth trying instead of `value`: its doubles and halves, and those that would bridge the gap to the stated size
+/// if sizes are linear in the value. `now` are the sizes with the value, `twice` those with twice as much.
+fn candidates(value: u64, stated: u64, now: &[u64], twice: &[u64]) -> BTreeSet<u64> {
+    let mut candidates: BTreeSet<u64> = (1..=5_u32)
+        .flat_map(|n| [value.checked_shl(n), value.checked_shr(n).filter(|v| v.checked_shl(n) == Some(value))])
+        .flatten()
+        .filter(|v| *v > 0)
+        .collect();
+    for (at, twice) in now.iter().zip(twice) {
+        let step = i128::from(*twice).saturating_sub(i128::from(*at));
+        let missing = i128::from(stated).saturating_sub(i128::from(*at)).saturating_mul(i128::from(value));
+        let whole = missing.checked_rem(step) == Some(0);
+        let moved = missing.checked_div(step).filter(|_| whole).map(|n| n.saturating_add(i128::from(value)));
+        candidates.extend(moved.and_then(|v| u64::try_from(v).ok()).filter(|v| *v > 0));
+    }
+    candidates
 }
 
 #[cfg(test)]
@@ -258,17 +264,17 @@ mod tests {
     fn a_shared_storage_may_be_counted_once_or_as_often_as_it_is_named() {
         let (rest, rows) = (4 * 8 * 8 + 3 * 8 * 24 + 3 * 8, 8000);
         let tied = llama(true);
-        let sizes = Weighed::of(&tied, &names(&tied)).and_then(|w| w.sizes(2)).expect("sizes");
+        let sizes = Weighed::new(&tied, &names(&tied)).and_then(|w| w.sizes(2)).expect("sizes");
         assert_eq!(sizes, [2 * (rest + rows), 2 * (rest + 2 * rows)]);
         let apart = llama(false);
-        let sizes = Weighed::of(&apart, &names(&apart)).and_then(|w| w.sizes(2)).expect("sizes");
+        let sizes = Weighed::new(&apart, &names(&apart)).and_then(|w| w.sizes(2)).expect("sizes");
         assert_eq!(sizes, [2 * (rest + 2 * rows)]);
     }
 
     #[test]
     fn one_kind_or_module_in_the_other_type_is_legitimate_and_some_other_difference_is_not() {
         let llama = llama(false);
-        let weighed = Weighed::of(&llama, &names(&llama)).expect("sizes");
+        let weighed = Weighed::new(&llama, &names(&llama)).expect("sizes");
         let plain = *weighed.sizes(2).expect("sizes").first().expect("a size");
         for more in [8000, 8, 4 * 8 * 8] {
             assert!(weighed.mixed(plain + 2 * more, 2), "{more}");

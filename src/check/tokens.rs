@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use crate::checkpoint::{Checkpoint, Fault, Place, Tokenizer, Vocabulary};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, Vocabulary, pointer};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::{EvalError, Scope};
 
@@ -97,64 +97,32 @@ pub fn open_tokenizer(
     Ok(Some(out))
 }
 
+/// The file whose `added_tokens_decoder` states ids.
+const DECODER: &str = "tokenizer_config.json";
+
 /// Faults of the tokenizer files among themselves and against the embedding.
 ///
 /// `rows` are the stored rows of the token embedding, where they are known.
 #[must_use]
-pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     let tokenizer = &checkpoint.tokenizer;
-    let mut faults = Vec::new();
-    let decoder = "tokenizer_config.json";
     let stated = tokenizer.stated();
-    if let Some(rows) = rows {
-        let above: Vec<(&u64, &&str)> = stated.range(rows..).collect();
-        if let (Some((first, token)), Some((last, _))) = (above.first(), above.last()) {
-            faults.push(
-                Fault::new("token-above-rows")
-                    .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{first}")))
-                    .with("count", above.len())
-                    .with("first", **first)
-                    .with("last", **last)
-                    .with("token", **token)
-                    .with("rows", rows),
-            );
-        }
-    }
+    let mut faults: Vec<Fault> = rows.and_then(|rows| tokens_above(&stated, rows)).into_iter().collect();
     // A slow tokenizer numbers added tokens one after another: a hole shifts all that follow.
-    if let Some(base) = tokenizer.base().map(Vocabulary::len).filter(|_| !checkpoint.has_file("tokenizer.json")) {
-        let mut expected = base;
-        for (id, token) in stated.range(base..) {
-            if *id != expected {
-                faults.push(
-                    Fault::new("token-hole")
-                        .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
-                        .with("missing", expected)
-                        .with("next", *id)
-                        .with("token", *token),
-                );
-                break;
-            }
-            expected = expected.saturating_add(1);
-        }
-    }
+    let base = tokenizer.base().map(Vocabulary::len).filter(|_| !checkpoint.has_file("tokenizer.json"));
+    faults.extend(base.and_then(|base| first_hole(&stated, base)));
     let mut by_content: BTreeMap<&str, u64> = BTreeMap::new();
     for (id, token) in &stated {
         if let Some(first) = by_content.insert(token, *id) {
-            faults.push(
-                Fault::new("token-id-twice")
-                    .at(Place::file(decoder).pointer(format!("/added_tokens_decoder/{id}")))
-                    .with("token", *token)
-                    .with("first", first)
-                    .with("second", *id),
-            );
+            let fault = Fault::new(FaultKind::TokenIdTwice).at(decoder_entry(*id));
+            faults.push(fault.with("token", *token).with("first", first).with("second", *id));
         }
     }
     for added in tokenizer.added_tokens_json.iter().flatten() {
         if let Some(decoder_id) = by_content.get(added.content.as_str()).filter(|d| **d != added.id) {
-            let pointer = added.content.replace('~', "~0").replace('/', "~1");
             faults.push(
-                Fault::new("added-tokens-disagree")
-                    .at(Place::file("added_tokens.json").pointer(format!("/{pointer}")))
+                Fault::new(FaultKind::AddedTokensDisagree)
+                    .at(Place::file("added_tokens.json").pointer(pointer::join("", &added.content)))
                     .with("token", added.content.as_str())
                     .with("id", added.id)
                     .with("decoder_id", *decoder_id),
@@ -162,4 +130,30 @@ pub fn compare(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
         }
     }
     faults
+}
+
+fn decoder_entry(id: u64) -> Place {
+    Place::file(DECODER).pointer(format!("/added_tokens_decoder/{id}"))
+}
+
+/// Tokens whose ids are not rows of the embedding.
+fn tokens_above(stated: &BTreeMap<u64, &str>, rows: u64) -> Option<Fault> {
+    let above: Vec<(&u64, &&str)> = stated.range(rows..).collect();
+    let ((first, token), (last, _)) = (above.first()?, above.last()?);
+    let fault = Fault::new(FaultKind::TokenAboveRows)
+        .at(decoder_entry(**first))
+        .with("count", above.len())
+        .with("first", **first)
+        .with("last", **last)
+        .with("token", **token)
+        .with("rows", rows);
+    Some(fault)
+}
+
+/// The first id from `base` on that no token has although a later one does.
+fn first_hole(stated: &BTreeMap<u64, &str>, base: u64) -> Option<Fault> {
+    let mut ids = (base..).zip(stated.range(base..));
+    let (expected, (id, token)) = ids.find(|(expected, (id, _))| expected != *id)?;
+    let fault = Fault::new(FaultKind::TokenHole).at(decoder_entry(*id));
+    Some(fault.with("missing", expected).with("next", *id).with("token", *token))
 }

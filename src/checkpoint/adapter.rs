@@ -23,7 +23,7 @@ pub struct Adapter<'c> {
 impl<'c> Adapter<'c> {
     /// The adapter in this directory, if there is one.
     #[must_use]
-    pub fn of(checkpoint: &'c Checkpoint) -> Option<Self> {
+    pub fn from_checkpoint(checkpoint: &'c Checkpoint) -> Option<Self> {
         Some(Self { checkpoint, document: checkpoint.document(CONFIG)? })
     }
 

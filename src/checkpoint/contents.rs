@@ -10,12 +10,13 @@ use std::path::Path;
 use sha2::{Digest as _, Sha256};
 
 use super::open::{Opened, open_regular};
-use super::shard::hex;
-use super::{Checkpoint, Dtype, Entry, Fault, Shard, Tensor};
+use super::shard::tail::zero_tail;
+use super::text::hex;
+use super::{Entry, Fault, FaultKind, Shard, Tensor};
 
 mod numbers;
 
-use numbers::Numbers;
+use numbers::{NonFiniteCounter, as_u64};
 
 /// Bytes read at a time: a multiple of every element's width, so that none lies across two reads.
 const CHUNK: usize = 1 << 20;
@@ -27,6 +28,23 @@ pub struct Contents {
 }
 
 impl Contents {
+    /// Reads the bytes of every tensor of these shards, and adds the faults that only their bytes show.
+    pub(super) fn read(root: &Path, entries: &BTreeMap<String, Entry>, shards: &mut BTreeMap<String, Shard>) -> Self {
+        let mut contents = Self::default();
+        for shard in shards.values_mut() {
+            let mut reader = ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new() };
+            reader.run(root, entries.get(&shard.name));
+            let ContentsReader { digests, faults, .. } = reader;
+            contents.digests.insert(shard.name.clone(), digests);
+            if faults.iter().any(|f| f.kind == FaultKind::ZeroTail) {
+                // The reader of headers saw a part of it already, where the file system told.
+                shard.faults.retain(|f| f.kind != FaultKind::ZeroTail);
+            }
+            shard.faults.extend(faults);
+        }
+        contents
+    }
+
     /// SHA-256 of a tensor's bytes; `None` where they could not be read.
     #[must_use]
     pub fn digest(&self, shard: &str, tensor: &str) -> Option<&[u8; 32]> {
@@ -34,34 +52,14 @@ impl Contents {
     }
 }
 
-impl Checkpoint {
-    /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
-    /// their bytes show. Never fails: what cannot be read is a fault too.
-    pub fn read_contents(&mut self) {
-        let mut contents = Contents::default();
-        for shard in self.shards.values_mut() {
-            let mut reading = Reading { shard, digests: BTreeMap::new(), faults: Vec::new() };
-            reading.run(&self.root, self.entries.get(&shard.name));
-            let Reading { digests, faults, .. } = reading;
-            contents.digests.insert(shard.name.clone(), digests);
-            if faults.iter().any(|f| f.kind == "zero-tail") {
-                // The reader of headers saw a part of it already, where the file system told.
-                shard.faults.retain(|f| f.kind != "zero-tail");
-            }
-            shard.faults.extend(faults);
-        }
-        self.contents = Some(contents);
-    }
-}
-
 /// One shard while it is read.
-struct Reading<'s> {
+struct ContentsReader<'s> {
     shard: &'s Shard,
     digests: BTreeMap<String, [u8; 32]>,
     faults: Vec<Fault>,
 }
 
-impl Reading<'_> {
+impl ContentsReader<'_> {
     fn run(&mut self, root: &Path, entry: Option<&Entry>) {
         // A header that is not to be trusted says nothing of what the bytes behind it are; it has its own faults.
         if self.shard.unread || self.shard.tensors.is_empty() {
@@ -81,7 +79,7 @@ impl Reading<'_> {
     }
 
     fn unread(&mut self, reason: &str) {
-        self.faults.push(Fault::new("contents-unread").at(self.shard.place()).with("reason", reason));
+        self.faults.push(Fault::new(FaultKind::ContentsUnread).at(self.shard.place()).with("reason", reason));
     }
 
     fn tensors(&mut self, opened: &Opened, entry: Option<&Entry>) -> std::io::Result<()> {
@@ -90,7 +88,8 @@ impl Reading<'_> {
         let mut tensors: Vec<&Tensor> = self.shard.tensors.iter().filter(|t| t.begin <= t.end).collect();
         tensors.sort_by_key(|t| (t.begin, t.end, t.name.as_str()));
         // Only a shard that is covered by its tensors is a file read to its end.
-        let stated = entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == "zero-tail"));
+        let stated =
+            entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == FaultKind::ZeroTail));
         let mut whole = stated.as_ref().map(|_| Sha256::new());
         if let Some(whole) = &mut whole {
             each_chunk(opened, 0, self.shard.data_start, &mut buffer, |bytes| whole.update(bytes))?;
@@ -103,7 +102,7 @@ impl Reading<'_> {
                 continue;
             }
             let mut digest = Sha256::new();
-            let mut numbers = Numbers::of(tensor.dtype);
+            let mut numbers = NonFiniteCounter::new(tensor.dtype);
             let mut at = tensor.begin;
             let start = self.shard.data_start.saturating_add(tensor.begin);
             each_chunk(opened, start, tensor.len(), &mut buffer, |bytes| {
@@ -121,13 +120,13 @@ impl Reading<'_> {
             self.faults.extend(numbers.fault(self.shard, tensor));
         }
         if last_value < region {
-            let tail = tail(self.shard, &tensors, last_value);
+            let tail = zero_tail(self.shard, &tensors, last_value);
             self.faults.extend(tail);
         }
         if let (Some(whole), Some(stated)) = (whole, stated) {
             let found = hex(&whole.finalize());
             if found != stated {
-                let fault = Fault::new("content-hash-differs").at(self.shard.place());
+                let fault = Fault::new(FaultKind::ContentHashDiffers).at(self.shard.place());
                 self.faults.push(fault.with("stated", stated).with("found", found));
             }
         }
@@ -140,29 +139,6 @@ fn stated_digest(entry: &Entry) -> Option<String> {
     let name = entry.link.as_deref()?.rsplit('/').next()?;
     let is_digest = name.len() == 64 && name.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
     is_digest.then(|| name.to_owned())
-}
-
-/// The fault of a shard whose last bytes from `from` on, counted in its data, are zero: when at least one whole matrix
-/// lies there, or the end of one. A bias may be zero, and so may be the second factor of a LoRA that was not trained.
-pub(super) fn tail(shard: &Shard, tensors: &[&Tensor], from: u64) -> Option<Fault> {
-    let zero = |t: &&&Tensor| t.begin >= from && !t.is_empty();
-    let matrix = |t: &&Tensor| t.shape.len() > 1 && !t.name.contains("lora_B") && !t.name.contains("lora_embedding_B");
-    let all: Vec<&Tensor> = tensors.iter().filter(zero).copied().collect();
-    let whole = all.iter().find(|t| matrix(t)).copied();
-    let first = whole.or_else(|| tensors.iter().copied().filter(|t| matrix(t)).find(|t| ends_within(t, from)))?;
-    let fault = Fault::new("zero-tail").at(shard.place().in_tensor(first.name.clone()));
-    let region = shard.file_len.saturating_sub(shard.data_start);
-    let fault = fault.with("tensors", all.len()).with("bytes", region.saturating_sub(from));
-    Some(fault.with("partly", whole.is_none()))
-}
-
-/// Whether the values of a matrix end within one of its rows, and at least a row of zeros follows. Rows that are zero
-/// from their start are padding.
-fn ends_within(tensor: &Tensor, from: u64) -> bool {
-    let is_float = matches!(tensor.dtype, Dtype::BF16 | Dtype::F16 | Dtype::F32 | Dtype::F64);
-    let row = tensor.shape.first().and_then(|rows| tensor.len().checked_div(*rows)).unwrap_or(0);
-    let begun = from.checked_sub(tensor.begin).and_then(|written| written.checked_rem(row)).is_some_and(|n| n > 0);
-    is_float && begun && tensor.end.saturating_sub(from) >= row
 }
 
 /// Hands `len` bytes from `start` on to `each`, in pieces.
@@ -183,8 +159,4 @@ fn each_chunk(
         left = left.saturating_sub(as_u64(size));
     }
     Ok(())
-}
-
-fn as_u64(n: usize) -> u64 {
-    u64::try_from(n).unwrap_or(u64::MAX)
 }

@@ -38,12 +38,6 @@ pub struct Document {
 }
 
 impl Document {
-    /// Reads a document. Never fails: what is wrong becomes a fault.
-    #[must_use]
-    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
-        read::parse(name.into(), bytes)
-    }
-
     /// The text of a document in UTF-16 or UTF-32; `None` for any other, and where characters would be lost.
     #[must_use]
     pub fn decoded(bytes: &[u8]) -> Option<String> {

@@ -5,14 +5,18 @@ use std::ops::Range;
 
 use serde_json::{Map, Value};
 
+mod kind;
+
+pub use kind::{FaultKind, FaultSource};
+
 /// One observed fault: what kind, where, and the figures a message needs.
 ///
 /// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself carries no
 /// severity and no prose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fault {
-    /// Kebab-case name of the kind, one of those a rule can name (`"header-truncated"`).
-    pub kind: &'static str,
+    /// The kind, by which rules select it.
+    pub kind: FaultKind,
     /// Where it was seen, most important place first. May be empty: then it is the whole checkpoint.
     pub places: Vec<Place>,
     /// Figures and names for the message, by the names the rule's message uses.
@@ -22,7 +26,7 @@ pub struct Fault {
 impl Fault {
     /// A fault of `kind` with no place and no detail yet.
     #[must_use]
-    pub fn new(kind: &'static str) -> Self {
+    pub fn new(kind: FaultKind) -> Self {
         Self { kind, places: Vec::new(), detail: Map::new() }
     }
 
@@ -89,95 +93,32 @@ impl Place {
     }
 }
 
-/// Every kind of fault this room can produce, sorted. Rules name kinds from this list.
-pub const FAULT_KINDS: &[&str] = &[
-    "appended-section",
-    "byte-order-mark",
-    "comment-in-json",
-    "content-hash-differs",
-    "contents-unread",
-    "dangling-symlink",
-    "data-hole",
-    "duplicate-header-key",
-    "duplicate-index-key",
-    "duplicate-json-key",
-    "empty-document",
-    "empty-file",
-    "entry-malformed",
-    "file-too-large",
-    "file-too-short",
-    "header-length-out-of-range",
-    "header-not-json",
-    "header-not-utf8",
-    "header-padding-not-spaces",
-    "header-too-deep",
-    "header-too-large",
-    "html-instead",
-    "huge-number",
-    "index-metadata-missing",
-    "index-unsafe-path",
-    "invalid-utf8",
-    "json-syntax",
-    "json-too-deep",
-    "json-too-many-values",
-    "lfs-pointer",
-    "lone-surrogate",
-    "merge-conflict-marker",
-    "metadata-not-strings",
-    "metadata-null",
-    "missing-comma",
-    "no-format-metadata",
-    "non-finite-number",
-    "non-finite-weights",
-    "not-a-regular-file",
-    "not-an-object",
-    "not-safetensors",
-    "nul-bytes",
-    "odd-tensor-name",
-    "offsets-out-of-order",
-    "partial-download",
-    "python-syntax",
-    "python-too-complex",
-    "repair-interrupted",
-    "shape-byte-mismatch",
-    "shape-overflow",
-    "shard-truncated",
-    "single-quoted-string",
-    "sub-byte-misaligned",
-    "symlink-loop",
-    "symlink-outside",
-    "tensors-overlap",
-    "total-size-malformed",
-    "trailing-bytes",
-    "trailing-comma",
-    "trailing-content",
-    "unknown-dtype",
-    "unreadable-file",
-    "vocabulary-malformed",
-    "weight-map-malformed",
-    "weight-map-missing",
-    "wrong-encoding",
-    "zero-tail",
-];
-
 /// How many faults of one kind one file may have before the rest are only counted.
 pub(crate) const KIND_CAP: usize = 64;
 
 /// Non-finite numbers are repaired one by one, so far more of them are kept.
 const NON_FINITE_CAP: usize = 4096;
 
+/// How many faults of this kind one file may have.
+const fn cap(kind: FaultKind) -> usize {
+    match kind {
+        FaultKind::NonFiniteNumber => NON_FINITE_CAP,
+        _ => KIND_CAP,
+    }
+}
+
 /// Collects the faults of one file, keeping at most a set number of each kind.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
     list: Vec<Fault>,
     /// How many of each kind were seen, and where the last one kept stands in `list`.
-    seen: BTreeMap<&'static str, (usize, usize)>,
+    seen: BTreeMap<FaultKind, (usize, usize)>,
 }
 
 impl Faults {
     /// Adds a fault, or only counts it when there are enough of its kind.
     pub(crate) fn push(&mut self, fault: Fault) {
-        let cap = if fault.kind == "non-finite-number" { NON_FINITE_CAP } else { KIND_CAP };
+        let cap = cap(fault.kind);
         let (count, last) = self.seen.entry(fault.kind).or_insert((0, 0));
         *count = count.saturating_add(1);
         if *count <= cap {
@@ -186,11 +127,15 @@ impl Faults {
         }
     }
 
+    /// Adds faults as [`Self::push`] does.
+    pub(crate) fn extend(&mut self, faults: impl IntoIterator<Item = Fault>) {
+        faults.into_iter().for_each(|fault| self.push(fault));
+    }
+
     /// The faults kept; the last of a kind that had too many says how many `more` there were.
     pub(crate) fn into_vec(mut self) -> Vec<Fault> {
         for (kind, (count, last)) in &self.seen {
-            let cap = if *kind == "non-finite-number" { NON_FINITE_CAP } else { KIND_CAP };
-            let more = count.saturating_sub(cap);
+            let more = count.saturating_sub(cap(*kind));
             if more > 0
                 && let Some(fault) = self.list.get_mut(*last)
             {

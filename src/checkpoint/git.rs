@@ -10,7 +10,7 @@ use std::path::Path;
 use globset::{GlobBuilder, GlobMatcher};
 
 use super::open::read_capped;
-use super::{Checkpoint, Fault};
+use super::{Checkpoint, Fault, FaultKind};
 
 /// Most bytes read of a `.gitattributes`.
 const CAP: u64 = 256 << 10;
@@ -18,7 +18,7 @@ const CAP: u64 = 256 << 10;
 const LINES: usize = 2_000;
 
 /// One line that says something of the filter: files that match it, and whether git-lfs keeps them.
-struct Line {
+struct AttributeLine {
     glob: GlobMatcher,
     /// Whether the glob is for the path below its folder; else it is for the file's name.
     whole: bool,
@@ -35,7 +35,7 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
     let kept = kept(&checkpoint.root, pointers);
     let mark = |fault: &mut Fault| {
         let file = fault.places.first().and_then(|place| place.file.as_deref());
-        if fault.kind == "lfs-pointer" && file.is_some_and(|file| kept.contains(file)) {
+        if fault.kind == FaultKind::LfsPointer && file.is_some_and(|file| kept.contains(file)) {
             fault.detail.insert("tracked".to_owned(), true.into());
         }
     };
@@ -58,10 +58,10 @@ fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
     // From the work tree's top down: the line that comes last decides.
     let mut folders: Vec<&Path> = root.ancestors().take_while(|dir| dir.starts_with(top)).collect();
     folders.reverse();
-    let lines: Vec<(&Path, Vec<Line>)> = folders.into_iter().map(|dir| (dir, lines(dir))).collect();
+    let lines: Vec<(&Path, Vec<AttributeLine>)> = folders.into_iter().map(|dir| (dir, lines(dir))).collect();
     files.retain(|file| {
         let path = root.join(file);
-        let says = |(dir, line): (&Path, &Line)| {
+        let says = |(dir, line): (&Path, &AttributeLine)| {
             let below = path.strip_prefix(dir).ok()?;
             line.glob.is_match(if line.whole { below } else { Path::new(file) }).then_some(line.lfs)
         };
@@ -80,14 +80,14 @@ fn lfs_was_here(top: &Path) -> bool {
     !git.is_dir() || is_there("lfs") || is_there("hooks/pre-push")
 }
 
-fn lines(dir: &Path) -> Vec<Line> {
+fn lines(dir: &Path) -> Vec<AttributeLine> {
     let Ok(bytes) = read_capped(&dir.join(".gitattributes"), CAP) else { return Vec::new() };
     let text = String::from_utf8_lossy(&bytes);
     text.lines().filter(|line| line.contains("filter")).take(LINES).filter_map(line).collect()
 }
 
 /// A line: `*.safetensors filter=lfs diff=lfs merge=lfs -text`.
-fn line(line: &str) -> Option<Line> {
+fn line(line: &str) -> Option<AttributeLine> {
     let line = line.trim();
     let (pattern, attributes) = match line.strip_prefix('"') {
         Some(quoted) => quoted.split_once('"')?,
@@ -106,7 +106,7 @@ fn line(line: &str) -> Option<Line> {
     // git knows no braces.
     let pattern = pattern.trim_start_matches('/').replace('{', "[{]").replace('}', "[}]");
     let glob = GlobBuilder::new(&pattern).literal_separator(true).build().ok()?;
-    Some(Line { glob: glob.compile_matcher(), whole, lfs })
+    Some(AttributeLine { glob: glob.compile_matcher(), whole, lfs })
 }
 
 #[cfg(test)]

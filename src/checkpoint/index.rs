@@ -6,8 +6,9 @@ use serde_json::Value;
 
 use super::fault::Faults;
 use super::open::is_plain_file_name;
-use super::text::{escape, push_pointer};
-use super::{Document, Fault, Place};
+use super::pointer;
+use super::text::escape;
+use super::{Document, Fault, FaultKind, Place};
 
 /// The name transformers looks for first.
 pub const INDEX_NAME: &str = "model.safetensors.index.json";
@@ -47,66 +48,60 @@ impl Index {
 
     /// Reads the index that `document` holds.
     #[must_use]
-    pub fn of(document: &Document) -> Self {
+    pub fn from_document(document: &Document) -> Self {
         let mut index = Self { document: document.name.clone(), ..Self::default() };
-        let mut faults = Faults::default();
         let Some(Value::Object(root)) = &document.value else {
             index.unread = true;
             return index;
         };
-        let at = |pointer: &str| Place::file(&*document.name).pointer(pointer);
-
-        match root.get("metadata") {
-            Some(Value::Object(metadata)) => {
-                index.has_metadata = true;
-                index.total_size = metadata.get("total_size").cloned();
-                let place = at("/metadata/total_size");
-                if let Some(found) = metadata.get("total_size").filter(|v| !is_size(v)) {
-                    let fault = Fault::new("total-size-malformed").at(place);
-                    faults.push(fault.with("found", escape(&found.to_string(), 60)));
-                }
-            }
-            other => {
-                let fault = Fault::new("index-metadata-missing").at(at(""));
-                faults.push(fault.with("present", other.is_some()));
-            }
-        }
-
-        match root.get("weight_map") {
-            Some(Value::Object(map)) => {
-                for (tensor, file) in map {
-                    let place = || {
-                        let mut pointer = "/weight_map".to_owned();
-                        push_pointer(&mut pointer, tensor);
-                        at(&pointer).in_tensor(tensor.clone())
-                    };
-                    match file.as_str() {
-                        Some(file) if is_plain_file_name(file) => {
-                            index.weight_map.insert(tensor.clone(), file.to_owned());
-                        }
-                        Some(file) => {
-                            let fault = Fault::new("index-unsafe-path").at(place());
-                            faults.push(fault.with("path", escape(file, 200)));
-                        }
-                        None => {
-                            let fault = Fault::new("weight-map-malformed").at(place());
-                            faults.push(fault.with("found", escape(&shown(file), 60)));
-                        }
-                    }
-                }
-            }
-            Some(other) => {
-                let fault = Fault::new("weight-map-malformed").at(at("/weight_map"));
-                faults.push(fault.with("found", escape(&shown(other), 60)));
-            }
-            None => faults.push(Fault::new("weight-map-missing").at(at(""))),
-        }
-
-        for fault in document.faults.iter().filter(|f| f.kind == "duplicate-json-key") {
-            faults.push(Fault { kind: "duplicate-index-key", ..fault.clone() });
+        let mut faults = Faults::default();
+        index.read_metadata(root.get("metadata"), &mut faults);
+        index.read_weight_map(root.get("weight_map"), &mut faults);
+        for fault in document.faults.iter().filter(|f| f.kind == FaultKind::DuplicateJsonKey) {
+            faults.push(Fault { kind: FaultKind::DuplicateIndexKey, ..fault.clone() });
         }
         index.faults = faults.into_vec();
         index
+    }
+
+    fn place(&self, pointer: &str) -> Place {
+        Place::file(&*self.document).pointer(pointer)
+    }
+
+    fn read_metadata(&mut self, metadata: Option<&Value>, faults: &mut Faults) {
+        let Some(Value::Object(metadata)) = metadata else {
+            let fault = Fault::new(FaultKind::IndexMetadataMissing).at(self.place(""));
+            return faults.push(fault.with("present", metadata.is_some()));
+        };
+        self.has_metadata = true;
+        self.total_size = metadata.get("total_size").cloned();
+        if let Some(found) = metadata.get("total_size").filter(|v| !is_size(v)) {
+            let fault = Fault::new(FaultKind::TotalSizeMalformed).at(self.place("/metadata/total_size"));
+            faults.push(fault.with("found", escape(&found.to_string(), 60)));
+        }
+    }
+
+    fn read_weight_map(&mut self, weight_map: Option<&Value>, faults: &mut Faults) {
+        let malformed = |place: Place, found: &Value| {
+            Fault::new(FaultKind::WeightMapMalformed).at(place).with("found", escape(&shown(found), 60))
+        };
+        let map = match weight_map {
+            Some(Value::Object(map)) => map,
+            Some(other) => return faults.push(malformed(self.place("/weight_map"), other)),
+            None => return faults.push(Fault::new(FaultKind::WeightMapMissing).at(self.place(""))),
+        };
+        for (tensor, file) in map {
+            let place = || self.place(&pointer::join("/weight_map", tensor)).in_tensor(tensor.clone());
+            match file.as_str() {
+                Some(file) if is_plain_file_name(file) => {
+                    self.weight_map.insert(tensor.clone(), file.to_owned());
+                }
+                Some(file) => {
+                    faults.push(Fault::new(FaultKind::IndexUnsafePath).at(place()).with("path", escape(file, 200)));
+                }
+                None => faults.push(malformed(place(), file)),
+            }
+        }
     }
 
     /// `total_size` as a number of bytes, when it is one.

@@ -10,13 +10,13 @@ mod parse;
 
 /// A Python file: the facts a loader acts on before and while it imports it.
 #[derive(Debug, Clone, Default)]
-pub struct Module {
+pub struct PythonModule {
     /// File name within the checkpoint.
     pub name: String,
     /// The text; `None` when it is not UTF-8.
     pub text: Option<Arc<str>>,
     /// Classes at any depth outside functions, in the order of the text.
-    pub classes: Vec<Class>,
+    pub classes: Vec<PythonClass>,
     /// `from .x import y` and `from . import x`, wherever they stand.
     pub relative_imports: Vec<RelativeImport>,
     /// `import x` and `from x import y`, wherever they stand.
@@ -33,7 +33,7 @@ pub struct Module {
 
 /// A class statement.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Class {
+pub struct PythonClass {
     /// Its name.
     pub name: String,
     /// Bytes of the name.
@@ -75,13 +75,7 @@ pub struct Import {
     pub nested: bool,
 }
 
-impl Module {
-    /// Reads a module. Never fails: what is wrong becomes a fault.
-    #[must_use]
-    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
-        parse::parse(name.into(), bytes)
-    }
-
+impl PythonModule {
     /// A module that could not be read at all.
     #[must_use]
     pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
@@ -90,7 +84,7 @@ impl Module {
 
     /// The class of this name; of several the last, which is the one Python keeps.
     #[must_use]
-    pub fn class(&self, name: &str) -> Option<&Class> {
+    pub fn class(&self, name: &str) -> Option<&PythonClass> {
         self.classes.iter().rev().find(|c| c.name == name)
     }
 

@@ -5,13 +5,13 @@
 
 use std::fs::{File, Metadata, OpenOptions};
 use std::io::Read as _;
-use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, OpenOptionsExt as _};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 use thiserror::Error;
 
-use super::{Fault, Place};
+use super::{EntryKind, Fault, FaultKind, Place};
 
 /// Most bytes read of a JSON document.
 pub const JSON_CAP: u64 = 64 << 20;
@@ -36,7 +36,7 @@ pub struct Identity {
 impl Identity {
     /// Reads it off a file's metadata.
     #[must_use]
-    pub fn of(metadata: &Metadata) -> Self {
+    pub fn from_metadata(metadata: &Metadata) -> Self {
         Self {
             dev: metadata.dev(),
             ino: metadata.ino(),
@@ -66,12 +66,12 @@ pub enum OpenError {
         path: PathBuf,
     },
     /// Something that is not a regular file.
-    #[error("{} is a {what}, not a regular file", path.display())]
+    #[error("{} is a {kind}, not a regular file", path.display())]
     NotRegular {
         /// The path asked for.
         path: PathBuf,
-        /// `FIFO`, `socket`, `device` or `directory`.
-        what: &'static str,
+        /// What it is instead.
+        kind: EntryKind,
     },
     /// A file where a directory was wanted.
     #[error("{} is not a directory", path.display())]
@@ -119,15 +119,15 @@ impl OpenError {
     pub fn fault(&self, name: &str) -> Fault {
         let fault = |kind| Fault::new(kind).at(Place::file(name));
         match self {
-            Self::NotRegular { what, .. } => fault("not-a-regular-file").with("what", *what),
-            Self::TooLarge { size, cap, .. } => fault("file-too-large").with("size", *size).with("cap", *cap),
+            Self::NotRegular { kind, .. } => fault(FaultKind::NotARegularFile).with("what", kind.name()),
+            Self::TooLarge { size, cap, .. } => fault(FaultKind::FileTooLarge).with("size", *size).with("cap", *cap),
             Self::DanglingLink { target, .. } => {
-                fault("dangling-symlink").with("target", target.to_string_lossy().into_owned())
+                fault(FaultKind::DanglingSymlink).with("target", target.to_string_lossy().into_owned())
             }
-            Self::SymlinkLoop { .. } => fault("symlink-loop"),
-            Self::Io { source, .. } => fault("unreadable-file").with("reason", source.to_string()),
+            Self::SymlinkLoop { .. } => fault(FaultKind::SymlinkLoop),
+            Self::Io { source, .. } => fault(FaultKind::UnreadableFile).with("reason", source.to_string()),
             Self::NotFound { .. } | Self::NotADirectory { .. } => {
-                fault("unreadable-file").with("reason", "it does not exist")
+                fault(FaultKind::UnreadableFile).with("reason", "it does not exist")
             }
         }
     }
@@ -148,22 +148,6 @@ impl OpenError {
     }
 }
 
-/// What a file is, when it is not a regular one.
-pub(crate) fn irregular(metadata: &Metadata) -> Option<&'static str> {
-    let kind = metadata.file_type();
-    if kind.is_file() {
-        None
-    } else if kind.is_dir() {
-        Some("directory")
-    } else if kind.is_fifo() {
-        Some("FIFO")
-    } else if kind.is_socket() {
-        Some("socket")
-    } else {
-        Some("device")
-    }
-}
-
 /// Opens a regular file of at most `cap` bytes for reading; symbolic links are followed.
 ///
 /// Asks what the file is before it opens it, because opening a device can do things, and again
@@ -173,18 +157,17 @@ pub(crate) fn irregular(metadata: &Metadata) -> Option<&'static str> {
 /// When there is no such file, it is not a regular one, or it has more than `cap` bytes.
 pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
     let io = |source| OpenError::from_io(path, source);
-    let not_regular = |what| OpenError::NotRegular { path: path.to_owned(), what };
-    if let Some(what) = irregular(&std::fs::metadata(path).map_err(io)?) {
-        return Err(not_regular(what));
-    }
+    let regular = |metadata: &Metadata| match EntryKind::from_metadata(metadata) {
+        EntryKind::Regular => Ok(()),
+        kind => Err(OpenError::NotRegular { path: path.to_owned(), kind }),
+    };
+    regular(&std::fs::metadata(path).map_err(io)?)?;
     let flags = OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY;
     let flags = i32::try_from(flags.bits()).unwrap_or(0);
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path).map_err(io)?;
     let metadata = file.metadata().map_err(io)?;
-    if let Some(what) = irregular(&metadata) {
-        return Err(not_regular(what));
-    }
-    let identity = Identity::of(&metadata);
+    regular(&metadata)?;
+    let identity = Identity::from_metadata(&metadata);
     if identity.size > cap {
         return Err(OpenError::TooLarge { path: path.to_owned(), size: identity.size, cap });
     }

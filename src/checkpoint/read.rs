@@ -1,17 +1,18 @@
 //! Reads a directory into a [`Checkpoint`]: its own files, and none that a file in it names.
 
 use std::collections::BTreeMap;
-use std::fs::{self, Metadata};
+use std::fs;
 use std::path::{Component, Path};
 use std::sync::Arc;
 
+use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
-use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, irregular, read_capped};
+use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_capped};
 use super::{
-    Checkpoint, Document, Entry, EntryKind, Fault, LfsPointer, Module, OpenError, Place, REPAIR_FOLDER, REPAIR_JOURNAL,
-    Shard, Vocabulary,
+    Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, OpenError, Place, PythonModule,
+    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Vocabulary,
 };
 
 /// Endings that a downloader gives to a file it has not finished.
@@ -48,70 +49,109 @@ pub(super) fn is_document(name: &str) -> bool {
     DOCUMENTS.contains(&name) || name.ends_with("config.json") || name.ends_with(".index.json")
 }
 
-pub(super) fn open(root: &Path) -> Result<Checkpoint, OpenError> {
+impl Checkpoint {
+    /// Reads a checkpoint directory.
+    ///
+    /// # Errors
+    /// When the directory itself cannot be read. Nothing in it can make this fail.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
+        open(path.as_ref())
+    }
+
+    /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
+    /// their bytes show. Never fails: what cannot be read is a fault too.
+    pub fn read_contents(&mut self) {
+        self.contents = Some(Contents::read(&self.root, &self.entries, &mut self.shards));
+    }
+}
+
+fn open(root: &Path) -> Result<Checkpoint, OpenError> {
     let io = |source| OpenError::from_io(root, source);
     if !fs::metadata(root).map_err(io)?.is_dir() {
         return Err(OpenError::NotADirectory { path: root.to_owned() });
     }
-    let mut checkpoint = Checkpoint { root: root.to_owned(), ..Checkpoint::default() };
-    let mut vocabularies = BTreeMap::new();
-    let mut faults_of_vocabularies = Vec::new();
+    let mut reader = DirectoryReader {
+        checkpoint: Checkpoint { root: root.to_owned(), ..Checkpoint::default() },
+        vocabularies: BTreeMap::new(),
+        vocabulary_faults: Vec::new(),
+    };
     for name in names(root)? {
-        let entry = entry(root, &name, &mut checkpoint.faults);
-        let path = root.join(&name);
-        if entry.kind == EntryKind::Directory && !is_document(&name) && !name.ends_with(".safetensors") {
+        let entry = entry(root, &name, &mut reader.checkpoint.faults);
+        reader.read_content(&name, &entry);
+        reader.check_entry(&name, &entry);
+        reader.checkpoint.entries.insert(name, entry);
+    }
+    let DirectoryReader { mut checkpoint, vocabularies, vocabulary_faults } = reader;
+    if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
+        let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
+        checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(place));
+    }
+    checkpoint.derive(vocabularies);
+    checkpoint.tokenizer.faults.extend(vocabulary_faults);
+    git::mark_pointers(&mut checkpoint);
+    Ok(checkpoint)
+}
+
+/// A directory while it is read.
+struct DirectoryReader {
+    checkpoint: Checkpoint,
+    vocabularies: BTreeMap<String, Arc<Vocabulary>>,
+    vocabulary_faults: Vec<Fault>,
+}
+
+impl DirectoryReader {
+    /// Reads what a file of this name holds, when a loader would.
+    fn read_content(&mut self, name: &str, entry: &Entry) {
+        let path = self.checkpoint.root.join(name);
+        let is_shard = name.ends_with(".safetensors");
+        if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
             // A folder is a checkpoint of its own, or none of ours.
-        } else if name.ends_with(".safetensors") {
-            checkpoint.shards.insert(name.clone(), Shard::read(root, &name));
-        } else if is_document(&name) {
+        } else if is_shard {
+            let shard = Shard::read(&self.checkpoint.root, name);
+            self.checkpoint.shards.insert(name.to_owned(), shard);
+        } else if is_document(name) {
             let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
             let document = match read_capped(&path, cap) {
-                Ok(bytes) => Document::parse(&*name, &bytes),
-                Err(error) => Document::unread(&*name, error.fault(&name)),
+                Ok(bytes) => Document::parse(name, &bytes),
+                Err(error) => Document::unread(name, error.fault(name)),
             };
-            checkpoint.documents.insert(name.clone(), document);
-        } else if has_ending(&name, "py") {
+            self.checkpoint.documents.insert(name.to_owned(), document);
+        } else if has_ending(name, "py") {
             let module = match read_capped(&path, MODULE_CAP) {
-                Ok(bytes) => Module::parse(&*name, &bytes),
-                Err(error) => Module::unread(&*name, error.fault(&name)),
+                Ok(bytes) => PythonModule::parse(name, &bytes),
+                Err(error) => PythonModule::unread(name, error.fault(name)),
             };
-            checkpoint.modules.insert(name.clone(), module);
-        } else if TEXTS.contains(&&*name) && entry.lfs.is_none() {
+            self.checkpoint.modules.insert(name.to_owned(), module);
+        } else if TEXTS.contains(&name) && entry.lfs.is_none() {
             match read_capped(&path, MODULE_CAP) {
                 Ok(bytes) => {
-                    checkpoint.texts.insert(name.clone(), String::from_utf8_lossy(&bytes).into());
+                    self.checkpoint.texts.insert(name.to_owned(), String::from_utf8_lossy(&bytes).into());
                 }
-                Err(error) => checkpoint.faults.push(error.fault(&name)),
+                Err(error) => self.checkpoint.faults.push(error.fault(name)),
             }
-        } else if VOCABULARIES.contains(&&*name) {
-            match vocabulary(&path, &name) {
-                Ok(vocabulary) => {
-                    vocabularies.insert(name.clone(), Arc::new(vocabulary));
-                }
-                Err(fault) => faults_of_vocabularies.push(*fault),
+        } else if VOCABULARIES.contains(&name) {
+            match vocabulary(&path, name) {
+                Ok(vocabulary) => drop(self.vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
+                Err(fault) => self.vocabulary_faults.push(*fault),
             }
         } else if entry.kind == EntryKind::Broken
             && let Err(error) = fs::metadata(&path)
         {
-            checkpoint.faults.push(OpenError::from_io(&path, error).fault(&name));
+            self.checkpoint.faults.push(OpenError::from_io(&path, error).fault(name));
         }
-        if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_pickle(&name) || TEXTS.contains(&&*name)) {
-            let fault = Fault::new("lfs-pointer").at(Place::file(&*name));
-            checkpoint.faults.push(fault.with("oid", pointer.oid.as_str()).with("size", pointer.size));
+    }
+
+    /// Adds the faults that the entry shows without its content.
+    fn check_entry(&mut self, name: &str, entry: &Entry) {
+        let faults = &mut self.checkpoint.faults;
+        if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_pickle(name) || TEXTS.contains(&name)) {
+            let fault = Fault::new(FaultKind::LfsPointer).at(Place::file(name));
+            faults.push(fault.with("oid", pointer.oid.as_str()).with("size", pointer.size));
         }
         if let Some(of) = UNFINISHED.iter().find_map(|ending| name.strip_suffix(ending)) {
-            checkpoint.faults.push(Fault::new("partial-download").at(Place::file(&*name)).with("of", of));
+            faults.push(Fault::new(FaultKind::PartialDownload).at(Place::file(name)).with("of", of));
         }
-        checkpoint.entries.insert(name, entry);
     }
-    if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
-        let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
-        checkpoint.faults.push(Fault::new("repair-interrupted").at(place));
-    }
-    checkpoint.derive(vocabularies);
-    checkpoint.tokenizer.faults.extend(faults_of_vocabularies);
-    git::mark_pointers(&mut checkpoint);
-    Ok(checkpoint)
 }
 
 /// Names in the directory, sorted. Hidden ones are the business of other tools; one that is no plain
@@ -143,10 +183,10 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
         && metadata.is_file()
         && is_outside(root, &path, target)
     {
-        let fault = Fault::new("symlink-outside").at(Place::file(name));
+        let fault = Fault::new(FaultKind::SymlinkOutside).at(Place::file(name));
         faults.push(fault.with("target", target.to_string_lossy().into_owned()));
     }
-    let kind = kind_of(&metadata);
+    let kind = EntryKind::from_metadata(&metadata);
     let size = if kind == EntryKind::Regular { metadata.len() } else { 0 };
     let small = u64::try_from(MAX_POINTER).is_ok_and(|cap| size <= cap);
     let lfs = if kind == EntryKind::Regular && size > 0 && small {
@@ -155,16 +195,6 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
         None
     };
     Entry { kind, size, link: link.map(|l| l.to_string_lossy().into_owned()), lfs }
-}
-
-fn kind_of(metadata: &Metadata) -> EntryKind {
-    match irregular(metadata) {
-        None => EntryKind::Regular,
-        Some("directory") => EntryKind::Directory,
-        Some("FIFO") => EntryKind::Fifo,
-        Some("socket") => EntryKind::Socket,
-        Some(_) => EntryKind::Device,
-    }
 }
 
 /// Whether a link leaves the directory for anything but a blob of the hub cache, whose snapshots
@@ -184,10 +214,11 @@ fn vocabulary(path: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {
     let bytes = read_capped(path, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
     let fault = |kind| Fault::new(kind).at(Place::file(name));
     if let Some(pointer) = LfsPointer::parse(&bytes) {
-        return Err(fault("lfs-pointer").with("oid", pointer.oid).with("size", pointer.size).into());
+        return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());
     }
     if bytes.is_empty() {
-        return Err(fault("empty-file").into());
+        return Err(fault(FaultKind::EmptyFile).into());
     }
-    Vocabulary::parse(name, &bytes).map_err(|reason| fault("vocabulary-malformed").with("reason", reason).into())
+    Vocabulary::parse(name, &bytes)
+        .map_err(|reason| fault(FaultKind::VocabularyMalformed).with("reason", reason).into())
 }

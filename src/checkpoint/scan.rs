@@ -11,7 +11,7 @@ use std::ops::Range;
 mod atoms;
 mod text;
 
-pub(crate) use text::Text;
+pub(crate) use text::JsonString;
 
 /// Deepest nesting read; what `serde_json` reads with its limit of 128.
 pub(crate) const MAX_DEPTH: usize = 127;
@@ -23,8 +23,8 @@ pub(crate) enum Token<'a> {
     EndObject,
     BeginArray,
     EndArray,
-    Key(Text<'a>),
-    String(Text<'a>),
+    Key(JsonString<'a>),
+    String(JsonString<'a>),
     /// A number as written.
     Number(&'a str),
     /// `NaN`, `Infinity` or `-Infinity`.
@@ -107,7 +107,7 @@ pub(crate) struct Scanner<'a> {
     pub(crate) refused: Option<ScanError>,
 }
 
-type Step<'a> = Result<Option<(Token<'a>, Range<usize>)>, ScanError>;
+type ScanStep<'a> = Result<Option<(Token<'a>, Range<usize>)>, ScanError>;
 
 impl<'a> Scanner<'a> {
     /// Scans strictly, from byte `start` (a character boundary; past the end means empty).
@@ -141,7 +141,7 @@ impl<'a> Scanner<'a> {
     }
 
     /// The next token and its bytes; `None` after the one value and nothing else but space.
-    pub(crate) fn next(&mut self) -> Step<'a> {
+    pub(crate) fn next(&mut self) -> ScanStep<'a> {
         loop {
             self.skip_space()?;
             let at = self.pos;
@@ -258,7 +258,7 @@ impl<'a> Scanner<'a> {
         (if object { Token::EndObject } else { Token::EndArray }, at..self.pos)
     }
 
-    fn close_after_comma(&mut self, object: bool, at: usize) -> Step<'a> {
+    fn close_after_comma(&mut self, object: bool, at: usize) -> ScanStep<'a> {
         match self.comma.take() {
             Some(span) if self.lenient => {
                 self.slip(SlipKind::TrailingComma, span);

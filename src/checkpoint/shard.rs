@@ -4,17 +4,17 @@
 //! of one name, and panics on a crafted file when overflow checks are on.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use super::{Fault, Place};
 
 mod dtype;
+mod entry;
 mod header;
 mod layout;
 mod read;
+pub(super) mod tail;
 
 pub use dtype::{Dtype, byte_len};
-pub(super) use header::hex;
 
 /// Longest header the format allows, in bytes. Source: `MAX_HEADER_SIZE` in safetensors 0.8.0.
 pub const MAX_HEADER: u64 = 100_000_000;
@@ -72,23 +72,6 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: what is
-    /// wrong becomes a fault.
-    #[must_use]
-    pub fn read(dir: &Path, name: &str) -> Self {
-        read::read(dir, name)
-    }
-
-    /// Reads a header from the first bytes of a file of `file_len` bytes.
-    ///
-    /// `head` must hold the length field and the header it states, if the file does; of a file that
-    /// is no safetensors file the first few hundred bytes tell what it is.
-    #[must_use]
-    pub fn parse(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
-        let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
-        header::parse(shard, head)
-    }
-
     /// A shard that could not be read at all.
     #[must_use]
     pub fn unread(name: impl Into<String>, fault: Fault) -> Self {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::{Document, Fault, Place};
+use super::{Document, Fault, FaultKind, Place};
 
 mod sentencepiece;
 mod vocabulary;
@@ -77,7 +77,7 @@ impl Tokenizer {
     ///
     /// `files` names the vocabulary files there are, whether they could be read or not.
     #[must_use]
-    pub fn of(
+    pub fn new(
         documents: &BTreeMap<String, Document>,
         mut vocabularies: BTreeMap<String, Arc<Vocabulary>>,
         files: BTreeSet<String>,
@@ -92,7 +92,7 @@ impl Tokenizer {
                     Ok(Some(vocabulary)) => drop(vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
                     Ok(None) => {}
                     Err(reason) => {
-                        let fault = Fault::new("vocabulary-malformed").at(Place::file(name).pointer(pointer));
+                        let fault = Fault::new(FaultKind::VocabularyMalformed).at(Place::file(name).pointer(pointer));
                         faults.push(fault.with("reason", reason));
                     }
                 }

@@ -1,21 +1,22 @@
-//! What can be typed.
+//! Arguments of the command line, with their help texts.
 
 use std::path::PathBuf;
 
 use ckpt_doctor::check::Severity;
 use ckpt_doctor::knowledge::loader::asked;
 use ckpt_doctor::report::Format;
+use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-/// Validates, repairs and merges model checkpoint directories from their files alone.
+/// Validates, repairs and merges model checkpoint directories by reading their files; nothing of a model is run.
 #[derive(Debug, Parser)]
 #[command(name = "ckpt-doctor", version, propagate_version = true)]
 pub struct Cli {
-    /// What to do.
+    /// The subcommand.
     #[command(subcommand)]
     pub command: Command,
-    /// A folder laid out as the program's own rules: checks/**/*.json5 are asked too; architectures/*.json5 are known too,
-    /// or replace what has the same name
+    /// Directory with extra rules (checks/**/*.json5) and architectures (architectures/*.json5); an architecture replaces
+    /// the built-in one of the same name
     #[arg(long, value_name = "DIR", global = true)]
     pub rules: Option<PathBuf>,
 }
@@ -23,31 +24,33 @@ pub struct Cli {
 /// The subcommands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Check checkpoint directories
+    /// Check checkpoint directories; with --fix, repair them
     Check(CheckArgs),
-    /// Take back the latest repair of a checkpoint, byte for byte
+    /// Undo the latest repair of a checkpoint, byte for byte
     Undo(UndoArgs),
-    /// Build one checkpoint from parts of two
+    /// Build one checkpoint from parts of two others
+    #[command(visible_alias = "merge")]
     BuildMerged(BuildMergedArgs),
-    /// Say what a checkpoint is: tensors, class, and the config values that the tensors show
+    /// Summarise a checkpoint: tensors, model class, inferred config values
     Inspect(InspectArgs),
-    /// Print the tensors that a model class has, by its config alone
+    /// Print the tensors that a model class expects, from its config alone
     Expect(ExpectArgs),
-    /// Say all there is to say of one rule
+    /// Print the documentation of a rule
     Explain(ExplainArgs),
     /// List the rules
     Rules(SettingsArgs),
-    /// Write a ckpt-doctor.json5 with every key explained
+    /// Write a settings file, ckpt-doctor.json5, with every key explained
     Init(InitArgs),
 }
 
-/// Which settings to go by.
+/// Settings file selection.
 #[derive(Debug, Args)]
+#[command(next_help_heading = "Settings")]
 pub struct SettingsArgs {
-    /// This settings file, instead of the nearest ckpt-doctor.json5 in the folders above each checkpoint
+    /// Use this settings file instead of the nearest ckpt-doctor.json5 in the directories above each checkpoint
     #[arg(long, value_name = "FILE", conflicts_with = "isolated")]
     pub config: Option<PathBuf>,
-    /// No settings file
+    /// Use no settings file
     #[arg(long)]
     pub isolated: bool,
 }
@@ -55,41 +58,43 @@ pub struct SettingsArgs {
 /// Arguments of `init`.
 #[derive(Debug, Args)]
 pub struct InitArgs {
-    /// Where to write it
+    /// Directory to write the settings file to
     #[arg(value_name = "DIR", default_value = ".")]
     pub dir: PathBuf,
-    /// Write a .pre-commit-config.yaml as well
+    /// Also write a .pre-commit-config.yaml
     #[arg(long)]
     pub pre_commit: bool,
 }
 
 /// Arguments of `expect`.
 #[derive(Debug, Args)]
-#[command(after_help = "Exit codes: 0 all were built, 1 one could not be, 2 a file could not be read.")]
+#[command(after_help = "Exit codes:\n  0  the tensors of every config were printed\n  \
+1  a config failed: its architecture is unknown, or its values are not possible\n  \
+2  a file could not be read")]
 pub struct ExpectArgs {
-    /// A config.json, a directory that has one, or @FILE: a JSON object a line, with the config in its `config` (and the
-    /// class, where it is not the config's own, in its `class`)
+    /// A config.json, a directory that contains one, or @FILE: one JSON object per line, with the config under "config"
+    /// and, to override the config's own class, a class name under "class"
     #[arg(value_name = "CONFIG|DIR|@FILE", required = true)]
     pub configs: Vec<String>,
-    /// The version that builds it, as 4.57.3 or transformers==4.57.3; the nearest known one that has the class stands for
-    /// it, and without this the one nearest to what the config names
-    #[arg(long = "for", value_name = "LOADER", value_parser = asked)]
+    /// Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3; the nearest known version that
+    /// has the class is used [default: the version that the config names]
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = asked)]
     pub version: Option<String>,
-    /// text: a tensor a line; json: a list; jsonl: an object a line for each config, and those that fail say why
-    #[arg(long, value_name = "FMT", default_value = "text")]
+    /// Output format; in jsonl, a config that fails has an "error" and the others are still printed
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "text")]
     pub output_format: ExpectFormat,
 }
 
 /// Arguments of `inspect`.
 #[derive(Debug, Args)]
 pub struct InspectArgs {
-    /// A checkpoint directory, with a config.json or without, or a .safetensors file
+    /// A checkpoint directory, with or without a config.json, or a .safetensors file
     #[arg(value_name = "PATH", default_value = ".")]
     pub path: PathBuf,
-    /// full: for a terminal; json: complete
-    #[arg(long, value_name = "FMT", default_value = "full")]
+    /// Output format
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,
-    /// When to use colours
+    /// When to print colours; auto respects `NO_COLOR`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }
@@ -97,152 +102,162 @@ pub struct InspectArgs {
 /// Formats of `inspect`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum InspectFormat {
-    /// For a terminal.
+    /// For a terminal
     Full,
-    /// An object.
+    /// One JSON object, complete
     Json,
 }
 
 /// Formats of `expect`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ExpectFormat {
-    /// A tensor a line.
+    /// One tensor per line
     Text,
-    /// A list of objects.
+    /// A list with one object per config
     Json,
-    /// An object a line.
+    /// One object per line and config
     Jsonl,
 }
 
 /// Arguments of `explain`.
 #[derive(Debug, Args)]
 pub struct ExplainArgs {
-    /// Code or name: IDX005, shard-missing
+    /// Code or name of a rule: IDX005, shard-missing
     #[arg(value_name = "RULE")]
     pub rule: String,
-    /// Which settings to go by.
+    /// Settings file selection.
     #[command(flatten)]
     pub settings: SettingsArgs,
 }
 
-/// How and where to report, and what counts as a failure.
+/// Report formats, files and the exit code.
 #[derive(Debug, Args)]
+#[command(next_help_heading = "Output")]
 pub struct ReportArgs {
     /// Format of the report on standard output
-    #[arg(long, value_name = "FMT", default_value = "full", value_parser = parse_format)]
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "full", value_parser = formats())]
     pub output_format: Format,
-    /// Also write the report to a file; may be given several times
+    /// Also write the report to a file in any of these formats; may be repeated
     #[arg(long, value_name = "FMT=FILE", value_parser = parse_report)]
     pub report: Vec<(Format, PathBuf)>,
-    /// Least severity that makes the exit code 1; default: error
+    /// Lowest severity that makes the exit code 1 [default: error]
     #[arg(long, value_name = "SEVERITY")]
     pub fail_on: Option<FailOn>,
-    /// Exit with 0 whatever is found
+    /// Exit with 0 even if there are findings
     #[arg(long)]
     pub exit_zero: bool,
-    /// When to use colours
+    /// When to print colours; auto respects `NO_COLOR`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }
 
-/// Findings that were there before.
+/// The baseline: findings that are accepted because they existed before.
 #[derive(Debug, Args)]
+#[command(next_help_heading = "Baseline")]
 pub struct BaselineArgs {
-    /// Do not count the findings in this file, and say which of them are gone
+    /// Do not count the findings listed in this file, and list those that no longer occur
     #[arg(long, value_name = "FILE")]
     pub baseline: Option<PathBuf>,
-    /// Write what is found to the baseline, instead of comparing with it
+    /// Write the current findings to the baseline instead of comparing with it
     #[arg(long)]
     pub write_baseline: bool,
 }
 
 /// Arguments of `check`.
 #[derive(Debug, Args)]
+#[command(after_help = "Exit codes:\n  0  no findings at or above --fail-on\n  \
+1  findings at or above --fail-on; with --diff, a fix would change something\n  \
+2  the check could not run: no checkpoint found, unreadable file, or wrong argument")]
 pub struct CheckArgs {
-    /// Checkpoint directories, directories that hold some, or files of checkpoints
+    /// Checkpoint directories, directories that contain checkpoints, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
-    /// Versions to predict the load for; default: the one that wrote config.json, and the newest known
+    /// Predict the load for this version; may be repeated [default: the version that wrote config.json, and the newest known]
     #[arg(long = "for", value_name = "transformers==VERSION", value_parser = asked)]
     pub versions: Vec<String>,
-    /// Also read the bytes of every tensor: NaN and infinity, ends of zeros, tied matrices that differ, hub checksums
+    /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub
+    /// checksums
     #[arg(long)]
     pub deep: bool,
-    /// Only these rules: codes, starts of codes (JSN), or names; comma-separated
-    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    /// Run only these rules: codes, prefixes of codes (JSN) or names, comma-separated
+    #[arg(long, value_name = "RULE", value_delimiter = ',', help_heading = "Rule selection")]
     pub select: Vec<String>,
-    /// These rules as well as those that the settings select
-    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    /// Run these rules in addition to those that the settings select
+    #[arg(long, value_name = "RULE", value_delimiter = ',', help_heading = "Rule selection")]
     pub extend_select: Vec<String>,
-    /// All but these rules; where both name one, the longer word wins
-    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    /// Skip these rules; if --select and --ignore both match a rule, the longer selector wins
+    #[arg(long, value_name = "RULE", value_delimiter = ',', help_heading = "Rule selection")]
     pub ignore: Vec<String>,
-    /// What was there before.
-    #[command(flatten)]
-    pub baseline: BaselineArgs,
-    /// Count findings by rule instead of showing them (full, concise and json)
-    #[arg(long)]
-    pub statistics: bool,
-    /// Say of each rule that was not asked why
-    #[arg(short, long)]
-    pub verbose: bool,
-    /// Which settings to go by.
+    /// Settings file selection.
     #[command(flatten)]
     pub settings: SettingsArgs,
-    /// What to do about findings.
+    /// The baseline.
+    #[command(flatten)]
+    pub baseline: BaselineArgs,
+    /// What to fix, and where to write it.
     #[command(flatten)]
     pub fix: FixArgs,
-    /// How to report.
+    /// Report formats and the exit code.
     #[command(flatten)]
     pub report: ReportArgs,
+    /// Count the findings of each rule instead of showing them (formats full, concise and json)
+    #[arg(long, help_heading = "Output")]
+    pub statistics: bool,
+    /// Explain why each skipped rule was skipped
+    #[arg(short, long, help_heading = "Output")]
+    pub verbose: bool,
 }
 
-/// What `check` does about findings.
+/// What `check` fixes, and where it writes.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Fixes")]
 #[allow(clippy::struct_excessive_bools, reason = "each is a switch of its own on the command line")]
 pub struct FixArgs {
-    /// Make the safe fixes; `undo` takes them back
+    /// Apply the safe fixes; `ckpt-doctor undo` restores the originals
     #[arg(long)]
     pub fix: bool,
-    /// Count unsafe fixes as well: they change what a loader would compute
+    /// Also apply (or, without --fix, mark) the unsafe fixes: they change values or tensor names that a loader reads
     #[arg(long)]
     pub unsafe_fixes: bool,
-    /// Show what the fixes would change and write nothing; the exit code is 1 if there is anything
+    /// Show the changes that the fixes would make, and write nothing
     #[arg(long, conflicts_with_all = ["output", "fix_only"])]
     pub diff: bool,
-    /// Make the fixes, and neither say what is left nor fail because of it
+    /// Apply the fixes as --fix does, but neither report the remaining findings nor fail because of them
     #[arg(long)]
     pub fix_only: bool,
-    /// Exit with 1 if anything was fixed, even if nothing is left
+    /// Exit with 1 if anything was fixed, even if no finding remains
     #[arg(long)]
     pub exit_non_zero_on_fix: bool,
-    /// Leave the checkpoint alone and make a repaired copy here, with links to the files that stay; needs --fix
+    /// With --fix: write a repaired copy to this directory and leave the checkpoint unchanged; files without changes
+    /// become hard links to the originals (symbolic links on another file system)
     #[arg(long, value_name = "DIR")]
     pub output: Option<PathBuf>,
 }
 
 /// Arguments of `undo`.
 #[derive(Debug, Args)]
-#[command(after_help = "Exit codes: 0 undone, 2 there was nothing to undo, or a file has changed since.")]
+#[command(
+    after_help = "Exit codes:\n  0  the repair was undone\n  2  there is no repair to undo, or a file has changed since the repair"
+)]
 pub struct UndoArgs {
-    /// The checkpoint that `check --fix` has repaired
+    /// The checkpoint that `check --fix` repaired
     #[arg(value_name = "DIR", default_value = ".")]
     pub path: PathBuf,
 }
 
 /// Arguments of `build-merged`.
 #[derive(Debug, Args)]
-#[command(after_help = "Without --recipe the donors' architectures choose it.\n\
-Exit codes: 0 the merged checkpoint is written and sound, 1 a donor or a seam stopped it, 2 it could not be tried.")]
+#[command(after_help = "Without --recipe, the architectures of the donors determine the recipe.\n\n\
+Exit codes:\n  0  the merged checkpoint is written (or, with --dry-run, planned) without findings at or above --fail-on\n  \
+1  a donor or a seam stopped the merge, or the result has findings\n  2  the merge could not be attempted")]
 pub struct BuildMergedArgs {
-    /// A merge.json5 that names recipe, donors, options and out
+    /// A merge file (JSON5) with the recipe, donors, options and output directory
     #[arg(value_name = "MERGE_FILE", conflicts_with_all = ["recipe", "donor", "vision", "language"])]
     pub file: Option<PathBuf>,
-    /// Recipe: a name, or a JSON5 file
+    /// Name of a built-in recipe, or a JSON5 file
     #[arg(long, value_name = "NAME|FILE")]
     pub recipe: Option<String>,
-    /// Donor in a role; may be given several times
+    /// Checkpoint that supplies the parts of a role; may be repeated
     #[arg(long, value_name = "ROLE=DIR", value_parser = parse_pair)]
     pub donor: Vec<(String, String)>,
     /// Short for --donor vision=DIR
@@ -251,36 +266,36 @@ pub struct BuildMergedArgs {
     /// Short for --donor language=DIR
     #[arg(long, value_name = "DIR")]
     pub language: Option<PathBuf>,
-    /// Directory to make: must not exist, or be empty
+    /// Output directory; it must not exist, or be empty
     #[arg(long, value_name = "DIR", required_unless_present = "file")]
     pub out: Option<PathBuf>,
-    /// Option of the recipe; may be given several times
+    /// Set an option of the recipe; may be repeated
     #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
     pub set: Vec<(String, String)>,
-    /// Stop before anything is written
+    /// Plan and check the merge, and write nothing
     #[arg(long)]
     pub dry_run: bool,
-    /// Record the SHA-256 of every byte of the donors, not only of documents and headers
+    /// Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers
     #[arg(long)]
     pub hash: bool,
-    /// How to report.
+    /// Report formats and the exit code.
     #[command(flatten)]
     pub report: ReportArgs,
 }
 
-/// Least severity that fails.
+/// Lowest severity that fails.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum FailOn {
-    /// Anything at all.
+    /// Any finding
     Info,
-    /// Warnings and errors.
+    /// Warnings and errors
     Warning,
-    /// Errors.
+    /// Errors only
     Error,
 }
 
 impl FailOn {
-    /// The severity it names.
+    /// The severity of this name.
     pub const fn severity(self) -> Severity {
         match self {
             Self::Info => Severity::Info,
@@ -290,15 +305,20 @@ impl FailOn {
     }
 }
 
-/// When to use colours.
+/// When to print colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Color {
-    /// On a terminal.
+    /// On a terminal
     Auto,
-    /// Always.
+    /// Always
     Always,
-    /// Never.
+    /// Never
     Never,
+}
+
+/// Accepts the names of report formats, and lists them in the help.
+fn formats() -> impl clap::builder::TypedValueParser<Value = Format> {
+    PossibleValuesParser::new(Format::ALL.map(Format::name)).try_map(|word| word.parse::<Format>())
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {

@@ -12,16 +12,16 @@ use ckpt_doctor::report::model::CheckpointReport;
 use super::output;
 use super::settings::Resolved;
 
-/// Gone findings that are named.
+/// How many findings that no longer occur are listed.
 const NAMED: usize = 10;
 
-/// Sets the findings aside that are in the baselines, which are written first if that is asked for.
-pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool) -> anyhow::Result<()> {
+/// Moves findings that a baseline accepts to the suppressed ones; with `write`, writes the baselines first.
+pub fn apply_baselines(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool) -> anyhow::Result<()> {
     let mut of_file: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
     for (at, resolved) in by.iter().enumerate() {
         match &resolved.baseline {
             Some(file) => of_file.entry(file).or_default().push(at),
-            None if write => bail!("no baseline to write: --baseline FILE names it, or `baseline` in the settings"),
+            None if write => bail!("no baseline file given; pass --baseline FILE, or set `baseline` in the settings"),
             None => {}
         }
     }
@@ -33,7 +33,7 @@ pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool)
         let older = read(file, &name, write)?;
         let baseline = if write {
             let looked: Vec<&CheckpointReport> = here.iter().filter_map(|at| reports.get(*at)).collect();
-            let mut baseline = Baseline::of(looked.iter().copied(), &folder);
+            let mut baseline = Baseline::from_reports(looked.iter().copied(), &folder);
             if let Some(older) = older {
                 baseline.keep(older, &looked, &folder, &asked);
             }
@@ -41,7 +41,7 @@ pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool)
             output::note(&format!("{name}: {} findings", baseline.len()));
             baseline
         } else {
-            older.unwrap_or_else(|| Baseline::of(std::iter::empty(), &folder))
+            older.unwrap_or_else(|| Baseline::from_reports(std::iter::empty(), &folder))
         };
         let mut gone = Vec::new();
         for at in here {
@@ -51,7 +51,7 @@ pub fn apply(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], write: bool)
         }
         if !gone.is_empty() {
             output::note(&format!(
-                "note: gone since {name} was written ({}); --write-baseline drops them:",
+                "note: findings in {name} that no longer occur ({}); --write-baseline removes them:",
                 gone.len()
             ));
             for entry in gone.iter().take(NAMED) {
@@ -69,12 +69,12 @@ fn codes(resolved: &Resolved) -> impl Iterator<Item = &str> {
     resolved.knowledge.rules.rules.iter().map(|rule| rule.code.as_str())
 }
 
-/// The baseline in a file; one that is to be written may not be there yet.
+/// Reads a baseline; a missing file is fine if it will be written.
 fn read(file: &Path, name: &str, write: bool) -> anyhow::Result<Option<Baseline>> {
     if write && file.symlink_metadata().is_err() {
         return Ok(None);
     }
-    let text = read_capped(file, JSON_CAP).context("the baseline cannot be read; --write-baseline writes it")?;
+    let text = read_capped(file, JSON_CAP).context("the baseline cannot be read; --write-baseline creates it")?;
     let text = String::from_utf8(text).with_context(|| format!("{name}: not UTF-8"))?;
     Ok(Some(Baseline::parse(name, &text)?))
 }

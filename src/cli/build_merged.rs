@@ -2,25 +2,25 @@
 
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::{Knowledge, Severity};
+use ckpt_doctor::check::Severity;
 use ckpt_doctor::checkpoint::open::{JSON_CAP, read_capped};
 use ckpt_doctor::knowledge::recipe::{MergeFile, Recipe};
-use ckpt_doctor::knowledge::source;
-use ckpt_doctor::report::model::CheckpointReport;
-use ckpt_doctor::report::{Format, Report, Style, render};
-use ckpt_doctor::surgery::apply::ApplyError;
-use ckpt_doctor::surgery::merge::pipeline::{self, PipelineError, Request, Run};
+use ckpt_doctor::knowledge::rule::RuleSet;
+use ckpt_doctor::knowledge::{Knowledge, source};
+use ckpt_doctor::merge::{self, MergeRequest, MergeRun};
+use ckpt_doctor::report::model::{MergeStage, Role};
 
 use super::args::{BuildMergedArgs, FailOn};
-use super::{FINDINGS, library, output, signals};
+use super::exit::{CLEAN, FINDINGS};
+use super::{library, output, signals};
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let request = request(args)?;
-    let knowledge = Knowledge { library: library::with(rules)?, ..Knowledge::embedded()? };
+    let knowledge = Knowledge::with(RuleSet::embedded()?, library::with(rules)?)?;
+    let request = request(args, &knowledge.recipes)?;
     signals::install()?;
     let terminal = std::io::stderr().is_terminal();
     let mut last = 0;
@@ -31,52 +31,26 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
             output::progress(percent);
         }
     };
-    let summary = |run: &Run| render(&report(run, true), Format::Markdown, Style { cap: 1000, ..Style::default() });
-    let run = match pipeline::run(&request, &knowledge, &summary, &mut progress) {
-        Ok(run) => run,
-        Err(PipelineError::Apply(ApplyError::Interrupted)) => {
-            output::note("interrupted; nothing was written");
-            return Ok(signals::exit_code());
-        }
-        Err(error) => return Err(error.into()),
-    };
-    output::finish(&report(&run, false), &args.report, false).with_context(|| match &*run.record.stage {
-        "written" => format!("{} is written; its report is not", run.record.out),
-        _ => "the report".to_owned(),
+    let run = merge::run(&request, &knowledge, &mut progress)?;
+    let stage = run.record.stage;
+    output::finish(&run.report(), &args.report, false).with_context(|| match stage {
+        Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
+        _ => "the report could not be written".to_owned(),
     })?;
     // What matters is the result; findings on a donor that the merge repaired are told, not counted.
-    Ok(match run.record.stage.as_str() {
-        "written" | "dry-run" if args.report.exit_zero || !result_fails(&run, args) => super::CLEAN,
+    Ok(match stage {
+        Some(MergeStage::Written | MergeStage::DryRun) if args.report.exit_zero || !result_fails(&run, args) => CLEAN,
         _ => FINDINGS,
     })
 }
 
-fn result_fails(run: &Run, args: &BuildMergedArgs) -> bool {
+fn result_fails(run: &MergeRun, args: &BuildMergedArgs) -> bool {
     let least = args.report.fail_on.map_or(Severity::Error, FailOn::severity);
-    let result = run.looked.iter().rfind(|l| !l.role.starts_with("donor"));
-    result.is_some_and(|l| l.outcome.findings.iter().any(|f| f.severity >= least))
+    let result = run.checked.iter().rfind(|c| !matches!(c.role, Role::Donor(_)));
+    result.is_some_and(|c| c.outcome.findings.iter().any(|f| f.severity >= least))
 }
 
-/// The report of a run; `portable` names directories by their last component, for a file that travels.
-fn report(run: &Run, portable: bool) -> Report {
-    let name = |path: &Path| match path.file_name() {
-        Some(name) if portable => name.to_string_lossy().into_owned(),
-        _ => path.display().to_string(),
-    };
-    let checkpoints = run
-        .looked
-        .iter()
-        .map(|l| CheckpointReport::new(name(&l.path), Some(l.role.clone()), &l.checkpoint, &l.outcome))
-        .collect();
-    let mut record = run.record.clone();
-    if portable {
-        record.out = name(Path::new(&record.out));
-        record.donors = record.donors.iter().map(|(role, dir)| (role.clone(), name(Path::new(dir)))).collect();
-    }
-    Report::new(checkpoints, Some(record))
-}
-
-fn request(args: &BuildMergedArgs) -> anyhow::Result<Request> {
+fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRequest> {
     let mut options: BTreeMap<String, String> = BTreeMap::new();
     let mut donors: BTreeMap<String, PathBuf> = BTreeMap::new();
     let (mut recipe, mut out, mut base) = (args.recipe.clone(), args.out.clone(), PathBuf::new());
@@ -85,14 +59,15 @@ fn request(args: &BuildMergedArgs) -> anyhow::Result<Request> {
         path.parent().unwrap_or(Path::new("")).clone_into(&mut base);
         recipe = file.recipe;
         for (role, dir) in &file.donors {
-            let dir = dir.as_str().with_context(|| format!("{}: donor {role} is not a path", path.display()))?;
-            donors.insert(role.clone(), base.join(dir));
+            let dir =
+                dir.as_str().with_context(|| format!("{}: donor {role}: the value must be a path", path.display()))?;
+            donors.insert(role.clone(), tidy(base.join(dir)));
         }
         for (name, value) in &file.options {
             let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
             options.insert(name.clone(), value);
         }
-        out = out.or_else(|| Some(base.join(file.out)));
+        out = out.or_else(|| Some(tidy(base.join(file.out))));
     }
     let short = [("vision", &args.vision), ("language", &args.language)];
     let typed = args.donor.iter().map(|(role, dir)| (role.clone(), PathBuf::from(dir)));
@@ -102,7 +77,7 @@ fn request(args: &BuildMergedArgs) -> anyhow::Result<Request> {
         }
     }
     if donors.is_empty() {
-        bail!("no donors: give --vision DIR and --language DIR, or a merge file");
+        bail!("no donors given; pass --vision DIR and --language DIR, or a merge file");
     }
     // The command line has the last word over the file, but not over itself.
     let mut typed = BTreeMap::new();
@@ -112,23 +87,45 @@ fn request(args: &BuildMergedArgs) -> anyhow::Result<Request> {
         }
     }
     options.extend(typed);
-    let recipe = recipe.map(|name| find_recipe(&name, &base)).transpose()?;
-    let out = out.context("no --out")?;
-    Ok(Request { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
+    let recipe = recipe.map(|name| find_recipe(recipes, &name, &base)).transpose()?;
+    let out = out.context("no output directory given; pass --out DIR")?;
+    Ok(MergeRequest { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
+}
+
+/// `fixtures/../merged` as `merged`, unless a symbolic link makes the two different places.
+fn tidy(path: PathBuf) -> PathBuf {
+    let mut short = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::ParentDir if matches!(short.components().next_back(), Some(Component::Normal(_))) => {
+                short.pop();
+            }
+            Component::CurDir => {}
+            other => short.push(other),
+        }
+    }
+    // The last component may be missing: it is the output directory.
+    let parent = |path: &Path| {
+        let parent = path.parent()?;
+        if parent.as_os_str().is_empty() { Path::new(".") } else { parent }.canonicalize().ok()
+    };
+    match (parent(&path), parent(&short)) {
+        (Some(long), Some(other)) if long == other && path.file_name() == short.file_name() => short,
+        _ => path,
+    }
 }
 
 /// A recipe by name, or from a file.
-fn find_recipe(name: &str, base: &Path) -> anyhow::Result<Recipe> {
-    let embedded = Recipe::embedded()?;
-    if let Some(recipe) = embedded.iter().find(|r| r.recipe == name) {
+fn find_recipe(recipes: &[Recipe], name: &str, base: &Path) -> anyhow::Result<Recipe> {
+    if let Some(recipe) = recipes.iter().find(|r| r.recipe == name) {
         return Ok(recipe.clone());
     }
     let path = base.join(name);
     if path.extension().is_some_and(|e| e == "json5" || e == "json") {
         return Ok(Recipe::parse(&path.display().to_string(), &text(&path)?)?);
     }
-    let names: Vec<&str> = embedded.iter().map(|r| r.recipe.as_str()).collect();
-    bail!("no recipe {name}; there are {}, or a path of a .json5 file", names.join(", "));
+    let names: Vec<&str> = recipes.iter().map(|r| r.recipe.as_str()).collect();
+    bail!("{name}: unknown recipe; pass one of {}, or the path of a .json5 file", names.join(", "));
 }
 
 fn text(path: &Path) -> anyhow::Result<String> {

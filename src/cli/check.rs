@@ -6,17 +6,18 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::{Outcome, check_for, policy};
+use ckpt_doctor::check::{Outcome, check_for, unused_suppressions};
 use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints, owner};
 use ckpt_doctor::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
 use ckpt_doctor::report::{Report, fixes};
 
 use super::args::CheckArgs;
-use super::settings::{Resolved, Resolver, Typed};
-use super::{CLEAN, FINDINGS, baseline, fix, output, signals, unasked};
+use super::exit::{CLEAN, FINDINGS};
+use super::settings::{Resolved, SettingsResolver, Typed};
+use super::{baseline, fix, output, signals, unasked};
 
-/// A checkpoint that was looked at.
-struct Looked {
+/// A checkpoint, the result of checking it and the settings it was checked under.
+struct Checked {
     dir: PathBuf,
     checkpoint: Arc<Checkpoint>,
     outcome: Outcome,
@@ -27,7 +28,7 @@ struct Looked {
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let mut settings = Resolver::new(Typed::check(args, rules));
+    let mut settings = SettingsResolver::new(Typed::check(args, rules));
     let mut seen = BTreeSet::new();
     let mut dirs = Vec::new();
     for path in &args.paths {
@@ -64,7 +65,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         return Ok(if fixed { FINDINGS } else { CLEAN });
     }
     let by: Vec<Rc<Resolved>> = looked.iter().map(|l| Rc::clone(&l.by)).collect();
-    baseline::apply(&mut reports, &by, args.baseline.write_baseline)?;
+    baseline::apply_baselines(&mut reports, &by, args.baseline.write_baseline)?;
     let fails =
         |(report, by): (&CheckpointReport, &Rc<Resolved>)| report.counts.worst().is_some_and(|w| w >= by.fail_on);
     let failed = reports.iter().zip(&by).any(fails);
@@ -86,7 +87,7 @@ fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     }
     let found = find_checkpoints(path);
     if found.is_empty() && path.is_dir() {
-        bail!("{}: no checkpoint there (no config.json, adapter_config.json, index or *.safetensors)", path.display());
+        bail!("{}: no checkpoint found (no config.json, adapter_config.json, index or *.safetensors)", path.display());
     }
     Ok(found)
 }
@@ -96,8 +97,8 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
     |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
 }
 
-fn look(dir: PathBuf, args: &CheckArgs, settings: &mut Resolver) -> anyhow::Result<Looked> {
-    let by = settings.of(&dir)?;
+fn look(dir: PathBuf, args: &CheckArgs, settings: &mut SettingsResolver) -> anyhow::Result<Checked> {
+    let by = settings.resolve(&dir)?;
     let open = |dir: &Path| {
         let mut checkpoint = Checkpoint::open(dir).with_context(|| dir.display().to_string())?;
         if args.deep {
@@ -113,21 +114,21 @@ fn look(dir: PathBuf, args: &CheckArgs, settings: &mut Resolver) -> anyhow::Resu
         bail!("{origin}: {} on {}: {}", rule.code, dir.display(), rule.why);
     }
     if !args.fix.writes() {
-        return Ok(Looked { dir, checkpoint, outcome, by, repaired: Default::default() });
+        return Ok(Checked { dir, checkpoint, outcome, by, repaired: Default::default() });
     }
     let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } =
         fix::repair(&args.fix, dir, &checkpoint, outcome, &open, &check_by(&by))?;
-    Ok(Looked { dir, checkpoint, outcome, by, repaired: (fixed, withdrawn) })
+    Ok(Checked { dir, checkpoint, outcome, by, repaired: (fixed, withdrawn) })
 }
 
 /// Adds a finding for each suppression that had nothing to suppress.
-fn suppressions_without_use(looked: &mut [Looked], settings: &Resolver, searched: &[PathBuf]) {
+fn suppressions_without_use(looked: &mut [Checked], settings: &SettingsResolver, searched: &[PathBuf]) {
     for resolved in settings.all() {
         let here: Vec<usize> =
             looked.iter().enumerate().filter(|(_, l)| Rc::ptr_eq(&l.by, resolved)).map(|(at, _)| at).collect();
         let outcomes: Vec<_> =
             here.iter().filter_map(|at| looked.get(*at)).map(|l| (Arc::clone(&l.checkpoint), &l.outcome)).collect();
-        let unused = policy::unused(&resolved.knowledge, &outcomes, searched);
+        let unused = unused_suppressions(&resolved.knowledge, &outcomes, searched);
         for (at, finding) in unused {
             if let Some(looked) = here.get(at).and_then(|at| looked.get_mut(*at)) {
                 looked.outcome.findings.push(finding);

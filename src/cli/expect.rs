@@ -1,4 +1,4 @@
-//! `expect`: what a model class has, by its config alone.
+//! `expect`: the tensors of a model class, from its config alone.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,9 +13,10 @@ use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::args::{ExpectArgs, ExpectFormat};
-use super::{CLEAN, FINDINGS, library, output};
+use super::exit::{CLEAN, FINDINGS};
+use super::{library, output};
 
-/// A line of `@FILE`; what else it has is ignored.
+/// One line of `@FILE`; other keys are ignored.
 #[derive(Deserialize)]
 struct Record {
     config: Value,
@@ -23,13 +24,13 @@ struct Record {
     class: Option<String>,
 }
 
-/// A config, and how to speak of it.
+/// A config, and the name of its source in messages.
 struct Asked {
     source: String,
     record: Result<Record, String>,
 }
 
-/// What came of it.
+/// The expected tensors of a config, or why there are none.
 struct Answer {
     source: String,
     /// The loader that was asked, or the version for which none was found.
@@ -83,13 +84,14 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) 
         match read.with_context(|| path.display().to_string())? {
             0 => break,
             _ if !line.ends_with(b"\n") && u64::try_from(line.len()).is_ok_and(|n| n >= JSON_CAP) => {
-                bail!("{source}: a line of more than {JSON_CAP} bytes")
+                bail!("{source}: the line is longer than {JSON_CAP} bytes")
             }
             _ if line.trim_ascii().is_empty() => {}
             _ => {
                 // Python writes infinities that are not JSON: those take the longer way.
                 let record = serde_json::from_slice(&line).or_else(|strict| {
-                    serde_json::from_value(parse(&line)?).map_err(|_| format!("no object with a \"config\": {strict}"))
+                    serde_json::from_value(parse(&line)?)
+                        .map_err(|_| format!("not a JSON object with a \"config\": {strict}"))
                 });
                 answer(Asked { source, record })?;
             }
@@ -98,11 +100,11 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) 
     Ok(())
 }
 
-/// JSON as checkpoints have it.
+/// Parses a config as `check` does: lenient about what Python writes.
 fn parse(bytes: &[u8]) -> Result<Value, String> {
     let document = Document::parse("config.json", bytes);
     document.value.ok_or_else(|| {
-        let kind = document.faults.first().map_or("not JSON", |f| f.kind);
+        let kind = document.faults.first().map_or("not JSON", |f| f.kind.name());
         format!("the config cannot be read: {kind}")
     })
 }
@@ -119,12 +121,18 @@ fn build(library: &Library, asked: Asked, version: Option<&str>) -> Answer {
             None => library.stands_for(&version, &config, &[]),
         };
         let unknown = || {
+            let known = |other: &Loader| match &class {
+                Some(class) => library.class(class, *other).is_some(),
+                None => library.find(&config, [], *other).is_some(),
+            };
+            let hint = Loader::ALL.into_iter().find(known);
+            let hint = hint.map_or_else(String::new, |other| format!("; try --for transformers=={other}"));
             let class = class.as_deref().or_else(|| config.pointer("/architectures/0")?.as_str());
             let model_type = config.get("model_type").and_then(Value::as_str);
             format!(
-                "no architecture is known for class {} and model type {} under transformers {version}",
-                class.unwrap_or("none"),
-                model_type.unwrap_or("none")
+                "no architecture is known for class {} and model_type {} under transformers {version}{hint}",
+                class.unwrap_or("(missing)"),
+                model_type.unwrap_or("(missing)")
             )
         };
         let (loader, architecture) = found.ok_or_else(unknown)?;

@@ -1,4 +1,4 @@
-//! `check --fix` and what belongs to it.
+//! `check --fix`, `--diff` and `--output`.
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -10,42 +10,43 @@ use ckpt_doctor::checkpoint::{Checkpoint, escape};
 use ckpt_doctor::report::model::{Fixed, Withdrawn};
 use ckpt_doctor::report::{diff, fixes};
 use ckpt_doctor::surgery::journal::{self, Recovered};
-use ckpt_doctor::surgery::repair::{Repair, overlay, plan};
+use ckpt_doctor::surgery::repair::{Repair, plan};
+use ckpt_doctor::surgery::{ApplyError, RepairError, overlay};
 
 use super::args::FixArgs;
 use super::output;
 
 /// What judges a checkpoint.
-type Check<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
+type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
 
 impl FixArgs {
-    /// Whether anything is to be written.
+    /// Whether this run writes repairs.
     pub const fn writes(&self) -> bool {
         (self.fix || self.fix_only) && !self.diff
     }
 
-    /// Refuses what cannot be meant.
+    /// Rejects combinations of options that make no sense.
     pub fn refuse(&self, checkpoints: usize) -> anyhow::Result<()> {
         if self.output.is_some() && !self.writes() {
-            bail!("--output needs --fix");
+            bail!("--output requires --fix");
         }
         if self.output.is_some() && checkpoints > 1 {
-            bail!("--output takes one checkpoint, and there are {checkpoints}");
+            bail!("--output accepts one checkpoint, but {checkpoints} were found");
         }
         Ok(())
     }
 }
 
-/// Finishes or takes back what an earlier run was interrupted in, before the checkpoint is looked at.
+/// Finishes or rolls back a repair that was interrupted, before the checkpoint is checked.
 pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
     if args.writes() && args.output.is_none() {
         let done = match journal::recover(dir)? {
             None => return Ok(()),
             Some(Recovered::Finished) => "finished",
-            Some(Recovered::TakenBack) => "taken back",
+            Some(Recovered::TakenBack) => "rolled back",
         };
         let dir = escape(&dir.display().to_string(), 300);
-        output::note(&format!("{dir}: an interrupted repair is {done}"));
+        output::note(&format!("{dir}: {done} an interrupted repair"));
     }
     Ok(())
 }
@@ -67,7 +68,7 @@ pub fn repair(
     checkpoint: &Arc<Checkpoint>,
     outcome: Outcome,
     open: &dyn Fn(&Path) -> anyhow::Result<Arc<Checkpoint>>,
-    check: Check<'_>,
+    check: CheckFn<'_>,
 ) -> anyhow::Result<Repaired> {
     let repair = plan(checkpoint, outcome, args.unsafe_fixes, check);
     let written = write(args, &dir, &repair)?;
@@ -99,11 +100,19 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         }
     };
     if let Some(out) = &args.output {
-        overlay(repair, out, &mut progress)?;
+        overlay(repair, out, &mut progress).map_err(|error| name_interrupted(error, out))?;
         return Ok(Some(out.clone()));
     }
-    journal::write(repair, &mut progress)?;
+    journal::write(repair, &mut progress).map_err(|error| name_interrupted(error, dir))?;
     Ok(Some(dir.to_owned()))
+}
+
+/// Names the directory that an interrupted repair did not write: others may have been repaired before it.
+fn name_interrupted(error: RepairError, dir: &Path) -> anyhow::Error {
+    match error {
+        RepairError::Apply(ApplyError::Interrupted) => anyhow::Error::new(error).context(dir.display().to_string()),
+        other => other.into(),
+    }
 }
 
 /// Shows what the fixes of a checkpoint would change; how many there are.
@@ -112,7 +121,7 @@ pub fn show(
     dir: &Path,
     checkpoint: &Arc<Checkpoint>,
     outcome: &Outcome,
-    check: Check<'_>,
+    check: CheckFn<'_>,
 ) -> anyhow::Result<usize> {
     let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, check);
     output::print(&diff::render(&dir.display().to_string(), &repair))?;

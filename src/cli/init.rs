@@ -4,7 +4,8 @@ use anyhow::{Context, bail};
 use ckpt_doctor::knowledge::settings::FILE;
 
 use super::args::InitArgs;
-use super::{CLEAN, output};
+use super::exit::CLEAN;
+use super::output;
 
 /// What `init` writes: every key, commented out, as it stands without it.
 const SETTINGS: &str = include_str!("init/ckpt-doctor.json5");

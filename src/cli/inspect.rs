@@ -8,7 +8,8 @@ use ckpt_doctor::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use ckpt_doctor::report::inspect as report;
 
 use super::args::{InspectArgs, InspectFormat};
-use super::{CLEAN, library, output};
+use super::exit::CLEAN;
+use super::{library, output};
 
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -21,7 +22,7 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     } else {
         let found = find_checkpoints(path);
         let [dir] = found.as_slice() else {
-            bail!("{}: {} checkpoints there; name one, or a .safetensors file", path.display(), found.len());
+            bail!("{}: contains {} checkpoints; pass one of them, or a .safetensors file", path.display(), found.len());
         };
         Checkpoint::open(dir).with_context(|| dir.display().to_string())?
     };
@@ -34,7 +35,7 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(CLEAN)
 }
 
-/// A shard with neither a config nor an index beside it is looked at by itself.
+/// A shard without a config and an index beside it, as a checkpoint of its own.
 fn alone(path: &Path) -> Option<Checkpoint> {
     if !path.is_file() || path.extension().is_none_or(|e| e != "safetensors") {
         return None;

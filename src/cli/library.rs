@@ -37,7 +37,7 @@ fn texts(rules: Option<&Path>, folder: &str) -> anyhow::Result<Vec<(String, Stri
         }
     }
     if files.is_empty() {
-        bail!("{} has neither architectures/*.json5 nor checks/**/*.json5", rules.display());
+        bail!("{} contains neither architectures/*.json5 nor checks/**/*.json5", rules.display());
     }
     files.retain(|file| file.starts_with(rules.join(folder)));
     files.sort();

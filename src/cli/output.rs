@@ -9,17 +9,17 @@ use ckpt_doctor::report::{Format, Report, Style, render, statistics};
 
 use super::args::{Color, ReportArgs};
 
-/// A line on standard error. Where that cannot be written to (a full disk, a closed pipe) nobody listens, and
-/// `eprintln` would panic.
+/// Prints a line to standard error. A failure (full disk, closed pipe) is ignored; `eprintln` would panic.
 pub fn note(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// Prints the report, or statistics of it, and writes those asked for.
+/// Prints the report or its statistics, and writes the files of `--report`.
 pub fn finish(report: &Report, args: &ReportArgs, counted: bool) -> anyhow::Result<()> {
     let text = if counted {
         let format = args.output_format;
-        statistics(report, format).with_context(|| format!("--statistics has no form as {format}"))?
+        statistics(report, format)
+            .with_context(|| format!("--statistics supports the formats full, concise and json, not {format}"))?
     } else {
         render(report, args.output_format, style(args.color))
     };
@@ -46,13 +46,13 @@ pub fn style(color: Color) -> Style {
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        // The reader of a pipe has seen enough.
+        // The reader closed the pipe, as `head` does: no error.
         Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         other => other.context("writing to standard output"),
     }
 }
 
-/// Writes a report where the user asked for it.
+/// Writes a report to the file that the user named.
 #[expect(clippy::disallowed_methods, reason = "a report, not a checkpoint")]
 pub fn write(file: &Path, text: &str) -> std::io::Result<()> {
     fs::write(file, text)
@@ -63,7 +63,7 @@ pub fn safe(line: &str) -> String {
     ckpt_doctor::checkpoint::escape(line, 4000)
 }
 
-/// Writes a file that must not be there yet.
+/// Writes a new file; fails if it exists.
 pub fn create(file: &Path, text: &str) -> std::io::Result<()> {
     fs::OpenOptions::new().write(true).create_new(true).open(file)?.write_all(text.as_bytes())
 }

@@ -8,12 +8,13 @@ use ckpt_doctor::knowledge::rule::Rule;
 use comfy_table::{Table, presets};
 
 use super::args::{ExplainArgs, SettingsArgs};
-use super::settings::{Resolver, Typed};
-use super::{CLEAN, output};
+use super::exit::CLEAN;
+use super::output;
+use super::settings::{SettingsResolver, Typed};
 
 /// Runs `rules`: a line for each that is asked here.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let here = Resolver::new(Typed::new(args, rules)).of(Path::new("."))?;
+    let here = SettingsResolver::new(Typed::new(args, rules)).resolve(Path::new("."))?;
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
     for rule in &here.knowledge.rules.rules {
@@ -26,7 +27,7 @@ pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 
 /// Runs `explain`: all there is to say of one rule.
 pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let here = Resolver::new(Typed::new(&args.settings, rules)).of(Path::new("."))?;
+    let here = SettingsResolver::new(Typed::new(&args.settings, rules)).resolve(Path::new("."))?;
     output::print(&page(here.knowledge.rules.find(&args.rule)?)?)?;
     Ok(CLEAN)
 }

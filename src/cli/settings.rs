@@ -1,32 +1,32 @@
-//! From what was typed and what settings files say to what is meant.
+//! Resolves command line and settings files to the options of each checkpoint.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use ckpt_doctor::check::{Knowledge, Severity};
-use ckpt_doctor::knowledge::processor::Processor;
+use ckpt_doctor::check::Severity;
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, nearest};
 
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
 
-/// What is meant for the checkpoints of one settings file.
+/// Resolved options for the checkpoints under one settings file.
 pub struct Resolved {
     /// The settings file, if there is one.
     pub file: Option<PathBuf>,
-    /// What the checks know, the settings included.
+    /// Rules, architectures and policy of the checks.
     pub knowledge: Knowledge,
     /// Versions to predict the load for.
     pub versions: Vec<String>,
-    /// Least severity that fails.
+    /// Lowest severity that fails.
     pub fail_on: Severity,
     /// The baseline.
     pub baseline: Option<PathBuf>,
 }
 
-/// What was typed. It has the last word over every settings file.
+/// Options of the command line. They override every settings file.
 #[derive(Default)]
 pub struct Typed {
     config: Option<PathBuf>,
@@ -39,7 +39,7 @@ pub struct Typed {
 }
 
 impl Typed {
-    /// Which settings and rules.
+    /// The options that all commands with settings share.
     pub fn new(settings: &SettingsArgs, rules: Option<&Path>) -> Self {
         Self {
             config: settings.config.clone(),
@@ -49,7 +49,7 @@ impl Typed {
         }
     }
 
-    /// As `check` has it.
+    /// The options of `check`.
     pub fn check(args: &CheckArgs, rules: Option<&Path>) -> Self {
         Self {
             choice: Choice {
@@ -66,19 +66,19 @@ impl Typed {
 }
 
 /// Finds the settings of checkpoints, and reads each file once.
-pub struct Resolver {
+pub struct SettingsResolver {
     typed: Typed,
-    read: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
+    resolved: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
     told: BTreeSet<PathBuf>,
 }
 
-impl Resolver {
+impl SettingsResolver {
     pub fn new(typed: Typed) -> Self {
-        Self { typed, read: BTreeMap::new(), told: BTreeSet::new() }
+        Self { typed, resolved: BTreeMap::new(), told: BTreeSet::new() }
     }
 
-    /// What is meant for the checkpoint in this directory.
-    pub fn of(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
+    /// The options for the checkpoint in this directory.
+    pub fn resolve(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
         let file = if self.typed.isolated {
             None
         } else if let Some(config) = &self.typed.config {
@@ -89,24 +89,26 @@ impl Resolver {
                 && self.told.insert(passed_over.clone())
             {
                 let file = output::safe(&passed_over.display().to_string());
-                output::note(&format!("note: {file} lies in a checkpoint and is not used; --config {file} uses it"));
+                output::note(&format!(
+                    "note: {file} is inside a checkpoint and is ignored; pass --config {file} to use it"
+                ));
             }
             found.file
         };
-        if let Some(resolved) = self.read.get(&file) {
+        if let Some(resolved) = self.resolved.get(&file) {
             return Ok(Rc::clone(resolved));
         }
-        let resolved = Rc::new(self.resolve(file.clone())?);
-        self.read.insert(file, Rc::clone(&resolved));
+        let resolved = Rc::new(self.read(file.clone())?);
+        self.resolved.insert(file, Rc::clone(&resolved));
         Ok(resolved)
     }
 
-    /// Every settings file that was found, and what it means.
+    /// The options of every settings file found so far.
     pub fn all(&self) -> impl Iterator<Item = &Rc<Resolved>> {
-        self.read.values()
+        self.resolved.values()
     }
 
-    fn resolve(&self, file: Option<PathBuf>) -> anyhow::Result<Resolved> {
+    fn read(&self, file: Option<PathBuf>) -> anyhow::Result<Resolved> {
         let typed = &self.typed;
         let chain = file.as_deref().map(Chain::load).transpose()?.unwrap_or_default();
         let folder = typed.rules.clone().or_else(|| chain.rules());
@@ -115,7 +117,7 @@ impl Resolver {
         let library = library::with(folder.as_deref())?;
         let versions = if typed.versions.is_empty() { chain.versions()? } else { typed.versions.clone() };
         Ok(Resolved {
-            knowledge: Knowledge { rules, library, processors: Processor::embedded()?, policy },
+            knowledge: Knowledge { policy, ..Knowledge::with(rules, library)? },
             versions,
             fail_on: typed.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
             baseline: typed.baseline.clone().or_else(|| chain.baseline()),

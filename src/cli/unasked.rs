@@ -1,4 +1,4 @@
-//! `-v`: why rules were not asked.
+//! `-v`: why rules were skipped.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,7 +12,7 @@ use super::output;
 /// Longest reason, in characters; `explain` shows a condition in full.
 const REASON: usize = 100;
 
-/// Says of each rule that was not asked why; those with the same reason together.
+/// Prints why each skipped rule was skipped; rules with the same reason share a line.
 pub fn say(dir: &Path, outcome: &Outcome, rules: &RuleSet) {
     let mut reasons: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for skipped in &outcome.skipped {
@@ -20,7 +20,7 @@ pub fn say(dir: &Path, outcome: &Outcome, rules: &RuleSet) {
     }
     let all: Vec<&str> = rules.all().map(|rule| rule.code.as_str()).collect();
     output::note(&output::safe(&format!(
-        "{}: {} of {} rules not asked",
+        "{}: {} of {} rules skipped",
         dir.display(),
         outcome.skipped.len(),
         all.len()

@@ -6,7 +6,8 @@ use ckpt_doctor::checkpoint::escape;
 use ckpt_doctor::surgery::journal;
 
 use super::args::UndoArgs;
-use super::{CLEAN, output, signals};
+use super::exit::CLEAN;
+use super::{output, signals};
 
 /// Runs `undo`.
 pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {

@@ -20,6 +20,9 @@ pub struct Processor {
     pub lets: Vec<Let>,
     /// In the order in which they are added; one that is there already keeps its id.
     pub add: Vec<TokenRun>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// A name for an expression.

@@ -4,17 +4,16 @@
 //! stand a few others, whose names and shapes follow from the plain one's.
 
 mod applied;
-
-use std::sync::OnceLock;
+mod declared;
 
 use serde::Deserialize;
-use serde_json::Value;
 
-use super::expression::{Expression, Scope};
+use super::expression::Expression;
 use super::processor::Let;
 use super::source::{self, DataError};
 
-pub use applied::{Applied, Shapes};
+pub use applied::{AppliedScheme, Shapes};
+pub use declared::{DeclaredScheme, block, declared_scheme};
 
 /// A scheme as its file gives it.
 ///
@@ -70,7 +69,7 @@ pub struct Scheme {
     #[serde(default)]
     pub skipped_are_modules: bool,
     /// What stands in place of the plain tensor; the first one holds the values.
-    pub tensors: Vec<Part>,
+    pub tensors: Vec<StoredPart>,
     /// Endings of tensors that a quantised module may have although the class has not.
     #[serde(default)]
     pub extra: Vec<String>,
@@ -80,6 +79,9 @@ pub struct Scheme {
     /// What transformers says of an incomplete module, when it raises; `{tensor}` is the plain name.
     #[serde(default)]
     pub raises: Option<String>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// A value that shapes depend on.
@@ -103,7 +105,7 @@ pub struct Parameter {
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Part {
+pub struct StoredPart {
     /// How its name ends.
     pub name: String,
     /// Its shape; null, or no expression, for any.
@@ -116,32 +118,13 @@ pub struct Part {
     pub required: Option<Expression>,
 }
 
-/// What a config says of how the weights are stored.
-pub enum Said {
-    /// Plainly.
-    Plain,
-    /// By a scheme that is not known here.
-    Unknown(String),
-    /// By this one.
-    Known(Box<Applied>),
-}
-
 impl Scheme {
     /// The schemes inside the program.
     ///
     /// # Errors
     /// [`DataError`]; the house tests see to it that there is none.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
-        source::embedded("quantization").iter().map(|(path, text)| source::parse(path, text)).collect()
-    }
-
-    /// The same, read once and only when a checkpoint is quantised.
-    ///
-    /// # Panics
-    /// As [`Self::embedded`] has errors.
-    pub fn all() -> &'static [Self] {
-        static ALL: OnceLock<Vec<Scheme>> = OnceLock::new();
-        ALL.get_or_init(|| Self::embedded().unwrap_or_else(|e| panic!("{e}")))
+        source::embedded("quantization").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 
     /// Endings of its tensors, in order.
@@ -153,40 +136,5 @@ impl Scheme {
     #[must_use]
     pub fn keeps_name(&self) -> bool {
         self.tensors.first().is_some_and(|part| part.name == self.plain)
-    }
-}
-
-/// The block of a config.json that is about quantisation, and the JSON pointer to it.
-///
-/// MLX writes `quantization` and, since 2024, the same again as `quantization_config`; compositions may have it in
-/// their text part. Source: `get_hf_quantizer` of transformers 5.23.0, `load_model` of mlx-lm.
-#[must_use]
-pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
-    ["/quantization_config", "/quantization", "/text_config/quantization_config"]
-        .into_iter()
-        .find_map(|pointer| Some((pointer, config.pointer(pointer).filter(|block| block.is_object())?)))
-}
-
-/// How the weights are stored, by the config.
-#[must_use]
-pub fn said(config: &Value) -> Said {
-    let Some((pointer, block)) = block(config) else { return Said::Plain };
-    let mut scope = Scope::new();
-    scope.bind("config", config);
-    scope.bind("q", block);
-    let meant = |scheme: &&Scheme| scheme.when.eval_bool(&scope).unwrap_or(false);
-    match Scheme::all().iter().find(meant) {
-        Some(scheme) => Said::Known(Box::new(Applied::new(scheme, config, (pointer, block)))),
-        None => Said::Unknown(method(block)),
-    }
-}
-
-/// What a config calls a scheme that is not known.
-fn method(block: &Value) -> String {
-    let text = |key: &str| block.get(key).and_then(Value::as_str);
-    match (text("quant_method"), text("format")) {
-        (Some(method), Some(format)) => format!("{method} ({format})"),
-        (Some(method), None) => method.to_owned(),
-        (None, _) => "a method it does not name".to_owned(),
     }
 }

@@ -46,6 +46,9 @@ pub struct Recipe {
     /// Sentences about what the merge decided that a person should know.
     #[serde(default)]
     pub notes: Vec<Note>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// A donor role.
@@ -150,14 +153,14 @@ pub struct DocumentSpec {
     pub non_finite: Option<Value>,
     /// Changes, in order.
     #[serde(default)]
-    pub edits: Vec<Edit>,
+    pub edits: Vec<DocumentEdit>,
 }
 
 /// A change to a document.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum Edit {
+pub enum DocumentEdit {
     /// Sets a value; missing objects on the way are made.
     Set(SetEdit),
     /// Puts a donor's config there.
@@ -382,4 +385,7 @@ pub struct MergeFile {
     pub options: Map<String, Value>,
     /// Directory to make.
     pub out: String,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }

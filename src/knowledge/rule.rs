@@ -1,14 +1,15 @@
 //! Rules: what to look for, why it matters and what to say; one JSON5 file each.
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 mod fix;
 
-pub use fix::{EditSpec, Fix, REPAIRS, Safety};
+pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template};
 use super::source::{self, DataError};
-use crate::checkpoint::fault::FAULT_KINDS;
+use crate::checkpoint::FaultKind;
 
 /// How bad a finding is; a rule says it for all of its findings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -70,6 +71,9 @@ pub struct Rule {
     /// The file it was read from, for a user's own rule.
     #[serde(skip)]
     pub origin: Option<String>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    pub schema: Option<String>,
 }
 
 /// The kinds of check. Adding a rule rarely needs another.
@@ -89,8 +93,9 @@ pub enum Check {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct FaultCheck {
-    /// Kinds, as the reader and the comparisons name them.
-    pub kinds: Vec<String>,
+    /// Kinds of fault.
+    #[serde(deserialize_with = "fault_kinds")]
+    pub kinds: Vec<FaultKind>,
     /// Only faults for which this holds; it sees what the message sees.
     #[serde(default)]
     pub only: Option<Expression>,
@@ -160,7 +165,7 @@ impl RuleSet {
     /// Rules from named texts.
     ///
     /// # Errors
-    /// [`DataError`] for a text that is no rule, a code given twice, or an unknown kind of fault.
+    /// [`DataError`] for a text that is no rule, a code given twice, or a file or repair that does not exist.
     pub fn from_files<'a>(files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
         Self::default().and_files(files)
     }
@@ -188,11 +193,6 @@ impl RuleSet {
             if !is_code(&rule.code) {
                 return wrong(format!("`{}` is no code: capitals for the family, then digits, as IDX005", rule.code));
             }
-            if let Check::Fault(f) = &rule.check
-                && let Some(kind) = f.kinds.iter().find(|k| !is_known_kind(k))
-            {
-                return wrong(format!("no such kind of fault: {kind}"));
-            }
             for edit in rule.fixes.iter().flat_map(|f| &f.edits) {
                 if let Err(reason) = edit.check() {
                     return wrong(reason);
@@ -216,79 +216,15 @@ fn is_code(code: &str) -> bool {
         && (1..=8).contains(&code.len().saturating_sub(family.len()))
 }
 
-/// Kinds of fault that the comparisons in `check` produce, beside those of the reader ([`FAULT_KINDS`]).
-pub const COMPARISON_KINDS: &[&str] = &[
-    "adapter-base-is-a-path",
-    "adapter-dora-disagrees",
-    "adapter-key-unread",
-    "adapter-magnitude-misshapen",
-    "adapter-module-not-saved",
-    "adapter-module-untargeted",
-    "adapter-of-a-model",
-    "adapter-pair-incomplete",
-    "adapter-rank-disagrees",
-    "adapter-rank-unusable",
-    "adapter-type-missing",
-    "adapter-type-unchecked",
-    "adapter-weights-missing",
-    "adapter-without-matrices",
-    "added-tokens-disagree",
-    "all-shards-absent",
-    "alias-misses-import",
-    "auto-map-class-missing",
-    "auto-map-malformed",
-    "auto-map-module-missing",
-    "auto-map-nested-missing",
-    "auto-map-remote",
-    "auto-map-unsafe-path",
-    "config-incomputable",
-    "config-outvoted",
-    "empty-tensors",
-    "index-key-nowhere",
-    "index-missing",
-    "index-names-other-shard",
-    "layer-lacks-tensor",
-    "lfs-sizes-below-total",
-    "load-raises",
-    "loads-differ",
-    "missing-tensors",
-    "module-needs-package",
-    "mismatched-tensor",
-    "names-moved",
-    "no-weights",
-    "pickle-weights",
-    "plain-though-quantized",
-    "prefix-hijack",
-    "quantize-config-disagrees",
-    "quantized-config-plain-tensors",
-    "quantized-dtype-wrong",
-    "quantized-for-another-loader",
-    "quantized-module-incomplete",
-    "quantized-shape-wrong",
-    "quantized-though-skipped",
-    "quantized-undeclared",
-    "relative-import-missing",
-    "shard-missing",
-    "shard-name-differs-in-case",
-    "shard-tensor-not-in-index",
-    "single-file-beside-index",
-    "stray-shard",
-    "suppression-unused",
-    "tensor-in-two-shards",
-    "tied-over",
-    "tied-over-another",
-    "token-above-rows",
-    "token-hole",
-    "token-id-twice",
-    "total-size-not-of-class",
-    "total-size-wrong",
-    "unexpected-tensors",
-    "unknown-architecture",
-    "unknown-quantization",
-];
-
-/// Whether some stage produces faults of this kind.
-#[must_use]
-pub fn is_known_kind(kind: &str) -> bool {
-    FAULT_KINDS.contains(&kind) || COMPARISON_KINDS.contains(&kind)
+/// Kinds of fault by their names; the error for an unknown one suggests the nearest name.
+fn fault_kinds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<FaultKind>, D::Error> {
+    let names = Vec::<String>::deserialize(deserializer)?;
+    let kind = |name: &String| {
+        FaultKind::from_name(name).ok_or_else(|| {
+            let near = source::nearest(name, FaultKind::ALL.iter().map(|kind| kind.name()));
+            let hint = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
+            D::Error::custom(format!("there is no kind of fault `{name}`{hint}"))
+        })
+    };
+    names.iter().map(kind).collect()
 }

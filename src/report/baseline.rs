@@ -9,9 +9,9 @@ use std::path::{Component, Path};
 use serde::{Deserialize, Serialize};
 
 use super::ci::{of_finding, tidy};
+use super::format::{name, sentence};
 use super::json;
 use super::model::CheckpointReport;
-use super::words::{name, sentence};
 use crate::check::finding::Accepted;
 use crate::knowledge::settings::absolute;
 use crate::knowledge::source::{self, DataError};
@@ -25,13 +25,16 @@ const SCHEMA: u32 = 1;
 pub struct Baseline {
     schema: u32,
     /// By checkpoint, rule and message.
-    findings: Vec<Entry>,
+    findings: Vec<BaselineEntry>,
+    /// Path or URL of a JSON Schema, for editors; the program keeps it and ignores it.
+    #[serde(default, rename = "$schema", skip_serializing_if = "Option::is_none")]
+    for_editors: Option<String>,
 }
 
 /// One finding. All but the fingerprint is for people.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
-pub struct Entry {
+pub struct BaselineEntry {
     /// The checkpoint, from the baseline's folder.
     pub path: String,
     /// Rule code.
@@ -56,19 +59,20 @@ impl Baseline {
     }
 
     /// What was found in these checkpoints, for a file in `folder`.
-    pub fn of<'r>(reports: impl Iterator<Item = &'r CheckpointReport>, folder: &Path) -> Self {
-        let mut findings: Vec<Entry> = reports.flat_map(|report| entries(report, folder)).collect();
+    pub fn from_reports<'r>(reports: impl Iterator<Item = &'r CheckpointReport>, folder: &Path) -> Self {
+        let mut findings: Vec<BaselineEntry> = reports.flat_map(|report| entries(report, folder)).collect();
         findings.sort();
-        Self { schema: SCHEMA, findings }
+        Self { schema: SCHEMA, findings, for_editors: None }
     }
 
     /// Keeps of an older baseline what this one cannot speak of: other checkpoints, and rules that were not asked.
     pub fn keep(&mut self, older: Self, reports: &[&CheckpointReport], folder: &Path, asked: &BTreeSet<&str>) {
         let paths: BTreeSet<String> = reports.iter().map(|report| below(folder, report)).collect();
-        let other = |e: &Entry| !paths.contains(&e.path) || !asked.contains(e.code.as_str());
+        let other = |e: &BaselineEntry| !paths.contains(&e.path) || !asked.contains(e.code.as_str());
         self.findings.extend(older.findings.into_iter().filter(other));
         self.findings.sort();
         self.findings.dedup();
+        self.for_editors = older.for_editors;
     }
 
     /// The text of the file.
@@ -97,25 +101,32 @@ impl Baseline {
         file: &str,
         folder: &Path,
         asked: &BTreeSet<&str>,
-    ) -> Vec<&Entry> {
+    ) -> Vec<&BaselineEntry> {
         let here = entries(report, folder);
         let known: BTreeSet<&str> = self.findings.iter().map(|e| e.fingerprint.as_str()).collect();
-        let is_known = |number| here.get(number).is_some_and(|e: &Entry| known.contains(e.fingerprint.as_str()));
+        let is_known =
+            |number| here.get(number).is_some_and(|e: &BaselineEntry| known.contains(e.fingerprint.as_str()));
         report.accept(|number, _| is_known(number).then(|| Accepted { by: file.to_owned(), reason: None }));
         let path = below(folder, report);
         let still: BTreeSet<&str> = here.iter().map(|e| e.fingerprint.as_str()).collect();
-        let gone =
-            |e: &&Entry| e.path == path && asked.contains(e.code.as_str()) && !still.contains(e.fingerprint.as_str());
+        let gone = |e: &&BaselineEntry| {
+            e.path == path && asked.contains(e.code.as_str()) && !still.contains(e.fingerprint.as_str())
+        };
         self.findings.iter().filter(gone).collect()
     }
 }
 
-fn entries(report: &CheckpointReport, folder: &Path) -> Vec<Entry> {
+fn entries(report: &CheckpointReport, folder: &Path) -> Vec<BaselineEntry> {
     let path = below(folder, report);
     let mut seen = BTreeMap::new();
     let entry = |finding| {
         let fingerprint = of_finding(finding, &path, "", &mut seen);
-        Entry { path: path.clone(), code: name(&finding.code), message: sentence(&finding.message), fingerprint }
+        BaselineEntry {
+            path: path.clone(),
+            code: name(&finding.code),
+            message: sentence(&finding.message),
+            fingerprint,
+        }
     };
     report.findings.iter().map(entry).collect()
 }

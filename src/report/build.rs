@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::model::{CheckpointReport, Counts};
+use super::model::{CheckpointReport, Counts, Role};
 use crate::check::finding::{Accepted, Suppressed};
 use crate::check::{Edit, Finding, Outcome};
 use crate::checkpoint::Checkpoint;
@@ -10,8 +10,8 @@ use crate::checkpoint::Checkpoint;
 impl CheckpointReport {
     /// The report on one checkpoint, named as the user named it.
     #[must_use]
-    pub fn new(path: impl Into<String>, role: Option<String>, checkpoint: &Checkpoint, outcome: &Outcome) -> Self {
-        let counts = Counts::of(&outcome.findings);
+    pub fn new(path: impl Into<String>, role: Option<Role>, checkpoint: &Checkpoint, outcome: &Outcome) -> Self {
+        let counts = Counts::new(&outcome.findings);
         let mut sources = BTreeMap::new();
         let places = outcome.findings.iter().flat_map(|f| &f.locations).filter_map(|l| l.file.as_ref());
         let edits = outcome.findings.iter().filter_map(|f| f.fix.as_ref()).flat_map(|fix| &fix.edits);
@@ -27,7 +27,7 @@ impl CheckpointReport {
             path: path.into(),
             role,
             architecture: outcome.architecture.clone(),
-            verdict: counts.verdict().to_owned(),
+            verdict: counts.verdict(),
             counts,
             settings: None,
             findings: outcome.findings.clone(),
@@ -49,7 +49,7 @@ impl CheckpointReport {
                 None => self.findings.push(finding),
             }
         }
-        self.counts = Counts::of(&self.findings);
-        self.counts.verdict().clone_into(&mut self.verdict);
+        self.counts = Counts::new(&self.findings);
+        self.verdict = self.counts.verdict();
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 /// One pattern and how many names it stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Group {
+pub struct NameGroup {
     /// A name, with `{0..25}` or `{0,3,5}` where several numbers occur.
     pub pattern: String,
     /// Names it stands for.
@@ -12,7 +12,7 @@ pub struct Group {
 }
 
 /// Numbers that occur at one place of a name, sorted.
-type Numbers = Vec<u64>;
+type NumberList = Vec<u64>;
 /// The text of a name between its numbers.
 type Words = Vec<String>;
 
@@ -20,9 +20,9 @@ type Words = Vec<String>;
 ///
 /// A pattern stands for exactly the names given: numbers are only gathered where every combination
 /// occurs. A name that occurs twice counts twice only if it has no numbers in it.
-pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Group> {
+pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<NameGroup> {
     let mut order: Vec<Words> = Vec::new();
-    let mut families: BTreeMap<Words, Vec<Vec<Numbers>>> = BTreeMap::new();
+    let mut families: BTreeMap<Words, Vec<Vec<NumberList>>> = BTreeMap::new();
     for name in names {
         let (words, numbers) = split(name);
         let members = families.entry(words).or_insert_with_key(|words| {
@@ -39,10 +39,10 @@ pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Group> {
         }
         let plain = words.len() <= 1;
         if plain {
-            groups.push(Group { pattern: words.concat(), count: members.len() });
+            groups.push(NameGroup { pattern: words.concat(), count: members.len() });
             continue;
         }
-        groups.extend(members.into_iter().map(|numbers| Group {
+        groups.extend(members.into_iter().map(|numbers| NameGroup {
             pattern: pattern(&words, &numbers),
             count: numbers.iter().map(Vec::len).fold(1, usize::saturating_mul),
         }));
@@ -51,8 +51,8 @@ pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Group> {
 }
 
 /// Merges members that differ only in the numbers at `at`.
-fn gather(members: Vec<Vec<Numbers>>, at: usize) -> Vec<Vec<Numbers>> {
-    let mut alike: BTreeMap<Vec<Numbers>, Numbers> = BTreeMap::new();
+fn gather(members: Vec<Vec<NumberList>>, at: usize) -> Vec<Vec<NumberList>> {
+    let mut alike: BTreeMap<Vec<NumberList>, NumberList> = BTreeMap::new();
     for mut member in members {
         let here = member.get_mut(at).map(std::mem::take).unwrap_or_default();
         alike.entry(member).or_default().extend(here);
@@ -92,7 +92,7 @@ fn split(name: &str) -> (Words, Vec<u64>) {
     (words, numbers)
 }
 
-fn pattern(words: &[String], numbers: &[Numbers]) -> String {
+fn pattern(words: &[String], numbers: &[NumberList]) -> String {
     let mut out = String::new();
     for (i, word) in words.iter().enumerate() {
         out.push_str(word);
@@ -132,10 +132,10 @@ fn ranges(numbers: &[u64]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::{Group, collapse};
+    use super::{NameGroup, collapse};
 
     fn shown(names: &[&str]) -> Vec<(String, usize)> {
-        collapse(names.iter().copied()).into_iter().map(|Group { pattern, count }| (pattern, count)).collect()
+        collapse(names.iter().copied()).into_iter().map(|NameGroup { pattern, count }| (pattern, count)).collect()
     }
 
     #[test]

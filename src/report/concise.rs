@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use super::fixes::mark;
+use super::format::{capped, more, name, place, sentence};
 use super::model::{CheckpointReport, Report};
-use super::words::{capped, more, name, place, sentence};
 
 pub fn render(report: &Report, cap: usize) -> String {
     let mut out = String::new();

@@ -6,7 +6,7 @@ use comfy_table::{Table, presets};
 use similar::TextDiff;
 
 use super::collapse::collapse;
-use super::words::{hostile, name, place};
+use super::format::{hostile, name, place};
 use crate::check::Location;
 use crate::surgery::plan::PlannedShard;
 use crate::surgery::repair::{Content, Repair};
@@ -100,7 +100,7 @@ fn shard(out: &mut String, at: &str, repair: &Repair, new: &PlannedShard) {
     for (before, after) in rows.iter().take(ROWS) {
         table.add_row(["tensor".to_owned(), name(before), name(after)]);
     }
-    if let Some(more) = super::words::more(rows.len(), ROWS) {
+    if let Some(more) = super::format::more(rows.len(), ROWS) {
         table.add_row([more.as_str(), "", ""]);
     }
     if table.row_count() == 0 {

@@ -4,7 +4,7 @@
 
 use std::ops::Range;
 
-use super::words::hostile;
+use super::format::hostile;
 
 /// Bytes kept before the first mark of a long line.
 const BEFORE: usize = 60;

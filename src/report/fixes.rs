@@ -2,18 +2,9 @@
 
 use std::fmt::Write as _;
 
-use super::model::{CheckpointReport, Report};
-use super::words::{name, plural, sentence};
+use super::format::{name, plural, sentence};
+use super::model::{CheckpointReport, Fixing, Report};
 use crate::check::{Finding, Safety};
-
-/// What the run was asked to do about findings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Fixing {
-    /// Whether unsafe fixes count as well.
-    pub unsafe_fixes: bool,
-    /// Whether fixes were made, or only offered.
-    pub made: bool,
-}
 
 /// The mark of a finding that `--fix` would do something about, as ruff has it; else nothing.
 pub(super) fn mark(finding: &Finding, fixing: Option<Fixing>) -> &'static str {

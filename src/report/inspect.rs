@@ -5,18 +5,19 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::Style;
+use super::format::{bytes, more, name, plural, sentence};
 use super::json::pretty;
-use super::model::Tool;
+use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
-use super::words::{bytes, more, name, plural, sentence};
-use crate::check::inspect::{Amount, Candidate, Inspection};
+use crate::check::inspect::{Amount, ClassCandidate, Inspection};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
-struct Document<'a> {
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct InspectDocument<'a> {
     schema: u32,
-    tool: Tool,
+    tool: ToolInfo,
     path: &'a str,
     #[serde(flatten)]
     inspection: &'a Inspection,
@@ -25,7 +26,7 @@ struct Document<'a> {
 /// The whole of an inspection as JSON (`schema` 1).
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection) -> String {
-    pretty(&Document { schema: 1, tool: Tool::this(), path, inspection })
+    pretty(&InspectDocument { schema: 1, tool: ToolInfo::this(), path, inspection })
 }
 
 /// An inspection for a terminal.
@@ -51,7 +52,7 @@ pub fn full(path: &str, inspection: &Inspection, style: Style) -> String {
         values(&mut out, votes, inspection.config.is_some(), style);
     }
     if !inspection.proven.is_null() && (inspection.config.is_none() || outvoted(inspection)) {
-        let _ok = writeln!(out, "\n  {}", paint.strong("what the tensors show, as a start of a config.json"));
+        let _ok = writeln!(out, "\n  {}", paint.strong("config.json inferred from the tensors (incomplete)"));
         indented(&mut out, &pretty(&inspection.proven));
     }
     for note in &inspection.notes {
@@ -99,8 +100,8 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
             let _ok = write!(
                 out,
                 "\n  class by config: {} (model_type {})",
-                paint.strong(&or(&said.class, "not named")),
-                or(&said.model_type, "not named")
+                paint.strong(&or(&said.class, "none")),
+                or(&said.model_type, "none")
             );
             if let Some(version) = &said.transformers_version {
                 let _ok = write!(out, ", written by transformers {}", name(version));
@@ -112,22 +113,22 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
         }
     };
     let Some(best) = inspection.classes.first() else { return };
-    let fit = best.fit.map(|fit| format!("; with the values below it has {} of names and shapes", percent(fit)));
+    let fit = best.fit.map(|fit| format!(", {} of names and shapes with the values below", percent(fit)));
     let _ok = writeln!(
         out,
-        "  class by tensors: {} ({}), {} of names{}; known for transformers {}",
+        "  class by tensors: {} ({}): matches {} of names{}; known for transformers {}",
         paint.strong(&name(&best.class)),
         name(&best.architecture),
         percent(best.names),
         fit.unwrap_or_default(),
         best.loaders.join(" and ")
     );
-    let others: Vec<&Candidate> = inspection.classes.iter().skip(1).collect();
+    let others: Vec<&ClassCandidate> = inspection.classes.iter().skip(1).collect();
     if !others.is_empty() {
         let mut shown: Vec<String> =
             others.iter().take(style.cap).map(|c| format!("{} {}", name(&c.class), percent(c.names))).collect();
         shown.extend(more(others.len(), style.cap));
-        let _ok = writeln!(out, "    then {}", shown.join(", "));
+        let _ok = writeln!(out, "    next: {}", shown.join(", "));
     }
 }
 
@@ -139,37 +140,37 @@ fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
         .map(|v| {
             [
                 name(v.pointer.trim_start_matches('/')).replace('/', "."),
-                said(v),
+                config_value(v),
                 name(&v.voted_value.to_string()),
                 tally(v),
                 v.evidence.first().map(|w| name(&w.to_string())).unwrap_or_default(),
             ]
         })
         .collect();
-    let _ok = writeln!(out, "\n  config values by the votes of the tensors");
+    let _ok = writeln!(out, "\n  config values inferred from the tensors");
     let first = if has_config { "config" } else { "default" };
-    table(out, ["", first, "tensors say", "votes", "for example"], &rows, style);
+    table(out, ["", first, "tensors imply", "votes", "for example"], &rows, style);
     let (before, after) = (votes.before, votes.after);
     let fits = |f: crate::check::votes::Fit| {
-        format!("{} of {} stored, {} of another shape", f.found, f.expected, f.mismatched)
+        format!("{} of {} stored, {} with another shape", f.found, f.expected, f.mismatched)
     };
     let _ok = match votes.outvoted().count() {
-        0 => writeln!(out, "  no value is outvoted; tensors of the class: {}", fits(after)),
+        0 => writeln!(out, "  the tensors contradict no value; tensors of the class: {}", fits(after)),
         n => writeln!(
             out,
-            "  {} outvoted; tensors of the class: {}; with the voted values: {}",
+            "  the tensors contradict {}; tensors of the class: {}; with the inferred values: {}",
             plural(n, "value"),
             fits(before),
             fits(after)
         ),
     };
     for open in &votes.undecided {
-        let _ok = writeln!(out, "  not decided, only: {}", name(&open.constraint));
+        let _ok = writeln!(out, "  undetermined; only this is known: {}", name(&open.constraint));
     }
 }
 
 /// What the config says, marked where the tensors say otherwise or it says nothing.
-fn said(vote: &Vote) -> String {
+fn config_value(vote: &Vote) -> String {
     let value = name(&vote.config_value.to_string());
     let value = if vote.given { value } else { format!("({value})") };
     if vote.outvotes() { format!("{value} ✗") } else { value }
@@ -177,7 +178,7 @@ fn said(vote: &Vote) -> String {
 
 fn tally(vote: &Vote) -> String {
     let all = vote.votes_for.saturating_add(vote.votes_against);
-    if all == 0 { "by absence".to_owned() } else { format!("{} of {all}", vote.votes_for) }
+    if all == 0 { "absence".to_owned() } else { format!("{} of {all}", vote.votes_for) }
 }
 
 fn indented(out: &mut String, text: &str) {

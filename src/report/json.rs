@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::Report;
-use super::model::{Summary, Tool};
-use super::words::hostile;
+use super::format::hostile;
+use super::model::{Role, Summary, ToolInfo};
 
 pub fn render(report: &Report) -> String {
     pretty(report)
@@ -23,35 +23,45 @@ pub fn pretty<T: Serialize>(value: &T) -> String {
 pub fn lines(report: &Report) -> String {
     let mut lines = Vec::new();
     for checkpoint in &report.checkpoints {
-        let (path, role) = (&checkpoint.path, &checkpoint.role);
-        let line = |finding| Line { r#type: "finding", path, role, said: finding };
+        let (path, role) = (&checkpoint.path, checkpoint.role.as_ref());
+        let line = |finding| JsonLine { r#type: LineKind::Finding, path, role, said: finding };
         lines.extend(checkpoint.findings.iter().map(|f| written(serde_json::to_string(&line(f)))));
     }
     if let Some(merge) = &report.merge {
-        let line = |seam| Line { r#type: "seam", path: &merge.out, role: &None, said: seam };
+        let line = |seam| JsonLine { r#type: LineKind::Seam, path: &merge.out, role: None, said: seam };
         lines.extend(merge.seams.iter().map(|s| written(serde_json::to_string(&line(s)))));
     }
-    let summary = Last { r#type: "summary", schema: report.schema, tool: &report.tool, summary: &report.summary };
+    let summary =
+        SummaryLine { r#type: LineKind::Summary, schema: report.schema, tool: &report.tool, summary: &report.summary };
     lines.push(written(serde_json::to_string(&summary)));
     harmless(&lines.join("\n"))
 }
 
+/// What a line tells of.
 #[derive(Serialize)]
-struct Line<'a, T> {
-    r#type: &'static str,
+#[serde(rename_all = "lowercase")]
+enum LineKind {
+    Finding,
+    Seam,
+    Summary,
+}
+
+#[derive(Serialize)]
+struct JsonLine<'a, T> {
+    r#type: LineKind,
     /// The checkpoint, as the user named it; for a seam, where the merge was to go.
     path: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
-    role: &'a Option<String>,
+    role: Option<&'a Role>,
     #[serde(flatten)]
     said: &'a T,
 }
 
 #[derive(Serialize)]
-struct Last<'a> {
-    r#type: &'static str,
+struct SummaryLine<'a> {
+    r#type: LineKind,
     schema: u32,
-    tool: &'a Tool,
+    tool: &'a ToolInfo,
     #[serde(flatten)]
     summary: &'a Summary,
 }

@@ -3,10 +3,10 @@
 
 use std::fmt::Write as _;
 
-use super::collapse::{Group, collapse};
+use super::collapse::{NameGroup, collapse};
+use super::format::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
-use super::words::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
-use crate::check::finding::LoadReport;
+use crate::check::load::LoadReport;
 use crate::check::{Finding, Location};
 
 pub fn render(report: &Report, cap: usize) -> String {
@@ -19,32 +19,32 @@ pub fn render(report: &Report, cap: usize) -> String {
     for checkpoint in &report.checkpoints {
         section(&mut out, checkpoint, cap);
     }
-    let _ok = writeln!(out, "\n---\n\nVerdict: **{}**. {}.", text(&report.summary.verdict), summary(report));
+    let _ok = writeln!(out, "\n---\n\nVerdict: **{}**. {}.", report.summary.verdict.name(), summary(report));
     let _ok = writeln!(out, "\n{} {}", report.tool.name, report.tool.version);
     out
 }
 
 fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
-    let title = match checkpoint.role.as_deref() {
-        Some(role) => text(role),
+    let title = match &checkpoint.role {
+        Some(role) => text(&role.to_string()),
         None => code(&name(&checkpoint.path)),
     };
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
     let (tensors, size) = checkpoint.tensors;
-    let verdict = text(&checkpoint.verdict);
+    let verdict = checkpoint.verdict.name();
     let _ok =
         writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
     if !checkpoint.suppressed.is_empty() {
         let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
-    for finding in words::alike(shown) {
+    for finding in format::alike(shown) {
         render_finding(out, &finding);
     }
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", text_name(code));
     }
-    for loaders in words::agreeing(&checkpoint.loads) {
+    for loaders in format::agreeing(&checkpoint.loads) {
         render_load(out, &loaders, cap);
     }
 }
@@ -98,7 +98,7 @@ fn place(location: &Location) -> Option<String> {
 
 fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
     let Some(load) = loaders.first() else { return };
-    let versions = text(&words::versions(loaders));
+    let versions = text(&format::versions(loaders));
     let (missing, unexpected) = (load.missing.len(), load.unexpected.len());
     let (mismatched, silent) = (load.mismatched.len(), load.silent.len());
     let _ok = writeln!(
@@ -106,25 +106,25 @@ fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
         "\nPredicted load by {versions}: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"
     );
     if let Some(exception) = &load.raises {
-        let _ok = writeln!(out, "\nBefore any of these is reported, the loader raises: {}", text(&sentence(exception)));
+        let _ok = writeln!(out, "\nBefore it reports any of these, the loader raises: {}", text(&sentence(exception)));
     }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
-    groups(out, "Missing: the loader initialises them anew", &names(&load.missing), cap);
-    groups(out, "Unexpected: the loader ignores them", &names(&load.unexpected), cap);
+    groups(out, "Missing: the loader initialises these with random values", &names(&load.missing), cap);
+    groups(out, "Unexpected: the loader ignores these", &names(&load.unexpected), cap);
     if !load.mismatched.is_empty() {
-        let rows: Vec<_> = words::mismatched(load)
+        let rows: Vec<_> = format::mismatched(load)
             .into_iter()
             .map(|[tensor, stored, expected]| [code(&tensor), stored, expected])
             .collect();
-        let _ok = writeln!(out, "\nMismatched: the load raises");
+        let _ok = writeln!(out, "\nMismatched: the loader raises an exception");
         table(out, ["tensor", "stored", "expected"], &rows, cap);
     }
-    for (reason, names) in words::silent(load) {
-        groups(out, &format!("Silent, reported by nobody: {}", text(&reason)), &names, cap);
+    for (reason, names) in format::silent(load) {
+        groups(out, &format!("Silent, loaded without a warning: {}", text(&reason)), &names, cap);
     }
 }
 
-fn groups(out: &mut String, title: &str, groups: &[Group], cap: usize) {
+fn groups(out: &mut String, title: &str, groups: &[NameGroup], cap: usize) {
     if groups.is_empty() {
         return;
     }
@@ -151,53 +151,50 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
         let _ok = writeln!(out, "{n}. {}: {}", text_name(&stage.name), text(&sentence(&stage.outcome)));
     }
     seams(out, merge, cap);
-    if !merge.transforms.is_empty() {
-        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", text_name(how))).collect();
-        let _ok = writeln!(
-            out,
-            "\n## Tensors\n\n{}, {}: {}",
-            plural(merge.tensors, "tensor"),
-            bytes(merge.bytes),
-            how.join(", ")
-        );
-    }
-    if !merge.changed.is_empty() {
-        let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
-        let rows: Vec<_> = merge
-            .changed
-            .iter()
-            .map(|c| [code(&name(&c.name)), text(&sentence(&c.transform)), from(c.from.as_deref()), shape(&c.to)])
-            .collect();
-        table(out, ["not a copy", "how", "from", "to"], &rows, cap);
-    }
-    if !merge.dropped.is_empty() {
-        let rows: Vec<_> = merge
-            .dropped
-            .iter()
-            .map(|d| [text_name(&d.donor), code(&name(&d.pattern)), d.count.to_string(), text(&sentence(&d.why))])
-            .collect();
-        let _ok = writeln!(out, "\n## Left behind");
-        table(out, ["donor", "tensors", "count", "why"], &rows, cap);
-    }
-    if !merge.repairs.is_empty() {
-        let _ok = writeln!(out, "\n## Repaired on the way\n");
-        for repair in merge.repairs.iter().take(cap) {
-            let _ok = writeln!(out, "- {}", text(&sentence(repair)));
-        }
-        if let Some(more) = more(merge.repairs.len(), cap) {
-            let _ok = writeln!(out, "- {more}");
-        }
-    }
-    if !merge.notes.is_empty() {
-        let _ok = writeln!(out, "\n## To know\n");
-        for note in &merge.notes {
-            let _ok = writeln!(out, "- {}", text(&sentence(note)));
-        }
-    }
+    merged_tensors(out, merge, cap);
+    sentences(out, "Repaired", &merge.repairs, cap);
+    sentences(out, "Notes", &merge.notes, usize::MAX);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
         let _ok = writeln!(out, "\n## Files");
         table(out, ["file", "from"], &rows, cap);
+    }
+}
+
+/// The tensors of a merge: how they are made, and which are left behind.
+fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
+    if !merge.transforms.is_empty() {
+        let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
+        let (tensors, size) = (plural(merge.tensors, "tensor"), bytes(merge.bytes));
+        let _ok = writeln!(out, "\n## Tensors\n\n{tensors}, {size}: {}", how.join(", "));
+    }
+    if !merge.changed.is_empty() {
+        let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
+        let changed = merge.changed.iter();
+        let row = changed
+            .map(|c| [code(&name(&c.name)), c.transform.name().to_owned(), from(c.from.as_deref()), shape(&c.to)]);
+        table(out, ["changed tensor", "how", "from", "to"], &row.collect::<Vec<_>>(), cap);
+    }
+    if !merge.dropped.is_empty() {
+        let dropped = merge.dropped.iter();
+        let row = dropped
+            .map(|d| [text_name(&d.donor), code(&name(&d.pattern)), d.count.to_string(), text(&sentence(&d.why))]);
+        let _ok = writeln!(out, "\n## Dropped");
+        table(out, ["donor", "tensors", "count", "why"], &row.collect::<Vec<_>>(), cap);
+    }
+}
+
+/// A list of sentences under a title, if there are any.
+fn sentences(out: &mut String, title: &str, sentences: &[String], cap: usize) {
+    if sentences.is_empty() {
+        return;
+    }
+    let _ok = writeln!(out, "\n## {title}\n");
+    for one in sentences.iter().take(cap) {
+        let _ok = writeln!(out, "- {}", text(&sentence(one)));
+    }
+    if let Some(more) = more(sentences.len(), cap) {
+        let _ok = writeln!(out, "- {more}");
     }
 }
 
@@ -217,8 +214,8 @@ fn seams(out: &mut String, merge: &MergeReport, cap: usize) {
                 needed.map_or_else(String::new, shape),
             ]
         };
-        let tensor = seam.tensor.iter().map(|t| row("does not fit", t, seam.needed.as_deref()));
-        let rows: Vec<_> = tensor.chain(seam.meets.iter().map(|m| row("has to meet", m, None))).collect();
+        let tensor = seam.tensor.iter().map(|t| row("mismatch", t, seam.needed.as_deref()));
+        let rows: Vec<_> = tensor.chain(seam.meets.iter().map(|m| row("must match", m, None))).collect();
         if !rows.is_empty() {
             table(out, ["", "donor", "tensor", "shape", "needed"], &rows, cap);
         }

@@ -5,24 +5,27 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-pub use super::fixes::Fixing;
-use crate::check::finding::{LoadReport, Suppressed};
+pub use super::merge::{
+    ChangedTensor, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName, StageOutcome,
+};
+use crate::check::finding::Suppressed;
+use crate::check::load::LoadReport;
 use crate::check::{Finding, Severity};
-pub use crate::surgery::merge::record::{ChangedTensor, Dropped, MergeReport, MergedFile, Seam, ShapedName, Stage};
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
-/// Everything one run has to say. Serialised as is, it is the JSON contract (`schema` 2).
+/// The report of one run. Serialised, it is the JSON contract (`schema` 2).
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Report {
     /// Version of this contract.
     pub schema: u32,
-    /// Which program wrote it.
-    pub tool: Tool,
-    /// One entry for each checkpoint, in the order given.
+    /// The program that wrote the report.
+    pub tool: ToolInfo,
+    /// One entry per checkpoint, in the order of the arguments; a merge has its donors, the plan and the result.
     pub checkpoints: Vec<CheckpointReport>,
-    /// What a merge did; absent for `check`.
+    /// The merge; null for `check`.
     pub merge: Option<MergeReport>,
-    /// Totals.
+    /// Totals over all checkpoints.
     pub summary: Summary,
 }
 
@@ -32,23 +35,24 @@ impl Report {
     pub fn new(checkpoints: Vec<CheckpointReport>, merge: Option<MergeReport>) -> Self {
         let counts = checkpoints.iter().fold(Counts::default(), |sum, c| sum.plus(c.counts));
         let seams = merge.as_ref().is_some_and(|m| !m.seams.is_empty());
-        let verdict = if seams { Severity::Error.name() } else { counts.verdict() };
+        let verdict = if seams { Verdict::Error } else { counts.verdict() };
         let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
-        let summary = Summary { checkpoints: checkpoints.len(), verdict: verdict.to_owned(), counts, suppressed };
-        Self { schema: 2, tool: Tool::this(), checkpoints, merge, summary }
+        let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed };
+        Self { schema: 2, tool: ToolInfo::this(), checkpoints, merge, summary }
     }
 }
 
 /// Name and version of the program.
 #[derive(Debug, Clone, Serialize)]
-pub struct Tool {
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct ToolInfo {
     /// Always `ckpt-doctor`.
     pub name: &'static str,
     /// Its version.
     pub version: &'static str,
 }
 
-impl Tool {
+impl ToolInfo {
     /// This program.
     #[must_use]
     pub const fn this() -> Self {
@@ -56,37 +60,38 @@ impl Tool {
     }
 }
 
-/// The verdict over one checkpoint.
+/// The report of one checkpoint.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct CheckpointReport {
-    /// As the user named it.
+    /// The path, as the user wrote it.
     pub path: String,
-    /// What it is in this run, for a merge: `donor vision`, `planned`, `written`; absent for `check`.
+    /// Its role in a merge: `donor vision`, `planned`, `written`; missing for `check`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub role: Option<String>,
-    /// Architecture the load reports were predicted with.
+    pub role: Option<Role>,
+    /// The architecture of the predicted loads; null if it is unknown.
     pub architecture: Option<String>,
-    /// `clean`, or the worst severity.
-    pub verdict: String,
+    /// Clean, or the worst severity.
+    pub verdict: Verdict,
     /// Findings by severity.
     pub counts: Counts,
-    /// The settings file that was gone by.
+    /// The settings file that applied.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub settings: Option<String>,
-    /// Findings sorted by file, place and code.
+    /// Findings, sorted by file, place and code.
     pub findings: Vec<Finding>,
-    /// Findings that settings or a baseline accept; they are not counted.
+    /// Findings that settings or a baseline accept; `counts` does not include them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub suppressed: Vec<Suppressed>,
-    /// Predicted load reports, one for each loader; none when the architecture is unknown or there are no tensors.
+    /// Predicted load reports, one per loader; empty if the architecture is unknown or there are no tensors.
     pub loads: Vec<LoadReport>,
-    /// Findings whose fixes were made; `findings` are those that are left.
+    /// Findings whose fixes were applied; `findings` has the remaining ones.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub fixed: Vec<Fixed>,
-    /// Fixes that were tried and not kept.
+    /// Fixes that were tried and rolled back.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub withdrawn: Vec<Withdrawn>,
-    /// What the run was asked to do about findings; for renderers that offer fixes.
+    /// The fix options of the run, for renderers that offer fixes.
     #[serde(skip)]
     pub fixing: Option<Fixing>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
@@ -97,21 +102,69 @@ pub struct CheckpointReport {
     pub tensors: (usize, u64),
 }
 
-/// How many findings there are of each severity.
+/// The verdict over one checkpoint, or over all of a run: clean, or the worst severity of its findings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum Verdict {
+    /// No findings.
+    Clean,
+    /// Information at most.
+    Info,
+    /// Warnings at most.
+    Warning,
+    /// Errors.
+    Error,
+}
+
+impl Verdict {
+    /// The word for it in reports.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Clean => "clean",
+            Self::Info => "info",
+            Self::Warning => "warning",
+            Self::Error => "error",
+        }
+    }
+}
+
+impl From<Severity> for Verdict {
+    fn from(worst: Severity) -> Self {
+        match worst {
+            Severity::Info => Self::Info,
+            Severity::Warning => Self::Warning,
+            Severity::Error => Self::Error,
+        }
+    }
+}
+
+/// What the run was asked to do about findings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Fixing {
+    /// Whether unsafe fixes count as well.
+    pub unsafe_fixes: bool,
+    /// Whether fixes were made, or only offered.
+    pub made: bool,
+}
+
+/// The number of findings of each severity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Counts {
     /// Errors.
     pub error: usize,
     /// Warnings.
     pub warning: usize,
-    /// Notes.
+    /// Findings of severity info.
     pub info: usize,
 }
 
 impl Counts {
     /// Counts findings.
     #[must_use]
-    pub fn of(findings: &[Finding]) -> Self {
+    pub fn new(findings: &[Finding]) -> Self {
         let n = |s| findings.iter().filter(|f| f.severity == s).count();
         Self { error: n(Severity::Error), warning: n(Severity::Warning), info: n(Severity::Info) }
     }
@@ -126,13 +179,10 @@ impl Counts {
         }
     }
 
-    /// `clean`, or the worst severity present.
+    /// Clean, or the worst severity present.
     #[must_use]
-    pub const fn verdict(self) -> &'static str {
-        match self.worst() {
-            Some(severity) => severity.name(),
-            None => "clean",
-        }
+    pub fn verdict(self) -> Verdict {
+        self.worst().map_or(Verdict::Clean, Verdict::from)
     }
 
     /// The worst severity present.
@@ -152,14 +202,15 @@ impl Counts {
 
 /// Totals over all checkpoints.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Summary {
-    /// Checkpoints looked at.
+    /// Number of checkpoints.
     pub checkpoints: usize,
-    /// `clean`, or the worst severity.
-    pub verdict: String,
+    /// Clean, or the worst severity.
+    pub verdict: Verdict,
     /// Findings by severity.
     pub counts: Counts,
-    /// Findings that are accepted, and not among the counts.
+    /// Number of suppressed findings; `counts` does not include them.
     #[serde(skip_serializing_if = "is_zero")]
     pub suppressed: usize,
 }

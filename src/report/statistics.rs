@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use comfy_table::{CellAlignment, Table, presets};
 use serde::Serialize;
 
-use super::words::{name, summary};
+use super::format::{name, summary};
 use super::{Format, Report, json};
 use crate::check::{Finding, Severity};
 
 #[derive(Serialize)]
-struct Line<'a> {
+struct RuleCount<'a> {
     code: &'a str,
     name: &'a str,
     severity: Severity,
@@ -30,11 +30,11 @@ pub fn statistics(report: &Report, format: Format) -> Option<String> {
         let more = finding.evidence.get("more").and_then(serde_json::Value::as_u64).unwrap_or(0);
         *count = count.saturating_add(1).saturating_add(usize::try_from(more).unwrap_or(usize::MAX));
     }
-    let mut lines: Vec<Line<'_>> = counts
+    let mut lines: Vec<RuleCount<'_>> = counts
         .into_iter()
         .map(|((code, severity), (count, finding))| {
             let fix = finding.fix.as_ref().map(|fix| fix.safety.name());
-            Line { code, name: &finding.name, severity, count, fix }
+            RuleCount { code, name: &finding.name, severity, count, fix }
         })
         .collect();
     lines.sort_by_key(|line| std::cmp::Reverse(line.count));
@@ -45,7 +45,7 @@ pub fn statistics(report: &Report, format: Format) -> Option<String> {
     }
 }
 
-fn text(lines: &[Line<'_>], report: &Report) -> String {
+fn text(lines: &[RuleCount<'_>], report: &Report) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
     for line in lines {

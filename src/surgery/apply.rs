@@ -6,30 +6,18 @@
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, LazyLock};
 
 use super::donor::{AtRest, DonorFile};
-use super::plan::{Plan, PlannedShard, PlannedTensor, Source, TensorRef};
+use super::error::{ApplyError, io_at};
+use super::plan::{Plan, PlannedShard, PlannedTensor, TensorRef, TensorSource};
 use super::staging::Staging;
-use super::system::{ask_for_room, copy_in_kernel, create, explain};
+use super::stop::interrupted;
+use super::system::{ask_for_room, copy_in_kernel, create, with_figures};
 use super::transform;
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::open_regular;
 
-pub use super::error::ApplyError;
-pub(super) use super::error::io_at;
-pub use super::target::check_target;
-
-/// The signal that asked the program to stop, set by its signal handler; 0 while there was none. A run under
-/// way then cleans up and stops.
-pub static INTERRUPTED: LazyLock<Arc<AtomicUsize>> = LazyLock::new(Arc::default);
-
-pub(super) fn interrupted() -> Result<(), ApplyError> {
-    if INTERRUPTED.load(Ordering::Relaxed) == 0 { Ok(()) } else { Err(ApplyError::Interrupted) }
-}
-
-/// Writes `plan` as the directory `out` (a path from [`check_target`]); `progress` hears of bytes written.
+/// Writes `plan` as the directory `out` (a path from [`super::check_target`]); `progress` hears of bytes written.
 ///
 /// The `donors` must still be as they were seen, or nothing is published.
 ///
@@ -40,7 +28,7 @@ pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMu
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let files = plan.files.iter().map(|f| f.bytes.len() as u64);
     let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
-    let explained = |error| explain(error, parent, &sizes);
+    let explained = |error| with_figures(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
     // Not before: what a killed run left may be what fills the disk, and is cleared now.
     let written = ask_for_room(parent, &sizes)
@@ -99,7 +87,7 @@ pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn 
     accepted_by_safetensors(&written.file).map_err(io_at(path, "verifying"))
 }
 
-/// Bytes moved between two looks at [`INTERRUPTED`].
+/// Bytes moved between two checks for a signal.
 const SLICE: u64 = 64 * 1024 * 1024;
 
 fn write_tensor(
@@ -110,7 +98,7 @@ fn write_tensor(
     progress: &mut dyn FnMut(u64),
 ) -> Result<(), ApplyError> {
     match &tensor.source {
-        Source::Copy(from) => copy_range(out, path, donor, from, progress),
+        TensorSource::Copy(from) => copy_range(out, path, donor, from, progress),
         source => {
             let from = source.donor();
             let elem = tensor.dtype.bits() / 8;
@@ -128,14 +116,14 @@ fn write_tensor(
                     })
                 };
                 let made = match source {
-                    Source::Pad(_) => transform::pad(&mut read, elem, &from.shape, &tensor.shape, &mut writer),
-                    Source::GrowRows(_) => {
+                    TensorSource::Pad(_) => transform::pad(&mut read, elem, &from.shape, &tensor.shape, &mut writer),
+                    TensorSource::GrowRows(_) => {
                         let rows = from.shape.first().copied().unwrap_or_default();
                         let width = tensor.shape.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d));
                         let more = tensor.shape.first().copied().unwrap_or_default().saturating_sub(rows);
                         transform::grow_rows(&mut read, tensor.dtype, rows, width, more, &mut writer)
                     }
-                    Source::Copy(_) | Source::Reinit { .. } => {
+                    TensorSource::Copy(_) | TensorSource::Reinit { .. } => {
                         transform::reinit(&tensor.name, tensor.dtype, &tensor.shape, &mut writer)
                     }
                 };

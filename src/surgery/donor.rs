@@ -2,12 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
+use std::io::{self, Read};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use sha2::{Digest, Sha256};
+
 use super::error::{ApplyError, io_at};
-use super::system::names;
+use super::stop::interrupted;
+use super::system::{names, retry};
+use crate::checkpoint::hex;
 use crate::checkpoint::open::{Identity, Opened, open_regular};
 
 /// The files of a directory, and which ones they were when a run began.
@@ -23,8 +27,9 @@ impl AtRest {
     /// Looks at the regular files in `dir`; hidden ones are the business of other tools.
     ///
     /// # Errors
-    /// [`ApplyError::Io`] when the directory cannot be listed.
-    pub fn see(dir: &Path) -> Result<Self, ApplyError> {
+    /// [`ApplyError::Io`] when the directory cannot be listed, and [`ApplyError::Interrupted`].
+    pub fn record(dir: &Path) -> Result<Self, ApplyError> {
+        interrupted()?;
         let mut files = BTreeMap::new();
         for name in names(dir).map_err(io_at(dir, "listing"))? {
             let path = dir.join(&name);
@@ -34,7 +39,7 @@ impl AtRest {
                 && metadata.is_file()
                 && !hidden
             {
-                files.insert(path, Identity::of(&metadata));
+                files.insert(path, Identity::from_metadata(&metadata));
             }
         }
         Ok(Self { files })
@@ -48,7 +53,7 @@ impl AtRest {
         for (path, was) in &self.files {
             let changed = |reason: &str| ApplyError::Changed { path: path.clone(), reason: reason.to_owned() };
             match fs::metadata(path) {
-                Ok(now) if Identity::of(&now) == *was => {}
+                Ok(now) if Identity::from_metadata(&now) == *was => {}
                 Ok(now) if now.len() < was.size => return Err(changed("was cut short")),
                 Ok(_) => return Err(changed("changed")),
                 Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(changed("was removed")),
@@ -90,5 +95,24 @@ impl DonorFile {
         } else {
             io_at(&self.path, "reading")(error)
         }
+    }
+}
+
+/// SHA-256 of a donor's file, in hexadecimal; for the manifest of a merge.
+///
+/// # Errors
+/// [`ApplyError::Changed`] when the file cannot be opened any more, [`ApplyError::Io`] when reading fails, and
+/// [`ApplyError::Interrupted`].
+pub fn sha256(path: &Path) -> Result<String, ApplyError> {
+    let mut donor = DonorFile::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut block = vec![0_u8; 1 << 20];
+    loop {
+        interrupted()?;
+        let read = retry(|| donor.opened.file.read(&mut block)).map_err(io_at(path, "reading"))?;
+        if read == 0 {
+            return Ok(hex(&hasher.finalize()));
+        }
+        hasher.update(block.get(..read).unwrap_or_default());
     }
 }

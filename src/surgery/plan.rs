@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::{Dtype, Shard, Tensor, byte_len};
 
@@ -58,7 +58,7 @@ pub struct PlannedTensor {
     /// Shape in the result.
     pub shape: Vec<u64>,
     /// How its bytes are made.
-    pub source: Source,
+    pub source: TensorSource,
 }
 
 /// A tensor of a donor: where its bytes lie.
@@ -80,7 +80,7 @@ pub struct TensorRef {
 
 /// How the bytes of a tensor are made.
 #[derive(Debug, Clone)]
-pub enum Source {
+pub enum TensorSource {
     /// The donor's bytes as they are.
     Copy(TensorRef),
     /// The donor's values in the leading corner of a larger shape, zeros elsewhere.
@@ -94,15 +94,43 @@ pub enum Source {
     },
 }
 
-impl Source {
-    /// The word for it in reports and options.
+/// How the bytes of a tensor are made: a [`TensorSource`] without the donor tensor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum TensorTransform {
+    /// The donor's bytes as they are.
+    Copy,
+    /// The donor's rows, then rows that hold their mean.
+    GrowRows,
+    /// The donor's values in the leading corner, zeros elsewhere.
+    Pad,
+    /// Seeded random values.
+    Reinit,
+}
+
+impl TensorTransform {
+    /// The word for it in recipes, options and reports.
     #[must_use]
-    pub const fn word(&self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
-            Self::Copy(_) => "copy",
-            Self::Pad(_) => "pad",
-            Self::GrowRows(_) => "grow-rows",
-            Self::Reinit { .. } => "reinit",
+            Self::Copy => "copy",
+            Self::GrowRows => "grow-rows",
+            Self::Pad => "pad",
+            Self::Reinit => "reinit",
+        }
+    }
+}
+
+impl TensorSource {
+    /// How the bytes are made.
+    #[must_use]
+    pub const fn transform(&self) -> TensorTransform {
+        match self {
+            Self::Copy(_) => TensorTransform::Copy,
+            Self::Pad(_) => TensorTransform::Pad,
+            Self::GrowRows(_) => TensorTransform::GrowRows,
+            Self::Reinit { .. } => TensorTransform::Reinit,
         }
     }
 
@@ -151,7 +179,7 @@ impl PlannedShard {
     #[must_use]
     pub fn header(&self) -> Vec<u8> {
         #[derive(Serialize)]
-        struct Entry<'a> {
+        struct EntryJson<'a> {
             dtype: &'static str,
             shape: &'a [u64],
             data_offsets: [u64; 2],
@@ -162,7 +190,7 @@ impl PlannedShard {
         let mut at = 0_u64;
         for t in &self.tensors {
             let end = at.saturating_add(t.len());
-            let entry = Entry { dtype: t.dtype.name(), shape: &t.shape, data_offsets: [at, end] };
+            let entry = EntryJson { dtype: t.dtype.name(), shape: &t.shape, data_offsets: [at, end] };
             let name = serde_json::to_string(&t.name).unwrap_or_default();
             let entry = serde_json::to_string(&entry).unwrap_or_default();
             json.push(',');

@@ -3,7 +3,7 @@
 #![expect(clippy::disallowed_methods, reason = "the writer's own calls")]
 
 use std::ffi::OsString;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -57,6 +57,15 @@ pub(super) fn remove_dir(path: &Path) -> io::Result<()> {
     absent_is_fine(retry(|| fs::remove_dir(path)))
 }
 
+/// The metadata of `path`, links not followed; `None` when nothing has this name.
+pub(super) fn look(path: &Path) -> Result<Option<Metadata>, ApplyError> {
+    match fs::symlink_metadata(path) {
+        Ok(metadata) => Ok(Some(metadata)),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(io_at(path, "looking at")(e)),
+    }
+}
+
 /// Names in a directory, in no order.
 pub(super) fn names(path: &Path) -> io::Result<Vec<OsString>> {
     retry(|| fs::read_dir(path))?.map(|entry| entry.map(|e| e.file_name())).collect()
@@ -92,7 +101,7 @@ fn room(dir: &Path) -> Result<Option<Room>, ApplyError> {
 /// Refuses files of these sizes that will not fit into `dir`, before the first byte of them is written.
 ///
 /// Each file takes whole blocks. What else a file system needs is its own affair, so this can be a little too
-/// hopeful: [`explain`] has the word when writing fails.
+/// hopeful: [`with_figures`] has the word when writing fails.
 pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> {
     let Some(room) = room(dir)? else { return Ok(()) };
     let blocks = sizes.iter().fold(0_u64, |n, size| n.saturating_add(size.div_ceil(room.block)));
@@ -105,7 +114,7 @@ pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> 
 
 /// Gives an error of the system its figures: files of these sizes were to be written into `dir`, and this is the room
 /// there is. To be asked when what was written is removed again.
-pub(super) fn explain(error: ApplyError, dir: &Path, sizes: &[u64]) -> ApplyError {
+pub(super) fn with_figures(error: ApplyError, dir: &Path, sizes: &[u64]) -> ApplyError {
     let ApplyError::Io { path, doing, error } = error else { return error };
     match Errno::from_io_error(&error) {
         Some(Errno::NOSPC | Errno::DQUOT) => match room(dir) {

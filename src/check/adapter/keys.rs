@@ -4,7 +4,7 @@ use crate::checkpoint::adapter::PREFIX;
 
 /// What a tensor is to its module.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Role {
+pub(super) enum MatrixRole {
     A,
     B,
     /// `lora_B.bias`, with `lora_bias`.
@@ -15,7 +15,7 @@ pub(super) enum Role {
     Magnitude,
 }
 
-impl Role {
+impl MatrixRole {
     /// How names spell it.
     pub(super) const fn word(self) -> &'static str {
         match self {
@@ -31,9 +31,9 @@ impl Role {
 
 /// A tensor's name, taken apart.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Key<'n> {
+pub(super) enum AdapterKey<'n> {
     /// A tensor of a LoRA, and the base model's module it belongs to.
-    Lora { module: &'n str, role: Role },
+    Lora { module: &'n str, role: MatrixRole },
     /// A tensor of the base model, stored whole: an embedding, a trained bias, one of `modules_to_save`.
     Whole(&'n str),
     /// PEFT finds no place for it, for this reason.
@@ -41,17 +41,17 @@ pub(super) enum Key<'n> {
 }
 
 /// Endings of the saved form, which has no adapter's name in it.
-const ENDINGS: [(&str, Role); 7] = [
-    (".lora_A.weight", Role::A),
-    (".lora_B.weight", Role::B),
-    (".lora_B.bias", Role::Bias),
-    (".lora_embedding_A", Role::EmbeddingA),
-    (".lora_embedding_B", Role::EmbeddingB),
-    (".lora_magnitude_vector", Role::Magnitude),
-    (".lora_magnitude_vector.weight", Role::Magnitude),
+const ENDINGS: [(&str, MatrixRole); 7] = [
+    (".lora_A.weight", MatrixRole::A),
+    (".lora_B.weight", MatrixRole::B),
+    (".lora_B.bias", MatrixRole::Bias),
+    (".lora_embedding_A", MatrixRole::EmbeddingA),
+    (".lora_embedding_B", MatrixRole::EmbeddingB),
+    (".lora_magnitude_vector", MatrixRole::Magnitude),
+    (".lora_magnitude_vector.weight", MatrixRole::Magnitude),
 ];
 
-impl<'n> Key<'n> {
+impl<'n> AdapterKey<'n> {
     pub(super) fn parse(name: &'n str) -> Self {
         let Some(bare) = name.strip_prefix(PREFIX) else {
             return Self::Foreign("it does not start with base_model.model.");
@@ -74,18 +74,18 @@ mod tests {
 
     #[test]
     fn names_say_module_and_role() {
-        let lora = |module, role| Key::Lora { module, role };
+        let lora = |module, role| AdapterKey::Lora { module, role };
         for (name, key) in [
-            ("base_model.model.h.0.c_attn.lora_A.weight", lora("h.0.c_attn", Role::A)),
-            ("base_model.model.h.0.c_attn.lora_B.bias", lora("h.0.c_attn", Role::Bias)),
-            ("base_model.model.wte.lora_embedding_B", lora("wte", Role::EmbeddingB)),
-            ("base_model.model.q.lora_magnitude_vector", lora("q", Role::Magnitude)),
-            ("base_model.model.lm_head.weight", Key::Whole("lm_head.weight")),
-            ("base_model.model.q.lora_A.default.weight", Key::Foreign("the name of an adapter is in it")),
-            ("base_model.model.wte.lora_embedding_A.default", Key::Foreign("the name of an adapter is in it")),
-            ("h.0.c_attn.lora_A.weight", Key::Foreign("it does not start with base_model.model.")),
+            ("base_model.model.h.0.c_attn.lora_A.weight", lora("h.0.c_attn", MatrixRole::A)),
+            ("base_model.model.h.0.c_attn.lora_B.bias", lora("h.0.c_attn", MatrixRole::Bias)),
+            ("base_model.model.wte.lora_embedding_B", lora("wte", MatrixRole::EmbeddingB)),
+            ("base_model.model.q.lora_magnitude_vector", lora("q", MatrixRole::Magnitude)),
+            ("base_model.model.lm_head.weight", AdapterKey::Whole("lm_head.weight")),
+            ("base_model.model.q.lora_A.default.weight", AdapterKey::Foreign("the name of an adapter is in it")),
+            ("base_model.model.wte.lora_embedding_A.default", AdapterKey::Foreign("the name of an adapter is in it")),
+            ("h.0.c_attn.lora_A.weight", AdapterKey::Foreign("it does not start with base_model.model.")),
         ] {
-            assert_eq!(Key::parse(name), key, "{name}");
+            assert_eq!(AdapterKey::parse(name), key, "{name}");
         }
     }
 }

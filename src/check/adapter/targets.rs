@@ -28,7 +28,7 @@ enum Modules<'c> {
 }
 
 impl<'c> Targets<'c> {
-    pub(super) fn of(config: &'c Value) -> Self {
+    pub(super) fn from_config(config: &'c Value) -> Self {
         let list = |key: &str| -> Vec<&'c str> {
             config.get(key).and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_str).collect()
         };

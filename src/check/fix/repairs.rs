@@ -13,24 +13,24 @@ pub(super) use names::rename;
 
 use super::{Edit, Site};
 use crate::check::index::{by_tensor, numbered, readable, shard_names, similar};
-use crate::checkpoint::{Checkpoint, INDEX_NAME, Shard};
+use crate::checkpoint::{Checkpoint, FaultKind, INDEX_NAME, Shard};
+use crate::knowledge::rule::BuiltInRepair;
 
-/// Runs the repair of this name, one of [`crate::knowledge::rule::REPAIRS`].
-pub(super) fn run(name: &str, site: &Site<'_>) -> Option<Vec<Edit>> {
-    match name {
-        "add-auto-class" => modules::add_auto_class(site),
-        "add-imports" => modules::add_imports(site),
-        "cut-nul-bytes" => texts::cut_nul_bytes(site),
-        "drop-equal-key" => texts::drop_equal_key(site),
-        "fill-token-holes" => tokens::fill_token_holes(site.checkpoint()),
-        "quote-string" => texts::quote_string(site),
-        "rebuild-index" => {
+/// The edits of a repair; `None` where the checkpoint does not hold what it needs.
+pub(super) fn run(repair: BuiltInRepair, site: &Site<'_>) -> Option<Vec<Edit>> {
+    match repair {
+        BuiltInRepair::AddAutoClass => modules::add_auto_class(site),
+        BuiltInRepair::AddImports => modules::add_imports(site),
+        BuiltInRepair::CutNulBytes => texts::cut_nul_bytes(site),
+        BuiltInRepair::DropEqualKey => texts::drop_equal_key(site),
+        BuiltInRepair::FillTokenHoles => tokens::fill_token_holes(site.checkpoint()),
+        BuiltInRepair::QuoteString => texts::quote_string(site),
+        BuiltInRepair::RebuildIndex => {
             let edit = site.bench.index.get_or_init(|| rebuild_index(site.checkpoint()));
             edit.clone().map(|edit| vec![edit])
         }
-        "reencode" => Some(vec![Edit::Reencode { file: site.place()?.file.clone()? }]),
-        "write-header" => write_headers(site),
-        _ => None,
+        BuiltInRepair::Reencode => Some(vec![Edit::Reencode { file: site.place()?.file.clone()? }]),
+        BuiltInRepair::WriteHeader => write_headers(site),
     }
 }
 
@@ -87,14 +87,14 @@ fn is_whole(shard: &Shard) -> bool {
 }
 
 /// Faults that a new header cures; with any other one the tensors are in doubt.
-const OF_THE_HEADER: [&str; 7] = [
-    "data-hole",
-    "header-padding-not-spaces",
-    "metadata-not-strings",
-    "metadata-null",
-    "no-format-metadata",
-    "odd-tensor-name",
-    "trailing-bytes",
+const OF_THE_HEADER: [FaultKind; 7] = [
+    FaultKind::DataHole,
+    FaultKind::HeaderPaddingNotSpaces,
+    FaultKind::MetadataNotStrings,
+    FaultKind::MetadataNull,
+    FaultKind::NoFormatMetadata,
+    FaultKind::OddTensorName,
+    FaultKind::TrailingBytes,
 ];
 
 /// Whether nothing is lost when the shard is written with a header made from what was read of the old one.

@@ -1,8 +1,8 @@
 //! What loads under one version of transformers and not under another.
 
+use super::LoadReport;
 use super::{Stored, listed};
-use crate::check::finding::LoadReport;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Expected, Loader};
 
 /// A loader's prediction, and the class it was made for.
@@ -32,7 +32,7 @@ pub fn difference(loads: Judged<'_>, other: Judged<'_>, stored: &Stored) -> Opti
         (None, []) => (format!("the load raises: {} of another shape", tensors(&mismatched)), mismatched.as_slice()),
         (None, missing) => (format!("{} would start random", tensors(missing)), missing),
     };
-    let mut fault = Fault::new("loads-differ")
+    let mut fault = Fault::new(FaultKind::LoadsDiffer)
         .with("loads", loads.report.version())
         .with("loader", report.version())
         .with("what", what);

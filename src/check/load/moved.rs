@@ -9,9 +9,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::json;
 
+use super::LoadReport;
 use super::{Stored, predict};
-use crate::check::finding::LoadReport;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::Expected;
 
 /// Stored names from which prefixes are guessed.
@@ -71,7 +71,7 @@ struct Step {
 
 impl Step {
     fn fault(&self, stored: &Stored) -> Fault {
-        let mut fault = Fault::new("names-moved")
+        let mut fault = Fault::new(FaultKind::NamesMoved)
             .with("from", self.from.as_str())
             .with("to", self.to.as_str())
             .with("count", self.names.len())

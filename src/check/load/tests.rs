@@ -3,8 +3,7 @@ use std::collections::BTreeMap;
 use serde_json::json;
 
 use super::*;
-use crate::check::finding::Mismatch;
-use crate::checkpoint::{Dtype, Shard, Tensor};
+use crate::checkpoint::{Dtype, FaultKind, Shard, Tensor};
 use crate::knowledge::{ExpectedTensor, Library, Loader};
 
 type Shapes = BTreeMap<String, Vec<u64>>;
@@ -35,8 +34,8 @@ fn shard(name: &str, tensors: &Shapes) -> Shard {
     Shard { name: name.to_owned(), tensors: tensors.iter().map(tensor).collect(), ..Shard::default() }
 }
 
-fn reasons(report: &LoadReport) -> Vec<(&str, &str)> {
-    report.silent.iter().map(|s| (s.name.as_str(), s.reason.as_str())).collect()
+fn reasons(report: &LoadReport) -> Vec<(&str, SilentReason)> {
+    report.silent.iter().map(|s| (s.name.as_str(), s.reason)).collect()
 }
 
 #[test]
@@ -67,7 +66,7 @@ fn base_model_keys_load_into_a_class_with_a_head() {
     stored.insert("lm_head.weight".to_owned(), vec![10, 4]);
     let report = predict(&expected, &Stored::from_shapes(stored));
     assert!(report.raises.as_deref().is_some_and(|r| r.starts_with("ValueError: The state dictionary")));
-    assert_eq!(faults(&report, None).iter().map(|f| f.kind).collect::<Vec<_>>(), ["load-raises"]);
+    assert_eq!(faults(&report, None).iter().map(|f| f.kind).collect::<Vec<_>>(), [FaultKind::LoadRaises]);
 }
 
 #[test]
@@ -98,9 +97,9 @@ fn one_stray_key_with_the_prefix_hijacks_the_whole_model() {
     let report = predict(&expected, &Stored::from_shapes(stored));
     assert_eq!(report.missing, ["model.language_model.model.w", "model.vision_tower.w"]);
     assert_eq!(report.unexpected, ["language_model.model.w", "modelx.weight", "vision_tower.w"]);
-    assert_eq!(reasons(&report), [("modelx.weight", "prefix-hijack")]);
+    assert_eq!(reasons(&report), [("modelx.weight", SilentReason::PrefixHijack)]);
     let faults = faults(&report, None);
-    assert_eq!(faults.iter().map(|f| f.kind).collect::<Vec<_>>(), ["prefix-hijack"]);
+    assert_eq!(faults.iter().map(|f| f.kind).collect::<Vec<_>>(), [FaultKind::PrefixHijack]);
     assert_eq!(faults[0].detail["tensor"], json!("modelx.weight"));
 }
 
@@ -109,7 +108,7 @@ fn tied_tensors_stand_for_each_other() {
     let expected = llama(true);
     let mut stored = all(&expected);
     let report = predict(&expected, &Stored::from_shapes(stored.clone()));
-    assert_eq!(reasons(&report), [("lm_head.weight", "tied-over")]);
+    assert_eq!(reasons(&report), [("lm_head.weight", SilentReason::TiedOver)]);
     stored.remove("lm_head.weight");
     assert_eq!(predict(&expected, &Stored::from_shapes(stored.clone())), clean());
     stored.remove("model.embed_tokens.weight");
@@ -133,7 +132,7 @@ fn the_index_says_what_is_there_and_the_shards_what_is_loaded() {
     // In the index and in no shard: nothing is reported, and it stays random.
     first.remove(&norm);
     let found = report(&index, &[shard("a.safetensors", &first)]);
-    assert_eq!((found.missing.len(), reasons(&found)), (0, vec![(norm.as_str(), "indexed-but-absent")]));
+    assert_eq!((found.missing.len(), reasons(&found)), (0, vec![(norm.as_str(), SilentReason::IndexedButAbsent)]));
 
     // In a shard the index names for others: loaded all the same.
     index.insert(head.clone(), "b.safetensors".to_owned());
@@ -177,7 +176,10 @@ fn faults_name_a_few_tensors_and_count_the_rest() {
     let report = LoadReport { missing: (0..7).map(|i| format!("t{i}")).collect(), ..LoadReport::default() };
     let faults = faults(&report, None);
     assert_eq!(faults[0].detail["names"], json!("t0, t1, t2, t3, t4 and 2 more"));
-    assert_eq!((faults[0].kind, &faults[0].detail["count"], faults[0].places.len()), ("missing-tensors", &json!(7), 5));
+    assert_eq!(
+        (faults[0].kind, &faults[0].detail["count"], faults[0].places.len()),
+        (FaultKind::MissingTensors, &json!(7), 5)
+    );
 }
 
 /// Llama as 4.57 builds it; its loader reads the same class from the same data.

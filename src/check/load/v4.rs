@@ -6,8 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::keys::{self, Spelling};
-use super::{Stored, absent_groups, pattern};
-use crate::check::finding::{LoadReport, Mismatch, Silent};
+use super::{LoadReport, Mismatch, Silent, SilentReason, Stored, absent_groups, pattern};
 use crate::knowledge::{Evidence, Expected};
 
 /// What it says when a class with a head is given base-model keys without prefix, and the head.
@@ -41,18 +40,18 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         }
         let kept: Vec<&String> = group.iter().filter(|name| file.contains(*name) && !stored.is_absent(name)).collect();
         let by = kept.first().map(|name| (*name).clone());
-        let over = |name: &String| Silent { name: name.clone(), reason: "tied-over".to_owned(), by: by.clone() };
+        let over = |name: &String| Silent { name: name.clone(), reason: SilentReason::TiedOver, by: by.clone() };
         silent.extend(kept.into_iter().skip(1).map(over));
     }
     pattern::ignore(&mut missing, &expected.ignore_missing);
     pattern::ignore(&mut unexpected, &expected.ignore_unexpected);
     for name in stored.absent().filter(|name| model.contains_key(&keys::renamed(name))) {
-        silent.push(Silent { name: name.to_owned(), reason: "indexed-but-absent".to_owned(), by: None });
+        silent.push(Silent { name: name.to_owned(), reason: SilentReason::IndexedButAbsent, by: None });
     }
     for name in keys::hijackers(expected, &file) {
-        silent.push(Silent { name: name.to_owned(), reason: "prefix-hijack".to_owned(), by: None });
+        silent.push(Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None });
     }
-    silent.sort_by(|a, b| (&a.reason, &a.name).cmp(&(&b.reason, &b.name)));
+    silent.sort_by(|a, b| (a.reason, &a.name).cmp(&(b.reason, &b.name)));
 
     let mismatched = stored
         .shapes()

@@ -7,8 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::pattern::Pattern;
 use super::v4::{CORRUPTED, tied_groups};
-use super::{Stored, absent_groups, keys, pattern};
-use crate::check::finding::{LoadReport, Mismatch, Silent};
+use super::{LoadReport, Mismatch, Silent, SilentReason, Stored, absent_groups, keys, pattern};
 use crate::knowledge::{Evidence, Expected};
 
 pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
@@ -50,7 +49,7 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         let kept: Vec<&str> =
             group.iter().filter_map(|name| file.get(*name).copied()).filter(|k| !stored.is_absent(k)).collect();
         let by = kept.first().map(|name| (*name).to_owned());
-        let over = |name: &str| Silent { name: name.to_owned(), reason: "tied-over".to_owned(), by: by.clone() };
+        let over = |name: &str| Silent { name: name.to_owned(), reason: SilentReason::TiedOver, by: by.clone() };
         silent.extend(kept.into_iter().skip(1).map(over));
     }
     missing.sort();
@@ -65,13 +64,13 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
             unexpected.into_iter().map(|name| name.strip_prefix(&prefix).map_or(name.clone(), str::to_owned)).collect();
     }
     for name in stored.absent().filter(|name| matches!(renaming.name(name), Renamed::Is(n) if in_model(&n))) {
-        silent.push(Silent { name: name.to_owned(), reason: "indexed-but-absent".to_owned(), by: None });
+        silent.push(Silent { name: name.to_owned(), reason: SilentReason::IndexedButAbsent, by: None });
     }
     let all: BTreeSet<String> = stored.names().map(str::to_owned).collect();
     for name in keys::hijackers(expected, &all) {
-        silent.push(Silent { name: name.to_owned(), reason: "prefix-hijack".to_owned(), by: None });
+        silent.push(Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None });
     }
-    silent.sort_by(|a, b| (&a.reason, &a.name).cmp(&(&b.reason, &b.name)));
+    silent.sort_by(|a, b| (a.reason, &a.name).cmp(&(b.reason, &b.name)));
 
     let mismatched = stored
         .shapes()

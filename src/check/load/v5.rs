@@ -11,8 +11,8 @@ use indexmap::IndexMap;
 use super::convert::{Shape, Tensors, convert};
 use super::pattern;
 use super::rename::Transform;
+use super::{LoadReport, Mismatch};
 use super::{Stored, absent_groups};
-use crate::check::finding::{LoadReport, Mismatch};
 use crate::knowledge::{Evidence, Expected, ExpectedTensor};
 
 const CONVERSION: &str = "RuntimeError: We encountered some issues during automatic conversion of the weights";

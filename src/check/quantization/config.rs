@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use serde_json::Value;
 
 use super::module;
-use crate::checkpoint::{Checkpoint, Fault, Place};
-use crate::knowledge::quantization::block;
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use crate::knowledge::quantization::{Scheme, block};
 
 /// What AutoGPTQ and AutoAWQ write beside config.json.
 const BESIDE: [&str; 2] = ["quantize_config.json", "quant_config.json"];
@@ -24,7 +24,7 @@ const PARAMETERS: [(&str, &str); 6] = [
 /// A config whose scheme is not known here.
 pub(super) fn unknown(method: &str, config: &Value) -> Fault {
     let pointer = block(config).map_or("", |(pointer, _)| pointer);
-    Fault::new("unknown-quantization").at(Place::file("config.json").pointer(pointer)).with("method", method)
+    Fault::new(FaultKind::UnknownQuantization).at(Place::file("config.json").pointer(pointer)).with("method", method)
 }
 
 /// Parameters that a separate file states otherwise than config.json does.
@@ -39,7 +39,7 @@ pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
             let (Some(here), Some(there)) = (spelled(block), spelled(&other)) else { continue };
             let (said, otherwise) = (block.get(here), other.get(there));
             if said != otherwise {
-                let fault = Fault::new("quantize-config-disagrees")
+                let fault = Fault::new(FaultKind::QuantizeConfigDisagrees)
                     .at(Place::file(name).pointer(format!("/{there}")))
                     .at(Place::file("config.json").pointer(format!("{pointer}/{here}")));
                 faults.push(
@@ -56,10 +56,15 @@ pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
 
 /// Names that nothing explains and that are a scheme's, under a config that says of none.
 #[must_use]
-pub fn undeclared<'n>(names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
+pub fn undeclared<'n>(schemes: &[Scheme], names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
     let names: BTreeSet<&str> = names.into_iter().collect();
-    let (scheme, module) = module::signature(&names)?;
+    let (scheme, module) = module::signature(schemes, &names)?;
     let carrier = scheme.endings().next().unwrap_or_default();
     let at = Place::tensor(format!("{module}{carrier}"));
-    Some(Fault::new("quantized-undeclared").at(at).with("scheme", scheme.summary.as_str()).with("module", module))
+    Some(
+        Fault::new(FaultKind::QuantizedUndeclared)
+            .at(at)
+            .with("scheme", scheme.summary.as_str())
+            .with("module", module),
+    )
 }

@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::skipped::Skipped;
+use super::skipped::SkippedModules;
 use crate::check::load::Stored;
 use crate::checkpoint::{Checkpoint, Dtype};
-use crate::knowledge::quantization::{Part, Scheme, Shapes};
+use crate::knowledge::quantization::{Scheme, Shapes, StoredPart};
 
 /// What is known of a stored tensor; an index alone tells neither.
 #[derive(Debug, Clone, Copy, Default)]
@@ -15,10 +15,10 @@ pub(super) struct Held<'c> {
 }
 
 /// The tensors that a loader finds, by name.
-pub(super) struct Tensors<'c>(BTreeMap<&'c str, Held<'c>>);
+pub(super) struct TensorLookup<'c>(BTreeMap<&'c str, Held<'c>>);
 
-impl<'c> Tensors<'c> {
-    pub(super) fn of(checkpoint: &'c Checkpoint, stored: &'c Stored) -> Self {
+impl<'c> TensorLookup<'c> {
+    pub(super) fn new(checkpoint: &'c Checkpoint, stored: &'c Stored) -> Self {
         let mut tensors: BTreeMap<&str, Held<'_>> = stored.names().map(|name| (name, Held::default())).collect();
         for (_, tensor) in checkpoint.tensors() {
             if let Some(held) = tensors.get_mut(tensor.name.as_str()) {
@@ -35,13 +35,13 @@ impl<'c> Tensors<'c> {
 
 /// A module whose values are stored by a scheme, and which of the scheme's tensors are there, by its order.
 #[derive(Debug)]
-pub(super) struct Module<'c> {
+pub(super) struct StoredModule<'c> {
     /// Its name: that of the plain tensor without the scheme's ending.
     pub(super) name: &'c str,
     pub(super) held: Vec<Option<Held<'c>>>,
 }
 
-impl Module<'_> {
+impl StoredModule<'_> {
     /// Endings of the tensors that are there.
     pub(super) fn endings<'s>(&self, scheme: &'s Scheme) -> Vec<&'s str> {
         scheme.endings().zip(&self.held).filter_map(|(ending, held)| held.is_some().then_some(ending)).collect()
@@ -57,7 +57,11 @@ impl Module<'_> {
 ///
 /// A module is one whose first tensor, which holds the values, is stored; where that keeps its plain name another one
 /// has to be there too. `plain` says whether a class has a tensor of that name: such a one is nobody's scale.
-pub(super) fn group<'c>(scheme: &Scheme, tensors: &Tensors<'c>, plain: impl Fn(&str) -> bool) -> Vec<Module<'c>> {
+pub(super) fn group<'c>(
+    scheme: &Scheme,
+    tensors: &TensorLookup<'c>,
+    plain: impl Fn(&str) -> bool,
+) -> Vec<StoredModule<'c>> {
     let mut endings: Vec<(usize, &str)> = scheme.endings().enumerate().collect();
     // `_scale_inv` before `_scale`; the plain ending is not told from any other tensor's here.
     endings.sort_by_key(|(_, ending)| std::cmp::Reverse(ending.len()));
@@ -71,18 +75,18 @@ pub(super) fn group<'c>(scheme: &Scheme, tensors: &Tensors<'c>, plain: impl Fn(&
         }
     }
     let held = |module: &str, ending: &str| tensors.0.get(format!("{module}{ending}").as_str()).copied();
-    let module = |name| Module { name, held: scheme.endings().map(|ending| held(name, ending)).collect() };
+    let module = |name| StoredModule { name, held: scheme.endings().map(|ending| held(name, ending)).collect() };
     names.into_iter().map(module).filter(|m| m.held.first().is_some_and(Option::is_some)).collect()
 }
 
 /// Modules that are stored plainly although others of their kind are quantised and the config does not leave them out.
 pub(super) fn left_plain<'c>(
     scheme: &Scheme,
-    tensors: &Tensors<'c>,
+    tensors: &TensorLookup<'c>,
     kinds: &BTreeSet<String>,
     quantised: &BTreeSet<&str>,
-    skipped: &Skipped<'_>,
-) -> Vec<Module<'c>> {
+    skipped: &SkippedModules<'_>,
+) -> Vec<StoredModule<'c>> {
     let held = |name: &'c str| {
         scheme
             .endings()
@@ -94,7 +98,7 @@ pub(super) fn left_plain<'c>(
         .filter_map(|name| Some((name, name.strip_suffix(scheme.plain.as_str())?)))
         .filter(|(_, module)| !quantised.contains(module) && kinds.contains(&kind(module)))
         .filter(|(_, module)| !skipped.may_cover(module))
-        .map(|(name, module)| Module { name: module, held: held(name) })
+        .map(|(name, module)| StoredModule { name: module, held: held(name) })
         .collect()
 }
 
@@ -108,10 +112,10 @@ pub(super) fn kind(name: &str) -> String {
 ///
 /// Only a module that has all that its scheme requires is taken for one.
 #[must_use]
-pub(super) fn signature<'n>(names: &BTreeSet<&'n str>) -> Option<(&'static Scheme, &'n str)> {
-    let has = |module: &str, part: &Part| names.contains(&*format!("{module}{}", part.name));
+pub(super) fn signature<'k, 'n>(schemes: &'k [Scheme], names: &BTreeSet<&'n str>) -> Option<(&'k Scheme, &'n str)> {
+    let has = |module: &str, part: &StoredPart| names.contains(&*format!("{module}{}", part.name));
     let whole = |scheme: &Scheme, module: &str| scheme.tensors.iter().all(|p| p.required.is_some() || has(module, p));
-    let found = Scheme::all().iter().filter_map(|scheme| {
+    let found = schemes.iter().filter_map(|scheme| {
         let sign = scheme.sign.as_deref()?;
         let module = names.iter().find_map(|name| name.strip_suffix(sign).filter(|module| whole(scheme, module)))?;
         Some((scheme, module))

@@ -7,30 +7,30 @@
 use regex::Regex;
 
 use crate::knowledge::expression::glob;
-use crate::knowledge::quantization::Applied;
+use crate::knowledge::quantization::AppliedScheme;
 
 /// Longest regular expression of a config that is compiled.
 const PATTERN_CAP: usize = 1_000;
 
 /// The patterns of one config.
-pub(super) struct Skipped<'a> {
-    patterns: Vec<Pattern<'a>>,
+pub(super) struct SkippedModules<'a> {
+    patterns: Vec<SkipPattern<'a>>,
     /// Names of modules, not of branches.
     modules: bool,
 }
 
-enum Pattern<'a> {
+enum SkipPattern<'a> {
     Text(&'a str),
     /// `re:…`, matched at the start as Python's `re.match` does; `None` when it cannot be compiled here.
     Regex(Option<Regex>),
 }
 
-impl<'a> Skipped<'a> {
-    pub(super) fn of(applied: &'a Applied) -> Self {
+impl<'a> SkippedModules<'a> {
+    pub(super) fn new(applied: &'a AppliedScheme<'_>) -> Self {
         let pattern = |text: &'a str| match text.strip_prefix("re:") {
-            Some(regex) if regex.len() > PATTERN_CAP => Pattern::Regex(None),
-            Some(regex) => Pattern::Regex(Regex::new(&format!("^(?:{regex})")).ok()),
-            None => Pattern::Text(text),
+            Some(regex) if regex.len() > PATTERN_CAP => SkipPattern::Regex(None),
+            Some(regex) => SkipPattern::Regex(Regex::new(&format!("^(?:{regex})")).ok()),
+            None => SkipPattern::Text(text),
         };
         let patterns = applied.skipped().into_iter().map(pattern).collect();
         Self { patterns, modules: applied.scheme().skipped_are_modules }
@@ -39,21 +39,21 @@ impl<'a> Skipped<'a> {
     /// The pattern by which every loader leaves this module plain.
     pub(super) fn covers(&self, module: &str) -> Option<&'a str> {
         self.patterns.iter().find_map(|pattern| match pattern {
-            Pattern::Text(text) => {
+            SkipPattern::Text(text) => {
                 // A last segment alone is matched by all; several at the end only by 5.23.
                 let last = || !text.contains('.') && glob(module, &format!("*.{text}"));
                 let branch = || glob(module, &format!("{text}.*")) || last();
                 (module == *text || (!self.modules && (glob(module, text) || branch()))).then_some(*text)
             }
-            Pattern::Regex(_) => None,
+            SkipPattern::Regex(_) => None,
         })
     }
 
     /// Whether some loader may leave this module plain.
     pub(super) fn may_cover(&self, module: &str) -> bool {
         self.patterns.iter().any(|pattern| match pattern {
-            Pattern::Text(text) => module.contains(tail(text)) || glob(module, &format!("*{text}*")),
-            Pattern::Regex(regex) => regex.as_ref().is_none_or(|r| r.is_match(module)),
+            SkipPattern::Text(text) => module.contains(tail(text)) || glob(module, &format!("*{text}*")),
+            SkipPattern::Regex(regex) => regex.as_ref().is_none_or(|r| r.is_match(module)),
         })
     }
 }

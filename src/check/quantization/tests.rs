@@ -1,15 +1,22 @@
+use std::sync::LazyLock;
+
 use serde_json::{Value, json};
 
 use super::*;
 use crate::check::load;
 use crate::checkpoint::Parts;
-use crate::checkpoint::{Document, Dtype, Shard, Tensor};
+use crate::checkpoint::{Document, Dtype, FaultKind, Shard, Tensor};
 use crate::knowledge::ExpectedTensor;
-use crate::knowledge::quantization::said;
+use crate::knowledge::quantization::declared_scheme;
 
-fn applied(block: &Value) -> Box<Applied> {
-    match said(&json!({ "quantization_config": block })) {
-        Said::Known(applied) => applied,
+fn schemes() -> &'static [Scheme] {
+    static SCHEMES: LazyLock<Vec<Scheme>> = LazyLock::new(|| Scheme::embedded().expect("schemes"));
+    &SCHEMES
+}
+
+fn applied(block: &Value) -> Box<AppliedScheme<'static>> {
+    match declared_scheme(&json!({ "quantization_config": block }), schemes()) {
+        DeclaredScheme::Known(applied) => applied,
         _ => panic!("{block} means no scheme"),
     }
 }
@@ -38,7 +45,7 @@ fn checkpoint(tensors: &[(&str, Dtype, &[u64])]) -> Checkpoint {
 }
 
 /// The kinds of fault, and the report of the load.
-fn look(block: &Value, expected: &Expected, checkpoint: &Checkpoint) -> (Vec<&'static str>, LoadReport) {
+fn look(block: &Value, expected: &Expected, checkpoint: &Checkpoint) -> (Vec<FaultKind>, LoadReport) {
     let (applied, stored) = (applied(block), Stored::of(checkpoint));
     let quantised = Quantised::new(&applied, Some(expected), checkpoint, &stored);
     let mut report = quantised.spelled(load::predict(expected, &quantised.plain(&stored))).expect("a report");
@@ -63,7 +70,7 @@ fn experts_of_gpt_oss_are_blocks_the_other_way_round() {
         ("experts.gate_up_proj_bias", Dtype::BF16, &[4, 96]),
     ]);
     let (faults, report) = look(&block, &expected, &turned);
-    assert_eq!((faults, report.mismatched.len()), (vec!["quantized-shape-wrong"; 2], 2));
+    assert_eq!((faults, report.mismatched.len()), (vec![FaultKind::QuantizedShapeWrong; 2], 2));
 }
 
 /// GPT-2 stores its linear layers with the input first.
@@ -85,7 +92,7 @@ fn what_is_missing_is_spelled_as_the_loader_looks_for_it() {
         ("h.1.q.weight", Dtype::F16, &[32, 32]),
     ]);
     let (faults, report) = look(&json!({ "quant_method": "gptq", "bits": 4, "group_size": -1 }), &expected, &stored);
-    assert_eq!(faults, ["plain-though-quantized"]);
+    assert_eq!(faults, [FaultKind::PlainThoughQuantized]);
     let layer = |n: u64| ["qweight", "qzeros", "scales"].map(|ending| format!("h.{n}.q.{ending}"));
     assert_eq!(report.missing, [layer(1), layer(2)].concat());
     assert_eq!(report.unexpected, ["h.1.q.weight"]);
@@ -102,7 +109,7 @@ fn a_module_that_the_config_leaves_plain_is_looked_for_plainly() {
     let tensors: Vec<(&str, Dtype, &[u64])> = tensors.iter().map(|(n, d, s)| (n.as_str(), *d, s.as_slice())).collect();
     let block = json!({ "quant_method": "awq", "group_size": -1, "modules_to_not_convert": ["h.1"] });
     let (faults, report) = look(&block, &expected, &checkpoint(&tensors));
-    assert_eq!(faults, ["quantized-though-skipped"]);
+    assert_eq!(faults, [FaultKind::QuantizedThoughSkipped]);
     assert_eq!(report.missing, ["h.1.q.weight"]);
     assert_eq!(report.unexpected, ["h.1.q.qweight", "h.1.q.qzeros", "h.1.q.scales"]);
 }
@@ -112,7 +119,7 @@ fn an_incomplete_module_of_bitsandbytes_raises() {
     let expected = class(&[("h.0.q.weight", &[32, 32])]);
     let stored = checkpoint(&[("h.0.q.weight", Dtype::U8, &[512, 1]), ("h.0.q.weight.absmax", Dtype::F32, &[16])]);
     let (faults, report) = look(&json!({ "load_in_4bit": true }), &expected, &stored);
-    assert_eq!(faults, ["quantized-module-incomplete"]);
+    assert_eq!(faults, [FaultKind::QuantizedModuleIncomplete]);
     assert_eq!(report.missing, ["h.0.q.weight.quant_map", "h.0.q.weight.quant_state.bitsandbytes__nf4"]);
     assert!(report.raises.is_some_and(|r| r.starts_with("ValueError: Supplied state dict for h.0.q.weight does not")));
 }
@@ -130,12 +137,14 @@ fn absurd_parameters_are_no_panic() {
     }
     let document = Document::parse("config.json", br#"{"quantization_config": 7}"#);
     let config = Checkpoint::planned("", Parts { documents: vec![document], ..Parts::default() });
-    assert!(matches!(said(config.config().expect("JSON")), Said::Plain));
+    assert!(matches!(declared_scheme(config.config().expect("JSON"), schemes()), DeclaredScheme::Plain));
 }
 
 #[test]
 fn tensors_tell_their_scheme() {
-    let told = |names: &[&'static str]| Some(module::signature(&names.iter().copied().collect())?.0.scheme.as_str());
+    let told = |names: &[&'static str]| {
+        Some(module::signature(schemes(), &names.iter().copied().collect())?.0.scheme.as_str())
+    };
     for (scheme, endings) in [
         ("gptq", &["q.qweight", "q.qzeros", "q.scales", "q.g_idx"][..]),
         ("awq", &["q.qweight", "q.qzeros", "q.scales"]),

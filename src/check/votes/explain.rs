@@ -2,11 +2,12 @@
 
 use serde_json::Value;
 
+use super::run::run;
 use super::solve::{put_all, stretch};
-use super::{Vote, run};
-use crate::check::finding::LoadReport;
+use super::vote::Vote;
 use crate::check::load::{self, Stored};
-use crate::checkpoint::{Fault, Place};
+use crate::check::load::{LoadReport, SilentReason};
+use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Architecture, Expected};
 
 /// Why a load report is as it is.
@@ -30,7 +31,7 @@ pub fn explain(
     report: &LoadReport,
 ) -> Option<Explanation> {
     let found = size(report);
-    let renamed = report.raises.is_some() || report.silent.iter().any(|s| s.reason == "prefix-hijack");
+    let renamed = report.raises.is_some() || report.silent.iter().any(|s| s.reason == SilentReason::PrefixHijack);
     // A quantised tensor has the shape that its scheme packs it into.
     if found == 0 || renamed || config.get("quantization_config").is_some_and(Value::is_object) {
         return None;
@@ -57,7 +58,7 @@ fn size(report: &LoadReport) -> usize {
 /// A vote against the config as a fault for the rules.
 #[must_use]
 pub fn fault(vote: &Vote) -> Fault {
-    let mut fault = Fault::new("config-outvoted")
+    let mut fault = Fault::new(FaultKind::ConfigOutvoted)
         .at(Place::file("config.json").pointer(&*vote.pointer))
         .with("key", vote.pointer.trim_start_matches('/').replace('/', "."))
         .with("given", vote.given)

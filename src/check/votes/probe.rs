@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use super::space::{Numbered, Space, put, with};
+use super::space::{Numbered, Space, with};
+use crate::checkpoint::pointer;
 use crate::knowledge::Expected;
 
 /// Another value for a leaf, to see what it changes. Half rather than double: it makes builds cheaper, and lists
@@ -31,7 +32,7 @@ pub(super) fn other(value: &Value) -> Option<Value> {
 }
 
 /// A value of the config that the class's tensors depend on.
-pub(super) struct Key {
+pub(super) struct ProbedKey {
     pub pointer: String,
     /// Its value now, given or by default.
     pub value: Value,
@@ -41,7 +42,7 @@ pub(super) struct Key {
 }
 
 /// The values that names or shapes depend on, found by changing many at once and splitting where something changed.
-pub(super) fn keys(space: &Space<'_>, config: &Value, base: &Expected) -> Vec<Key> {
+pub(super) fn keys(space: &Space<'_>, config: &Value, base: &Expected) -> Vec<ProbedKey> {
     let mut kinds: BTreeMap<u8, Vec<(String, Value, Value)>> = BTreeMap::new();
     for pointer in space.shaping(&base.config) {
         let Some(value) = base.config.pointer(&pointer) else { continue };
@@ -61,10 +62,16 @@ pub(super) fn keys(space: &Space<'_>, config: &Value, base: &Expected) -> Vec<Ke
     found
 }
 
-fn split(space: &Space<'_>, config: &Value, base: &Expected, group: &[(String, Value, Value)], found: &mut Vec<Key>) {
+fn split(
+    space: &Space<'_>,
+    config: &Value,
+    base: &Expected,
+    group: &[(String, Value, Value)],
+    found: &mut Vec<ProbedKey>,
+) {
     let mut changed = config.clone();
     for (pointer, _, other) in group {
-        put(&mut changed, &base.config, pointer, other.clone());
+        pointer::put(&mut changed, &base.config, pointer, other.clone());
     }
     let built = space.build(&changed);
     if built.as_ref().is_some_and(|b| b.tensors == base.tensors) || space.exhausted() {
@@ -72,7 +79,7 @@ fn split(space: &Space<'_>, config: &Value, base: &Expected, group: &[(String, V
     }
     match (group, built) {
         ([(pointer, value, other)], Some(built)) => {
-            found.push(Key { pointer: pointer.clone(), value: value.clone(), other: other.clone(), built });
+            found.push(ProbedKey { pointer: pointer.clone(), value: value.clone(), other: other.clone(), built });
         }
         ([(pointer, value, _)], None) => {
             // Half a value may be refused where twice it, or one more, is not.
@@ -82,7 +89,7 @@ fn split(space: &Space<'_>, config: &Value, base: &Expected, group: &[(String, V
                 (built.tensors != base.tensors).then_some((n, built))
             });
             if let Some((n, built)) = tried.next() {
-                found.push(Key { pointer: pointer.clone(), value: value.clone(), other: n.into(), built });
+                found.push(ProbedKey { pointer: pointer.clone(), value: value.clone(), other: n.into(), built });
             }
         }
         (group, _) => {
@@ -122,7 +129,7 @@ pub(super) type Tally = BTreeMap<u64, usize>;
 /// The values of `key` that would make stored dimensions come out, taking each as a linear function of it.
 ///
 /// The first tally is of dimensions that *are* the value (`vocab_size`), the second of all.
-pub(super) fn by_dimensions(space: &Space<'_>, key: &Key, base: &Expected) -> (Tally, Tally) {
+pub(super) fn by_dimensions(space: &Space<'_>, key: &ProbedKey, base: &Expected) -> (Tally, Tally) {
     let (mut pure, mut all) = (Tally::new(), Tally::new());
     let (Some(value), Some(other)) = (key.value.as_u64(), key.other.as_u64()) else { return (pure, all) };
     for d in dimensions(base, &key.built) {
@@ -161,12 +168,12 @@ fn linear(value: u64, other: u64, d: Dimension<'_>, stored: u64) -> Option<u64> 
 }
 
 /// The values of a count that stored names ask for: one more layer for each number beyond those built.
-pub(super) fn by_names(numbered: &Numbered, key: &Key, base: &Expected) -> Tally {
+pub(super) fn by_names(numbered: &Numbered, key: &ProbedKey, base: &Expected) -> Tally {
     let mut tally = Tally::new();
     let (Some(value), Some(other)) = (key.value.as_u64(), key.other.as_u64()) else { return tally };
     let (larger, smaller) = if value > other { (base, &key.built) } else { (&key.built, base) };
     let differ = larger.tensors.keys().filter(|name| !smaller.tensors.contains_key(*name)).map(String::as_str);
-    for (pattern, last) in Numbered::of(differ).iter() {
+    for (pattern, last) in Numbered::from_names(differ).iter() {
         if let Some(stored) = numbered.largest(pattern)
             && let Some(wanted) = value.max(other).checked_add(stored).and_then(|n| n.checked_sub(last))
             && wanted > 0

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use super::probe::{Key, Tally, by_dimensions, by_names, dimensions, keys, stored_dimension};
-use super::space::{Space, put, with};
+use super::probe::{ProbedKey, Tally, by_dimensions, by_names, dimensions, keys, stored_dimension};
+use super::space::{Space, with};
+use crate::checkpoint::pointer;
 use crate::knowledge::Expected;
 
 /// Times all values are voted on: a value can hide behind another (image size behind patch size), rarely two.
@@ -17,7 +18,7 @@ const LARGEST: u64 = 1 << 32;
 
 /// A config, and what the class builds from it.
 #[derive(Clone)]
-pub(super) struct State {
+pub(super) struct SearchState {
     pub config: Value,
     pub built: Expected,
     pub distance: u64,
@@ -25,7 +26,7 @@ pub(super) struct State {
     pub changed: BTreeSet<String>,
 }
 
-impl State {
+impl SearchState {
     /// The first state: names are spelled as its class spells them.
     pub fn new(space: &mut Space<'_>, config: Value) -> Option<Self> {
         let built = space.build(&config)?;
@@ -59,7 +60,7 @@ impl State {
 pub(super) fn put_all(config: &Value, resolved: &Value, values: &[(String, Value)]) -> Value {
     let mut config = config.clone();
     for (pointer, value) in values {
-        put(&mut config, resolved, pointer, value.clone());
+        pointer::put(&mut config, resolved, pointer, value.clone());
     }
     config
 }
@@ -80,8 +81,7 @@ pub(super) fn stretch(config: &mut Value, resolved: &Value, pointer: &str, value
             && items.len() == before
         {
             let longer: Vec<Value> = items.iter().cycle().take(after).cloned().collect();
-            let key = key.replace('~', "~0").replace('/', "~1");
-            put(config, resolved, &format!("{parent}/{key}"), Value::Array(longer));
+            pointer::put(config, resolved, &pointer::join(parent, key), Value::Array(longer));
         }
     }
 }
@@ -98,7 +98,7 @@ fn reconciled(space: &Space<'_>, config: &mut Value, resolved: &Value, values: &
             }
             let Some(heads) = sibling.as_u64() else { continue };
             let mut other = config.clone();
-            put(&mut other, resolved, &format!("{parent}/{key}"), common_divisor(width, heads).into());
+            pointer::put(&mut other, resolved, &pointer::join(parent, key), common_divisor(width, heads).into());
             if let Some(built) = space.build(&other) {
                 *config = other;
                 return Some(built);
@@ -116,7 +116,7 @@ fn common_divisor(a: u64, b: u64) -> u64 {
 }
 
 /// The config nearest to `start` that votes lead to.
-pub(super) fn solve(space: &Space<'_>, start: State) -> State {
+pub(super) fn solve(space: &Space<'_>, start: SearchState) -> SearchState {
     let mut state = start;
     for _ in 0..ROUNDS {
         let before = state.distance;
@@ -135,7 +135,7 @@ pub(super) fn solve(space: &Space<'_>, start: State) -> State {
 }
 
 /// Dimensions that are a value themselves decide it: products of several values are read more easily after that.
-fn directly(space: &Space<'_>, keys: &[Key], state: State) -> State {
+fn directly(space: &Space<'_>, keys: &[ProbedKey], state: SearchState) -> SearchState {
     let votes: Vec<(String, Value)> = keys
         .iter()
         .filter_map(|key| {
@@ -160,7 +160,7 @@ fn directly(space: &Space<'_>, keys: &[Key], state: State) -> State {
 }
 
 /// Each value that would bring the class nearer to the store, the one that brings it nearest first.
-fn one_by_one(space: &Space<'_>, keys: &[Key], mut state: State) -> State {
+fn one_by_one(space: &Space<'_>, keys: &[ProbedKey], mut state: SearchState) -> SearchState {
     // Among those that bring it as near, a size that grows with a value is better explained than one that shrinks.
     let mut proposals: Vec<((u64, bool), String, Value)> = Vec::new();
     for key in keys {
@@ -191,20 +191,20 @@ fn one_by_one(space: &Space<'_>, keys: &[Key], mut state: State) -> State {
 }
 
 /// Whether some dimension shrinks when the value grows.
-fn falls(key: &Key, base: &Expected) -> bool {
+fn falls(key: &ProbedKey, base: &Expected) -> bool {
     let (Some(value), Some(other)) = (key.value.as_u64(), key.other.as_u64()) else { return false };
     dimensions(base, &key.built).any(|d| (d.here > d.there) != (value > other))
 }
 
 /// Values worth trying for a key, most wanted first.
-fn candidates(space: &Space<'_>, key: &Key, state: &State) -> Vec<Value> {
+fn candidates(space: &Space<'_>, key: &ProbedKey, state: &SearchState) -> Vec<Value> {
     match &key.value {
         Value::Bool(flag) => vec![Value::Bool(!flag)],
         Value::Null => {
             // A first value shows what depends on it; a second one, how.
             let probe = |n: u64| {
                 let built = space.build(&with(&state.config, &state.built.config, &key.pointer, n.into()))?;
-                Some(Key { pointer: key.pointer.clone(), value: key.other.clone(), other: n.into(), built })
+                Some(ProbedKey { pointer: key.pointer.clone(), value: key.other.clone(), other: n.into(), built })
             };
             let Some(second) = probe(16) else { return Vec::new() };
             let (_, mut tally) = by_dimensions(space, &second, &key.built);
@@ -244,7 +244,7 @@ fn most(tally: Tally, but: Option<u64>) -> Vec<Value> {
 
 /// For a ratio such as `mlp_ratio`: the value that scales the first dimension to what is stored.
 #[expect(clippy::cast_precision_loss, reason = "sizes are far below 2^52")]
-fn scaled(space: &Space<'_>, key: &Key, base: &Expected) -> Option<Value> {
+fn scaled(space: &Space<'_>, key: &ProbedKey, base: &Expected) -> Option<Value> {
     let d = dimensions(base, &key.built).next()?;
     let stored = stored_dimension(space, base, &d)?;
     let value = key.value.as_f64()? * (stored as f64) / (d.here as f64);
@@ -252,7 +252,7 @@ fn scaled(space: &Space<'_>, key: &Key, base: &Expected) -> Option<Value> {
 }
 
 /// The value at which a dimension that no line explains, such as `(image_size / patch_size)²`, comes out as stored.
-fn inverted(space: &Space<'_>, key: &Key, state: &State) -> Option<(u64, Value)> {
+fn inverted(space: &Space<'_>, key: &ProbedKey, state: &SearchState) -> Option<(u64, Value)> {
     let (value, other) = (key.value.as_u64()?, key.other.as_u64()?);
     let (d, stored) = dimensions(&state.built, &key.built)
         .filter_map(|d| Some((d, stored_dimension(space, &state.built, &d)?)))

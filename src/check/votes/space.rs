@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Map, Value};
 
 use crate::check::load::{self, Stored};
+use crate::checkpoint::pointer;
 use crate::knowledge::{Architecture, Evidence, Expected};
 
 /// Tensors that may be built in one search: it tries a few hundred configs, and a mixture of experts has tens of
@@ -37,7 +38,7 @@ impl<'a> Space<'a> {
     /// The names are those of the file until [`Self::rename`] is told what the class has.
     pub fn new(architecture: Architecture<'a>, files: &'a Stored) -> Self {
         let evidence = files.evidence();
-        let numbered = Numbered::of(evidence.iter().map(|(name, _)| name));
+        let numbered = Numbered::from_names(evidence.iter().map(|(name, _)| name));
         let stored = evidence.clone();
         Self { architecture, files, evidence, stored, numbered, known: BTreeSet::new(), spent: Cell::new(0) }
     }
@@ -47,7 +48,7 @@ impl<'a> Space<'a> {
         let stored = load::in_model(expected, self.files);
         let changed = !stored.iter().eq(self.stored.iter());
         if changed {
-            self.numbered = Numbered::of(stored.iter().map(|(name, _)| name));
+            self.numbered = Numbered::from_names(stored.iter().map(|(name, _)| name));
             self.stored = stored;
         }
         changed
@@ -57,7 +58,7 @@ impl<'a> Space<'a> {
     pub fn learn(&mut self, config: &Value) {
         let mut bare = Value::Object(Map::new());
         for pointer in leaves(config).iter().filter(|p| p.ends_with("model_type")) {
-            put(&mut bare, &Value::Null, pointer, config.pointer(pointer).cloned().unwrap_or_default());
+            pointer::put(&mut bare, &Value::Null, pointer, config.pointer(pointer).cloned().unwrap_or_default());
         }
         if let Some(built) = self.build(&bare) {
             self.known = leaves(&built.config).iter().map(|pointer| unnumbered(pointer)).collect();
@@ -167,8 +168,7 @@ fn collect(value: &Value, pointer: &mut String, found: &mut Vec<String>) {
     const APART: [&str; 5] = ["id2label", "label2id", "auto_map", "task_specific_params", "quantization_config"];
     let mut step = |key: &str, value: &Value, found: &mut Vec<String>| {
         let before = pointer.len();
-        pointer.push('/');
-        pointer.push_str(&key.replace('~', "~0").replace('/', "~1"));
+        pointer::push(pointer, key);
         collect(value, pointer, found);
         pointer.truncate(before);
     };
@@ -193,51 +193,8 @@ fn collect(value: &Value, pointer: &mut String, found: &mut Vec<String>) {
 /// config with all defaults filled in.
 pub(in crate::check) fn with(config: &Value, resolved: &Value, pointer: &str, value: Value) -> Value {
     let mut config = config.clone();
-    put(&mut config, resolved, pointer, value);
+    pointer::put(&mut config, resolved, pointer, value);
     config
-}
-
-pub(super) fn put(config: &mut Value, resolved: &Value, pointer: &str, value: Value) {
-    let steps: Vec<String> =
-        pointer.split('/').skip(1).map(|step| step.replace("~1", "/").replace("~0", "~")).collect();
-    let Some((last, way)) = steps.split_last() else { return };
-    let (mut here, mut filled) = (config, resolved);
-    for step in way {
-        filled = child(filled, step).unwrap_or(&Value::Null);
-        here = match here {
-            Value::Object(map) => {
-                let next = map.entry(step.clone()).or_insert(Value::Null);
-                if next.is_null() {
-                    *next = if filled.is_null() { Value::Object(Map::new()) } else { filled.clone() };
-                }
-                next
-            }
-            Value::Array(items) => match step.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
-                Some(next) => next,
-                None => return,
-            },
-            _ => return,
-        };
-    }
-    match here {
-        Value::Object(map) => {
-            map.insert(last.clone(), value);
-        }
-        Value::Array(items) => {
-            if let Some(slot) = last.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
-                *slot = value;
-            }
-        }
-        _ => {}
-    }
-}
-
-fn child<'v>(value: &'v Value, step: &str) -> Option<&'v Value> {
-    match value {
-        Value::Object(map) => map.get(step),
-        Value::Array(items) => items.get(step.parse::<usize>().ok()?),
-        _ => None,
-    }
 }
 
 /// The stored names by what is left of them without one of their numbers, and the largest such number.
@@ -246,7 +203,7 @@ fn child<'v>(value: &'v Value, step: &str) -> Option<&'v Value> {
 pub(super) struct Numbered(BTreeMap<String, u64>);
 
 impl Numbered {
-    pub fn of<'n>(names: impl Iterator<Item = &'n str>) -> Self {
+    pub fn from_names<'n>(names: impl Iterator<Item = &'n str>) -> Self {
         let mut largest: BTreeMap<String, u64> = BTreeMap::new();
         for name in names {
             for (pattern, number) in patterns(name) {

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::probe::{Key, dimensions, keys, stored_dimension};
-use super::solve::State;
+use super::probe::{ProbedKey, dimensions, keys, stored_dimension};
+use super::solve::SearchState;
 use super::space::{Space, with};
-use super::{Undecided, Vote, Witness};
+use super::vote::{Undecided, Vote, Witness};
 use crate::knowledge::Expected;
 
 /// Tensors named for one vote.
@@ -16,10 +16,16 @@ const WITNESSES: usize = 3;
 /// The votes on every value that shapes the class.
 ///
 /// `said` is the config as it was given with defaults filled in, `given` that without them.
-pub(super) fn votes(space: &Space<'_>, state: &State, given: &Value, said: &Value) -> (Vec<Vote>, Vec<Undecided>) {
+pub(super) fn votes(
+    space: &Space<'_>,
+    state: &SearchState,
+    given: &Value,
+    said: &Value,
+) -> (Vec<Vote>, Vec<Undecided>) {
     // With computed values written out each value stands for itself: `head_dim` no longer follows `hidden_size`.
-    let pinned = State::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
-    let state = &pinned.map_or_else(|| state.clone(), |pinned| State { changed: state.changed.clone(), ..pinned });
+    let pinned = SearchState::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
+    let state =
+        &pinned.map_or_else(|| state.clone(), |pinned| SearchState { changed: state.changed.clone(), ..pinned });
     let keys = keys(space, &state.config, &state.built);
     let undecided = undecided(&keys, state);
     let loose: BTreeSet<&str> = undecided.iter().flat_map(|u| &u.pointers).map(String::as_str).collect();
@@ -35,7 +41,7 @@ pub(super) fn votes(space: &Space<'_>, state: &State, given: &Value, said: &Valu
     (votes, undecided)
 }
 
-fn vote(space: &Space<'_>, key: &Key, state: &State, given: &Value, said: &Value) -> Vote {
+fn vote(space: &Space<'_>, key: &ProbedKey, state: &SearchState, given: &Value, said: &Value) -> Vote {
     let mut ballot = Ballot::default();
     ballot.count(space, &state.built, &key.built);
     if let Some(more) = key.value.as_u64().and_then(|n| n.checked_add(1))
@@ -114,7 +120,7 @@ impl<'e> Ballot<'e> {
 }
 
 /// Values of which only products or ratios show in the tensors: halving one and doubling another changes nothing.
-fn undecided(keys: &[Key], state: &State) -> Vec<Undecided> {
+fn undecided(keys: &[ProbedKey], state: &SearchState) -> Vec<Undecided> {
     // Every dimension as a product of powers of the values: one row for each set of exponents that occurs.
     let mut rows: BTreeMap<(&str, usize), BTreeMap<usize, i8>> = BTreeMap::new();
     let mut fixed = BTreeSet::new();
@@ -149,7 +155,7 @@ fn undecided(keys: &[Key], state: &State) -> Vec<Undecided> {
     let mut report = |change: &[(usize, i8)]| {
         if vanishes(change) && change.iter().all(|(at, _)| !taken.contains(at)) {
             taken.extend(change.iter().map(|(at, _)| *at));
-            found.extend(Undecided::of(change, keys));
+            found.extend(Undecided::from_scaling(change, keys));
         }
     };
     for (n, &a) in loose.iter().enumerate() {
@@ -174,7 +180,7 @@ fn undecided(keys: &[Key], state: &State) -> Vec<Undecided> {
 
 impl Undecided {
     /// From which values can be scaled together, each with the sign of its exponent.
-    fn of(change: &[(usize, i8)], keys: &[Key]) -> Option<Self> {
+    fn from_scaling(change: &[(usize, i8)], keys: &[ProbedKey]) -> Option<Self> {
         // Name the odd one out first: with it, every other forms a product.
         let positive = change.iter().filter(|(_, sign)| *sign > 0).count();
         let odd = if positive.saturating_mul(2) > change.len() { -1 } else { 1 };

@@ -1,5 +1,7 @@
 #![allow(clippy::arithmetic_side_effects, reason = "numbers here are small")]
 
+use crate::check::load::Stored;
+use crate::checkpoint::FaultKind;
 use proptest::prelude::*;
 use serde_json::json;
 
@@ -69,7 +71,7 @@ fn votes_name_their_witnesses() {
     let named: Vec<String> = vote.evidence.iter().map(ToString::to_string).collect();
     assert_eq!(named, ["model.embed_tokens.weight [340, 64]", "lm_head.weight [340, 64]"]);
     let fault = fault(vote);
-    assert_eq!((fault.kind, fault.places[0].pointer.as_deref()), ("config-outvoted", Some("/vocab_size")));
+    assert_eq!((fault.kind, fault.places[0].pointer.as_deref()), (FaultKind::ConfigOutvoted, Some("/vocab_size")));
     assert_eq!(fault.detail["names"], json!("model.embed_tokens.weight [340, 64], lm_head.weight [340, 64]"));
 }
 

@@ -1,9 +1,9 @@
 //! Numbers that are none: NaN and infinity, by the bits of each element type.
 
-use super::super::{Dtype, Fault, Place, Shard, Tensor};
+use super::super::{Dtype, Fault, FaultKind, Place, Shard, Tensor};
 
 /// Counts of one tensor.
-pub(super) struct Numbers {
+pub(super) struct NonFiniteCounter {
     dtype: Dtype,
     nan: u64,
     infinite: u64,
@@ -12,8 +12,8 @@ pub(super) struct Numbers {
     seen: u64,
 }
 
-impl Numbers {
-    pub(super) fn of(dtype: Dtype) -> Self {
+impl NonFiniteCounter {
+    pub(super) fn new(dtype: Dtype) -> Self {
         Self { dtype, nan: 0, infinite: 0, first: None, seen: 0 }
     }
 
@@ -46,28 +46,33 @@ impl Numbers {
                 self.count(number, infinite);
             }
         }
-        self.seen = self.seen.saturating_add(super::as_u64(elements.len()));
+        self.seen = self.seen.saturating_add(as_u64(elements.len()));
     }
 
     fn narrow(&mut self, bytes: &[u8], is_nan: impl Fn(u8) -> bool) {
         for (number, _) in bytes.iter().enumerate().filter(|(_, b)| is_nan(**b)) {
             self.count(number, false);
         }
-        self.seen = self.seen.saturating_add(super::as_u64(bytes.len()));
+        self.seen = self.seen.saturating_add(as_u64(bytes.len()));
     }
 
     fn count(&mut self, number: usize, infinite: bool) {
         let counter = if infinite { &mut self.infinite } else { &mut self.nan };
         *counter = counter.saturating_add(1);
-        self.first.get_or_insert(self.seen.saturating_add(super::as_u64(number)));
+        self.first.get_or_insert(self.seen.saturating_add(as_u64(number)));
     }
 
     pub(super) fn fault(&self, shard: &Shard, tensor: &Tensor) -> Option<Fault> {
         let first = self.first?;
         let place = Place::file(&*shard.name).in_tensor(&*tensor.name);
-        let fault = Fault::new("non-finite-weights").at(place).with("nan", self.nan).with("infinite", self.infinite);
+        let fault =
+            Fault::new(FaultKind::NonFiniteWeights).at(place).with("nan", self.nan).with("infinite", self.infinite);
         Some(fault.with("elements", self.seen).with("first", first))
     }
+}
+
+pub(super) fn as_u64(n: usize) -> u64 {
+    u64::try_from(n).unwrap_or(u64::MAX)
 }
 
 #[cfg(test)]
@@ -75,7 +80,7 @@ mod tests {
     use super::*;
 
     fn counts(dtype: Dtype, bytes: &[u8]) -> (u64, u64, Option<u64>) {
-        let mut numbers = Numbers::of(dtype);
+        let mut numbers = NonFiniteCounter::new(dtype);
         // In two pieces, as a large tensor comes.
         let (one, two) = bytes.split_at(8);
         numbers.add(one);

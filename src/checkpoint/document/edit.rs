@@ -5,119 +5,19 @@
 
 use std::ops::Range;
 
-use serde::Serialize;
 use serde_json::Value;
 
 use super::Document;
-use crate::checkpoint::scan::{Scanner, Token};
-use crate::checkpoint::text::pointer_steps;
+use crate::checkpoint::pointer;
 
+mod container;
 mod layout;
+mod splice;
 
+pub use splice::{Splice, spliced};
+
+use container::Container;
 use layout::Layout;
-
-/// New text for a byte range.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Splice {
-    /// Bytes that go; empty where something is only put in.
-    pub range: Range<usize>,
-    /// What comes in their place.
-    pub text: String,
-}
-
-impl Splice {
-    /// Whether the two would change the same bytes, or put something in at the same place.
-    #[must_use]
-    pub fn meets(&self, other: &Self) -> bool {
-        let (a, b) = (&self.range, &other.range);
-        a.start == b.start || (a.start < b.end && b.start < a.end)
-    }
-}
-
-/// The text with all splices made; `None` when one lies outside it or two of them meet.
-#[must_use]
-pub fn spliced(text: &str, splices: &[Splice]) -> Option<String> {
-    let mut sorted: Vec<&Splice> = splices.iter().collect();
-    sorted.sort_by_key(|s| s.range.start);
-    if sorted.windows(2).any(|pair| matches!(pair, [a, b] if a.meets(b))) {
-        return None;
-    }
-    let mut out = String::with_capacity(text.len());
-    let mut at = 0;
-    for splice in sorted {
-        out.push_str(text.get(at..splice.range.start)?);
-        out.push_str(&splice.text);
-        text.get(splice.range.clone())?;
-        at = splice.range.end;
-    }
-    out.push_str(text.get(at..)?);
-    Some(out)
-}
-
-/// A member of an object or an element of an array.
-#[derive(Debug, Clone)]
-pub(super) struct Member {
-    pub(super) name: String,
-    pub(super) key: Option<Range<usize>>,
-    pub(super) value: Range<usize>,
-}
-
-impl Member {
-    pub(super) fn start(&self) -> usize {
-        self.key.as_ref().map_or(self.value.start, |key| key.start)
-    }
-}
-
-/// An object or array as it stands in the text.
-#[derive(Debug, Clone)]
-pub(super) struct Container {
-    pub(super) is_object: bool,
-    pub(super) range: Range<usize>,
-    pub(super) members: Vec<Member>,
-}
-
-impl Container {
-    /// Reads the object or array that starts at or after `start`.
-    fn read(text: &str, start: usize) -> Option<Self> {
-        let mut scanner = Scanner::lenient(text, start);
-        let (open, span) = scanner.next().ok()??;
-        let is_object = match open {
-            Token::BeginObject => true,
-            Token::BeginArray => false,
-            _ => return None,
-        };
-        let mut members = Vec::new();
-        loop {
-            let (token, here) = scanner.next().ok()??;
-            match token {
-                Token::EndObject | Token::EndArray => {
-                    return Some(Self { is_object, range: span.start..here.end, members });
-                }
-                Token::Key(key) => {
-                    let (first, value) = scanner.next().ok()??;
-                    scanner.skip_rest_of(&first).ok()?;
-                    let value = value.start..scanner.position();
-                    members.push(Member { name: key.decode().0.into_owned(), key: Some(here), value });
-                }
-                first => {
-                    scanner.skip_rest_of(&first).ok()?;
-                    let name = members.len().to_string();
-                    members.push(Member { name, key: None, value: here.start..scanner.position() });
-                }
-            }
-        }
-    }
-
-    /// Where the member stands that a reader would take: of equal keys the last.
-    fn position(&self, step: &str) -> Option<usize> {
-        self.members.iter().rposition(|m| m.name == step)
-    }
-
-    /// Whether `step` may name a new member.
-    fn takes(&self, step: &str) -> bool {
-        self.is_object || step == "-" || step.parse() == Ok(self.members.len())
-    }
-}
 
 impl Document {
     /// The edit that gives the place at a JSON pointer this value; members and objects that are not there are added.
@@ -126,8 +26,8 @@ impl Document {
     #[must_use]
     pub fn set(&self, pointer: &str, value: &Value) -> Option<Splice> {
         let text = self.text.as_deref()?;
-        let steps = pointer_steps(pointer)?;
-        let layout = Layout::of(text);
+        let steps = pointer::steps(pointer)?;
+        let layout = Layout::from_text(text);
         let mut at = start_of(text);
         for (depth, step) in steps.iter().enumerate() {
             let Some(container) = Container::read(text, at) else {
@@ -180,7 +80,7 @@ impl Document {
     }
 
     fn parent(&self, text: &str, pointer: &str) -> Option<(Container, String)> {
-        let step = pointer_steps(pointer)?.pop()?;
+        let step = pointer::steps(pointer)?.pop()?;
         let (parent, _) = pointer.rsplit_once('/')?;
         Some((Container::read(text, self.locate(parent)?.start)?, step))
     }

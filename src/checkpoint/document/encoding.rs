@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use serde_json::Value;
 
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Text made from a document's bytes.
 pub(super) struct Decoded<'a> {
@@ -17,21 +17,21 @@ pub(super) struct Decoded<'a> {
 /// Decodes as UTF-8, or as what the bytes plainly are instead.
 pub(super) fn decode<'a>(name: &str, bytes: &'a [u8]) -> Decoded<'a> {
     if let Some((encoding, text)) = wide(bytes) {
-        let fault = Fault::new("wrong-encoding").at(Place::file(name)).with("encoding", encoding);
+        let fault = Fault::new(FaultKind::WrongEncoding).at(Place::file(name)).with("encoding", encoding);
         return Decoded { text: Cow::Owned(text), verbatim: false, faults: vec![fault] };
     }
     match std::str::from_utf8(bytes) {
         Ok(text) => {
             let mut faults = Vec::new();
             if text.starts_with('\u{feff}') {
-                faults.push(Fault::new("byte-order-mark").at(Place::file(name).span(0..3)));
+                faults.push(Fault::new(FaultKind::ByteOrderMark).at(Place::file(name).span(0..3)));
             }
             Decoded { text: Cow::Borrowed(text), verbatim: true, faults }
         }
         Err(error) => {
             let at = error.valid_up_to();
             let byte = bytes.get(at).map_or(Value::Null, |b| format!("0x{b:02x}").into());
-            let fault = Fault::new("invalid-utf8").at(Place::file(name)).with("offset", at).with("byte", byte);
+            let fault = Fault::new(FaultKind::InvalidUtf8).at(Place::file(name)).with("offset", at).with("byte", byte);
             Decoded { text: String::from_utf8_lossy(bytes), verbatim: false, faults: vec![fault] }
         }
     }

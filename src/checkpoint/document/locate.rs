@@ -3,8 +3,8 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
-use crate::checkpoint::text::pointer_steps;
 
 /// Finds many places in one text. Each container on the way to one is read once, and so is the text for its lines:
 /// a hundred findings in a document of one line and fifty megabytes would otherwise read it some thousand times.
@@ -12,22 +12,22 @@ use crate::checkpoint::text::pointer_steps;
 pub struct Locator<'t> {
     text: &'t str,
     /// Members of the containers looked into, by where these begin.
-    containers: HashMap<usize, Container>,
+    containers: HashMap<usize, LocatedMembers>,
     /// Line, start of the line and characters before it in the line, for every [`STRIDE`] bytes.
     lines: Vec<Mark>,
 }
 
 /// Where a member stands.
 #[derive(Debug, Clone)]
-struct Found {
+struct MemberSpans {
     key: Option<Range<usize>>,
     value: Range<usize>,
 }
 
 #[derive(Debug)]
-enum Container {
+enum LocatedMembers {
     /// By key; of equal keys the last.
-    Object(HashMap<String, Found>),
+    Object(HashMap<String, MemberSpans>),
     Array(Vec<Range<usize>>),
 }
 
@@ -73,20 +73,22 @@ impl<'t> Locator<'t> {
         (mark.line_breaks.saturating_add(1), mark.characters.saturating_add(1))
     }
 
-    fn find(&mut self, pointer: &str) -> Option<Found> {
+    fn find(&mut self, pointer: &str) -> Option<MemberSpans> {
         let start = if self.text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
-        let mut found: Option<Found> = None;
-        for step in pointer_steps(pointer)? {
+        let mut found: Option<MemberSpans> = None;
+        for step in pointer::steps(pointer)? {
             let start = found.map_or(start, |f| f.value.start);
             if !self.containers.contains_key(&start) {
                 self.containers.insert(start, members(self.text, start)?);
             }
             found = Some(match self.containers.get(&start)? {
-                Container::Object(members) => members.get(&step)?.clone(),
-                Container::Array(items) => Found { key: None, value: items.get(step.parse::<usize>().ok()?)?.clone() },
+                LocatedMembers::Object(members) => members.get(&step)?.clone(),
+                LocatedMembers::Array(items) => {
+                    MemberSpans { key: None, value: items.get(step.parse::<usize>().ok()?)?.clone() }
+                }
             });
         }
-        found.or_else(|| Some(Found { key: None, value: value_at(self.text, start)? }))
+        found.or_else(|| Some(MemberSpans { key: None, value: value_at(self.text, start)? }))
     }
 }
 
@@ -124,16 +126,18 @@ pub(super) fn value_at(text: &str, start: usize) -> Option<Range<usize>> {
 }
 
 /// The members of the container that starts at `start`.
-fn members(text: &str, start: usize) -> Option<Container> {
+fn members(text: &str, start: usize) -> Option<LocatedMembers> {
     let mut scanner = Scanner::lenient(text, start);
     match scanner.next().ok()??.0 {
         Token::BeginObject => {
             let mut members = HashMap::new();
             loop {
-                let (Token::Key(key), span) = scanner.next().ok()?? else { return Some(Container::Object(members)) };
+                let (Token::Key(key), span) = scanner.next().ok()?? else {
+                    return Some(LocatedMembers::Object(members));
+                };
                 let (first, value) = scanner.next().ok()??;
                 scanner.skip_rest_of(&first).ok()?;
-                let found = Found { key: Some(span), value: value.start..scanner.position() };
+                let found = MemberSpans { key: Some(span), value: value.start..scanner.position() };
                 members.insert(key.decode().0.into_owned(), found);
             }
         }
@@ -142,7 +146,7 @@ fn members(text: &str, start: usize) -> Option<Container> {
             loop {
                 let (first, span) = scanner.next().ok()??;
                 if first == Token::EndArray {
-                    return Some(Container::Array(items));
+                    return Some(LocatedMembers::Array(items));
                 }
                 scanner.skip_rest_of(&first).ok()?;
                 items.push(span.start..scanner.position());

@@ -11,16 +11,13 @@ use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::scan::{MAX_DEPTH, ScanError, ScanErrorKind, Scanner, SlipKind, Token};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::text::escape;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 mod build;
 mod duplicates;
 
-use build::Builder;
+use build::{ValueBuilder, is_huge};
 use duplicates::Duplicates;
-
-/// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
-const MAX_DIGITS: usize = 4300;
 
 /// Parts of documents that are left out of the value: what a tokenizer holds in less space.
 fn left_out(name: &str) -> Vec<&'static str> {
@@ -31,18 +28,24 @@ fn left_out(name: &str) -> Vec<&'static str> {
     }
 }
 
-pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
+impl Document {
+    /// Reads a document. Never fails: what is wrong becomes a fault.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
+        parse(name.into(), bytes)
+    }
+}
+
+fn parse(name: String, bytes: &[u8]) -> Document {
     let mut faults = Faults::default();
     if let Some(fault) = not_json_at_all(&name, bytes) {
         let text = std::str::from_utf8(bytes).ok().map(Into::into);
         return Document { name, text, faults: vec![fault], ..Document::default() };
     }
     let Decoded { text, verbatim, faults: of_encoding } = encoding::decode(&name, bytes);
-    for fault in of_encoding {
-        faults.push(fault);
-    }
+    faults.extend(of_encoding);
 
-    let mut reader = Reader { name: &name, verbatim, faults, left_out: left_out(&name) };
+    let mut reader = DocumentReader { name: &name, verbatim, faults, left_out: left_out(&name) };
     let body = reader.cut_nul_bytes(&text);
     let value = reader.read(body);
     if let Some(value) = &value
@@ -50,9 +53,9 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
         && reader.left_out != [""]
     {
         let found = kind_of(value);
-        reader.faults.push(Fault::new("not-an-object").at(Place::file(&*name)).with("found", found));
+        reader.faults.push(Fault::new(FaultKind::NotAnObject).at(Place::file(&*name)).with("found", found));
     }
-    let Reader { faults, left_out, .. } = reader;
+    let DocumentReader { faults, left_out, .. } = reader;
     let text = verbatim.then(|| text.into());
     Document { name, text, value, left_out, faults: faults.into_vec() }
 }
@@ -61,16 +64,16 @@ pub(super) fn parse(name: String, bytes: &[u8]) -> Document {
 fn not_json_at_all(name: &str, bytes: &[u8]) -> Option<Fault> {
     let place = Place::file(name);
     if bytes.trim_ascii().is_empty() {
-        return Some(Fault::new("empty-document").at(place).with("size", bytes.len()));
+        return Some(Fault::new(FaultKind::EmptyDocument).at(place).with("size", bytes.len()));
     }
     if let Some(pointer) = LfsPointer::parse(bytes) {
-        return Some(Fault::new("lfs-pointer").at(place).with("oid", pointer.oid).with("size", pointer.size));
+        return Some(Fault::new(FaultKind::LfsPointer).at(place).with("oid", pointer.oid).with("size", pointer.size));
     }
     if bytes.iter().all(|b| *b == 0) {
-        return Some(Fault::new("nul-bytes").at(place).with("count", bytes.len()).with("all", true));
+        return Some(Fault::new(FaultKind::NulBytes).at(place).with("count", bytes.len()).with("all", true));
     }
     let what = looks_like(bytes)?;
-    Some(Fault::new("html-instead").at(place).with("looks_like", what))
+    Some(Fault::new(FaultKind::HtmlInstead).at(place).with("looks_like", what))
 }
 
 fn kind_of(value: &Value) -> &'static str {
@@ -84,14 +87,14 @@ fn kind_of(value: &Value) -> &'static str {
     }
 }
 
-struct Reader<'n> {
+struct DocumentReader<'n> {
     name: &'n str,
     verbatim: bool,
     faults: Faults,
     left_out: Vec<&'static str>,
 }
 
-impl Reader<'_> {
+impl DocumentReader<'_> {
     /// A place at `span`, when spans mean anything in this document.
     fn place(&self, span: Range<usize>) -> Place {
         let place = Place::file(self.name);
@@ -103,7 +106,7 @@ impl Reader<'_> {
         let Some(first) = text.find('\0') else { return text };
         let count = text.bytes().filter(|b| *b == 0).count();
         let place = self.place(first..first.saturating_add(1));
-        self.faults.push(Fault::new("nul-bytes").at(place).with("count", count).with("all", false));
+        self.faults.push(Fault::new(FaultKind::NulBytes).at(place).with("count", count).with("all", false));
         text.get(..first).filter(|_| text.trim_end_matches('\0').len() == first).unwrap_or(text)
     }
 
@@ -114,7 +117,7 @@ impl Reader<'_> {
         let markers = explain::conflict_markers(text);
         if error.kind != ScanErrorKind::TooDeep && !markers.is_empty() {
             for (span, marker) in &markers {
-                let fault = Fault::new("merge-conflict-marker").at(self.place(span.clone()));
+                let fault = Fault::new(FaultKind::MergeConflictMarker).at(self.place(span.clone()));
                 self.faults.push(fault.with("marker", *marker));
             }
             // The second pass only serves the value; its faults would be consequences of the markers.
@@ -123,7 +126,7 @@ impl Reader<'_> {
             self.faults = faults;
             return value.filter(|_| error.is_none());
         }
-        self.explain(text, &error);
+        self.push_scan_fault(text, &error);
         value.filter(|_| error.kind == ScanErrorKind::Trailing)
     }
 
@@ -131,7 +134,7 @@ impl Reader<'_> {
     fn pass(&mut self, text: &str) -> (Option<Value>, Option<ScanError>) {
         let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
         let mut scanner = Scanner::lenient(text, start);
-        let mut builder = Builder::new(self.left_out.clone(), build::most_nodes(self.name));
+        let mut builder = ValueBuilder::new(self.left_out.clone(), build::most_nodes(self.name));
         let mut duplicates = Duplicates::new(text);
         let error = loop {
             let (token, span) = match scanner.next() {
@@ -139,16 +142,16 @@ impl Reader<'_> {
                 Ok(None) => break None,
                 Err(error) => break Some(error),
             };
-            duplicates.see(&token, &span, &builder);
-            self.see(&token, &span, &builder);
-            builder.see(&token);
+            duplicates.on_token(&token, &span, &builder);
+            self.on_token(&token, &span, &builder);
+            builder.on_token(&token);
         };
         for slip in &scanner.slips {
             let kind = match slip.kind {
-                SlipKind::TrailingComma => "trailing-comma",
-                SlipKind::MissingComma => "missing-comma",
-                SlipKind::Comment => "comment-in-json",
-                SlipKind::SingleQuotes => "single-quoted-string",
+                SlipKind::TrailingComma => FaultKind::TrailingComma,
+                SlipKind::MissingComma => FaultKind::MissingComma,
+                SlipKind::Comment => FaultKind::CommentInJson,
+                SlipKind::SingleQuotes => FaultKind::SingleQuotedString,
             };
             let fault = Fault::new(kind).at(self.place(slip.span.clone()));
             self.faults.push(fault);
@@ -157,24 +160,24 @@ impl Reader<'_> {
             let mut place = self.place(found.later);
             place.pointer = found.pointer;
             let first = self.place(found.first);
-            let fault = Fault::new("duplicate-json-key").at(place).at(first);
+            let fault = Fault::new(FaultKind::DuplicateJsonKey).at(place).at(first);
             self.faults.push(fault.with("key", escape(&found.key, 200)).with("equal", found.equal));
         }
         if builder.overflowed() {
-            let fault = Fault::new("json-too-many-values").at(Place::file(self.name));
+            let fault = Fault::new(FaultKind::JsonTooManyValues).at(Place::file(self.name));
             self.faults.push(fault.with("cap", build::most_nodes(self.name)));
         }
         (builder.finish(), error)
     }
 
     /// Faults of single tokens.
-    fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &Builder) {
+    fn on_token(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
         let fault = match token {
-            Token::NonFinite(literal) => Fault::new("non-finite-number").with("literal", *literal),
+            Token::NonFinite(literal) => Fault::new(FaultKind::NonFiniteNumber).with("literal", *literal),
             Token::Number(literal) if is_huge(literal) => {
-                Fault::new("huge-number").with("literal", escape(literal, 24)).with("digits", literal.len())
+                Fault::new(FaultKind::HugeNumber).with("literal", escape(literal, 24)).with("digits", literal.len())
             }
-            Token::String(text) | Token::Key(text) if text.decode().1 => Fault::new("lone-surrogate"),
+            Token::String(text) | Token::Key(text) if text.decode().1 => Fault::new(FaultKind::LoneSurrogate),
             _ => return,
         };
         let mut place = self.place(span.clone());
@@ -183,29 +186,22 @@ impl Reader<'_> {
     }
 
     /// Turns what ended a pass early into a fault.
-    fn explain(&mut self, text: &str, error: &ScanError) {
+    fn push_scan_fault(&mut self, text: &str, error: &ScanError) {
         let found = text.get(error.span.clone()).unwrap_or_default().trim_end();
         let place = self.place(error.span.start..error.span.start.saturating_add(found.len()));
         self.faults.push(match error.kind {
-            ScanErrorKind::TooDeep => Fault::new("json-too-deep").at(place).with("cap", MAX_DEPTH),
+            ScanErrorKind::TooDeep => Fault::new(FaultKind::JsonTooDeep).at(place).with("cap", MAX_DEPTH),
             ScanErrorKind::Syntax(reason) => {
-                Fault::new("json-syntax").at(place).with("reason", reason).with("found", escape(found, 40))
+                Fault::new(FaultKind::JsonSyntax).at(place).with("reason", reason).with("found", escape(found, 40))
             }
             ScanErrorKind::Trailing => {
                 if let Some(section) = explain::ini_section(found) {
-                    Fault::new("appended-section").at(place).with("section", escape(section, 80))
+                    Fault::new(FaultKind::AppendedSection).at(place).with("section", escape(section, 80))
                 } else {
                     let what = explain::trailing(found);
-                    Fault::new("trailing-content").at(place).with("what", what).with("bytes", found.len())
+                    Fault::new(FaultKind::TrailingContent).at(place).with("what", what).with("bytes", found.len())
                 }
             }
         });
     }
-}
-
-/// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
-/// double becomes infinite.
-fn is_huge(literal: &str) -> bool {
-    literal.len() > MAX_DIGITS
-        || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
 }

@@ -4,10 +4,10 @@ use std::ops::ControlFlow;
 
 use tree_sitter::{Node, ParseOptions, Parser, Tree, TreeCursor};
 
-use super::{Class, Import, Module, RelativeImport};
+use super::{Import, PythonClass, PythonModule, RelativeImport};
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Most syntax nodes looked at: some 3 MB of honest Python, ten times the largest module known.
 const MAX_NODES: usize = 1_000_000;
@@ -21,32 +21,40 @@ const MAX_PROGRESS: usize = 200_000;
 
 /// Where a statement stands.
 #[derive(Debug, Clone, Copy, Default)]
-struct Scope {
+struct StatementContext {
     guarded: bool,
     function: bool,
     class: bool,
 }
 
-pub(super) fn parse(name: String, bytes: &[u8]) -> Module {
+impl PythonModule {
+    /// Reads a module. Never fails: what is wrong becomes a fault.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
+        parse(name.into(), bytes)
+    }
+}
+
+fn parse(name: String, bytes: &[u8]) -> PythonModule {
     let place = Place::file(&*name);
     if let Some(pointer) = LfsPointer::parse(bytes) {
-        let fault = Fault::new("lfs-pointer").at(place).with("oid", pointer.oid).with("size", pointer.size);
-        return Module::unread(name, fault);
+        let fault = Fault::new(FaultKind::LfsPointer).at(place).with("oid", pointer.oid).with("size", pointer.size);
+        return PythonModule::unread(name, fault);
     }
     let text = match std::str::from_utf8(bytes) {
         Ok(text) => text,
         Err(error) => {
-            let fault = Fault::new("invalid-utf8").at(place).with("offset", error.valid_up_to());
-            return Module::unread(name, fault);
+            let fault = Fault::new(FaultKind::InvalidUtf8).at(place).with("offset", error.valid_up_to());
+            return PythonModule::unread(name, fault);
         }
     };
-    let mut module = Module { name, text: Some(text.into()), ..Module::default() };
+    let mut module = PythonModule { name, text: Some(text.into()), ..PythonModule::default() };
     let mut faults = Faults::default();
     if let Some(tree) = Some(text).filter(|text| text.len() <= MAX_BYTES).and_then(tree_of) {
-        Reader { text, module: &mut module, faults: &mut faults }.walk(&tree);
+        ModuleReader { text, module: &mut module, faults: &mut faults }.walk(&tree);
     } else {
         module.unread = true;
-        faults.push(Fault::new("python-too-complex").at(place));
+        faults.push(Fault::new(FaultKind::PythonTooComplex).at(place));
     }
     module.faults = faults.into_vec();
     module
@@ -66,18 +74,18 @@ fn tree_of(text: &str) -> Option<Tree> {
     parser.parse_with_options(&mut |at, _| bytes.get(at..).unwrap_or_default(), None, Some(options))
 }
 
-struct Reader<'a> {
+struct ModuleReader<'a> {
     text: &'a str,
-    module: &'a mut Module,
+    module: &'a mut PythonModule,
     faults: &'a mut Faults,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> ModuleReader<'a> {
     /// Visits every node, without recursion.
     fn walk(&mut self, tree: &Tree) {
         let mut cursor = tree.walk();
         // The scope each open node gives to its children.
-        let mut scopes = vec![Scope::default()];
+        let mut scopes = vec![StatementContext::default()];
         for _ in 0..MAX_NODES {
             let node = cursor.node();
             let scope = scopes.last().copied().unwrap_or_default();
@@ -93,11 +101,11 @@ impl<'a> Reader<'a> {
             }
         }
         self.module.unread = true;
-        self.faults.push(Fault::new("python-too-complex").at(Place::file(&*self.module.name)));
+        self.faults.push(Fault::new(FaultKind::PythonTooComplex).at(Place::file(&*self.module.name)));
     }
 
     #[allow(clippy::unused_self, reason = "reads like the other steps")]
-    fn next(&self, cursor: &mut TreeCursor<'_>, scopes: &mut Vec<Scope>) -> bool {
+    fn next(&self, cursor: &mut TreeCursor<'_>, scopes: &mut Vec<StatementContext>) -> bool {
         while !cursor.goto_next_sibling() {
             if !cursor.goto_parent() {
                 return false;
@@ -112,35 +120,35 @@ impl<'a> Reader<'a> {
     }
 
     /// Takes what a node says; the scope for its children, or `None` when they say nothing.
-    fn visit(&mut self, node: Node<'_>, scope: Scope) -> Option<Scope> {
+    fn visit(&mut self, node: Node<'_>, scope: StatementContext) -> Option<StatementContext> {
         if node.is_error() || node.is_missing() {
             let start = node.start_byte();
             // An error node can span the rest of the file; its beginning is where to look.
             let rest = self.text.get(node.byte_range()).unwrap_or_default();
             let len = rest.find('\n').unwrap_or(rest.len());
             let place = Place::file(&*self.module.name).span(start..start.saturating_add(len));
-            self.faults.push(Fault::new("python-syntax").at(place));
+            self.faults.push(Fault::new(FaultKind::PythonSyntax).at(place));
             return Some(scope);
         }
         let top = !scope.function && !scope.class;
         match node.kind() {
             "class_definition" => {
                 self.class(node, scope);
-                Some(Scope { class: true, ..scope })
+                Some(StatementContext { class: true, ..scope })
             }
             "function_definition" => {
                 if let Some(name) = node.child_by_field_name("name").filter(|_| top) {
                     let name = self.str(name).to_owned();
                     self.module.names.insert(name);
                 }
-                Some(Scope { function: true, ..scope })
+                Some(StatementContext { function: true, ..scope })
             }
             "lambda" | "call" | "string" | "comment" => None,
-            "try_statement" => Some(Scope { guarded: true, ..scope }),
+            "try_statement" => Some(StatementContext { guarded: true, ..scope }),
             "if_statement" => {
                 let test = node.child_by_field_name("condition").map_or("", |c| self.str(c));
                 let guard = test.contains("TYPE_CHECKING") || test.contains("is_") && test.contains("available");
-                Some(Scope { guarded: scope.guarded || guard, ..scope })
+                Some(StatementContext { guarded: scope.guarded || guard, ..scope })
             }
             "import_statement" => {
                 self.import(node, scope, top);
@@ -177,7 +185,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn class(&mut self, node: Node<'_>, scope: Scope) {
+    fn class(&mut self, node: Node<'_>, scope: StatementContext) {
         let Some(name) = node.child_by_field_name("name") else { return };
         if scope.function {
             return;
@@ -195,7 +203,7 @@ impl<'a> Reader<'a> {
                 .collect()
         });
         let tokenizer_class = node.child_by_field_name("body").and_then(|body| self.attribute(body, "tokenizer_class"));
-        self.module.classes.push(Class {
+        self.module.classes.push(PythonClass {
             name: self.str(name).to_owned(),
             name_span: name.byte_range(),
             span: node.byte_range(),
@@ -251,7 +259,7 @@ impl<'a> Reader<'a> {
         Some(content)
     }
 
-    fn import(&mut self, node: Node<'_>, scope: Scope, top: bool) {
+    fn import(&mut self, node: Node<'_>, scope: StatementContext, top: bool) {
         let mut cursor = node.walk();
         let items: Vec<_> = node.children_by_field_name("name", &mut cursor).collect();
         for item in items {
@@ -267,7 +275,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn import_from(&mut self, node: Node<'_>, scope: Scope, top: bool) {
+    fn import_from(&mut self, node: Node<'_>, scope: StatementContext, top: bool) {
         let mut names = Vec::new();
         let mut cursor = node.walk();
         let items: Vec<_> = node.children_by_field_name("name", &mut cursor).collect();

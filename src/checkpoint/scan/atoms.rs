@@ -1,6 +1,6 @@
 //! Words, numbers and strings.
 
-use super::{ScanError, Scanner, SlipKind, Text, Token};
+use super::{JsonString, ScanError, Scanner, SlipKind, Token};
 
 impl<'a> Scanner<'a> {
     pub(super) fn word(&mut self, at: usize) -> Result<Token<'a>, ScanError> {
@@ -76,7 +76,7 @@ impl<'a> Scanner<'a> {
     }
 
     /// Reads a string whose opening `quote` is at the position.
-    pub(super) fn string(&mut self, quote: u8) -> Result<Text<'a>, ScanError> {
+    pub(super) fn string(&mut self, quote: u8) -> Result<JsonString<'a>, ScanError> {
         let open = self.pos;
         let start = open.saturating_add(1);
         let mut at = start;
@@ -104,7 +104,7 @@ impl<'a> Scanner<'a> {
         if quote == b'\'' {
             self.slip(SlipKind::SingleQuotes, open..self.pos);
         }
-        Ok(Text { raw: self.text.get(start..at).unwrap_or_default(), escaped })
+        Ok(JsonString { raw: self.text.get(start..at).unwrap_or_default(), escaped })
     }
 
     /// Bytes of the escape at `at`, checked.

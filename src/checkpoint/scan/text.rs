@@ -4,12 +4,12 @@ use std::borrow::Cow;
 
 /// A string as it stands in the text, without its quotes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Text<'a> {
+pub(crate) struct JsonString<'a> {
     pub(super) raw: &'a str,
     pub(super) escaped: bool,
 }
 
-impl<'a> Text<'a> {
+impl<'a> JsonString<'a> {
     /// The string after unescaping, and whether it held a lone surrogate (replaced by U+FFFD).
     pub(crate) fn decode(self) -> (Cow<'a, str>, bool) {
         if self.escaped { unescape(self.raw) } else { (Cow::Borrowed(self.raw), false) }

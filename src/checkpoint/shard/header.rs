@@ -4,23 +4,34 @@ use std::collections::{BTreeMap, HashMap};
 
 use sha2::{Digest as _, Sha256};
 
-use super::{Dtype, MAX_HEADER, Shard, Tensor, layout};
+use super::entry::HeaderEntry;
+use super::{MAX_HEADER, Shard, layout};
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::scan::{ScanError, ScanErrorKind, Scanner, Token};
 use crate::checkpoint::sniff::looks_like;
-use crate::checkpoint::text::escape;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::text::{escape, hex};
+use crate::checkpoint::{Fault, FaultKind};
 
-mod entry;
-
-pub(super) use entry::Entry;
+mod fields;
 
 /// `format` values that transformers opens. Source: `load_state_dict` in transformers 4.47.0.
 const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
 
+impl Shard {
+    /// Reads a header from the first bytes of a file of `file_len` bytes.
+    ///
+    /// `head` must hold the length field and the header it states, if the file does; of a file that
+    /// is no safetensors file the first few hundred bytes tell what it is.
+    #[must_use]
+    pub fn parse(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
+        let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
+        parse(shard, head)
+    }
+}
+
 /// Fills in `shard`, which has its name and length, from the first bytes of the file.
-pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
+fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     let (header, data_start) = match frame(&shard, head) {
         Ok(frame) => frame,
         Err(fault) => {
@@ -32,66 +43,28 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     shard.header_sha256 = hex(&Sha256::digest(head.get(..header.len().saturating_add(8)).unwrap_or(head)));
 
     let mut faults = Faults::default();
-    let padding = |what: &str| Fault::new("header-padding-not-spaces").at(shard.place()).with("what", what);
-    let header = match header.strip_prefix(b"\xef\xbb\xbf") {
-        Some(rest) => {
-            faults.push(padding("a byte-order mark"));
-            rest
-        }
-        None => header,
+    let Some(text) = header_text(&shard, header, &mut faults) else {
+        shard.faults = faults.into_vec();
+        return shard;
     };
-    let text = match std::str::from_utf8(header) {
-        Ok(text) => text,
-        Err(error) => {
-            faults.push(Fault::new("header-not-utf8").at(shard.place()).with("offset", error.valid_up_to()));
-            shard.faults = faults.into_vec();
-            return shard;
-        }
-    };
-
-    let mut reader = Reader {
-        shard: &shard,
-        scanner: Scanner::strict(text, 0),
-        faults,
-        entries: Vec::new(),
-        metadata: Metadata::Absent,
-    };
+    let scanner = Scanner::strict(text, 0);
+    let mut reader =
+        HeaderReader { shard: &shard, scanner, faults, entries: Vec::new(), metadata: HeaderMetadata::Absent };
     let error = reader.object().err();
-    let Reader { mut faults, entries, metadata, scanner, .. } = reader;
+    let HeaderReader { mut faults, entries, metadata, scanner, .. } = reader;
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
-        let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
-        faults.push(fault.with("offset", span.start));
+        faults.push(not_json(&shard, reason, span.start));
     }
-    let mut unread = true;
-    match error {
-        None => unread = false,
-        Some(ScanError { kind: ScanErrorKind::Trailing, span }) => {
-            unread = false;
-            let rest = text.get(span).unwrap_or_default();
-            faults.push(padding(match rest.trim_start().chars().next() {
-                Some('\0') => "NUL bytes",
-                Some('{') => "a second object",
-                _ => "other bytes",
-            }));
-        }
-        Some(ScanError { kind: ScanErrorKind::TooDeep, span }) => {
-            faults.push(Fault::new("header-too-deep").at(shard.place()).with("offset", span.start));
-        }
-        Some(ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), .. }) => {
-            faults.push(Fault::new("json-too-many-values").at(shard.place()).with("cap", MAX_ENTRIES));
-        }
-        Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) => {
-            let fault = Fault::new("header-not-json").at(shard.place()).with("reason", reason);
-            faults.push(fault.with("offset", span.start));
-        }
-    }
+    // What follows the object is padding; any other error leaves entries unread.
+    let unread = error.as_ref().is_some_and(|error| error.kind != ScanErrorKind::Trailing);
+    faults.extend(error.map(|error| scan_fault(&shard, text, error)));
     if !unread {
         check_format(&shard, &metadata, &mut faults);
     }
     shard.unread = unread;
     shard.metadata = match metadata {
-        Metadata::Strings(strings) => Some(strings),
-        Metadata::Absent | Metadata::Null => None,
+        HeaderMetadata::Strings(strings) => Some(strings),
+        HeaderMetadata::Absent | HeaderMetadata::Null => None,
     };
     let entries = without_duplicates(&shard, entries, &mut faults);
     layout::check(&shard, &entries, &mut faults);
@@ -105,34 +78,81 @@ pub(super) fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     shard
 }
 
+/// The header as text, without a byte-order mark; `None` when it is not UTF-8.
+fn header_text<'h>(shard: &Shard, header: &'h [u8], faults: &mut Faults) -> Option<&'h str> {
+    let bare = header.strip_prefix(b"\xef\xbb\xbf");
+    if bare.is_some() {
+        faults.push(padding(shard, "a byte-order mark"));
+    }
+    match std::str::from_utf8(bare.unwrap_or(header)) {
+        Ok(text) => Some(text),
+        Err(error) => {
+            faults.push(Fault::new(FaultKind::HeaderNotUtf8).at(shard.place()).with("offset", error.valid_up_to()));
+            None
+        }
+    }
+}
+
+/// The fault behind what ended the reading of the object.
+fn scan_fault(shard: &Shard, text: &str, error: ScanError) -> Fault {
+    let start = error.span.start;
+    match error.kind {
+        ScanErrorKind::Trailing => {
+            let rest = text.get(error.span).unwrap_or_default();
+            padding(
+                shard,
+                match rest.trim_start().chars().next() {
+                    Some('\0') => "NUL bytes",
+                    Some('{') => "a second object",
+                    _ => "other bytes",
+                },
+            )
+        }
+        ScanErrorKind::TooDeep => Fault::new(FaultKind::HeaderTooDeep).at(shard.place()).with("offset", start),
+        ScanErrorKind::Syntax(TOO_MANY) => {
+            Fault::new(FaultKind::JsonTooManyValues).at(shard.place()).with("cap", MAX_ENTRIES)
+        }
+        ScanErrorKind::Syntax(reason) => not_json(shard, reason, start),
+    }
+}
+
+fn not_json(shard: &Shard, reason: &str, offset: usize) -> Fault {
+    Fault::new(FaultKind::HeaderNotJson).at(shard.place()).with("reason", reason).with("offset", offset)
+}
+
+fn padding(shard: &Shard, what: &str) -> Fault {
+    Fault::new(FaultKind::HeaderPaddingNotSpaces).at(shard.place()).with("what", what)
+}
+
 /// The header's bytes and where the data region starts, if the file is framed like a safetensors file.
 fn frame<'a>(shard: &Shard, head: &'a [u8]) -> Result<(&'a [u8], u64), Box<Fault>> {
     let fault = |kind| Fault::new(kind).at(shard.place());
     let file_len = shard.file_len;
     if file_len == 0 {
-        return Err(fault("empty-file").into());
+        return Err(fault(FaultKind::EmptyFile).into());
     }
     let whole = u64::try_from(head.len()).is_ok_and(|len| len == file_len);
     if let Some(pointer) = LfsPointer::parse(head).filter(|_| whole) {
-        return Err(fault("lfs-pointer").with("oid", pointer.oid).with("size", pointer.size).into());
+        return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());
     }
     if file_len < 8 {
-        return Err(fault("file-too-short").with("file_len", file_len).into());
+        return Err(fault(FaultKind::FileTooShort).with("file_len", file_len).into());
     }
-    let short = || Box::new(fault("unreadable-file").with("reason", "fewer bytes could be read than the file has"));
+    let short =
+        || Box::new(fault(FaultKind::UnreadableFile).with("reason", "fewer bytes could be read than the file has"));
     let length = head.first_chunk::<8>().ok_or_else(short)?;
     let stated = u64::from_le_bytes(*length);
     let available = file_len.saturating_sub(8);
     if stated == 0 || stated > available || stated > MAX_HEADER {
         if let Some(what) = other_format(head) {
-            return Err(fault("not-safetensors").with("what", what).into());
+            return Err(fault(FaultKind::NotSafetensors).with("what", what).into());
         }
         if stated > MAX_HEADER && stated <= available {
-            return Err(fault("header-too-large").with("stated", stated).with("cap", MAX_HEADER).into());
+            return Err(fault(FaultKind::HeaderTooLarge).with("stated", stated).with("cap", MAX_HEADER).into());
         }
         let big = u64::from_be_bytes(*length);
         let big_endian = big >= 2 && big <= available.min(MAX_HEADER);
-        let fault = fault("header-length-out-of-range").with("stated", stated).with("file_len", file_len);
+        let fault = fault(FaultKind::HeaderLengthOutOfRange).with("stated", stated).with("file_len", file_len);
         return Err(fault.with("big_endian", big_endian).into());
     }
     let end = stated.saturating_add(8);
@@ -163,25 +183,25 @@ fn other_format(head: &[u8]) -> Option<String> {
 const MAX_ENTRIES: usize = 200_000;
 
 /// What `__metadata__` held.
-enum Metadata {
+enum HeaderMetadata {
     Absent,
     Null,
     Strings(BTreeMap<String, String>),
 }
 
-fn check_format(shard: &Shard, metadata: &Metadata, faults: &mut Faults) {
+fn check_format(shard: &Shard, metadata: &HeaderMetadata, faults: &mut Faults) {
     let format = match metadata {
-        Metadata::Strings(strings) => strings.get("format"),
-        Metadata::Absent | Metadata::Null => None,
+        HeaderMetadata::Strings(strings) => strings.get("format"),
+        HeaderMetadata::Absent | HeaderMetadata::Null => None,
     };
     if format.is_none_or(|f| !FORMATS.contains(&f.as_str())) {
-        let fault = Fault::new("no-format-metadata").at(shard.place());
+        let fault = Fault::new(FaultKind::NoFormatMetadata).at(shard.place());
         faults.push(fault.with("format", format.map(|f| escape(f, 80))));
     }
 }
 
 /// Keeps the last of equal names, as Python does, and reports the others.
-fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -> Vec<Entry> {
+fn without_duplicates(shard: &Shard, entries: Vec<HeaderEntry>, faults: &mut Faults) -> Vec<HeaderEntry> {
     let mut drop = vec![false; entries.len()];
     let mut last: HashMap<&str, usize> = HashMap::with_capacity(entries.len());
     for (at, entry) in entries.iter().enumerate() {
@@ -191,17 +211,17 @@ fn without_duplicates(shard: &Shard, entries: Vec<Entry>, faults: &mut Faults) -
     }
     for entry in entries.iter().zip(&drop).filter_map(|(e, d)| d.then_some(e)) {
         let place = shard.place().in_tensor(entry.name.clone());
-        faults.push(Fault::new("duplicate-header-key").at(place).with("key", escape(&entry.name, 200)));
+        faults.push(Fault::new(FaultKind::DuplicateHeaderKey).at(place).with("key", escape(&entry.name, 200)));
     }
     entries.into_iter().zip(drop).filter_map(|(e, d)| (!d).then_some(e)).collect()
 }
 
-struct Reader<'s, 't> {
+struct HeaderReader<'s, 't> {
     shard: &'s Shard,
     scanner: Scanner<'t>,
     faults: Faults,
-    entries: Vec<Entry>,
-    metadata: Metadata,
+    entries: Vec<HeaderEntry>,
+    metadata: HeaderMetadata,
 }
 
 /// Why a header of too many entries is not read on.
@@ -216,7 +236,7 @@ fn ended() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax("the header ends too early"), span: 0..0 }
 }
 
-impl<'t> Reader<'_, 't> {
+impl<'t> HeaderReader<'_, 't> {
     fn token(&mut self) -> Result<Token<'t>, ScanError> {
         Ok(self.scanner.next()?.ok_or_else(ended)?.0)
     }
@@ -235,7 +255,7 @@ impl<'t> Reader<'_, 't> {
             let (name, lone) = key.decode();
             if name == "__metadata__" {
                 if metadata_seen {
-                    let fault = Fault::new("duplicate-header-key").at(self.shard.place());
+                    let fault = Fault::new(FaultKind::DuplicateHeaderKey).at(self.shard.place());
                     self.faults.push(fault.with("key", "__metadata__"));
                 }
                 metadata_seen = true;
@@ -250,11 +270,11 @@ impl<'t> Reader<'_, 't> {
     }
 
     fn read_metadata(&mut self) -> Result<(), ScanError> {
-        let fault = Fault::new("metadata-not-strings").at(self.shard.place());
+        let fault = Fault::new(FaultKind::MetadataNotStrings).at(self.shard.place());
         match self.token()? {
             Token::Null => {
-                self.faults.push(Fault::new("metadata-null").at(self.shard.place()));
-                self.metadata = Metadata::Null;
+                self.faults.push(Fault::new(FaultKind::MetadataNull).at(self.shard.place()));
+                self.metadata = HeaderMetadata::Null;
             }
             Token::BeginObject => {
                 let mut strings = BTreeMap::new();
@@ -267,7 +287,7 @@ impl<'t> Reader<'_, 't> {
                         Token::String(value) if !value.decode().1 => {
                             if strings.contains_key(&key) {
                                 let label = format!("__metadata__.{}", escape(&key, 80));
-                                let fault = Fault::new("duplicate-header-key").at(self.shard.place());
+                                let fault = Fault::new(FaultKind::DuplicateHeaderKey).at(self.shard.place());
                                 self.faults.push(fault.with("key", label));
                             }
                             strings.insert(key, value.decode().0.into_owned());
@@ -285,7 +305,7 @@ impl<'t> Reader<'_, 't> {
                         }
                     }
                 }
-                self.metadata = Metadata::Strings(strings);
+                self.metadata = HeaderMetadata::Strings(strings);
             }
             other => {
                 self.scanner.skip_rest_of(&other)?;
@@ -310,15 +330,7 @@ impl<'t> Reader<'_, 't> {
             return;
         };
         let place = self.shard.place().in_tensor(name);
-        self.faults.push(Fault::new("odd-tensor-name").at(place).with("reason", reason).with("bytes", name.len()));
+        self.faults
+            .push(Fault::new(FaultKind::OddTensorName).at(place).with("reason", reason).with("bytes", name.len()));
     }
-}
-
-pub(in crate::checkpoint) fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write as _;
-    bytes.iter().fold(String::new(), |mut out, byte| {
-        // Writing to a String cannot fail.
-        let _ = write!(out, "{byte:02x}");
-        out
-    })
 }

@@ -6,16 +6,25 @@ use std::path::Path;
 use rustix::fs::SeekFrom;
 use rustix::io::Errno;
 
+use super::tail::zero_tail;
 use super::{MAX_HEADER, Shard, Tensor};
-use crate::checkpoint::contents::tail;
 use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::sniff::looks_like;
-use crate::checkpoint::{Fault, Place};
+use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Enough to recognise what a file is, and most tiny headers whole.
 const SAMPLE: u64 = 4096;
 
-pub(super) fn read(dir: &Path, name: &str) -> Shard {
+impl Shard {
+    /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: what is
+    /// wrong becomes a fault.
+    #[must_use]
+    pub fn read(dir: &Path, name: &str) -> Self {
+        read(dir, name)
+    }
+}
+
+fn read(dir: &Path, name: &str) -> Shard {
     let opened = match open_regular(&dir.join(name), u64::MAX) {
         Ok(opened) => opened,
         Err(error) => return Shard::unread(name, error.fault(name)),
@@ -23,7 +32,7 @@ pub(super) fn read(dir: &Path, name: &str) -> Shard {
     let head = match read_head(&opened) {
         Ok(head) => head,
         Err(error) => {
-            let fault = Fault::new("unreadable-file").at(Place::file(name)).with("reason", error.to_string());
+            let fault = Fault::new(FaultKind::UnreadableFile).at(Place::file(name)).with("reason", error.to_string());
             return Shard { file_len: opened.identity.size, ..Shard::unread(name, fault) };
         }
     };
@@ -56,7 +65,7 @@ fn unwritten_tail(shard: &Shard, opened: &Opened) -> Option<Fault> {
             Ok(data) if data > hole => at = data,
             Err(Errno::NXIO) => {
                 let tensors: Vec<&Tensor> = shard.tensors.iter().collect();
-                return tail(shard, &tensors, written(opened, shard.data_start, hole)?);
+                return zero_tail(shard, &tensors, written(opened, shard.data_start, hole)?);
             }
             _ => return None,
         }
@@ -93,7 +102,7 @@ fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
 
 /// Adds what the bytes behind the last tensor look like, when they are recognisable.
 fn name_trailing_bytes(shard: &mut Shard, opened: &Opened) {
-    for fault in shard.faults.iter_mut().filter(|f| f.kind == "trailing-bytes") {
+    for fault in shard.faults.iter_mut().filter(|f| f.kind == FaultKind::TrailingBytes) {
         let Some(count) = fault.detail.get("count").and_then(serde_json::Value::as_u64) else { continue };
         let mut bytes = vec![0; usize::try_from(count.min(512)).unwrap_or(0)];
         if opened.file.read_exact_at(&mut bytes, opened.identity.size.saturating_sub(count)).is_err() {

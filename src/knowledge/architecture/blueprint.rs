@@ -93,6 +93,10 @@ pub(crate) struct Blueprint {
     /// By loader, in the order of [`Loader::ALL`]: what [`Self::config`] merged.
     #[serde(skip)]
     merged: [OnceLock<ConfigClass>; Loader::ALL.len()],
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    #[expect(dead_code, reason = "for editors")]
+    pub schema: Option<String>,
 }
 
 /// What a config class fills in under one loader, and what it means.

@@ -20,6 +20,17 @@ pub enum Doubt {
     Null(String),
 }
 
+impl Doubt {
+    /// The JSON pointer of the key it is about, where it is about one.
+    #[must_use]
+    pub fn pointer(&self) -> Option<&str> {
+        match self {
+            Self::UnreadKey(pointer) | Self::Null(pointer) => Some(pointer),
+            Self::Corner(_) => None,
+        }
+    }
+}
+
 /// The keys of a config, and of those in it, that the source reads and the description knows nothing of.
 ///
 /// Called with the config as it is written. A key whose value is the one that all samples had is covered.

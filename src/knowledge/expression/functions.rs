@@ -5,15 +5,33 @@ use cel::common::value::Val;
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 use serde_json::Value;
 
-use super::{Scope, steps};
+use super::scope::Scope;
+use super::steps;
 
 /// Longest list `range` makes.
 const RANGE_CAP: i64 = 100_000;
 
-type Outcome = Result<Value, String>;
+type FunctionResult = Result<Value, String>;
+
+impl Scope<'static> {
+    /// A root scope with the standard functions of CEL and those of the data files:
+    /// `pow isqrt sum floor ceil range min max get keys zpad glob`.
+    #[must_use]
+    pub fn new() -> Self {
+        let mut scope = Self::bare();
+        register(&mut scope);
+        scope
+    }
+}
+
+impl Default for Scope<'static> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
 
 /// Adds all functions to a root scope.
-pub(super) fn register(scope: &mut Scope<'static>) {
+fn register(scope: &mut Scope<'static>) {
     scope.function("pow", pow);
     scope.function("isqrt", isqrt);
     scope.function("sum", sum);
@@ -34,7 +52,7 @@ pub(super) fn register(scope: &mut Scope<'static>) {
 }
 
 /// The words of a text, in lower case, between separators; a list is its words already. As `pos_att_type: "p2c|c2p"`.
-fn split(arguments: &[Value]) -> Outcome {
+fn split(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [Value::String(text), Value::String(separator)] => {
             Ok(text.to_lowercase().split(separator.as_str()).map(|word| Value::from(word.trim())).collect())
@@ -44,7 +62,7 @@ fn split(arguments: &[Value]) -> Outcome {
     }
 }
 
-fn pow(arguments: &[Value]) -> Outcome {
+fn pow(arguments: &[Value]) -> FunctionResult {
     let usage = || "pow(base, exponent) takes two integers, the exponent from 0".to_owned();
     let [base, exponent] = arguments else { return Err(usage()) };
     let (Some(base), Some(exponent)) = (base.as_i64(), exponent.as_u64()) else { return Err(usage()) };
@@ -53,7 +71,7 @@ fn pow(arguments: &[Value]) -> Outcome {
 }
 
 /// The whole part of an integer's square root.
-fn isqrt(arguments: &[Value]) -> Outcome {
+fn isqrt(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n] => {
             n.as_i64().and_then(i64::checked_isqrt).map(Value::from).ok_or_else(|| format!("{n} has no square root"))
@@ -63,7 +81,7 @@ fn isqrt(arguments: &[Value]) -> Outcome {
 }
 
 /// The sum of a list of integers, or of numbers when one is not an integer.
-fn sum(arguments: &[Value]) -> Outcome {
+fn sum(arguments: &[Value]) -> FunctionResult {
     let [Value::Array(items)] = arguments else { return Err("sum(list) takes one list of numbers".to_owned()) };
     if let Some(integers) = items.iter().map(Value::as_i64).collect::<Option<Vec<_>>>() {
         let total = integers.into_iter().try_fold(0_i64, i64::checked_add);
@@ -73,7 +91,7 @@ fn sum(arguments: &[Value]) -> Outcome {
     numbers.map(|n| n.into_iter().sum::<f64>().into()).ok_or_else(|| "sum(list) takes numbers only".to_owned())
 }
 
-fn round(arguments: &[Value], to: fn(f64) -> f64) -> Outcome {
+fn round(arguments: &[Value], to: fn(f64) -> f64) -> FunctionResult {
     match arguments {
         [Value::Number(n)] if n.is_i64() => Ok(Value::Number(n.clone())),
         [Value::Number(n)] => {
@@ -91,7 +109,7 @@ fn round(arguments: &[Value], to: fn(f64) -> f64) -> Outcome {
     }
 }
 
-fn range(arguments: &[Value]) -> Outcome {
+fn range(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n] => match n.as_i64() {
             Some(n) if n <= RANGE_CAP => Ok((0..n).collect::<Vec<_>>().into()),
@@ -101,14 +119,14 @@ fn range(arguments: &[Value]) -> Outcome {
     }
 }
 
-fn keys(arguments: &[Value]) -> Outcome {
+fn keys(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [Value::Object(map)] => Ok(map.keys().cloned().collect::<Vec<_>>().into()),
         _ => Err("keys(map) takes one map".to_owned()),
     }
 }
 
-fn zpad(arguments: &[Value]) -> Outcome {
+fn zpad(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n, width] => match (n.as_u64(), width.as_u64()) {
             (Some(n), Some(width @ 0..=64)) => {

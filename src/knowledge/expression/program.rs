@@ -5,7 +5,8 @@ use cel::common::types::CelString;
 use cel::common::value::Val;
 use cel::{Context, ExecutionError, Value as Cel};
 
-use super::{ENV, steps};
+use super::scope::ENV;
+use super::steps;
 
 /// Most expressions of the data files are a number, a flag, or a path such as `c.hidden_size`: those need neither CEL's
 /// parser, which is slow, nor its interpreter.

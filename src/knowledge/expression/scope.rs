@@ -1,14 +1,15 @@
 //! The names an expression can use, and the way between JSON and CEL values.
 
 use std::collections::HashMap;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use cel::common::types::{CelBool, CelDouble, CelInt, CelList, CelMap, CelMapKey, CelNull, CelString};
 use cel::common::value::Val;
-use cel::{Context, ExecutionError, FunctionContext, Value as Cel};
+use cel::{Context, Env, ExecutionError, FunctionContext, Value as Cel};
 use serde_json::{Map, Value};
 
-use super::functions;
+/// The standard CEL environment, built once.
+pub(super) static ENV: LazyLock<Arc<Env>> = LazyLock::new(|| Arc::new(Env::stdlib()));
 
 /// An evaluation environment: variables and functions.
 ///
@@ -19,13 +20,9 @@ pub struct Scope<'p> {
 }
 
 impl Scope<'static> {
-    /// A root scope with the standard functions of CEL and those of the data files:
-    /// `pow isqrt sum floor ceil range min max get keys zpad glob`.
-    #[must_use]
-    pub fn new() -> Self {
-        let mut scope = Self { context: Context::with_env(Arc::clone(&super::ENV)) };
-        functions::register(&mut scope);
-        scope
+    /// A root scope with the standard functions of CEL alone; [`Scope::new`] adds those of the data files.
+    pub(super) fn bare() -> Self {
+        Self { context: Context::with_env(Arc::clone(&ENV)) }
     }
 
     /// Adds a function of any number of arguments; an `Err` becomes the expression's error.
@@ -86,12 +83,6 @@ impl Scope<'static> {
         if let Err(e) = self.context.add_function(name, f) {
             panic!("{e}");
         }
-    }
-}
-
-impl Default for Scope<'static> {
-    fn default() -> Self {
-        Self::new()
     }
 }
 
@@ -190,4 +181,13 @@ pub(super) fn to_json(value: &Cel) -> Option<Value> {
         }
         _ => return None,
     })
+}
+
+/// A value as it stands in a sentence.
+pub(super) fn plain(value: &Value) -> String {
+    match value {
+        Value::String(s) => s.clone(),
+        Value::Array(items) => format!("[{}]", items.iter().map(plain).collect::<Vec<_>>().join(", ")),
+        other => other.to_string(),
+    }
 }

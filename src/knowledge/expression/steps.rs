@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use cel::common::ast::{CallExpr, EntryExpr, Expr, IdedExpr, operators};
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 
-use super::Scope;
+use super::scope::Scope;
 
 /// Name of the function; `@` is in no identifier.
 const COUNT: &str = "@count";
@@ -32,14 +32,14 @@ thread_local! {
 /// Runs `work`, in which expressions may take so many steps, and says whether they took them all. Any evaluation after
 /// that fails, so the result is then worth nothing.
 pub(crate) fn within<T>(steps: u64, work: impl FnOnce() -> T) -> (T, bool) {
-    struct Before(Option<Limit>);
-    impl Drop for Before {
+    struct RestoreLimit(Option<Limit>);
+    impl Drop for RestoreLimit {
         fn drop(&mut self) {
             LIMIT.set(self.0);
         }
     }
     let until = Instant::now().checked_add(LONGEST).unwrap_or_else(Instant::now);
-    let _before = Before(LIMIT.replace(Some(Limit { steps, until })));
+    let _before = RestoreLimit(LIMIT.replace(Some(Limit { steps, until })));
     let result = work();
     (result, LIMIT.get().is_some_and(|limit| limit.steps == 0))
 }

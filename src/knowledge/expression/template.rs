@@ -4,9 +4,9 @@ use std::borrow::Cow;
 use std::fmt;
 
 use serde::{Deserialize, Deserializer};
-use serde_json::Value;
 
-use super::{EvalError, Expression, ParseError, Scope};
+use super::compiled::{EvalError, Expression, ParseError, compiled_at_once};
+use super::scope::{Scope, plain};
 
 /// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
 #[derive(Clone, PartialEq, Eq)]
@@ -33,7 +33,7 @@ impl Template {
     /// # Errors
     /// When a brace has no partner, or a placeholder is not an expression.
     pub fn parse(source: &str) -> Result<Self, ParseError> {
-        super::compiled_at_once(|| Self::written(source))
+        compiled_at_once(|| Self::written(source))
     }
 
     fn written(source: &str) -> Result<Self, ParseError> {
@@ -133,15 +133,6 @@ fn closing_brace(body: &str) -> Option<usize> {
         }
     }
     None
-}
-
-/// A value as it stands in a sentence.
-pub(super) fn plain(value: &Value) -> String {
-    match value {
-        Value::String(s) => s.clone(),
-        Value::Array(items) => format!("[{}]", items.iter().map(plain).collect::<Vec<_>>().join(", ")),
-        other => other.to_string(),
-    }
 }
 
 impl fmt::Display for Template {

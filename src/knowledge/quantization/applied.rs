@@ -8,9 +8,9 @@ use crate::knowledge::Scope;
 /// Shapes of a module's tensors by the order of the scheme's; `None` where any is right.
 pub type Shapes = Vec<Option<Vec<u64>>>;
 
-/// A scheme as one config means it.
-pub struct Applied {
-    scheme: &'static Scheme,
+/// A scheme with the parameters that one config gives it.
+pub struct AppliedScheme<'k> {
+    scheme: &'k Scheme,
     block: Value,
     pointer: &'static str,
     /// Binds `config`, `q` and the functions; parameters are bound in scopes inside it.
@@ -19,8 +19,8 @@ pub struct Applied {
     values: Vec<Value>,
 }
 
-impl Applied {
-    pub(super) fn new(scheme: &'static Scheme, config: &Value, (pointer, block): (&'static str, &Value)) -> Self {
+impl<'k> AppliedScheme<'k> {
+    pub(super) fn new(scheme: &'k Scheme, config: &Value, (pointer, block): (&'static str, &Value)) -> Self {
         // Where both of MLX's blocks stand, modules with parameters of their own are in the older one.
         let block = if scheme.overrides { config.get("quantization").unwrap_or(block) } else { block }.clone();
         let mut scope = Scope::new();
@@ -44,7 +44,7 @@ impl Applied {
 
     /// The scheme.
     #[must_use]
-    pub const fn scheme(&self) -> &'static Scheme {
+    pub const fn scheme(&self) -> &'k Scheme {
         self.scheme
     }
 
@@ -116,7 +116,7 @@ impl Applied {
     pub fn required(&self, held: &[&str]) -> Vec<bool> {
         let mut scope = self.inner(&self.values);
         scope.bind("held", &held.into());
-        let required = |part: &super::Part| {
+        let required = |part: &super::StoredPart| {
             part.required.as_ref().is_none_or(|required| required.eval_bool(&scope).unwrap_or(false))
         };
         self.scheme.tensors.iter().map(required).collect()
@@ -158,7 +158,7 @@ impl Applied {
     }
 }
 
-impl std::fmt::Debug for Applied {
+impl std::fmt::Debug for AppliedScheme<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{} {:?}", self.scheme.scheme, self.values)
     }

@@ -89,17 +89,14 @@ pub enum EditSpec {
         /// Path below `rules/recipes/`.
         text: String,
     },
-    /// One of [`REPAIRS`].
-    Repair(String),
+    /// A repair that needs more than an expression.
+    Repair(BuiltInRepair),
 }
 
 impl EditSpec {
     /// Whether what it names exists; the error says what does not.
     pub(super) fn check(&self) -> Result<(), String> {
         match self {
-            Self::Repair(name) if !REPAIRS.contains(&name.as_str()) => {
-                Err(format!("no such repair: {name}; there are {}", REPAIRS.join(", ")))
-            }
             Self::Write { text, .. } if source::text(&format!("recipes/{text}")).is_none() => {
                 Err(format!("no such file: rules/recipes/{text}"))
             }
@@ -108,18 +105,45 @@ impl EditSpec {
     }
 }
 
-/// Repairs that need more than an expression, by the names rules use; `src/check/fix/repairs.rs` has them.
-pub const REPAIRS: &[&str] = &[
-    "add-auto-class",
-    "add-imports",
-    "cut-nul-bytes",
-    "drop-equal-key",
-    "fill-token-holes",
-    "quote-string",
-    "rebuild-index",
-    "reencode",
-    "write-header",
-];
+/// A repair that needs more than an expression; `src/check/fix/repairs.rs` implements each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum BuiltInRepair {
+    /// Adds to `auto_map` the class that the modules define for a key.
+    AddAutoClass,
+    /// Adds to a module the imports of the modules that it imports.
+    AddImports,
+    /// Cuts off the NUL bytes at the end of a document.
+    CutNulBytes,
+    /// Removes the second of two equal members, key and value.
+    DropEqualKey,
+    /// Adds the entries that `added_tokens_decoder` lacks and another tokenizer file has.
+    FillTokenHoles,
+    /// Puts a single-quoted string in double quotes.
+    QuoteString,
+    /// Rebuilds the index from the shard headers.
+    RebuildIndex,
+    /// Writes a document in UTF-8 that is in another encoding.
+    Reencode,
+    /// Writes the header of a shard again.
+    WriteHeader,
+}
+
+impl BuiltInRepair {
+    /// Every repair, in the order of their names.
+    pub const ALL: &[Self] = &[
+        Self::AddAutoClass,
+        Self::AddImports,
+        Self::CutNulBytes,
+        Self::DropEqualKey,
+        Self::FillTokenHoles,
+        Self::QuoteString,
+        Self::RebuildIndex,
+        Self::Reencode,
+        Self::WriteHeader,
+    ];
+}
 
 /// The two ways to write fixes, for the schema.
 #[cfg(test)]

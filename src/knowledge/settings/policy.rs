@@ -5,21 +5,22 @@ use std::path::{Path, PathBuf};
 
 use globset::{GlobBuilder, GlobMatcher};
 
-use super::{Source, absolute};
+use super::SettingsSource;
+use super::find::absolute;
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::source::DataError;
 
 /// What becomes of findings, by their rule and place.
 #[derive(Debug, Clone, Default)]
 pub struct Policy {
-    places: Vec<Place>,
+    places: Vec<AreaSettings>,
     /// What is accepted, in the order it was written.
     pub suppressions: Vec<Suppression>,
 }
 
 /// Other severities, and silence, in some place.
 #[derive(Debug, Clone)]
-struct Place {
+struct AreaSettings {
     area: Area,
     ignore: BTreeSet<String>,
     severity: BTreeMap<String, Severity>,
@@ -54,13 +55,16 @@ struct Area {
 
 impl Policy {
     /// What the sources say, of which a later one has the last word.
-    pub(super) fn of(sources: &[Source], rules: &RuleSet) -> Result<Self, DataError> {
+    pub(super) fn from_sources(sources: &[SettingsSource], rules: &RuleSet) -> Result<Self, DataError> {
         let mut policy = Self::default();
         for source in sources {
             let codes = |word: &String| rules.codes(word).map_err(|e| source.wrong(word, e.to_string()));
             for (glob, said) in &source.settings.per_path {
-                let mut place =
-                    Place { area: Area::of(source, Some(glob))?, ignore: BTreeSet::new(), severity: BTreeMap::new() };
+                let mut place = AreaSettings {
+                    area: Area::new(source, Some(glob))?,
+                    ignore: BTreeSet::new(),
+                    severity: BTreeMap::new(),
+                };
                 for word in &said.ignore {
                     place.ignore.extend(codes(word)?);
                 }
@@ -83,7 +87,7 @@ impl Policy {
                     path: said.path.clone(),
                     reason: said.reason.clone(),
                     written: format!("{}: suppress[{number}]", source.name),
-                    area: Area::of(source, said.path.as_ref())?,
+                    area: Area::new(source, said.path.as_ref())?,
                 });
             }
         }
@@ -128,7 +132,7 @@ impl Suppression {
 }
 
 impl Area {
-    fn of(source: &Source, glob: Option<&String>) -> Result<Self, DataError> {
+    fn new(source: &SettingsSource, glob: Option<&String>) -> Result<Self, DataError> {
         let mut dir = source.dir.clone();
         let Some(written) = glob else { return Ok(Self { base: dir.clone(), dir, glob: None }) };
         let mut rest = written.trim_end_matches('/');

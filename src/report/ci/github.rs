@@ -9,7 +9,7 @@ use super::{Group, Item, PATH, file, groups};
 use crate::check::Severity;
 use crate::checkpoint::escape;
 use crate::report::Report;
-use crate::report::words::name;
+use crate::report::format::name;
 
 pub fn render(report: &Report) -> String {
     let mut out = String::new();

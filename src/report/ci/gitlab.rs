@@ -7,20 +7,20 @@ use serde::Serialize;
 use super::{file, groups};
 use crate::check::Severity;
 use crate::report::Report;
+use crate::report::format::name;
 use crate::report::json;
-use crate::report::words::name;
 
 #[derive(Serialize)]
-struct Entry {
+struct QualityEntry {
     description: String,
     check_name: String,
     fingerprint: String,
     severity: &'static str,
-    location: Place,
+    location: QualityLocation,
 }
 
 #[derive(Serialize)]
-struct Place {
+struct QualityLocation {
     path: String,
     lines: Lines,
 }
@@ -43,12 +43,12 @@ pub fn render(report: &Report) -> String {
                 Severity::Warning => "minor",
                 Severity::Info => "info",
             };
-            entries.push(Entry {
+            entries.push(QualityEntry {
                 description: item.message,
                 check_name: name(item.code),
                 fingerprint: item.fingerprint,
                 severity,
-                location: Place { path, lines: Lines { begin } },
+                location: QualityLocation { path, lines: Lines { begin } },
             });
         }
     }

@@ -11,7 +11,7 @@ use super::{Group, Item, PATH, file, groups, spot};
 use crate::check::Severity;
 use crate::checkpoint::escape;
 use crate::report::Report;
-use crate::report::words::{more, name, tensors};
+use crate::report::format::{more, name, tensors};
 
 /// Most places told of one finding.
 const PLACES: usize = 100;

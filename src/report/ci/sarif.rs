@@ -3,93 +3,84 @@
 //! <https://docs.oasis-open.org/sarif/sarif/v2.1.0/sarif-v2.1.0.html>; the numbers below are its sections.
 
 mod fixes;
+mod parts;
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use super::{Group, Item, file, groups};
+use super::{Group, Item, SEAM, file, groups};
 use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
-use crate::report::words::{name, sentence};
+use crate::report::format::{name, sentence};
 use crate::report::{Report, json};
+use parts::{ArtifactLocation, ROOT, SarifText, artifact_at, text};
 
 const SCHEMA: &str = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json";
 /// Most locations of one result: GitHub takes no more.
 const LOCATIONS: usize = 1_000;
-/// What relative paths start from: by custom the root of the sources, which the reader knows.
-const SOURCES: &str = "%SRCROOT%";
-/// What absolute paths start from.
-const ROOT: &str = "ROOT";
-
 #[derive(Serialize)]
-struct Log {
+struct SarifLog {
     #[serde(rename = "$schema")]
     schema: &'static str,
     version: &'static str,
-    runs: [Run; 1],
+    runs: [SarifRun; 1],
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Run {
-    tool: Tool,
+struct SarifRun {
+    tool: SarifTool,
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    original_uri_base_ids: BTreeMap<&'static str, Base>,
+    original_uri_base_ids: BTreeMap<&'static str, SarifBase>,
     column_kind: &'static str,
-    results: Vec<Found>,
+    results: Vec<SarifResult>,
 }
 
 #[derive(Serialize)]
-struct Tool {
-    driver: Driver,
+struct SarifTool {
+    driver: SarifDriver,
 }
 
 #[derive(Serialize)]
-struct Driver {
+struct SarifDriver {
     name: &'static str,
     version: &'static str,
-    rules: Vec<Rule>,
+    rules: Vec<SarifRule>,
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Rule {
+struct SarifRule {
     id: String,
     name: String,
-    short_description: Text,
-    help: Text,
+    short_description: SarifText,
+    help: SarifText,
 }
 
 #[derive(Serialize)]
-struct Text {
-    text: String,
-}
-
-#[derive(Serialize)]
-struct Base {
+struct SarifBase {
     uri: &'static str,
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Found {
+struct SarifResult {
     rule_id: String,
     rule_index: usize,
     level: &'static str,
-    message: Text,
-    locations: Vec<Place>,
+    message: SarifText,
+    locations: Vec<SarifLocation>,
     partial_fingerprints: BTreeMap<&'static str, String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    suppressions: Vec<Suppression>,
+    suppressions: Vec<SarifSuppression>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    fixes: Vec<fixes::Fix>,
+    fixes: Vec<fixes::SarifFix>,
 }
 
 /// Why a result is not counted (3.35); `external`, because it is not written beside what it is about.
 #[derive(Serialize)]
-struct Suppression {
+struct SarifSuppression {
     kind: &'static str,
     status: &'static str,
     justification: String,
@@ -97,25 +88,18 @@ struct Suppression {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Place {
-    physical_location: Physical,
+struct SarifLocation {
+    physical_location: PhysicalLocation,
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    logical_locations: Vec<Logical>,
+    logical_locations: Vec<LogicalLocation>,
 }
 
 #[derive(Serialize, PartialEq)]
 #[serde(rename_all = "camelCase")]
-struct Physical {
-    artifact_location: Artifact,
+struct PhysicalLocation {
+    artifact_location: ArtifactLocation,
     #[serde(skip_serializing_if = "Option::is_none")]
     region: Option<Region>,
-}
-
-#[derive(Serialize, PartialEq)]
-#[serde(rename_all = "camelCase")]
-struct Artifact {
-    uri: String,
-    uri_base_id: &'static str,
 }
 
 #[derive(Serialize, PartialEq)]
@@ -128,13 +112,13 @@ struct Region {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Logical {
+struct LogicalLocation {
     fully_qualified_name: String,
     kind: &'static str,
 }
 
 pub fn render(report: &Report) -> String {
-    let mut rules: Vec<Rule> = Vec::new();
+    let mut rules: Vec<SarifRule> = Vec::new();
     let mut known: BTreeMap<String, usize> = BTreeMap::new();
     let mut results = Vec::new();
     for group in groups(report) {
@@ -146,7 +130,7 @@ pub fn render(report: &Report) -> String {
                 rules.len().saturating_sub(1)
             });
             let partial_fingerprints = BTreeMap::from([("checkpointFinding/v1", item.fingerprint.clone())]);
-            results.push(Found {
+            results.push(SarifResult {
                 rule_id: id,
                 rule_index,
                 level: level(item.severity),
@@ -154,25 +138,25 @@ pub fn render(report: &Report) -> String {
                 locations: locations(&group, item),
                 partial_fingerprints,
                 suppressions: accepted.map(suppression).into_iter().collect(),
-                fixes: item.fix.zip(group.sources).map_or_else(Vec::new, |(f, s)| fixes::of(f, &group.path, s)),
+                fixes: item.fix.zip(group.sources).map_or_else(Vec::new, |(f, s)| fixes::fixes(f, &group.path, s)),
             });
         }
     }
-    let absolute = |place: &Place| place.physical_location.artifact_location.uri_base_id == ROOT;
+    let absolute = |place: &SarifLocation| place.physical_location.artifact_location.uri_base_id == ROOT;
     let mut original_uri_base_ids = BTreeMap::new();
     if results.iter().flat_map(|r| &r.locations).any(absolute) {
-        original_uri_base_ids.insert(ROOT, Base { uri: "file:///" });
+        original_uri_base_ids.insert(ROOT, SarifBase { uri: "file:///" });
     }
-    let tool = Tool { driver: Driver { name: report.tool.name, version: report.tool.version, rules } };
+    let tool = SarifTool { driver: SarifDriver { name: report.tool.name, version: report.tool.version, rules } };
     // Columns of findings count characters (3.14.17).
-    let run = Run { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
-    json::pretty(&Log { schema: SCHEMA, version: "2.1.0", runs: [run] })
+    let run = SarifRun { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
+    json::pretty(&SarifLog { schema: SCHEMA, version: "2.1.0", runs: [run] })
 }
 
-fn suppression(accepted: &Accepted) -> Suppression {
+fn suppression(accepted: &Accepted) -> SarifSuppression {
     let reason = accepted.reason.iter().map(|reason| sentence(&format!("{reason} ({})", accepted.by)));
     let justification = reason.chain([sentence(&accepted.by)]).next().unwrap_or_default();
-    Suppression { kind: "external", status: "accepted", justification }
+    SarifSuppression { kind: "external", status: "accepted", justification }
 }
 
 const fn level(severity: Severity) -> &'static str {
@@ -183,8 +167,8 @@ const fn level(severity: Severity) -> &'static str {
     }
 }
 
-fn rule(id: String, item: &Item<'_>) -> Rule {
-    let why = if item.code == "seam" {
+fn rule(id: String, item: &Item<'_>) -> SarifRule {
+    let why = if item.code == SEAM {
         String::new()
     } else {
         format!("`ckpt-doctor explain {id}` says what it means and what to do.")
@@ -193,84 +177,36 @@ fn rule(id: String, item: &Item<'_>) -> Rule {
     let help = step.chain([why]).collect::<String>().trim_end().to_owned();
     let stated = sentence(&item.name.replace('-', " "));
     let help = if help.is_empty() { stated.clone() } else { help };
-    Rule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
+    SarifRule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
 }
 
 /// The places of a finding, tensors of the same place together; the checkpoint if it has none.
-fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<Place> {
-    let mut places: Vec<Place> = Vec::new();
+fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<SarifLocation> {
+    let mut places: Vec<SarifLocation> = Vec::new();
     for location in item.locations.iter().take(LOCATIONS) {
         let place = physical(group, location);
         let named = [(&location.pointer, "value"), (&location.tensor, "tensor")].into_iter();
         let named = named.filter_map(|(what, kind)| Some((what.as_deref().filter(|w| !w.is_empty())?, kind)));
-        let logical = named.map(|(what, kind)| Logical { fully_qualified_name: name(what), kind });
+        let logical = named.map(|(what, kind)| LogicalLocation { fully_qualified_name: name(what), kind });
         match places.last_mut() {
             Some(last) if last.physical_location == place => last.logical_locations.extend(logical),
-            _ => places.push(Place { physical_location: place, logical_locations: logical.collect() }),
+            _ => places.push(SarifLocation { physical_location: place, logical_locations: logical.collect() }),
         }
     }
     if places.is_empty() {
-        places.push(Place { physical_location: physical(group, &Location::default()), logical_locations: Vec::new() });
+        places.push(SarifLocation {
+            physical_location: physical(group, &Location::default()),
+            logical_locations: Vec::new(),
+        });
     }
     places
 }
 
-fn physical(group: &Group<'_>, location: &Location) -> Physical {
+fn physical(group: &Group<'_>, location: &Location) -> PhysicalLocation {
     let found = file(&group.path, location);
     let region = location
         .line
         .filter(|_| found.is_some())
         .map(|start_line| Region { start_line, start_column: location.column });
-    Physical { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
-}
-
-/// A file of the checkpoint at `path`.
-fn artifact(path: &str, name: &str) -> Artifact {
-    let location = Location { file: Some(name.to_owned()), ..Location::default() };
-    artifact_at(file(path, &location).as_deref().unwrap_or(path))
-}
-
-fn artifact_at(path: &str) -> Artifact {
-    let (uri, uri_base_id) = match path.strip_prefix('/') {
-        Some(below) => (uri(below), ROOT),
-        None => (uri(path), SOURCES),
-    };
-    Artifact { uri, uri_base_id }
-}
-
-/// A path as a relative reference (RFC 3986): only unreserved characters and `/` stand for themselves.
-fn uri(path: &str) -> String {
-    let mut out = String::with_capacity(path.len());
-    for byte in path.bytes() {
-        if byte.is_ascii_alphanumeric() || b"-._~/".contains(&byte) {
-            out.push(char::from(byte));
-        } else {
-            let _infallible = write!(out, "%{byte:02X}");
-        }
-    }
-    // The directory itself is no empty reference.
-    if out.is_empty() { ".".to_owned() } else { out }
-}
-
-/// Plain text in which nothing is a link (3.11.6).
-fn text(plain: &str) -> Text {
-    let linked = plain.contains("](");
-    Text { text: if linked { plain.replace('[', "\\[").replace(']', "\\]") } else { plain.to_owned() } }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{text, uri};
-
-    #[test]
-    fn every_byte_that_means_something_is_percent_encoded() {
-        assert_eq!(uri("a b/c:d?e#f%20[é]"), "a%20b/c%3Ad%3Fe%23f%2520%5B%C3%A9%5D");
-        assert_eq!(uri(""), ".");
-    }
-
-    #[test]
-    fn words_make_no_link() {
-        assert_eq!(text("[a](javascript:x)").text, "\\[a\\](javascript:x)");
-        assert_eq!(text("is [1, 2]").text, "is [1, 2]");
-    }
+    PhysicalLocation { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
 }

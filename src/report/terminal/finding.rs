@@ -8,8 +8,8 @@ use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer,
 use super::super::Style;
 use super::super::excerpt::{cut, near};
 use super::super::fixes::mark;
+use super::super::format::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use super::super::model::CheckpointReport;
-use super::super::words::{evidence, fix, more, name, place, sentence, tensors, wrap};
 use crate::check::{Finding, Location, Severity};
 use crate::checkpoint::line_column;
 
@@ -58,14 +58,14 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
 }
 
 /// One place: the locations that share an excerpt, or one location without any.
-struct Place<'a> {
+struct FilePlaces<'a> {
     locations: Vec<&'a Location>,
     source: Option<&'a str>,
 }
 
 /// Locations in their order, neighbours in one file together, a file without a span once.
-fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<Place<'a>> {
-    let mut places: Vec<Place<'a>> = Vec::new();
+fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<FilePlaces<'a>> {
+    let mut places: Vec<FilePlaces<'a>> = Vec::new();
     let mut bare = BTreeSet::new();
     for location in locations {
         let Some(file) = location.file.as_deref() else { continue };
@@ -77,13 +77,13 @@ fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Ve
             Some(place) if source.is_some() && place.source.is_some() && shares(place, location) => {
                 place.locations.push(location);
             }
-            _ => places.push(Place { locations: vec![location], source }),
+            _ => places.push(FilePlaces { locations: vec![location], source }),
         }
     }
     places
 }
 
-fn shares(place: &Place<'_>, location: &Location) -> bool {
+fn shares(place: &FilePlaces<'_>, location: &Location) -> bool {
     let (Some(first), Some(last)) = (place.locations.first(), place.locations.last()) else { return false };
     match (&first.span, &last.span, &location.span) {
         (Some(a), Some(b), Some(c)) => first.file == location.file && near(a, c) && c.start >= b.start,
@@ -100,7 +100,7 @@ struct Shown {
     column: Option<(String, String)>,
 }
 
-fn show(place: &Place<'_>, checkpoint: &CheckpointReport) -> Shown {
+fn show(place: &FilePlaces<'_>, checkpoint: &CheckpointReport) -> Shown {
     let Some(first) = place.locations.first() else {
         return Shown { elements: Vec::new(), excerpt: false, column: None };
     };

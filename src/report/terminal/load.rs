@@ -1,16 +1,16 @@
-//! The predicted load report: what the loader would say, and what it would not.
+//! The predicted load report: the keys a loader would report, and those it would load wrong without a warning.
 
 use std::fmt::Write as _;
 
 use comfy_table::{ContentArrangement, Table, presets};
 
 use super::super::Style;
-use super::super::collapse::{Group, collapse};
-use super::super::words::{mismatched, more, name, sentence, silent, versions};
+use super::super::collapse::{NameGroup, collapse};
+use super::super::format::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
-use crate::check::finding::LoadReport;
+use crate::check::load::LoadReport;
 
-/// What these loaders say alike.
+/// Renders one load report for loaders that agree on it.
 pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
     let Some(load) = loaders.first() else { return };
     let paint = Paint(style.color);
@@ -29,22 +29,22 @@ pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
     }
     let _ok = writeln!(out, "  {}", paint.strong(&line));
     if let Some(exception) = &load.raises {
-        let _ok = writeln!(out, "\n  before any of these is reported, the loader raises");
+        let _ok = writeln!(out, "\n  before it reports any of these, the loader raises");
         let _ok = writeln!(out, "    {}", sentence(exception));
     }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
-    list(out, "missing: the loader initialises them anew", &names(&load.missing), style);
-    list(out, "unexpected: the loader ignores them", &names(&load.unexpected), style);
+    list(out, "missing: the loader initialises these with random values", &names(&load.missing), style);
+    list(out, "unexpected: the loader ignores these", &names(&load.unexpected), style);
     if !load.mismatched.is_empty() {
-        let _ok = writeln!(out, "\n  mismatched: the load raises");
+        let _ok = writeln!(out, "\n  mismatched: the loader raises an exception");
         table(out, ["tensor", "stored", "expected"], &mismatched(load), style);
     }
     for (reason, groups) in silent(load) {
-        list(out, &format!("silent, reported by nobody: {reason}"), &groups, style);
+        list(out, &format!("silent, loaded without a warning: {reason}"), &groups, style);
     }
 }
 
-fn list(out: &mut String, title: &str, groups: &[Group], style: Style) {
+fn list(out: &mut String, title: &str, groups: &[NameGroup], style: Style) {
     if groups.is_empty() {
         return;
     }

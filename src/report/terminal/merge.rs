@@ -1,10 +1,10 @@
-//! What a merge planned and did.
+//! The plan and the result of a merge.
 
 use std::fmt::Write as _;
 
 use super::super::Style;
-use super::super::model::{MergeReport, Seam, ShapedName};
-use super::super::words::{bytes, more, name, plural, sentence, shape, wrap};
+use super::super::format::{bytes, more, name, plural, sentence, shape, wrap};
+use super::super::model::{MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
 use super::paint::Paint;
 
@@ -24,18 +24,18 @@ pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
     }
     if !merge.seams.is_empty() {
         list(out, "seams", merge.seams.len(), style, Vec::new());
-        // The rest of the plan is not what stands in the way.
+        // The rest of the plan does not explain the stop.
         return;
     }
     changed(out, merge, style);
     let dropped = merge.dropped.iter().map(|d| {
         format!("{} of {}: {} ({})", plural(d.count, "tensor"), name(&d.donor), name(&d.pattern), sentence(&d.why))
     });
-    list(out, "left behind", merge.dropped.len(), style, dropped.take(style.cap).collect());
+    list(out, "dropped", merge.dropped.len(), style, dropped.take(style.cap).collect());
     let repairs = merge.repairs.iter().map(|r| sentence(r));
-    list(out, "repaired on the way", merge.repairs.len(), style, repairs.take(style.cap).collect());
+    list(out, "repaired", merge.repairs.len(), style, repairs.take(style.cap).collect());
     let notes = merge.notes.iter().map(|n| sentence(n));
-    list(out, "to know", merge.notes.len(), style, notes.take(style.cap).collect());
+    list(out, "notes", merge.notes.len(), style, notes.take(style.cap).collect());
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [name(&f.name), sentence(&f.origin)]).collect();
         let size = format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
@@ -56,7 +56,7 @@ fn stages(out: &mut String, merge: &MergeReport, style: Style) {
 fn render_seam(out: &mut String, seam: &Seam, style: Style) {
     let paint = Paint(style.color);
     let said = hang(&sentence(&seam.message), 4, style);
-    let title = format!("{}:\n    {}", paint.verdict("error", "error[seam]"), paint.strong(&said));
+    let title = format!("{}:\n    {}", paint.verdict(Verdict::Error, "error[seam]"), paint.strong(&said));
     let _ok = writeln!(out, "\n  {title}");
     let mut rows = Vec::new();
     let mut row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
@@ -69,10 +69,10 @@ fn render_seam(out: &mut String, seam: &Seam, style: Style) {
         ]);
     };
     if let Some(tensor) = &seam.tensor {
-        row("does not fit", tensor, seam.needed.as_deref());
+        row("mismatch", tensor, seam.needed.as_deref());
     }
     if let Some(meets) = &seam.meets {
-        row("has to meet", meets, None);
+        row("must match", meets, None);
     }
     if !rows.is_empty() {
         table(out, ["", "donor", "tensor", "shape", "needed"], &rows, style);
@@ -87,7 +87,7 @@ fn changed(out: &mut String, merge: &MergeReport, style: Style) {
     if merge.transforms.is_empty() {
         return;
     }
-    let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", name(how))).collect();
+    let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
     let _ok = writeln!(out, "\n  tensors: {}", how.join(", "));
     if merge.changed.is_empty() {
         return;
@@ -98,13 +98,13 @@ fn changed(out: &mut String, merge: &MergeReport, style: Style) {
         .map(|c| {
             [
                 name(&c.name),
-                sentence(&c.transform),
+                c.transform.name().to_owned(),
                 c.from.as_deref().map_or_else(|| "new".to_owned(), shape),
                 shape(&c.to),
             ]
         })
         .collect();
-    table(out, ["not a copy", "how", "from", "to"], &rows, style);
+    table(out, ["changed tensor", "how", "from", "to"], &rows, style);
 }
 
 fn list(out: &mut String, title: &str, total: usize, style: Style, shown: Vec<String>) {

@@ -2,6 +2,8 @@
 
 use annotate_snippets::renderer::{AnsiColor, Effects, Style};
 
+use crate::report::model::Verdict;
+
 /// Paints text when it holds `true`.
 #[derive(Debug, Clone, Copy)]
 pub struct Paint(pub bool);
@@ -22,13 +24,13 @@ impl Paint {
         self.with(AnsiColor::BrightCyan.on_default().effects(Effects::BOLD), text)
     }
 
-    /// Text in the colour of a verdict: `clean`, `info`, `warning` or `error`.
-    pub fn verdict(self, verdict: &str, text: &str) -> String {
+    /// Text in the colour of a verdict.
+    pub fn verdict(self, verdict: Verdict, text: &str) -> String {
         let color = match verdict {
-            "clean" => AnsiColor::Green,
-            "info" => AnsiColor::BrightBlue,
-            "warning" => AnsiColor::Yellow,
-            _ => AnsiColor::BrightRed,
+            Verdict::Clean => AnsiColor::Green,
+            Verdict::Info => AnsiColor::BrightBlue,
+            Verdict::Warning => AnsiColor::Yellow,
+            Verdict::Error => AnsiColor::BrightRed,
         };
         self.with(color.on_default().effects(Effects::BOLD), text)
     }

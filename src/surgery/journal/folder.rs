@@ -5,13 +5,12 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::run::look;
-use super::{Journal, JournalError, Result};
+use super::record::Journal;
 use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
-use crate::surgery::apply::{ApplyError, io_at};
+use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::lock::{self, Lock};
-use crate::surgery::system::{self, create, explain, retry, sync_dir};
+use crate::surgery::system::{self, create, look, retry, sync_dir, with_figures};
 
 /// Says that the folder is nothing for version control, as caches of other tools say it.
 const IGNORE: (&str, &str) = (".gitignore", "# made by ckpt-doctor, so that a repair can be undone\n*\n");
@@ -43,7 +42,7 @@ impl Folder {
     }
 
     /// Locks the folder of a checkpoint; `None` when it has none.
-    pub(super) fn open(root: &Path) -> Result<Option<Self>> {
+    pub(super) fn open(root: &Path) -> Result<Option<Self>, RepairError> {
         let path = root.join(REPAIR_FOLDER);
         only_folders(&path)?;
         match lock::take(&path.join(LOCK))? {
@@ -53,13 +52,13 @@ impl Folder {
                 let _ = lock::sign(&mut lock);
                 Ok(Some(Self { root: root.to_owned(), path, _lock: lock }))
             }
-            Lock::Theirs(holder) => Err(JournalError::Busy { path: root.to_owned(), holder }),
+            Lock::Theirs(holder) => Err(RepairError::Busy { path: root.to_owned(), holder }),
             Lock::Gone => Ok(None),
         }
     }
 
     /// Locks the folder of a checkpoint, and makes it when there is none.
-    pub(super) fn create(root: &Path) -> Result<Self> {
+    pub(super) fn create(root: &Path) -> Result<Self, RepairError> {
         let path = root.join(REPAIR_FOLDER);
         for _ in 0..8 {
             let made = retry(|| fs::create_dir(&path));
@@ -68,7 +67,7 @@ impl Folder {
                 Err(error)
                     if matches!(error.kind(), io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem) =>
                 {
-                    return Err(JournalError::ReadOnly { path: root.to_owned(), error });
+                    return Err(RepairError::ReadOnly { path: root.to_owned(), error });
                 }
                 Err(e) if e.kind() != io::ErrorKind::AlreadyExists => return Err(io_at(&path, "creating")(e).into()),
                 _ => {}
@@ -77,7 +76,7 @@ impl Folder {
                 Ok(None) => {}
                 Ok(Some(folder)) => return folder.for_version_control(),
                 Err(error) => {
-                    if new && !matches!(error, JournalError::Busy { .. }) {
+                    if new && !matches!(error, RepairError::Busy { .. }) {
                         let _ = system::remove_file(&path.join(LOCK));
                         let _ = system::remove_dir(&path);
                     }
@@ -85,13 +84,13 @@ impl Folder {
                 }
             }
         }
-        Err(JournalError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
+        Err(RepairError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
     }
 
-    fn for_version_control(self) -> Result<Self> {
+    fn for_version_control(self) -> Result<Self, RepairError> {
         let (name, text) = IGNORE;
         let path = self.path.join(name);
-        let write = || -> Result<()> {
+        let write = || -> Result<(), RepairError> {
             if look(&path)?.is_none() {
                 create(&path)?.write_all(text.as_bytes()).map_err(io_at(&path, "writing"))?;
             }
@@ -128,13 +127,13 @@ impl Folder {
     }
 
     /// What is under way, if anything is.
-    pub(super) fn pending(&self) -> Result<Option<Journal>> {
-        Self::read(&self.journal())
+    pub(super) fn pending(&self) -> Result<Option<Journal>, RepairError> {
+        Self::read_journal(&self.journal())
     }
 
     /// A journal; `None` when there is none of this name.
-    pub(super) fn read(path: &Path) -> Result<Option<Journal>> {
-        let unusable = |reason: String| JournalError::Journal { path: path.to_owned(), reason };
+    pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>, RepairError> {
+        let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
         let bytes = match read_capped(path, JSON_CAP) {
             Err(OpenError::NotFound { .. }) => return Ok(None),
             other => other.map_err(|e| unusable(e.to_string()))?,
@@ -151,12 +150,12 @@ impl Folder {
     }
 
     /// Writes the journal of what begins now; from here on the next run would finish it.
-    pub(super) fn begin(&self, journal: &Journal) -> Result<()> {
+    pub(super) fn begin(&self, journal: &Journal) -> Result<(), RepairError> {
         let path = self.journal();
         let draft = self.path.join(DRAFT);
         let text = serde_json::to_vec_pretty(journal).unwrap_or_default();
         remove_file(&draft)?;
-        let write = || -> std::result::Result<(), ApplyError> {
+        let write = || -> Result<(), ApplyError> {
             let mut file = create(&draft)?;
             file.write_all(&text).map_err(io_at(&draft, "writing"))?;
             file.sync_all().map_err(io_at(&draft, "syncing"))?;
@@ -168,12 +167,12 @@ impl Folder {
             // Nothing is changed yet. What cannot be removed is finished by the next run.
             let _ = system::remove_file(&path);
             let _ = system::remove_file(&draft);
-            explain(error, &self.root, &[text.len() as u64]).into()
+            with_figures(error, &self.root, &[text.len() as u64]).into()
         })
     }
 
     /// Makes a folder in this one, and durable.
-    pub(super) fn folder(&self, path: &Path) -> Result<()> {
+    pub(super) fn folder(&self, path: &Path) -> Result<(), RepairError> {
         let inner = path.strip_prefix(&self.path).unwrap_or(Path::new(""));
         let mut made = self.path.clone();
         for step in inner {
@@ -191,7 +190,7 @@ impl Folder {
     }
 
     /// Numbers of the repairs that can be undone, latest last.
-    pub(super) fn numbers(&self) -> Result<Vec<u32>> {
+    pub(super) fn numbers(&self) -> Result<Vec<u32>, RepairError> {
         let undo = self.path.join("undo");
         let mut numbers = Vec::new();
         for name in names(&undo)? {
@@ -202,7 +201,7 @@ impl Folder {
     }
 
     /// Removes what a run left that was killed before it had a journal.
-    pub(super) fn clear(&self) -> Result<()> {
+    pub(super) fn clear(&self) -> Result<(), RepairError> {
         remove_tree(&self.staged())?;
         remove_file(&self.path.join(DRAFT))?;
         let kept = self.numbers()?;
@@ -231,7 +230,7 @@ impl Folder {
 
 /// Refuses links where folders are made: through them a checkpoint from elsewhere could have files moved that are not
 /// its own.
-fn only_folders(path: &Path) -> Result<()> {
+fn only_folders(path: &Path) -> Result<(), RepairError> {
     let undo = path.join("undo");
     let mut folders = vec![path.to_owned(), path.join(NEW), undo.clone()];
     if look(&undo)?.is_some_and(|m| m.is_dir()) {
@@ -239,14 +238,14 @@ fn only_folders(path: &Path) -> Result<()> {
     }
     for folder in folders {
         if look(&folder)?.is_some_and(|m| !m.is_dir()) {
-            return Err(JournalError::Journal { path: folder, reason: "it is not a directory".to_owned() });
+            return Err(RepairError::UnusableJournal { path: folder, reason: "it is not a directory".to_owned() });
         }
     }
     Ok(())
 }
 
 /// Names in a folder; none when it is not there.
-fn names(path: &Path) -> Result<Vec<String>> {
+fn names(path: &Path) -> Result<Vec<String>, RepairError> {
     let names = match system::names(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         other => other.map_err(io_at(path, "listing"))?,
@@ -254,10 +253,10 @@ fn names(path: &Path) -> Result<Vec<String>> {
     Ok(names.into_iter().map(|name| name.to_string_lossy().into_owned()).collect())
 }
 
-pub(super) fn remove_file(path: &Path) -> Result<()> {
+pub(super) fn remove_file(path: &Path) -> Result<(), RepairError> {
     Ok(system::remove_file(path).map_err(io_at(path, "removing"))?)
 }
 
-pub(super) fn remove_tree(path: &Path) -> Result<()> {
+pub(super) fn remove_tree(path: &Path) -> Result<(), RepairError> {
     Ok(system::remove_dir_all(path).map_err(io_at(path, "removing"))?)
 }

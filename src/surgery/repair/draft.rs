@@ -7,8 +7,8 @@ use serde_json::{Map, Value, json};
 
 use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
-use crate::checkpoint::{Checkpoint, Document, Module, Parts, Splice, spliced};
-use crate::surgery::plan::{PlannedShard, PlannedTensor, Source, TensorRef, format_pt};
+use crate::checkpoint::{Checkpoint, Document, Parts, PythonModule, Splice, spliced};
+use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
 /// What became of the edits of one fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,7 +33,7 @@ enum Touch {
 }
 
 /// A file before a fix was tried.
-struct Before {
+struct FileState {
     file: String,
     text: Option<Arc<str>>,
     shard: Option<Arc<PlannedShard>>,
@@ -42,7 +42,7 @@ struct Before {
 
 /// A checkpoint with some of its files changed.
 #[derive(Debug, Clone)]
-pub(super) struct Draft {
+pub(super) struct RepairDraft {
     original: Arc<Checkpoint>,
     /// As it was when the round began.
     current: Arc<Checkpoint>,
@@ -55,7 +55,7 @@ pub(super) struct Draft {
     made: Vec<Edit>,
 }
 
-impl Draft {
+impl RepairDraft {
     pub(super) fn new(original: &Arc<Checkpoint>) -> Self {
         Self {
             original: Arc::clone(original),
@@ -84,9 +84,9 @@ impl Draft {
     }
 
     /// What is known of the files that these edits touch.
-    fn before(&self, edits: &[Edit]) -> Vec<Before> {
+    fn before(&self, edits: &[Edit]) -> Vec<FileState> {
         let files: BTreeSet<String> = edits.iter().flat_map(|edit| self.files(edit)).collect();
-        let state = |file: String| Before {
+        let state = |file: String| FileState {
             text: self.texts.get(&file).cloned(),
             shard: self.shards.get(&file).cloned(),
             touch: self.touched.get(&file).cloned(),
@@ -95,17 +95,17 @@ impl Draft {
         files.into_iter().map(state).collect()
     }
 
-    fn restore(&mut self, before: Vec<Before>) {
-        fn put<T>(map: &mut BTreeMap<String, T>, file: &str, old: Option<T>) {
+    fn restore(&mut self, before: Vec<FileState>) {
+        fn put_back<T>(map: &mut BTreeMap<String, T>, file: &str, old: Option<T>) {
             match old {
                 Some(old) => drop(map.insert(file.to_owned(), old)),
                 None => drop(map.remove(file)),
             }
         }
-        for Before { file, text, shard, touch } in before {
-            put(&mut self.texts, &file, text);
-            put(&mut self.shards, &file, shard);
-            put(&mut self.touched, &file, touch);
+        for FileState { file, text, shard, touch } in before {
+            put_back(&mut self.texts, &file, text);
+            put_back(&mut self.shards, &file, shard);
+            put_back(&mut self.touched, &file, touch);
         }
     }
 
@@ -138,7 +138,7 @@ impl Draft {
         let mut parts = Parts::default();
         for (name, text) in &self.texts {
             if name.ends_with(".py") {
-                parts.modules.push(Module::parse(name.as_str(), text.as_bytes()));
+                parts.modules.push(PythonModule::parse(name.as_str(), text.as_bytes()));
             } else {
                 parts.documents.push(Document::parse(name.as_str(), text.as_bytes()));
             }
@@ -283,7 +283,7 @@ impl Draft {
             name: t.name.clone(),
             dtype: t.dtype,
             shape: t.shape.clone(),
-            source: Source::Copy(TensorRef {
+            source: TensorSource::Copy(TensorRef {
                 donor: String::new(),
                 path: path.clone(),
                 name: t.name.clone(),
@@ -334,7 +334,7 @@ mod tests {
         let dir = tempfile::tempdir().expect("a directory");
         std::fs::write(dir.path().join("config.json"), r#"{"a": 1, "b": 2}"#).expect("a file");
         let checkpoint = Arc::new(Checkpoint::open(dir.path()).expect("a checkpoint"));
-        let mut draft = Draft::new(&checkpoint);
+        let mut draft = RepairDraft::new(&checkpoint);
         let file = || "config.json".to_owned();
         let set = |pointer: &str| Edit::Set { file: file(), pointer: pointer.to_owned(), value: json!(3) };
         let write = || Edit::Write { file: "alias.py".to_owned(), text: "import torch\n".to_owned() };

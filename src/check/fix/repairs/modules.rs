@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use crate::check::fix::{Edit, Site};
 use crate::check::modules::relative_modules;
-use crate::checkpoint::{Checkpoint, Module};
+use crate::checkpoint::{Checkpoint, PythonModule};
 
 /// Makes a module import by itself what its imports import, because transformers copies only that along.
 pub(super) fn add_imports(site: &Site<'_>) -> Option<Vec<Edit>> {
@@ -40,7 +40,7 @@ pub(super) fn add_imports(site: &Site<'_>) -> Option<Vec<Edit>> {
 }
 
 /// Whether a module imports another, directly or through others.
-fn reaches(checkpoint: &Checkpoint, from: &Module, to: &str) -> bool {
+fn reaches(checkpoint: &Checkpoint, from: &PythonModule, to: &str) -> bool {
     let mut seen = vec![from.name.clone()];
     let mut next = 0;
     while let Some(module) = seen.get(next).and_then(|name| checkpoint.modules.get(name)) {
@@ -63,7 +63,7 @@ pub(super) fn add_auto_class(site: &Site<'_>) -> Option<Vec<Edit>> {
     let config = site.checkpoint().config()?;
     let key = site.scope.get("it")?;
     let key = key.as_str()?;
-    let wanted = |class: &crate::checkpoint::module::Class| match key {
+    let wanted = |class: &crate::checkpoint::module::PythonClass| match key {
         "AutoConfig" => class.bases.iter().any(|base| base.rsplit('.').next() == Some("PretrainedConfig")),
         "AutoModel" => config.pointer("/architectures/0").and_then(serde_json::Value::as_str) == Some(&*class.name),
         _ => false,

@@ -7,7 +7,8 @@ use serde::Serialize as _;
 use serde_json::Value;
 use serde_json::ser::{Formatter, PrettyFormatter, Serializer};
 
-use super::{Container, Member, Splice};
+use super::container::{Container, DocumentMember};
+use super::splice::Splice;
 
 /// The layout of a document: several lines or one.
 pub(super) struct Layout {
@@ -19,7 +20,7 @@ pub(super) struct Layout {
 
 impl Layout {
     /// Reads it off the first line break and the indentation that follows.
-    pub(super) fn of(text: &str) -> Self {
+    pub(super) fn from_text(text: &str) -> Self {
         let body = text.trim();
         let line = match body.find('\n').and_then(|at| body.get(..at)) {
             Some(first) if first.ends_with('\r') => Some("\r\n"),
@@ -104,7 +105,7 @@ fn indent_of(line: &str) -> &str {
 }
 
 /// What stands between a member's key and its value.
-fn colon_of<'t>(text: &'t str, member: &Member) -> &'t str {
+fn colon_of<'t>(text: &'t str, member: &DocumentMember) -> &'t str {
     let between = member.key.as_ref().and_then(|key| text.get(key.end..member.value.start));
     between.filter(|b| b.trim() == ":" && !b.contains('\n')).unwrap_or(": ")
 }

@@ -2,9 +2,11 @@
 
 use serde_json::{Map, Number, Value};
 
-use super::is_huge;
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::Token;
-use crate::checkpoint::text::push_pointer;
+
+/// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
+const MAX_DIGITS: usize = 4300;
 
 /// Bytes of text that take as much room as a value does.
 const NODE_BYTES: usize = 100;
@@ -33,7 +35,7 @@ enum Open {
     Array(Vec<Value>, usize),
 }
 
-pub(super) struct Builder {
+pub(super) struct ValueBuilder {
     stack: Vec<Open>,
     root: Option<Value>,
     nodes: usize,
@@ -43,7 +45,7 @@ pub(super) struct Builder {
     skipping: Option<usize>,
 }
 
-impl Builder {
+impl ValueBuilder {
     pub(super) fn new(left_out: Vec<&'static str>, most: usize) -> Self {
         Self { stack: Vec::new(), root: None, nodes: 0, most, left_out, skipping: None }
     }
@@ -63,8 +65,8 @@ impl Builder {
         let mut pointer = String::new();
         for open in &self.stack {
             match open {
-                Open::Object(_, key) => push_pointer(&mut pointer, key),
-                Open::Array(_, index) => push_pointer(&mut pointer, &index.to_string()),
+                Open::Object(_, key) => pointer::push(&mut pointer, key),
+                Open::Array(_, index) => pointer::push(&mut pointer, &index.to_string()),
             }
             if pointer.len() > MAX_POINTER {
                 return None;
@@ -82,7 +84,7 @@ impl Builder {
     }
 
     /// Takes one token.
-    pub(super) fn see(&mut self, token: &Token<'_>) {
+    pub(super) fn on_token(&mut self, token: &Token<'_>) {
         match token {
             Token::Key(key) => {
                 if let Some(Open::Object(_, next)) = self.stack.last_mut() {
@@ -111,7 +113,7 @@ impl Builder {
                 if self.skipping == Some(self.stack.len()) {
                     self.skipping = None;
                 }
-                if inside { self.advance() } else { self.put(value) }
+                if inside { self.advance() } else { self.push_value(value) }
             }
             Token::String(text) => self.leaf(|| Value::String(text.decode().0.into_owned())),
             Token::Number(literal) => self.leaf(|| number(literal)),
@@ -130,10 +132,10 @@ impl Builder {
     }
 
     fn leaf(&mut self, make: impl FnOnce() -> Value) {
-        if self.skipping.is_some() { self.advance() } else { self.put(make()) }
+        if self.skipping.is_some() { self.advance() } else { self.push_value(make()) }
     }
 
-    fn put(&mut self, value: Value) {
+    fn push_value(&mut self, value: Value) {
         let weight = value.as_str().map_or(0, str::len).checked_div(NODE_BYTES).unwrap_or(0);
         self.nodes = self.nodes.saturating_add(weight).saturating_add(1);
         if !self.overflowed() {
@@ -161,4 +163,11 @@ fn number(literal: &str) -> Value {
         return Value::Null;
     }
     literal.parse::<Number>().map_or(Value::Null, Value::Number)
+}
+
+/// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
+/// double becomes infinite.
+pub(super) fn is_huge(literal: &str) -> bool {
+    literal.len() > MAX_DIGITS
+        || (literal.len() > 300 || literal.contains(['e', 'E'])) && !literal.parse::<f64>().is_ok_and(f64::is_finite)
 }

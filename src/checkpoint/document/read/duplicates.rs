@@ -3,10 +3,10 @@
 use std::hash::{BuildHasher as _, RandomState};
 use std::ops::Range;
 
-use super::build::Builder;
+use super::build::ValueBuilder;
 use crate::checkpoint::fault::KIND_CAP;
+use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
-use crate::checkpoint::text::push_pointer;
 
 /// Two members of one object with the same key.
 pub(super) struct Duplicate {
@@ -54,7 +54,7 @@ impl<'t> Duplicates<'t> {
     }
 
     /// Takes one token; `builder` has not seen it yet.
-    pub(super) fn see(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &Builder) {
+    pub(super) fn on_token(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
         match token {
             Token::BeginObject => self.frames.push(self.keys.len()),
             Token::Key(key) => self.keys.push((self.hasher.hash_one(&*key.decode().0), span.start)),
@@ -67,7 +67,7 @@ impl<'t> Duplicates<'t> {
         }
     }
 
-    fn close(&mut self, from: usize, builder: &Builder) {
+    fn close(&mut self, from: usize, builder: &ValueBuilder) {
         let Some(keys) = self.keys.get_mut(from..) else { return };
         if keys.len() < 2 {
             return;
@@ -84,7 +84,7 @@ impl<'t> Duplicates<'t> {
                 continue;
             }
             let pointer = builder.container().map(|mut pointer| {
-                push_pointer(&mut pointer, &later.name);
+                pointer::push(&mut pointer, &later.name);
                 pointer
             });
             let equal =
@@ -100,14 +100,14 @@ impl<'t> Duplicates<'t> {
     }
 }
 
-struct Member {
+struct KeyedMember {
     name: String,
     key: Range<usize>,
     value: Range<usize>,
 }
 
 /// Reads the member whose key stands at `at`.
-fn member(text: &str, at: usize) -> Option<Member> {
+fn member(text: &str, at: usize) -> Option<KeyedMember> {
     let mut scanner = Scanner::lenient(text, at);
     let (Token::String(name), key) = scanner.next().ok()?? else { return None };
     let rest = text.get(key.end..)?;
@@ -115,7 +115,7 @@ fn member(text: &str, at: usize) -> Option<Member> {
     let mut scanner = Scanner::lenient(text, key.end.checked_add(colon)?.checked_add(1)?);
     let (first, value) = scanner.next().ok()??;
     scanner.skip_rest_of(&first).ok()?;
-    Some(Member { name: name.decode().0.into_owned(), key, value: value.start..scanner.position() })
+    Some(KeyedMember { name: name.decode().0.into_owned(), key, value: value.start..scanner.position() })
 }
 
 fn same(a: &str, b: &str) -> bool {
@@ -127,9 +127,9 @@ fn same(a: &str, b: &str) -> bool {
     }
     let value = |text| {
         let mut scanner = Scanner::lenient(text, 0);
-        let mut builder = Builder::new(Vec::new(), COMPARE_CAP);
+        let mut builder = ValueBuilder::new(Vec::new(), COMPARE_CAP);
         while let Ok(Some((token, _))) = scanner.next() {
-            builder.see(&token);
+            builder.on_token(&token);
         }
         builder.finish()
     };

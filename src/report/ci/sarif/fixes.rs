@@ -5,25 +5,25 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::{Artifact, Text, artifact, text};
+use super::parts::{ArtifactLocation, SarifText, artifact, text};
 use crate::check::{Edit, FixHint};
 use crate::checkpoint::{Document, Splice, line_column, spliced};
-use crate::report::words::sentence;
+use crate::report::format::sentence;
 
 /// Most replacements of one fix; a viewer is no place for more.
 const REPLACEMENTS: usize = 200;
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-pub(super) struct Fix {
-    description: Text,
-    artifact_changes: Vec<Change>,
+pub(super) struct SarifFix {
+    description: SarifText,
+    artifact_changes: Vec<SarifChange>,
 }
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Change {
-    artifact_location: Artifact,
+struct SarifChange {
+    artifact_location: ArtifactLocation,
     replacements: Vec<Replacement>,
 }
 
@@ -32,7 +32,7 @@ struct Change {
 struct Replacement {
     deleted_region: Deleted,
     #[serde(skip_serializing_if = "Option::is_none")]
-    inserted_content: Option<Content>,
+    inserted_content: Option<SarifContent>,
 }
 
 #[derive(Serialize)]
@@ -45,12 +45,12 @@ struct Deleted {
 }
 
 #[derive(Serialize)]
-struct Content {
+struct SarifContent {
     text: String,
 }
 
 /// The fix of a finding on the checkpoint at `path`; nothing where files have to be made or shards be written.
-pub(super) fn of(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>>) -> Vec<Fix> {
+pub(super) fn fixes(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>>) -> Vec<SarifFix> {
     let mut files: BTreeMap<&str, Vec<Splice>> = BTreeMap::new();
     for edit in hint.edits.iter().take(REPLACEMENTS.saturating_add(1)) {
         let Some((file, splice)) = splice(edit, sources) else { return Vec::new() };
@@ -64,10 +64,10 @@ pub(super) fn of(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>
         // Edits that depend on one another are no list of replacements.
         spliced(source, &splices)?;
         let replacements = splices.into_iter().map(|splice| replacement(source, splice)).collect();
-        Some(Change { artifact_location: artifact(path, file), replacements })
+        Some(SarifChange { artifact_location: artifact(path, file), replacements })
     };
-    let changes: Option<Vec<Change>> = files.into_iter().map(change).collect();
-    let fix = |artifact_changes| Fix { description: text(&sentence(&hint.title)), artifact_changes };
+    let changes: Option<Vec<SarifChange>> = files.into_iter().map(change).collect();
+    let fix = |artifact_changes| SarifFix { description: text(&sentence(&hint.title)), artifact_changes };
     changes.map(fix).into_iter().collect()
 }
 
@@ -86,6 +86,6 @@ fn replacement(source: &str, splice: Splice) -> Replacement {
     let (end_line, end_column) = line_column(source, splice.range.end);
     Replacement {
         deleted_region: Deleted { start_line, start_column, end_line, end_column },
-        inserted_content: (!splice.text.is_empty()).then_some(Content { text: splice.text }),
+        inserted_content: (!splice.text.is_empty()).then_some(SarifContent { text: splice.text }),
     }
 }

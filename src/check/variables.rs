@@ -1,0 +1,131 @@
+//! What a rule's expressions see of a checkpoint.
+
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+
+use super::load::LoadReport;
+use super::tokens::OpenedTokenizer;
+use super::{index, modules};
+use crate::checkpoint::{Checkpoint, Document, FaultKind, Vocabulary};
+use crate::knowledge::{Expression, Scope};
+
+/// Keys of `tokenizer_config.json` that are large; rules reach them through `tokenizer`, `id_of` and `chat_templates`.
+const BULKY: [&str; 3] = ["added_tokens_decoder", "additional_special_tokens", "chat_template"];
+
+/// Documents by the name expressions use.
+const DOCUMENTS: [(&str, &str); 6] = [
+    ("config", "config.json"),
+    ("generation", "generation_config.json"),
+    ("processor", "processor_config.json"),
+    ("preprocessor", "preprocessor_config.json"),
+    ("tokenizer_config", "tokenizer_config.json"),
+    ("special_tokens", "special_tokens_map.json"),
+];
+
+/// The first document that an expression asks about and that is not there, or has no value.
+#[must_use]
+pub fn absent(checkpoint: &Checkpoint, expression: &Expression) -> Option<&'static str> {
+    let asked = expression.variables();
+    let is_absent = |file| checkpoint.document(file).is_none_or(|d| d.value.is_none());
+    let mut documents = DOCUMENTS.into_iter().filter(|(name, _)| asked.iter().any(|a| a == name));
+    documents.find(|(_, file)| is_absent(file)).map(|(_, file)| file)
+}
+
+/// The variables and functions named in [`crate::knowledge::rule::Assert`].
+#[must_use]
+pub fn scope(
+    checkpoint: &Arc<Checkpoint>,
+    architecture: Option<&str>,
+    model: &Value,
+    opened: Option<&OpenedTokenizer>,
+    rows: Option<u64>,
+) -> Scope<'static> {
+    let mut scope = Scope::new();
+    for (name, file) in DOCUMENTS {
+        // Of two versions that a merge left in it neither is the document.
+        let torn = |d: &&Document| d.faults.iter().any(|f| f.kind == FaultKind::MergeConflictMarker);
+        let value = checkpoint.document(file).filter(|d| !torn(d)).and_then(|d| d.value.as_ref());
+        match value {
+            Some(Value::Object(map)) if name == "tokenizer_config" => {
+                let lean: Map<String, Value> = map
+                    .iter()
+                    .filter(|(k, _)| !BULKY.contains(&k.as_str()))
+                    .map(|(k, v)| (k.clone(), v.clone()))
+                    .collect();
+                scope.bind(name, &Value::Object(lean));
+            }
+            Some(value) => scope.bind(name, value),
+            None => scope.bind(name, &Value::Null),
+        }
+    }
+    scope.bind("arch", &json!(architecture.unwrap_or_default()));
+    scope.bind("model", model);
+    let text = model.get("text_config").or_else(|| model.get("llm_config")).unwrap_or(model);
+    scope.bind("text", text);
+    scope.bind("tokenizer", &tokenizer(checkpoint));
+    scope.bind("chat_templates", &chat_templates(checkpoint));
+    scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
+    scope.bind("rows", &rows.map_or(Value::Null, Value::from));
+    scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
+    let name = checkpoint.root.file_name().map(|n| n.to_string_lossy().into_owned());
+    scope.bind("directory", &json!(name.unwrap_or_default()));
+    let has_weights = checkpoint.tensors().next().is_some();
+    scope.bind("has_weights", &json!(has_weights));
+    scope.bind("all_read", &json!(has_weights && index::all_read(checkpoint)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("shape", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.shape)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
+    let here = Arc::clone(checkpoint);
+    scope.function1("has_file", move |name| json!(here.has_file(name)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));
+    scope
+}
+
+/// `stays_random`: what the loaders would say of a name.
+pub fn bind_loads(scope: &mut Scope<'static>, loads: Vec<LoadReport>) {
+    scope.function1("stays_random", move |name| match loads.as_slice() {
+        [] => Value::Null,
+        loads => json!(loads.iter().any(|report| report.leaves_random(name))),
+    });
+}
+
+/// Chat templates by the file that holds them; of several in one list the default.
+fn chat_templates(checkpoint: &Checkpoint) -> Value {
+    let mut found = Map::new();
+    for (name, text) in &checkpoint.texts {
+        found.insert(name.clone(), json!(text.trim()));
+    }
+    for name in ["chat_template.json", "tokenizer_config.json"] {
+        let Some(value) = checkpoint.document(name).and_then(|d| d.get("/chat_template")) else { continue };
+        let is_default = |item: &&Value| item.get("name").and_then(Value::as_str) == Some("default");
+        let listed = || value.as_array()?.iter().find(is_default)?.get("template")?.as_str();
+        if let Some(text) = value.as_str().or_else(listed) {
+            found.insert(name.to_owned(), json!(text.trim()));
+        }
+    }
+    Value::Object(found)
+}
+
+fn tokenizer(checkpoint: &Checkpoint) -> Value {
+    let t = &checkpoint.tokenizer;
+    let special = |attribute: &str| {
+        let (_, content) = t.special_tokens.iter().find(|(a, _)| a == attribute)?;
+        t.id_of(content)
+    };
+    let entries = |file: &str| t.vocabularies.get(file).map(|v| v.len());
+    json!({
+        "length": t.length(),
+        "base": t.base().map(Vocabulary::len),
+        "class": t.tokenizer_class,
+        "source": t.source,
+        "json_base": entries("tokenizer.json"),
+        "model_base": entries("tokenizer.model"),
+        "bos": special("bos_token"),
+        "eos": special("eos_token"),
+        "pad": special("pad_token"),
+        "highest": t.stated().keys().last().copied().max(t.base().and_then(Vocabulary::max_id)),
+    })
+}

@@ -1,0 +1,76 @@
+//! Entries of a checkpoint directory.
+
+use std::fmt;
+use std::fs::Metadata;
+use std::os::unix::fs::FileTypeExt as _;
+
+use super::lfs::LfsPointer;
+
+/// A directory entry, and what it turned out to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum EntryKind {
+    /// A regular file.
+    #[default]
+    Regular,
+    /// A directory.
+    Directory,
+    /// A FIFO, which would hang a reader.
+    Fifo,
+    /// A socket.
+    Socket,
+    /// A device.
+    Device,
+    /// A symbolic link that leads nowhere, or in a circle; or nothing the system tells about.
+    Broken,
+}
+
+impl EntryKind {
+    /// The kind that metadata tell, links followed; what is none of the others is a device.
+    #[must_use]
+    pub(super) fn from_metadata(metadata: &Metadata) -> Self {
+        let kind = metadata.file_type();
+        if kind.is_file() {
+            Self::Regular
+        } else if kind.is_dir() {
+            Self::Directory
+        } else if kind.is_fifo() {
+            Self::Fifo
+        } else if kind.is_socket() {
+            Self::Socket
+        } else {
+            Self::Device
+        }
+    }
+
+    /// The word for it in messages.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Regular => "regular file",
+            Self::Directory => "directory",
+            Self::Fifo => "FIFO",
+            Self::Socket => "socket",
+            Self::Device => "device",
+            Self::Broken => "broken link",
+        }
+    }
+}
+
+impl fmt::Display for EntryKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// One entry of a checkpoint directory.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Entry {
+    /// What it is, after following symbolic links.
+    pub kind: EntryKind,
+    /// Bytes in the file, after following symbolic links; 0 for anything but a file.
+    pub size: u64,
+    /// What the symbolic link says, if it is one.
+    pub link: Option<String>,
+    /// The pointer, if the file is one.
+    pub lfs: Option<LfsPointer>,
+}

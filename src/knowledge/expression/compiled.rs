@@ -1,0 +1,222 @@
+//! Expressions: parsed when they are read or when they are first evaluated.
+
+use std::borrow::Cow;
+use std::cell::RefCell;
+use std::collections::HashMap;
+use std::fmt;
+use std::sync::{Arc, OnceLock};
+
+use cel::Value as Cel;
+use serde::{Deserialize, Deserializer};
+use serde_json::Value;
+
+use super::program::Program;
+use super::scope::{self, Scope};
+use super::steps;
+
+/// Characters of an evaluation error that are kept: the crate prints whole operands.
+const MESSAGE_CAP: usize = 300;
+
+/// An expression that could not be evaluated; it names the expression and the cause.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{source_text}`: {cause}")]
+pub struct EvalError {
+    /// The expression as written.
+    pub source_text: String,
+    /// What went wrong, capped.
+    pub cause: String,
+}
+
+/// A text that is not an expression.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{source_text}` is not an expression: {cause}")]
+pub struct ParseError {
+    /// The text.
+    pub source_text: String,
+    /// The parser's message, with its place in the text.
+    pub cause: String,
+}
+
+/// A CEL expression. Cloning is cheap.
+///
+/// In the program's own data files there are thousands of them, of which a run needs a few: one that is read from a
+/// file may be compiled when it is first evaluated.
+#[derive(Clone)]
+pub struct Expression(Arc<Inner>);
+
+struct Inner {
+    source: Box<str>,
+    /// Whether it comes from a user's file, and its steps are counted.
+    counted: bool,
+    program: OnceLock<Result<Program, String>>,
+}
+
+/// How the file at hand is read; serde has no way to hand this down.
+#[derive(Default)]
+struct Reading {
+    /// Whether an expression that is none is an error of the file, with its place.
+    at_once: bool,
+    /// The file's expressions so far: equal ones are compiled once.
+    seen: Option<HashMap<Box<str>, Expression>>,
+}
+
+thread_local! {
+    static READING: RefCell<Reading> = RefCell::default();
+}
+
+/// Reads a data file whose author wants to know what in it is no expression.
+pub(crate) fn compiled_at_once<T>(read: impl FnOnce() -> T) -> T {
+    reading(true, read)
+}
+
+/// Reads a data file whose expressions are known to be right: they are compiled when they are evaluated.
+pub(crate) fn compiled_when_needed<T>(read: impl FnOnce() -> T) -> T {
+    reading(false, read)
+}
+
+fn reading<T>(at_once: bool, read: impl FnOnce() -> T) -> T {
+    /// Also after a panic the next file is read as it wishes.
+    struct RestoreReading(Reading);
+    impl Drop for RestoreReading {
+        fn drop(&mut self) {
+            READING.set(std::mem::take(&mut self.0));
+        }
+    }
+    let _before = RestoreReading(READING.replace(Reading { at_once, seen: Some(HashMap::new()) }));
+    read()
+}
+
+impl Expression {
+    /// Parses `source`.
+    ///
+    /// # Errors
+    /// When it is not CEL.
+    pub fn parse(source: &str) -> Result<Self, ParseError> {
+        let expression = Self(Arc::new(Inner { source: source.into(), counted: true, program: OnceLock::new() }));
+        match expression.program() {
+            Ok(_) => Ok(expression),
+            Err(cause) => Err(ParseError { source_text: source.to_owned(), cause: cause.to_owned() }),
+        }
+    }
+
+    /// An expression of the file that is being read.
+    pub(super) fn written(source: &str) -> Result<Self, ParseError> {
+        let (at_once, seen) =
+            READING.with_borrow(|r| (r.at_once, r.seen.as_ref().and_then(|seen| seen.get(source).cloned())));
+        if let Some(seen) = seen {
+            return Ok(seen);
+        }
+        let expression = if at_once {
+            Self::parse(source)?
+        } else {
+            Self(Arc::new(Inner { source: source.into(), counted: false, program: OnceLock::new() }))
+        };
+        READING.with_borrow_mut(|r| Some(r.seen.as_mut()?.insert(source.into(), expression.clone())));
+        Ok(expression)
+    }
+
+    fn program(&self) -> Result<&Program, &str> {
+        let program = self.0.program.get_or_init(|| Program::compile(&self.0.source, self.0.counted));
+        program.as_ref().map_err(String::as_str)
+    }
+
+    /// The text it was parsed from.
+    #[must_use]
+    pub fn source(&self) -> &str {
+        &self.0.source
+    }
+
+    /// Variables the expression mentions, sorted; those bound by its own macros are included.
+    #[must_use]
+    pub fn variables(&self) -> Vec<String> {
+        self.program().map_or_else(|_| Vec::new(), Program::variables)
+    }
+
+    /// Evaluates to a JSON value; objects come back with sorted keys.
+    ///
+    /// # Errors
+    /// On a missing key or variable, an overflow, a division by zero, a type that does not fit.
+    pub fn eval(&self, scope: &Scope<'_>) -> Result<Value, EvalError> {
+        let value = self.value(scope)?;
+        scope::to_json(&value).ok_or_else(|| self.error(&"the result has no JSON form"))
+    }
+
+    /// Evaluates and binds the result in the scope it was evaluated in.
+    ///
+    /// # Errors
+    /// As [`Self::eval`].
+    pub(crate) fn bind(&self, name: &str, scope: &mut Scope<'_>) -> Result<(), EvalError> {
+        let value = self.value(scope)?.try_into().map_err(|e| self.error(&e))?;
+        scope.bind_val(name, value);
+        Ok(())
+    }
+
+    fn value(&self, scope: &Scope<'_>) -> Result<Cel, EvalError> {
+        steps::spend(1).map_err(|cause| self.error(&cause))?;
+        self.program().map_err(|cause| self.error(&cause))?.run(scope.context()).map_err(|e| self.error(&e))
+    }
+
+    /// Evaluates to true or false.
+    ///
+    /// # Errors
+    /// As [`Self::eval`], and when the result is not a boolean.
+    pub fn eval_bool(&self, scope: &Scope<'_>) -> Result<bool, EvalError> {
+        match self.value(scope)? {
+            Cel::Bool(b) => Ok(b),
+            other => Err(self.unfit("true or false", &other)),
+        }
+    }
+
+    /// Evaluates to a count or a dimension: an integer from 0 to 2^53.
+    ///
+    /// # Errors
+    /// As [`Self::eval`], and when the result is not such an integer.
+    pub fn eval_u64(&self, scope: &Scope<'_>) -> Result<u64, EvalError> {
+        let value = self.value(scope)?;
+        match value {
+            Cel::Int(n @ 0..=0x20_0000_0000_0000) => Ok(n.unsigned_abs()),
+            _ => Err(self.unfit("a size of 0 to 2^53", &value)),
+        }
+    }
+
+    fn unfit(&self, wanted: &str, value: &Cel) -> EvalError {
+        let value = scope::to_json(value).unwrap_or(Value::Null);
+        self.error(&format_args!("{wanted} expected, got {}", scope::plain(&value)))
+    }
+
+    fn error(&self, cause: &dyn fmt::Display) -> EvalError {
+        let mut cause = cause.to_string();
+        if let Some((at, _)) = cause.char_indices().nth(MESSAGE_CAP) {
+            cause.truncate(at);
+            cause.push('…');
+        }
+        EvalError { source_text: self.0.source.to_string(), cause }
+    }
+}
+
+impl PartialEq for Expression {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.source == other.0.source
+    }
+}
+
+impl Eq for Expression {}
+
+impl fmt::Display for Expression {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0.source)
+    }
+}
+
+impl fmt::Debug for Expression {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "`{}`", self.0.source)
+    }
+}
+
+impl<'de> Deserialize<'de> for Expression {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let source = Cow::<str>::deserialize(deserializer)?;
+        Self::written(&source).map_err(serde::de::Error::custom)
+    }
+}

@@ -1,0 +1,52 @@
+//! The scheme that a config declares.
+
+use serde_json::Value;
+
+use super::Scheme;
+use super::applied::AppliedScheme;
+use crate::knowledge::Scope;
+
+/// How the weights are stored, as config.json declares it.
+pub enum DeclaredScheme<'k> {
+    /// Not quantised.
+    Plain,
+    /// A scheme that is not among the known ones, by the name that the config gives it.
+    Unknown(String),
+    /// A known scheme.
+    Known(Box<AppliedScheme<'k>>),
+}
+
+/// The block of a config.json that is about quantisation, and the JSON pointer to it.
+///
+/// MLX writes `quantization` and, since 2024, the same again as `quantization_config`; compositions may have it in
+/// their text part. Source: `get_hf_quantizer` of transformers 5.23.0, `load_model` of mlx-lm.
+#[must_use]
+pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
+    ["/quantization_config", "/quantization", "/text_config/quantization_config"]
+        .into_iter()
+        .find_map(|pointer| Some((pointer, config.pointer(pointer).filter(|block| block.is_object())?)))
+}
+
+/// The scheme that a config declares, one of `schemes` where it is known.
+#[must_use]
+pub fn declared_scheme<'k>(config: &Value, schemes: &'k [Scheme]) -> DeclaredScheme<'k> {
+    let Some((pointer, block)) = block(config) else { return DeclaredScheme::Plain };
+    let mut scope = Scope::new();
+    scope.bind("config", config);
+    scope.bind("q", block);
+    let meant = |scheme: &&Scheme| scheme.when.eval_bool(&scope).unwrap_or(false);
+    match schemes.iter().find(meant) {
+        Some(scheme) => DeclaredScheme::Known(Box::new(AppliedScheme::new(scheme, config, (pointer, block)))),
+        None => DeclaredScheme::Unknown(method(block)),
+    }
+}
+
+/// What a config calls a scheme that is not known.
+fn method(block: &Value) -> String {
+    let text = |key: &str| block.get(key).and_then(Value::as_str);
+    match (text("quant_method"), text("format")) {
+        (Some(method), Some(format)) => format!("{method} ({format})"),
+        (Some(method), None) => method.to_owned(),
+        (None, _) => "a method it does not name".to_owned(),
+    }
+}

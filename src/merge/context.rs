@@ -1,0 +1,136 @@
+//! The donors of a merge, and the scope in which the recipe's expressions are evaluated.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+
+use super::error::MergeError;
+use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::processor::Processor;
+use crate::knowledge::recipe::{Recipe, SeamTensor};
+use crate::knowledge::{EvalError, Expression, Scope};
+use crate::report::model::ShapedName;
+
+/// Options in force, by name.
+pub type Options = BTreeMap<String, String>;
+
+/// A donor in its role.
+#[derive(Debug, Clone)]
+pub struct Donor {
+    /// Role in the recipe.
+    pub role: String,
+    /// What was read.
+    pub checkpoint: Arc<Checkpoint>,
+    /// Its config with the class's defaults filled in; null for a directory that is no checkpoint.
+    pub config: Value,
+}
+
+/// What the recipe's expressions see, and the donors they are about.
+pub(super) struct Context<'a> {
+    pub(super) recipe: &'a Recipe,
+    pub(super) donors: &'a [Donor],
+    pub(super) scope: Scope<'static>,
+    pub(super) tokens: Option<OpenedTokenizer>,
+    processors: &'a [Processor],
+}
+
+impl Context<'_> {
+    pub(super) fn donor(&self, role: &str) -> Option<&Donor> {
+        self.donors.iter().find(|d| d.role == role)
+    }
+
+    pub(super) fn at(&self, place: impl Into<String>) -> impl FnOnce(EvalError) -> MergeError {
+        let (recipe, place) = (self.recipe.recipe.clone(), place.into());
+        move |error| MergeError::Expression { recipe, place, error }
+    }
+
+    pub(super) fn holds(&self, when: Option<&Expression>, place: &str) -> Result<bool, MergeError> {
+        when.map_or(Ok(true), |w| w.eval_bool(&self.scope)).map_err(self.at(place))
+    }
+
+    /// Name and shape of a donor tensor; `None` when the donor has no such tensor.
+    pub(super) fn shaped(&self, t: &SeamTensor) -> Option<ShapedName> {
+        let (_, tensor) = self.donor(&t.from)?.checkpoint.tensor(&t.name)?;
+        Some(ShapedName { donor: t.from.clone(), name: t.name.clone(), shape: tensor.shape.clone() })
+    }
+}
+
+impl<'a> Context<'a> {
+    /// Binds options and donors, then evaluates the recipe's `let`.
+    pub(super) fn new(
+        recipe: &'a Recipe,
+        donors: &'a [Donor],
+        options: &Options,
+        processors: &'a [Processor],
+    ) -> Result<Self, MergeError> {
+        let mut scope = Scope::new();
+        let mut opt = Map::new();
+        let mut arg = Map::new();
+        for (name, value) in options {
+            // `forward:PACKAGE` is the value `forward` with the argument `PACKAGE`.
+            let (head, tail) = value.split_once(':').unwrap_or((value, ""));
+            opt.insert(name.clone(), json!(head));
+            arg.insert(name.clone(), json!(tail));
+        }
+        scope.bind("opt", &Value::Object(opt));
+        scope.bind("arg", &Value::Object(arg));
+        for donor in donors {
+            scope.bind(&donor.role, &donor.config);
+        }
+        for (name, file) in [("processor", "processor_config.json"), ("preprocessor", "preprocessor_config.json")] {
+            scope.bind(name, &document(donors, file).unwrap_or_default());
+        }
+        let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
+            Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
+        let all = Arc::clone(&checkpoints);
+        scope.function2("shape", move |role, name| {
+            all.get(role).and_then(|c| c.tensor(name)).map_or(Value::Null, |(_, t)| json!(t.shape))
+        });
+        scope.function2("has", move |role, prefix| {
+            json!(checkpoints.get(role).is_some_and(|c| c.tensors().any(|(_, t)| t.name.starts_with(prefix))))
+        });
+        let mut context = Self { recipe, donors, scope, tokens: None, processors };
+        for item in &recipe.lets {
+            if context.tokens.is_none() && item.is.variables().iter().any(|v| v == "tokens") {
+                context.add_tokens()?;
+            }
+            let value = item.is.eval(&context.scope).map_err(context.at(format!("let {}", item.name)))?;
+            context.scope.bind(&item.name, &value);
+        }
+        context.add_tokens()?;
+        Ok(context)
+    }
+}
+
+impl Context<'_> {
+    fn add_tokens(&mut self) -> Result<(), MergeError> {
+        let Some(spec) = &self.recipe.tokens else { return Ok(()) };
+        if self.tokens.is_none() {
+            let processor = self.processors.iter().find(|p| p.processor == spec.processor).ok_or_else(|| {
+                MergeError::Recipe(format!("{}: no processor {}", self.recipe.recipe, spec.processor))
+            })?;
+            let donor = self
+                .donor(&spec.base)
+                .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;
+            let config = document(self.donors, "processor_config.json").unwrap_or_default();
+            let opened = open_tokenizer(&donor.checkpoint.tokenizer, processor, &config)
+                .map_err(self.at(format!("processor {}", spec.processor)))?
+                .ok_or_else(|| {
+                    MergeError::Donor(format!(
+                        "the {} donor has no vocabulary file (tokenizer.model or tokenizer.json), so the ids of the tokens to be added cannot be known; put its tokenizer files beside its config.json",
+                        spec.base
+                    ))
+                })?;
+            self.scope.bind("tokens", &opened.summary());
+            self.tokens = Some(opened);
+        }
+        Ok(())
+    }
+}
+
+/// The document of that name of the first donor that has it.
+fn document(donors: &[Donor], name: &str) -> Option<Value> {
+    donors.iter().find_map(|d| d.checkpoint.document(name)?.value.clone())
+}

@@ -1,0 +1,53 @@
+//! The draft of a merge: the plan, its documents, and what the report tells of it.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use crate::checkpoint::tokenizer::VOCABULARY_FILES;
+use crate::checkpoint::{Checkpoint, Document, Entry, Parts, PythonModule, Vocabulary};
+use crate::report::model::{ChangedTensor, Dropped, MergedFile, Seam};
+use crate::surgery::plan::{Plan, PlannedShard};
+
+/// What would be written, and the seams that prevent it.
+#[derive(Debug, Default)]
+pub(super) struct MergeDraft {
+    /// The plan; incomplete when `seams` is not empty.
+    pub(super) plan: Plan,
+    /// Documents of the plan, for its preview.
+    pub(super) documents: Vec<Document>,
+    /// Seams that do not fit.
+    pub(super) seams: Vec<Seam>,
+    /// Tensors that are not byte copies.
+    pub(super) changed: Vec<ChangedTensor>,
+    /// Donor tensors left behind.
+    pub(super) dropped: Vec<Dropped>,
+    /// Repairs made on the way.
+    pub(super) repairs: Vec<String>,
+    /// What a person should know.
+    pub(super) notes: Vec<String>,
+    /// Files and where they came from.
+    pub(super) files: Vec<MergedFile>,
+}
+
+impl MergeDraft {
+    /// The planned checkpoint as a reader would see it.
+    pub(super) fn preview(&self, out: &Path) -> Checkpoint {
+        let mut parts = Parts { documents: self.documents.clone(), ..Parts::default() };
+        parts.shards = self.plan.shards.iter().map(PlannedShard::preview).collect();
+        for file in &self.plan.files {
+            if file.name.ends_with(".py") {
+                parts.modules.push(PythonModule::parse(file.name.as_str(), &file.bytes));
+            } else if !self.documents.iter().any(|d| d.name == file.name) {
+                if file.name.ends_with(".json") {
+                    parts.documents.push(Document::parse(file.name.as_str(), &file.bytes));
+                } else if VOCABULARY_FILES.contains(&file.name.as_str())
+                    && let Ok(vocabulary) = Vocabulary::parse(&file.name, &file.bytes)
+                {
+                    parts.vocabularies.insert(file.name.clone(), Arc::new(vocabulary));
+                }
+                parts.entries.insert(file.name.clone(), Entry { size: file.bytes.len() as u64, ..Entry::default() });
+            }
+        }
+        Checkpoint::planned(out, parts)
+    }
+}

@@ -1,0 +1,140 @@
+//! The files of a merge: documents, copies, Python modules, aliases, and the index last but for config.json.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use serde_json::{Map, Value, json};
+
+use super::context::Context;
+use super::documents::MergedDocument;
+use super::draft::MergeDraft;
+use super::error::MergeError;
+use crate::check::modules::relative_modules;
+use crate::checkpoint::Document;
+use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
+use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
+use crate::knowledge::source;
+use crate::report::model::MergedFile;
+use crate::surgery::plan::PlannedFile;
+
+pub(super) fn plan(
+    context: &Context<'_>,
+    documents: Vec<MergedDocument>,
+    draft: &mut MergeDraft,
+) -> Result<(), MergeError> {
+    let mut files: Vec<PlannedFile> = Vec::new();
+    for spec in &context.recipe.files {
+        match spec {
+            FileSpec::Copy(copy) => {
+                if context.holds(copy.when.as_ref(), "files")? {
+                    for name in &copy.names {
+                        files.extend(copy_of(context, &copy.from, name)?);
+                    }
+                }
+            }
+            FileSpec::Modules(spec) => {
+                if context.holds(spec.when.as_ref(), "files")? {
+                    files.extend(modules(context, spec)?);
+                }
+            }
+            FileSpec::Template(template) => {
+                if context.holds(template.when.as_ref(), "files")? {
+                    files.push(fill_template(context, template)?);
+                }
+            }
+        }
+    }
+    if let Some(index) = index(draft) {
+        files.push(PlannedFile {
+            name: index.name.clone(),
+            bytes: bytes_of(&index),
+            origin: "made from the shards".to_owned(),
+        });
+        draft.documents.push(index);
+    }
+    // A loader starts at config.json: it comes last, so that even a copy cut short is not taken for a checkpoint.
+    let (config, others): (Vec<MergedDocument>, Vec<MergedDocument>) =
+        documents.into_iter().partition(|b| b.document.name == "config.json");
+    for built in others.into_iter().chain(config) {
+        files.push(PlannedFile {
+            name: built.document.name.clone(),
+            bytes: bytes_of(&built.document),
+            origin: built.origin,
+        });
+        draft.documents.push(built.document);
+    }
+    let mut seen = BTreeSet::new();
+    for file in &files {
+        // Two names that differ in case only are one file on some file systems.
+        if !seen.insert(file.name.to_lowercase()) {
+            return Err(MergeError::Recipe(format!("{}: {} would be written twice", context.recipe.recipe, file.name)));
+        }
+    }
+    draft.files = files.iter().map(|f| MergedFile { name: f.name.clone(), origin: f.origin.clone() }).collect();
+    draft.plan.files = files;
+    Ok(())
+}
+
+fn bytes_of(document: &Document) -> Arc<[u8]> {
+    document.text.as_deref().unwrap_or_default().as_bytes().into()
+}
+
+/// A donor's file; nothing when the donor has none of that name.
+fn copy_of(context: &Context<'_>, role: &str, name: &str) -> Result<Option<PlannedFile>, MergeError> {
+    let Some(donor) = context.donor(role) else { return Ok(None) };
+    if !donor.checkpoint.has_file(name) {
+        return Ok(None);
+    }
+    let bytes = read_capped(&donor.checkpoint.root.join(name), TOKENIZER_CAP)
+        .map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
+    Ok(Some(PlannedFile { name: name.to_owned(), bytes: bytes.into(), origin: format!("{role} donor, unchanged") }))
+}
+
+/// The root modules and every module they import, each from the first donor that has it.
+fn modules(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>, MergeError> {
+    let mut found: BTreeMap<String, PlannedFile> = BTreeMap::new();
+    let mut pending = spec.roots.clone();
+    while let Some(module) = pending.pop() {
+        let name = format!("{module}.py");
+        if found.contains_key(&name) {
+            continue;
+        }
+        for role in &spec.from {
+            let Some(parsed) = context.donor(role).and_then(|d| d.checkpoint.modules.get(&name)) else { continue };
+            if let Some(file) = copy_of(context, role, &name)? {
+                pending.extend(relative_modules(parsed));
+                found.insert(name, file);
+                break;
+            }
+        }
+    }
+    Ok(found.into_values().collect())
+}
+
+fn fill_template(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFile, MergeError> {
+    let recipe = &context.recipe.recipe;
+    let mut text = source::text(&format!("recipes/{}", spec.text))
+        .ok_or_else(|| MergeError::Recipe(format!("{recipe}: no template {}", spec.text)))?
+        .to_owned();
+    for (key, expression) in &spec.fill {
+        let value = expression.eval(&context.scope).map_err(context.at(spec.text.as_str()))?;
+        let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        text = text.replace(&format!("{{{{{key}}}}}"), &value);
+    }
+    Ok(PlannedFile {
+        name: spec.name.clone(),
+        bytes: text.into_bytes().into(),
+        origin: "alias of the recipe".to_owned(),
+    })
+}
+
+/// The index, when there is more than one shard; one shard needs none.
+fn index(draft: &MergeDraft) -> Option<Document> {
+    if draft.plan.shards.len() < 2 {
+        return None;
+    }
+    let map: BTreeMap<&str, &str> = draft.plan.tensors().map(|(s, t)| (t.name.as_str(), s.name.as_str())).collect();
+    let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k.to_owned(), json!(v))).collect();
+    let value = json!({ "metadata": { "total_size": draft.plan.tensor_bytes() }, "weight_map": map });
+    Some(Document::from_value("model.safetensors.index.json", value))
+}

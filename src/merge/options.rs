@@ -1,0 +1,104 @@
+//! Options of a recipe: those given, checked, and defaults for the others.
+
+use std::collections::BTreeMap;
+
+use super::context::Options;
+use super::error::MergeError;
+use crate::knowledge::recipe::{OptionSpec, Recipe};
+
+/// Largest shard when a recipe has no such option: what `save_pretrained` uses.
+pub(super) const DEFAULT_SHARD: u64 = 5_000_000_000;
+
+/// Options in force: those given, checked, and the recipe's defaults for the rest.
+///
+/// # Errors
+/// [`MergeError::Option`] for a name the recipe does not have or a value it does not take.
+pub(super) fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Result<Options, MergeError> {
+    for name in given.keys() {
+        if !recipe.options.iter().any(|o| o.name == *name) {
+            let known: Vec<&str> = recipe.options.iter().map(|o| o.name.as_str()).collect();
+            let reason = format!("recipe {} has no option {name}; it has {}", recipe.recipe, known.join(", "));
+            return Err(MergeError::Option(reason));
+        }
+    }
+    recipe
+        .options
+        .iter()
+        .map(|spec| {
+            let value = given.get(&spec.name).unwrap_or(&spec.default);
+            check(spec, value)?;
+            Ok((spec.name.clone(), value.clone()))
+        })
+        .collect()
+}
+
+fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
+    if spec.values.is_empty() {
+        return parse_size(value).map(drop);
+    }
+    let takes = |v: &String| match v.strip_suffix(':') {
+        // What follows the colon goes into a Python import: a dotted module path and nothing else.
+        Some(head) => value.strip_prefix(head).and_then(|t| t.strip_prefix(':')).is_some_and(is_module_path),
+        None => v == value,
+    };
+    if spec.values.iter().any(takes) {
+        return Ok(());
+    }
+    let forms: Vec<String> =
+        spec.values.iter().map(|v| if v.ends_with(':') { format!("{v}PACKAGE") } else { v.clone() }).collect();
+    Err(MergeError::Option(format!("{}={value} is not one of {}", spec.name, forms.join(", "))))
+}
+
+fn is_module_path(text: &str) -> bool {
+    text.split('.').all(|part| {
+        part.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+            && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+    })
+}
+
+/// Bytes of a size such as `5GB` (5·10⁹), `300MiB` (300·2²⁰) or `1000`; at least one.
+///
+/// # Errors
+/// [`MergeError::Option`] for anything else.
+pub(super) fn parse_size(text: &str) -> Result<u64, MergeError> {
+    let bad = || MergeError::Option(format!("shard-size={text} is not a size such as 5GB, 300MiB or 1000000"));
+    let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(digits);
+    let number: u64 = number.parse().map_err(|_| bad())?;
+    let unit: u64 = match unit.trim().to_ascii_uppercase().as_str() {
+        "" | "B" => 1,
+        "KB" => 1_000,
+        "MB" => 1_000_000,
+        "GB" => 1_000_000_000,
+        "TB" => 1_000_000_000_000,
+        "KIB" => 1 << 10,
+        "MIB" => 1 << 20,
+        "GIB" => 1 << 30,
+        "TIB" => 1 << 40,
+        _ => return Err(bad()),
+    };
+    number.checked_mul(unit).filter(|n| *n > 0).ok_or_else(bad)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes() {
+        assert_eq!(parse_size("5GB").unwrap(), 5_000_000_000);
+        assert_eq!(parse_size("5GiB").unwrap(), 5 << 30);
+        assert_eq!(parse_size("300").unwrap(), 300);
+        for bad in ["", "GB", "0", "-1", "5 parsecs", "99999999999TB"] {
+            assert!(parse_size(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn packages_are_module_paths() {
+        assert!(is_module_path("pkg.sub_mod"));
+        for bad in ["", ".x", "a..b", "a;import os", "a b", "1a", "a\n"] {
+            assert!(!is_module_path(bad), "{bad}");
+        }
+    }
+}

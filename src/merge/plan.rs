@@ -1,0 +1,55 @@
+//! A recipe and its donors become a draft: the plan, and the seams that do not fit.
+//!
+//! Nothing here writes, and nothing here judges a checkpoint: the pipeline checks donors and preview with the rules.
+
+use serde_json::Value;
+
+use super::context::{Context, Donor, Options};
+use super::draft::MergeDraft;
+use super::error::MergeError;
+use super::{documents, files, options, tensors};
+use crate::knowledge::Knowledge;
+use crate::knowledge::recipe::Recipe;
+use crate::report::model::Seam;
+
+/// Turns a recipe into a draft: seams, documents, tensors, files, notes.
+///
+/// # Errors
+/// A [`MergeError`] when the recipe cannot be followed at all with these donors and options.
+pub(super) fn plan(
+    recipe: &Recipe,
+    donors: &[Donor],
+    options: &Options,
+    knowledge: &Knowledge,
+) -> Result<MergeDraft, MergeError> {
+    let context = Context::new(recipe, donors, options, &knowledge.processors)?;
+    let mut draft = MergeDraft::default();
+    for (i, seam) in recipe.seams.iter().enumerate() {
+        let place = format!("seam {}", i.saturating_add(1));
+        if seam.that.eval_bool(&context.scope).map_err(context.at(place.as_str()))? {
+            continue;
+        }
+        let needed = seam.needed.as_ref().and_then(|e| e.eval(&context.scope).ok()).and_then(|v| shape_of(&v));
+        draft.seams.push(Seam {
+            message: seam.message.render(&context.scope),
+            tensor: seam.tensor.as_ref().and_then(|t| context.shaped(t)),
+            meets: seam.meets.as_ref().and_then(|t| context.shaped(t)),
+            needed,
+            options: seam.options.iter().map(|o| format!("--set {o}")).collect(),
+        });
+    }
+    let documents = documents::plan(&context, &mut draft)?;
+    let limit = options.get("shard-size").map_or(Ok(options::DEFAULT_SHARD), |s| options::parse_size(s))?;
+    tensors::plan(&context, &documents, &knowledge.library, limit, &mut draft)?;
+    files::plan(&context, documents, &mut draft)?;
+    for note in &recipe.notes {
+        if context.holds(Some(&note.when), "a note")? {
+            draft.notes.push(note.say.render(&context.scope));
+        }
+    }
+    Ok(draft)
+}
+
+fn shape_of(value: &Value) -> Option<Vec<u64>> {
+    value.as_array()?.iter().map(Value::as_u64).collect()
+}

@@ -1,0 +1,140 @@
+//! A merge under way: the checkpoints it has checked and the record for its report.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::draft::MergeDraft;
+use crate::check::{Outcome, Severity, check};
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::Knowledge;
+use crate::knowledge::recipe::Recipe;
+use crate::report::Report;
+use crate::report::model::{CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
+
+/// What a merge is asked to do.
+#[derive(Debug, Clone)]
+pub struct MergeRequest {
+    /// The recipe; chosen by the donors' architectures when absent.
+    pub recipe: Option<Recipe>,
+    /// Role to directory, as given.
+    pub donors: BTreeMap<String, PathBuf>,
+    /// Options as given.
+    pub options: BTreeMap<String, String>,
+    /// Directory to make.
+    pub out: PathBuf,
+    /// Stop before anything is written.
+    pub dry_run: bool,
+    /// Hash every byte of the donors for the manifest, not only documents and headers.
+    pub hash: bool,
+}
+
+/// A checkpoint that was checked on the way.
+#[derive(Debug, Clone)]
+pub struct CheckedCheckpoint {
+    /// What it is in this merge.
+    pub role: Role,
+    /// As the user named it.
+    pub path: PathBuf,
+    /// The checkpoint.
+    pub checkpoint: Arc<Checkpoint>,
+    /// The result of checking it.
+    pub outcome: Outcome,
+}
+
+/// A merge: how far it came, and what every stage found.
+#[derive(Debug, Clone, Default)]
+pub struct MergeRun {
+    /// Checkpoints in the order they were checked.
+    pub checked: Vec<CheckedCheckpoint>,
+    /// The record for the reports.
+    pub record: MergeReport,
+}
+
+impl MergeRun {
+    /// A run that has done nothing yet.
+    pub(super) fn new(request: &MergeRequest) -> Self {
+        let donors = request.donors.iter().map(|(role, dir)| (role.clone(), dir.display().to_string())).collect();
+        let record = MergeReport { out: request.out.display().to_string(), donors, ..MergeReport::default() };
+        Self { checked: Vec::new(), record }
+    }
+
+    /// The donor in a role of the recipe, once it was checked.
+    pub(super) fn donor(&self, role: &str) -> Option<&CheckedCheckpoint> {
+        self.checked.iter().find(|c| matches!(&c.role, Role::Donor(own) if own == role))
+    }
+
+    /// Adds the line about one stage.
+    pub(super) fn note(&mut self, name: &str, outcome: &str) {
+        self.record.stages.push(StageOutcome { name: name.to_owned(), outcome: outcome.to_owned() });
+    }
+
+    /// The run, ended with `stage`.
+    pub(super) fn end(mut self, stage: MergeStage) -> Self {
+        self.record.stage = Some(stage);
+        self
+    }
+
+    /// Records what is planned.
+    pub(super) fn record_draft(&mut self, draft: &MergeDraft) {
+        let record = &mut self.record;
+        record.seams.clone_from(&draft.seams);
+        record.changed.clone_from(&draft.changed);
+        record.dropped.clone_from(&draft.dropped);
+        record.repairs.clone_from(&draft.repairs);
+        record.notes.clone_from(&draft.notes);
+        record.files.clone_from(&draft.files);
+        record.tensors = draft.plan.tensors().count();
+        record.bytes = draft.plan.tensor_bytes();
+        record.transforms.clear();
+        for (_, tensor) in draft.plan.tensors() {
+            let count = record.transforms.entry(tensor.source.transform()).or_default();
+            *count = count.saturating_add(1);
+        }
+    }
+
+    /// Checks the planned or the written checkpoint and notes the verdict; false when it has errors.
+    pub(super) fn check(&mut self, role: Role, path: &Path, checkpoint: Checkpoint, knowledge: &Knowledge) -> bool {
+        let checkpoint = Arc::new(checkpoint);
+        let outcome = check(&checkpoint, knowledge);
+        let found = |severity| outcome.findings.iter().filter(|f| f.severity == severity).count();
+        let errors = found(Severity::Error);
+        let verdict = match (errors, found(Severity::Warning)) {
+            (0, 0) => "clean".to_owned(),
+            (0, n) => count(n, "warning", "warnings"),
+            (n, _) => count(n, "error", "errors"),
+        };
+        self.note(&format!("check {role}"), &verdict);
+        self.checked.push(CheckedCheckpoint { role, path: path.to_owned(), checkpoint, outcome });
+        errors == 0
+    }
+
+    /// The report of the run.
+    #[must_use]
+    pub fn report(&self) -> Report {
+        self.report_with(|path| path.display().to_string())
+    }
+
+    /// The report with directories named by their last component, for the file that travels with the result.
+    pub(super) fn portable_report(&self) -> Report {
+        self.report_with(|path| match path.file_name() {
+            Some(name) => name.to_string_lossy().into_owned(),
+            None => path.display().to_string(),
+        })
+    }
+
+    fn report_with(&self, name: impl Fn(&Path) -> String) -> Report {
+        let checkpoint = |c: &CheckedCheckpoint| {
+            CheckpointReport::new(name(&c.path), Some(c.role.clone()), &c.checkpoint, &c.outcome)
+        };
+        let mut record = self.record.clone();
+        record.out = name(Path::new(&record.out));
+        record.donors = record.donors.iter().map(|(role, dir)| (role.clone(), name(Path::new(dir)))).collect();
+        Report::new(self.checked.iter().map(checkpoint).collect(), Some(record))
+    }
+}
+
+/// `1 shard`, `2 shards`.
+pub(super) fn count(n: usize, one: &str, many: &str) -> String {
+    format!("{n} {}", if n == 1 { one } else { many })
+}

@@ -1,0 +1,180 @@
+//! Formats that other programs show: what they have in common.
+//!
+//! They take no notice of `Style`: a program that reads a report wants all of it.
+
+pub mod github;
+pub mod gitlab;
+pub mod junit;
+pub mod sarif;
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::sync::Arc;
+
+use sha2::{Digest as _, Sha256};
+
+use super::format::{fix, sentence};
+use super::model::{CheckpointReport, MergeReport, Report};
+use crate::check::finding::Accepted;
+use crate::check::{Finding, FixHint, Location, Severity};
+use crate::checkpoint::hex;
+
+/// Longest path written, in characters: no longer one exists on Linux.
+const PATH: usize = 4_096;
+
+/// The findings on one checkpoint, or the seams of a merge.
+pub struct Group<'a> {
+    /// What it is about, with its part in a merge.
+    pub title: String,
+    /// Where it is, [`tidy`].
+    pub path: String,
+    /// Texts of its documents; none for a merge.
+    pub sources: Option<&'a BTreeMap<String, Arc<str>>>,
+    /// In the order of the report.
+    pub items: Vec<Item<'a>>,
+    /// Findings that are accepted, with where that is written and why.
+    pub suppressed: Vec<(Item<'a>, &'a Accepted)>,
+}
+
+/// What stands for a rule code at a seam.
+pub const SEAM: &str = "seam";
+
+/// A finding, or a seam that does not fit.
+pub struct Item<'a> {
+    /// Rule code; [`SEAM`] for a seam.
+    pub code: &'a str,
+    /// Rule name.
+    pub name: &'a str,
+    /// How bad it is.
+    pub severity: Severity,
+    /// What is said of it, safe to show.
+    pub message: String,
+    /// Where; may be empty.
+    pub locations: &'a [Location],
+    /// The fix, if there is one.
+    pub fix: Option<&'a FixHint>,
+    /// The next step, safe to show.
+    pub help: Option<String>,
+    /// SHA-256 in hexadecimal. The same while the finding is, wherever in its file it moves; unique in a report.
+    pub fingerprint: String,
+}
+
+/// Everything there is to say, one group for each checkpoint and one for a merge.
+pub fn groups(report: &Report) -> Vec<Group<'_>> {
+    let mut seen = BTreeMap::new();
+    let mut groups: Vec<Group<'_>> = report.checkpoints.iter().map(|c| findings(c, &mut seen)).collect();
+    groups.extend(report.merge.as_ref().map(|m| seams(m, &mut seen)));
+    groups
+}
+
+fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
+    let path = tidy(&checkpoint.path);
+    let role = checkpoint.role.as_ref().map(ToString::to_string).unwrap_or_default();
+    let title = if role.is_empty() { path.clone() } else { format!("{path} ({role})") };
+    let mut item = |finding: &'a Finding| Item {
+        code: &finding.code,
+        name: &finding.name,
+        severity: finding.severity,
+        message: sentence(&finding.message),
+        locations: &finding.locations,
+        fix: finding.fix.as_ref(),
+        help: finding.fix.as_ref().map(fix),
+        fingerprint: of_finding(finding, &path, &role, seen),
+    };
+    let items = checkpoint.findings.iter().map(&mut item).collect();
+    let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
+    Group { title, path, sources: Some(&checkpoint.sources), items, suppressed }
+}
+
+/// Fingerprint of a finding of the checkpoint at `path`.
+pub fn of_finding(finding: &Finding, path: &str, role: &str, seen: &mut BTreeMap<String, usize>) -> String {
+    let mut parts = vec![path, role, &finding.code];
+    // One place is enough: a finding stays what it is when it gets a place more.
+    if let Some(first) = finding.locations.first() {
+        parts.extend([&first.file, &first.pointer, &first.tensor].map(|p| p.as_deref().unwrap_or_default()));
+    }
+    parts.push(&finding.message);
+    fingerprint(&parts, seen)
+}
+
+fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
+    let path = tidy(&merge.out);
+    let items = merge.seams.iter().map(|seam| Item {
+        code: SEAM,
+        name: "seam-does-not-fit",
+        severity: Severity::Error,
+        message: sentence(&seam.message),
+        locations: &[],
+        fix: None,
+        help: (!seam.options.is_empty()).then(|| sentence(&format!("Try {}", seam.options.join(" or ")))),
+        fingerprint: fingerprint(&[&path, SEAM, &merge.recipe, &seam.message], seen),
+    });
+    let items = items.collect();
+    Group { title: format!("merge {}", merge.recipe), path, sources: None, items, suppressed: Vec::new() }
+}
+
+/// Parts are hashed with their lengths, so that none can pass for another; what occurs again is numbered.
+fn fingerprint(parts: &[&str], seen: &mut BTreeMap<String, usize>) -> String {
+    let hash = |before: &str, nth: usize| {
+        let mut hasher = Sha256::new();
+        for part in [before].iter().chain(parts) {
+            hasher.update(part.len().to_be_bytes());
+            hasher.update(part);
+        }
+        hasher.update(nth.to_be_bytes());
+        hex(&hasher.finalize())
+    };
+    let first = hash("finding", 0);
+    let times = seen.entry(first.clone()).or_default();
+    let nth = *times;
+    *times = times.saturating_add(1);
+    if nth == 0 { first } else { hash("again", nth) }
+}
+
+/// A path without empty and `.` parts, cut where no path goes on.
+pub fn tidy(path: &str) -> String {
+    let parts: Vec<&str> = path.split('/').filter(|part| !part.is_empty() && *part != ".").collect();
+    let root = if path.starts_with('/') { "/" } else { "" };
+    let tidy: String = root.chars().chain(parts.join("/").chars()).take(PATH).collect();
+    if tidy.is_empty() { ".".to_owned() } else { tidy }
+}
+
+/// The file a location is in, below the directory `path`.
+pub fn file(path: &str, location: &Location) -> Option<String> {
+    location.file.as_deref().map(|file| tidy(&format!("{path}/{file}")))
+}
+
+/// `path/file:line:column`, or what there is of it.
+pub fn spot(path: &str, location: &Location) -> String {
+    let mut spot = file(path, location).unwrap_or_else(|| path.to_owned());
+    for n in [location.line, location.column].into_iter().map_while(|n| n) {
+        let _infallible = write!(spot, ":{n}");
+    }
+    spot
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::{PATH, fingerprint, tidy};
+
+    #[test]
+    fn paths_are_tidied_and_bounded() {
+        let shown = ["", ".", "./a//b/", "/a/./b", "/", "../a", "//host/a"].map(tidy);
+        assert_eq!(shown, [".", ".", "a/b", "/a/b", "/", "../a", "/host/a"]);
+        assert_eq!(tidy(&"é".repeat(10_000)).chars().count(), PATH);
+    }
+
+    #[test]
+    fn fingerprints_tell_parts_and_repetitions_apart() {
+        let mut seen = BTreeMap::new();
+        let shown: Vec<String> = [["ab", "c"], ["a", "bc"], ["ab", "c"], ["ab", "c"]]
+            .iter()
+            .map(|parts| fingerprint(parts, &mut seen))
+            .collect();
+        let distinct: std::collections::BTreeSet<&String> = shown.iter().collect();
+        assert_eq!(distinct.len(), shown.len());
+        assert_eq!(shown.first(), Some(&fingerprint(&["ab", "c"], &mut BTreeMap::new())));
+    }
+}

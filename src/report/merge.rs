@@ -1,0 +1,165 @@
+//! The record of a merge: what it planned and what it wrote, as data for every renderer.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde::{Serialize, Serializer};
+
+use crate::surgery::plan::TensorTransform;
+
+/// The record of a merge.
+#[derive(Debug, Clone, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct MergeReport {
+    /// Recipe name.
+    pub recipe: String,
+    /// The stage it ended with; null while it runs, as in the report that is written into the result.
+    pub stage: Option<MergeStage>,
+    /// The output directory.
+    pub out: String,
+    /// Directories of the donors, by role.
+    pub donors: BTreeMap<String, String>,
+    /// Options in effect, defaults included.
+    pub options: BTreeMap<String, String>,
+    /// The stages that ran, in order.
+    pub stages: Vec<StageOutcome>,
+    /// Seams that do not fit; if there are any, nothing was written.
+    pub seams: Vec<Seam>,
+    /// Number of tensors by transform.
+    pub transforms: BTreeMap<TensorTransform, usize>,
+    /// Tensors that are not byte copies.
+    pub changed: Vec<ChangedTensor>,
+    /// Donor tensors that the result does not contain, by role and pattern.
+    pub dropped: Vec<Dropped>,
+    /// Repairs of donor documents, one sentence each.
+    pub repairs: Vec<String>,
+    /// Notes about the result for its user, one sentence each.
+    pub notes: Vec<String>,
+    /// Files of the result and their origin.
+    pub files: Vec<MergedFile>,
+    /// Tensors in the result.
+    pub tensors: usize,
+    /// Bytes of tensor data in the result.
+    pub bytes: u64,
+}
+
+/// The stage that a merge ended with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum MergeStage {
+    /// A donor has errors that the recipe does not tolerate; nothing was written.
+    Donors,
+    /// Seams do not fit; nothing was written.
+    Seam,
+    /// The planned checkpoint has errors; nothing was written.
+    Planned,
+    /// The plan is sound, and `--dry-run` asked for no more.
+    DryRun,
+    /// The result was written.
+    Written,
+}
+
+/// What a checkpoint is in a merge. Reports spell it `donor vision`, `planned`, `written`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[cfg_attr(test, derive(schemars::JsonSchema), schemars(with = "String"))]
+pub enum Role {
+    /// A donor, by its role in the recipe.
+    Donor(String),
+    /// The checkpoint that the plan describes.
+    Planned,
+    /// The result, read again from disk.
+    Written,
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Donor(role) => write!(f, "donor {role}"),
+            Self::Planned => f.write_str("planned"),
+            Self::Written => f.write_str("written"),
+        }
+    }
+}
+
+impl Serialize for Role {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// One line about one stage of the pipeline.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct StageOutcome {
+    /// Its name.
+    pub name: String,
+    /// Its outcome.
+    pub outcome: String,
+}
+
+/// A seam that does not fit: two parts that must agree and do not.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct Seam {
+    /// The mismatch, in one sentence.
+    pub message: String,
+    /// The stored tensor that does not fit.
+    pub tensor: Option<ShapedName>,
+    /// The tensor that it must match.
+    pub meets: Option<ShapedName>,
+    /// The shape that the result needs for `tensor`.
+    pub needed: Option<Vec<u64>>,
+    /// Options that resolve the mismatch: `--set projector=pad`.
+    pub options: Vec<String>,
+}
+
+/// A name with a shape.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct ShapedName {
+    /// Role of the donor.
+    pub donor: String,
+    /// Name in the donor.
+    pub name: String,
+    /// Shape in the donor.
+    pub shape: Vec<u64>,
+}
+
+/// A tensor of the result that is not a byte copy.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct ChangedTensor {
+    /// Name in the result.
+    pub name: String,
+    /// The transform of its bytes.
+    pub transform: TensorTransform,
+    /// Shape in the donor; null if nothing was taken from it.
+    pub from: Option<Vec<u64>>,
+    /// Shape in the result.
+    pub to: Vec<u64>,
+}
+
+/// Donor tensors that the result does not contain.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct Dropped {
+    /// Donor role.
+    pub donor: String,
+    /// Pattern of the recipe.
+    pub pattern: String,
+    /// Number of tensors that it matches.
+    pub count: usize,
+    /// Why the recipe drops them.
+    pub why: String,
+}
+
+/// A file of the result.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct MergedFile {
+    /// File name.
+    pub name: String,
+    /// Its origin.
+    pub origin: String,
+}

@@ -1,0 +1,95 @@
+//! Output formats, and the layout of those for people.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// How a report is written down.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Format {
+    /// For a terminal: source excerpts and tables.
+    #[default]
+    Full,
+    /// One line for each finding: `path/file:line:column: error[CODE] message`.
+    Concise,
+    /// The JSON contract, complete.
+    Json,
+    /// The findings of the JSON contract, one object a line, and a summary in the last.
+    Jsonl,
+    /// Workflow commands that GitHub Actions shows beside the files.
+    Github,
+    /// The Code Quality report of GitLab.
+    Gitlab,
+    /// `JUnit` XML: a test suite for each checkpoint.
+    Junit,
+    /// SARIF 2.1.0, for code scanning.
+    Sarif,
+    /// Markdown that is the same wherever it was made: no times, no directories.
+    Markdown,
+}
+
+impl Format {
+    /// Every format.
+    pub const ALL: [Self; 9] = [
+        Self::Full,
+        Self::Concise,
+        Self::Json,
+        Self::Jsonl,
+        Self::Github,
+        Self::Gitlab,
+        Self::Junit,
+        Self::Sarif,
+        Self::Markdown,
+    ];
+
+    /// The word for it on the command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::Concise => "concise",
+            Self::Json => "json",
+            Self::Jsonl => "jsonl",
+            Self::Github => "github",
+            Self::Gitlab => "gitlab",
+            Self::Junit => "junit",
+            Self::Sarif => "sarif",
+            Self::Markdown => "markdown",
+        }
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// A word that names no format.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is not an output format; known are full, concise, json, jsonl, github, gitlab, junit, sarif, markdown")]
+pub struct UnknownFormat(String);
+
+impl FromStr for Format {
+    type Err = UnknownFormat;
+
+    fn from_str(word: &str) -> Result<Self, UnknownFormat> {
+        Self::ALL.into_iter().find(|f| f.name() == word).ok_or_else(|| UnknownFormat(word.to_owned()))
+    }
+}
+
+/// How text for people is laid out. Formats for programs take no notice of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Style {
+    /// Whether to use ANSI colours (`full` only).
+    pub color: bool,
+    /// Width of the terminal in columns; `None` when there is none.
+    pub width: Option<usize>,
+    /// Longest list that is shown in full; what is beyond it becomes "and N more".
+    pub cap: usize,
+}
+
+impl Default for Style {
+    fn default() -> Self {
+        Self { color: false, width: None, cap: 20 }
+    }
+}

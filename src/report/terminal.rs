@@ -1,0 +1,84 @@
+//! The report for people at a terminal: source excerpts, tables, one verdict line at the end.
+
+mod finding;
+pub(super) mod load;
+mod merge;
+pub(super) mod paint;
+
+use std::fmt::Write as _;
+
+use self::paint::Paint;
+use super::format::{agreeing, alike, bytes, capped, counts, name, plural, summary};
+use super::model::{CheckpointReport, Report};
+use super::{Style, fixes};
+
+pub fn render(report: &Report, style: Style) -> String {
+    let paint = Paint(style.color);
+    let mut out = String::new();
+    let mut above: Option<&CheckpointReport> = None;
+    for checkpoint in &report.checkpoints {
+        header(&mut out, checkpoint, paint);
+        if above.is_some_and(|a| repeats(a, checkpoint)) {
+            let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
+        } else {
+            findings(&mut out, checkpoint, style);
+            out.push_str(&fixes::section(checkpoint));
+            for loaders in agreeing(&checkpoint.loads) {
+                load::render(&mut out, &loaders, style);
+            }
+        }
+        out.push('\n');
+        above = Some(checkpoint);
+    }
+    if let Some(merge) = &report.merge {
+        merge::render(&mut out, merge, style);
+        out.push('\n');
+    }
+    let _ok = writeln!(out, "{}", paint.verdict(report.summary.verdict, &summary(report)));
+    if let Some(closing) = fixes::closing(report) {
+        let _ok = writeln!(out, "{closing}");
+    }
+    out
+}
+
+/// Whether a checkpoint has the findings of the one above it: what was planned is usually what was written.
+fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
+    !checkpoint.findings.is_empty()
+        && (&above.path, &above.findings, &above.loads) == (&checkpoint.path, &checkpoint.findings, &checkpoint.loads)
+}
+
+/// `fixtures/vision (donor vision): spatialvla, 690 tensors, 1.23 MB, clean`
+fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
+    out.push_str(&paint.strong(&name(&checkpoint.path)));
+    if let Some(role) = &checkpoint.role {
+        let _ok = write!(out, " ({})", name(&role.to_string()));
+    }
+    let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
+    let _ok = write!(out, ": {architecture}");
+    let (tensors, size) = checkpoint.tensors;
+    let _ok = write!(out, ", {}, {}", plural(tensors, "tensor"), bytes(size));
+    let found = counts(checkpoint.counts);
+    let verdict = if found.is_empty() { "clean" } else { &found };
+    let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
+    let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
+    let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
+    let said: Vec<String> = settings.into_iter().chain(suppressed).collect();
+    if !said.is_empty() {
+        let _ok = writeln!(out, "  {}", paint.quiet(&said.join(", ")));
+    }
+}
+
+fn findings(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
+    let (shown, hidden) = capped(&checkpoint.findings, style.cap);
+    for finding in alike(shown) {
+        out.push('\n');
+        out.push_str(&finding::render(&finding, checkpoint, style));
+        out.push('\n');
+    }
+    for (code, n) in hidden {
+        let _ok = writeln!(out, "\nand {n} more {}", name(code));
+    }
+    if !checkpoint.findings.is_empty() {
+        out.push('\n');
+    }
+}

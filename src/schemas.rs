@@ -1,0 +1,210 @@
+//! The schemas in `schemas/`: generated from the types that read the data files, or that are written as JSON, and
+//! compared with every data file of this repository. `tests/it/reports/schemas.rs` compares them with real output.
+#![allow(clippy::disallowed_methods, reason = "reads the files of this repository, and writes its schemas on request")]
+
+use std::borrow::Cow;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use schemars::generate::SchemaSettings;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+
+use crate::knowledge::architecture::Blueprint;
+use crate::knowledge::expression::{Expression, Template};
+use crate::knowledge::loader::Loader;
+use crate::knowledge::processor::Processor;
+use crate::knowledge::quantization::Scheme;
+use crate::knowledge::recipe::{MergeFile, Recipe};
+use crate::knowledge::rule::Rule;
+use crate::knowledge::settings::Settings;
+use crate::knowledge::source::{self, DataError};
+use crate::merge::manifest::Manifest;
+use crate::report::Report;
+use crate::report::baseline::Baseline;
+use crate::report::inspect::InspectDocument;
+
+macro_rules! text {
+    ($type:ty, $name:literal, $about:literal) => {
+        impl JsonSchema for $type {
+            fn schema_name() -> Cow<'static, str> {
+                $name.into()
+            }
+
+            fn json_schema(_: &mut SchemaGenerator) -> Schema {
+                json_schema!({ "type": "string", "description": $about })
+            }
+        }
+    };
+}
+
+text!(Expression, "Expression", "An expression in CEL, the Common Expression Language: https://cel.dev");
+text!(Template, "Template", "Text with expressions in braces; a brace itself is written twice.");
+text!(Loader, "Loader", "A version of transformers; the nearest known one stands for it.");
+
+fn project() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// A data file: its schema, the files of this repository that it describes, and the function that reads one.
+struct Input {
+    name: &'static str,
+    schema: Value,
+    files: Vec<(PathBuf, Value)>,
+    read: fn(&str) -> Result<(), DataError>,
+}
+
+fn inputs() -> Vec<Input> {
+    vec![
+        input::<Rule>("rule", "A rule of ckpt-doctor", values("rules/checks")),
+        input::<Blueprint>("architecture", "An architecture of ckpt-doctor", values("rules/architectures")),
+        input::<Recipe>("recipe", "A recipe of ckpt-doctor", values("rules/recipes")),
+        input::<Processor>("processor", "A processor of ckpt-doctor", values("rules/processors")),
+        input::<Scheme>("quantization", "A quantisation scheme of ckpt-doctor", values("rules/quantization")),
+        input::<Settings>("settings", "Settings of ckpt-doctor: ckpt-doctor.json5", settings()),
+        input::<MergeFile>(
+            "merge",
+            "A merge file of ckpt-doctor",
+            vec![value(&project().join("fixtures/merge.json5"))],
+        ),
+    ]
+}
+
+fn input<T: JsonSchema + DeserializeOwned>(name: &'static str, title: &str, files: Vec<(PathBuf, Value)>) -> Input {
+    let read = |text: &str| source::parse::<T>(std::any::type_name::<T>(), text).map(drop);
+    Input { name, schema: schema::<T>(title, SchemaSettings::draft2020_12()), files, read }
+}
+
+/// The schemas of what the program writes as JSON.
+fn outputs() -> Vec<(&'static str, Value)> {
+    let settings = || SchemaSettings::draft2020_12().for_serialize();
+    vec![
+        ("report", schema::<Report>("The JSON report of ckpt-doctor check and build-merged", settings())),
+        ("inspect", schema::<InspectDocument<'_>>("The JSON report of ckpt-doctor inspect", settings())),
+        ("manifest", schema::<Manifest>("merge-manifest.json of ckpt-doctor build-merged", settings())),
+    ]
+}
+
+fn schema<T: JsonSchema>(title: &str, settings: SchemaSettings) -> Value {
+    let mut schema = settings.into_generator().into_root_schema_for::<T>().to_value();
+    schema["title"] = title.into();
+    without_lists(&mut schema);
+    schema
+}
+
+/// A map in the order it was written is a list in memory, and so is its default; in a file it is none.
+fn without_lists(schema: &mut Value) {
+    if let Value::Object(map) = schema {
+        if map.get("type") == Some(&json!("object")) && map.get("default") == Some(&json!([])) {
+            map.remove("default");
+        }
+        map.values_mut().for_each(without_lists);
+    }
+}
+
+/// Path and value of a JSON5 file.
+fn value(path: &Path) -> (PathBuf, Value) {
+    let text = fs::read_to_string(path).unwrap();
+    (path.to_owned(), source::parse(&path.display().to_string(), &text).unwrap())
+}
+
+/// Path and value of every JSON5 file below a directory of the project.
+fn values(folder: &str) -> Vec<(PathBuf, Value)> {
+    let mut found = Vec::new();
+    let mut folders = vec![project().join(folder)];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == "json5") {
+                found.push(value(&path));
+            }
+        }
+    }
+    found.sort_by(|a, b| a.0.cmp(&b.0));
+    found
+}
+
+/// The settings in the fixtures, and what `init` writes.
+fn settings() -> Vec<(PathBuf, Value)> {
+    let cases = values("fixtures");
+    let mut found: Vec<_> =
+        cases.into_iter().filter_map(|(path, case)| Some((path, case.get("settings")?.clone()))).collect();
+    assert!(!found.is_empty());
+    found.extend(values("src/cli/init"));
+    found
+}
+
+#[test]
+fn schemas_are_fresh() {
+    let write = std::env::var_os("CKPT_DOCTOR_WRITE").is_some();
+    let inputs = inputs().into_iter().map(|input| (input.name, input.schema));
+    for (name, schema) in inputs.chain(outputs()) {
+        let file = project().join(format!("schemas/{name}.schema.json"));
+        let text = format!("{}\n", serde_json::to_string_pretty(&schema).unwrap());
+        if write {
+            fs::create_dir_all(file.parent().unwrap()).unwrap();
+            fs::write(&file, &text).unwrap();
+        }
+        let stale = "is stale: run `CKPT_DOCTOR_WRITE=1 cargo test --lib schemas`, and commit it";
+        assert!(fs::read_to_string(&file).unwrap_or_default() == text, "{} {stale}", file.display());
+    }
+}
+
+#[test]
+fn every_shipped_file_is_valid_and_none_with_a_misspelt_key_is() {
+    for Input { name, schema, files, .. } in inputs() {
+        let validator = jsonschema::draft202012::new(&schema).unwrap();
+        assert!(!files.is_empty(), "{name}");
+        for (path, mut value) in files {
+            let wrong: Vec<String> = validator
+                .iter_errors(&value)
+                .map(|e| format!("{}: {}: {e}", path.display(), e.instance_path()))
+                .collect();
+            assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+            value["sumary"] = json!("a slip of the pen");
+            assert!(!validator.is_valid(&value), "{}", path.display());
+        }
+    }
+}
+
+/// Editors find the schema of a file by its `$schema`; the program ignores the key.
+#[test]
+fn every_file_may_name_its_schema() {
+    for Input { name, schema, files, read } in inputs() {
+        let validator = jsonschema::draft202012::new(&schema).unwrap();
+        let (_, mut value) = files.into_iter().next().unwrap();
+        value["$schema"] = json!(format!("schemas/{name}.schema.json"));
+        assert!(validator.is_valid(&value), "{name}");
+        read(&value.to_string()).unwrap_or_else(|error| panic!("{error}"));
+    }
+    let baseline = json!({ "$schema": "a.json", "schema": 1, "findings": [] }).to_string();
+    let baseline = Baseline::parse("baseline.json", &baseline).unwrap_or_else(|error| panic!("{error}"));
+    assert!(baseline.text().contains("a.json"), "{}", baseline.text());
+}
+
+/// The schema rejects what the program rejects, below the first level too.
+#[test]
+fn what_the_program_refuses_is_not_valid() {
+    let of = |name: &str| {
+        let input = inputs().into_iter().find(|input| input.name == name).unwrap();
+        jsonschema::draft202012::new(&input.schema).unwrap()
+    };
+    let (rule, settings) = (of("rule"), of("settings"));
+    for (wrong, right) in [
+        (json!({ "suppress": [{ "rule": "JSN" }] }), json!({ "suppress": [{ "rule": "JSN", "reason": "known" }] })),
+        (json!({ "per-path": { "a": { "ignor": [] } } }), json!({ "per-path": { "a": { "ignore": [] } } })),
+        (json!({ "severity": { "JSN": "warn" } }), json!({ "severity": { "JSN": "warning" } })),
+        (json!({ "extend_select": [] }), json!({ "extend-select": [] })),
+    ] {
+        assert!(!settings.is_valid(&wrong) && settings.is_valid(&right), "{wrong}");
+        assert!(source::parse::<Settings>("s", &wrong.to_string()).is_err(), "{wrong}");
+        assert!(source::parse::<Settings>("s", &right.to_string()).is_ok(), "{right}");
+    }
+    let (_, mut one) = values("rules/checks/jsn").remove(0);
+    assert!(rule.is_valid(&one));
+    one["check"]["fault"]["kind"] = json!([]);
+    assert!(!rule.is_valid(&one));
+}

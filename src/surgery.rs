@@ -1,0 +1,23 @@
+//! Plans changes to checkpoints and writes them; the only stage that writes checkpoints.
+
+mod apply;
+mod changes;
+pub mod donor;
+mod error;
+pub mod journal;
+mod lock;
+mod overlay;
+pub mod plan;
+pub mod repair;
+mod staging;
+mod stop;
+mod system;
+mod target;
+pub mod transform;
+pub mod verify;
+
+pub use apply::apply;
+pub use error::{ApplyError, RepairError};
+pub use overlay::overlay;
+pub use stop::stop_on;
+pub use target::check_target;

@@ -1,0 +1,76 @@
+//! The changed files of a repair: what a repair in place and a repaired copy have in common.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::apply::write_shard;
+use super::error::{ApplyError, RepairError, io_at};
+use super::repair::{Change, Content, Repair};
+use super::system::{create, look, with_figures};
+use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
+use crate::checkpoint::{FaultKind, Shard};
+
+/// Makes sure that a file is still what the repair was planned for.
+pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> Result<(), RepairError> {
+    let original = &repair.original;
+    let there = look(path)?;
+    let mut unreadable = None;
+    let same = match (&change.new, original.entries.get(&change.name)) {
+        (_, None) => there.is_none(),
+        (Content::Shard(_), Some(_)) => original.shards.get(&change.name).is_some_and(|was| {
+            let now = Shard::read(&original.root, &change.name);
+            if let Some(fault) = now.faults.iter().find(|f| f.kind == FaultKind::UnreadableFile) {
+                let reason = fault.detail.get("reason").and_then(Value::as_str).unwrap_or_default();
+                unreadable = Some(io::Error::other(reason.to_owned()));
+            }
+            (now.file_len, &now.header_sha256) == (was.file_len, &was.header_sha256)
+        }),
+        (Content::Text(_), Some(entry)) => {
+            let document = original.document(&change.name).and_then(|d| d.text.clone());
+            let text = document.or_else(|| original.modules.get(&change.name).and_then(|m| m.text.clone()));
+            match text {
+                Some(text) => match read_capped(path, TOKENIZER_CAP) {
+                    Ok(bytes) => bytes == text.as_bytes(),
+                    Err(error) => {
+                        if let OpenError::Io { source, .. } = error {
+                            unreadable = Some(source);
+                        }
+                        false
+                    }
+                },
+                // Not UTF-8, so that the text is not kept.
+                None => there.is_some_and(|m| m.len() == entry.size),
+            }
+        }
+    };
+    match unreadable {
+        Some(error) => Err(io_at(path, "reading")(error).into()),
+        None if same => Ok(()),
+        None => Err(RepairError::ChangedWhilePlanned { path: path.to_owned() }),
+    }
+}
+
+/// Writes a file that is not there yet, and makes it durable.
+pub(super) fn write_content(path: &Path, content: &Content, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
+    match content {
+        Content::Shard(shard) => write_shard(path, shard, progress)?,
+        Content::Text(text) => {
+            let mut file = create(path)?;
+            file.write_all(text.as_bytes()).map_err(io_at(path, "writing"))?;
+            file.sync_all().map_err(io_at(path, "syncing"))?;
+            progress(text.len() as u64);
+        }
+    }
+    Ok(())
+}
+
+/// Gives an error of the system its figures, in the words of a repair.
+pub(super) fn explain_error(error: RepairError, dir: &Path, repair: &Repair) -> RepairError {
+    let RepairError::Apply(error) = error else { return error };
+    match with_figures(error, dir, &repair.sizes()) {
+        ApplyError::Space { path, cause, need, have } => RepairError::Space { path, cause, need, have },
+        other => other.into(),
+    }
+}

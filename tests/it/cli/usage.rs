@@ -1,0 +1,67 @@
+//! Help texts, tips for words of other tools, and paths as the user wrote them.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::support::project;
+
+fn doctor(dir: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).current_dir(dir).env_remove("COLUMNS").output().unwrap()
+}
+
+#[test]
+fn every_command_has_its_help() {
+    let mut all = String::new();
+    for command in ["", "check", "undo", "build-merged", "inspect", "expect", "explain", "rules", "init"] {
+        let args: Vec<&str> = [command, "-h"].into_iter().filter(|arg| !arg.is_empty()).collect();
+        let output = doctor(project(), &args);
+        assert!(output.status.success());
+        let _ok = writeln!(all, "$ ckpt-doctor {}\n{}", args.join(" "), String::from_utf8(output.stdout).unwrap());
+    }
+    snapshot!("help", all);
+}
+
+#[test]
+fn words_of_other_tools_get_a_tip() {
+    for (word, tip) in [("fix", "check --fix"), ("validate", "check"), ("diff", "check --diff")] {
+        let output = doctor(project(), &[word]);
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        assert!(errors.contains(&format!("tip: run 'ckpt-doctor {tip}'\n")), "{errors}");
+    }
+    let errors = String::from_utf8(doctor(project(), &["chekc"]).stderr).unwrap();
+    assert!(errors.contains("similar subcommand exists: 'check'"), "{errors}");
+}
+
+/// The record of a dry run.
+fn planned(dir: &Path, file: &str) -> Value {
+    let output = doctor(dir, &["merge", file, "--dry-run", "--format", "json"]);
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {output:?}"));
+    report["merge"].clone()
+}
+
+#[test]
+fn paths_of_a_merge_file_are_printed_in_their_short_form() {
+    let merge = planned(project(), "fixtures/merge.json5");
+    assert_eq!(merge["out"], "merged-tiny");
+    assert_eq!(merge["donors"]["vision"], "fixtures/donors/spatialvla-tiny");
+
+    // `link/../merged` is beside the target of the link, not beside the link.
+    let work = TempDir::new().unwrap();
+    fs::create_dir_all(work.path().join("real/deep")).unwrap();
+    symlink("real/deep", work.path().join("link")).unwrap();
+    let donor = |name: &str| project().join("fixtures/donors").join(name);
+    let file = json!({
+        "donors": { "vision": donor("spatialvla-tiny"), "language": donor("llava3d-tiny") },
+        "out": "../merged",
+    });
+    fs::write(work.path().join("real/deep/merge.json5"), file.to_string()).unwrap();
+    assert_eq!(planned(work.path(), "link/merge.json5")["out"], "link/../merged");
+    assert_eq!(planned(work.path(), "real/deep/merge.json5")["out"], "real/merged");
+}

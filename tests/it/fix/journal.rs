@@ -1,0 +1,206 @@
+//! Repairs that are interrupted, refused, or made beside the original.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ckpt_doctor::check::check;
+use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::surgery::journal::{self, Recovered};
+use ckpt_doctor::surgery::repair::{Repair, plan};
+use ckpt_doctor::surgery::{RepairError, overlay};
+use tempfile::TempDir;
+
+use super::seen;
+use crate::support;
+
+/// A checkpoint of which one file has to change and one is missing.
+fn broken() -> (TempDir, PathBuf) {
+    let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
+    let changes =
+        r#"[{ encode: { file: "config.json", to: "utf-8-bom" } }, { remove: "model.safetensors.index.json" }]"#;
+    let dir = support::made("llama-sharded", changes, room.path());
+    (room, dir)
+}
+
+fn repair(dir: &Path) -> Repair {
+    let knowledge = support::knowledge();
+    let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
+    let outcome = check(&checkpoint, &knowledge);
+    let repair = plan(&checkpoint, outcome, false, &|c| check(c, &knowledge));
+    let names: Vec<&str> = repair.changes.iter().map(|c| c.name.as_str()).collect();
+    assert_eq!(names, ["config.json", "model.safetensors.index.json"]);
+    repair
+}
+
+/// Name and content of every file but the hidden ones.
+fn contents(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+    seen(dir).into_iter().filter(|(name, _)| !name.starts_with('.')).map(|(name, seen)| (name, seen.3)).collect()
+}
+
+/// Every state that a killed run can leave, and what becomes of it.
+#[test]
+fn an_interrupted_repair_is_finished_or_taken_back() {
+    let (_room, dir) = broken();
+    let before = contents(&dir);
+    let repair = repair(&dir);
+    journal::write(&repair, &mut |_| {}).expect("written");
+    let after = contents(&dir);
+    assert_ne!(before, after);
+    let folder = dir.join(".ckpt-doctor");
+    let filed = fs::read(folder.join("undo/1.json")).expect("a journal");
+    journal::undo(&dir).expect("undone");
+    assert_eq!(contents(&dir), before);
+    assert!(!folder.exists());
+
+    for step in 0..=7 {
+        for damaged in [false, true] {
+            // 0: staged, no journal. 1: the journal. 2: the original linked. 3, 4: each file replaced. 5: the journal
+            // filed. 6: the staging folder gone. 7: nothing done at all.
+            let staging = folder.join("new");
+            if step < 7 {
+                fs::create_dir_all(&staging).expect("a folder");
+                for name in ["config.json", "model.safetensors.index.json"] {
+                    fs::write(staging.join(name), &after[name]).expect("a file");
+                }
+            }
+            if (1..7).contains(&step) {
+                fs::write(folder.join("journal.json"), &filed).expect("a journal");
+            }
+            if (2..7).contains(&step) {
+                fs::create_dir_all(folder.join("undo/1")).expect("a folder");
+                fs::hard_link(dir.join("config.json"), folder.join("undo/1/config.json")).expect("a link");
+            }
+            if (3..7).contains(&step) {
+                fs::rename(staging.join("config.json"), dir.join("config.json")).expect("a rename");
+            }
+            if (4..7).contains(&step) {
+                let name = "model.safetensors.index.json";
+                fs::rename(staging.join(name), dir.join(name)).expect("a rename");
+            }
+            if (5..7).contains(&step) {
+                fs::rename(folder.join("journal.json"), folder.join("undo/1.json")).expect("a rename");
+            }
+            if step == 6 {
+                fs::remove_dir_all(&staging).expect("removed");
+            }
+            // A staged file that was cut short cannot be used.
+            let cut = staging.join("model.safetensors.index.json");
+            let damaged = damaged && cut.exists();
+            if damaged {
+                fs::write(&cut, "{").expect("a file");
+            }
+
+            let found = check(&Arc::new(Checkpoint::open(&dir).expect("open")), &support::knowledge()).findings;
+            assert_eq!(found.iter().any(|f| f.code == "FIL010"), (1..5).contains(&step), "step {step}");
+            let recovered = journal::recover(&dir).expect("recovered");
+            let (outcome, files) = match step {
+                1..=3 if damaged => (Some(Recovered::TakenBack), &before),
+                1..=4 => (Some(Recovered::Finished), &after),
+                5 | 6 => (None, &after),
+                _ => (None, &before),
+            };
+            assert_eq!((recovered, &contents(&dir)), (outcome, files), "step {step}, damaged: {damaged}");
+            if files == &after {
+                journal::undo(&dir).expect("undone");
+            }
+            assert_eq!(contents(&dir), before, "step {step}");
+            assert!(!folder.exists(), "step {step}: the folder is left behind");
+        }
+    }
+}
+
+#[test]
+fn an_undo_that_was_interrupted_is_finished() {
+    let (_room, dir) = broken();
+    let before = contents(&dir);
+    journal::write(&repair(&dir), &mut |_| {}).expect("written");
+    let folder = dir.join(".ckpt-doctor");
+    let filed = fs::read_to_string(folder.join("undo/1.json")).expect("a journal");
+    fs::write(folder.join("journal.json"), filed.replace("\"repair\"", "\"undo\"")).expect("a journal");
+    fs::rename(folder.join("undo/1/config.json"), dir.join("config.json")).expect("a rename");
+    journal::undo(&dir).expect("finished");
+    assert_eq!(contents(&dir), before);
+    assert!(!folder.exists());
+}
+
+#[test]
+fn what_changed_since_is_left_alone() {
+    let (_room, dir) = broken();
+    journal::write(&repair(&dir), &mut |_| {}).expect("written");
+    fs::write(dir.join("config.json"), "{}").expect("a file");
+    let now = contents(&dir);
+    let error = journal::undo(&dir).expect_err("refused");
+    assert!(matches!(&error, RepairError::ChangedSinceRepair { path, .. } if path.ends_with("config.json")), "{error}");
+    assert!(error.to_string().contains(".ckpt-doctor/undo/1"), "{error}");
+    assert_eq!(contents(&dir), now);
+}
+
+#[test]
+fn a_file_that_changes_meanwhile_stops_the_repair() {
+    let (_room, dir) = broken();
+    let repair = repair(&dir);
+    fs::write(dir.join("config.json"), "{}").expect("a file");
+    let now = contents(&dir);
+    assert!(matches!(journal::write(&repair, &mut |_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
+    assert_eq!(contents(&dir), now);
+    assert!(!dir.join(".ckpt-doctor").exists());
+}
+
+#[test]
+fn mode_is_kept_and_the_last_repair_is_undone_first() {
+    let (_room, dir) = broken();
+    fs::set_permissions(dir.join("config.json"), PermissionsExt::from_mode(0o640)).expect("a mode");
+    let before = seen(&dir);
+    journal::write(&repair(&dir), &mut |_| {}).expect("written");
+    assert_eq!(fs::metadata(dir.join("config.json")).expect("a file").mode() & 0o7777, 0o640);
+    assert_eq!(fs::read_to_string(dir.join(".ckpt-doctor/.gitignore")).expect("a file").lines().last(), Some("*"));
+    let between = contents(&dir);
+    let text = fs::read(dir.join("config.json")).expect("a file");
+    fs::write(dir.join("config.json"), [b"\xef\xbb\xbf", &*text].concat()).expect("a file");
+    let knowledge = support::knowledge();
+    let checkpoint = Arc::new(Checkpoint::open(&dir).expect("a directory"));
+    let second = plan(&checkpoint, check(&checkpoint, &knowledge), false, &|c| check(c, &knowledge));
+    journal::write(&second, &mut |_| {}).expect("written");
+    assert_eq!(contents(&dir), between);
+    assert_eq!(journal::undo(&dir).expect("undone").left, 1);
+    fs::write(dir.join("config.json"), &text).expect("a file");
+    assert_eq!(journal::undo(&dir).expect("undone").left, 0);
+    assert_eq!(seen(&dir), before);
+    assert!(matches!(journal::undo(&dir), Err(RepairError::NothingToUndo { .. })));
+}
+
+#[test]
+fn links_are_never_written_through() {
+    let (room, dir) = broken();
+    let blob = room.path().join("blob");
+    fs::rename(dir.join("config.json"), &blob).expect("a rename");
+    symlink(&blob, dir.join("config.json")).expect("a link");
+    let bytes = fs::read(&blob).expect("a file");
+    let repair = repair(&dir);
+    let error = journal::write(&repair, &mut |_| {}).expect_err("refused");
+    assert!(error.to_string().contains("--fix --output DIR"), "{error}");
+    assert!(!dir.join(".ckpt-doctor").exists());
+    let out = overlay(&repair, &room.path().join("repaired"), &mut |_| {}).expect("a copy");
+    assert_eq!(fs::read(&blob).expect("a file"), bytes);
+    assert!(fs::symlink_metadata(out.join("config.json")).expect("a file").is_file());
+}
+
+#[test]
+fn a_copy_leaves_the_original_alone() {
+    let (room, dir) = broken();
+    let before = seen(&dir);
+    let repair = repair(&dir);
+    let out = overlay(&repair, &room.path().join("repaired"), &mut |_| {}).expect("a copy");
+    assert_eq!(seen(&dir), before);
+    let found = check(&Arc::new(Checkpoint::open(&out).expect("open")), &support::knowledge()).findings;
+    assert_eq!(found, repair.outcome.findings);
+    let shard = "model-00001-of-00002.safetensors";
+    let inode = |dir: &Path| fs::metadata(dir.join(shard)).expect("a shard").ino();
+    assert_eq!(inode(&out), inode(&dir), "an unchanged shard is a link");
+    for target in [dir.clone(), dir.join("inside")] {
+        assert!(overlay(&repair, &target, &mut |_| {}).is_err(), "{}", target.display());
+    }
+}

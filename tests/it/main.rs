@@ -1,0 +1,30 @@
+//! All integration tests, in one binary: it links the library once.
+//!
+//! `cargo test --test it merge::` runs one area. `tests/README.md` says what each is about.
+
+#![allow(
+    clippy::arithmetic_side_effects,
+    clippy::cast_possible_truncation,
+    clippy::expect_used,
+    clippy::format_push_string,
+    clippy::indexing_slicing,
+    clippy::print_stdout,
+    clippy::unwrap_used,
+    reason = "a test that panics has failed, as it should"
+)]
+#![allow(clippy::disallowed_methods, reason = "tests read the project's files and write temporary directories")]
+
+#[macro_use]
+mod support;
+
+mod cli;
+mod docs;
+mod fix;
+mod hostile;
+mod house;
+mod load;
+mod merge;
+mod mutation;
+mod readers;
+mod reports;
+mod rules;

@@ -1,0 +1,246 @@
+//! `build-merged` from the outside: what it writes, what it refuses, and that donors stay as they are.
+
+mod refused;
+mod writing;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::SystemTime;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn donor(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors").join(name)
+}
+
+fn doctor(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).output().unwrap()
+}
+
+fn text(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+fn merge(vision: &Path, language: &Path, out: &Path, more: &[&str]) -> Output {
+    let path = |p: &Path| p.to_str().unwrap().to_owned();
+    let (vision, language, out) = (path(vision), path(language), path(out));
+    let mut args = vec!["build-merged", "--vision", &vision, "--language", &language, "--out", &out];
+    args.extend(more);
+    doctor(&args)
+}
+
+fn tiny(out: &Path, more: &[&str]) -> Output {
+    merge(&donor("spatialvla-tiny"), &donor("llava3d-tiny"), out, more)
+}
+
+/// Names and bytes of a directory.
+fn content(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = fs::read_dir(dir).unwrap().map(|e| e.unwrap());
+    entries.map(|e| (e.file_name().into_string().unwrap(), fs::read(e.path()).unwrap())).collect()
+}
+
+/// Bytes and times of a directory.
+fn state(dir: &Path) -> BTreeMap<String, (Vec<u8>, SystemTime)> {
+    content(dir)
+        .into_iter()
+        .map(|(n, b)| (n.clone(), (b, fs::metadata(dir.join(n)).unwrap().modified().unwrap())))
+        .collect()
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir(to).unwrap();
+    for (name, bytes) in content(from) {
+        fs::write(to.join(name), bytes).unwrap();
+    }
+}
+
+/// What is in a directory, hidden names too: nothing may be left behind by a run that failed.
+fn names(dir: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+fn json(output: &Output) -> Value {
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn the_default_merge_is_written_whole_and_checks_clean() {
+    let work = TempDir::new().unwrap();
+    let before = (state(&donor("spatialvla-tiny")), state(&donor("llava3d-tiny")));
+    let out = work.path().join("merged");
+    let run = tiny(&out, &["--output-format", "json"]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let report = json(&run);
+    let stages: Vec<&str> = report
+        .pointer("/merge/stages")
+        .unwrap()
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|s| s["name"].as_str().unwrap())
+        .collect();
+    assert_eq!(stages, ["donors", "recipe", "plan", "check planned", "write", "check written"]);
+    assert_eq!(report["merge"]["transforms"], serde_json::json!({ "copy": 349, "grow-rows": 2, "pad": 3 }));
+    let written = report["checkpoints"].as_array().unwrap().last().unwrap().clone();
+    assert_eq!(written["counts"]["error"], 0);
+    assert_eq!(written["counts"]["warning"], 0);
+    for list in ["missing", "unexpected", "mismatched", "silent"] {
+        assert_eq!(written["loads"][0][list], serde_json::json!([]), "{list}");
+    }
+    assert_eq!(names(work.path()), ["merged"]);
+    assert_eq!(
+        before,
+        (state(&donor("spatialvla-tiny")), state(&donor("llava3d-tiny"))),
+        "donors are never written to"
+    );
+    let check = doctor(&["check", out.to_str().unwrap(), "--fail-on", "warning"]);
+    assert_eq!(check.status.code(), Some(0), "{}", text(&check));
+    // Strict JSON throughout, though the donor has Infinity.
+    for (name, bytes) in content(&out).iter().filter(|(n, _)| n.ends_with(".json")) {
+        serde_json::from_slice::<Value>(bytes).unwrap_or_else(|e| panic!("{name}: {e}"));
+    }
+}
+
+#[test]
+fn copied_tensors_are_the_donors_bytes() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("merged");
+    assert_eq!(tiny(&out, &["--set", "shard-size=300KB"]).status.code(), Some(0));
+    let load = |dir: &Path| -> BTreeMap<String, (String, Vec<usize>, Vec<u8>)> {
+        let shards = content(dir).into_iter().filter(|(n, _)| n.ends_with(".safetensors"));
+        shards
+            .flat_map(|(_, bytes)| {
+                let parsed = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+                let own = |(n, t): (String, safetensors::tensor::TensorView<'_>)| {
+                    (n, (t.dtype().to_string(), t.shape().to_vec(), t.data().to_vec()))
+                };
+                parsed.tensors().into_iter().map(own).collect::<Vec<_>>()
+            })
+            .collect()
+    };
+    let (merged, vision, language) = (load(&out), load(&donor("spatialvla-tiny")), load(&donor("llava3d-tiny")));
+    let manifest: Value = serde_json::from_slice(&fs::read(out.join("merge-manifest.json")).unwrap()).unwrap();
+    let mut copied = 0;
+    for entry in manifest["tensors"].as_array().unwrap() {
+        let from = if entry["source"]["donor"] == "vision" { &vision } else { &language };
+        let source = &from[entry["source"]["name"].as_str().unwrap()];
+        let result = &merged[entry["name"].as_str().unwrap()];
+        match entry["transform"].as_str().unwrap() {
+            "copy" => {
+                assert_eq!(source, result, "{}", entry["name"]);
+                copied += 1;
+            }
+            "grow-rows" => assert!(result.2.starts_with(&source.2), "{}", entry["name"]),
+            "pad" => assert_eq!(result.2[..16], source.2[..16], "{}", entry["name"]),
+            other => panic!("{other}"),
+        }
+    }
+    assert_eq!((copied, merged.len()), (349, 354));
+}
+
+#[test]
+fn the_same_merge_gives_the_same_bytes() {
+    let work = TempDir::new().unwrap();
+    let (a, b) = (work.path().join("a"), work.path().join("b"));
+    for out in [&a, &b] {
+        assert_eq!(tiny(out, &["--set", "projector=reinit", "--set", "tokenizer=baked"]).status.code(), Some(0));
+    }
+    let (mut a, mut b) = (content(&a), content(&b));
+    // The report names the directory it describes.
+    a.remove("merge-report.md");
+    b.remove("merge-report.md");
+    assert!(a == b);
+}
+
+#[test]
+fn every_combination_of_options_merges_clean_or_stops_at_a_seam() {
+    let work = TempDir::new().unwrap();
+    let mut merged = 0;
+    for projector in ["pad", "reinit", "keep"] {
+        for spatial in ["off", "pad"] {
+            for zoe in ["on", "off"] {
+                for rows in ["grow", "keep"] {
+                    for tokenizer in ["plain", "baked"] {
+                        for layout in ["upstream", "wrapped"] {
+                            let options = [
+                                format!("projector={projector}"),
+                                format!("spatial={spatial}"),
+                                format!("zoe={zoe}"),
+                                format!("rows={rows}"),
+                                format!("tokenizer={tokenizer}"),
+                                format!("layout={layout}"),
+                            ];
+                            let mut args: Vec<&str> = options.iter().flat_map(|o| ["--set", o.as_str()]).collect();
+                            args.extend(["--output-format", "json"]);
+                            let out = work.path().join("out");
+                            let run = tiny(&out, &args);
+                            let fits = projector != "keep"
+                                && rows == "grow"
+                                && (layout == "upstream" || (spatial == "off" && zoe == "off"));
+                            let report = json(&run);
+                            if fits {
+                                assert_eq!(run.status.code(), Some(0), "{options:?}\n{}", text(&run));
+                                let written = report["checkpoints"].as_array().unwrap().last().unwrap();
+                                assert!(
+                                    ["clean", "info"].contains(&written["verdict"].as_str().unwrap()),
+                                    "{options:?}"
+                                );
+                                merged += 1;
+                                fs::remove_dir_all(&out).unwrap();
+                            } else {
+                                assert_eq!(run.status.code(), Some(1), "{options:?}\n{}", text(&run));
+                                assert_eq!(report["merge"]["stage"], "seam", "{options:?}");
+                                assert!(
+                                    !report["merge"]["seams"][0]["options"].as_array().unwrap().is_empty(),
+                                    "{options:?}"
+                                );
+                            }
+                            assert_eq!(names(work.path()), Vec::<String>::new(), "{options:?}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+    assert_eq!(merged, 20);
+}
+
+#[test]
+fn forwarding_aliases_need_no_modules_of_the_donor() {
+    let work = TempDir::new().unwrap();
+    let vision = work.path().join("vision");
+    copy(&donor("spatialvla-tiny"), &vision);
+    for (name, _) in content(&vision).iter().filter(|(n, _)| n.ends_with(".py")) {
+        fs::remove_file(vision.join(name)).unwrap();
+    }
+    let out = work.path().join("out");
+    let refused = merge(&vision, &donor("llava3d-tiny"), &out, &[]);
+    assert_eq!(refused.status.code(), Some(1), "{}", text(&refused));
+    assert!(text(&refused).contains("configuration_spatialvla.py") && !out.exists(), "{}", text(&refused));
+    let code = donor("spatialvla-tiny");
+    let lent = format!("code={}", code.display());
+    let run = merge(&vision, &donor("llava3d-tiny"), &out, &["--donor", &lent]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    fs::remove_dir_all(&out).unwrap();
+    let run = merge(&vision, &donor("llava3d-tiny"), &out, &["--set", "alias=forward:spatialvla.model"]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let alias = fs::read_to_string(out.join("modeling_spatialvla_llava3d.py")).unwrap();
+    assert!(alias.contains("spatialvla.model") && !alias.contains("{{"), "{alias}");
+}
+
+#[test]
+fn a_dry_run_writes_nothing_and_tells_the_plan() {
+    let work = TempDir::new().unwrap();
+    let run = tiny(&work.path().join("out"), &["--dry-run", "--output-format", "json"]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let report = json(&run);
+    assert_eq!(report["merge"]["stage"], "dry-run");
+    assert_eq!(report["merge"]["tensors"], 354);
+    assert_eq!(names(work.path()), Vec::<String>::new());
+}

@@ -1,0 +1,175 @@
+//! What `build-merged` refuses, and what it does not take along.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::{copy, donor, merge, names, state, text, tiny};
+
+#[test]
+fn a_target_in_the_way_is_refused() {
+    let work = TempDir::new().unwrap();
+    let vision = work.path().join("vision");
+    copy(&donor("spatialvla-tiny"), &vision);
+    let full = work.path().join("full");
+    fs::create_dir(&full).unwrap();
+    fs::write(full.join("mine"), "keep me").unwrap();
+    fs::write(work.path().join("file"), "keep me").unwrap();
+    std::os::unix::fs::symlink(&vision, work.path().join("link")).unwrap();
+    let before = state(&vision);
+    let cases = [
+        (vision.clone(), "is the donor"),
+        (work.path().join("vision/../vision"), "is the donor"),
+        (work.path().join("link"), "is the donor"),
+        (vision.join("inside"), "lies inside the donor"),
+        (work.path().to_owned(), "contains the donor"),
+        (full.clone(), "with files in it"),
+        (work.path().join("file"), "is a file"),
+        (work.path().join("no/such/parent"), "does not exist"),
+    ];
+    for (out, reason) in cases {
+        let run = merge(&vision, &donor("llava3d-tiny"), &out, &[]);
+        assert_eq!(run.status.code(), Some(2), "{}: {}", out.display(), text(&run));
+        assert!(text(&run).contains(reason), "{}: {}", out.display(), text(&run));
+    }
+    assert_eq!(before, state(&vision));
+    assert_eq!(names(work.path()), ["file", "full", "link", "vision"]);
+    // An empty directory is as good as none.
+    let empty = work.path().join("empty");
+    fs::create_dir(&empty).unwrap();
+    assert_eq!(merge(&vision, &donor("llava3d-tiny"), &empty, &[]).status.code(), Some(0));
+}
+
+/// What is done to a donor.
+type Damage = fn(&Path);
+
+#[test]
+fn a_damaged_donor_stops_the_merge_and_says_why() {
+    let work = TempDir::new().unwrap();
+    let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n";
+    let cases: [(&str, Damage, &[&str]); 5] = [
+        (
+            "missing",
+            |d| fs::remove_file(d.join("model-00002-of-00005.safetensors")).unwrap(),
+            &["model-00002-of-00005.safetensors", "not there"],
+        ),
+        ("pointer", |_| {}, &["model-00003-of-00005.safetensors", "git-lfs pointer", "git lfs pull"]),
+        (
+            "fifo",
+            |d| {
+                fs::remove_file(d.join("config.json")).unwrap();
+                assert!(Command::new("mkfifo").arg(d.join("config.json")).status().unwrap().success());
+            },
+            &["config.json", "FIFO"],
+        ),
+        (
+            "truncated",
+            |d| {
+                let path = d.join("model-00004-of-00005.safetensors");
+                let bytes = fs::read(&path).unwrap();
+                fs::write(&path, &bytes[..bytes.len() - 100]).unwrap();
+            },
+            &["model-00004-of-00005.safetensors", "cut short", "100"],
+        ),
+        ("broken-json", |d| fs::write(d.join("config.json"), "{\"model_type\": ").unwrap(), &["config.json"]),
+    ];
+    for (name, damage, words) in cases {
+        let vision = work.path().join(name);
+        copy(&donor("spatialvla-tiny"), &vision);
+        damage(&vision);
+        if name == "pointer" {
+            fs::write(vision.join("model-00003-of-00005.safetensors"), pointer).unwrap();
+        }
+        let out = work.path().join("out");
+        let run = merge(&vision, &donor("llava3d-tiny"), &out, &["--recipe", "spatialvla-llava3d"]);
+        assert!(matches!(run.status.code(), Some(1 | 2)), "{name}: {}", text(&run));
+        for word in words {
+            assert!(text(&run).contains(word), "{name}: {word} is not in\n{}", text(&run));
+        }
+        assert!(!out.exists() && !work.path().join(".out.partial").exists(), "{name}");
+    }
+}
+
+#[test]
+fn a_donor_document_that_says_two_things_is_refused() {
+    let work = TempDir::new().unwrap();
+    let language = work.path().join("language");
+    copy(&donor("llava3d-tiny"), &language);
+    let path = language.join("config.json");
+    let config = fs::read_to_string(&path).unwrap();
+    fs::write(&path, config.replacen('{', "{ \"rms_norm_eps\": 0.1,", 1)).unwrap();
+    let out = work.path().join("out");
+    let run = merge(&donor("spatialvla-tiny"), &language, &out, &[]);
+    assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+    for word in ["language", "config.json", "rms_norm_eps", "twice"] {
+        assert!(text(&run).contains(word), "{word}: {}", text(&run));
+    }
+    assert_eq!(names(work.path()), ["language"]);
+}
+
+#[test]
+fn keys_that_switch_on_code_never_travel() {
+    let work = TempDir::new().unwrap();
+    let language = work.path().join("language");
+    copy(&donor("llava3d-tiny"), &language);
+    let path = language.join("config.json");
+    let mut config: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    config["use_kernels"] = true.into();
+    config["auto_map"] = serde_json::json!({ "AutoConfig": "someone/repo--evil.Config" });
+    config["mm_video_tower"] = "SpatialAwareModule".into();
+    fs::write(&path, config.to_string()).unwrap();
+    let out = work.path().join("out");
+    let run = merge(&donor("spatialvla-tiny"), &language, &out, &[]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let merged = fs::read_to_string(out.join("config.json")).unwrap();
+    for key in ["use_kernels", "evil", "mm_", "trust_remote_code"] {
+        assert!(!merged.contains(key), "{key} in {merged}");
+    }
+}
+
+#[test]
+fn bad_requests_end_with_two_and_a_sentence() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    let (vision, language) = (donor("spatialvla-tiny"), donor("llava3d-tiny"));
+    let cases: [(&[&str], &str); 6] = [
+        (&["--set", "colour=red"], "has no option colour"),
+        (&["--set", "projector=fold"], "projector=fold is not one of pad, reinit, keep"),
+        (&["--set", "shard-size=big"], "is not a size"),
+        (&["--set", "alias=forward:os;rm"], "is not one of"),
+        (&["--recipe", "nonesuch"], "nonesuch: unknown recipe"),
+        (&["--recipe", "paligemma-llama"], "has to be paligemma"),
+    ];
+    for (more, reason) in cases {
+        let run = merge(&vision, &language, &out, more);
+        assert_eq!(run.status.code(), Some(2), "{more:?}: {}", text(&run));
+        assert!(text(&run).contains(reason), "{more:?}: {}", text(&run));
+        assert!(!out.exists());
+    }
+    // The roles the other way round: no recipe fits.
+    let run = merge(&language, &vision, &out, &[]);
+    assert_eq!(run.status.code(), Some(2));
+    assert!(text(&run).contains("no recipe fits"), "{}", text(&run));
+}
+
+#[test]
+fn a_seam_names_both_tensors_both_shapes_and_the_options() {
+    let work = TempDir::new().unwrap();
+    let run = tiny(&work.path().join("out"), &["--set", "projector=keep"]);
+    let said = text(&run);
+    assert_eq!(run.status.code(), Some(1));
+    for word in [
+        "multi_modal_projector.linear.weight",
+        "[48, 32]",
+        "[64, 32]",
+        "model.embed_tokens.weight",
+        "[340, 64]",
+        "--set projector=pad",
+        "--set projector=reinit",
+    ] {
+        assert!(said.contains(word), "{word} is not in\n{said}");
+    }
+}

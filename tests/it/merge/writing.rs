@@ -1,0 +1,206 @@
+//! Where and how a checkpoint is written: targets that are refused, modes, locks, signals.
+//!
+//! What needs failing calls, full disks and kills at a given call is in `tests/peer/crash.py`.
+
+use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
+use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+use super::{copy, donor, names, text, tiny};
+
+/// A merge of the donors in `work`, or of the fixtures where it has none.
+fn merge(work: &Path, out: &Path) -> Command {
+    let place = |name: &str| if work.join(name).exists() { work.join(name) } else { donor(name) };
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    command.arg("build-merged").arg("--vision").arg(place("spatialvla-tiny"));
+    command.arg("--language").arg(place("llava3d-tiny")).arg("--out").arg(out).current_dir(work);
+    command
+}
+
+#[test]
+fn the_current_directory_is_a_target_when_it_is_empty() {
+    let work = TempDir::new().unwrap();
+    let here = work.path().join("here");
+    fs::create_dir(&here).unwrap();
+    let run = merge(&here, Path::new(".")).output().unwrap();
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    assert!(here.join("config.json").is_file());
+    assert_eq!(names(work.path()), ["here"]);
+}
+
+#[test]
+fn a_detour_to_a_donor_is_seen() {
+    let work = TempDir::new().unwrap();
+    copy(&donor("spatialvla-tiny"), &work.path().join("spatialvla-tiny"));
+    symlink(work.path(), work.path().join("around")).unwrap();
+    fs::create_dir(work.path().join("empty")).unwrap();
+    let cases = [
+        ("around/spatialvla-tiny", "is the donor"),
+        ("around/spatialvla-tiny/new", "lies inside the donor"),
+        ("empty/../spatialvla-tiny/new", "lies inside the donor"),
+        ("around/around/spatialvla-tiny/../spatialvla-tiny", "is the donor"),
+        ("no/such/..", "does not exist"),
+    ];
+    for (out, reason) in cases {
+        let run = merge(work.path(), Path::new(out)).output().unwrap();
+        assert_eq!(run.status.code(), Some(2), "{out}: {}", text(&run));
+        assert!(text(&run).contains(reason), "{out}: {}", text(&run));
+    }
+    assert_eq!(names(work.path()), ["around", "empty", "spatialvla-tiny"]);
+    assert_eq!(names(&work.path().join("spatialvla-tiny")), names(&donor("spatialvla-tiny")));
+}
+
+/// Clearing it would remove the donor.
+#[test]
+fn a_donor_inside_the_staging_directory_is_refused() {
+    let work = TempDir::new().unwrap();
+    let staging = work.path().join(".out.partial");
+    fs::create_dir(&staging).unwrap();
+    fs::write(staging.join("ckpt-doctor-owner"), "process 1").unwrap();
+    copy(&donor("spatialvla-tiny"), &staging.join("content"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    command.arg("build-merged").arg("--vision").arg(staging.join("content"));
+    command.arg("--language").arg(donor("llava3d-tiny")).arg("--out").arg(work.path().join("out"));
+    let run = command.output().unwrap();
+    assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+    assert!(text(&run).contains("holds a donor"), "{}", text(&run));
+    assert_eq!(names(&staging.join("content")), names(&donor("spatialvla-tiny")));
+}
+
+#[test]
+fn what_is_in_the_place_of_the_staging_directory_stays() {
+    let work = TempDir::new().unwrap();
+    let (staging, elsewhere) = (work.path().join(".out.partial"), work.path().join("elsewhere"));
+    fs::create_dir(&elsewhere).unwrap();
+    fs::write(elsewhere.join("mine"), "keep me").unwrap();
+    for put in [
+        (|s, _| fs::write(s, "keep me").unwrap()) as fn(&Path, &Path),
+        |s, e| symlink(e, s).unwrap(),
+        |s, _| symlink("/no/such/place", s).unwrap(),
+    ] {
+        put(&staging, &elsewhere);
+        let run = merge(work.path(), &work.path().join("out")).output().unwrap();
+        assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+        assert!(text(&run).contains("is not a directory"), "{}", text(&run));
+        assert_eq!(names(work.path()), [".out.partial", "elsewhere"]);
+        assert_eq!(names(&elsewhere), ["mine"]);
+        fs::remove_file(&staging).unwrap();
+    }
+}
+
+/// A link in the staging directory of a crashed run is removed as a link.
+#[test]
+fn clearing_does_not_follow_links() {
+    let work = TempDir::new().unwrap();
+    let (content, elsewhere) = (work.path().join(".out.partial/content"), work.path().join("elsewhere"));
+    fs::create_dir_all(&content).unwrap();
+    fs::create_dir(&elsewhere).unwrap();
+    fs::write(elsewhere.join("mine"), "keep me").unwrap();
+    fs::write(work.path().join(".out.partial/ckpt-doctor-owner"), "process 1").unwrap();
+    symlink(&elsewhere, content.join("link")).unwrap();
+    let run = merge(work.path(), &work.path().join("out")).output().unwrap();
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    assert_eq!(names(work.path()), ["elsewhere", "out"]);
+    assert_eq!(names(&elsewhere), ["mine"]);
+}
+
+#[test]
+fn modes_follow_the_umask() {
+    let work = TempDir::new().unwrap();
+    for (umask, directory, file) in [("022", 0o755, 0o644), ("077", 0o700, 0o600), ("002", 0o775, 0o664)] {
+        let out = work.path().join(umask);
+        let program = merge(work.path(), &out);
+        let mut shell = Command::new("sh");
+        shell.arg("-c").arg(format!("umask {umask}; exec \"$@\"")).arg("sh").arg(program.get_program());
+        let run = shell.args(program.get_args()).output().unwrap();
+        assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+        assert_eq!(fs::metadata(&out).unwrap().permissions().mode() & 0o777, directory, "{umask}");
+        for name in names(&out) {
+            let metadata = fs::metadata(out.join(&name)).unwrap();
+            assert_eq!(metadata.mode() & 0o777, file, "{umask}: {name}");
+            assert_eq!(metadata.nlink(), 1, "{name}");
+        }
+    }
+}
+
+/// Whenever the signal comes: nothing is left, or all is there.
+#[test]
+fn a_signal_leaves_nothing_or_everything() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    for (signal, number) in [("INT", 2), ("TERM", 15)] {
+        for delay in [0, 20, 50, 100, 200, 400, 800] {
+            let child = merge(work.path(), &out).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+            std::thread::sleep(Duration::from_millis(delay));
+            let _ = Command::new("kill").arg(format!("-{signal}")).arg(child.id().to_string()).status().unwrap();
+            let run = child.wait_with_output().unwrap();
+            match (run.status.code(), run.status.signal()) {
+                (Some(0), None) => {
+                    assert_eq!(names(work.path()), ["out"], "after {delay} ms");
+                    fs::remove_dir_all(&out).unwrap();
+                }
+                // Before the handler is set up there is nothing to clean up.
+                (None, Some(ended)) => assert_eq!(ended, number),
+                (code, _) => {
+                    assert_eq!(code, Some(128 + number), "{}", text(&run));
+                    assert!(text(&run).contains("interrupted; nothing was written"), "{}", text(&run));
+                }
+            }
+            assert_eq!(names(work.path()), Vec::<String>::new(), "after {delay} ms");
+        }
+    }
+}
+
+/// Standard error that cannot be written to is nobody's loss.
+#[test]
+fn a_full_standard_error_is_no_panic() {
+    let full = || Stdio::from(fs::OpenOptions::new().write(true).open("/dev/full").unwrap());
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    let run = merge(work.path(), Path::new("no/such/parent")).stderr(full()).output().unwrap();
+    assert_eq!(run.status.code(), Some(2));
+    // The report cannot be printed: what was written is there, and the message says so.
+    let run = merge(work.path(), &out).stdout(full()).output().unwrap();
+    assert_eq!(run.status.code(), Some(2));
+    assert!(text(&run).contains("is written, but the report could not be"), "{}", text(&run));
+    assert!(out.join("config.json").is_file());
+}
+
+#[test]
+fn staging_of_a_crashed_run_is_cleared_and_anybody_elses_is_not() {
+    let work = TempDir::new().unwrap();
+    let stale = work.path().join(".out.partial");
+    fs::create_dir_all(stale.join("content")).unwrap();
+    fs::write(stale.join("content/model.safetensors"), "half").unwrap();
+    fs::write(stale.join("ckpt-doctor-owner"), "process 1").unwrap();
+    let out = work.path().join("out");
+    assert_eq!(tiny(&out, &[]).status.code(), Some(0));
+    assert_eq!(names(work.path()), ["out"]);
+    fs::remove_dir_all(&out).unwrap();
+
+    fs::create_dir_all(&stale).unwrap();
+    fs::write(stale.join("thesis.txt"), "years of work").unwrap();
+    let run = tiny(&out, &[]);
+    assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+    assert_eq!(fs::read_to_string(stale.join("thesis.txt")).unwrap(), "years of work");
+    assert_eq!(names(&stale), ["thesis.txt"]);
+}
+
+#[test]
+fn a_run_under_way_is_respected() {
+    let work = TempDir::new().unwrap();
+    let staging = work.path().join(".out.partial");
+    fs::create_dir(&staging).unwrap();
+    fs::write(staging.join("ckpt-doctor-owner"), "process 4711").unwrap();
+    let lock = fs::File::open(staging.join("ckpt-doctor-owner")).unwrap();
+    lock.lock().unwrap();
+    let run = tiny(&work.path().join("out"), &[]);
+    assert_eq!(run.status.code(), Some(2));
+    assert!(text(&run).contains("process 4711"), "{}", text(&run));
+    assert_eq!(names(&staging), ["ckpt-doctor-owner"]);
+}

@@ -1,0 +1,130 @@
+//! Mutations of sound files: whatever they come out as, the readers' laws hold, and the checks do not panic.
+//!
+//! The inputs follow from a seed. `cargo test` tries some thousands; with `CKPT_DOCTOR_MUTATIONS=200000`, as CI has it,
+//! that many.
+
+mod mutate;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use ckpt_doctor::check::check;
+use ckpt_doctor::checkpoint::{Checkpoint, Document, Parts, PythonModule, Shard, Vocabulary};
+use ckpt_doctor::knowledge::Knowledge;
+use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::{Format, Report, Style, render};
+use mutate::Mutator;
+
+/// Inputs of a plain `cargo test`.
+const FEW: usize = 2_000;
+/// Of so many inputs one goes through all the checks and a renderer: that takes a hundred times as long.
+const CHECKED: usize = 100;
+
+/// A sound file.
+struct Seed {
+    name: String,
+    bytes: Vec<u8>,
+}
+
+/// The files of a checkpoint that are read, with the weights cut down to the header.
+fn seeds(base: &str) -> Vec<Seed> {
+    let dir = tempfile::TempDir::new().unwrap();
+    crate::support::make_base(base, dir.path());
+    let mut seeds = Vec::new();
+    for entry in fs::read_dir(dir.path()).unwrap() {
+        let entry = entry.unwrap();
+        let name = entry.file_name().into_string().unwrap();
+        let bytes = fs::read(entry.path()).unwrap();
+        // Of what is larger than this a mutation changes too little to be seen.
+        if bytes.len() < 1 << 20 {
+            seeds.push(Seed { name, bytes });
+        }
+    }
+    seeds.sort_by(|a, b| a.name.cmp(&b.name));
+    seeds
+}
+
+/// The laws for a file of this name.
+fn hold(name: &str, bytes: &[u8]) {
+    if name.ends_with(".safetensors") {
+        crate::support::invariants::header::hold(bytes);
+    } else if name.ends_with(".index.json") {
+        crate::support::invariants::documents::index(bytes);
+    } else if name == "tokenizer.json" || name == "tokenizer_config.json" {
+        crate::support::invariants::documents::tokenizer(&[(name, bytes)]);
+    } else if name.ends_with(".json") {
+        crate::support::invariants::documents::hold(name, bytes);
+    } else if name.ends_with(".py") {
+        crate::support::invariants::module::hold(bytes);
+    } else {
+        crate::support::invariants::documents::vocabulary(name, bytes);
+    }
+}
+
+/// The checkpoint with one file changed, checked and reported.
+fn look(seeds: &[Seed], changed: usize, bytes: &[u8], knowledge: &Knowledge, format: Format) {
+    let mut parts = Parts::default();
+    for (at, seed) in seeds.iter().enumerate() {
+        let (name, bytes) = (seed.name.as_str(), if at == changed { bytes } else { &seed.bytes });
+        if name.ends_with(".safetensors") {
+            parts.shards.push(Shard::parse(name, bytes.len() as u64, bytes));
+        } else if name.ends_with(".json") {
+            parts.documents.push(Document::parse(name, bytes));
+        } else if name.ends_with(".py") {
+            parts.modules.push(PythonModule::parse(name, bytes));
+        } else if let Ok(vocabulary) = Vocabulary::parse(name, bytes) {
+            parts.vocabularies.insert(name.to_owned(), Arc::new(vocabulary));
+        }
+    }
+    let checkpoint = Arc::new(Checkpoint::planned("mutated", parts));
+    let outcome = check(&checkpoint, knowledge);
+    let report = Report::new(vec![CheckpointReport::new("mutated", None, &checkpoint, &outcome)], None);
+    let text = render(&report, format, Style::default());
+    assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{format:?} lets a control character through");
+}
+
+#[test]
+fn whatever_becomes_of_a_file_the_laws_hold() {
+    let wanted = std::env::var("CKPT_DOCTOR_MUTATIONS").map_or(FEW, |n| n.parse().expect("a number"));
+    let bases: Vec<Vec<Seed>> =
+        ["llama", "llama-sharded", "llama-gptq", "lora", "spatialvla"].map(seeds).into_iter().collect();
+    let files: Vec<(usize, usize)> =
+        bases.iter().enumerate().flat_map(|(b, seeds)| (0..seeds.len()).map(move |s| (b, s))).collect();
+    let knowledge = crate::support::knowledge();
+    let next = AtomicUsize::new(0);
+    let work = || {
+        let mut broken = BTreeMap::new();
+        loop {
+            let number = next.fetch_add(1, Ordering::Relaxed);
+            if number >= wanted {
+                return broken;
+            }
+            let (base, file) = files[number % files.len()];
+            let seed = &bases[base][file];
+            let mut mutator = Mutator::new(number as u64);
+            let other = &bases[base][mutator.below(bases[base].len())];
+            let bytes = mutator.mutate(&seed.bytes, &other.bytes);
+            let tried = catch_unwind(AssertUnwindSafe(|| {
+                hold(&seed.name, &bytes);
+                if number.is_multiple_of(CHECKED) {
+                    let format = Format::ALL[number / CHECKED % Format::ALL.len()];
+                    look(&bases[base], file, &bytes, &knowledge, format);
+                }
+            }));
+            if tried.is_err() {
+                broken.insert(number, seed.name.clone());
+            }
+        }
+    };
+    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(8);
+    let mut broken = BTreeMap::new();
+    std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+        broken.extend(workers.into_iter().flat_map(|w| w.join().unwrap()));
+    });
+    let shown: Vec<_> = broken.iter().take(20).map(|(number, name)| format!("{name}, mutation {number}")).collect();
+    assert!(broken.is_empty(), "{} of {wanted}: {}", broken.len(), shown.join("; "));
+}

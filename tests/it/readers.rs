@@ -1,0 +1,51 @@
+//! What the reading room says of hostile, damaged and merely odd input.
+//!
+//! Each table gives bytes and the exact set of fault kinds they must come out as; an empty set is a
+//! promise that an oddity is clean.
+
+use std::collections::BTreeSet;
+
+use ckpt_doctor::checkpoint::{Fault, FaultKind, FaultSource};
+
+mod contents;
+mod directories;
+mod documents;
+mod modules;
+mod properties;
+mod shards;
+mod tokenizers;
+
+/// One row of a table.
+struct Case {
+    label: &'static str,
+    expected: Vec<FaultKind>,
+    faults: Vec<Fault>,
+}
+
+impl Case {
+    fn new(label: &'static str, expected: &[FaultKind], faults: Vec<Fault>) -> Self {
+        Self { label, expected: expected.to_vec(), faults }
+    }
+}
+
+/// Compares every row, and reports all that differ at once.
+fn hold(cases: &[Case]) {
+    let mut wrong = Vec::new();
+    for case in cases {
+        let found: BTreeSet<_> = case.faults.iter().map(|f| f.kind).collect();
+        let expected: BTreeSet<_> = case.expected.iter().copied().collect();
+        if found != expected {
+            wrong.push(format!("{}: expected {expected:?}, found {found:?}", case.label));
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn every_kind_of_a_reader_is_produced_by_some_case() {
+    let tables =
+        [&documents::CASES, &shards::CASES, &contents::CASES, &modules::CASES, &tokenizers::CASES, &directories::CASES];
+    let produced: BTreeSet<_> = tables.iter().flat_map(|t| t.iter()).flat_map(|c| &c.faults).map(|f| f.kind).collect();
+    let readers = FaultKind::ALL.iter().copied().filter(|kind| kind.source() == FaultSource::Reader);
+    assert_eq!(produced, readers.collect());
+}

@@ -1,0 +1,86 @@
+//! Bytes of tensors, read on demand.
+
+use std::fs;
+use std::path::Path;
+use std::sync::LazyLock;
+
+use ckpt_doctor::checkpoint::{Checkpoint, Fault, FaultKind};
+
+use super::{Case, hold};
+
+const NAME: &str = "model.safetensors";
+
+/// Writes a shard of one tensor `w` of 4 by 8 numbers in two bytes each.
+fn write(file: &Path, data: &[u8; 64]) {
+    let header = br#"{"__metadata__":{"format":"pt"},"w":{"dtype":"BF16","shape":[4,8],"data_offsets":[0,64]}}"#;
+    let length = u64::try_from(header.len()).unwrap().to_le_bytes();
+    fs::write(file, [&length[..], header, data].concat()).unwrap();
+}
+
+/// What is found in a directory that is changed between opening it and reading the tensors.
+fn faults(before: impl Fn(&Path), after: impl Fn(&Path)) -> Vec<Fault> {
+    let dir = tempfile::tempdir().unwrap();
+    before(dir.path());
+    let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
+    after(dir.path());
+    checkpoint.read_contents();
+    checkpoint.shards.remove(NAME).unwrap().faults
+}
+
+pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
+
+fn cases() -> Vec<Case> {
+    let with = |change: fn(&mut [u8; 64])| {
+        let mut data = [1; 64];
+        change(&mut data);
+        faults(|dir| write(&dir.join(NAME), &data), |_| ())
+    };
+    let cut = |dir: &Path| {
+        let whole = fs::read(dir.join(NAME)).unwrap();
+        fs::write(dir.join(NAME), &whole[..whole.len() - 10]).unwrap();
+    };
+    let cached = |dir: &Path| {
+        let blob = "4d7a".repeat(16);
+        write(&dir.join(&blob), &[1; 64]);
+        std::os::unix::fs::symlink(blob, dir.join(NAME)).unwrap();
+    };
+    vec![
+        Case::new("ordinary numbers", &[], with(|_| ())),
+        Case::new("a NaN", &[FaultKind::NonFiniteWeights], with(|data| data[6..8].copy_from_slice(&[0xc0, 0x7f]))),
+        Case::new("nothing but zeros", &[FaultKind::ZeroTail], with(|data| data.fill(0))),
+        Case::new("half of the only tensor is zero", &[], with(|data| data[32..].fill(0))),
+        Case::new(
+            "cut off meanwhile",
+            &[FaultKind::ContentsUnread],
+            faults(|dir| write(&dir.join(NAME), &[1; 64]), cut),
+        ),
+        Case::new("another content than the cache says", &[FaultKind::ContentHashDiffers], faults(cached, |_| ())),
+    ]
+}
+
+#[test]
+fn each_content_is_named() {
+    hold(&CASES);
+}
+
+/// Space that was set aside and never written, as the file system tells it; where it cannot tell, nothing is said.
+#[test]
+fn a_hole_at_the_end_is_seen_without_reading() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join(NAME);
+    let header = br#"{"__metadata__":{"format":"pt"},"v":{"dtype":"U8","shape":[1024,1024],"data_offsets":[0,1048576]},"w":{"dtype":"U8","shape":[1024,1024],"data_offsets":[1048576,2097152]}}"#;
+    let length = u64::try_from(header.len()).unwrap().to_le_bytes();
+    let start = u64::try_from(header.len() + 8).unwrap();
+    fs::write(&file, [&length[..], header, &vec![1; 1_000_000]].concat()).unwrap();
+    let written = fs::OpenOptions::new().write(true).open(&file).unwrap();
+    written.set_len(start + 2_097_152).unwrap();
+    let hole = rustix::fs::seek(&written, rustix::fs::SeekFrom::Hole(0)).unwrap();
+    let tells = hole < start + 2_097_152;
+    let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
+    let kinds = |c: &Checkpoint| c.shards[NAME].faults.iter().map(|f| f.kind).collect::<Vec<_>>();
+    assert_eq!(kinds(&checkpoint), if tells { vec![FaultKind::ZeroTail] } else { vec![] });
+    checkpoint.read_contents();
+    assert_eq!(kinds(&checkpoint), [FaultKind::ZeroTail]);
+    let detail = &checkpoint.shards[NAME].faults[0].detail;
+    assert_eq!((detail["tensors"].as_u64(), detail["bytes"].as_u64()), (Some(1), Some(1_097_152)));
+}

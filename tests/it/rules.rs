@@ -1,0 +1,162 @@
+//! Every rule on every fixture: each case trips its own rule, and nobody else's unseen.
+
+mod failure_modes;
+mod seeded;
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+
+use crate::support::{Expect, Tried, tried};
+use ckpt_doctor::check::check;
+use ckpt_doctor::check::finding::{Finding, Severity};
+use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, FaultSource};
+
+fn failures(of: impl Fn(&Tried) -> Option<String>) -> Vec<String> {
+    tried().iter().filter_map(|t| of(t).map(|why| format!("{}: {why}\n  found {}", t.case.name, t.codes()))).collect()
+}
+
+fn shown(findings: &[&Finding]) -> String {
+    let mut out = String::new();
+    for finding in findings {
+        let _ = write!(out, "\n    {} {} {}", finding.code, finding.severity.name(), finding.message);
+        for place in finding.locations.iter().take(3) {
+            let _ = write!(
+                out,
+                "\n      at {:?} line {:?} pointer {:?} tensor {:?}",
+                place.file, place.line, place.pointer, place.tensor
+            );
+        }
+    }
+    out
+}
+
+fn mismatch(expect: &Expect, own: &[&Finding]) -> Option<String> {
+    let at = |wanted: &Option<String>, of: &dyn Fn(&Finding) -> bool| wanted.is_some() && !own.iter().any(|f| of(f));
+    let any = |f: &Finding, is: &dyn Fn(&ckpt_doctor::check::finding::Location) -> bool| f.locations.iter().any(is);
+    let wrong = [
+        (own.is_empty(), "the rule is silent"),
+        (own.len() != expect.count.unwrap_or(1), "another number of findings"),
+        (own.iter().any(|f| f.severity != expect.severity), "another severity"),
+        (at(&expect.file, &|f| any(f, &|l| l.file == expect.file)), "the file is not named"),
+        (at(&expect.tensor, &|f| any(f, &|l| l.tensor == expect.tensor)), "the tensor is not named"),
+        (at(&expect.pointer, &|f| any(f, &|l| l.pointer == expect.pointer)), "the pointer is not named"),
+        (expect.line.is_some() && !own.iter().any(|f| any(f, &|l| l.line == expect.line)), "the line is not named"),
+        (
+            at(&expect.says, &|f| f.message.contains(expect.says.as_deref().unwrap_or_default())),
+            "the message says something else",
+        ),
+    ];
+    let reasons: Vec<&str> = wrong.iter().filter(|(wrong, _)| *wrong).map(|(_, reason)| *reason).collect();
+    (!reasons.is_empty()).then(|| format!("{}{}", reasons.join(", "), shown(own)))
+}
+
+#[test]
+fn each_case_trips_its_rule() {
+    let wrong = failures(|t| mismatch(t.case.expect.as_ref()?, &t.own()));
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn each_rule_is_silent_on_the_base_of_its_case() {
+    let wrong = failures(|t| {
+        let code = t.case.code.as_ref()?;
+        t.before.contains(code).then(|| "the base trips the rule already".to_owned())
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn sound_checkpoints_trip_nothing_above_info() {
+    let wrong = failures(|t| {
+        let loud: Vec<&Finding> = t.outcome.findings.iter().filter(|f| f.severity > Severity::Info).collect();
+        (t.case.code.is_none() && !loud.is_empty()).then(|| shown(&loud))
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Their tensors stand for those of the class, and the report says so.
+#[test]
+fn quantised_checkpoints_load_clean() {
+    let quantised = |t: &&Tried| t.case.name.starts_with("sound/quantized-");
+    let dirty: Vec<String> = tried()
+        .iter()
+        .filter(quantised)
+        .filter(|t| t.outcome.loads.iter().any(|load| !is_clean(load)))
+        .map(|t| format!("{}: {:?}", t.case.name, t.outcome.loads))
+        .collect();
+    assert!(dirty.is_empty(), "{}", dirty.join("\n"));
+    let loaded = tried().iter().filter(quantised).filter(|t| !t.outcome.loads.is_empty()).count();
+    assert!(loaded >= 10, "{loaded} quantised cases have a load report");
+}
+
+fn is_clean(load: &LoadReport) -> bool {
+    let names = load.missing.is_empty() && load.unexpected.is_empty();
+    names && load.mismatched.is_empty() && load.silent.is_empty() && load.raises.is_none()
+}
+
+#[test]
+fn messages_render_in_full() {
+    // What was found may itself hold such characters: the loader's own sentence, the start of a file.
+    let quoted =
+        |f: &Finding, c: char| f.evidence.values().filter_map(|v| v.as_str()).map(|v| v.matches(c).count()).sum();
+    let broken = |f: &Finding, text: &str, of: &[char]| {
+        text.trim().is_empty() || of.iter().any(|c| text.matches(*c).count() > quoted(f, *c))
+    };
+    let wrong = failures(|t| {
+        let own = t.own();
+        let bad: Vec<&Finding> = own
+            .into_iter()
+            // A fix may show JSON; a message never does.
+            .filter(|f| {
+                broken(f, &f.message, &['?', '{', '}'])
+                    || f.fix.as_ref().is_some_and(|fix| broken(f, &fix.title, &['?']))
+            })
+            .collect();
+        (!bad.is_empty()).then(|| shown(&bad))
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The donor as published checkpoints are: three `Infinity` and nothing else.
+#[test]
+fn the_donor_has_three_infinities() {
+    let donor = crate::support::project().join("fixtures/donors/spatialvla-tiny");
+    let outcome = check(&Checkpoint::open(donor).expect("the donor").into(), &crate::support::knowledge());
+    let loud: Vec<_> = outcome.findings.iter().filter(|f| f.severity > Severity::Info).collect();
+    let places: Vec<_> =
+        loud.iter().map(|f| (&*f.code, f.locations[0].line, f.locations[0].pointer.as_deref())).collect();
+    let std = |i: usize| {
+        Some(
+            [
+                "/statistics/rh20t_rlds~11.0.0/action/std/0",
+                "/statistics/rh20t_rlds~11.0.0/action/std/1",
+                "/statistics/rh20t_rlds~11.0.0/action/std/2",
+            ][i],
+        )
+    };
+    assert_eq!(
+        places,
+        [("JSN001", Some(128), std(0)), ("JSN001", Some(129), std(1)), ("JSN001", Some(130), std(2))],
+        "{}",
+        shown(&loud)
+    );
+}
+
+#[test]
+fn every_kind_of_a_comparison_is_produced_by_some_case() {
+    let produced: BTreeSet<FaultKind> = tried().iter().flat_map(|t| &t.kinds).copied().collect();
+    let comparisons = FaultKind::ALL.iter().filter(|kind| kind.source() == FaultSource::Comparison);
+    let never: Vec<&FaultKind> = comparisons.filter(|kind| !produced.contains(kind)).collect();
+    assert!(never.is_empty(), "{never:?}");
+}
+
+/// Every rule on every case. A rule that starts to speak elsewhere shows up here.
+#[test]
+fn cross_fire() {
+    let mut matrix = String::new();
+    for t in tried() {
+        let _ = writeln!(matrix, "{}: {}", t.case.name, t.codes());
+    }
+    snapshot!("cross-fire", matrix.trim_end());
+}

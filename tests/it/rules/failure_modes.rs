@@ -1,0 +1,114 @@
+//! The failure modes that `fixtures/failure-modes.json5` lists: reported, repaired, clean, and undone byte for byte.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use crate::support::project;
+use ckpt_doctor::check::finding::{Finding, Severity};
+use ckpt_doctor::check::{Outcome, check};
+use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::knowledge::Knowledge;
+use ckpt_doctor::knowledge::source;
+use ckpt_doctor::surgery::journal;
+use ckpt_doctor::surgery::repair::plan;
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Modes {
+    modes: Vec<Listed>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Listed {
+    mode: String,
+    /// Names of cases below `fixtures/rules`.
+    cases: Vec<String>,
+    /// Rules whose warnings stay: what they are about does no harm.
+    #[serde(default)]
+    left: Vec<String>,
+    /// Why there is none.
+    #[serde(default)]
+    why: Option<String>,
+}
+
+fn modes() -> Vec<Listed> {
+    let path = "fixtures/failure-modes.json5";
+    let text = fs::read_to_string(project().join(path)).expect("text");
+    source::parse::<Modes>(path, &text).unwrap_or_else(|e| panic!("{e}")).modes
+}
+
+fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = fs::read_dir(dir).expect("a directory").map(|e| e.expect("an entry"));
+    let named = entries.map(|e| (e.file_name().to_string_lossy().into_owned(), e.path()));
+    named.filter(|(_, path)| path.is_file()).map(|(name, path)| (name, fs::read(path).expect("a file"))).collect()
+}
+
+fn looked(dir: &Path, knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
+    let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
+    let outcome = check(&checkpoint, knowledge);
+    (checkpoint, outcome)
+}
+
+fn shown(findings: &[Finding]) -> String {
+    let mut out = String::new();
+    for f in findings {
+        let _ = write!(out, "\n    {} {} {}", f.code, f.severity.name(), f.message);
+    }
+    out
+}
+
+/// Takes one case through all of it; the error says where it went wrong.
+fn round_trip(code: &str, left: &[String], dir: &Path, knowledge: &Knowledge) -> Result<(), String> {
+    let before = files(dir);
+    let (checkpoint, broken) = looked(dir, knowledge);
+    if !broken.findings.iter().any(|f| f.code == code) {
+        return Err(format!("{code} is silent{}", shown(&broken.findings)));
+    }
+    let repair = plan(&checkpoint, broken, true, &|c| check(c, knowledge));
+    journal::write(&repair, &mut |_| {}).map_err(|e| format!("writing: {e}"))?;
+    let (_, repaired) = looked(dir, knowledge);
+    let loud =
+        |f: &Finding| f.severity > Severity::Info && !(f.severity == Severity::Warning && left.contains(&f.code));
+    if repaired.findings.iter().any(|f| f.code == code || loud(f)) {
+        return Err(format!("not clean after the repair{}", shown(&repaired.findings)));
+    }
+    if files(dir) == before {
+        return Err("nothing was written".to_owned());
+    }
+    journal::undo(dir).map_err(|e| format!("undo: {e}"))?;
+    if files(dir) != before {
+        return Err("undo has not restored every byte".to_owned());
+    }
+    Ok(())
+}
+
+#[test]
+fn each_mode_is_reported_repaired_and_undone() {
+    let modes = modes();
+    let wanted: Vec<&str> = modes.iter().flat_map(|m| &m.cases).map(String::as_str).collect();
+    let knowledge = crate::support::knowledge();
+    let taken = |case: &str| wanted.contains(&case);
+    let tried = crate::support::on_cases(&knowledge, taken, |_, case, dir| {
+        let left = modes.iter().find(|m| m.cases.contains(&case.name)).map_or(&[][..], |m| &m.left);
+        round_trip(case.code.as_deref().unwrap_or_default(), left, dir, &knowledge)
+    });
+    let wrong: Vec<String> =
+        tried.iter().filter_map(|(case, result)| Some(format!("{}: {}", case.name, result.as_ref().err()?))).collect();
+    assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
+    assert_eq!(tried.len(), wanted.len(), "every case of the list is one of fixtures/rules, once");
+}
+
+#[test]
+fn a_mode_without_a_case_says_why() {
+    let modes = modes();
+    for mode in &modes {
+        assert!(mode.cases.is_empty() == mode.why.is_some(), "{}", mode.mode);
+    }
+    let numbered = (1..=11).filter(|n| modes.iter().any(|m| m.mode.starts_with(&format!("{n} ")))).count();
+    assert_eq!(numbered, 11, "the eleven modes of docs/decisions.md");
+}
