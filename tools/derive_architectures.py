@@ -56,6 +56,7 @@ def add_verify(commands):
     p.add_argument("--binary", help="ckpt-doctor (default: the environment variable CKPT_DOCTOR, else the one on the path)")
     p.add_argument("--seeds", default="a", help="seeds of the draws to verify on, between commas")
     p.add_argument("--out", type=Path, help="another folder to write to")
+    p.add_argument("--versions", help="only these versions of transformers, between commas; with --out, to try something")
     p.set_defaults(run="derive.verify")
 
 

@@ -1,10 +1,13 @@
 """A class that is right but for one corner of its configs ships with that corner named, and nothing is predicted there."""
 import itertools
+import re
 
 from .conditions import quoted
-from .keys import HEADS, KV_HEADS, LAYERS, NOISE, WIDTH
+from .keys import NOISE
 
 MOST = 3                                                     # corners of one class
+WHOLE = re.compile(r"(^|\.)(hidden_size|d_model|n_embd|embed_dim|emb_dim|dim)$")
+HEADS = re.compile(r"(^|\.)(num_attention_heads|n_heads?|num_heads)$")
 
 
 def found(v, name, records, outcomes, named, enough):
@@ -35,9 +38,9 @@ def candidates(flat, default):
     for key in keys:
         for text, holds in asked(key, flat[key], default.get(key)):
             yield text, key, holds
-    sizes = [k for k in keys if positive(flat[k]) and (WIDTH.search(k) or HEADS.search(k) or KV_HEADS.search(k) or LAYERS.search(k))]
+    sizes = [k for k in keys if positive(flat[k]) and (WHOLE.search(k) or HEADS.search(k))]
     for a, b in itertools.permutations(sizes, 2):
-        if a.rpartition(".")[0] == b.rpartition(".")[0] and HEADS.search(b) and WIDTH.search(a) and flat[a] % flat[b]:
+        if a.rpartition(".")[0] == b.rpartition(".")[0] and HEADS.search(b) and WHOLE.search(a) and flat[a] % flat[b]:
             yield f"c.{a} % c.{b} != 0", a, lambda f, a=a, b=b: positive(f.get(a)) and positive(f.get(b)) and f[a] % f[b] != 0
 
 

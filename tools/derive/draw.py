@@ -41,15 +41,13 @@ class Drawer:
         """What the class has under a config.json, or None where it cannot be built from it."""
         given = copied(config)
         try:
-            made = self.config_class.from_dict(copied(given))
+            made = self.config_class.from_dict(decoded(given))
             flat = flatten(made)
-            b = build(self.cls, made)
+            b = built(self.cls, made, lambda: self.config_class.from_dict(decoded(given)))
         except (MemoryError, TooSlow):
             raise
         except Exception as e:
-            if "meta" not in str(e):
-                return {"config": given, "kind": kind, "error": f"{type(e).__name__}: {e}"[:300]}
-            b = build(self.cls, self.config_class.from_dict(copied(given)), "cpu")
+            return {"config": given, "kind": kind, "error": f"{type(e).__name__}: {e}"[:300]}
         return {"config": given, "kind": kind, "flat": flat, "state_dict": b.tensors, "tied": b.tied, "buffers": b.buffers, "base_model_prefix": b.instance.base_model_prefix}
 
     def saved(self, raw):
@@ -134,6 +132,30 @@ class Drawer:
         return out
 
 
+def decoded(value):
+    """A config as transformers reads it from JSON: 5.x writes infinities as objects."""
+    if isinstance(value, dict):
+        if value.keys() == {"__float__"}:
+            return float(value["__float__"])
+        return {k: decoded(v) for k, v in value.items()}
+    return [decoded(v) for v in value] if isinstance(value, list) else value
+
+
+def built(cls, config, again):
+    """The model, on `meta` where it needs no values while it is built."""
+    try:
+        return build(cls, config)
+    except (MemoryError, TooSlow):
+        raise
+    except Exception as e:
+        try:
+            return build(cls, again(), "cpu")
+        except (MemoryError, TooSlow):
+            raise
+        except Exception:
+            raise e from None
+
+
 def other(key, value, words, rng):
     found = alternatives(key, value, words)
     return rng.choice(found[:3]) if found else value
@@ -165,7 +187,7 @@ def derived_of(root, model_type):
 def raws_for(cls, config_class, model_type, seed, count):
     """Small random configs that the class can be built from, with numbers of labels where it has some."""
     def works(raw):
-        build(cls, config_class(**copied(raw)))
+        built(cls, config_class(**copied(raw)), lambda: config_class(**copied(raw)))
     name = cls.__name__
     rng = random.Random(f"labels/{seed}/{name}")
     raws = config_sample.base_raws(model_type, config_class, works, count, f"{seed}/{name}")

@@ -101,6 +101,26 @@ class Fit:
         return at
 
 
+LAYERS = re.compile(r"^c\.(\w+\.)*(num_hidden_layers|n_layers?|num_layers|encoder_layers|decoder_layers|depth)$")
+
+
+def clamped(tensors):
+    """No tensor lies in a layer that there is none of: `first_k_dense_replace` may be more than `num_hidden_layers`."""
+    whole = {}                                               # what all layers of a list have, by what their names start with
+    for name, entry in tensors:
+        repeat = entry.get("repeat", [])
+        if len(repeat) == 1 and not entry.get("when") and LAYERS.match(repeat[0][1]):
+            whole.setdefault(name.split("{")[0], repeat[0][1])
+    out = []
+    for name, entry in tensors:
+        repeat, count = entry.get("repeat", []), whole.get(name.split("{")[0])
+        if count and repeat and name.split("{")[1].startswith(f"{repeat[0][0]}}}") and repeat[0][1].startswith("c.") and repeat[0][1] != count \
+                and re.fullmatch(r"c\.[\w.]+", repeat[0][1]):
+            entry = {**entry, "repeat": [[repeat[0][0], f"min({repeat[0][1]}, {count})"], *repeat[1:]]}
+        out.append([name, entry])
+    return out
+
+
 def repeats(entry):
     """Counts that may fall below zero are zero then, as in Python's `range`."""
     return [(i, f"max({n}, 0)" if top_level(n, {"-"}) else n) for i, n in entry.get("repeat", [])]
@@ -151,6 +171,7 @@ class Version:
             raw = load(path)
             for key in ("tensors", "buffers", "parts", "refuses"):
                 raw[key] = tidied(raw.get(key) or [])
+            raw["tensors"] = clamped(raw["tensors"])
             if raw.get("unexplained"):
                 what = raw["unexplained"][0]
                 out.reasons[raw["class"]] = "not explained: " + " ".join(str(w) for w in (what if isinstance(what, list) else [what]))[:100]
@@ -238,6 +259,13 @@ class Version:
                         out[t].add(leaf)
         return out
 
+    def of_others(self, model_type):
+        """Keys that only other config classes of the same modeling module declare: its source reads them of those."""
+        modules = {f.raw["module"] for f in self.family(model_type)}
+        near = {f.raw["model_type"] for f in self.fits.values() if f.raw["module"] in modules} - {model_type}
+        declared = set().union(*(self.configs.get(t, {}).get("declared", ()) for t in near))
+        return declared - set(self.configs.get(model_type, {}).get("declared", ()))
+
     def unvaried(self, model_type, used):
         """{key: its default} of keys that the source reads, that no expression uses, and that no sample had another value of."""
         config = self.configs.get(model_type)
@@ -246,7 +274,7 @@ class Version:
         family = self.family(model_type)
         reads = set(config["reads"]).union(*(f.raw["source_reads"] for f in family), *(f.raw["absent"] for f in family))
         varied = set(config["varied"]).union(*(f.raw["varied"] for f in family)) | self.varied_inside[model_type]
-        left = reads - varied - used - set(self.aliases(model_type)) - set(config["configs"])
+        left = reads - varied - used - set(self.aliases(model_type)) - set(config["configs"]) - self.of_others(model_type)
         static = config["defaults"]
         return {k: static.get(k) for k in sorted(left) if "." not in k and not NOISE.search(k) and not NO_KEY.search(k) and simple(static.get(k))}
 
@@ -266,8 +294,9 @@ def expressions(items):
         yield from (text for text in (item.when, item.tied_when, *(item.shape or ()), *(count for _, count in item.repeat)) if text)
 
 
-def used_keys(version, classes, corners=None):
-    """{model_type: keys} that the templates and the corners of the classes read, with what those keys are computed from."""
+def used_keys(version, classes, corners=None, kept=()):
+    """{model_type: keys} that the templates and the corners of the classes read, and those of classes kept from the files, with what those
+    keys are computed from."""
     used = defaultdict(set)
 
     def read(model_type, path):
@@ -314,7 +343,11 @@ def used_keys(version, classes, corners=None):
                         for text in expressions(version.fits[other].items):
                             for path in paths(text):
                                 read(model_type, path)
-    for model_type in {version.model_type(n) for n in classes}:
+    for each in kept:
+        for path in [*each.configs(), *(path for text in each.texts() for path in paths(text))]:
+            read(each.model_type, path)
+            used[each.model_type].add(path.split(".")[0])
+    for model_type in {version.model_type(n) for n in classes} | {each.model_type for each in kept}:
         for spec in version.sub_configs(model_type).values():
             read_values(model_type, spec.get("absent"))
             read_values(model_type, spec.get("set"))

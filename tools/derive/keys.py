@@ -6,7 +6,7 @@ NOISE = re.compile(
     r"(token_id|token_index|token_ids)$|^(bos|eos|pad|cls|sep|unk|mask)_token$|dropout|drop_|initializer|_eps$|epsilon|^use_cache|dtype"
     r"|transformers_version|name_or_path|architectures|label2id|id2label|rope_(theta|type|scaling)|rope_param|temperature|_coef|coefficient"
     r"|mask_time|mask_feature|^num_beams|chunk_size_feed|problem_type|return_dict|output_(hidden_st|att|sco)|^ctc_|finetuning|loss"
-    r"|torchscript|pruned|min_length|^top_[kp]|penalty|diversity|suppress|^begin_|num_return|sampling_rate|tokenizer_class|^prefix$|attn_implementation"
+    r"|torchscript|pruned|min_length|^top_[kp]|penalty|diversity|suppress|^begin_|num_return|(^|_)sampling_rate|tokenizer_class|^prefix$|attn_implementation"
     r"|model_type$|task_specific|keys_to_ignore|tf_legacy|use_bfloat|remove_invalid|early_stopping"
     r"|gradient_check|^base_model_(tp|pp)|logit_scale|softcap|_multiplier$|init_std|init_range|_init$|^training|^chunk_length|transformers_weights")
 

@@ -90,16 +90,12 @@ def field_types(config_class):
     """{key: what transformers 5 lets it be, in JSON's words}: `int|null`, `list[int]|null`, `"a"|"b"`; keys of one class."""
     if not hasattr(config_class, "__dataclass_fields__"):
         return {}
-    try:
-        hints = typing.get_type_hints(config_class)
-    except Exception:                                         # a name that only a type checker knows
-        return {}
     out = {}
-    for key in config_class.__dataclass_fields__:
+    for key, field in config_class.__dataclass_fields__.items():
         if key in CONFIG_BASE.__annotations__ or key.startswith("_"):
             continue
-        text = told_type(hints.get(key))
-        if text is not None:
+        text = told_type(field.type)
+        if text:
             out[key] = text
     return out
 

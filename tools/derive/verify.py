@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from . import corners, ship, store
+from . import corners, graft, ship, store
 from .family import load
 from .mended import MENDED
 from .write import Writer, mended_classes, put, read_conversions, read_versions
@@ -93,19 +93,21 @@ class Verifier:
         self.writer, self.program, self.seeds = writer, program, seeds
         self.told = {}                                       # (version, class) -> (mark of the files, what came of each record)
         self.kinds = {}                                      # (version, class) -> kinds of its records
+        self.instead = set()                                 # (version, class) for which the files' own entry was tried
 
     def outcomes(self, only=None):
         """{version: {class: [what came of each record]}} for what the writer ships now. Asked again only of what changed."""
         files = self.writer.files()
         marks = {stem: hashlib.sha256(text.encode()).hexdigest() for stem, text in files.items()}
+        everything = hashlib.sha256("".join(marks.values()).encode()).hexdigest()
         out = {}
         with tempfile.TemporaryDirectory() as folder:
             place(files, Path(folder) / "architectures")
             for v in self.writer.versions:
                 told = out[v.version] = {}
                 todo = []
-                for n in sorted(self.writer.ships[v.version]):
-                    mark = "".join(marks.get(stem, "-") for stem in sorted(self.stems(v, n)))
+                for n in sorted(self.writer.ships[v.version] | {k.name for k in self.writer.kept_classes(v)}):
+                    mark = "".join(marks.get(stem, "-") for stem in sorted(self.stems(v, n))) if n in self.writer.ships[v.version] else everything
                     kept = self.told.get((v.version, n))
                     if kept and kept[0] == mark:
                         told[n] = kept[1]
@@ -142,11 +144,17 @@ class Verifier:
 
     def run(self, report=print):
         self.writer.start()
+        for v in self.writer.versions:                       # what a hand corrected comes before what the tool found
+            first = [n for n in json.loads(graft.KEPT.read_text()).get(v.version, ()) if n in self.writer.grafts[v.version]]
+            self.instead.update((v.version, n) for n in first if n in self.writer.ships[v.version])
+            self.writer.ships[v.version] -= set(first)
+        self.writer.drop_dependent()
         self.settle(report)
         self.choose(report)
         self.settle(report)
         for v in self.writer.versions:
-            self.writer.verified[v.version] = {n: self.told[v.version, n][1].count("exact") for n in self.writer.ships[v.version]}
+            names = self.writer.ships[v.version] | {k.name for k in self.writer.kept_classes(v)}
+            self.writer.verified[v.version] = {n: self.told[v.version, n][1].count("exact") for n in names}
 
     def settle(self, report):
         """Drops what is not exact, and what depends on it, until all that is left is exact."""
@@ -162,7 +170,17 @@ class Verifier:
                         continue
                     wrong += 1
                     again = True
+                    grafts = writer.grafts[version]
+                    if name not in writer.ships[version]:     # kept from the files, and not right either
+                        del grafts[name]
+                        if (version, name) in self.instead:
+                            writer.ships[version].add(name)
+                        continue
                     if how and writer.prefer.pop(name, None) is not None:
+                        continue
+                    if how and name in grafts and (version, name) not in self.instead:
+                        self.instead.add((version, name))
+                        writer.ships[version].discard(name)
                         continue
                     corner = how and corners.found(v, name, records(v.folder, name, self.seeds), found, writer.corners[version].get(name, []), ENOUGH)
                     if corner:
@@ -235,9 +253,12 @@ def comparable(row):
 
 
 def main(args):
-    versions = read_versions(args.cache)
+    versions = [v for v in read_versions(args.cache) if not args.versions or v.version in args.versions.split(",")]
     writer = Writer(versions, read_conversions(args.cache, versions))
     writer.mended = mended_classes(ship.RULES)
+    kept = graft.read(ship.RULES)
+    for v in versions:
+        writer.grafts[v.version] = {n: k for n, k in graft.of_version(kept, v.version).items() if records(v.folder, n, args.seeds.split(","))}
     verifier = Verifier(writer, Program(args.binary or os.environ.get("CKPT_DOCTOR", "ckpt-doctor")), args.seeds.split(","))
     verifier.run()
     verifier.conversions(print)

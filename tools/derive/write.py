@@ -27,6 +27,7 @@ class Writer:
         self.mended = {}                                     # version -> classes of files that are not written
         self.apart = {}
         self.corners = {v.version: {} for v in versions}     # class -> [{"when", "why"}]
+        self.grafts = {v.version: {} for v in versions}      # class -> Kept, used where `ships` has none
 
     def start(self):
         self.ships = {v.version: set(v.fits) - set(REFUSED) for v in self.versions}
@@ -40,35 +41,52 @@ class Writer:
             ships, again = self.ships[v.version], True
             while again:
                 again = False
+                there = self.there(v)
                 for name in sorted(ships):
-                    lacking = missing_part(v.fits[name], ships | self.mended.get(v.version, set()))
+                    lacking = missing_part(v.fits[name], there)
                     if lacking:
                         ships.discard(name)
                         v.reasons[name] = f"a part is not shipped: {lacking}"
                         again = True
+                grafts = self.grafts[v.version]
+                for name in [n for n, kept in grafts.items() if not set(kept.parts()) <= there or not known(v, kept.model_type)]:
+                    del grafts[name]
+                    again = True
+
+    def there(self, v):
+        """All classes that the files have for a version."""
+        return self.ships[v.version] | self.mended.get(v.version, set()) | set(self.grafts[v.version])
+
+    def kept_classes(self, v, model_type=None):
+        """Classes that stand in the files as they did before, for want of an explanation."""
+        return [k for n, k in sorted(self.grafts[v.version].items()) if n not in self.ships[v.version] and model_type in (None, k.model_type)]
 
     def files(self):
         """{stem: text} of all families."""
-        used = [used_keys(v, self.ships[v.version], self.corners[v.version]) for v in self.versions]
+        used = [used_keys(v, self.ships[v.version], self.corners[v.version], self.kept_classes(v)) for v in self.versions]
         # A version that knows a config class knows all its keys: entries may be shared between versions.
         self.used = {v.version: {t: set().union(*(u.get(t, ()) for u in used)) for t in mine} for v, mine in zip(self.versions, used)}
         model_types = {t for used in self.used.values() for t in used}
         model_types |= {v.model_type(n) for v in self.versions for n in self.ships[v.version]}
+        model_types |= {k.model_type for v in self.versions for k in self.kept_classes(v)}
         # Where a row of the conversion table stands: rows are written for the classes of transformers 5 alone.
         self.places = {}
         v5 = self.versions[-1]
         for name in self.ships[v5.version]:
             self.places[name] = self.places[v5.model_type(name)] = v5.model_type(name)
+        for kept in self.kept_classes(v5):
+            self.places[kept.name] = self.places[kept.model_type] = kept.model_type
         return {t: json5.document(self.file(t)) for t in sorted(model_types) if t and any(known(v, t) for v in self.versions)}
 
     def file(self, model_type):
-        present = [v for v in self.versions if self.used[v.version].get(model_type) or self.family(v, model_type)]
+        present = [v for v in self.versions if self.used[v.version].get(model_type) or self.family(v, model_type) or self.kept_classes(v, model_type)]
         common, by_loader = self.config_class(model_type, present)
         entries = self.classes(model_type, present)
         lets, trees = name_all([e["tensors"] for e in entries])
         for entry, tensors in zip(entries, trees):
             entry["tensors"] = layout(tensors)
-        derived = {v.version: self.provenance(v, model_type) for v in present if self.family(v, model_type)}
+        entries += self.kept_entries(model_type, present)
+        derived = {v.version: self.provenance(v, model_type) for v in present if self.family(v, model_type) or self.kept_classes(v, model_type)}
         names = sorted({e["class"] for e in entries})
         modules = sorted({f.raw["module"].split(".")[-2] for v in present for f in self.family(v, model_type)}) or [model_type]
         config_class = next((f.raw.get("config_class") for v in reversed(present) for f in self.family(v, model_type)), None)
@@ -103,7 +121,8 @@ class Writer:
     def provenance(self, v, model_type):
         family = self.family(v, model_type)
         verified = self.verified.get(v.version, {})
-        return json5.Filled(samples=sum(f.raw["samples"] for f in family), verified=json5.Filled({f.name: verified.get(f.name, 0) for f in family}))
+        names = sorted([f.name for f in family] + [k.name for k in self.kept_classes(v, model_type)])
+        return json5.Filled(samples=sum(f.raw["samples"] for f in family), verified=json5.Filled({n: verified.get(n, 0) for n in names}))
 
     # ---- the config class ------------------------------------------------------------------------------------
 
@@ -144,11 +163,13 @@ class Writer:
     def config_side(self, v, model_type):
         used = self.used[v.version].get(model_type, set())
         static, computed, configs = v.static(model_type), v.computed(model_type), v.sub_configs(model_type)
-        auto = {}
+        auto, there = {}, self.there(v)
         for mapping, table in sorted(v.auto.items()):
             name = first(table.get(model_type))
-            if name in self.ships[v.version]:
+            if name in there:
                 auto[mapping.lower()] = name
+        for kept in self.kept_classes(v, model_type):         # what a file computes for such a class
+            computed.update({k: (text, "filled") for k, text in kept.computed.items() if k in used and k not in computed and isinstance(text, str)})
         return {
             "auto": auto,
             "inside": inside if isinstance(inside := v.configs.get(model_type, {}).get("inside"), str) else None,
@@ -200,6 +221,13 @@ class Writer:
                 loaders = [v.version for v, _ in group]
                 entries.append(with_loaders(entry, loaders if len(loaders) < len(present) else None))
         return entries
+
+    def kept_entries(self, model_type, present):
+        found = {}
+        for v in present:
+            for kept in self.kept_classes(v, model_type):
+                found.setdefault(id(kept), (kept, []))[1].append(v.version)
+        return [with_loaders(kept.entry, loaders if len(loaders) < len(present) else None) for kept, loaders in found.values()]
 
     def entries(self, name, have):
         """[(versions, entry)]: as few entries as say everything, each for versions that follow each other."""
@@ -289,7 +317,7 @@ class Writer:
     def shippable(self, v, items):
         """The items; of a part that the config chooses, only classes that are there."""
         out = []
-        known_classes = set().union(*self.ships.values(), *self.mended.values())
+        known_classes = set().union(*(self.there(v) for v in self.versions))
         for item in items:
             table = (item.part or {}).get("by_model_type")
             if table:
@@ -317,9 +345,10 @@ class Writer:
         table, same_as = self.conversions.get("identifiers", {}), self.conversions.get("same_as", {})
         v5 = self.versions[-1]
         family = self.family(v5, model_type) if v5.version.startswith("5") else []
-        if not family and not self.used[v5.version].get(model_type):
+        kept = self.kept_classes(v5, model_type) if v5.version.startswith("5") else []
+        if not family and not kept and not self.used[v5.version].get(model_type):
             return {}
-        wanted = {model_type} | {f.name for f in family}
+        wanted = {model_type} | {f.name for f in family} | {name for k in kept for name in {k.name, *k.models()}}
         for fit in family:
             for _, name, inner in self.marks(v5, fit):
                 wanted.add(name if name in table else inner)
