@@ -451,6 +451,8 @@ def compared_words(*sources):
     for source in sources:
         for m in re.finditer(r"(\w+)(?:\[[^\]\n]*\])?\s*(?:==|!=|not in|in)\s*" + strings, source):
             add_words(out, m[1], m[2])
+        for m in re.finditer(r"([\"'][\w.\-]+[\"'])\s+(?:not )?in\s+(?:self\.)?(?:config\.)?(\w+)", source):
+            add_words(out, m[2], m[1])
         for m in re.finditer(r"(\w+)\s*:\s*(?:list\[)?Literal\[((?:\s*[\"'][\w.\-]+[\"']\s*,?)+)", source):
             add_words(out, m[1], m[2])
     for k in list(out):                                         # a list of layer types, compared one by one

@@ -282,7 +282,8 @@ class Version:
 # What is read of a config that is no key of it, or that every config has and no class builds by.
 NO_KEY = re.compile(r"^(_|to_|get_|from_|update|save|is_composition|name_or_path|num_labels|architectures|quantization_config|sub_configs|layer_types_|use_return_dict|attribute_map"
                     r"|keys_to|auto_map|output_attentions|use_bfloat16|tie_encoder_decoder$|is_encoder_decoder$|base_config|per_layer_config|is_heterogeneous|text_config|vision_config"
-                    r"|head_mask|items|keys|values|copy|pop|get)")
+                    r"|(\w+_)?act(ivation)?(_fn|_func|_function)?$|forced_|max_length$|min_length$|num_beam|length_penalty|no_repeat|do_sample|num_return|decoder_start|max_new"
+                    r"|generation|head_mask|items|keys|values|copy|pop|get)")
 
 
 def simple(v):

@@ -624,7 +624,45 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
                 todo[q], first[q] = sub, first[pattern]
                 queue.append(q)
     done.sort(key=lambda d: (d[0], d[1]))
-    return done, bad
+    return collapsed(done, samples, names_of), bad
+
+
+def collapsed(done, samples, names_of):
+    """Layers that were told one by one, because all samples that have these tensors have as many, as layers of a list whose
+    length is known from others: only where that holds for every sample."""
+    counts = {}                                              # what names of layers start with -> how many there are
+    for _, name, entry, _ in done:
+        if len(entry.get("repeat", ())) == 1 and name.count("{") == 1:
+            counts.setdefault(name.split("{")[0], entry["repeat"][0][1])
+    groups_of = {}
+    for row in done:
+        name, entry = row[1], row[2]
+        for prefix in counts:
+            m = re.match(re.escape(prefix) + r"(\d+)(\..*)", name)
+            if m and not entry.get("repeat"):
+                groups_of.setdefault((prefix, m[2]), {})[int(m[1])] = row
+    out = list(done)
+    for (prefix, rest), rows in groups_of.items():
+        if len(rows) < 2 or sorted(rows) != list(range(len(rows))):
+            continue
+        entries = [json.dumps(row[2]).replace(f".{index}.", ".{i}.") for index, row in sorted(rows.items())]
+        count, entry = counts[prefix], json.loads(entries[0])
+        if len(set(entries)) > 1 or not all(fits_all(s, names_of, prefix, rest, count, entry.get("when")) for s in samples):
+            continue
+        at = out.index(rows[0])
+        out[at] = (rows[0][0], f"{prefix}{{i}}{rest}", {"repeat": [["i", count]], **entry}, {})
+        out = [row for row in out if row not in rows.values()]
+    return out
+
+
+def fits_all(sample, names_of, prefix, rest, count, when):
+    try:
+        wanted = evaluate.value(count, sample.flat) if not when or evaluate.value(when, sample.flat) else 0
+    except Exception:                                         # it asks for what this config does not have
+        return False
+    names = names_of(sample)
+    have = [n for n in names if n.startswith(prefix) and n.endswith(rest) and n[len(prefix):-len(rest)].isdigit()]
+    return len(have) == wanted and all(f"{prefix}{k}{rest}" in names for k in range(wanted))
 
 
 def strided(fitter, pattern, per, shapes):

@@ -82,8 +82,10 @@ fn walk<'c>(
     }
     for (key, spec) in &class.configs {
         let Some((key, Value::Object(sub))) = config.get_key_value(key) else { continue };
-        let model_type = sub.get("model_type").and_then(Value::as_str).or(spec.model_type.as_deref());
-        let inner = model_type.and_then(|t| library.of_model_type(t, loader)).filter(|f| !std::ptr::eq(*f, file));
+        let inner = spec
+            .model_type_of(file, sub)
+            .and_then(|t| library.of_model_type(t, loader))
+            .filter(|f| !std::ptr::eq(*f, file));
         if let Some(inner) = inner {
             path.push(key);
             walk(library, inner, loader, sub, path, look);

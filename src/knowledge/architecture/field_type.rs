@@ -83,7 +83,10 @@ impl Kind {
             | (Self::Null, Value::Null)
             | (Self::Object, Value::Object(_))
             | (Self::List(None), Value::Array(_)) => true,
-            (Self::List(Some(inner)), Value::Array(items)) => items.iter().all(|item| inner.takes(item)),
+            // `Infinity` in a list of numbers is read as null.
+            (Self::List(Some(inner)), Value::Array(items)) => {
+                items.iter().all(|item| inner.takes(item) || item.is_null() && inner.0.contains(&Self::Float))
+            }
             (Self::Word(word), Value::String(text)) => word == text,
             _ => false,
         }
@@ -107,6 +110,7 @@ mod tests {
             ("int|null", json!(null), json!("3")),
             ("bool", json!(false), json!(0)),
             ("list[int|null]|str", json!([1, null]), json!([1, "a"])),
+            ("list[float]", json!([0.0, null]), json!([0.0, 1])),
             ("list[int|null]|str", json!("x"), json!({})),
             ("'relu'|'gelu'", json!("gelu"), json!("silu")),
             ("list", json!([]), json!(null)),

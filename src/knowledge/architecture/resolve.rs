@@ -123,10 +123,8 @@ impl Resolver<'_> {
             (None | Some(Value::Null), None) => return Ok(None),
             (Some(_), _) => return Err(Refusal::impossible(format!("`{key}` is not an object"))),
         };
-        if let Some(model_type) = &spec.model_type
-            && sub.get("model_type").is_none_or(Value::is_null)
-        {
-            sub.insert("model_type".to_owned(), model_type.clone().into());
+        if let Some(model_type) = spec.model_type_of(owner, &sub).map(str::to_owned) {
+            sub.insert("model_type".to_owned(), model_type.into());
         }
         sub.extend(evaluated(&spec.set, scope)?);
         fill(&mut sub, &spec.defaults);
@@ -151,7 +149,7 @@ impl Resolver<'_> {
     pub fn unknown_sub_config(&self, file: &Blueprint, config: &Map<String, Value>) -> Option<UnknownPart> {
         file.config(self.loader).configs.iter().find_map(|(key, spec)| {
             let sub = config.get(key)?.as_object()?;
-            let model_type = sub.get("model_type").and_then(Value::as_str).or(spec.model_type.as_deref())?;
+            let model_type = spec.model_type_of(file, sub)?;
             let is_known = spec.model_type.as_deref() == Some(model_type)
                 || self.library.of_model_type(model_type, self.loader).is_some();
             let part = || UnknownPart { config: key.clone(), model_type: Some(model_type.to_owned()), class: None };
