@@ -275,6 +275,8 @@ def settle(model_type, over, base, rng):
     elif model_type == "hubert" or model_type.startswith(("wav2vec2", "wavlm", "unispeech", "data2vec-audio", "sew")):
         over.pop("conv_dim", None)
     settle_stages(model_type, over, base, rng)
+    if model_type in ("deberta", "deberta-v2") and rng.random() < .6:     # words of a list, which do nothing without the flag
+        over.update(relative_attention=True, pos_att_type=rng.choice([["c2p"], ["p2c"], ["p2c", "c2p"], "p2c|c2p"]))
     text = over.get("text_config")
     width = text.get("hidden_size") if isinstance(text, dict) else None
     if width:

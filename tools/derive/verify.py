@@ -39,7 +39,7 @@ class Program:
 
 
 # The program says that it does not know the model a config chooses for a part: no wrong answer, and no right one.
-UNKNOWN_PART = re.compile(r"\) is not known here|is not known here$|which it has as a part, is not known")
+UNKNOWN_PART = re.compile(r"it is not known here: |\) is not known here|is not known here$|which it has as a part, is not known")
 
 
 def judged(record, answer):
