@@ -66,7 +66,7 @@ class Kept:
         self.entry = {"class": self.name, **{k: body[k] for k in ("base_model_prefix", "base_module") if k in body}}
         if wanted:
             self.entry["let"] = wanted
-        self.entry.update({k: v for k, v in body.items() if k not in self.entry and k != "not_predicted_when"})
+        self.entry.update({k: v for k, v in body.items() if k not in self.entry and k not in ("not_predicted_when", "refuses")})
 
     def texts(self):
         return list(strings(self.entry))

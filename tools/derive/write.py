@@ -12,6 +12,9 @@ from .tree import Clash, layout, nest
 
 FIELDS = ("auto", "inside", "aliases", "defaults", "computed", "unvaried", "types", "refuses", "configs")
 FILLED = ("aliases", "defaults", "unvaried", "types")
+# Conditions on which a class raises are derived (`refusals.py`) and not shipped yet: the draws seldom test them from both
+# sides, and a wrong one calls a sound checkpoint broken. `tests/peer/families.py` found one that was.
+REFUSALS = False
 MARK = re.compile(r"^  derived: ", re.MULTILINE)
 
 
@@ -179,7 +182,7 @@ class Writer:
             "computed": {k: text if mode == "filled" else {mode: text} for k, (text, mode) in computed.items() if k in used},
             "unvaried": v.unvaried(model_type, used),
             "types": by_type(v.configs.get(model_type, {}).get("types") or {}),
-            "refuses": [r for r in v.configs.get(model_type, {}).get("refuses", ()) if set(tops(r["when"])) <= used],
+            "refuses": [r for r in v.configs.get(model_type, {}).get("refuses", ()) if set(tops(r["when"])) <= used] if REFUSALS else [],
             "configs": {k: self.sub_config(v, model_type, k, spec) for k, spec in sorted(configs.items()) if k in used},
         }
 
@@ -268,7 +271,7 @@ class Writer:
     def refusals(self, v, fit):
         """What the class raises with, where it asks for nothing that its tensors do not."""
         used = self.used[v.version].get(fit.raw["model_type"], set())
-        return [r for r in fit.raw.get("refuses") or () if set(tops(r["when"])) <= used]
+        return [r for r in fit.raw.get("refuses") or () if set(tops(r["when"])) <= used] if REFUSALS else []
 
     def differs(self, name):
         """Whether the versions say different things of a class."""
