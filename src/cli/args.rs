@@ -79,7 +79,7 @@ pub struct ExpectArgs {
     /// Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3; the nearest known version that
     /// has the class is used [default: the version that the config names]
     #[arg(long = "for", value_name = "transformers==VERSION", value_parser = asked)]
-    pub version: Option<String>,
+    pub target: Option<String>,
     /// Output format; in jsonl, a config that fails has an "error" and the others are still printed
     #[arg(long, alias = "format", value_name = "FMT", default_value = "text")]
     pub output_format: ExpectFormat,

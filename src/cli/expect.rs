@@ -44,7 +44,7 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut failed = false;
     let mut list = Vec::new();
     let mut answer = |asked: Asked| -> anyhow::Result<()> {
-        let answer = build(&library, asked, args.version.as_deref());
+        let answer = build(&library, asked, args.target.as_deref());
         failed |= answer.built.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),
