@@ -43,7 +43,7 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
             match loader {
                 Loader::V4_47_0 => {}
                 Loader::V4_57_6 => {
-                    expected.conversions = class.key_mapping.iter().map(conversions::key_mapping).collect()
+                    expected.conversions = class.key_mapping.iter().map(conversions::key_mapping).collect();
                 }
                 Loader::V5_23_0 => {
                     expected.conversions = conversions::collect(library, &builder.modules, &class.base_model_prefix);
