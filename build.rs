@@ -1,4 +1,4 @@
-//! The program carries `rules/` inside: build it again when a file there changes or comes along.
+//! Rebuilds the program when a file in `rules/` changes: the program embeds this directory.
 
 #![allow(clippy::print_stdout, reason = "how a build script talks to cargo")]
 

@@ -1,15 +1,15 @@
-//! How long headers take to read: `cargo bench --bench headers [-- SHARD...]`
+//! Measures the time for reading headers: `cargo bench --bench headers [-- SHARD...]`
 //!
-//! Without a shard, a header of forty thousand tensors is made, as a model of experts has. `tools/overflow-checks` runs this
-//! with and without overflow checks.
+//! Without a shard, the bench generates a header of forty thousand tensors, as in a mixture-of-experts model.
+//! `tools/overflow-checks` runs it with and without overflow checks.
 
-#![allow(clippy::print_stdout, reason = "a bench says what it measured")]
+#![allow(clippy::print_stdout, reason = "a bench prints its result")]
 #![allow(
     clippy::arithmetic_side_effects,
     clippy::disallowed_methods,
     clippy::expect_used,
     clippy::indexing_slicing,
-    reason = "the input is the caller's own, and a bench that cannot go on says so"
+    reason = "a bench stops at the first error"
 )]
 
 use std::fmt::Write as _;
@@ -33,7 +33,7 @@ fn main() {
     for (name, bytes) in headers {
         let read = || Shard::parse("model.safetensors", 1 << 50, black_box(&bytes));
         let tensors = read().tensors.len();
-        // The fastest of many: what disturbs a run only ever makes it slower.
+        // The fastest of many runs, because disturbances only make a run slower.
         let fastest = (0..100).map(|_| {
             let begun = Instant::now();
             black_box(read());

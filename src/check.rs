@@ -1,4 +1,4 @@
-//! Compares what is there with what should be; pure functions from a checkpoint to findings.
+//! Compares a checkpoint with the knowledge about its class; pure functions from a checkpoint to findings.
 
 pub mod adapter;
 pub mod engine;
@@ -22,6 +22,6 @@ pub mod votes;
 pub use crate::knowledge::rule::Safety;
 pub use engine::{check, check_for};
 pub use finding::{Finding, Location, Severity};
-pub use fix::{Edit, FixHint, renamed};
+pub use fix::{Edit, FixHint, clamped, renamed};
 pub use outcome::Outcome;
 pub use suppressions::unused_suppressions;

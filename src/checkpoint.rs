@@ -1,7 +1,7 @@
-//! What is there: a checkpoint directory as data, faults included.
+//! A checkpoint directory as data, faults included.
 //!
-//! Bad content is never an error here. A broken `config.json` is a [`Document`] with faults and no
-//! tree; a broken shard is a [`Shard`] with faults and whatever entries could be read.
+//! Malformed content is never an error here. A broken `config.json` is a [`Document`] with faults and no value; a
+//! broken shard is a [`Shard`] with faults and the entries that could be read.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -33,48 +33,49 @@ pub use discover::{find_checkpoints, is_checkpoint, owner};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
 pub use entry::{Entry, EntryKind};
-pub use fault::{Fault, FaultKind, FaultSource, Place};
+#[cfg(feature = "internals")]
+pub use fault::FaultSource;
+pub use fault::{Fault, FaultKind, Place};
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::PythonModule;
 pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
-pub use sniff::looks_like;
 pub(crate) use text::hex;
-pub use text::{escape, line_column};
+pub use text::{escape, file_size, line_column};
 pub use tokenizer::{Tokenizer, Vocabulary};
 
-/// Folder in a checkpoint where a repair keeps what it takes to undo it.
+/// Folder in a checkpoint with the journal and the saved originals of a repair.
 pub const REPAIR_FOLDER: &str = ".ckpt-doctor";
-/// File in [`REPAIR_FOLDER`] that is there while a repair is being written.
+/// File in [`REPAIR_FOLDER`] that exists while a repair is written.
 pub const REPAIR_JOURNAL: &str = "journal.json";
 
-/// A model directory: everything a rule can ask about, and no tensor bytes.
+/// A model directory: all facts that rules use, without tensor bytes.
 #[derive(Debug, Clone, Default)]
 pub struct Checkpoint {
-    /// The directory.
+    /// Path of the directory.
     pub root: PathBuf,
-    /// Everything directly in it that is not hidden, by name.
+    /// All entries of the directory that are not hidden, by name.
     pub entries: BTreeMap<String, Entry>,
     /// JSON documents, by file name.
     pub documents: BTreeMap<String, Document>,
-    /// Safetensors shards, by file name; those on disk, whether an index names them or not.
+    /// Safetensors shards on disk, by file name, including shards that no index lists.
     pub shards: BTreeMap<String, Shard>,
-    /// The index, if there is one.
+    /// The index; `None` when the directory has none.
     pub index: Option<Index>,
     /// Python modules, by file name.
     pub modules: BTreeMap<String, PythonModule>,
     /// The tokenizer.
     pub tokenizer: Tokenizer,
-    /// Text of files that are neither document nor module, by name: `chat_template.jinja`.
+    /// Text of files that are neither documents nor modules, by name: `chat_template.jinja`.
     pub texts: BTreeMap<String, Arc<str>>,
-    /// What the tensors' bytes hold; `None` when they were not read.
+    /// Digests of the tensors' bytes; `None` unless [`Checkpoint::read_contents`] ran.
     pub contents: Option<Contents>,
-    /// Faults of the directory itself; [`Checkpoint::all_faults`] has those of its parts too.
+    /// Faults of the directory itself; [`Checkpoint::all_faults`] adds those of the files.
     pub faults: Vec<Fault>,
 }
 
-/// What a checkpoint that does not exist yet will consist of.
+/// Contents of a checkpoint that is not written yet, for [`Checkpoint::planned`] and [`Checkpoint::replaced`].
 #[derive(Debug, Clone, Default)]
 pub struct Parts {
     /// JSON documents.
@@ -83,15 +84,15 @@ pub struct Parts {
     pub shards: Vec<Shard>,
     /// Python modules.
     pub modules: Vec<PythonModule>,
-    /// Vocabularies that no document holds, by file name (`tokenizer.model`); a donor's
-    /// [`Tokenizer::vocabularies`] can be passed on as they are.
+    /// Vocabularies outside JSON documents, by file name (`tokenizer.model`). A donor's [`Tokenizer::vocabularies`] can
+    /// be reused.
     pub vocabularies: BTreeMap<String, Arc<Vocabulary>>,
-    /// Other files, and sizes where they matter; files named above need no entry.
+    /// Other files. Files listed above need no entry.
     pub entries: BTreeMap<String, Entry>,
 }
 
 impl Checkpoint {
-    /// A checkpoint that is not on disk yet, so that the same checks judge it as if it were.
+    /// Builds a checkpoint that is not on disk yet, so that a plan is checked like a directory.
     #[must_use]
     pub fn planned(root: impl Into<PathBuf>, parts: Parts) -> Self {
         let Parts { documents, shards, modules, vocabularies, mut entries } = parts;
@@ -123,9 +124,9 @@ impl Checkpoint {
         checkpoint
     }
 
-    /// The same checkpoint with these parts in place of those of the same name, or beside the others.
+    /// Clones the checkpoint with `parts` added; a part replaces the part of the same name.
     ///
-    /// Only what changed is worked out anew: entries of other files and the faults of the directory stay.
+    /// Index and tokenizer are derived again. Entries of other files and the faults of the directory stay.
     #[must_use]
     pub fn replaced(&self, parts: Parts) -> Self {
         let Parts { documents, shards, modules, mut vocabularies, entries } = parts;
@@ -156,7 +157,7 @@ impl Checkpoint {
         }
         let (index, faults) = (next.index.take(), std::mem::take(&mut next.tokenizer.faults));
         next.derive(vocabularies);
-        // Faults of keys given twice have moved from the document to the index: it is not read a second time.
+        // The first pass moved faults of duplicate keys from the document to the index, so an unchanged index is kept.
         if !indexed {
             next.index = index;
         }
@@ -176,7 +177,7 @@ impl Checkpoint {
         };
         if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
             self.index = Some(Index::from_document(document));
-            // The index reports these itself, under a kind of its own.
+            // The index reports duplicate keys under a kind of its own.
             document.faults.retain(|f| f.kind != FaultKind::DuplicateJsonKey);
         }
     }
@@ -193,20 +194,21 @@ impl Checkpoint {
         self.documents.get(name)
     }
 
-    /// Whether there is a file of this name, of any kind but a directory or a broken link.
+    /// Whether a file of this name exists; directories and broken links do not count.
     #[must_use]
     pub fn has_file(&self, name: &str) -> bool {
         self.entries.get(name).is_some_and(|e| !matches!(e.kind, EntryKind::Directory | EntryKind::Broken))
     }
 
-    /// Every tensor of every shard, in the order of shard names and headers.
+    /// Every tensor of every shard, by shard name and then in header order.
     pub fn tensors(&self) -> impl Iterator<Item = (&Shard, &Tensor)> {
         self.shards.values().flat_map(|shard| shard.tensors.iter().map(move |tensor| (shard, tensor)))
     }
 
-    /// The tensor of this name: from the shard the index names, or else the first that has it.
+    /// The tensor of this name: from the shard that the index maps it to, otherwise from the first shard that contains
+    /// it.
     ///
-    /// Looks through headers; to look up many names, collect [`Checkpoint::tensors`] once.
+    /// Searches the headers on each call; for many names, collect [`Checkpoint::tensors`] once.
     #[must_use]
     pub fn tensor(&self, name: &str) -> Option<(&Shard, &Tensor)> {
         let mapped = self.index.as_ref().and_then(|i| self.shards.get(i.weight_map.get(name)?));
@@ -214,7 +216,8 @@ impl Checkpoint {
         mapped.into_iter().chain(self.shards.values()).find_map(|s| Some((s, s.tensors.get(of(s)?)?)))
     }
 
-    /// Faults of the directory and of everything in it, by file name within each kind of part.
+    /// Faults of the directory, then of documents, index, shards, modules and tokenizer; by file name within each
+    /// group.
     pub fn all_faults(&self) -> impl Iterator<Item = &Fault> {
         let documents = self.documents.values().flat_map(|d| &d.faults);
         let index = self.index.iter().flat_map(|i| &i.faults);

@@ -15,14 +15,16 @@ mod output;
 mod rules;
 mod settings;
 mod signals;
-mod unasked;
+mod skipped;
+
 mod undo;
 
 use std::process::ExitCode;
 
-use ckpt_doctor::merge::PipelineError;
-use ckpt_doctor::surgery::{ApplyError, RepairError};
 use clap::Parser;
+
+use crate::merge::PipelineError;
+use crate::surgery::{ApplyError, RepairError};
 
 /// Whether a signal ended the run.
 fn interrupted(error: &anyhow::Error) -> bool {
@@ -31,6 +33,7 @@ fn interrupted(error: &anyhow::Error) -> bool {
 }
 
 /// Runs the program.
+#[must_use]
 pub fn main() -> ExitCode {
     let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
     let result = match &command {
@@ -46,7 +49,7 @@ pub fn main() -> ExitCode {
     match result {
         Ok(code) => ExitCode::from(code),
         Err(error) => {
-            // Names in an error may come from a checkpoint: nothing of them may reach the terminal raw.
+            // Names in an error may come from a checkpoint, so they are escaped.
             let causes: Vec<String> = error.chain().map(|e| output::safe(&e.to_string())).collect();
             let causes = causes.join(": ");
             if interrupted(&error) {

@@ -1,6 +1,7 @@
 //! Rules, architectures, processors, recipes and quantisation schemes, read from `rules/`, and their expressions.
 
 pub mod architecture;
+pub mod embeddings;
 pub mod evidence;
 pub mod expression;
 pub mod library;
@@ -21,6 +22,7 @@ pub use expression::{EvalError, Expression, Scope, Template};
 pub use library::Library;
 pub use loader::Loader;
 
+use embeddings::TokenEmbedding;
 use processor::Processor;
 use quantization::Scheme;
 use recipe::Recipe;
@@ -28,7 +30,7 @@ use rule::RuleSet;
 use settings::Policy;
 use source::DataError;
 
-/// Everything that a check or a merge is judged by. The caller chooses it once and passes it down.
+/// Data used by a check or a merge. The caller loads it once and passes it down.
 pub struct Knowledge {
     /// Rules.
     pub rules: RuleSet,
@@ -36,24 +38,26 @@ pub struct Knowledge {
     pub library: Library,
     /// Processors.
     pub processors: Vec<Processor>,
-    /// Recipes, of which a merge chooses one by its donors.
+    /// Recipes; a merge selects one by its donors.
     pub recipes: Vec<Recipe>,
     /// Quantisation schemes.
     pub schemes: Vec<Scheme>,
-    /// Suppressions of a settings file.
+    /// Names of token embeddings.
+    pub token_embedding: TokenEmbedding,
+    /// Severities and suppressions of a settings file for single findings.
     pub policy: Policy,
 }
 
 impl Knowledge {
-    /// The data files inside the program.
+    /// The built-in data files.
     ///
     /// # Errors
-    /// [`DataError`] for a file that cannot be used; the tests parse every file that is shipped.
+    /// [`DataError`] for a malformed file; the tests parse every built-in file.
     pub fn embedded() -> Result<Self, DataError> {
         Self::with(RuleSet::embedded()?, Library::embedded())
     }
 
-    /// The data files inside the program, with these rules and architectures.
+    /// The built-in data files, with these rules and architectures.
     ///
     /// # Errors
     /// As [`Self::embedded`].
@@ -64,6 +68,7 @@ impl Knowledge {
             processors: Processor::embedded()?,
             recipes: Recipe::embedded()?,
             schemes: Scheme::embedded()?,
+            token_embedding: TokenEmbedding::embedded()?,
             policy: Policy::default(),
         })
     }

@@ -1,9 +1,7 @@
 //! The `ckpt-doctor` program.
 
-mod cli;
-
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    cli::main()
+    ckpt_doctor::main()
 }

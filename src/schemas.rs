@@ -1,5 +1,5 @@
-//! The schemas in `schemas/`: generated from the types that read the data files, or that are written as JSON, and
-//! compared with every data file of this repository. `tests/it/reports/schemas.rs` compares them with real output.
+//! The schemas in `schemas/`: generated from the types that read data files or are written as JSON, and validated
+//! against every data file of this repository. `tests/it/reports/schemas.rs` validates real output.
 #![allow(clippy::disallowed_methods, reason = "reads the files of this repository, and writes its schemas on request")]
 
 use std::borrow::Cow;
@@ -40,8 +40,8 @@ macro_rules! text {
 }
 
 text!(Expression, "Expression", "An expression in CEL, the Common Expression Language: https://cel.dev");
-text!(Template, "Template", "Text with expressions in braces; a brace itself is written twice.");
-text!(Loader, "Loader", "A version of transformers; the nearest known one stands for it.");
+text!(Template, "Template", "Text with expressions in braces; a literal brace is doubled.");
+text!(Loader, "Loader", "A version of transformers; it is mapped to the nearest known one.");
 
 fn project() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -76,7 +76,7 @@ fn input<T: JsonSchema + DeserializeOwned>(name: &'static str, title: &str, file
     Input { name, schema: schema::<T>(title, SchemaSettings::draft2020_12()), files, read }
 }
 
-/// The schemas of what the program writes as JSON.
+/// The schemas of the program's JSON output.
 fn outputs() -> Vec<(&'static str, Value)> {
     let settings = || SchemaSettings::draft2020_12().for_serialize();
     vec![
@@ -93,7 +93,7 @@ fn schema<T: JsonSchema>(title: &str, settings: SchemaSettings) -> Value {
     schema
 }
 
-/// A map in the order it was written is a list in memory, and so is its default; in a file it is none.
+/// Removes defaults of ordered maps: they are lists in memory, but objects in a file.
 fn without_lists(schema: &mut Value) {
     if let Value::Object(map) = schema {
         if map.get("type") == Some(&json!("object")) && map.get("default") == Some(&json!([])) {
@@ -127,7 +127,7 @@ fn values(folder: &str) -> Vec<(PathBuf, Value)> {
     found
 }
 
-/// The settings in the fixtures, and what `init` writes.
+/// The settings in the fixtures, and the template of `init`.
 fn settings() -> Vec<(PathBuf, Value)> {
     let cases = values("fixtures");
     let mut found: Vec<_> =
@@ -154,7 +154,7 @@ fn schemas_are_fresh() {
 }
 
 #[test]
-fn every_shipped_file_is_valid_and_none_with_a_misspelt_key_is() {
+fn every_data_file_is_valid_and_unknown_keys_are_rejected() {
     for Input { name, schema, files, .. } in inputs() {
         let validator = jsonschema::draft202012::new(&schema).unwrap();
         assert!(!files.is_empty(), "{name}");
@@ -164,13 +164,13 @@ fn every_shipped_file_is_valid_and_none_with_a_misspelt_key_is() {
                 .map(|e| format!("{}: {}: {e}", path.display(), e.instance_path()))
                 .collect();
             assert!(wrong.is_empty(), "{}", wrong.join("\n"));
-            value["sumary"] = json!("a slip of the pen");
+            value["sumary"] = json!("an unknown key");
             assert!(!validator.is_valid(&value), "{}", path.display());
         }
     }
 }
 
-/// Editors find the schema of a file by its `$schema`; the program ignores the key.
+/// Editors find the schema of a file by its `$schema`; the program ignores this key.
 #[test]
 fn every_file_may_name_its_schema() {
     for Input { name, schema, files, read } in inputs() {
@@ -185,9 +185,9 @@ fn every_file_may_name_its_schema() {
     assert!(baseline.text().contains("a.json"), "{}", baseline.text());
 }
 
-/// The schema rejects what the program rejects, below the first level too.
+/// The schema rejects everything that the program rejects, at all levels.
 #[test]
-fn what_the_program_refuses_is_not_valid() {
+fn the_schema_rejects_what_the_program_rejects() {
     let of = |name: &str| {
         let input = inputs().into_iter().find(|input| input.name == name).unwrap();
         jsonschema::draft202012::new(&input.schema).unwrap()

@@ -1,4 +1,4 @@
-//! Plans changes to checkpoints and writes them; the only stage that writes checkpoints.
+//! Plans and writes changes of checkpoints; the only stage that writes them.
 
 mod apply;
 mod changes;

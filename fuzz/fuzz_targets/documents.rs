@@ -1,4 +1,4 @@
-//! JSON documents: read, faults explained, places found again.
+//! JSON documents: values, faults and their places.
 
 #![no_main]
 

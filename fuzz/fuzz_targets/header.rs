@@ -1,8 +1,7 @@
 //! Shard headers.
 //!
-//! The first byte says what the rest is: 255, a whole file; anything else, a header in front of so many bytes of data
-//! (0: as many as its entries ask for). A length field that the fuzzer had to keep in step would cost it most of its
-//! inputs.
+//! The first byte selects the input: 255 is a whole file; any other value is a header with that many bytes of data (0: as
+//! many as its entries need). The length field is computed, because most inputs with a random one would be invalid.
 
 #![no_main]
 
@@ -14,7 +13,7 @@ use std::cell::RefCell;
 use ckpt_doctor::checkpoint::Shard;
 use libfuzzer_sys::fuzz_target;
 
-/// Most bytes of data put behind a header.
+/// Maximum number of data bytes after a header.
 const MOST: u64 = 1 << 16;
 
 thread_local! {

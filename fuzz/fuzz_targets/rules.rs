@@ -1,7 +1,7 @@
 //! The data files that a user may write: rules, recipes, architectures, quantisation schemes, expressions.
 //!
-//! The first byte says which. Expressions come in inputs of their own: their parser is so slow that files full of them
-//! would leave the fuzzer no time for the files.
+//! The first byte selects the kind. Expressions have inputs of their own, because their parser is slow; files with many
+//! expressions would take most of the time.
 
 #![no_main]
 

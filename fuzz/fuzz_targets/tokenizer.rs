@@ -1,4 +1,4 @@
-//! The files of a tokenizer. The first byte says which one the rest is; 0xff bytes separate several.
+//! The files of a tokenizer. The first byte selects the file; 0xff bytes separate several files.
 
 #![no_main]
 
@@ -20,7 +20,7 @@ const FILES: [&str; 7] = [
 fuzz_target!(|data: &[u8]| {
     let Some((first, rest)) = data.split_first() else { return };
     if *first == 0 {
-        // A protocol buffer may hold any byte.
+        // A protocol buffer may contain any byte.
         return invariants::documents::tokenizer(&[("tokenizer.model", rest)]);
     }
     let mut files = Vec::with_capacity(4);

@@ -19,7 +19,7 @@ use targets::Targets;
 /// The tensors of one module.
 type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
-/// Faults of the adapter in this directory; none when there is none.
+/// Faults of the adapter in this directory; none without an adapter.
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return Vec::new() };
@@ -36,7 +36,7 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
         }
         Some(_) => {}
     }
-    // What is wrong with a config that is no object the document says itself.
+    // A config that is not an object has a fault of its own.
     let Some(config) = adapter.config() else { return faults };
     let text = |key: &str| config.get(key).and_then(Value::as_str);
     let base = text("base_model_name_or_path").unwrap_or_default();
@@ -107,7 +107,7 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
     let is_saved = |module: &&str| whole.iter().any(|name| format!(".{name}").contains(&format!(".{module}.")));
     if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
         let at = Place::file(CONFIG).pointer("/modules_to_save");
-        faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.join(", ")));
+        faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.clone()));
     }
 }
 

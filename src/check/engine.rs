@@ -5,25 +5,33 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::finding::{Finding, Location, Skipped};
+use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
-use super::load::Stored;
+use super::load::{self, Stored, Target};
 use super::outcome::Outcome;
 use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
-use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Rule};
-use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
+use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Object, Rule};
+use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
 
-/// Findings of one rule that are kept; the last one says how many more there are.
-const CAP: usize = 100;
+/// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
+const CAP: usize = 1000;
 
-/// Steps that a user's own rule may take over one checkpoint: elements its loops go over, and values they gather.
+/// Steps that a user's rule may take for one checkpoint: elements that its loops visit, and values that they collect.
 const STEPS: u64 = 2_000_000;
 
-/// Places of one finding that are kept.
-const PLACES: usize = 20;
+/// Places of one finding that are kept, for the same reason.
+const PLACES: usize = 1000;
+
+/// What every rule of a run sees.
+struct Context<'a> {
+    bench: Bench<'a>,
+    /// The versions of transformers of the run.
+    targets: Vec<Target>,
+}
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
 #[must_use]
@@ -31,7 +39,7 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     check_for(checkpoint, knowledge, &[])
 }
 
-/// Runs every rule over a checkpoint, for these versions of transformers; for those of [`check`] when there are none.
+/// As [`check`], for these versions of transformers unless the list is empty.
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
@@ -50,7 +58,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         ..Outcome::default()
     };
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
-    let rows = embedding_rows(checkpoint);
+    let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
     faults.extend(tokens::faults(checkpoint, rows));
     let opened = outcome.architecture.as_deref().and_then(|name| {
         let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
@@ -59,15 +67,17 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
-    scope.bind("loaders", &json!(loaders(config, versions)));
-    variables::bind_loads(&mut scope, outcome.loads.clone());
+    let targets = load::wanted(config, versions);
+    let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
+    scope.bind("loaders", &leading.collect());
+    variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
-    let bench = Bench::new(checkpoint);
+    let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
     for rule in &knowledge.rules.rules {
-        // Rules of the program are known to end; of a user's rule that is found out.
+        // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
-            Some(_) => within(STEPS, || ask(rule, &bench, &faults, &scope, architecture)),
-            None => (ask(rule, &bench, &faults, &scope, architecture), false),
+            Some(_) => within(STEPS, || evaluate(rule, &context, &faults, &scope, architecture)),
+            None => (evaluate(rule, &context, &faults, &scope, architecture), false),
         };
         if stopped {
             let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
@@ -92,25 +102,16 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome
 }
 
-/// What the rules that name these faults make of them, outside the checks of a checkpoint.
+/// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
-    let asked = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
-    let rules = knowledge.rules.rules.iter().filter(asked);
-    let bench = Bench::new(checkpoint);
+    let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
+    let rules = knowledge.rules.rules.iter().filter(named);
+    // Without a loader: these faults concern no load.
+    let context = Context { bench: Bench::new(checkpoint), targets: Vec::new() };
     let mut findings: Vec<Finding> =
-        rules.flat_map(|rule| run(rule, &bench, faults, &Scope::new()).unwrap_or_default()).collect();
+        rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);
     findings
-}
-
-/// Versions of the loaders that the checkpoint has to load under.
-fn loaders(config: Option<&Value>, versions: &[String]) -> Vec<&'static str> {
-    let wrote = config.and_then(|c| c.get("transformers_version")).and_then(Value::as_str);
-    match (versions, wrote) {
-        ([], None) => vec![Loader::NEWEST.version()],
-        ([], Some(version)) => vec![Loader::nearest(version).version()],
-        (asked, _) => asked.iter().map(|version| Loader::nearest(version).version()).collect(),
-    }
 }
 
 fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
@@ -124,26 +125,16 @@ fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
     )
 }
 
-/// Rows of the token embedding: what every token id has to stay below.
-fn embedding_rows(checkpoint: &Checkpoint) -> Option<u64> {
-    const NAMES: [&str; 5] = [
-        "embed_tokens.weight",
-        "transformer.wte.weight",
-        "word_embeddings.weight",
-        "gpt_neox.embed_in.weight",
-        "tok_embeddings.weight",
-    ];
-    checkpoint
-        .tensors()
-        .filter(|(_, t)| NAMES.iter().any(|n| t.name.ends_with(n)) && !t.name.contains("spatial_embed"))
-        .filter_map(|(_, t)| if t.shape.len() == 2 { t.shape.first().copied() } else { None })
-        .max()
+/// Rows of the largest token embedding, which every token id must stay below; `None` without one.
+fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option<u64> {
+    let embeddings = checkpoint.tensors().filter(|(_, t)| embedding.matches(&t.name, &t.shape));
+    embeddings.filter_map(|(_, t)| t.shape.first().copied()).max()
 }
 
-/// A rule's findings, or why it was not asked.
-fn ask(
+/// The findings of a rule, or the reason why it was skipped.
+fn evaluate(
     rule: &Rule,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
     architecture: Option<&str>,
@@ -152,39 +143,41 @@ fn ask(
         let is = architecture.unwrap_or("unknown");
         return Err(format!("applies to {}; the architecture is {is}", rule.applies.join(", ")));
     }
-    let cannot = |expression: &Expression, error: &EvalError| match variables::absent(bench.checkpoint, expression) {
-        Some(file) => format!("{file} is missing"),
-        None => format!("cannot be evaluated: {}", error.cause),
-    };
+    let cannot =
+        |expression: &Expression, error: &EvalError| match variables::absent(context.bench.checkpoint, expression) {
+            Some(file) => format!("{file} is missing"),
+            None => format!("cannot be evaluated: {}", error.cause),
+        };
     if let Some(when) = &rule.when {
         match when.eval_bool(scope) {
             Ok(true) => {}
-            Ok(false) => return Err(format!("condition is false: {when}")),
+            // The expression means something to the author of a rule only.
+            Ok(false) if rule.origin.is_some() => return Err(format!("condition is false: {when}")),
+            Ok(false) => return Err("the condition of the rule is false".to_owned()),
             Err(error) => return Err(cannot(when, &error)),
         }
     }
-    run(rule, bench, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
+    run(rule, context, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
-/// An expression that could not be evaluated, and why.
-type Unasked<'r> = (&'r Expression, EvalError);
+/// An expression that could not be evaluated, and the error.
+type Unevaluated<'r> = (&'r Expression, EvalError);
 
 fn run<'r>(
     rule: &'r Rule,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
-) -> Result<Vec<Finding>, Unasked<'r>> {
+) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let mut findings = match &rule.check {
-        Check::Fault(check) => from_faults(rule, check, bench, faults, scope),
-        Check::Assert(check) => from_assert(rule, check, bench, scope)?,
+        Check::Fault(check) => from_faults(rule, check, context, faults, scope),
+        Check::Assert(check) => from_assert(rule, check, context, scope)?,
     };
     let more = findings.len().saturating_sub(CAP);
     if more > 0 {
         findings.truncate(CAP);
         if let Some(last) = findings.last_mut() {
-            last.message = format!("{} (and {more} more of {})", last.message, rule.code);
-            last.evidence.insert("more".to_owned(), json!(more));
+            last.hidden = last.hidden.saturating_add(more as u64);
         }
     }
     Ok(findings)
@@ -193,7 +186,7 @@ fn run<'r>(
 fn from_faults(
     rule: &Rule,
     check: &FaultCheck,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Vec<Finding> {
@@ -205,67 +198,79 @@ fn from_faults(
         let all: Vec<&Fault> = matching.collect();
         let Some(first) = all.first() else { return Vec::new() };
         let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
+        let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
         let mut evidence = first.detail.clone();
-        evidence.insert("count".to_owned(), json!(all.len()));
-        let fix = all.iter().map(|f| hint(rule, bench, f, &fault_scope(scope, f, all.len())));
+        evidence.insert("count".to_owned(), json!(count));
+        let fix = all.iter().map(|f| hint(rule, context, f, &fault_scope(scope, f, count)));
         let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
-        return vec![finding(rule, &fault_scope(scope, first, all.len()), places, evidence, fix)];
+        let mut inner = fault_scope(scope, first, count);
+        inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
+        let mut caused = Caused::default();
+        for fault in all.iter().take(PLACES) {
+            caused.add(rule, &context.targets, &fault.loaders, &fault_scope(scope, fault, count));
+        }
+        return vec![finding(rule, &inner, caused, places, evidence, fix)];
     }
     let mut out = Vec::new();
-    // Of a kind that one file has too often the reader keeps some, and says with the last how many more there were.
-    let unkept = |fault: &Fault| fault.detail.get("more").and_then(Value::as_u64).unwrap_or(0);
     let mut more = 0_u64;
     for fault in matching.by_ref().take(CAP) {
         let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
-        more = more.saturating_add(unkept(fault));
+        more = more.saturating_add(fault.hidden);
         let inner = fault_scope(scope, fault, 1);
-        let fix = hint(rule, bench, fault, &inner);
-        out.push(finding(rule, &inner, locate(&places), fault.detail.clone(), fix));
+        let fix = hint(rule, context, fault, &inner);
+        let mut caused = Caused::default();
+        caused.add(rule, &context.targets, &fault.loaders, &inner);
+        out.push(finding(rule, &inner, caused, locate(&places), fault.detail.clone(), fix));
     }
-    // The rest is only counted, and repaired with the last where each has a place of its own in a text.
+    // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
     for fault in matching {
-        more = more.saturating_add(unkept(fault)).saturating_add(1);
+        more = more.saturating_add(fault.hidden).saturating_add(1);
         let last = out.last_mut().and_then(|last| last.fix.as_mut());
         if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
-            && let Some(fix) = hint(rule, bench, fault, &fault_scope(scope, fault, 1))
+            && let Some(fix) = hint(rule, context, fault, &fault_scope(scope, fault, 1))
             && fix.safety == last.safety
         {
             last.edits.extend(fix.edits);
         }
     }
-    if more > 0
-        && let Some(last) = out.last_mut()
-    {
-        last.message = format!("{} (and {more} more of {})", last.message, rule.code);
-        last.evidence.insert("more".to_owned(), json!(more));
+    if let Some(last) = out.last_mut() {
+        last.hidden = more;
     }
     out
 }
 
-/// A fault's `kind` and details as variables, with `file`, `tensor` and `pointer` of its first place.
-fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: usize) -> Scope<'a> {
+/// The variables of a rule on faults, for one of `count` faults.
+fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: u64) -> Scope<'a> {
     let mut inner = scope.child();
-    let place = fault.places.first().cloned().unwrap_or_default();
-    inner.bind("kind", &json!(fault.kind));
-    inner.bind("file", &json!(place.file));
-    inner.bind("tensor", &json!(place.tensor));
-    inner.bind("pointer", &json!(place.pointer));
-    inner.bind_int("count", count as u64);
-    for (name, value) in &fault.detail {
+    inner.bind_int("count", count);
+    for (name, value) in &variables(fault) {
         inner.bind(name, value);
     }
     inner.bind("fault", &Value::Object(fault.detail.clone()));
     inner
 }
 
+/// Kind, first place and details of a fault, by the names that rules use.
+fn variables(fault: &Fault) -> Map<String, Value> {
+    let place = fault.places.first().cloned().unwrap_or_default();
+    let own = [
+        ("kind", json!(fault.kind)),
+        ("file", json!(place.file)),
+        ("tensor", json!(place.tensor)),
+        ("pointer", json!(place.pointer)),
+    ];
+    let own = own.into_iter().map(|(name, value)| (name.to_owned(), value));
+    own.chain(fault.detail.clone()).collect()
+}
+
 fn from_assert<'r>(
     rule: &'r Rule,
     check: &'r Assert,
-    bench: &Bench<'_>,
+    context: &Context<'_>,
     scope: &Scope<'_>,
-) -> Result<Vec<Finding>, Unasked<'r>> {
+) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let Some(each) = &check.each else {
-        let found = one_assert(rule, check, bench, scope).map_err(|error| (&check.that, error))?;
+        let found = one_assert(rule, check, context, scope).map_err(|error| (&check.that, error))?;
         return Ok(found.into_iter().collect());
     };
     let items = match each.eval(scope).map_err(|error| (each, error))? {
@@ -276,19 +281,26 @@ fn from_assert<'r>(
     for item in items {
         let mut inner = scope.child();
         inner.bind("it", &item);
-        // A value that is not there cannot be wrong: whether it has to be there is another rule's question.
-        out.extend(one_assert(rule, check, bench, &inner).unwrap_or(None));
+        // A missing value cannot be wrong; another rule reports it when it is required.
+        out.extend(one_assert(rule, check, context, &inner).unwrap_or(None));
     }
     Ok(out)
 }
 
-fn one_assert(rule: &Rule, check: &Assert, bench: &Bench<'_>, scope: &Scope<'_>) -> Result<Option<Finding>, EvalError> {
+fn one_assert(
+    rule: &Rule,
+    check: &Assert,
+    context: &Context<'_>,
+    scope: &Scope<'_>,
+) -> Result<Option<Finding>, EvalError> {
     if check.that.eval_bool(scope)? {
         return Ok(None);
     }
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
-    let fix = fix::hint(&rule.fixes, &Site { bench, fault: None, scope });
-    Ok(Some(finding(rule, scope, locate(&places), Map::new(), fix)))
+    let fix = fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: None, scope });
+    let mut caused = Caused::default();
+    caused.add(rule, &context.targets, &[], scope);
+    Ok(Some(finding(rule, scope, caused, locate(&places), Map::new(), fix)))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {
@@ -296,25 +308,26 @@ fn place(at: &At, scope: &Scope<'_>) -> Place {
     Place { file: render(&at.file), span: None, pointer: render(&at.pointer), tensor: render(&at.tensor) }
 }
 
-fn hint(rule: &Rule, bench: &Bench<'_>, fault: &Fault, scope: &Scope<'_>) -> Option<FixHint> {
-    fix::hint(&rule.fixes, &Site { bench, fault: Some(fault), scope })
+fn hint(rule: &Rule, context: &Context<'_>, fault: &Fault, scope: &Scope<'_>) -> Option<FixHint> {
+    fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: Some(fault), scope })
 }
 
-/// The fix of a finding that stands for several faults: all their edits, where each has some of the same safety.
+/// The fix of a finding for several faults: all their edits, if they have the same safety.
 fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
     let (first, next) = (first?, next?);
-    let mut edits = Vec::new();
-    if first.safety == next.safety {
-        edits = first.edits;
-        let new: Vec<_> = next.edits.into_iter().filter(|edit| edits.last() != Some(edit)).collect();
-        edits.extend(new);
+    if first.safety != next.safety {
+        return Some(first.without_edits());
     }
-    Some(FixHint::new(first.safety, first.title, edits))
+    let FixHint { mut edits, .. } = first;
+    let new: Vec<_> = next.edits.into_iter().filter(|edit| edits.last() != Some(edit)).collect();
+    edits.extend(new);
+    Some(FixHint { edits, ..first })
 }
 
 fn finding(
     rule: &Rule,
     scope: &Scope<'_>,
+    caused: Caused,
     locations: Vec<Location>,
     evidence: Map<String, Value>,
     fix: Option<FixHint>,
@@ -322,15 +335,60 @@ fn finding(
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity: rule.severity,
+        severity: rule.severity_given(caused.leading, !caused.effects.is_empty()),
         message: rule.message.render(scope),
+        details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
+        effects: caused.effects,
         locations,
         evidence,
         fix,
+        hidden: 0,
     }
 }
 
-/// Places as locations; [`pinpoint`] says where in their files they stand.
+/// The effects of one finding.
+#[derive(Default)]
+struct Caused {
+    /// One effect for each object, loader and consequence.
+    effects: Vec<FindingEffect>,
+    /// Whether a leading loader has one.
+    leading: bool,
+}
+
+impl Caused {
+    /// Adds the effects of `rule` under the loaders of a fault; all of the run if `loaders` is empty.
+    fn add(&mut self, rule: &Rule, targets: &[Target], loaders: &[&str], scope: &Scope<'_>) {
+        for effect in &rule.effects {
+            let holds = |when: &Expression| when.eval_bool(scope).unwrap_or(false);
+            if !effect.when.as_ref().is_none_or(holds) {
+                continue;
+            }
+            let file = scope.get("file");
+            let reader = || Object::reading(file.as_ref()?.as_str()?);
+            let Some(object) = effect.object.or_else(reader) else { continue };
+            for target in targets {
+                let loader = target.loader.version();
+                let is_meant = loaders.is_empty() || loaders.contains(&loader);
+                let same = |e: &FindingEffect| {
+                    (e.object, e.outcome, e.loader.as_str()) == (object, effect.consequence, loader)
+                };
+                if !is_meant || !effect.loaders.contains(target.version()) || self.effects.iter().any(same) {
+                    continue;
+                }
+                self.leading |= target.leads;
+                self.effects.push(FindingEffect {
+                    object,
+                    loader: loader.to_owned(),
+                    stands_for: target.stands_for.clone(),
+                    outcome: effect.consequence,
+                    text: effect.text.render(scope),
+                });
+            }
+        }
+    }
+}
+
+/// Places as locations; [`pinpoint`] adds their lines and columns.
 fn locate(places: &[Place]) -> Vec<Location> {
     let location = |place: &Place| Location {
         file: place.file.clone(),
@@ -344,7 +402,7 @@ fn locate(places: &[Place]) -> Vec<Location> {
 
 /// Gives locations their line and column; a pointer that names no value points at the nearest parent.
 ///
-/// All at once, so that each text is read once, however many findings point into it.
+/// Takes all findings at once, so that each text is scanned once.
 fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
     let mut locators: BTreeMap<String, Option<Locator<'_>>> = BTreeMap::new();
     for location in findings.iter_mut().flat_map(|f| &mut f.locations) {
@@ -372,7 +430,7 @@ fn nearest(locator: &mut Locator<'_>, mut pointer: &str) -> Option<std::ops::Ran
             return Some(span);
         }
         pointer = pointer.rsplit_once('/')?.0;
-        // The whole document says nothing.
+        // The whole document is no place to point at.
         if pointer.is_empty() {
             return None;
         }

@@ -1,4 +1,4 @@
-//! What a rule found: the unit every report is made of.
+//! Findings: what rules report, and load reports.
 
 use std::ops::Range;
 
@@ -6,11 +6,12 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::fix::FixHint;
-pub use crate::knowledge::rule::Severity;
+pub use crate::knowledge::rule::{Consequence, Object, Severity};
 
 /// Where a finding points: a file, a place in it, a tensor.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Location {
     /// File name within the checkpoint.
     pub file: Option<String>,
@@ -30,21 +31,62 @@ pub struct Location {
 /// One finding of one rule.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Finding {
-    /// Rule code, `CFG004`.
+    /// Rule code, `IDX005`.
     pub code: String,
     /// Rule name in kebab case; it states the fault.
     pub name: String,
     /// Severity.
     pub severity: Severity,
-    /// One sentence that names the cause, with the figures at hand.
+    /// One sentence that names the cause, with figures.
     pub message: String,
+    /// Further facts, one sentence each.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub details: Vec<String>,
+    /// What loaders of the run do because of it, the leading ones first.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub effects: Vec<FindingEffect>,
     /// Places; empty if the finding concerns the whole checkpoint.
     pub locations: Vec<Location>,
     /// The figures behind the message.
     pub evidence: Map<String, Value>,
     /// The fix, or the manual step.
     pub fix: Option<FixHint>,
+    /// Further findings of the rule that are counted and not listed, because one file or one checkpoint has too many.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub hidden: u64,
+}
+
+impl Finding {
+    /// The number of findings that it counts for: itself, and the hidden ones.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        usize::try_from(self.hidden).unwrap_or(usize::MAX).saturating_add(1)
+    }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
+const fn is_zero(n: &u64) -> bool {
+    *n == 0
+}
+
+/// What one loader does with one object because of a finding.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct FindingEffect {
+    /// The object that fails.
+    pub object: Object,
+    /// Version of transformers that was read for this effect: `4.47.0`.
+    pub loader: String,
+    /// The version that the user named, or that wrote config.json, when `loader` stands for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stands_for: Option<String>,
+    /// How the object fails.
+    pub outcome: Consequence,
+    /// The exception with its message, or what becomes wrong.
+    pub text: String,
 }
 
 /// A finding that settings or a baseline accept.

@@ -1,4 +1,4 @@
-//! Fixes: what a rule's `fix` comes to for one finding. Nothing here changes a checkpoint.
+//! Resolves the fixes of a rule for one finding. Nothing here changes a checkpoint.
 
 use std::cell::OnceCell;
 use std::ops::Range;
@@ -8,75 +8,77 @@ use serde_json::Value;
 
 use crate::checkpoint::{Checkpoint, Fault, Place};
 use crate::knowledge::rule::{EditSpec, Fix, Safety};
-use crate::knowledge::{Scope, source};
+use crate::knowledge::{Scope, Template, source};
 
 mod repairs;
 
-/// One change to a checkpoint. The edits of a fix are made together or not at all.
+/// One change to a checkpoint. `check --fix` makes all edits of a fix, or none.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Edit {
-    /// Puts text in place of bytes of a document or module.
+    /// Replaces bytes of a document or module.
     Splice {
         /// File name.
         file: String,
         /// Bytes of its text.
         range: Range<usize>,
-        /// What comes in their place.
+        /// The new text.
         text: String,
     },
-    /// Gives a value of a JSON document another, or adds it.
+    /// Sets a value of a JSON document; adds it when missing.
     Set {
         /// File name.
         file: String,
         /// JSON pointer.
         pointer: String,
-        /// The value.
+        /// The new value.
         value: Value,
     },
-    /// Takes a member of a JSON document away.
+    /// Removes a member of a JSON document.
     Remove {
         /// File name.
         file: String,
         /// JSON pointer.
         pointer: String,
     },
-    /// Writes a document or module, in place of what is there.
+    /// Writes a document or module, replacing the file.
     Write {
         /// File name.
         file: String,
         /// Its text.
         text: String,
     },
-    /// Writes a document in UTF-8 that is in another encoding.
+    /// Converts a document to UTF-8.
     Reencode {
         /// File name.
         file: String,
     },
-    /// Rebuilds the index from the headers of these shards; of its entries for others those are kept that lead nowhere.
+    /// Rebuilds the index from the headers of these shards. Entries for tensors that no shard holds stay, and so does a
+    /// `total_size` that is a byte count.
     Index {
         /// File name of the index.
         file: String,
         /// The shards, by file name.
         shards: Vec<String>,
     },
-    /// Writes the header of a shard anew, with `"format": "pt"` beside the metadata it has; tensors stay as they are.
+    /// Rewrites the header of a shard, with `"format": "pt"` added to its metadata; the bytes of the tensors stay.
     Header {
         /// File name of the shard.
         file: String,
     },
-    /// Gives tensors whose names start so another start, in the shards and in the index.
+    /// Replaces prefixes of tensor names, in the shards and in the index.
     Rename {
-        /// How names start, and how they start afterwards; of several that fit the first counts.
+        /// Old and new prefix; the first that matches a name applies.
         prefixes: Vec<(String, String)>,
     },
 }
 
 impl Edit {
-    /// The file whose text it changes in places; `None` where a whole file is written.
+    /// The text file that the edit changes in place; `None` for edits that write whole files.
     #[must_use]
-    pub const fn text_file(&self) -> Option<&String> {
+    pub(crate) const fn text_file(&self) -> Option<&String> {
         match self {
             Self::Splice { file, .. } | Self::Set { file, .. } | Self::Remove { file, .. } => Some(file),
             _ => None,
@@ -84,36 +86,71 @@ impl Edit {
     }
 }
 
-/// The name of a tensor after a renaming by prefixes; `None` where none of them fits.
+/// The largest float32 of the sign of `Infinity` or `-Infinity`; `None` for `NaN`, which no number stands for.
+///
+/// Repairs and merges write it where strict JSON needs a finite number. A division by it, or a comparison with it, gives
+/// what the infinity gives, up to float32.
+#[must_use]
+pub fn clamped(literal: &str) -> Option<Value> {
+    match literal {
+        "Infinity" => Some(Value::from(f64::from(f32::MAX))),
+        "-Infinity" => Some(Value::from(f64::from(f32::MIN))),
+        _ => None,
+    }
+}
+
+/// The name of a tensor after its prefix was replaced; `None` when no prefix matches.
 #[must_use]
 pub fn renamed(prefixes: &[(String, String)], name: &str) -> Option<String> {
     prefixes.iter().find_map(|(from, to)| Some(format!("{to}{}", name.strip_prefix(from.as_str())?)))
 }
 
-/// What can be done about a finding.
+/// The resolved fix of a finding.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct FixHint {
-    /// How safe it is.
+    /// Safety of the edits; `manual` without edits.
     pub safety: Safety,
-    /// The step, as an imperative sentence.
-    pub title: String,
-    /// What `check --fix` does about it; none when that is for a person to do.
+    /// What the edits do, as an imperative; present exactly when there are edits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub title: Option<String>,
+    /// What a person should do, as an imperative; always present without edits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub help: Option<String>,
+    /// The changes that `check --fix` makes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub edits: Vec<Edit>,
 }
 
 impl FixHint {
-    /// A fix of these edits; without any it is a manual one, whatever the rule hoped for.
+    /// A fix with edits.
     #[must_use]
     pub fn new(safety: Safety, title: impl Into<String>, edits: Vec<Edit>) -> Self {
-        let safety = if edits.is_empty() { Safety::Manual } else { safety };
-        Self { safety, title: title.into(), edits }
+        Self { safety, title: Some(title.into()), help: None, edits }
     }
 
-    /// Whether `check --fix` may do it: safe ones always, unsafe ones when they are asked for.
+    /// Advice without edits.
     #[must_use]
-    pub fn is_permitted(&self, unsafe_fixes: bool) -> bool {
+    pub(crate) fn manual(help: impl Into<String>) -> Self {
+        Self { safety: Safety::Manual, title: None, help: Some(help.into()), edits: Vec::new() }
+    }
+
+    /// The same as advice, without its edits.
+    #[must_use]
+    pub fn without_edits(self) -> Self {
+        Self::manual(self.help.or(self.title).unwrap_or_default())
+    }
+
+    /// What the edits do; for a manual fix, the advice.
+    #[must_use]
+    pub fn title(&self) -> &str {
+        self.title.as_deref().or(self.help.as_deref()).unwrap_or_default()
+    }
+
+    /// Whether `check --fix` makes this fix: safe ones always, unsafe ones with `--unsafe-fixes`.
+    #[must_use]
+    pub(crate) fn is_permitted(&self, unsafe_fixes: bool) -> bool {
         match self.safety {
             Safety::Safe => true,
             Safety::Unsafe => unsafe_fixes,
@@ -122,10 +159,10 @@ impl FixHint {
     }
 }
 
-/// What fixes of one checkpoint share: what takes long is worked out once.
+/// Shared by the fixes of one checkpoint, so that slow work is done once.
 pub(super) struct Bench<'a> {
     pub(super) checkpoint: &'a Checkpoint,
-    /// The edit that rebuilds the index, if that can be done.
+    /// The edit that rebuilds the index; `None` when that is impossible.
     index: OnceCell<Option<Edit>>,
 }
 
@@ -135,10 +172,10 @@ impl<'a> Bench<'a> {
     }
 }
 
-/// What a repair sees of a finding.
+/// The finding that a fix is resolved for.
 pub(super) struct Site<'a> {
     pub(super) bench: &'a Bench<'a>,
-    /// The fault it comes from, if it comes from one.
+    /// The fault that the finding reports, for a rule on faults.
     pub(super) fault: Option<&'a Fault>,
     pub(super) scope: &'a Scope<'a>,
 }
@@ -148,26 +185,34 @@ impl<'a> Site<'a> {
         self.bench.checkpoint
     }
 
-    /// The place the finding points at first.
+    /// The first place of the finding.
     fn place(&self) -> Option<&Place> {
         self.fault.and_then(|fault| fault.places.first())
     }
 }
 
-/// The fix of a finding: the first whose condition holds and whose edits can be made, or else the first that could be.
+/// The fix of a finding: the first whose condition holds and whose edits can be made; if none can, the first whose condition
+/// holds, as advice.
 pub(super) fn hint(fixes: &[Fix], site: &Site<'_>) -> Option<FixHint> {
     let holds = |fix: &&Fix| fix.when.as_ref().is_none_or(|when| when.eval_bool(site.scope).unwrap_or(false));
-    let mut without_edits = None;
+    let render = |text: &Option<Template>| text.as_ref().map(|text| text.render(site.scope));
+    let resolved =
+        |fix: &Fix, edits| FixHint { safety: fix.safety, title: render(&fix.title), help: render(&fix.help), edits };
+    let mut advice = None;
     for fix in fixes.iter().filter(holds) {
-        if let Some(edits) = each(fix, site) {
-            return Some(FixHint::new(fix.safety, fix.help.render(site.scope), edits));
+        let edits = each(fix, site);
+        let decided = edits.is_some();
+        let hint = resolved(fix, edits.unwrap_or_default());
+        let hint = if hint.edits.is_empty() { hint.without_edits() } else { hint };
+        if decided {
+            return Some(hint);
         }
-        without_edits = without_edits.or(Some(fix));
+        advice = advice.or(Some(hint));
     }
-    without_edits.map(|fix| FixHint::new(fix.safety, fix.help.render(site.scope), Vec::new()))
+    advice
 }
 
-/// The edits of a fix for each element of its list; `None` when one cannot be made, or there is no element.
+/// The edits of a fix for each element of its list; `None` when one cannot be made or the list is empty.
 fn each(fix: &Fix, site: &Site<'_>) -> Option<Vec<Edit>> {
     let Some(each) = &fix.each else { return made(&fix.edits, site) };
     let Ok(Value::Array(items)) = each.eval(site.scope) else { return None };
@@ -182,13 +227,13 @@ fn each(fix: &Fix, site: &Site<'_>) -> Option<Vec<Edit>> {
 
 /// The edits of a fix; `None` when one cannot be made.
 fn made(specs: &[EditSpec], site: &Site<'_>) -> Option<Vec<Edit>> {
-    let text = |template: &crate::knowledge::Template| template.try_render(site.scope).ok();
+    let text = |template: &Template| template.try_render(site.scope).ok();
     let mut edits = Vec::new();
     for spec in specs {
         match spec {
             EditSpec::Set { file, pointer, to } => {
                 let (file, pointer, value) = (text(file)?, text(pointer)?, to.eval(site.scope).ok()?);
-                // A value that is the same already would be no repair.
+                // Setting the same value again would repair nothing.
                 let document = site.checkpoint().document(&file)?;
                 document.text.as_ref().filter(|_| document.get(&pointer) != Some(&value))?;
                 edits.push(Edit::Set { file, pointer, value });

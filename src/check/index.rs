@@ -7,7 +7,7 @@ use unicode_normalization::UnicodeNormalization as _;
 
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, pointer};
 
-/// The file that, when it is there, a loader takes without looking at an index.
+/// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
 
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
@@ -28,11 +28,28 @@ pub(super) fn readable(shard: &Shard) -> bool {
     !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind))
 }
 
-/// Whether every shard is there and its header could be read, so that a tensor that is not seen is not there.
+/// Whether every shard exists and its header was read, so that a tensor that was not read is missing.
 #[must_use]
 pub fn all_read(checkpoint: &Checkpoint) -> bool {
     let named = checkpoint.index.iter().flat_map(|index| index.weight_map.values());
     checkpoint.shards.values().all(readable) && named.into_iter().all(|name| checkpoint.shards.contains_key(name))
+}
+
+/// Whether nothing suggests that a tensor was lost: every shard that the index or the shards' own names count is present
+/// and was read, and every key of the index is in a shard.
+pub(super) fn is_complete(checkpoint: &Checkpoint) -> bool {
+    let map = checkpoint.index.as_ref().and_then(|index| checkpoint.document(&index.document)?.get("/weight_map"));
+    let listed = map.and_then(Value::as_object).into_iter().flat_map(|map| map.keys());
+    let held: BTreeSet<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+    let mut families: BTreeMap<(&str, u32), BTreeSet<u32>> = BTreeMap::new();
+    for (prefix, number, count) in shard_names(checkpoint).into_iter().filter_map(numbered) {
+        families.entry((prefix, count)).or_default().insert(number);
+    }
+    let whole = |count: u32, numbers: &BTreeSet<u32>| usize::try_from(count).is_ok_and(|count| numbers.len() >= count);
+    all_read(checkpoint)
+        && checkpoint.shards.values().all(|shard| shard.unreadable.is_empty())
+        && listed.into_iter().all(|name| held.contains(name.as_str()))
+        && families.iter().all(|((_, count), numbers)| whole(*count, numbers))
 }
 
 /// Which shard holds a tensor of that name; the first when there are several.
@@ -57,7 +74,7 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     }
 }
 
-/// An index that states more bytes of tensors than its shards have, when git-lfs pointers say how large these are.
+/// An index that states more bytes than its shards have, when Git LFS pointers state their sizes.
 fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item = &'n str> + Clone) -> Option<Fault> {
     let index = checkpoint.index.as_ref()?;
     let stated = index.total_bytes()?;
@@ -75,7 +92,7 @@ fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item 
     (sum < stated).then_some(fault)
 }
 
-/// Weights, as far as file names tell: base-model shards, not adapters.
+/// Whether a file is a shard of the base model by its name; those of adapters are not.
 pub(super) fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
     checkpoint
         .shards
@@ -85,7 +102,7 @@ pub(super) fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
         .collect()
 }
 
-/// The first shard that the index names and that is not there, when others are: the loader stops at it.
+/// The first missing shard of the index when other shards exist: the loader raises at it.
 #[must_use]
 pub fn first_absent_shard(checkpoint: &Checkpoint) -> Option<&str> {
     let index = checkpoint.index.as_ref()?;
@@ -109,7 +126,7 @@ struct IndexComparison<'c> {
 }
 
 impl<'c> IndexComparison<'c> {
-    /// `None` for an index without entries: it tells nothing of what is not in it.
+    /// `None` for an index without entries, which implies nothing about missing ones.
     fn new(checkpoint: &'c Checkpoint, index: &'c Index) -> Option<Self> {
         let mut referenced: BTreeMap<&str, (usize, &str)> = BTreeMap::new();
         for (tensor, file) in &index.weight_map {
@@ -170,7 +187,7 @@ impl<'c> IndexComparison<'c> {
         Some(Fault::new(FaultKind::PickleWeights).at(Place::file(*name)))
     }
 
-    /// Entries whose tensor is in another shard than the index maps it to, or in none.
+    /// Entries whose tensor is in another shard than the one mapped, or in none.
     fn misplaced_entries(&self) -> Vec<Fault> {
         let shards = &self.checkpoint.shards;
         let unreadable: BTreeSet<&str> = shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
@@ -322,7 +339,7 @@ fn is_pointer(checkpoint: &Checkpoint, name: &str) -> bool {
     checkpoint.entries.get(name).is_some_and(|entry| entry.lfs.is_some())
 }
 
-/// The shard whose name differs from this one only in what some file systems ignore.
+/// The shard whose name differs from this one only in case or Unicode form, which some file systems ignore.
 pub(super) fn similar<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<&'c str> {
     checkpoint.shards.keys().map(String::as_str).find(|s| *s != name && folded(s) == folded(name))
 }
@@ -339,7 +356,7 @@ impl<'c> Lookalikes<'c> {
         Self(names)
     }
 
-    /// The shard whose name differs from this one only in what some file systems ignore.
+    /// The shard whose name differs from this one only in case or Unicode form, which some file systems ignore.
     fn get(&self, name: &str) -> Option<&'c str> {
         self.0.get(&folded(name))?.iter().copied().find(|other| *other != name)
     }

@@ -13,7 +13,7 @@ use crate::knowledge::{Architecture, Library, Loader};
 
 /// Classes that are named beside the best.
 const CANDIDATES: usize = 8;
-/// Classes with equally good names that are built to tell them apart by their defaults.
+/// Classes with equally good names that are built, to compare their defaults with the tensors.
 const BUILT: usize = 40;
 /// Model types that are tried for a part.
 const PARTS: usize = 6;
@@ -206,14 +206,13 @@ fn by_config<'l>(library: &'l Library, config: &Value, stored: &Stored) -> Optio
     loaders.into_iter().find_map(|loader| library.find(config, stored.names(), loader))
 }
 
-/// Puts first, of the classes whose names fit equally well, the one whose defaults are nearest to the tensors.
+/// Orders classes whose names fit equally well by how close their defaults are to the tensors.
 fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
     let Some(best) = alike.first().map(Resemblance::score) else { return };
-    let evidence = stored.evidence();
     let tied = alike.iter().take(BUILT).take_while(|r| r.score() >= best).count();
     let Some(tied) = alike.get_mut(..tied) else { return };
     tied.sort_by_cached_key(|r| {
-        let expected = r.architecture.expect_given(&r.architecture.start(), &evidence);
+        let expected = load::build(r.architecture, &r.architecture.start(), stored);
         let fit = expected.map(|e| Fit::new(&e, &load::in_model(&e, stored)));
         fit.map_or(usize::MAX, |fit| {
             fit.expected.saturating_add(fit.stored).saturating_sub(fit.found).saturating_add(fit.mismatched)
@@ -241,13 +240,13 @@ fn parts(
     stored: &Stored,
     library: &Library,
 ) -> Value {
-    let evidence = stored.evidence();
     let distance = |config: &Value| {
-        let expected = whole.expect_given(config, &evidence).ok()?;
+        let expected = load::build(whole, config, stored).ok()?;
         let fit = Fit::new(&expected, &load::in_model(&expected, stored));
         Some(fit.expected.saturating_add(fit.stored).saturating_sub(fit.found.saturating_mul(2)))
     };
     for (prefix, config) in alike.into_iter().flat_map(|r| &r.parts) {
+        let evidence = stored.evidence();
         let inside = evidence.iter().filter_map(|(name, shape)| Some((name.strip_prefix(prefix)?, shape)));
         let inside = inside.map(|(name, shape)| (name.to_owned(), shape.unwrap_or_default().to_vec()));
         let inside = Stored::from_shapes(inside.collect());
@@ -261,7 +260,7 @@ fn parts(
             pointer::put(&mut config, &Value::Null, &pointer, model_type.into());
             config
         });
-        // The one that the composition takes when nothing is said comes first among equals.
+        // Among equals, the default of the composition comes first.
         let choices = std::iter::once(start.clone()).chain(choices);
         let best = choices.filter_map(|config| Some((distance(&config)?, config))).min_by_key(|(d, _)| *d);
         start = best.map_or(start, |(_, config)| config);

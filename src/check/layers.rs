@@ -1,6 +1,6 @@
 //! Layers of an unknown class: one that lacks a tensor which all its siblings have.
 //!
-//! No template says what a layer has to hold, so only the clearest case speaks: a stack of layers that are alike but
+//! Without a class, only the clearest case is reported: a stack of layers that are alike but
 //! for one or two, and these lack some tensors and have none of their own. Layers of two kinds (dense and sparse ones,
 //! attention and state space) differ in more than what one of them lacks, or too often.
 
@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::checkpoint::{Fault, FaultKind, Place};
 
-/// Layers a stack must have before its majority says anything.
+/// Least number of layers in a stack for its majority to count.
 const STACK: usize = 6;
 /// Most layers of a stack that may be at fault.
 const ODD: usize = 2;
@@ -65,7 +65,7 @@ fn lacking(stack: &str, layers: &BTreeMap<u64, BTreeSet<&str>>) -> Vec<Fault> {
             let mut fault = Fault::new(FaultKind::LayerLacksTensor)
                 .with("layer", format!("{stack}{index}"))
                 .with("siblings", members.len())
-                .with("names", lost.join(", "))
+                .with("names", lost.clone())
                 .with("lacks", lost.len());
             fault.places = lost.iter().map(Place::tensor).collect();
             fault
@@ -83,7 +83,8 @@ mod tests {
 
     fn missing(names: &[String]) -> Vec<String> {
         let faults = faults(names.iter().map(String::as_str));
-        faults.iter().map(|f| f.detail.get("names").and_then(|n| n.as_str()).unwrap_or_default().to_owned()).collect()
+        let lists = faults.iter().filter_map(|f| f.detail.get("names")?.as_array());
+        lists.flatten().filter_map(|name| name.as_str()).map(str::to_owned).collect()
     }
 
     #[test]
@@ -94,7 +95,7 @@ mod tests {
 
     #[test]
     fn layers_of_two_kinds_are_by_design() {
-        // Every third, the first, too few to tell, and one that has something else instead.
+        // Every third layer, the first one, too few layers, and one with other tensors instead.
         assert!(missing(&stack(12, |i| if i % 3 == 0 { vec!["a"] } else { vec!["a", "b"] })).is_empty());
         assert!(missing(&stack(12, |i| if i == 0 { vec!["mlp"] } else { vec!["gate", "mlp", "up"] })).is_empty());
         assert!(missing(&stack(4, |i| if i == 2 { vec!["a"] } else { vec!["a", "b"] })).is_empty());

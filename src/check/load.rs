@@ -1,6 +1,5 @@
-//! The load report: what `from_pretrained` would say of a checkpoint's tensors, and what it would not.
-//!
-//! One prediction for each loader that is known, on names and shapes alone.
+//! Load reports: the lists that `from_pretrained` reports for a checkpoint, and the tensors that it loads incorrectly
+//! without a warning. One predictor for each known loader, from names and shapes alone.
 
 mod convert;
 mod difference;
@@ -17,17 +16,17 @@ mod v5;
 
 use std::collections::BTreeSet;
 
+use serde_json::{Value, json};
+
 use crate::checkpoint::{Fault, FaultKind, Place};
-use crate::knowledge::{Evidence, Expected, Loader};
+use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
 
 pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
 pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
 pub use target::{Target, targets};
-
-/// Names in the message of one fault.
-const NAMES_SHOWN: usize = 5;
+pub(super) use target::{of_run, wanted};
 
 /// Predicts the lists of the loader that `expected` was built for.
 #[must_use]
@@ -51,17 +50,44 @@ pub fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
     }
 }
 
-/// Optional groups of which nothing is there.
+/// The class that the loader builds from `config` for these tensors. [`Architecture::expect_given`] explains the errors.
+///
+/// A class that reads sizes from stored tensors finds them under the names that it has for them itself: the loader
+/// renames stored tensors, and `from_pretrained` accepts a checkpoint of the base model alone.
+///
+/// # Errors
+/// The reason why the class cannot be built from this config.
+pub fn build(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> Result<Expected, Refusal> {
+    let expected = architecture.expect_given(config, &stored.evidence())?;
+    if !architecture.reads_tensors() {
+        return Ok(expected);
+    }
+    architecture.expect_given(config, &spelled(&expected, stored))
+}
+
+/// The stored tensors for [`Architecture::expect_given`]: under the names of the class, and those that the class does not
+/// have under the base-model prefix too, because it may have them once it is built with them.
+pub(super) fn spelled(expected: &Expected, stored: &Stored) -> Evidence {
+    let named = in_model(expected, stored);
+    let prefix = format!("{}.", expected.base_model_prefix);
+    let is_stray = |name: &str| !expected.tensors.contains_key(name) && !name.starts_with(&prefix);
+    let strays =
+        named.iter().filter(|(name, _)| is_stray(name)).map(|(name, shape)| (format!("{prefix}{name}"), shape));
+    let all = named.iter().map(|(name, shape)| (name.to_owned(), shape)).chain(strays);
+    all.map(|(name, shape)| (name, shape.map(<[u64]>::to_vec))).collect()
+}
+
+/// Optional groups of which no tensor is stored.
 fn absent_groups(expected: &Expected, there: impl Fn(&str) -> bool) -> BTreeSet<&str> {
     let optional = || expected.tensors.iter().filter_map(|(name, t)| Some((name, t.optional.as_deref()?)));
     let present: BTreeSet<&str> = optional().filter(|(name, _)| there(name)).map(|(_, group)| group).collect();
     optional().map(|(_, group)| group).filter(|group| !present.contains(group)).collect()
 }
 
-/// Faults for the rules to judge: one for each cause, not one for each tensor.
+/// Faults of a load report, one for each cause.
 ///
-/// `indexed-but-absent` is not among them: comparing the index with the shards finds it without a class.
-/// `under` names the loader where several say different things.
+/// `indexed-but-absent` is not among them: the comparison of the index with the shards reports it without a class.
+/// `under` names the loader when loaders differ.
 #[must_use]
 pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     let mut faults = Vec::new();
@@ -82,8 +108,8 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
             [(FaultKind::MissingTensors, &report.missing), (FaultKind::UnexpectedTensors, &report.unexpected)]
         {
             if !names.is_empty() {
-                let mut fault = Fault::new(kind).with("count", names.len()).with("names", listed(names));
-                fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
+                let mut fault = Fault::new(kind).with("count", names.len()).with("names", json!(names));
+                fault.places = names.iter().map(Place::tensor).collect();
                 faults.push(fault);
             }
         }
@@ -92,9 +118,8 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
         let (empty, others): (Vec<&Mismatch>, Vec<&Mismatch>) = report.mismatched.iter().partition(is_empty);
         if !empty.is_empty() {
             let names: Vec<String> = empty.iter().map(|m| m.name.clone()).collect();
-            let mut fault =
-                Fault::new(FaultKind::EmptyTensors).with("count", names.len()).with("names", listed(&names));
-            fault.places = names.iter().take(NAMES_SHOWN).map(Place::tensor).collect();
+            let mut fault = Fault::new(FaultKind::EmptyTensors).with("count", names.len()).with("names", json!(names));
+            fault.places = names.iter().map(Place::tensor).collect();
             faults.push(fault);
         }
         faults.extend(others.into_iter().map(|m| {
@@ -108,14 +133,6 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
         None => fault,
     };
     faults.into_iter().map(named).collect()
-}
-
-fn listed(names: &[String]) -> String {
-    let shown: Vec<&str> = names.iter().take(NAMES_SHOWN).map(String::as_str).collect();
-    match names.len().saturating_sub(shown.len()) {
-        0 => shown.join(", "),
-        more => format!("{} and {more} more", shown.join(", ")),
-    }
 }
 
 #[cfg(test)]

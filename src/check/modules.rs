@@ -1,4 +1,4 @@
-//! `auto_map`: whether each entry leads to a class in a module that is there and can import what it needs.
+//! `auto_map`: whether the module of each entry exists, has the class, and can import what it needs.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, PythonModule, is_plain_file_name, pointer};
 
-/// An `auto_map` entry: where it stands and what it says.
+/// An `auto_map` entry: its place and its value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AutoMapEntry {
     /// Document.
@@ -55,7 +55,7 @@ fn read(checkpoint: &Checkpoint) -> (Vec<AutoMapEntry>, Vec<Fault>) {
             if let Some(auto_map) = map.get("auto_map") {
                 maps.read(name, &format!("{pointer}/auto_map"), auto_map, depth > 0);
             }
-            // Sub-configs lie one or two levels down; statistics and vocabularies are not searched.
+            // Sub-configs are one or two levels down; statistics and vocabularies are not searched.
             if depth < 2 {
                 let inner = map.iter().filter(|(k, v)| v.is_object() && k.ends_with("config"));
                 pending.extend(inner.map(|(k, v)| (pointer::join(&pointer, k), v, depth.saturating_add(1))));
@@ -110,7 +110,7 @@ impl AutoMaps {
     }
 
     fn malformed(&mut self, file: &str, pointer: String, key: &str, found: &Value) {
-        // Strings have been escaped where they are shown; anything else is told by its kind.
+        // Strings are escaped where they are shown; of other values the type is shown.
         let target = match found {
             Value::Array(_) => "a list".to_owned(),
             Value::Object(_) => "an object".to_owned(),
@@ -138,7 +138,7 @@ pub fn relative_modules(module: &PythonModule) -> BTreeSet<String> {
     beside.filter_map(|i| i.module.split('.').next()).map(str::to_owned).collect()
 }
 
-/// A module and everything it imports relatively, itself first; and whether all of it is there.
+/// A module and everything that it imports relatively, itself first; and whether all of these exist.
 fn closure<'a>(checkpoint: &'a Checkpoint, root: &str) -> Vec<(String, Option<&'a PythonModule>)> {
     let mut seen: BTreeSet<String> = BTreeSet::from([root.to_owned()]);
     let mut pending = vec![root.to_owned()];
@@ -195,7 +195,7 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
         };
         let Some(parsed) = checkpoint.modules.get(&format!("{module}.py")) else {
             let kind = if entry.nested { FaultKind::AutoMapNestedMissing } else { FaultKind::AutoMapModuleMissing };
-            // Stop at one entry a module: the second says nothing new.
+            // One entry per module is enough.
             if entry.nested || roots.insert(module) {
                 let fault = fault(kind).with("module", format!("{module}.py"));
                 faults.push(origin.iter().fold(fault, |fault, origin| fault.with("origin", origin.as_str())));
@@ -243,7 +243,7 @@ fn imports(
             Fault::new(FaultKind::ModuleNeedsPackage)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
-                .with("packages", packages.into_iter().collect::<Vec<_>>().join(", ")),
+                .with("packages", packages.into_iter().collect::<Vec<_>>()),
         );
     }
     for name in absent {
@@ -261,13 +261,13 @@ fn imports(
             Fault::new(FaultKind::AliasMissesImport)
                 .at(Place::file(format!("{root}.py")))
                 .with("module", format!("{root}.py"))
-                .with("imports", names.join(", "))
+                .with("imports", names)
                 .with("target", entry.target.as_str()),
         );
     }
 }
 
-/// Packages that loading a root's modules asks for, beside what comes with Python and transformers.
+/// Packages that the modules of a root import, other than those of Python and transformers.
 ///
 /// transformers looks for every import outside a `try`, in functions too. Source: `get_imports` of 4.47.0.
 fn needed_packages<'a>(checkpoint: &'a Checkpoint, root: &str) -> BTreeSet<&'a str> {
@@ -276,7 +276,7 @@ fn needed_packages<'a>(checkpoint: &'a Checkpoint, root: &str) -> BTreeSet<&'a s
     imports.map(|i| i.package.as_str()).filter(|p| !AT_HAND.contains(p)).collect()
 }
 
-/// What comes with Python, and with transformers and torch.
+/// Packages that come with Python, transformers and torch.
 const AT_HAND: [&str; 71] = [
     "PIL",
     "__future__",
@@ -351,9 +351,9 @@ const AT_HAND: [&str; 71] = [
     "warnings",
 ];
 
-/// Tokenizer classes that the processor behind `AutoProcessor` accepts, when its module says so in plain sight.
+/// Tokenizer classes that the processor of `AutoProcessor` accepts, if its module names them literally.
 ///
-/// Looks in the entry's class, then in classes of its base names in the modules at hand.
+/// Looks in the class of the entry, then in its base classes in the modules of the checkpoint.
 #[must_use]
 pub fn processor_tokenizers(checkpoint: &Checkpoint) -> Option<Vec<String>> {
     // Once processor_config.json exists, only its auto_map counts.

@@ -13,7 +13,7 @@ pub struct Outcome {
     pub architecture: Option<String>,
     /// Sorted by file, place and code.
     pub findings: Vec<Finding>,
-    /// One for each loader that was asked; none when the architecture is unknown or there are no weights to speak of.
+    /// A report for each loader; none when the architecture is unknown or no tensor name was read.
     pub loads: Vec<LoadReport>,
     /// The config with the class's defaults filled in; null when the architecture is unknown.
     pub config: Value,
@@ -21,9 +21,8 @@ pub struct Outcome {
     pub votes: Vec<Vote>,
     /// Findings that settings accept, in the order of the others.
     pub suppressed: Vec<Suppressed>,
-    /// Rules that did not apply, or were not chosen.
+    /// Rules that were skipped, with the reason.
     pub skipped: Vec<Skipped>,
-    /// Rules of the user's own that cannot be used, and why: they take more steps than a rule may, or name what there is
-    /// not.
+    /// Rules of the user that cannot be used, with the reason: one exceeds the evaluation limit, or names an unknown variable.
     pub unusable: Vec<Skipped>,
 }

@@ -12,8 +12,8 @@ pub(super) fn apply_policy(policy: &Policy, checkpoint: &Checkpoint, outcome: &m
     }
     for mut finding in std::mem::take(&mut outcome.findings) {
         let file = finding.locations.first().and_then(|l| l.file.as_deref());
-        // One that speaks for others, which are not kept, may stand for another file.
-        let alone = !finding.evidence.contains_key("more");
+        // A finding that also counts hidden ones, which may be in other files, stays.
+        let alone = finding.hidden == 0;
         match policy.grade(&checkpoint.root, file, &finding.code, finding.severity) {
             Some(severity) => finding.severity = severity,
             None if alone => continue,

@@ -1,8 +1,8 @@
 //! Quantised weights: taken out of their wrapping before the load is predicted, and checked for themselves.
 //!
-//! A class is compared with the plain tensors that the stored ones stand for ([`Quantised::plain`]). So prefixes,
-//! renamings, ties and everything else a loader does to names hold for quantised checkpoints unchanged. What concerns
-//! the wrapping alone is said of the stored tensors, with or without a known class.
+//! A class is compared with the plain tensors that the stored ones represent ([`Quantised::plain`]). Prefixes, renames,
+//! ties and everything else a loader does to names therefore apply to quantised checkpoints unchanged. Faults of the
+//! layout alone are reported for the stored tensors, with or without a known class.
 
 mod config;
 mod module;
@@ -23,7 +23,7 @@ use skipped::SkippedModules;
 
 pub use config::undeclared;
 
-/// What can be said of a config's scheme, and of the tensors that it is about.
+/// Faults of the declared scheme and of the tensors that it covers.
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint, declared: &DeclaredScheme<'_>, quantised: Option<&Quantised<'_>>) -> Vec<Fault> {
     let mut faults = config::disagreements(checkpoint);
@@ -34,7 +34,7 @@ pub fn faults(checkpoint: &Checkpoint, declared: &DeclaredScheme<'_>, quantised:
     faults
 }
 
-/// The quantised modules of a checkpoint whose config says how they are stored.
+/// The quantised modules of a checkpoint, stored by the scheme that its config declares.
 pub struct Quantised<'a> {
     applied: &'a AppliedScheme<'a>,
     modules: Vec<QuantizedModule<'a>>,
@@ -80,7 +80,7 @@ impl<'a> Quantised<'a> {
         for judged in self.modules.iter().filter(|m| m.state != ModuleState::Plain) {
             let name = judged.module.name;
             let held = judged.module.endings(scheme).into_iter().map(|ending| format!("{name}{ending}"));
-            // The loader takes what is packed in a plain module's place for what it is named.
+            // The loader takes a packed tensor of an excluded module for a plain one of that name.
             if judged.state == ModuleState::Skipped {
                 let held: BTreeSet<String> = held.collect();
                 taken.retain(|name| !held.contains(name));
@@ -119,15 +119,15 @@ impl<'a> Quantised<'a> {
                 None => drop(missing.insert(name)),
             }
         }
-        // Scales whose values are missing are in the file and known to the class.
+        // Scales without their values exist in the file, and the class knows them.
         report.unexpected.retain(|name| !missing.remove(name));
         report.missing = missing.into_iter().collect();
         Some(report)
     }
 
-    /// Adds what the loader says of modules that are stored otherwise than the scheme asks.
+    /// Adds the keys that the loader reports for modules that do not follow the scheme.
     ///
-    /// Apart from [`Self::spelled`], because [`Self::faults`] speak of these already.
+    /// Separate from [`Self::spelled`], because [`Self::faults`] reports these modules already.
     pub fn complete(&self, report: &mut LoadReport) {
         let scheme = self.applied.scheme();
         for judged in self.modules.iter().filter(|m| m.state != ModuleState::Skipped) {
@@ -185,7 +185,7 @@ impl<'a> Quantised<'a> {
                         let carrier = scheme.endings().next().unwrap_or_default();
                         let names: Vec<String> = lacks.iter().map(|ending| tensor(ending)).collect();
                         let at = Place::tensor(tensor(carrier));
-                        faults.push(fault(FaultKind::QuantizedModuleIncomplete).at(at).with("lacks", names.join(", ")));
+                        faults.push(fault(FaultKind::QuantizedModuleIncomplete).at(at).with("lacks", names));
                     }
                     faults.extend(judged.misshapen(scheme).map(|(ending, stored, expected)| {
                         let at = Place::tensor(tensor(ending));
@@ -209,7 +209,7 @@ impl<'a> Quantised<'a> {
     }
 }
 
-/// Tensors of a module whose element type is none of those the scheme writes: ending, type, those allowed.
+/// Tensors of a module with an element type that the scheme does not write: ending, type, allowed types.
 fn mistyped<'s>(
     scheme: &'s Scheme,
     judged: &'s QuantizedModule<'_>,

@@ -1,7 +1,7 @@
-//! The bytes that an index states against those of the class: a check of shapes that needs no weights.
+//! Compares the size that an index states with that of the class: a check of shapes without weights.
 //!
-//! `metadata.total_size` is the only thing that tells of shapes when no shard is there. A config value that changes no
-//! name (the key-value heads, the vocabulary) shows in it and nowhere else.
+//! Without shards, only `metadata.total_size` depends on shapes. A config value that changes no name (the number of
+//! key-value heads, the vocabulary) affects nothing else.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,12 +17,12 @@ use crate::knowledge::{Architecture, Evidence, Expected};
 const BUDGET: usize = 400_000;
 /// Explanations that are named.
 const SHOWN: usize = 6;
-/// What is kept as 64-bit integers, whatever the type of the rest.
+/// Endings of buffers that are stored as 64-bit integers.
 const INTEGERS: [&str; 3] = ["num_batches_tracked", "position_ids", "relative_position_index"];
 /// Bytes of the narrowest and the widest float that weights are kept in without a quantisation scheme.
 const FLOATS: (u64, u64) = (2, 4);
 
-/// Compares the size in the index with that of the class, where no shard tells and every name is as it should be.
+/// Compares the size in the index with that of the class, if no shard exists and every name matches.
 #[must_use]
 pub fn fault(
     checkpoint: &Checkpoint,
@@ -179,7 +179,6 @@ fn explain(
     stated: u64,
     width: u64,
 ) -> Vec<(String, Value)> {
-    let evidence = stored.evidence();
     let mut spent = 0_usize;
     let mut sizes = |pointer: &str, value: u64| -> Option<Vec<u64>> {
         if spent > BUDGET {
@@ -187,7 +186,7 @@ fn explain(
         }
         spent = spent.saturating_add(expected.tensors.len());
         let config = with(config, &expected.config, pointer, value.into());
-        let built = architecture.expect_given(&config, &evidence).ok()?;
+        let built = load::build(architecture, &config, stored).ok()?;
         let same = built.tensors.len() == expected.tensors.len()
             && built.tensors.keys().all(|name| expected.tensors.contains_key(name));
         Weighed::new(&built, &load::in_model(&built, stored)).filter(|_| same)?.sizes(width)
@@ -209,7 +208,7 @@ fn explain(
         }
         let Some(doubled) = value.checked_mul(2) else { continue };
         let probe = sizes(&pointer, doubled);
-        // Sizes that do not follow this value, and those that are not possible twice as large, tell nothing.
+        // Sizes that do not follow this value, or that cannot double, imply nothing.
         if probe.as_ref() == Some(&now) {
             continue;
         }

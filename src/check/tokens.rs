@@ -1,4 +1,4 @@
-//! Tokenizer ids: what a tokenizer holds once its processor is open, and whether the files agree.
+//! Token ids: the ids of a tokenizer after its processor is opened, and whether the files agree on them.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, Vocabula
 use crate::knowledge::processor::Processor;
 use crate::knowledge::{EvalError, Scope};
 
-/// A bound on what a processor may add, whatever the counts in its config say.
+/// Most tokens that a processor may add; its config may state any count.
 const MAX_ADDED: u64 = 1_000_000;
 
 /// A tokenizer with its processor's tokens in it.
@@ -16,7 +16,7 @@ const MAX_ADDED: u64 = 1_000_000;
 pub struct OpenedTokenizer {
     /// `len(tokenizer)` afterwards.
     pub length: u64,
-    /// Ids of the named tokens, and what the processor's `let` computed.
+    /// Ids of the named tokens, and the values that the processor's `let` computes.
     pub named: BTreeMap<String, Value>,
     /// The tokens that the processor adds, by id; those the tokenizer had are not among them.
     pub new: BTreeMap<u64, NewToken>,
@@ -36,7 +36,7 @@ pub struct NewToken {
 }
 
 impl OpenedTokenizer {
-    /// What expressions see as `tokens`.
+    /// The value of `tokens` in expressions.
     #[must_use]
     pub fn summary(&self) -> Value {
         let mut map: Map<String, Value> = self.named.clone().into_iter().collect();
@@ -46,7 +46,7 @@ impl OpenedTokenizer {
     }
 }
 
-/// Adds a processor's tokens, as `add_tokens` does: one that is there keeps its id, a new one gets the next.
+/// Adds a processor's tokens as `add_tokens` does: a known token keeps its id, a new one gets the next.
 ///
 /// `Ok(None)` when the tokenizer has no vocabulary file, so that ids cannot be known.
 ///
@@ -136,7 +136,7 @@ fn decoder_entry(id: u64) -> Place {
     Place::file(DECODER).pointer(format!("/added_tokens_decoder/{id}"))
 }
 
-/// Tokens whose ids are not rows of the embedding.
+/// Tokens whose ids are out of range for the embedding.
 fn tokens_above(stated: &BTreeMap<u64, &str>, rows: u64) -> Option<Fault> {
     let above: Vec<(&u64, &&str)> = stated.range(rows..).collect();
     let ((first, token), (last, _)) = (above.first()?, above.last()?);

@@ -1,4 +1,4 @@
-//! What a rule's expressions see of a checkpoint.
+//! The variables and functions of a checkpoint for the expressions of rules.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
 use super::{index, modules};
-use crate::checkpoint::{Checkpoint, Document, FaultKind, Vocabulary};
+use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
 use crate::knowledge::{Expression, Scope};
 
 /// Keys of `tokenizer_config.json` that are large; rules reach them through `tokenizer`, `id_of` and `chat_templates`.
@@ -23,7 +23,7 @@ const DOCUMENTS: [(&str, &str); 6] = [
     ("special_tokens", "special_tokens_map.json"),
 ];
 
-/// The first document that an expression asks about and that is not there, or has no value.
+/// The first document that an expression reads and that is missing or invalid.
 #[must_use]
 pub fn absent(checkpoint: &Checkpoint, expression: &Expression) -> Option<&'static str> {
     let asked = expression.variables();
@@ -84,8 +84,15 @@ pub fn scope(
     scope
 }
 
-/// `stays_random`: what the loaders would say of a name.
-pub fn bind_loads(scope: &mut Scope<'static>, loads: Vec<LoadReport>) {
+/// Binds `stays_random` and `complete`, which depend on the predicted loads.
+pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: Vec<LoadReport>) {
+    // Without a class no load is predicted, and a `total_size` that is too large is the only trace of a lost tensor.
+    let stored = || checkpoint.tensors().fold(0_u64, |n, (_, tensor)| n.saturating_add(tensor.len()));
+    let stated = checkpoint.index.as_ref().and_then(Index::total_bytes);
+    let held = |name: &String| checkpoint.tensor(name).is_some();
+    let whole = loads.iter().all(|load| load.missing.iter().all(held) && load.raises.is_none());
+    let known = !loads.is_empty() || stated.is_none_or(|stated| stated <= stored());
+    scope.bind("complete", &json!(whole && known && index::is_complete(checkpoint)));
     scope.function1("stays_random", move |name| match loads.as_slice() {
         [] => Value::Null,
         loads => json!(loads.iter().any(|report| report.leaves_random(name))),

@@ -1,8 +1,8 @@
-//! Architectures run backwards: each stored tensor votes for the config values that explain its name and shape.
+//! Infers config values from tensors: each stored tensor votes for the values that explain its name and shape.
 //!
-//! The class is a black box. One value of the config is changed, what the class builds then shows which names and
-//! dimensions follow it, and those that are stored say what it should be. A value is believed when building with it
-//! brings the class nearer to the store.
+//! The class is a black box. One value of the config is changed at a time. The tensors that the class then builds show
+//! which names and dimensions follow that value, and the stored ones imply what it should be. A value is accepted when the
+//! class that it builds is closer to the stored tensors.
 
 mod explain;
 mod probe;
@@ -19,7 +19,7 @@ use serde_json::Value;
 pub use self::explain::{Explanation, explain, fault};
 pub use self::run::vote;
 pub(super) use self::space::{leaves, with};
-pub use self::vote::{Fit, Undecided, Vote, Votes, Witness};
+pub use self::vote::{Fit, Vote, Votes};
 
 /// The `model_type` of every config inside a config.
 #[must_use]

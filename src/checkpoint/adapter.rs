@@ -1,16 +1,16 @@
-//! A PEFT adapter: a small set of weights that another model is changed by, and the config that says how.
+//! A PEFT adapter: a small set of weights that changes another model, and its config.
 
 use serde_json::Value;
 
 use super::{Checkpoint, Document, Tensor};
 
-/// The document that makes a directory an adapter's. Source: `CONFIG_NAME` in peft/utils/constants.py.
+/// The document that marks an adapter directory. Source: `CONFIG_NAME` in peft/utils/constants.py.
 pub const CONFIG: &str = "adapter_config.json";
 
-/// Its weights. Source: `SAFETENSORS_WEIGHTS_NAME` and `WEIGHTS_NAME` in peft/utils/constants.py.
+/// The weights files of an adapter. Source: `SAFETENSORS_WEIGHTS_NAME` and `WEIGHTS_NAME` in peft/utils/constants.py.
 pub const WEIGHTS: [&str; 2] = ["adapter_model.safetensors", "adapter_model.bin"];
 
-/// What every name starts with: PEFT's own two wrappers around the model.
+/// Prefix of every tensor name: PEFT's two wrappers around the model.
 pub const PREFIX: &str = "base_model.model.";
 
 /// An adapter beside, or in place of, a model.
@@ -21,26 +21,26 @@ pub struct Adapter<'c> {
 }
 
 impl<'c> Adapter<'c> {
-    /// The adapter in this directory, if there is one.
+    /// The adapter in this directory; `None` without `adapter_config.json`.
     #[must_use]
     pub fn from_checkpoint(checkpoint: &'c Checkpoint) -> Option<Self> {
         Some(Self { checkpoint, document: checkpoint.document(CONFIG)? })
     }
 
-    /// Its config, when that is a JSON object.
+    /// The adapter config; `None` unless it is a JSON object.
     #[must_use]
     pub fn config(&self) -> Option<&'c Value> {
         self.document.value.as_ref().filter(|value| value.is_object())
     }
 
-    /// The tensors; `None` when they are not in a safetensors file whose header could be read.
+    /// The tensors; `None` unless they are in a safetensors file with a readable header.
     #[must_use]
     pub fn tensors(&self) -> Option<&'c [Tensor]> {
         let shard = self.checkpoint.shards.get(WEIGHTS[0]).filter(|shard| !shard.unread)?;
         Some(&shard.tensors)
     }
 
-    /// The first of [`WEIGHTS`] that is there: the one PEFT opens.
+    /// The first file of [`WEIGHTS`] that exists, which is the one PEFT opens.
     #[must_use]
     pub fn file(&self) -> Option<&'static str> {
         WEIGHTS.into_iter().find(|name| self.checkpoint.has_file(name))

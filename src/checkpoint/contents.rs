@@ -1,7 +1,7 @@
-//! What the bytes of the tensors hold; read only when somebody asks for it (`check --deep`).
+//! Digests and faults from the bytes of the tensors; read only for `check --deep`.
 //!
-//! Every byte of every shard passes once through one buffer, whatever the size of the weights. Positioned reads, no
-//! memory map: a file that shrinks meanwhile is a message and not a signal.
+//! Every byte of every shard passes once through one buffer, independent of the size of the weights. Reads are
+//! positioned instead of memory-mapped: a file that shrinks during the read gives a fault instead of a signal.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::FileExt as _;
@@ -18,17 +18,17 @@ mod numbers;
 
 use numbers::{NonFiniteCounter, as_u64};
 
-/// Bytes read at a time: a multiple of every element's width, so that none lies across two reads.
+/// Bytes read at a time: a multiple of every element width, so that no element is split between two reads.
 const CHUNK: usize = 1 << 20;
 
-/// What reading the tensors' bytes gave.
+/// SHA-256 digests of the tensors, by shard and tensor name.
 #[derive(Debug, Clone, Default)]
 pub struct Contents {
     digests: BTreeMap<String, BTreeMap<String, [u8; 32]>>,
 }
 
 impl Contents {
-    /// Reads the bytes of every tensor of these shards, and adds the faults that only their bytes show.
+    /// Reads the bytes of every tensor of `shards`, and adds the faults that only the bytes reveal.
     pub(super) fn read(root: &Path, entries: &BTreeMap<String, Entry>, shards: &mut BTreeMap<String, Shard>) -> Self {
         let mut contents = Self::default();
         for shard in shards.values_mut() {
@@ -37,7 +37,7 @@ impl Contents {
             let ContentsReader { digests, faults, .. } = reader;
             contents.digests.insert(shard.name.clone(), digests);
             if faults.iter().any(|f| f.kind == FaultKind::ZeroTail) {
-                // The reader of headers saw a part of it already, where the file system told.
+                // The header reader may already have reported a part of the zeros, from holes in the file.
                 shard.faults.retain(|f| f.kind != FaultKind::ZeroTail);
             }
             shard.faults.extend(faults);
@@ -45,14 +45,14 @@ impl Contents {
         contents
     }
 
-    /// SHA-256 of a tensor's bytes; `None` where they could not be read.
+    /// SHA-256 of a tensor's bytes; `None` when they could not be read.
     #[must_use]
     pub fn digest(&self, shard: &str, tensor: &str) -> Option<&[u8; 32]> {
         self.digests.get(shard)?.get(tensor)
     }
 }
 
-/// One shard while it is read.
+/// State of reading one shard.
 struct ContentsReader<'s> {
     shard: &'s Shard,
     digests: BTreeMap<String, [u8; 32]>,
@@ -61,7 +61,7 @@ struct ContentsReader<'s> {
 
 impl ContentsReader<'_> {
     fn run(&mut self, root: &Path, entry: Option<&Entry>) {
-        // A header that is not to be trusted says nothing of what the bytes behind it are; it has its own faults.
+        // Offsets of an unreadable header are not reliable; the header has its own faults.
         if self.shard.unread || self.shard.tensors.is_empty() {
             return;
         }
@@ -87,17 +87,17 @@ impl ContentsReader<'_> {
         let region = self.shard.file_len.saturating_sub(self.shard.data_start);
         let mut tensors: Vec<&Tensor> = self.shard.tensors.iter().filter(|t| t.begin <= t.end).collect();
         tensors.sort_by_key(|t| (t.begin, t.end, t.name.as_str()));
-        // Only a shard that is covered by its tensors is a file read to its end.
+        // The file is hashed in the order of its tensors, which must cover all of it.
         let stated =
             entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == FaultKind::ZeroTail));
         let mut whole = stated.as_ref().map(|_| Sha256::new());
         if let Some(whole) = &mut whole {
             each_chunk(opened, 0, self.shard.data_start, &mut buffer, |bytes| whole.update(bytes))?;
         }
-        // Where the last byte ends that is not zero, and the number of tensors before each that are all zero.
+        // End of the last nonzero byte, counted from the start of the data.
         let mut last_value = 0_u64;
         for tensor in &tensors {
-            // Of a shard that is cut short the rest can still be read.
+            // The other tensors of a truncated shard can still be read.
             if tensor.end > region {
                 continue;
             }
@@ -134,14 +134,14 @@ impl ContentsReader<'_> {
     }
 }
 
-/// The SHA-256 that a file's name in the hub cache gives; smaller files have names of another kind.
+/// The SHA-256 in the name of a blob of the hub cache; names of smaller files are git hashes.
 fn stated_digest(entry: &Entry) -> Option<String> {
     let name = entry.link.as_deref()?.rsplit('/').next()?;
     let is_digest = name.len() == 64 && name.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
     is_digest.then(|| name.to_owned())
 }
 
-/// Hands `len` bytes from `start` on to `each`, in pieces.
+/// Calls `each` with the `len` bytes from `start` on, one chunk at a time.
 fn each_chunk(
     opened: &Opened,
     start: u64,

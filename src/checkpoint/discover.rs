@@ -1,17 +1,17 @@
-//! Finds the checkpoints that a path given by the user means.
+//! Finds the checkpoints for a path given by the user.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// How many folders deep checkpoints are searched for.
+/// Depth of folders to which checkpoints are searched for.
 const MAX_DEPTH: usize = 6;
 
 /// The checkpoint directories at or below `path`, sorted.
 ///
-/// A file means the checkpoint that owns it ([`owner`]), if one does. A directory that is a checkpoint is the answer itself, and
-/// folders inside it (`checkpoint-500`, ONNX copies) are not searched; any other directory is searched
-/// to a depth of six. Hidden folders and links to folders are not followed. A path that does not
-/// exist comes back as it is, so that opening it says so.
+/// A file stands for its checkpoint, if any ([`owner`]). A directory that is a checkpoint is the only result, and
+/// folders inside it (`checkpoint-500`, ONNX copies) are not searched; any other directory is searched to a depth of
+/// six. Hidden folders and links to folders are not followed. A path that does not exist is returned unchanged, so that
+/// opening it reports the error.
 #[must_use]
 pub fn find_checkpoints(path: &Path) -> Vec<PathBuf> {
     if path.is_dir() {
@@ -26,8 +26,8 @@ pub fn find_checkpoints(path: &Path) -> Vec<PathBuf> {
     vec![path.to_owned()]
 }
 
-/// The checkpoint that a file belongs to, there or not: the nearest folder above it that is one, within the git work tree
-/// and, for a relative path, within the current directory.
+/// The checkpoint that a file belongs to, whether or not the file exists: the nearest folder above it that is a
+/// checkpoint. The search ends at the root of the git work tree and, for a relative path, at the current directory.
 #[must_use]
 pub fn owner(file: &Path) -> Option<PathBuf> {
     for dir in file.ancestors().skip(1).take(MAX_DEPTH) {

@@ -1,4 +1,4 @@
-//! A JSON document: its text, its value, and what is wrong with it.
+//! A JSON document: text, value and faults.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -13,39 +13,36 @@ mod explain;
 mod locate;
 mod read;
 
+use edit::{Splice, spliced};
 pub use locate::Locator;
 use locate::value_at;
-
-pub use super::text::line_column;
 
 /// A JSON file of a checkpoint.
 #[derive(Debug, Clone, Default)]
 pub struct Document {
     /// File name within the checkpoint.
     pub name: String,
-    /// The file's text, byte for byte; `None` when the file is not UTF-8, so that every span in
-    /// this document counts bytes of the file.
+    /// The file's text, byte for byte; `None` when the file is not UTF-8. Every span in this document counts bytes of
+    /// the file.
     pub text: Option<Arc<str>>,
-    /// What the text says. Non-finite and huge numbers are null here; of equal keys the last counts.
-    /// `None` when the text could not be understood to its end: then nothing follows from a key
-    /// not being there.
+    /// The parsed value. Non-finite and huge numbers are null here; of duplicate keys the last one counts. `None` when
+    /// the text could not be parsed to its end: then a missing key proves nothing.
     pub value: Option<Value>,
-    /// JSON pointers of large parts that `value` leaves out because [`super::Tokenizer`] holds them
-    /// in less space; the parts were read, and their faults are here.
+    /// JSON pointers of large parts that `value` omits because [`super::Tokenizer`] holds them in less space; these
+    /// parts were parsed, and their faults are in `faults`.
     pub left_out: Vec<&'static str>,
     /// Faults of the document.
     pub faults: Vec<Fault>,
 }
 
 impl Document {
-    /// The text of a document in UTF-16 or UTF-32; `None` for any other, and where characters would be lost.
+    /// Decodes a document in UTF-16 or UTF-32; `None` for any other encoding, and when characters would be lost.
     #[must_use]
     pub fn decoded(bytes: &[u8]) -> Option<String> {
         encoding::wide(bytes).map(|(_, text)| text).filter(|text| !text.contains(char::REPLACEMENT_CHARACTER))
     }
 
-    /// A document that is to be written: two spaces of indent and a final line break, as Hugging Face
-    /// libraries write theirs.
+    /// A document to be written: two spaces of indent and a final line break, as Hugging Face libraries write theirs.
     #[must_use]
     pub fn from_value(name: impl Into<String>, value: Value) -> Self {
         let mut text = serde_json::to_string_pretty(&value).unwrap_or_default();
@@ -65,13 +62,13 @@ impl Document {
         self.value.as_ref()?.pointer(pointer)
     }
 
-    /// Byte range of the value at a JSON pointer. Reads the text anew; for many pointers take a [`Locator`].
+    /// Byte range of the value at a JSON pointer. Scans the text on each call; for many pointers use a [`Locator`].
     #[must_use]
     pub fn locate(&self, pointer: &str) -> Option<Range<usize>> {
         Locator::new(self.text.as_deref()?).value(pointer)
     }
 
-    /// Byte range of the key, quotes included, that the last step of a JSON pointer names.
+    /// Byte range of the key, quotes included, for the last step of a JSON pointer.
     #[must_use]
     pub fn locate_key(&self, pointer: &str) -> Option<Range<usize>> {
         Locator::new(self.text.as_deref()?).key(pointer)

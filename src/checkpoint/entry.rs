@@ -6,7 +6,7 @@ use std::os::unix::fs::FileTypeExt as _;
 
 use super::lfs::LfsPointer;
 
-/// A directory entry, and what it turned out to be.
+/// Kind of a directory entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum EntryKind {
     /// A regular file.
@@ -20,12 +20,12 @@ pub enum EntryKind {
     Socket,
     /// A device.
     Device,
-    /// A symbolic link that leads nowhere, or in a circle; or nothing the system tells about.
+    /// A symbolic link with a missing target or in a loop, or an entry without readable metadata.
     Broken,
 }
 
 impl EntryKind {
-    /// The kind that metadata tell, links followed; what is none of the others is a device.
+    /// The kind according to metadata of the link target; any other kind of file counts as a device.
     #[must_use]
     pub(super) fn from_metadata(metadata: &Metadata) -> Self {
         let kind = metadata.file_type();
@@ -42,7 +42,7 @@ impl EntryKind {
         }
     }
 
-    /// The word for it in messages.
+    /// The name used in messages.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -65,12 +65,12 @@ impl fmt::Display for EntryKind {
 /// One entry of a checkpoint directory.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Entry {
-    /// What it is, after following symbolic links.
+    /// Kind of the entry, after following symbolic links.
     pub kind: EntryKind,
     /// Bytes in the file, after following symbolic links; 0 for anything but a file.
     pub size: u64,
-    /// What the symbolic link says, if it is one.
+    /// Target of the symbolic link; `None` when the entry is not a link.
     pub link: Option<String>,
-    /// The pointer, if the file is one.
+    /// The Git LFS pointer; `None` when the file is not one.
     pub lfs: Option<LfsPointer>,
 }

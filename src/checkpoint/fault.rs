@@ -1,4 +1,4 @@
-//! A fault is something observed to be wrong in a file, before any rule has judged it.
+//! A fault: a problem observed in a file, before any rule evaluates it.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -7,39 +7,52 @@ use serde_json::{Map, Value};
 
 mod kind;
 
-pub use kind::{FaultKind, FaultSource};
+pub use kind::FaultKind;
+#[cfg(feature = "internals")]
+pub use kind::FaultSource;
 
-/// One observed fault: what kind, where, and the figures a message needs.
+/// One observed fault: its kind, its places and the figures for a message.
 ///
-/// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself carries no
-/// severity and no prose.
+/// A rule in `rules/checks/` turns faults of one kind into findings; the kind itself has no severity and no text.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Fault {
-    /// The kind, by which rules select it.
+    /// The kind, by which rules select faults.
     pub kind: FaultKind,
-    /// Where it was seen, most important place first. May be empty: then it is the whole checkpoint.
+    /// The places, most important first. Empty means the whole checkpoint.
     pub places: Vec<Place>,
-    /// Figures and names for the message, by the names the rule's message uses.
+    /// Figures and names for the message, under the names that the rule's message uses.
     pub detail: Map<String, Value>,
+    /// Versions of the loaders whose predicted load has the fault; empty for a fault of the checkpoint itself.
+    pub loaders: Vec<&'static str>,
+    /// Further faults of this kind in this file, which are counted and not kept.
+    pub hidden: u64,
 }
 
 impl Fault {
-    /// A fault of `kind` with no place and no detail yet.
+    /// A fault of `kind` without places or details.
     #[must_use]
-    pub fn new(kind: FaultKind) -> Self {
-        Self { kind, places: Vec::new(), detail: Map::new() }
+    pub(crate) fn new(kind: FaultKind) -> Self {
+        Self { kind, places: Vec::new(), detail: Map::new(), loaders: Vec::new(), hidden: 0 }
     }
 
     /// Adds a place.
     #[must_use]
-    pub fn at(mut self, place: Place) -> Self {
+    pub(crate) fn at(mut self, place: Place) -> Self {
         self.places.push(place);
+        self
+    }
+
+    /// Adds the version of a loader whose predicted load has the fault.
+    #[must_use]
+    pub(crate) fn under(mut self, loader: &'static str) -> Self {
+        self.loaders.push(loader);
         self
     }
 
     /// Adds a named detail.
     #[must_use]
-    pub fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
+    pub(crate) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
         self.detail.insert(name.to_owned(), value.into());
         self
     }
@@ -47,6 +60,7 @@ impl Fault {
 
 /// A place in a checkpoint: a file, and optionally a byte range, a JSON pointer or a tensor in it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[non_exhaustive]
 pub struct Place {
     /// File name within the checkpoint directory, unescaped.
     pub file: Option<String>,
@@ -61,45 +75,45 @@ pub struct Place {
 impl Place {
     /// The whole of a file.
     #[must_use]
-    pub fn file(name: impl Into<String>) -> Self {
+    pub(crate) fn file(name: impl Into<String>) -> Self {
         Self { file: Some(name.into()), ..Self::default() }
     }
 
-    /// A tensor, in no particular file.
+    /// A tensor, without a file.
     #[must_use]
-    pub fn tensor(name: impl Into<String>) -> Self {
+    pub(crate) fn tensor(name: impl Into<String>) -> Self {
         Self { tensor: Some(name.into()), ..Self::default() }
     }
 
     /// Narrows to a byte range.
     #[must_use]
-    pub fn span(mut self, span: Range<usize>) -> Self {
+    pub(crate) fn span(mut self, span: Range<usize>) -> Self {
         self.span = Some(span);
         self
     }
 
     /// Narrows to a JSON pointer.
     #[must_use]
-    pub fn pointer(mut self, pointer: impl Into<String>) -> Self {
+    pub(crate) fn pointer(mut self, pointer: impl Into<String>) -> Self {
         self.pointer = Some(pointer.into());
         self
     }
 
     /// Narrows to a tensor.
     #[must_use]
-    pub fn in_tensor(mut self, tensor: impl Into<String>) -> Self {
+    pub(crate) fn in_tensor(mut self, tensor: impl Into<String>) -> Self {
         self.tensor = Some(tensor.into());
         self
     }
 }
 
-/// How many faults of one kind one file may have before the rest are only counted.
+/// Maximum number of faults of one kind in one file; further ones are only counted.
 pub(crate) const KIND_CAP: usize = 64;
 
-/// Non-finite numbers are repaired one by one, so far more of them are kept.
+/// Limit for non-finite numbers. Each one is repaired by an edit of its own, so the limit is higher.
 const NON_FINITE_CAP: usize = 4096;
 
-/// How many faults of this kind one file may have.
+/// Maximum number of faults of this kind in one file.
 const fn cap(kind: FaultKind) -> usize {
     match kind {
         FaultKind::NonFiniteNumber => NON_FINITE_CAP,
@@ -107,16 +121,16 @@ const fn cap(kind: FaultKind) -> usize {
     }
 }
 
-/// Collects the faults of one file, keeping at most a set number of each kind.
+/// Collects the faults of one file, up to a limit for each kind.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
     list: Vec<Fault>,
-    /// How many of each kind were seen, and where the last one kept stands in `list`.
+    /// By kind: number of faults, and the position in `list` of the last one kept.
     seen: BTreeMap<FaultKind, (usize, usize)>,
 }
 
 impl Faults {
-    /// Adds a fault, or only counts it when there are enough of its kind.
+    /// Adds a fault, or only counts it above the limit of its kind.
     pub(crate) fn push(&mut self, fault: Fault) {
         let cap = cap(fault.kind);
         let (count, last) = self.seen.entry(fault.kind).or_insert((0, 0));
@@ -132,14 +146,14 @@ impl Faults {
         faults.into_iter().for_each(|fault| self.push(fault));
     }
 
-    /// The faults kept; the last of a kind that had too many says how many `more` there were.
+    /// The faults kept; the last of a kind that had too many counts the others as hidden.
     pub(crate) fn into_vec(mut self) -> Vec<Fault> {
         for (kind, (count, last)) in &self.seen {
             let more = count.saturating_sub(cap(*kind));
             if more > 0
                 && let Some(fault) = self.list.get_mut(*last)
             {
-                fault.detail.insert("more".to_owned(), more.into());
+                fault.hidden = more as u64;
             }
         }
         self.list

@@ -1,8 +1,8 @@
-//! What a git work tree says of a checkpoint's files: which of them git-lfs keeps.
+//! Marks Git LFS pointers that a git work tree contains on purpose.
 //!
-//! A model repository holds pointers in the place of its large files, and a work tree without their content is how
-//! `GIT_LFS_SKIP_SMUDGE=1` leaves it; so does a clone where git-lfs is not installed, and there nobody meant it. No git is
-//! run: `.gitattributes` says which files git-lfs keeps (<https://git-scm.com/docs/gitattributes>).
+//! A model repository stores pointers in place of its large files. `GIT_LFS_SKIP_SMUDGE=1` leaves them in the work tree
+//! on purpose; a clone without git-lfs leaves them by accident. Git is not run: `.gitattributes` lists the files that
+//! git-lfs handles (<https://git-scm.com/docs/gitattributes>).
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -12,20 +12,20 @@ use globset::{GlobBuilder, GlobMatcher};
 use super::open::read_capped;
 use super::{Checkpoint, Fault, FaultKind};
 
-/// Most bytes read of a `.gitattributes`.
+/// Maximum number of bytes read of a `.gitattributes`.
 const CAP: u64 = 256 << 10;
-/// Most lines of one that are looked at.
+/// Maximum number of lines read of a `.gitattributes`.
 const LINES: usize = 2_000;
 
-/// One line that says something of the filter: files that match it, and whether git-lfs keeps them.
+/// One line that sets the filter attribute: a pattern, and whether the filter is git-lfs.
 struct AttributeLine {
     glob: GlobMatcher,
-    /// Whether the glob is for the path below its folder; else it is for the file's name.
+    /// Whether the glob matches the path below its folder; otherwise it matches the file name.
     whole: bool,
     lfs: bool,
 }
 
-/// Marks the pointers among the faults that stand where a git work tree has them stand.
+/// Adds the detail `tracked` to faults of pointers that the work tree contains on purpose.
 pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
     let pointers: BTreeSet<String> =
         checkpoint.entries.iter().filter(|(_, e)| e.lfs.is_some()).map(|(name, _)| name.clone()).collect();
@@ -46,38 +46,39 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
     documents.chain(shards).chain(modules).chain(others).for_each(mark);
 }
 
-/// Those of the files that git-lfs keeps by the `.gitattributes` of the work tree that `root` lies in.
+/// The given files that git-lfs handles according to the `.gitattributes` of the work tree around `root`.
 fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
     let Ok(root) = root.canonicalize() else { return BTreeSet::new() };
     let Some(top) = root.ancestors().find(|dir| dir.join(".git").symlink_metadata().is_ok()) else {
         return BTreeSet::new();
     };
-    if !lfs_was_here(top) {
+    if !has_git_lfs(top) {
         return BTreeSet::new();
     }
-    // From the work tree's top down: the line that comes last decides.
+    // From the top of the work tree down: the last matching line decides.
     let mut folders: Vec<&Path> = root.ancestors().take_while(|dir| dir.starts_with(top)).collect();
     folders.reverse();
     let lines: Vec<(&Path, Vec<AttributeLine>)> = folders.into_iter().map(|dir| (dir, lines(dir))).collect();
     files.retain(|file| {
         let path = root.join(file);
-        let says = |(dir, line): (&Path, &AttributeLine)| {
+        let lfs_of = |(dir, line): (&Path, &AttributeLine)| {
             let below = path.strip_prefix(dir).ok()?;
             line.glob.is_match(if line.whole { below } else { Path::new(file) }).then_some(line.lfs)
         };
         let all = lines.iter().flat_map(|(dir, lines)| lines.iter().map(move |line| (*dir, line)));
-        all.filter_map(says).next_back().unwrap_or(false)
+        all.filter_map(lfs_of).next_back().unwrap_or(false)
     });
     files
 }
 
-/// Whether git-lfs has run in this work tree, and so its files are pointers by choice; without it a clone has pointers
-/// because nobody fetched the content. Its filter leaves a folder and a hook behind, even where it is told to fetch
-/// nothing. What is elsewhere, for a work tree of another clone, is taken for granted.
-fn lfs_was_here(top: &Path) -> bool {
+/// Whether git-lfs has run in this work tree, so that pointers are there on purpose.
+///
+/// git-lfs creates `.git/lfs` and a `pre-push` hook, even when it is configured to download nothing. If `.git` is a
+/// file (a linked work tree or a submodule), git-lfs is assumed.
+fn has_git_lfs(top: &Path) -> bool {
     let git = top.join(".git");
-    let is_there = |path: &str| git.join(path).symlink_metadata().is_ok();
-    !git.is_dir() || is_there("lfs") || is_there("hooks/pre-push")
+    let exists = |path: &str| git.join(path).symlink_metadata().is_ok();
+    !git.is_dir() || exists("lfs") || exists("hooks/pre-push")
 }
 
 fn lines(dir: &Path) -> Vec<AttributeLine> {
@@ -103,7 +104,7 @@ fn line(line: &str) -> Option<AttributeLine> {
         return None;
     }
     let whole = pattern.contains('/');
-    // git knows no braces.
+    // Git patterns do not support braces.
     let pattern = pattern.trim_start_matches('/').replace('{', "[{]").replace('}', "[}]");
     let glob = GlobBuilder::new(&pattern).literal_separator(true).build().ok()?;
     Some(AttributeLine { glob: glob.compile_matcher(), whole, lfs })

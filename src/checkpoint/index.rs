@@ -1,4 +1,4 @@
-//! The index of a sharded checkpoint: which tensor is in which shard.
+//! The index of a sharded checkpoint: a map from tensors to shards.
 
 use std::collections::BTreeMap;
 
@@ -10,26 +10,26 @@ use super::pointer;
 use super::text::escape;
 use super::{Document, Fault, FaultKind, Place};
 
-/// The name transformers looks for first.
+/// The index name that transformers tries first.
 pub const INDEX_NAME: &str = "model.safetensors.index.json";
-/// The index of pickled shards, which transformers takes where there is no safetensors file. Its shards are never
-/// opened; it tells their names and size all the same.
+/// The index of pickled shards, which transformers uses when no safetensors file exists. These shards are never opened;
+/// only their names and sizes are used.
 pub const PICKLE_INDEX_NAME: &str = "pytorch_model.bin.index.json";
 
-/// What `*.safetensors.index.json` says.
+/// Content of `*.safetensors.index.json`.
 #[derive(Debug, Clone, Default)]
 pub struct Index {
     /// File name of the document.
     pub document: String,
-    /// Tensor name to file name, without the entries whose file name is not a plain one.
+    /// Tensor name to file name, without entries whose file name is not a plain one.
     pub weight_map: BTreeMap<String, String>,
-    /// `metadata.total_size` as it stands there.
+    /// `metadata.total_size` as written.
     pub total_size: Option<Value>,
-    /// Whether there is a `metadata` object.
+    /// Whether the document has a `metadata` object.
     pub has_metadata: bool,
-    /// The document could not be understood, so nothing follows from a tensor not being in it.
+    /// The document could not be parsed, so a tensor missing here may still be mapped.
     pub unread: bool,
-    /// Faults of the index; those of the document are in the document.
+    /// Faults of the index; faults of the JSON text are in the document.
     pub faults: Vec<Fault>,
 }
 
@@ -104,14 +104,14 @@ impl Index {
         }
     }
 
-    /// `total_size` as a number of bytes, when it is one.
+    /// `total_size` as a number of bytes; `None` when it is not one.
     #[must_use]
     pub fn total_bytes(&self) -> Option<u64> {
         bytes(self.total_size.as_ref()?)
     }
 }
 
-/// A number of bytes, written as an integer or, as transformers did for years, as a whole float.
+/// A number of bytes: an integer, or a float without a fraction, as older versions of transformers wrote it.
 fn bytes(value: &Value) -> Option<u64> {
     if let Some(bytes) = value.as_u64() {
         return Some(bytes);
@@ -125,7 +125,7 @@ fn is_size(value: &Value) -> bool {
     bytes(value).is_some()
 }
 
-/// A value in a few characters.
+/// A value, shortened for a message.
 fn shown(value: &Value) -> String {
     match value {
         Value::Array(_) => "an array".to_owned(),

@@ -1,26 +1,26 @@
-//! Git LFS pointers: small text files that stand where the real bytes should be.
+//! Git LFS pointers: small text files in place of the content.
 
-/// What a pointer promises.
+/// The content that a pointer refers to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LfsPointer {
-    /// SHA-256 of the real content, in hexadecimal, without the `sha256:` before it.
+    /// SHA-256 of the content, in hexadecimal, without the prefix `sha256:`.
     pub oid: String,
-    /// Size of the real content in bytes.
+    /// Size of the content in bytes.
     pub size: u64,
 }
 
 /// Pointer files are smaller than this (git-lfs docs/spec.md: "less than 1024 bytes").
 pub(crate) const MAX_POINTER: usize = 1024;
 
-/// Addresses a pointer's first line may name, newest first.
+/// Addresses on the first line of a pointer, newest first.
 const VERSIONS: [&str; 3] =
     ["https://git-lfs.github.com/spec/", "https://hawser.github.com/spec/", "http://git-media.io/v/"];
 
 impl LfsPointer {
-    /// Reads a pointer, `None` when the bytes are anything else.
+    /// Reads a pointer; `None` when the bytes are not one.
     ///
-    /// Takes what git-lfs takes: either line ending, the older `hawser` address, `ext-` lines, and
-    /// keys in any order after `version`. Source: git-lfs docs/spec.md.
+    /// Accepts what git-lfs accepts: either line ending, the older `hawser` address, `ext-` lines, and keys in any
+    /// order after `version`. Source: git-lfs docs/spec.md.
     #[must_use]
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         if bytes.len() > MAX_POINTER {

@@ -8,24 +8,24 @@ use super::Fault;
 
 mod parse;
 
-/// A Python file: the facts a loader acts on before and while it imports it.
+/// A Python file: the facts that affect its import by a loader.
 #[derive(Debug, Clone, Default)]
 pub struct PythonModule {
     /// File name within the checkpoint.
     pub name: String,
     /// The text; `None` when it is not UTF-8.
     pub text: Option<Arc<str>>,
-    /// Classes at any depth outside functions, in the order of the text.
+    /// Classes at any depth outside functions, in text order.
     pub classes: Vec<PythonClass>,
-    /// `from .x import y` and `from . import x`, wherever they stand.
+    /// `from .x import y` and `from . import x`, at any depth.
     pub relative_imports: Vec<RelativeImport>,
-    /// `import x` and `from x import y`, wherever they stand.
+    /// `import x` and `from x import y`, at any depth.
     pub imports: Vec<Import>,
     /// Names bound at module level: classes, functions, assignments, imports.
     pub names: BTreeSet<String>,
-    /// `from x import *` at module level: other names may be bound too.
+    /// Whether `from x import *` occurs at module level, so that further names may be bound.
     pub star_import: bool,
-    /// The text could not be read to its end, so nothing follows from a name not being here.
+    /// The text could not be parsed to its end, so a name missing here may still be defined.
     pub unread: bool,
     /// Faults of the module.
     pub faults: Vec<Fault>,
@@ -57,21 +57,20 @@ pub struct RelativeImport {
     pub names: Vec<String>,
     /// Bytes of the statement.
     pub span: Range<usize>,
-    /// Whether it stands where a failure is expected: in a `try`, under `if TYPE_CHECKING` or
-    /// `if is_..._available()`.
+    /// Whether a failure is handled: the statement is in a `try`, under `if TYPE_CHECKING` or `if is_..._available()`.
     pub guarded: bool,
 }
 
 /// An absolute import.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Import {
-    /// First component of the dotted name, which is what has to be installed.
+    /// First component of the dotted name, which is the package to install.
     pub package: String,
     /// Bytes of the statement.
     pub span: Range<usize>,
-    /// Whether it stands where a failure is expected (see [`RelativeImport::guarded`]).
+    /// Whether a failure is handled (see [`RelativeImport::guarded`]).
     pub guarded: bool,
-    /// Whether it stands inside a function, and so does not run on import.
+    /// Whether it is inside a function, and so does not run on import.
     pub nested: bool,
 }
 
@@ -82,13 +81,13 @@ impl PythonModule {
         Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
     }
 
-    /// The class of this name; of several the last, which is the one Python keeps.
+    /// The class of this name; of several the last, which is the one that Python keeps.
     #[must_use]
     pub fn class(&self, name: &str) -> Option<&PythonClass> {
         self.classes.iter().rev().find(|c| c.name == name)
     }
 
-    /// Whether the module has this name once it is imported; `None` when that cannot be told.
+    /// Whether importing the module defines this name; `None` when unknown.
     #[must_use]
     pub fn defines(&self, name: &str) -> Option<bool> {
         if self.names.contains(name) {
@@ -100,7 +99,7 @@ impl PythonModule {
         }
     }
 
-    /// Packages that must be installed for the module to import: absolute, unguarded, not nested.
+    /// Packages required to import the module: absolute, unguarded, not nested.
     pub fn required_packages(&self) -> impl Iterator<Item = &Import> {
         self.imports.iter().filter(|i| !i.guarded && !i.nested)
     }

@@ -1,7 +1,7 @@
-//! The one way a file of a checkpoint is opened.
+//! The only way a file of a checkpoint is opened.
 //!
-//! A FIFO under the name of a config would hang a plain `open` for ever, and a sparse six-gigabyte
-//! "config" would take all memory: both end here.
+//! A plain `open` would block for ever on a FIFO named like a config, and a sparse "config" of six gigabytes would fill
+//! the memory. [`open_regular`] refuses both.
 
 use std::fs::{File, Metadata, OpenOptions};
 use std::io::Read as _;
@@ -13,14 +13,14 @@ use thiserror::Error;
 
 use super::{EntryKind, Fault, FaultKind, Place};
 
-/// Most bytes read of a JSON document.
+/// Maximum number of bytes read of a JSON document.
 pub const JSON_CAP: u64 = 64 << 20;
-/// Most bytes read of a vocabulary file or of `tokenizer.json`; the largest published has 34 MB.
+/// Maximum number of bytes read of a vocabulary file or of `tokenizer.json`; the largest published one has 34 MB.
 pub const TOKENIZER_CAP: u64 = 64 << 20;
-/// Most bytes read of a Python module.
+/// Maximum number of bytes read of a Python module.
 pub const MODULE_CAP: u64 = 4 << 20;
 
-/// What tells one file from another, and from itself after a change.
+/// Identity of a file: tells it from other files, and detects changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Identity {
     /// Device number.
@@ -34,7 +34,7 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Reads it off a file's metadata.
+    /// Reads the identity from a file's metadata.
     #[must_use]
     pub fn from_metadata(metadata: &Metadata) -> Self {
         Self {
@@ -46,67 +46,67 @@ impl Identity {
     }
 }
 
-/// An open regular file, and which one it is.
+/// An open regular file with its identity.
 #[derive(Debug)]
 pub struct Opened {
     /// The file, open for reading only.
     pub file: File,
-    /// What it was when it was opened.
+    /// The identity at the time of opening.
     pub identity: Identity,
     cap: u64,
 }
 
-/// Why a file or directory was not opened.
+/// Why a file or directory could not be opened.
 #[derive(Debug, Error)]
 pub enum OpenError {
-    /// Nothing of this name.
+    /// No file of this name.
     #[error("{} does not exist", path.display())]
     NotFound {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
     },
-    /// Something that is not a regular file.
+    /// Not a regular file.
     #[error("{} is a {kind}, not a regular file", path.display())]
     NotRegular {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
-        /// What it is instead.
+        /// The kind of the entry.
         kind: EntryKind,
     },
-    /// A file where a directory was wanted.
+    /// A file in place of a directory.
     #[error("{} is not a directory", path.display())]
     NotADirectory {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
     },
-    /// More bytes than are read of such a file.
+    /// More bytes than the limit for such a file.
     #[error("{} has {size} bytes; at most {cap} are read of such a file", path.display())]
     TooLarge {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
         /// Bytes in the file.
         size: u64,
         /// Bytes allowed.
         cap: u64,
     },
-    /// A symbolic link to nothing.
+    /// A symbolic link with a missing target.
     #[error("{} is a symbolic link to {}, which does not exist", path.display(), target.display())]
     DanglingLink {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
-        /// What the link says.
+        /// Target of the link.
         target: PathBuf,
     },
-    /// Symbolic links that lead in a circle.
+    /// A loop of symbolic links.
     #[error("{} is a symbolic link that leads back to itself", path.display())]
     SymlinkLoop {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
     },
-    /// Anything else the system said.
+    /// Any other error of the system.
     #[error("cannot read {}: {source}", path.display())]
     Io {
-        /// The path asked for.
+        /// The given path.
         path: PathBuf,
         /// The system's own error.
         source: std::io::Error,
@@ -114,7 +114,7 @@ pub enum OpenError {
 }
 
 impl OpenError {
-    /// The error of one file as a fault of the checkpoint that has it under `name`.
+    /// The error as a fault of the file `name`.
     #[must_use]
     pub fn fault(&self, name: &str) -> Fault {
         let fault = |kind| Fault::new(kind).at(Place::file(name));
@@ -132,7 +132,7 @@ impl OpenError {
         }
     }
 
-    /// The error behind a failed system call on `path`.
+    /// The error for a failed system call on `path`.
     pub(crate) fn from_io(path: &Path, source: std::io::Error) -> Self {
         let path = path.to_owned();
         if source.raw_os_error() == Some(rustix::io::Errno::LOOP.raw_os_error()) {
@@ -150,11 +150,11 @@ impl OpenError {
 
 /// Opens a regular file of at most `cap` bytes for reading; symbolic links are followed.
 ///
-/// Asks what the file is before it opens it, because opening a device can do things, and again
-/// after, because it may have been swapped in between.
+/// The kind is checked before opening, because opening a device can have effects, and again after, because the file may
+/// have been replaced in between.
 ///
 /// # Errors
-/// When there is no such file, it is not a regular one, or it has more than `cap` bytes.
+/// When the file is missing, is not regular, or has more than `cap` bytes.
 pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
     let io = |source| OpenError::from_io(path, source);
     let regular = |metadata: &Metadata| match EntryKind::from_metadata(metadata) {
@@ -174,7 +174,7 @@ pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
     Ok(Opened { file, identity, cap })
 }
 
-/// Reads a whole regular file of at most `cap` bytes, even if it grows meanwhile.
+/// Reads a whole regular file of at most `cap` bytes, even if it grows during the read.
 ///
 /// # Errors
 /// As [`open_regular`], and when reading fails.
@@ -183,10 +183,10 @@ pub fn read_capped(path: &Path, cap: u64) -> Result<Vec<u8>, OpenError> {
 }
 
 impl Opened {
-    /// Reads everything, at most the cap it was opened with.
+    /// Reads the whole file, up to the cap it was opened with.
     ///
     /// # Errors
-    /// When reading fails or there is more than the cap allows; `path` is for the message.
+    /// When reading fails or the file has more bytes than the cap; `path` is used in the message.
     pub fn read_all(&self, path: &Path) -> Result<Vec<u8>, OpenError> {
         let mut bytes = Vec::with_capacity(usize::try_from(self.identity.size).unwrap_or(0));
         let limit = self.cap.saturating_add(1);
@@ -199,10 +199,10 @@ impl Opened {
     }
 }
 
-/// Whether a string from a checkpoint may become a file name: one plain component and nothing else.
+/// Whether a string from a checkpoint may be used as a file name: one plain component.
 ///
-/// Refuses separators of any system, drive letters and streams (`:`), control characters, `.` and
-/// `..`, the empty name, and more than 255 bytes.
+/// Refuses separators of any system, drive letters and streams (`:`), control characters, `.` and `..`, the empty name,
+/// and more than 255 bytes.
 #[must_use]
 pub fn is_plain_file_name(name: &str) -> bool {
     !name.is_empty()

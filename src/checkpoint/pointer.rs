@@ -1,8 +1,8 @@
-//! JSON pointers (RFC 6901): escaping, joining, and values put and removed by them. Reading is `Value::pointer`.
+//! JSON pointers (RFC 6901): escaping, joining, setting and removing values. `Value::pointer` reads them.
 
 use serde_json::{Map, Value};
 
-/// A step as a pointer spells it: `~` is `~0`, `/` is `~1`.
+/// Escapes a step: `~` becomes `~0`, `/` becomes `~1`.
 pub fn escape(step: &str) -> String {
     step.replace('~', "~0").replace('/', "~1")
 }
@@ -13,12 +13,12 @@ pub fn push(pointer: &mut String, step: &str) {
     pointer.push_str(&escape(step));
 }
 
-/// The pointer to a member of what `parent` points to.
+/// The pointer to the member `step` of the value at `parent`.
 pub fn join(parent: &str, step: &str) -> String {
     format!("{parent}/{}", escape(step))
 }
 
-/// The steps, unescaped; `None` when the pointer is not empty and does not begin with `/`.
+/// The steps, unescaped; `None` when the pointer is neither empty nor begins with `/`.
 pub fn steps(pointer: &str) -> Option<Vec<String>> {
     if pointer.is_empty() {
         return Some(Vec::new());
@@ -30,10 +30,9 @@ fn unescape(step: &str) -> String {
     step.replace("~1", "/").replace("~0", "~")
 }
 
-/// Sets the value at a pointer; `None` when a step leads through something that has no members.
+/// Sets the value at a pointer; `None` when a step leads through a scalar.
 ///
-/// A missing or null step on the way becomes what `defaults`, a document of the same layout, has there, or else an
-/// empty object.
+/// A missing or null value on the way is copied from the same pointer of `defaults`, or else becomes an empty object.
 pub fn put(root: &mut Value, defaults: &Value, pointer: &str, value: Value) -> Option<()> {
     let steps = steps(pointer)?;
     let Some((last, way)) = steps.split_last() else {
@@ -68,7 +67,7 @@ fn member<'v>(value: &'v Value, step: &str) -> Option<&'v Value> {
     }
 }
 
-/// Removes the member of an object that a pointer names, if there is one.
+/// Removes the member of an object at a pointer, if it exists.
 pub fn remove(root: &mut Value, pointer: &str) {
     if let Some((parent, step)) = pointer.rsplit_once('/')
         && let Some(map) = root.pointer_mut(parent).and_then(Value::as_object_mut)

@@ -1,4 +1,4 @@
-//! Reads a directory into a [`Checkpoint`]: its own files, and none that a file in it names.
+//! Reads a directory into a [`Checkpoint`]: only its own files, never other paths that a file refers to.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -15,10 +15,10 @@ use super::{
     REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Vocabulary,
 };
 
-/// Endings that a downloader gives to a file it has not finished.
+/// Suffixes of unfinished downloads.
 const UNFINISHED: [&str; 5] = [".incomplete", ".aria2", ".part", ".crdownload", ".download"];
 
-/// Documents with names of their own; besides them `*config.json` and `*.index.json` are read.
+/// Documents read by their full name; `*config.json` and `*.index.json` are read as well.
 const DOCUMENTS: [&str; 6] = [
     "added_tokens.json",
     "chat_template.json",
@@ -28,18 +28,18 @@ const DOCUMENTS: [&str; 6] = [
     "dataset_statistics.json",
 ];
 
-/// Vocabulary files that are no documents.
+/// Vocabulary files that are not JSON documents.
 const VOCABULARIES: [&str; 4] = ["tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.txt"];
 
-/// Files of plain text that a loader reads.
+/// Plain text files that a loader reads.
 const TEXTS: [&str; 1] = ["chat_template.jinja"];
 
-/// Whether the name is one that pickled weights have.
+/// Whether the name is one of pickled weights.
 fn is_pickle(name: &str) -> bool {
     has_ending(name, "bin") && ["pytorch_model", "adapter_model", "model"].iter().any(|start| name.starts_with(start))
 }
 
-/// Whether the name ends so; loaders compare names as they are, and so do we.
+/// Whether the name has this extension; case-sensitive, like the loaders.
 fn has_ending(name: &str, ending: &str) -> bool {
     Path::new(name).extension().is_some_and(|e| e == ending)
 }
@@ -53,13 +53,13 @@ impl Checkpoint {
     /// Reads a checkpoint directory.
     ///
     /// # Errors
-    /// When the directory itself cannot be read. Nothing in it can make this fail.
+    /// When the directory itself cannot be read. The content of its files cannot make this fail.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
         open(path.as_ref())
     }
 
     /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
-    /// their bytes show. Never fails: what cannot be read is a fault too.
+    /// the bytes reveal. Never fails: a read error becomes a fault.
     pub fn read_contents(&mut self) {
         self.contents = Some(Contents::read(&self.root, &self.entries, &mut self.shards));
     }
@@ -92,7 +92,7 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
     Ok(checkpoint)
 }
 
-/// A directory while it is read.
+/// State of reading a directory.
 struct DirectoryReader {
     checkpoint: Checkpoint,
     vocabularies: BTreeMap<String, Arc<Vocabulary>>,
@@ -100,12 +100,12 @@ struct DirectoryReader {
 }
 
 impl DirectoryReader {
-    /// Reads what a file of this name holds, when a loader would.
+    /// Reads the content of this file, if a loader would.
     fn read_content(&mut self, name: &str, entry: &Entry) {
         let path = self.checkpoint.root.join(name);
         let is_shard = name.ends_with(".safetensors");
         if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
-            // A folder is a checkpoint of its own, or none of ours.
+            // A folder is a checkpoint of its own, or unrelated.
         } else if is_shard {
             let shard = Shard::read(&self.checkpoint.root, name);
             self.checkpoint.shards.insert(name.to_owned(), shard);
@@ -141,7 +141,7 @@ impl DirectoryReader {
         }
     }
 
-    /// Adds the faults that the entry shows without its content.
+    /// Adds the faults that show without reading the content.
     fn check_entry(&mut self, name: &str, entry: &Entry) {
         let faults = &mut self.checkpoint.faults;
         if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_pickle(name) || TEXTS.contains(&name)) {
@@ -154,8 +154,8 @@ impl DirectoryReader {
     }
 }
 
-/// Names in the directory, sorted. Hidden ones are the business of other tools; one that is no plain
-/// UTF-8 name cannot be one a loader asks for.
+/// Names of the entries, sorted. Hidden entries belong to other tools. Names that are not plain UTF-8 are skipped: no
+/// loader opens them.
 fn names(root: &Path) -> Result<Vec<String>, OpenError> {
     let io = |source| OpenError::from_io(root, source);
     let mut names = Vec::new();
@@ -171,7 +171,7 @@ fn names(root: &Path) -> Result<Vec<String>, OpenError> {
     Ok(names)
 }
 
-/// What one entry is. Faults of the entry that no reader of its content would meet are added.
+/// Reads one directory entry, and adds the faults that no reader of its content would report.
 fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
     let path = root.join(name);
     let link = fs::read_link(&path).ok();
@@ -197,8 +197,8 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
     Entry { kind, size, link: link.map(|l| l.to_string_lossy().into_owned()), lfs }
 }
 
-/// Whether a link leaves the directory for anything but a blob of the hub cache, whose snapshots
-/// are nothing but links to `../../blobs/…`.
+/// Whether a link leads outside the directory. Links into the `blobs` folder of the hub cache are allowed: its
+/// snapshots consist of links to `../../blobs/…`.
 fn is_outside(root: &Path, path: &Path, target: &Path) -> bool {
     let mut steps = target.components().skip_while(|c| *c == Component::ParentDir);
     if target.starts_with("..") && steps.next() == Some(Component::Normal("blobs".as_ref())) {

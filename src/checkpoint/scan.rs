@@ -1,10 +1,9 @@
 //! A JSON scanner: tokens with byte ranges, one at a time, never recursing.
 //!
-//! One scanner serves documents, shard headers and the search for a place in a document. It is
-//! iterative and bounded in depth, so no nesting can exhaust the stack, and it knows the few slips
-//! people make by hand, so the slip that makes a document readable *is* the cause.
-//! `serde_json` could not serve: it keeps the last of two equal keys without a word, has no byte
-//! ranges, and (with `arbitrary_precision`) turns a crafted object into a number.
+//! Documents, shard headers and [`Locator`](super::document::Locator) use the same scanner. It is iterative and limits
+//! the depth, so nesting cannot exhaust the stack. The lenient mode accepts a few common slips of hand-written JSON and
+//! records them, so that a fault can name the cause of a syntax error. `serde_json` is not used: it silently keeps the
+//! last of two duplicate keys, has no byte ranges, and rounds integers of more than 64 bits.
 
 use std::ops::Range;
 
@@ -13,10 +12,10 @@ mod text;
 
 pub(crate) use text::JsonString;
 
-/// Deepest nesting read; what `serde_json` reads with its limit of 128.
+/// Deepest nesting read; the same as `serde_json` with its limit of 128.
 pub(crate) const MAX_DEPTH: usize = 127;
 
-/// One token of JSON as Python's `json` reads it: strict JSON and the three non-finite literals.
+/// One JSON token. As in Python's `json`, three non-finite literals are accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Token<'a> {
     BeginObject,
@@ -33,13 +32,13 @@ pub(crate) enum Token<'a> {
     Null,
 }
 
-/// Why a number is refused that no double can hold.
+/// Reason for refusing a number that no double can represent.
 const HUGE: &str = "a number larger than any double";
 
-/// Most slips kept of one text.
+/// Maximum number of slips recorded for one text.
 const SLIP_CAP: usize = 100_000;
 
-/// A slip that a lenient scan reads past.
+/// A slip that a lenient scan accepts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Slip {
     pub(crate) kind: SlipKind,
@@ -55,7 +54,7 @@ pub(crate) enum SlipKind {
     SingleQuotes,
 }
 
-/// Why a scan ended early.
+/// The error that ended a scan early.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ScanError {
     pub(crate) kind: ScanErrorKind,
@@ -69,7 +68,7 @@ pub(crate) enum ScanErrorKind {
     Syntax(&'static str),
     /// Nested deeper than [`MAX_DEPTH`].
     TooDeep,
-    /// Something follows the one value.
+    /// Text follows the value.
     Trailing,
 }
 
@@ -97,20 +96,21 @@ pub(crate) struct Scanner<'a> {
     stack: Vec<bool>,
     expect: Expect,
     lenient: bool,
-    /// End of the last token, where a missing comma belongs.
+    /// End of the last token, the place of a missing comma.
     last_end: usize,
-    /// The comma just read, for a trailing one.
+    /// The last comma, which is a trailing one if a bracket follows.
     comma: Option<Range<usize>>,
-    /// Slips read past so far, the first [`SLIP_CAP`] of them; a strict scan makes none.
+    /// Slips accepted so far, the first [`SLIP_CAP`] of them; empty in a strict scan.
     pub(crate) slips: Vec<Slip>,
-    /// The first token of a strict scan that has a form here, for the sake of its faults, and none in strict JSON.
+    /// The first token of a strict scan that this scanner accepts, so that a fault can name it, and strict JSON does
+    /// not.
     pub(crate) refused: Option<ScanError>,
 }
 
 type ScanStep<'a> = Result<Option<(Token<'a>, Range<usize>)>, ScanError>;
 
 impl<'a> Scanner<'a> {
-    /// Scans strictly, from byte `start` (a character boundary; past the end means empty).
+    /// A strict scanner from byte `start` on (a character boundary; past the end means empty).
     pub(crate) fn strict(text: &'a str, start: usize) -> Self {
         Self {
             text,
@@ -125,22 +125,22 @@ impl<'a> Scanner<'a> {
         }
     }
 
-    /// Scans past trailing and missing commas, comments and single quotes, and notes each.
+    /// A scanner that accepts and records trailing and missing commas, comments and single quotes.
     pub(crate) fn lenient(text: &'a str, start: usize) -> Self {
         Self { lenient: true, ..Self::strict(text, start) }
     }
 
-    /// How many containers are open.
+    /// Number of open containers.
     pub(crate) fn depth(&self) -> usize {
         self.stack.len()
     }
 
-    /// Where the next token is looked for.
+    /// Offset at which the search for the next token begins.
     pub(crate) const fn position(&self) -> usize {
         self.pos
     }
 
-    /// The next token and its bytes; `None` after the one value and nothing else but space.
+    /// The next token and its bytes; `None` after the value and trailing space.
     pub(crate) fn next(&mut self) -> ScanStep<'a> {
         loop {
             self.skip_space()?;
@@ -201,7 +201,7 @@ impl<'a> Scanner<'a> {
         }
     }
 
-    /// Moves over the rest of the value whose first token was just read, however large.
+    /// Skips the rest of the value whose first token was just read, without building it.
     pub(crate) fn skip_rest_of(&mut self, first: &Token<'a>) -> Result<(), ScanError> {
         if !matches!(first, Token::BeginObject | Token::BeginArray) {
             return Ok(());
@@ -295,7 +295,7 @@ impl<'a> Scanner<'a> {
         Ok((token, at..self.pos))
     }
 
-    /// Notes what Rust's readers of JSON refuse and Python's takes.
+    /// Records tokens that Rust's JSON readers refuse and Python's accept.
     fn refuse(&mut self, token: &Token<'a>, at: usize) {
         if self.lenient || self.refused.is_some() {
             return;
@@ -303,7 +303,7 @@ impl<'a> Scanner<'a> {
         let reason = match token {
             Token::NonFinite(_) => "a number that is not finite",
             Token::Number(literal) if !literal.parse::<f64>().is_ok_and(f64::is_finite) => HUGE,
-            Token::Key(text) | Token::String(text) if text.decode().1 => "half of a surrogate pair",
+            Token::Key(text) | Token::String(text) if text.decode().1 => "an unpaired surrogate escape",
             _ => return,
         };
         self.refused = Some(self.syntax(at, self.pos, reason));
@@ -319,7 +319,7 @@ impl<'a> Scanner<'a> {
         match self.stack.last() {
             Some(true) => "the text ends inside an object",
             Some(false) => "the text ends inside an array",
-            None => "the text holds no value",
+            None => "the text contains no value",
         }
     }
 

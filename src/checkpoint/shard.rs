@@ -1,7 +1,7 @@
-//! A safetensors shard: its header entries, never its bytes.
+//! A safetensors shard: its header entries, not its bytes.
 //!
-//! The header reader is our own: the `safetensors` crate stops at the first fault, accepts two tensors
-//! of one name, and panics on a crafted file when overflow checks are on.
+//! The `safetensors` crate is not used to read headers: it stops at the first fault, accepts two tensors of one name,
+//! and panics on a crafted file when overflow checks are on.
 
 use std::collections::BTreeMap;
 
@@ -48,8 +48,9 @@ impl Tensor {
     }
 }
 
-/// One safetensors file: what its header says, and what is wrong with it.
+/// One safetensors file: its header and its faults.
 #[derive(Debug, Clone, Default)]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Shard {
     /// File name within the checkpoint.
     pub name: String,
@@ -57,13 +58,13 @@ pub struct Shard {
     pub file_len: u64,
     /// Where the data region starts: 8 + header length.
     pub data_start: u64,
-    /// Entries in header order; only those that could be read.
+    /// Readable entries, in header order.
     pub tensors: Vec<Tensor>,
     /// `__metadata__`; `None` when the header has none.
     pub metadata: Option<BTreeMap<String, String>>,
-    /// The header could not be read to its end, so nothing follows from a tensor not being in it.
+    /// The header could not be parsed to its end, so a tensor missing here may still exist.
     pub unread: bool,
-    /// Names of entries that are in the header but too malformed to be in `tensors`.
+    /// Names of entries in the header that are too malformed for `tensors`.
     pub unreadable: Vec<String>,
     /// SHA-256 of the first `data_start` bytes, in hexadecimal; empty for a planned shard.
     pub header_sha256: String,
@@ -74,7 +75,7 @@ pub struct Shard {
 impl Shard {
     /// A shard that could not be read at all.
     #[must_use]
-    pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
+    pub(crate) fn unread(name: impl Into<String>, fault: Fault) -> Self {
         Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
     }
 
@@ -84,9 +85,9 @@ impl Shard {
         self.tensors.iter().find(|t| t.name == name)
     }
 
-    /// The place that is this whole file.
+    /// The place that covers the whole file.
     #[must_use]
-    pub fn place(&self) -> Place {
+    pub(crate) fn place(&self) -> Place {
         Place::file(self.name.clone())
     }
 }

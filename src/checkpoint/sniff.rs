@@ -1,6 +1,6 @@
-//! What bytes really are, when they are not what the file name says.
+//! Recognises file formats by their first bytes.
 
-/// Names the format that `bytes` (the start of a file) begin with, when it is recognisable.
+/// The format of a file that starts with `bytes`; `None` when unknown.
 #[must_use]
 pub fn looks_like(bytes: &[u8]) -> Option<&'static str> {
     const MAGIC: [(&[u8], &str); 20] = [

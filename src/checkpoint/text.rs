@@ -1,11 +1,11 @@
-//! Strings and places from a checkpoint, made fit for people.
+//! Escapes strings of a checkpoint, and formats sizes and positions for messages.
 
 use std::fmt::Write as _;
 
 /// Makes a string from a checkpoint safe to print, in at most about `cap` characters.
 ///
-/// Control characters (ESC and line breaks included), bidirectional overrides and other invisible
-/// characters come out as `\u{..}`; what is cut off is marked with `…`.
+/// Control characters (ESC and line breaks included), bidirectional overrides and other invisible characters become
+/// `\u{..}`; `…` marks omitted text.
 #[must_use]
 pub fn escape(text: &str, cap: usize) -> String {
     let mut out = String::new();
@@ -36,9 +36,34 @@ const fn is_invisible(c: char) -> bool {
         | '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{fff0}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
+/// A size in decimal units, three digits: `8.06 GB`.
+#[must_use]
+pub fn file_size(n: u64) -> String {
+    const UNITS: [(&str, u64); 5] = [
+        ("PB", 1_000_000_000_000_000),
+        ("TB", 1_000_000_000_000),
+        ("GB", 1_000_000_000),
+        ("MB", 1_000_000),
+        ("kB", 1_000),
+    ];
+    let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else {
+        return format!("{n} B");
+    };
+    let size = u128::from(size);
+    let hundredths = u128::from(n).saturating_mul(100).saturating_add(size / 2).checked_div(size).unwrap_or_default();
+    let (whole, rest) = (hundredths / 100, hundredths % 100);
+    if whole >= 100 {
+        format!("{whole} {unit}")
+    } else if whole >= 10 {
+        format!("{whole}.{} {unit}", rest / 10)
+    } else {
+        format!("{whole}.{rest:02} {unit}")
+    }
+}
+
 /// Line and column of a byte offset, both from 1; the column counts characters.
 ///
-/// An offset past the end means the end; one inside a character means that character.
+/// An offset past the end counts as the end; an offset inside a character counts as the start of that character.
 #[must_use]
 pub fn line_column(text: &str, offset: usize) -> (usize, usize) {
     let mut offset = offset.min(text.len());

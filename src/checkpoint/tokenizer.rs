@@ -1,4 +1,4 @@
-//! What is known of the tokenizer without running it: which vocabulary, which added tokens, how many.
+//! Facts about the tokenizer without running it: vocabulary, added tokens, length.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -12,7 +12,7 @@ mod vocabulary;
 
 pub use vocabulary::Vocabulary;
 
-/// Vocabulary files of the tokenizers in transformers; one of them must be there.
+/// Vocabulary files of the tokenizers in transformers; a tokenizer needs one of them.
 pub const VOCABULARY_FILES: [&str; 8] = [
     "tokenizer.json",
     "tokenizer.model",
@@ -36,46 +36,47 @@ const SPECIAL: [&str; 8] = [
     "additional_special_tokens",
 ];
 
-/// A token added to the vocabulary, as one file states it.
+/// A token added to the vocabulary, as stated by one file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AddedToken {
-    /// Its id there.
+    /// The stated id.
     pub id: u64,
     /// Its text.
     pub content: String,
 }
 
-/// Facts of a tokenizer.
+/// Facts about a tokenizer.
 #[derive(Debug, Clone, Default)]
 pub struct Tokenizer {
-    /// Vocabulary files that are there, readable or not.
+    /// Vocabulary files that exist, readable or not.
     pub files: BTreeSet<String>,
-    /// Vocabularies that could be read, by file name.
+    /// Readable vocabularies, by file name.
     pub vocabularies: BTreeMap<String, Arc<Vocabulary>>,
     /// `tokenizer_class` of `tokenizer_config.json`.
     pub tokenizer_class: Option<String>,
-    /// `added_tokens_decoder` of `tokenizer_config.json`, in its order; `None` when it has none.
+    /// `added_tokens_decoder` of `tokenizer_config.json`, in file order; `None` when it is missing.
     pub added_tokens_decoder: Option<Vec<AddedToken>>,
-    /// `added_tokens.json`, in its order; `None` when there is none.
+    /// `added_tokens.json`, in file order; `None` when it is missing.
     pub added_tokens_json: Option<Vec<AddedToken>>,
-    /// `added_tokens` of `tokenizer.json`, in its order; `None` when there is none.
+    /// `added_tokens` of `tokenizer.json`, in file order; `None` when it is missing.
     pub tokenizer_json_added: Option<Vec<AddedToken>>,
-    /// Special tokens by attribute (`bos_token`), from `tokenizer_config.json` or, without an
-    /// `added_tokens_decoder` there, `special_tokens_map.json`. Additional ones have that attribute each.
+    /// Special tokens with their attribute (`bos_token`), from `tokenizer_config.json` or, if that has no
+    /// `added_tokens_decoder`, from `special_tokens_map.json`. Each additional special token has the attribute
+    /// `additional_special_tokens`.
     pub special_tokens: Vec<(String, String)>,
-    /// The file the loader takes the vocabulary from.
+    /// The file from which the loader takes the vocabulary.
     pub source: Option<String>,
-    /// Faults of vocabulary files that are no documents.
+    /// Faults of vocabulary files that are not documents.
     pub faults: Vec<Fault>,
-    /// Every token beside the base vocabulary, with the id it has once loaded.
+    /// Every token outside the base vocabulary, with its id after loading.
     added: BTreeMap<String, u64>,
     length: Option<u64>,
 }
 
 impl Tokenizer {
-    /// Derives the facts from documents and from vocabularies read elsewhere.
+    /// Derives the facts from documents and from vocabularies read before.
     ///
-    /// `files` names the vocabulary files there are, whether they could be read or not.
+    /// `files` lists the vocabulary files that exist, readable or not.
     #[must_use]
     pub fn new(
         documents: &BTreeMap<String, Document>,
@@ -88,7 +89,7 @@ impl Tokenizer {
             if !vocabularies.contains_key(name)
                 && let Some(document) = documents.get(name)
             {
-                match Vocabulary::of_document(document, pointer) {
+                match Vocabulary::from_document(document, pointer) {
                     Ok(Some(vocabulary)) => drop(vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
                     Ok(None) => {}
                     Err(reason) => {
@@ -129,9 +130,8 @@ impl Tokenizer {
         tokenizer
     }
 
-    /// Which file the vocabulary is taken from: `tokenizer.json`, unless the fast class rebuilds itself
-    /// from the slow one because `add_prefix_space` is set. Source: `LlamaTokenizerFast` and
-    /// `T5TokenizerFast` in transformers 4.47.0.
+    /// Chooses the file of the vocabulary: `tokenizer.json`, unless the fast class is rebuilt from the slow one because
+    /// `add_prefix_space` is set. Source: `LlamaTokenizerFast` and `T5TokenizerFast` in transformers 4.47.0.
     fn choose_source(&self, prefix_space: bool) -> Option<String> {
         let class = self.tokenizer_class.as_deref().unwrap_or_default();
         let rebuilt = prefix_space && (class.starts_with("Llama") || class.starts_with("T5"));
@@ -143,14 +143,14 @@ impl Tokenizer {
         Some(source.to_owned())
     }
 
-    /// The vocabulary the loader starts from, if it could be read.
+    /// The base vocabulary; `None` when its file could not be read.
     #[must_use]
     pub fn base(&self) -> Option<&Vocabulary> {
         self.vocabularies.get(self.source.as_deref()?).map(AsRef::as_ref)
     }
 
-    /// Added tokens by id as the files state them: `added_tokens_decoder`, or else `added_tokens.json`,
-    /// or else `tokenizer.json`.
+    /// Added tokens by id, from the first file that states them: `added_tokens_decoder`, `added_tokens.json`,
+    /// `tokenizer.json`.
     #[must_use]
     pub fn stated(&self) -> BTreeMap<u64, &str> {
         let lists = [&self.added_tokens_decoder, &self.added_tokens_json, &self.tokenizer_json_added];
@@ -158,32 +158,32 @@ impl Tokenizer {
         list.into_iter().flatten().map(|t| (t.id, t.content.as_str())).collect()
     }
 
-    /// Tokens beside the base vocabulary, with the ids they have once loaded.
+    /// Tokens outside the base vocabulary, with their ids after loading.
     #[must_use]
     pub const fn added(&self) -> &BTreeMap<String, u64> {
         &self.added
     }
 
-    /// `len(tokenizer)` in transformers; `None` when the vocabulary could not be read, or its class
-    /// adds tokens that no file names.
+    /// `len(tokenizer)` in transformers; `None` when the vocabulary could not be read, or when the class adds tokens
+    /// that no file lists.
     #[must_use]
     pub const fn length(&self) -> Option<u64> {
         self.length
     }
 
-    /// The id a token has once loaded.
+    /// The id of a token after loading.
     #[must_use]
     pub fn id_of(&self, token: &str) -> Option<u64> {
         self.added.get(token).copied().or_else(|| self.base()?.id_of(token))
     }
 
-    /// Whether the tokenizer has this token.
+    /// Whether the tokenizer contains this token.
     #[must_use]
     pub fn contains(&self, token: &str) -> bool {
         self.id_of(token).is_some()
     }
 
-    /// Works out ids and length as transformers does on load: stated tokens, then special ones.
+    /// Computes ids and length as transformers does on load: stated tokens first, then special ones.
     fn resolve(&mut self) {
         let base = self.base().cloned();
         let fast = self.source.as_deref() == Some("tokenizer.json");
@@ -192,7 +192,7 @@ impl Tokenizer {
         let mut ids: BTreeMap<String, u64> = BTreeMap::new();
         let stated = self.added_tokens_decoder.as_ref().or(self.added_tokens_json.as_ref());
         let mut later: Vec<&str> = Vec::new();
-        // Without the base vocabulary nothing can be worked out; what the files state is all there is.
+        // Without the base vocabulary, only the stated ids are known.
         if fast && base.is_some() {
             let own = self.tokenizer_json_added.iter().flatten();
             ids.extend(own.map(|t| (t.content.clone(), t.id)));
@@ -213,7 +213,7 @@ impl Tokenizer {
                 length = length.saturating_add(1);
             }
         }
-        // Classes behind these two shift ids or add tokens of their own.
+        // Tokenizer classes for these two files shift ids or add tokens of their own.
         let known = !matches!(self.source.as_deref(), Some("spiece.model" | "sentencepiece.bpe.model"));
         let more = u64::try_from(length).unwrap_or(u64::MAX);
         self.length = base.filter(|_| known).map(|_| base_len.saturating_add(more));
@@ -226,7 +226,7 @@ fn added(id: u64, token: &Value) -> Option<AddedToken> {
     Some(AddedToken { id, content: content.to_owned() })
 }
 
-/// Special tokens in the order they are added; of several files the first that names one.
+/// Special tokens in the order of addition; of several files the first that states one counts.
 fn special_tokens<'v>(files: &[&str], get: &impl Fn(&str, &str) -> Option<&'v Value>) -> Vec<(String, String)> {
     let content = |v: &Value| v.as_str().or_else(|| v.get("content")?.as_str()).map(str::to_owned);
     let mut tokens = Vec::new();

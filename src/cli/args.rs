@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
-use ckpt_doctor::check::Severity;
-use ckpt_doctor::knowledge::loader::asked;
-use ckpt_doctor::report::Format;
 use clap::builder::{PossibleValuesParser, TypedValueParser as _};
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
+
+use crate::check::Severity;
+use crate::knowledge::loader::parse_requirement;
+use crate::report::Format;
 
 /// Validates, repairs and merges model checkpoint directories by reading their files; nothing of a model is run.
 #[derive(Debug, Parser)]
@@ -55,8 +56,14 @@ pub struct SettingsArgs {
     pub isolated: bool,
 }
 
+/// Hides the global option `--rules` in the help of a subcommand that does not use it.
+fn hidden_rules() -> Arg {
+    Arg::new("rules").long("rules").value_name("DIR").value_parser(clap::value_parser!(PathBuf)).hide(true)
+}
+
 /// Arguments of `init`.
 #[derive(Debug, Args)]
+#[command(arg(hidden_rules()))]
 pub struct InitArgs {
     /// Directory to write the settings file to
     #[arg(value_name = "DIR", default_value = ".")]
@@ -78,7 +85,7 @@ pub struct ExpectArgs {
     pub configs: Vec<String>,
     /// Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3; the nearest known version that
     /// has the class is used [default: the version that the config names]
-    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = asked)]
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_requirement)]
     pub target: Option<String>,
     /// Output format; in jsonl, a config that fails has an "error" and the others are still printed
     #[arg(long, alias = "format", value_name = "FMT", default_value = "text")]
@@ -122,7 +129,7 @@ pub enum ExpectFormat {
 /// Arguments of `explain`.
 #[derive(Debug, Args)]
 pub struct ExplainArgs {
-    /// Code or name of a rule: IDX005, shard-missing
+    /// Code, name or family: IDX005, shard-missing, IDX
     #[arg(value_name = "RULE")]
     pub rule: String,
     /// Settings file selection.
@@ -173,7 +180,7 @@ pub struct CheckArgs {
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
     /// Predict the load for this version; may be repeated [default: the version that wrote config.json, and the newest known]
-    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = asked)]
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_requirement)]
     pub versions: Vec<String>,
     /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub
     /// checksums
@@ -237,6 +244,7 @@ pub struct FixArgs {
 /// Arguments of `undo`.
 #[derive(Debug, Args)]
 #[command(
+    arg(hidden_rules()),
     after_help = "Exit codes:\n  0  the repair was undone\n  2  there is no repair to undo, or a file has changed since the repair"
 )]
 pub struct UndoArgs {
@@ -322,17 +330,17 @@ fn formats() -> impl clap::builder::TypedValueParser<Value = Format> {
 }
 
 fn parse_format(word: &str) -> Result<Format, String> {
-    word.parse().map_err(|e: ckpt_doctor::report::UnknownFormat| e.to_string())
+    word.parse().map_err(|e: crate::report::UnknownFormat| e.to_string())
 }
 
 fn parse_pair(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((name, value)) if !name.is_empty() && !value.is_empty() => Ok((name.to_owned(), value.to_owned())),
-        _ => Err("write it as NAME=VALUE".to_owned()),
+        _ => Err("expected NAME=VALUE".to_owned()),
     }
 }
 
 fn parse_report(text: &str) -> Result<(Format, PathBuf), String> {
-    let (format, file) = parse_pair(text).map_err(|_| "write it as FMT=FILE".to_owned())?;
+    let (format, file) = parse_pair(text).map_err(|_| "expected FMT=FILE".to_owned())?;
     Ok((parse_format(&format)?, PathBuf::from(file)))
 }

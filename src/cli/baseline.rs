@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::checkpoint::open::{JSON_CAP, read_capped};
-use ckpt_doctor::report::baseline::Baseline;
-use ckpt_doctor::report::model::CheckpointReport;
 
 use super::output;
 use super::settings::Resolved;
+use crate::checkpoint::open::{JSON_CAP, read_capped};
+use crate::report::baseline::Baseline;
+use crate::report::model::CheckpointReport;
 
-/// How many findings that no longer occur are listed.
+/// Maximum number of findings listed that no longer occur.
 const NAMED: usize = 10;
 
 /// Moves findings that a baseline accepts to the suppressed ones; with `write`, writes the baselines first.
@@ -29,13 +29,13 @@ pub fn apply_baselines(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], wr
         let name = file.display().to_string();
         let folder =
             file.parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(|| PathBuf::from("."), Path::to_owned);
-        let asked: BTreeSet<&str> = here.iter().filter_map(|at| by.get(*at)).flat_map(|r| codes(r)).collect();
+        let selected: BTreeSet<&str> = here.iter().filter_map(|at| by.get(*at)).flat_map(|r| codes(r)).collect();
         let older = read(file, &name, write)?;
         let baseline = if write {
-            let looked: Vec<&CheckpointReport> = here.iter().filter_map(|at| reports.get(*at)).collect();
-            let mut baseline = Baseline::from_reports(looked.iter().copied(), &folder);
+            let checked: Vec<&CheckpointReport> = here.iter().filter_map(|at| reports.get(*at)).collect();
+            let mut baseline = Baseline::from_reports(checked.iter().copied(), &folder);
             if let Some(older) = older {
-                baseline.keep(older, &looked, &folder, &asked);
+                baseline.keep(older, &checked, &folder, &selected);
             }
             output::write(file, &baseline.text()).with_context(|| format!("writing {name}"))?;
             output::note(&format!("{name}: {} findings", baseline.len()));
@@ -46,7 +46,7 @@ pub fn apply_baselines(reports: &mut [CheckpointReport], by: &[Rc<Resolved>], wr
         let mut gone = Vec::new();
         for at in here {
             if let Some(report) = reports.get_mut(at) {
-                gone.extend(baseline.accept(report, &name, &folder, &asked));
+                gone.extend(baseline.accept(report, &name, &folder, &selected));
             }
         }
         if !gone.is_empty() {

@@ -6,15 +6,15 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::{Outcome, check_for, unused_suppressions};
-use ckpt_doctor::checkpoint::{Checkpoint, find_checkpoints, owner};
-use ckpt_doctor::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
-use ckpt_doctor::report::{Report, fixes};
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FINDINGS};
 use super::settings::{Resolved, SettingsResolver, Typed};
-use super::{baseline, fix, output, signals, unasked};
+use super::{baseline, fix, output, signals, skipped};
+use crate::check::{Outcome, check_for, unused_suppressions};
+use crate::checkpoint::{Checkpoint, find_checkpoints, owner};
+use crate::report::model::{CheckpointReport, Fixed, Fixing, Withdrawn};
+use crate::report::{Report, fixes};
 
 /// A checkpoint, the result of checking it and the settings it was checked under.
 struct Checked {
@@ -22,7 +22,7 @@ struct Checked {
     checkpoint: Arc<Checkpoint>,
     outcome: Outcome,
     by: Rc<Resolved>,
-    /// What was fixed, and what was tried.
+    /// Applied fixes, and fixes that were rolled back.
     repaired: (Vec<Fixed>, Vec<Withdrawn>),
 }
 
@@ -33,7 +33,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut dirs = Vec::new();
     for path in &args.paths {
         for dir in directories(path)? {
-            // Two files of one checkpoint, as pre-commit passes them, are one checkpoint.
+            // pre-commit passes several files of one checkpoint; it is checked once.
             if !seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone())) {
                 continue;
             }
@@ -50,7 +50,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         let changes = changes.sum::<anyhow::Result<usize>>()?;
         return Ok(if changes > 0 { FINDINGS } else { CLEAN });
     }
-    suppressions_without_use(&mut looked, &settings, &args.paths);
+    report_unused_suppressions(&mut looked, &settings, &args.paths);
     let reports = looked.iter().map(|l| {
         let mut report = CheckpointReport::new(l.dir.display().to_string(), None, &l.checkpoint, &l.outcome);
         report.settings = l.by.file.as_ref().map(|file| file.display().to_string());
@@ -72,14 +72,14 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     output::finish(&Report::new(reports, None), &args.report, args.statistics)?;
     if args.verbose {
         for l in &looked {
-            unasked::say(&l.dir, &l.outcome, &l.by.knowledge.rules);
+            skipped::print(&l.dir, &l.outcome, &l.by.knowledge.rules);
         }
     }
     Ok(if fixed || failed && !args.report.exit_zero { FINDINGS } else { CLEAN })
 }
 
-/// The checkpoints that a path means. A file may belong to none, as when pre-commit passes all that a commit changes; one
-/// that is gone means the checkpoint it is missing from.
+/// The checkpoints for a path. A file may belong to no checkpoint: pre-commit passes all files of a commit. A deleted
+/// file stands for the checkpoint that contained it.
 fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     if !path.exists() {
         let Some(owner) = owner(path) else { bail!("{}: no such file or directory", path.display()) };
@@ -92,7 +92,7 @@ fn directories(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// Judges a checkpoint as its settings say.
+/// Checks a checkpoint under its settings.
 fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
     |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
 }
@@ -121,8 +121,8 @@ fn look(dir: PathBuf, args: &CheckArgs, settings: &mut SettingsResolver) -> anyh
     Ok(Checked { dir, checkpoint, outcome, by, repaired: (fixed, withdrawn) })
 }
 
-/// Adds a finding for each suppression that had nothing to suppress.
-fn suppressions_without_use(looked: &mut [Checked], settings: &SettingsResolver, searched: &[PathBuf]) {
+/// Adds a finding for each suppression that suppressed nothing.
+fn report_unused_suppressions(looked: &mut [Checked], settings: &SettingsResolver, searched: &[PathBuf]) {
     for resolved in settings.all() {
         let here: Vec<usize> =
             looked.iter().enumerate().filter(|(_, l)| Rc::ptr_eq(&l.by, resolved)).map(|(at, _)| at).collect();

@@ -6,15 +6,15 @@ use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::checkpoint::open::{JSON_CAP, open_regular, read_capped};
-use ckpt_doctor::checkpoint::{Document, escape};
-use ckpt_doctor::knowledge::{Expected, Library, Loader};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::args::{ExpectArgs, ExpectFormat};
 use super::exit::{CLEAN, FINDINGS};
 use super::{library, output};
+use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped};
+use crate::checkpoint::{Document, escape};
+use crate::knowledge::{Expected, Library, Loader};
 
 /// One line of `@FILE`; other keys are ignored.
 #[derive(Deserialize)]
@@ -25,17 +25,17 @@ struct Record {
 }
 
 /// A config, and the name of its source in messages.
-struct Asked {
+struct Input {
     source: String,
     record: Result<Record, String>,
 }
 
-/// The expected tensors of a config, or why there are none.
+/// The expected tensors of a config, or the reason for the failure.
 struct Answer {
     source: String,
-    /// The loader that was asked, or the version for which none was found.
+    /// The loader that builds the class, or the version for which no loader has it.
     loader: String,
-    built: Result<Expected, String>,
+    expected: Result<Expected, String>,
 }
 
 /// Runs `expect`.
@@ -43,9 +43,9 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let library = library::with(rules)?;
     let mut failed = false;
     let mut list = Vec::new();
-    let mut answer = |asked: Asked| -> anyhow::Result<()> {
-        let answer = build(&library, asked, args.target.as_deref());
-        failed |= answer.built.is_err();
+    let mut answer = |input: Input| -> anyhow::Result<()> {
+        let answer = build(&library, input, args.target.as_deref());
+        failed |= answer.expected.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),
             ExpectFormat::Jsonl => output::print(&format!("{}\n", object(&answer))),
@@ -67,15 +67,15 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(if failed { FINDINGS } else { CLEAN })
 }
 
-/// A config.json, or a directory's.
-fn one(path: &Path) -> anyhow::Result<Asked> {
+/// Reads a config.json, or the one in a directory.
+fn one(path: &Path) -> anyhow::Result<Input> {
     let file = if path.is_dir() { path.join("config.json") } else { path.to_owned() };
     let record = parse(&read_capped(&file, JSON_CAP)?).map(|config| Record { config, class: None });
-    Ok(Asked { source: path.display().to_string(), record })
+    Ok(Input { source: path.display().to_string(), record })
 }
 
-/// The configs of a file of records, one after the other: such a file may be larger than memory.
-fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) -> anyhow::Result<()> {
+/// Reads the configs of a JSONL file one at a time, because such a file may be larger than memory.
+fn each_line(path: &Path, answer: &mut impl FnMut(Input) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let mut lines = BufReader::new(open_regular(path, u64::MAX)?.file);
     for number in 1_usize.. {
         let mut line = Vec::new();
@@ -88,19 +88,19 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Asked) -> anyhow::Result<()>) 
             }
             _ if line.trim_ascii().is_empty() => {}
             _ => {
-                // Python writes infinities that are not JSON: those take the longer way.
+                // Python writes infinities, which are not JSON; the lenient parser accepts them.
                 let record = serde_json::from_slice(&line).or_else(|strict| {
                     serde_json::from_value(parse(&line)?)
                         .map_err(|_| format!("not a JSON object with a \"config\": {strict}"))
                 });
-                answer(Asked { source, record })?;
+                answer(Input { source, record })?;
             }
         }
     }
     Ok(())
 }
 
-/// Parses a config as `check` does: lenient about what Python writes.
+/// Parses a config as `check` does, with the extensions of Python's JSON.
 fn parse(bytes: &[u8]) -> Result<Value, String> {
     let document = Document::parse("config.json", bytes);
     document.value.ok_or_else(|| {
@@ -109,13 +109,13 @@ fn parse(bytes: &[u8]) -> Result<Value, String> {
     })
 }
 
-/// `version`: what `--for` asked for; without it, the version that wrote the config, or the newest.
-fn build(library: &Library, asked: Asked, version: Option<&str>) -> Answer {
-    let Asked { source, record } = asked;
-    let written = record.as_ref().ok().and_then(|r| r.config.get("transformers_version")).and_then(Value::as_str);
-    let version = version.or(written).unwrap_or_else(|| Loader::NEWEST.version()).to_owned();
-    let mut answer = Answer { source, loader: version.clone(), built: Err(String::new()) };
-    answer.built = record.and_then(|Record { config, class }| {
+/// `version`: the value of `--for`; without it, the version that wrote the config, or the newest.
+fn build(library: &Library, input: Input, version: Option<&str>) -> Answer {
+    let Input { source, record } = input;
+    let wrote = record.as_ref().ok().and_then(|r| r.config.get("transformers_version")).and_then(Value::as_str);
+    let version = version.or(wrote).unwrap_or_else(|| Loader::NEWEST.version()).to_owned();
+    let mut answer = Answer { source, loader: version.clone(), expected: Err(String::new()) };
+    answer.expected = record.and_then(|Record { config, class }| {
         let found = match &class {
             Some(class) => library.class_under(&version, class),
             None => library.stands_for(&version, &config, &[]),
@@ -142,13 +142,13 @@ fn build(library: &Library, asked: Asked, version: Option<&str>) -> Answer {
     answer
 }
 
-/// Longest text of a checkpoint in a line of output.
+/// Maximum length of a text from a checkpoint in a line of output, in characters.
 const CAP: usize = 1000;
 
 fn text(answer: &Answer) -> String {
     let mut out = String::new();
     let source = escape(&answer.source, CAP);
-    match &answer.built {
+    match &answer.expected {
         Err(reason) => {
             let _ok = writeln!(out, "{source}: error: {}", escape(reason, CAP));
         }
@@ -174,7 +174,7 @@ fn text(answer: &Answer) -> String {
 }
 
 fn object(answer: &Answer) -> Value {
-    match &answer.built {
+    match &answer.expected {
         Err(reason) => json!({ "source": answer.source, "loader": answer.loader, "error": reason }),
         Ok(e) => json!({
             "source": answer.source,
@@ -195,7 +195,7 @@ fn object(answer: &Answer) -> Value {
     }
 }
 
-/// Names that share a storage, each group in the order of the state dict.
+/// Tensor names that share a storage, each group in the order of the state dict.
 fn tied(expected: &Expected) -> Vec<Vec<&str>> {
     let mut groups: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (name, tensor) in &expected.tensors {
@@ -214,7 +214,7 @@ fn tied(expected: &Expected) -> Vec<Vec<&str>> {
     whole
 }
 
-/// The end of a chain of ties.
+/// The last tensor of a chain of ties.
 fn source_of<'e>(expected: &'e Expected, name: &'e str) -> &'e str {
     let mut at = name;
     for _ in 0..8 {

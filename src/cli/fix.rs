@@ -5,18 +5,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::bail;
-use ckpt_doctor::check::Outcome;
-use ckpt_doctor::checkpoint::{Checkpoint, escape};
-use ckpt_doctor::report::model::{Fixed, Withdrawn};
-use ckpt_doctor::report::{diff, fixes};
-use ckpt_doctor::surgery::journal::{self, Recovered};
-use ckpt_doctor::surgery::repair::{Repair, plan};
-use ckpt_doctor::surgery::{ApplyError, RepairError, overlay};
 
 use super::args::FixArgs;
 use super::output;
+use crate::check::Outcome;
+use crate::checkpoint::{Checkpoint, escape};
+use crate::report::model::{Fixed, Withdrawn};
+use crate::report::{diff, fixes};
+use crate::surgery::journal::{self, Recovered};
+use crate::surgery::repair::{Repair, plan};
+use crate::surgery::{ApplyError, RepairError, overlay};
 
-/// What judges a checkpoint.
+/// Checks a checkpoint with the selected rules.
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
 
 impl FixArgs {
@@ -25,7 +25,7 @@ impl FixArgs {
         (self.fix || self.fix_only) && !self.diff
     }
 
-    /// Rejects combinations of options that make no sense.
+    /// Rejects invalid combinations of options.
     pub fn refuse(&self, checkpoints: usize) -> anyhow::Result<()> {
         if self.output.is_some() && !self.writes() {
             bail!("--output requires --fix");
@@ -43,7 +43,7 @@ pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
         let done = match journal::recover(dir)? {
             None => return Ok(()),
             Some(Recovered::Finished) => "finished",
-            Some(Recovered::TakenBack) => "rolled back",
+            Some(Recovered::RolledBack) => "rolled back",
         };
         let dir = escape(&dir.display().to_string(), 300);
         output::note(&format!("{dir}: {done} an interrupted repair"));
@@ -51,9 +51,9 @@ pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A checkpoint after its fixes were made.
+/// A checkpoint after its fixes were applied.
 pub struct Repaired {
-    /// Where it is: the directory itself, or the copy that was made.
+    /// The repaired directory: the original or the copy.
     pub dir: PathBuf,
     pub checkpoint: Arc<Checkpoint>,
     pub outcome: Outcome,
@@ -61,7 +61,7 @@ pub struct Repaired {
     pub withdrawn: Vec<Withdrawn>,
 }
 
-/// Makes the fixes of a checkpoint, of which `outcome` tells.
+/// Applies the fixes of the findings in `outcome`.
 pub fn repair(
     args: &FixArgs,
     dir: PathBuf,
@@ -74,7 +74,7 @@ pub fn repair(
     let written = write(args, &dir, &repair)?;
     let Repair { outcome, fixed, withdrawn, .. } = repair;
     Ok(match written {
-        // What counts is what a reader finds there now.
+        // The written files are read and checked again.
         Some(dir) => {
             let checkpoint = open(&dir)?;
             Repaired { outcome: check(&checkpoint), dir, checkpoint, fixed, withdrawn }
@@ -83,7 +83,7 @@ pub fn repair(
     })
 }
 
-/// Writes a repair; where it is, if there was anything to write.
+/// Writes a repair; returns the written directory, or `None` without changes.
 fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<PathBuf>> {
     if repair.changes.is_empty() {
         return Ok(None);
@@ -107,7 +107,7 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
     Ok(Some(dir.to_owned()))
 }
 
-/// Names the directory that an interrupted repair did not write: others may have been repaired before it.
+/// Names the directory that was not written because of a signal: earlier ones may already be repaired.
 fn name_interrupted(error: RepairError, dir: &Path) -> anyhow::Error {
     match error {
         RepairError::Apply(ApplyError::Interrupted) => anyhow::Error::new(error).context(dir.display().to_string()),
@@ -115,7 +115,7 @@ fn name_interrupted(error: RepairError, dir: &Path) -> anyhow::Error {
     }
 }
 
-/// Shows what the fixes of a checkpoint would change; how many there are.
+/// Shows the changes that the fixes would make; returns the number of changed files.
 pub fn show(
     args: &FixArgs,
     dir: &Path,

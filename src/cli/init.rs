@@ -1,27 +1,27 @@
 //! `init`.
 
 use anyhow::{Context, bail};
-use ckpt_doctor::knowledge::settings::FILE;
 
 use super::args::InitArgs;
 use super::exit::CLEAN;
 use super::output;
+use crate::knowledge::settings::FILE;
 
-/// What `init` writes: every key, commented out, as it stands without it.
+/// The settings file: every key with its default, commented out.
 const SETTINGS: &str = include_str!("init/ckpt-doctor.json5");
-/// What `init --pre-commit` writes beside it.
+/// The hooks that `--pre-commit` adds.
 const HOOKS: &str = include_str!("init/pre-commit-config.yaml");
 
-/// Runs `init`.
+/// Runs `init`: writes a settings file, and hooks with `--pre-commit`.
 pub fn run(args: &InitArgs) -> anyhow::Result<u8> {
     let mut files = vec![(args.dir.join(FILE), SETTINGS)];
     if args.pre_commit {
         files.push((args.dir.join(".pre-commit-config.yaml"), HOOKS));
     }
-    // All or nothing, as far as a check beforehand can see to it.
+    // Checked before the first write, so that all files are written or none.
     for (file, _) in &files {
         if file.symlink_metadata().is_ok() {
-            bail!("{} is there already; nothing is written", file.display());
+            bail!("{} already exists; nothing was written", file.display());
         }
     }
     for (file, text) in &files {

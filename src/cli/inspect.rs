@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use ckpt_doctor::check::inspect::inspect;
-use ckpt_doctor::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
-use ckpt_doctor::report::inspect as report;
 
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output};
+use crate::check::inspect::inspect;
+use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
+use crate::report::inspect as report;
 
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -35,7 +35,7 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(CLEAN)
 }
 
-/// A shard without a config and an index beside it, as a checkpoint of its own.
+/// Opens a shard as a checkpoint of its own, if it has no config and no index beside it.
 fn alone(path: &Path) -> Option<Checkpoint> {
     if !path.is_file() || path.extension().is_none_or(|e| e != "safetensors") {
         return None;

@@ -1,17 +1,18 @@
-//! The rules and architectures of the program, and those of `--rules`.
+//! The built-in rules and architectures, and those of `--rules`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use ckpt_doctor::checkpoint::open::{MODULE_CAP, read_capped};
-use ckpt_doctor::knowledge::Library;
-use ckpt_doctor::knowledge::rule::RuleSet;
 
-/// How many folders deep a user's rules are looked for.
+use crate::checkpoint::open::{MODULE_CAP, read_capped};
+use crate::knowledge::Library;
+use crate::knowledge::rule::RuleSet;
+
+/// Maximum depth of folders in a directory of rules.
 const MAX_DEPTH: usize = 8;
 
-/// The library inside the program, with the files of `rules/architectures` over it.
+/// The built-in library with the files of `rules/architectures`, which override built-in ones.
 pub fn with(rules: Option<&Path>) -> anyhow::Result<Library> {
     let mut library = Library::embedded();
     for (name, text) in texts(rules, "architectures")? {
@@ -20,13 +21,13 @@ pub fn with(rules: Option<&Path>) -> anyhow::Result<Library> {
     Ok(library)
 }
 
-/// The rules inside the program, and those in the files of `rules/checks`.
+/// The built-in rules and those in `rules/checks`.
 pub fn rules(rules: Option<&Path>) -> anyhow::Result<RuleSet> {
     let texts = texts(rules, "checks")?;
     Ok(RuleSet::embedded()?.and_files(texts.iter().map(|(name, text)| (name.clone(), text.as_str())))?)
 }
 
-/// Name and text of the `.json5` files in a folder of the user's rules.
+/// Name and text of the `.json5` files in a folder of `--rules`.
 fn texts(rules: Option<&Path>, folder: &str) -> anyhow::Result<Vec<(String, String)>> {
     let Some(rules) = rules else { return Ok(Vec::new()) };
     let mut files = Vec::new();
@@ -54,7 +55,7 @@ fn find(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> anyhow::Result
     for entry in entries {
         let entry = entry?;
         let path = entry.path();
-        // A link to a folder may lead back.
+        // Links to folders are skipped: they may form a loop.
         if entry.file_type()?.is_dir() {
             if let Some(depth) = depth.checked_sub(1) {
                 find(&path, depth, files)?;

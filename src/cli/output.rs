@@ -5,9 +5,9 @@ use std::io::{IsTerminal, Write};
 use std::path::Path;
 
 use anyhow::Context;
-use ckpt_doctor::report::{Format, Report, Style, render, statistics};
 
 use super::args::{Color, ReportArgs};
+use crate::report::{Format, Report, Style, render, statistics};
 
 /// Prints a line to standard error. A failure (full disk, closed pipe) is ignored; `eprintln` would panic.
 pub fn note(line: &str) {
@@ -46,21 +46,21 @@ pub fn style(color: Color) -> Style {
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        // The reader closed the pipe, as `head` does: no error.
+        // The reader closed the pipe, as `head` does. This is not an error.
         Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         other => other.context("writing to standard output"),
     }
 }
 
-/// Writes a report to the file that the user named.
+/// Writes a report to a file given by the user.
 #[expect(clippy::disallowed_methods, reason = "a report, not a checkpoint")]
 pub fn write(file: &Path, text: &str) -> std::io::Result<()> {
     fs::write(file, text)
 }
 
-/// A line that may quote a checkpoint, safe to show.
+/// Escapes a line that may quote a checkpoint for display.
 pub fn safe(line: &str) -> String {
-    ckpt_doctor::checkpoint::escape(line, 4000)
+    crate::checkpoint::escape(line, 4000)
 }
 
 /// Writes a new file; fails if it exists.
@@ -68,7 +68,7 @@ pub fn create(file: &Path, text: &str) -> std::io::Result<()> {
     fs::OpenOptions::new().write(true).create_new(true).open(file)?.write_all(text.as_bytes())
 }
 
-/// Columns of the terminal.
+/// Width of the terminal in columns.
 fn columns() -> Option<usize> {
     let size = rustix::termios::tcgetwinsize(std::io::stdout()).ok()?;
     (size.ws_col > 0).then_some(usize::from(size.ws_col))

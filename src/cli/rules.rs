@@ -1,54 +1,116 @@
 //! `rules` and `explain`.
 
-use std::fmt::Write;
-
+use std::fmt::{self, Write};
 use std::path::Path;
 
-use ckpt_doctor::knowledge::rule::Rule;
 use comfy_table::{Table, presets};
 
 use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
 use super::settings::{SettingsResolver, Typed};
+use crate::knowledge::rule::{Fix, Object, Rule, RuleSet, Safety, example};
+use crate::knowledge::{Loader, Template};
 
-/// Runs `rules`: a line for each that is asked here.
+/// Runs `rules`: lists the selected rules.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let here = SettingsResolver::new(Typed::new(args, rules)).resolve(Path::new("."))?;
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING);
-    for rule in &here.knowledge.rules.rules {
-        table.add_row([rule.code.as_str(), rule.severity.name(), rule.name.as_str()]);
-    }
-    let lines: Vec<String> = table.lines().map(|line| line.trim().to_owned()).collect();
-    output::print(&format!("{}\n", lines.join("\n")))?;
+    let rows = here.knowledge.rules.rules.iter().map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name]);
+    output::print(&table(rows))?;
     Ok(CLEAN)
 }
 
-/// Runs `explain`: all there is to say of one rule.
+/// Runs `explain`: prints the page of a rule, or the list of a family.
 pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let here = SettingsResolver::new(Typed::new(&args.settings, rules)).resolve(Path::new("."))?;
-    output::print(&page(here.knowledge.rules.find(&args.rule)?)?)?;
+    let rules = &here.knowledge.rules;
+    let text = match family(rules, &args.rule) {
+        Some(list) => list,
+        None => page(rules.find(&args.rule)?)?,
+    };
+    output::print(&text)?;
     Ok(CLEAN)
 }
 
-fn page(rule: &Rule) -> Result<String, std::fmt::Error> {
+fn table<'r, const N: usize>(rows: impl Iterator<Item = [&'r str; N]>) -> String {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.add_rows(rows);
+    table.lines().fold(String::new(), |text, line| text + line.trim() + "\n")
+}
+
+/// Title and rules of a family; `None` if `word` is not a family.
+fn family(rules: &RuleSet, word: &str) -> Option<String> {
+    let word = word.to_ascii_uppercase();
+    let is_member = |rule: &&Rule| rule.code.trim_end_matches(|c: char| c.is_ascii_digit()) == word;
+    let members: Vec<&Rule> = rules.all().filter(is_member).collect();
+    let title = rules.catalogue.families.iter().find(|(family, _)| *family == word);
+    let title = title.map(|(_, title)| format!(": {title}")).unwrap_or_default();
+    let rows = members
+        .iter()
+        .map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name, &rule.summary].map(AsRef::as_ref));
+    (!members.is_empty()).then(|| format!("{word}{title}\n\n{}", table(rows)))
+}
+
+fn page(rule: &Rule) -> Result<String, fmt::Error> {
     let mut out = String::new();
-    writeln!(out, "{} {} ({})\n", rule.code, rule.name, rule.severity.name())?;
-    writeln!(out, "What it finds\n  {}\n", rule.summary)?;
+    writeln!(out, "{} {} ({})\n", rule.code, rule.name, rule.highest_severity().name())?;
+    writeln!(out, "What it reports\n  {}\n", rule.summary)?;
     writeln!(out, "Why it matters\n  {}", rule.why)?;
     if !rule.applies.is_empty() {
         writeln!(out, "\nApplies to\n  {}", rule.applies.join(", "))?;
     }
-    writeln!(out, "\nMessage\n  {}", rule.message.source())?;
+    match example(&rule.code).filter(|_| rule.origin.is_none()) {
+        Some(example) => writeln!(out, "\nExample\n  {}", example.replace('\n', "\n  "))?,
+        None => writeln!(out, "\nMessage\n  {}", rule.message.prose())?,
+    }
+    if let Some(harm) = rule.harm {
+        writeln!(out, "\nHarm\n  {}", harm.name())?;
+    }
+    if !rule.effects.is_empty() {
+        writeln!(out, "\nEffects\n  {}", effects(rule).trim_end().replace('\n', "\n  "))?;
+    }
     for fix in &rule.fixes {
-        writeln!(out, "\nFix ({})\n  {}", fix.safety.name(), fix.help.source())?;
+        writeln!(out, "\nFix ({})", safety(fix.safety))?;
+        for text in texts(fix) {
+            writeln!(out, "  {text}")?;
+        }
     }
     if let Some(origin) = &rule.origin {
-        writeln!(out, "\nFrom\n  {origin}")?;
+        writeln!(out, "\nDefined in\n  {origin}")?;
     }
     if !rule.references.is_empty() {
         writeln!(out, "\nReferences\n  {}", rule.references.join("\n  "))?;
     }
     Ok(out)
+}
+
+/// The effects of a rule, with a column for each known loader.
+fn effects(rule: &Rule) -> String {
+    let header = ["object"].into_iter().chain(Loader::ALL.map(Loader::version)).chain(["what happens"]);
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.add_row(header);
+    for effect in &rule.effects {
+        let under = |loader: Loader| {
+            if effect.loaders.contains(loader.version()) { effect.consequence.name() } else { "-" }
+        };
+        let happens = effect.text.prose();
+        let happens = if effect.when.is_some() { format!("{happens} (in some cases)") } else { happens };
+        let object = effect.object.map_or("by file", Object::name);
+        table.add_row([object].into_iter().chain(Loader::ALL.map(under)).chain([happens.as_str()]));
+    }
+    table.lines().fold(String::new(), |text, line| text + line.trim() + "\n")
+}
+
+fn texts(fix: &Fix) -> impl Iterator<Item = String> {
+    [&fix.title, &fix.help].into_iter().flatten().map(Template::prose)
+}
+
+const fn safety(safety: Safety) -> &'static str {
+    match safety {
+        Safety::Safe => "safe, applied by --fix",
+        Safety::Unsafe => "unsafe, applied by --fix --unsafe-fixes",
+        Safety::Manual => "manual",
+    }
 }

@@ -1,20 +1,19 @@
-//! Resolves command line and settings files to the options of each checkpoint.
+//! Combines the command line and settings files into the options of each checkpoint.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use ckpt_doctor::check::Severity;
-use ckpt_doctor::knowledge::Knowledge;
-use ckpt_doctor::knowledge::selection::Choice;
-use ckpt_doctor::knowledge::settings::{Chain, nearest};
-
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
+use crate::check::Severity;
+use crate::knowledge::Knowledge;
+use crate::knowledge::selection::Choice;
+use crate::knowledge::settings::{Chain, nearest};
 
 /// Resolved options for the checkpoints under one settings file.
 pub struct Resolved {
-    /// The settings file, if there is one.
+    /// The settings file, if any.
     pub file: Option<PathBuf>,
     /// Rules, architectures and policy of the checks.
     pub knowledge: Knowledge,
@@ -69,12 +68,12 @@ impl Typed {
 pub struct SettingsResolver {
     typed: Typed,
     resolved: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
-    told: BTreeSet<PathBuf>,
+    reported: BTreeSet<PathBuf>,
 }
 
 impl SettingsResolver {
     pub fn new(typed: Typed) -> Self {
-        Self { typed, resolved: BTreeMap::new(), told: BTreeSet::new() }
+        Self { typed, resolved: BTreeMap::new(), reported: BTreeSet::new() }
     }
 
     /// The options for the checkpoint in this directory.
@@ -85,10 +84,10 @@ impl SettingsResolver {
             Some(config.clone())
         } else {
             let found = nearest(checkpoint);
-            if let Some(passed_over) = found.passed_over
-                && self.told.insert(passed_over.clone())
+            if let Some(ignored) = found.ignored
+                && self.reported.insert(ignored.clone())
             {
-                let file = output::safe(&passed_over.display().to_string());
+                let file = output::safe(&ignored.display().to_string());
                 output::note(&format!(
                     "note: {file} is inside a checkpoint and is ignored; pass --config {file} to use it"
                 ));

@@ -2,12 +2,11 @@
 
 use std::fmt::Write as _;
 
-use ckpt_doctor::checkpoint::escape;
-use ckpt_doctor::surgery::journal;
-
 use super::args::UndoArgs;
 use super::exit::CLEAN;
 use super::{output, signals};
+use crate::checkpoint::escape;
+use crate::surgery::journal;
 
 /// Runs `undo`.
 pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {

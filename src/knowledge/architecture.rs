@@ -62,16 +62,16 @@ impl<'l> Architecture<'l> {
         self.library.text(self.name()).is_some_and(|text| text.contains(key))
     }
 
+    /// Whether its file reads sizes from stored tensors, as classes do whose config does not name them.
+    #[must_use]
+    pub fn reads_tensors(&self) -> bool {
+        ["stored(", "stored_count(", "has_tensor("].iter().any(|function| self.speaks_of(function))
+    }
+
     /// The config that a search for one begins with when there is none.
     #[must_use]
     pub fn start(&self) -> Value {
         Value::Object(self.file.start.clone())
-    }
-
-    /// The loader that builds it.
-    #[must_use]
-    pub const fn loader(&self) -> Loader {
-        self.loader
     }
 
     /// The tensors the class builds from `config`, the content of config.json.
@@ -162,15 +162,6 @@ pub struct ExpectedTensor {
 }
 
 impl Expected {
-    /// Bytes of all tensors, each shared storage once; `None` when that overflows.
-    #[must_use]
-    pub fn total_bytes(&self, bytes_per_element: u64) -> Option<u64> {
-        self.tensors.values().filter(|t| t.tied_to.is_none()).try_fold(0_u64, |total, tensor| {
-            let elements = tensor.shape.iter().try_fold(1_u64, |n, d| n.checked_mul(*d))?;
-            total.checked_add(elements.checked_mul(bytes_per_element)?)
-        })
-    }
-
     /// Drops the optional groups of which no tensor is present.
     pub fn drop_absent_groups(&mut self, present: impl Fn(&str) -> bool) {
         let found: BTreeSet<String> =

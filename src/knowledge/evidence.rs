@@ -1,41 +1,41 @@
-//! What is known of a checkpoint's tensors when an architecture is built.
+//! Tensors of a checkpoint, as input for building an architecture.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Tensors found in a checkpoint, by name, with their shape where it is known.
+/// Tensors of a checkpoint by name, with their shapes where known.
 ///
-/// A few facts are in no config (the size of LLaVA-3D's CLIP tower): those are read off the tensors.
+/// Some facts are in no config (the size of LLaVA-3D's CLIP tower) and are derived from tensors.
 #[derive(Debug, Clone, Default)]
 pub struct Evidence {
     shapes: Arc<BTreeMap<String, Option<Vec<u64>>>>,
 }
 
 impl Evidence {
-    /// Shape of the tensor of this name, when there is one and its shape is known.
+    /// Shape of this tensor; `None` when the tensor is missing or its shape is unknown.
     #[must_use]
     pub fn shape(&self, name: &str) -> Option<&[u64]> {
         self.shapes.get(name)?.as_deref()
     }
 
-    /// Whether there is a tensor of this name.
+    /// Whether the tensor exists.
     #[must_use]
     pub fn contains(&self, name: &str) -> bool {
         self.shapes.contains_key(name)
     }
 
-    /// The tensor of this name, as it is held here.
+    /// Name and shape of this tensor; the name borrows from the evidence.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<(&str, Option<&[u64]>)> {
         self.shapes.get_key_value(name).map(|(name, shape)| (name.as_str(), shape.as_deref()))
     }
 
-    /// Every tensor by name, with its shape where that is known.
+    /// Every tensor by name, with its shape where known.
     pub fn iter(&self) -> impl Iterator<Item = (&str, Option<&[u64]>)> {
         self.shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_deref()))
     }
 
-    /// One more than the largest number that follows `prefix` in a tensor's name; 0 when none does.
+    /// One more than the largest number after `prefix` in a tensor name; 0 without a match.
     #[must_use]
     pub fn count(&self, prefix: &str) -> u64 {
         let index = |name: &str| -> Option<u64> {
@@ -53,7 +53,7 @@ impl FromIterator<(String, Option<Vec<u64>>)> for Evidence {
     }
 }
 
-/// Names alone.
+/// Names without shapes.
 impl<'n> FromIterator<&'n str> for Evidence {
     fn from_iter<I: IntoIterator<Item = &'n str>>(names: I) -> Self {
         names.into_iter().map(|name| (name.to_owned(), None)).collect()

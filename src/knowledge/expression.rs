@@ -1,7 +1,7 @@
 //! Expressions of the data files: the Common Expression Language, wrapped so that no other stage sees the crate.
 //!
-//! Every evaluation is total. Overflow, division by zero and missing keys are errors with a message,
-//! whatever values a checkpoint's documents hold.
+//! Every evaluation terminates. Overflow, division by zero and missing keys are errors with a message, for any values
+//! in a checkpoint's documents.
 
 mod compiled;
 mod functions;
@@ -10,8 +10,8 @@ mod scope;
 mod steps;
 mod template;
 
-pub use compiled::{EvalError, Expression, ParseError};
-pub(crate) use compiled::{compiled_at_once, compiled_when_needed};
+pub use compiled::{EvalError, Expression};
+pub(crate) use compiled::{compile_eagerly, compile_lazily};
 pub(crate) use functions::glob;
 pub use scope::Scope;
 pub(crate) use steps::within;

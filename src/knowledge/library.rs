@@ -60,22 +60,6 @@ impl Library {
         self.files.iter().map(|file| file.stem.as_str())
     }
 
-    /// What the file of this name is about, in one line, and where its facts come from.
-    #[must_use]
-    pub fn about(&self, name: &str) -> Option<(&str, &[String])> {
-        let file = self.files.iter().find(|file| file.stem == name)?.blueprint();
-        Some((&file.summary, &file.sources))
-    }
-
-    /// The architecture of this name: the first class of its file, under the first loader it is known for.
-    #[must_use]
-    pub fn architecture(&self, name: &str) -> Option<Architecture<'_>> {
-        let file = self.files.iter().find(|file| file.stem == name)?.blueprint();
-        Loader::ALL
-            .into_iter()
-            .find_map(|loader| Some(Architecture::new(self, file, file.classes(loader).next()?, loader)))
-    }
-
     /// The class of this name, as `loader` builds it.
     #[must_use]
     pub fn class(&self, name: &str, loader: Loader) -> Option<Architecture<'_>> {

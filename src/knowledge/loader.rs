@@ -1,11 +1,11 @@
-//! The loaders whose behaviour is known: versions of transformers that were read and run.
+//! The known loaders: versions of transformers whose behaviour was read and run.
 
 use std::fmt;
 
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-/// A version of transformers that architectures and load reports speak for.
+/// A version of transformers for which loads are predicted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Loader {
     /// transformers 4.47.0.
@@ -17,13 +17,13 @@ pub enum Loader {
 }
 
 impl Loader {
-    /// All of them, oldest first.
+    /// All loaders, oldest first.
     pub const ALL: [Self; 3] = [Self::V4_47_0, Self::V4_57_6, Self::V5_23_0];
 
-    /// The newest one.
+    /// The newest loader.
     pub const NEWEST: Self = Self::V5_23_0;
 
-    /// Its version number.
+    /// Version number.
     #[must_use]
     pub const fn version(self) -> &'static str {
         match self {
@@ -33,7 +33,7 @@ impl Loader {
         }
     }
 
-    /// The first number of its version.
+    /// Major version.
     #[must_use]
     pub const fn major(self) -> u64 {
         match self {
@@ -42,7 +42,7 @@ impl Loader {
         }
     }
 
-    /// Its version as one number that expressions of architecture files compare: `release >= 457`.
+    /// The version as one number that expressions of architecture files compare: `release >= 457`.
     #[must_use]
     pub const fn release(self) -> u64 {
         match self {
@@ -52,8 +52,8 @@ impl Loader {
         }
     }
 
-    /// The known loader nearest to a version. A text that does not start with a number names no version, and means the
-    /// newest. Which loader stands for a version for one class is `Library::stands_for`'s to say.
+    /// The known loader nearest to a version; the newest if the text does not start with a number.
+    /// [`Library::stands_for`](super::Library::stands_for) chooses among those that have a class.
     #[must_use]
     pub fn nearest(version: &str) -> Self {
         let [nearest, ..] = Self::by_distance(version);
@@ -85,7 +85,7 @@ impl Loader {
         }
     }
 
-    /// The known loader nearest to the version that wrote this config.json; the newest when it does not say.
+    /// The known loader nearest to the version that wrote this config.json; the newest if the config has no version.
     #[must_use]
     pub fn of_config(config: &Value) -> Self {
         config.get("transformers_version").and_then(Value::as_str).map_or(Self::NEWEST, Self::nearest)
@@ -98,24 +98,24 @@ impl fmt::Display for Loader {
     }
 }
 
-/// A data file may name the version that its author read; the nearest known one stands for it.
+/// Data files state the version that their author read; it is mapped to the nearest known loader.
 impl<'de> Deserialize<'de> for Loader {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let version = String::deserialize(deserializer)?;
         if version.starts_with(|c: char| c.is_ascii_digit()) {
             Ok(Self::nearest(&version))
         } else {
-            Err(serde::de::Error::custom(format!("`{version}` is no version of transformers")))
+            Err(serde::de::Error::custom(format!("`{version}` is not a version of transformers")))
         }
     }
 }
 
-/// `transformers==4.51.3`, `4.51.3` or `4.51`: the version, as Python packages have it. Which loader stands for it is
-/// `Library::stands_for`'s to say.
+/// Parses `transformers==4.51.3`, `4.51.3` or `4.51`, and returns the version;
+/// [`Library::stands_for`](super::Library::stands_for) maps it to a loader.
 ///
 /// # Errors
-/// Says how a version is written.
-pub fn asked(text: &str) -> Result<String, String> {
+/// The expected form, with the known versions.
+pub fn parse_requirement(text: &str) -> Result<String, String> {
     let version = text.strip_prefix("transformers==").unwrap_or(text);
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
     if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
@@ -123,7 +123,7 @@ pub fn asked(text: &str) -> Result<String, String> {
     }
     let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
     Err(format!(
-        "write it as VERSION or transformers==VERSION; known are {}, others are judged as the nearest",
+        "expected VERSION or transformers==VERSION; known versions are {}, others are predicted as the nearest one",
         known.join(", ")
     ))
 }
@@ -164,11 +164,11 @@ mod tests {
     #[test]
     fn a_version_is_asked_for_with_and_without_the_package() {
         for text in ["transformers==4.57.3", "4.57.3"] {
-            assert_eq!(asked(text), Ok("4.57.3".to_owned()));
+            assert_eq!(parse_requirement(text), Ok("4.57.3".to_owned()));
         }
-        assert_eq!(asked("4.57"), Ok("4.57".to_owned()));
+        assert_eq!(parse_requirement("4.57"), Ok("4.57".to_owned()));
         for text in ["", "transformers==", "transformers", "torch==2.1", "4 57", "v4.57"] {
-            assert!(asked(text).is_err(), "{text}");
+            assert!(parse_requirement(text).is_err(), "{text}");
         }
     }
 }

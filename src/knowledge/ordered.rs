@@ -1,4 +1,4 @@
-//! Maps in the order they were written.
+//! Maps that keep the order of the file.
 
 use std::collections::HashSet;
 use std::fmt;
@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use serde::de::{Error as _, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
-/// A map in the order it was written; a key given twice is an error.
+/// Deserialises a map in file order; a duplicate key is an error.
 pub(super) fn ordered<'de, D, K, V>(deserializer: D) -> Result<Vec<(K, V)>, D::Error>
 where
     D: Deserializer<'de>,
@@ -27,7 +27,7 @@ where
             let mut entries = Vec::new();
             while let Some((key, value)) = map.next_entry::<K, V>()? {
                 if !seen.insert(key.to_string()) {
-                    return Err(A::Error::custom(format!("`{key}` is given twice")));
+                    return Err(A::Error::custom(format!("duplicate key `{key}`")));
                 }
                 entries.push((key, value));
             }
@@ -37,7 +37,7 @@ where
     deserializer.deserialize_map(Ordered(PhantomData))
 }
 
-/// As [`ordered`], for a field that may be left out.
+/// As [`ordered`], for an optional field.
 pub(super) fn ordered_option<'de, D, K, V>(deserializer: D) -> Result<Option<Vec<(K, V)>>, D::Error>
 where
     D: Deserializer<'de>,

@@ -1,27 +1,29 @@
-//! Processors: which tokens one adds to a tokenizer when it is opened.
+//! Processors: the tokens that a processor adds to a tokenizer when it is opened.
 
 use serde::Deserialize;
 
 use super::expression::{Expression, Template};
 use super::source::{self, DataError};
 
-/// A processor as its file in `rules/processors/` gives it. Expressions see the checkpoint's
-/// `processor` (`processor_config.json`) and what `let` has named so far.
+/// A processor, as read from its file in `rules/processors/`.
+///
+/// Expressions see `processor` (the `processor_config.json` of the checkpoint) and the names that `let` defined so far.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Processor {
-    /// Its name.
+    /// Name of the processor.
     pub processor: String,
-    /// Architectures it belongs to.
+    /// Architectures that use the processor.
     pub architectures: Vec<String>,
-    /// Names for expressions, in order.
+    /// Names for expressions, in order; each may use the names before it.
     #[serde(rename = "let", default)]
     pub lets: Vec<Let>,
-    /// In the order in which they are added; one that is there already keeps its id.
+    /// Tokens in the order in which they are added; a token that the tokenizer has already keeps its id.
     pub add: Vec<TokenRun>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
@@ -32,36 +34,36 @@ pub struct Processor {
 pub struct Let {
     /// The name.
     pub name: String,
-    /// Its value.
+    /// The expression.
     pub is: Expression,
 }
 
-/// A token, or a numbered run of them.
+/// A token, or a numbered series of tokens.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TokenRun {
-    /// Content; `i` is the number within the run: `<loc{zpad(i, 4)}>`.
+    /// Text of the token; `i` is its number in the series: `<loc{zpad(i, 4)}>`.
     pub content: Template,
-    /// How many; one when absent.
+    /// Number of tokens; 1 when missing.
     #[serde(default)]
     pub count: Option<Expression>,
-    /// Whether the tokenizer treats them as special.
+    /// Whether the tokens are special.
     #[serde(default)]
     pub special: bool,
-    /// Whether text is normalised before they are looked for.
+    /// Whether the tokenizer normalises text before it looks for the tokens.
     #[serde(default)]
     pub normalized: bool,
-    /// Name under which expressions find the first one's id in `tokens`.
+    /// Name under which `tokens` holds the id of the first token.
     #[serde(rename = "as", default)]
     pub name: Option<String>,
 }
 
 impl Processor {
-    /// The processors inside the program.
+    /// The built-in processors.
     ///
     /// # Errors
-    /// [`DataError`]; the house tests see to it that there is none.
+    /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("processors").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }

@@ -1,7 +1,7 @@
-//! Quantisation schemes: how a weight is stored when it is not stored plainly; one file each in `rules/quantization/`.
+//! Quantisation schemes: how a quantised weight is stored; one file each in `rules/quantization/`.
 //!
-//! A scheme wraps the plain template of a class and is never a template of its own: in place of one plain tensor
-//! stand a few others, whose names and shapes follow from the plain one's.
+//! A scheme transforms the plain template of a class and has no template of its own. It replaces each plain tensor with
+//! others, whose names and shapes follow from the plain one.
 
 mod applied;
 mod declared;
@@ -15,124 +15,127 @@ use super::source::{self, DataError};
 pub use applied::{AppliedScheme, Shapes};
 pub use declared::{DeclaredScheme, block, declared_scheme};
 
-/// A scheme as its file gives it.
+/// A quantisation scheme, as read from its file in `rules/quantization/`.
 ///
-/// Expressions see the `config`, `q` (its block about quantisation) and the parameters; shapes also see the plain
-/// tensor: `rows` and `cols` (its last two dimensions), `lead` (those before them), `count` (of its values), and what
-/// `let` names. `held` lists the names that are stored of a module. `init(list)` and `last(list)` take a list apart.
+/// Expressions see `config`, `q` (its quantisation block) and the parameters. Shapes also see the plain tensor: `rows` and
+/// `cols` (its last two dimensions), `lead` (the dimensions before them), `count` (the number of its values), and the names
+/// in `let`. `held` lists the stored names of a module. `init(list)` is a list without its last element, `last(list)` that
+/// element.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Scheme {
-    /// Its name: the stem of its file.
+    /// Name of the scheme: the stem of its file.
     pub scheme: String,
-    /// What people call it.
+    /// Usual name of the scheme, for messages.
     pub summary: String,
-    /// Where its facts come from.
+    /// Sources of the facts.
+    #[allow(dead_code, reason = "for readers of the file")]
     pub sources: Vec<String>,
-    /// Whether a config means this scheme.
+    /// Condition on the config for this scheme.
     pub when: Expression,
-    /// The program that loads it, when that is not transformers.
+    /// Program that loads the weights, when it is not transformers.
     #[serde(default)]
     pub loaded_by: Option<String>,
-    /// What the shapes depend on besides the plain shape, in order.
+    /// Values that the shapes depend on besides the plain shape, in order.
     #[serde(default)]
     pub parameters: Vec<Parameter>,
-    /// Whether a module's name in `q` stands for parameters of its own.
+    /// Whether `q` may contain parameters of single modules, under their names.
     #[serde(default)]
     pub overrides: bool,
-    /// When shapes follow from the config at all; always when absent.
+    /// Condition under which the config determines the shapes; always true when missing.
     #[serde(default)]
     pub shapes_when: Option<Expression>,
-    /// Names for what shapes say often, in order.
+    /// Names for expressions of the shapes, in order.
     #[serde(default, rename = "let")]
     pub lets: Vec<Let>,
-    /// How the plain tensor's name ends; `tensors` put other endings in its place.
+    /// Ending of the name of the plain tensor; `tensors` replace it by other endings.
     pub plain: String,
-    /// The plain shape, read off the stored shapes in `s`; of one dimension where these say only how many values there
-    /// are; absent where they do not say that either.
+    /// The plain shape, computed from the stored shapes in `s`; one dimension if they determine only the number of values;
+    /// missing if they do not determine that either.
     #[serde(default)]
     pub plain_shape: Option<Expression>,
-    /// Keys of `q` that list what is left plain.
+    /// Keys of `q` that list the modules excluded from quantisation.
     #[serde(default)]
     pub skipped: Vec<String>,
-    /// Tensors may as well be plain: the loader takes them as they are.
+    /// Whether the loader also accepts plain tensors.
     #[serde(default)]
     pub plain_too: bool,
-    /// Whether modules of one kind are stored alike in every layer but for those listed; true when absent.
+    /// Whether all modules of one kind are stored alike, except for the excluded ones; true when missing.
     #[serde(default)]
     pub all_alike: Option<Expression>,
-    /// Ending by which tensors are taken for this scheme's when no config says so.
+    /// Ending of tensor names that identifies the scheme when the config declares none.
     #[serde(default)]
     pub sign: Option<String>,
-    /// Those lists name modules one by one (or match them by `re:…`), not whole branches.
+    /// Whether the exclusions name single modules (or match them with `re:…`) instead of whole branches.
     #[serde(default)]
     pub skipped_are_modules: bool,
-    /// What stands in place of the plain tensor; the first one holds the values.
+    /// Tensors that replace the plain one; the first contains the values.
     pub tensors: Vec<StoredPart>,
-    /// Endings of tensors that a quantised module may have although the class has not.
+    /// Endings of tensors that a quantised module may have in addition to those of the class.
     #[serde(default)]
     pub extra: Vec<String>,
-    /// Globs of further names that belong to the scheme and are not checked.
+    /// Globs of further names of the scheme; they are not checked.
     #[serde(default)]
     pub ignored: Vec<String>,
-    /// What transformers says of an incomplete module, when it raises; `{tensor}` is the plain name.
+    /// Exception that transformers raises for an incomplete module; `{tensor}` is the plain name.
     #[serde(default)]
     pub raises: Option<String>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
-/// A value that shapes depend on.
+/// A value that the shapes depend on.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Parameter {
     /// Name in expressions.
     pub name: String,
-    /// Its value.
+    /// The value.
     pub is: Expression,
-    /// Other values worth trying when the shapes disagree.
+    /// Other values to try when the shapes do not match.
     #[serde(default)]
     pub others: Vec<i64>,
-    /// No config says it: whichever value fits is right.
+    /// Whether no config sets the value: any value that matches the shapes is right.
     #[serde(default)]
     pub free: bool,
 }
 
-/// One of the tensors that stand in place of a plain one.
+/// One of the tensors that replace a plain one.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct StoredPart {
-    /// How its name ends.
+    /// Ending of its name.
     pub name: String,
-    /// Its shape; null, or no expression, for any.
+    /// Its shape; any shape when null or missing.
     #[serde(default)]
     pub shape: Option<Expression>,
-    /// Element types it may have.
+    /// Dtypes that it may have.
     pub dtypes: Vec<String>,
-    /// Whether a module is incomplete without it; true when absent.
+    /// Whether a module needs it; true when missing.
     #[serde(default)]
     pub required: Option<Expression>,
 }
 
 impl Scheme {
-    /// The schemes inside the program.
+    /// The built-in schemes.
     ///
     /// # Errors
-    /// [`DataError`]; the house tests see to it that there is none.
+    /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("quantization").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 
-    /// Endings of its tensors, in order.
+    /// Name endings of its tensors, in order.
     pub fn endings(&self) -> impl Iterator<Item = &str> {
         self.tensors.iter().map(|part| part.name.as_str())
     }
 
-    /// Whether values are stored under the plain name.
+    /// Whether the values are stored under the plain name.
     #[must_use]
     pub fn keeps_name(&self) -> bool {
         self.tensors.first().is_some_and(|part| part.name == self.plain)

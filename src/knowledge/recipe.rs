@@ -1,4 +1,4 @@
-//! Recipes: what `build-merged` takes from which donor, as data.
+//! Recipes: the parts that `build-merged` takes from each donor.
 
 use std::collections::BTreeMap;
 
@@ -9,45 +9,46 @@ use super::expression::{Expression, Template};
 use super::processor::Let;
 use super::source::{self, DataError};
 
-/// A recipe as its file in `rules/recipes/` gives it.
+/// A recipe, as read from its file in `rules/recipes/`.
 ///
-/// Expressions see `opt` (options in force), one variable for each donor role (its config with the
-/// class's defaults filled in), `processor`, `preprocessor`, `tokens`, what `let` has named so far, and the
-/// functions `shape(role, tensor)` and `has(role, prefix)`.
+/// Expressions see `opt` (the options), a variable for each donor role (its config with the defaults of the class filled in),
+/// `processor`, `preprocessor`, `tokens`, the names that `let` defined so far, and the functions `shape(role, tensor)` and
+/// `has(role, prefix)`.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// Name on the command line.
+    /// Name of the recipe on the command line.
     pub recipe: String,
-    /// One line.
+    /// The result, as one line.
     pub summary: String,
-    /// Donor roles.
+    /// Roles of the donors.
     pub donors: Vec<DonorSpec>,
-    /// Options.
+    /// Options of the recipe.
     #[serde(default)]
     pub options: Vec<OptionSpec>,
-    /// Names for expressions, in order; each may use those before it.
+    /// Names for expressions, in order; each may use the names before it.
     #[serde(rename = "let", default)]
     pub lets: Vec<Let>,
-    /// The processor of the result and the tokenizer it opens: `tokens` then knows the ids of what it adds.
+    /// Processor and tokenizer of the result; `tokens` then holds the ids of the tokens that the processor adds.
     #[serde(default)]
     pub tokens: Option<TokenSpec>,
-    /// What must fit before anything is planned.
+    /// Conditions that the donors must meet before the merge is planned.
     #[serde(default)]
     pub seams: Vec<SeamSpec>,
-    /// The documents of the result.
+    /// JSON documents of the result.
     pub documents: Vec<DocumentSpec>,
-    /// Where tensors come from; the first entry that matches a donor tensor decides.
+    /// Tensors of the result; the first entry that matches a donor tensor applies.
     pub tensors: Vec<TensorSpec>,
-    /// Files that are copied or made from a template.
+    /// Other files of the result.
     #[serde(default)]
     pub files: Vec<FileSpec>,
-    /// Sentences about what the merge decided that a person should know.
+    /// Notes in the report about decisions of the merge.
     #[serde(default)]
     pub notes: Vec<Note>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
@@ -56,17 +57,17 @@ pub struct Recipe {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct DonorSpec {
-    /// Role on the command line.
+    /// Name of the role on the command line.
     pub role: String,
-    /// What the role is for.
+    /// Description of the donor.
     pub what: String,
-    /// Architectures that can play it; empty for a directory that is no checkpoint.
+    /// Architectures that the donor may have; empty for a directory that is not a checkpoint.
     #[serde(default)]
     pub architectures: Vec<String>,
-    /// Whether the merge can do without.
+    /// Whether the donor may be left out.
     #[serde(default)]
     pub optional: bool,
-    /// Rules whose findings on this donor do not stop the merge, because it repairs or leaves behind what they are about.
+    /// Rules whose findings on this donor do not stop the merge, because the result does not have the fault.
     #[serde(default)]
     pub tolerates: Vec<String>,
 }
@@ -76,59 +77,60 @@ pub struct DonorSpec {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct OptionSpec {
-    /// Name on the command line.
+    /// Name of the option on the command line.
     pub name: String,
-    /// What it decides.
+    /// Effect of the option.
+    #[allow(dead_code, reason = "for readers of the file")]
     pub help: String,
-    /// Values it may have; a value that ends in `:` takes any text after the colon. Empty: a size such as `5GB`.
+    /// Allowed values; a value that ends in `:` takes any text after the colon. Empty for a size such as `5GB`.
     #[serde(default)]
     pub values: Vec<String>,
-    /// Value when not given.
+    /// Default value.
     pub default: String,
 }
 
-/// Which processor adds its tokens to which donor's tokenizer.
+/// Processor and tokenizer of the result.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TokenSpec {
-    /// Role whose tokenizer it is.
+    /// Role of the donor whose tokenizer is used.
     pub base: String,
-    /// Processor, one of `rules/processors/`.
+    /// Name of a processor in `rules/processors/`.
     pub processor: String,
 }
 
-/// Something that must fit.
+/// A condition that the donors must meet.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SeamSpec {
     /// The condition.
     pub that: Expression,
-    /// What does not fit, in one sentence.
+    /// The mismatch, as one sentence.
     pub message: Template,
-    /// The tensor that does not fit.
+    /// Tensor that does not match.
     #[serde(default)]
     pub tensor: Option<SeamTensor>,
-    /// The tensor it has to meet.
+    /// Tensor that it must match.
     #[serde(default)]
     pub meets: Option<SeamTensor>,
-    /// The shape that `tensor` would need.
+    /// Shape that `tensor` would need.
     #[serde(default)]
     pub needed: Option<Expression>,
-    /// Options that solve it.
+    /// Options that avoid the mismatch.
     #[serde(default)]
     pub options: Vec<String>,
 }
 
-/// A donor tensor named by a seam.
+/// A donor tensor that a seam names.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SeamTensor {
-    /// Role.
+    /// Role of the donor.
     pub from: String,
-    /// Its name there.
+    /// Name of the tensor in the donor.
     pub name: String,
 }
 
@@ -139,35 +141,35 @@ pub struct SeamTensor {
 pub struct DocumentSpec {
     /// File name.
     pub name: String,
-    /// When it is written.
+    /// Condition for writing the document.
     #[serde(default)]
     pub when: Option<Expression>,
-    /// Role whose document of that name is the start; an empty object when absent there and `optional` is not set.
+    /// Role of the donor whose document is the starting point; an empty object if the donor has none.
     #[serde(default)]
     pub from: Option<String>,
-    /// Leave the document out when the donor has none.
+    /// Whether the document is left out if the donor has none.
     #[serde(default)]
     pub optional: bool,
-    /// What takes the place of `Infinity` and `NaN`, which strict JSON cannot say.
+    /// Whether `Infinity` becomes the largest float32, as in the fix of JSN001; otherwise `Infinity` stops the merge.
     #[serde(default)]
-    pub non_finite: Option<Value>,
-    /// Changes, in order.
+    pub clamp_infinity: bool,
+    /// Edits, in order.
     #[serde(default)]
     pub edits: Vec<DocumentEdit>,
 }
 
-/// A change to a document.
+/// An edit of a document.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum DocumentEdit {
-    /// Sets a value; missing objects on the way are made.
+    /// Sets a value; creates missing parent objects.
     Set(SetEdit),
-    /// Puts a donor's config there.
+    /// Inserts the config of a donor.
     Graft(GraftEdit),
     /// Removes values.
     Remove(RemoveEdit),
-    /// Writes the tokenizer's added tokens, the simulated ones included.
+    /// Writes the added tokens of the tokenizer, including those that the processor adds.
     Tokens(TokensEdit),
 }
 
@@ -178,9 +180,9 @@ pub enum DocumentEdit {
 pub struct TokensEdit {
     /// JSON pointer.
     pub at: String,
-    /// As which of transformers' two forms.
+    /// Form of the tokens.
     pub form: TokensForm,
-    /// When.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
 }
@@ -205,21 +207,21 @@ pub struct SetEdit {
     pub at: String,
     /// The value.
     pub to: Expression,
-    /// When.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
 }
 
-/// Puts a donor's document there.
+/// Inserts the config of a donor.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct GraftEdit {
     /// JSON pointer.
     pub at: String,
-    /// Role whose config.json it is.
+    /// Role of the donor.
     pub from: String,
-    /// Keys left out: exact, or a prefix that ends in `*`.
+    /// Keys to leave out: exact names, or prefixes that end in `*`.
     #[serde(default)]
     pub without: Vec<String>,
 }
@@ -231,36 +233,36 @@ pub struct GraftEdit {
 pub struct RemoveEdit {
     /// JSON pointers.
     pub at: Vec<String>,
-    /// When.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
 }
 
-/// Where tensors come from, or that they are left behind.
+/// Tensors that are taken from a donor, or left out.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TensorSpec {
-    /// Role.
+    /// Role of the donor.
     pub from: String,
-    /// Regular expression over the donor's names.
+    /// Regular expression for tensor names of the donor.
     pub names: String,
-    /// When the entry counts at all.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
-    /// Name in the result; `{…}` are expressions, then `$1` is the first group. The name itself when absent.
+    /// Name in the result: a template, in which `$1` is the first group of `names`. The name of the donor when missing.
     #[serde(rename = "as", default)]
     pub rename: Option<Template>,
-    /// What is done when the shape does not fit; an expression that gives `copy`, `pad`, `grow-rows` or `reinit`.
+    /// Treatment of a shape that does not match: an expression that gives `copy`, `pad`, `grow-rows` or `reinit`.
     #[serde(default)]
     pub fit: Option<Expression>,
-    /// Left behind, and why.
+    /// Reason for leaving the tensors out.
     #[serde(default)]
     pub drop: Option<String>,
-    /// The donor tensor it has to meet, for the message when it does not fit.
+    /// Donor tensor that it must match, for the message.
     #[serde(default)]
     pub meets: Option<SeamTensor>,
-    /// Options that make it fit.
+    /// Options that avoid the mismatch.
     #[serde(default)]
     pub options: Vec<String>,
 }
@@ -270,11 +272,11 @@ pub struct TensorSpec {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum FileSpec {
-    /// Copies files, those that are there.
+    /// Copies files that exist in the donor.
     Copy(CopySpec),
-    /// Copies the Python modules that the given ones import, themselves included.
+    /// Copies Python modules and the modules that they import.
     Modules(ModulesSpec),
-    /// Writes a file that comes with the recipe.
+    /// Writes a file of the recipe.
     Template(TemplateSpec),
 }
 
@@ -283,11 +285,11 @@ pub enum FileSpec {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct CopySpec {
-    /// Role.
+    /// Role of the donor.
     pub from: String,
     /// File names.
     pub names: Vec<String>,
-    /// When.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
 }
@@ -297,16 +299,16 @@ pub struct CopySpec {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ModulesSpec {
-    /// Roles, the first that is given and has the module is taken.
+    /// Roles of the donors; the first one that has the module is used.
     pub from: Vec<String>,
     /// Modules to start from, without `.py`.
     pub roots: Vec<String>,
-    /// When.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
 }
 
-/// Writes a file that comes with the recipe.
+/// Writes a file of the recipe.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -315,29 +317,29 @@ pub struct TemplateSpec {
     pub name: String,
     /// Path below `rules/recipes/`.
     pub text: String,
-    /// Placeholders: `{{key}}` becomes the expression's value.
+    /// Values of placeholders: `{{key}}` becomes the value of the expression.
     #[serde(default)]
     pub fill: BTreeMap<String, Expression>,
-    /// When.
+    /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
 }
 
-/// A sentence for the report.
+/// A note in the report.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Note {
-    /// When.
+    /// Condition for this entry.
     pub when: Expression,
     /// The sentence.
     pub say: Template,
 }
 
-/// Keys that make a loader fetch or run code; no merge carries them from a donor's config.
+/// Config keys that make a loader download or run code; no merge copies them from a donor.
 ///
-/// `trust_remote_code`: CVE-2026-5241. `_attn_implementation_internal` and its kin: CVE-2026-4372.
-/// A recipe that needs an `auto_map` writes its own.
+/// `trust_remote_code`: CVE-2026-5241. `_attn_implementation_internal` and related keys: CVE-2026-4372. A recipe that
+/// needs an `auto_map` writes its own.
 pub const CODE_SWITCHES: &[&str] = &[
     "auto_map",
     "custom_pipelines",
@@ -356,36 +358,37 @@ impl Recipe {
     /// Parses a recipe.
     ///
     /// # Errors
-    /// [`DataError`] with the place.
+    /// [`DataError`] with the position.
     pub fn parse(path: &str, text: &str) -> Result<Self, DataError> {
         source::parse(path, text)
     }
 
-    /// The recipes inside the program, by name.
+    /// The built-in recipes, by name.
     ///
     /// # Errors
-    /// [`DataError`]; the house tests see to it that there is none.
+    /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("recipes").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 }
 
-/// A merge written down in a file: `build-merged merge.json5`. Relative paths start at the file's folder.
+/// A merge file: `build-merged merge.json5`. Paths in it are relative to its folder.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct MergeFile {
-    /// Recipe name, or a path of one; chosen by the donors when absent.
+    /// Name or path of the recipe; chosen by the architectures of the donors when missing.
     #[serde(default)]
     pub recipe: Option<String>,
-    /// Role to directory.
+    /// Directory of each donor, by role.
     pub donors: Map<String, Value>,
     /// Options.
     #[serde(default)]
     pub options: Map<String, Value>,
-    /// Directory to make.
+    /// Directory of the result.
     pub out: String,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }

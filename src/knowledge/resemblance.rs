@@ -1,7 +1,7 @@
-//! Which classes have names like these: the search for an architecture when no config names one.
+//! Search for classes with similar tensor names, for checkpoints without a known architecture.
 //!
-//! Names are compared as patterns, with `#` for every number, and classes as they are written, with no config at all:
-//! nothing is built, so that hundreds of files are searched in a fraction of a second.
+//! Names are compared as patterns, with `#` for every number. The search uses the class files without a config and
+//! builds no architecture, so that hundreds of files take a fraction of a second.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,38 +11,38 @@ use super::architecture::member::{Kind, Member, Part};
 use super::architecture::{Architecture, Blueprint, Class};
 use super::{Library, Loader, Template};
 
-/// Files that are parsed: those that say most of the words of the names.
+/// Maximum number of files parsed: those that contain most of the words.
 const FILES: usize = 80;
-/// Words of stored names that are looked for.
+/// Maximum number of words searched for.
 const WORDS: usize = 400;
-/// Depth of parts within parts.
+/// Maximum depth of nested parts.
 const DEPTH: usize = 6;
-/// Patterns of one class.
+/// Maximum number of patterns of one class.
 const PATTERNS: usize = 20_000;
 
-/// A class, and how its names agree with some stored names; counted in patterns.
+/// A class, and the overlap of its tensor names with stored names, counted in patterns.
 #[derive(Debug, Clone)]
 pub struct Resemblance<'l> {
     /// The class, as the first of `loaders` builds it.
     pub architecture: Architecture<'l>,
-    /// Names on both sides.
+    /// Patterns both in the class and stored.
     pub common: usize,
-    /// Names that the class has under any config, and that are not stored.
+    /// Patterns that the class has under any config, and that are not stored.
     pub missing: usize,
-    /// Stored names that the class does not have.
+    /// Stored patterns that the class lacks.
     pub unexpected: usize,
-    /// Stored names in a part that may be any class.
+    /// Stored patterns inside a part of unknown class.
     pub open: usize,
-    /// Such parts: what their names start with (with `#` for numbers), and where their config is.
+    /// Parts of unknown class: the prefix of their names (with `#` for numbers), and the pointer to their config.
     pub parts: Vec<(String, String)>,
 }
 
 impl Resemblance<'_> {
-    /// Share of the names on either side that are on both, from 0 to 1.
+    /// Share of the patterns that are on both sides, from 0 to 1.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts of names are far below 2^52")]
     pub fn score(&self) -> f64 {
-        // A part that may be anything explains its names only half.
+        // A part of unknown class explains its patterns only half.
         let explained = self.common as f64 + self.open as f64 / 2.0;
         let all = self.common.saturating_add(self.missing).saturating_add(self.unexpected).saturating_add(self.open);
         if all == 0 { 0.0 } else { explained / all as f64 }
@@ -50,15 +50,15 @@ impl Resemblance<'_> {
 }
 
 impl Library {
-    /// The classes that have names like these, the most alike first; classes without a common name are left out.
+    /// The classes with similar names, best first; classes without a common pattern are omitted.
     ///
-    /// A class that several loaders know stands for the first of them.
+    /// A class that several loaders have appears once, for the first of them.
     #[must_use]
     pub fn resembling<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Vec<Resemblance<'_>> {
         let stored: BTreeSet<String> = names.into_iter().map(pattern).take(PATTERNS).collect();
         let mut found: Vec<Resemblance<'_>> = Vec::new();
         let mut seen = BTreeSet::new();
-        for file in self.files_saying(&words(&stored)) {
+        for file in self.files_with(&words(&stored)) {
             for loader in Loader::ALL {
                 for class in file.classes(loader) {
                     if seen.insert((&file.architecture, std::ptr::from_ref(class))) {
@@ -73,8 +73,8 @@ impl Library {
         found
     }
 
-    /// Files in which the words of the names stand; a word that few files have counts more.
-    fn files_saying(&self, words: &BTreeSet<&str>) -> Vec<&Blueprint> {
+    /// The files that contain most of the words; rare words count more.
+    fn files_with(&self, words: &BTreeSet<&str>) -> Vec<&Blueprint> {
         let texts: Vec<(&str, &[u8])> = self.texts().collect();
         let mut scores = vec![0_u64; texts.len()];
         for word in words.iter().take(WORDS) {
@@ -117,7 +117,7 @@ impl Library {
     }
 }
 
-/// Words that tell one class from another: the dotted parts of names without those that are all number.
+/// Words that distinguish classes: the dotted components of names, without numbers and common words.
 fn words(patterns: &BTreeSet<String>) -> BTreeSet<&str> {
     let plain = |word: &&str| word.len() > 2 && *word != "weight" && *word != "bias";
     patterns.iter().flat_map(|name| name.split('.')).flat_map(|part| part.split('#')).filter(plain).collect()
@@ -136,14 +136,14 @@ fn pattern(name: &str) -> String {
     out
 }
 
-/// All names a class may have.
+/// All names that a class may have.
 struct Names<'l> {
     library: &'l Library,
     loader: Loader,
-    /// With whether the class has it under any config.
+    /// By pattern: whether the class has it under any config.
     patterns: BTreeMap<String, bool>,
     buffers: BTreeSet<String>,
-    /// Parts whose class a config decides: the start of their names, and where that config is.
+    /// Parts whose class depends on the config: the prefix of their names, and the pointer to their config.
     open: Vec<(String, String)>,
 }
 
@@ -192,7 +192,7 @@ impl<'l> Names<'l> {
             Some(class.as_str())
         } else {
             self.open.push((prefix.to_owned(), part.config.clone().unwrap_or_default()));
-            // What the composition takes when nothing is said is the likeliest.
+            // Without a config, the default of the composition is the most likely class.
             let model_type = part.config.as_deref().and_then(|key| file.sub_config_type(key, self.loader));
             let mapped = model_type.as_deref().and_then(|t| part.by_model_type.get(t)).and_then(|class| class.as_str());
             mapped.or_else(|| {
@@ -238,7 +238,7 @@ mod tests {
         let expected = gemma.expect(&serde_json::json!({ "num_hidden_layers": 1 })).expect("its defaults build it");
         let found = library.resembling(expected.tensors.keys().map(String::as_str));
         let best = found.first().expect("a class has these names").score();
-        // Others may have the same names.
+        // Other classes may have the same names.
         let alike = found.iter().take_while(|r| (r.score() - best).abs() < f64::EPSILON);
         assert!(alike.map(|r| r.architecture.class()).any(|class| class == "Gemma2ForCausalLM"));
         assert!(library.resembling(["nothing.like.it"]).is_empty());

@@ -1,26 +1,30 @@
-//! Rules: what to look for, why it matters and what to say; one JSON5 file each.
+//! Rules, one JSON5 file each: the condition to check, the reason, the message, the fixes.
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
+mod catalogue;
+mod effect;
 mod fix;
 
+pub use catalogue::{Catalogue, example};
+pub use effect::{Consequence, Effect, Harm, Object};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template};
 use super::source::{self, DataError};
 use crate::checkpoint::FaultKind;
 
-/// How bad a finding is; a rule says it for all of its findings.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// Worth knowing; nothing needs doing.
+    /// Worth knowing; needs no action.
     Info,
-    /// Probably unintended, or will hurt later.
+    /// Probably unintended, or breaks later.
     Warning,
-    /// Will not load, or loads wrong weights.
+    /// Fails to load, or loads wrong values.
     Error,
 }
 
@@ -36,101 +40,149 @@ impl Severity {
     }
 }
 
-/// A rule as its file in `rules/checks/` gives it.
+/// A rule, as read from its file in `rules/checks/`.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
     /// Family and number: `IDX003`.
     pub code: String,
-    /// What is wrong, in kebab case: `shard-missing`.
+    /// The fault in kebab case: `shard-missing`.
     pub name: String,
-    /// How bad it is.
-    pub severity: Severity,
-    /// One line.
+    /// Severity of a finding without effect; required for a rule without `effects` and `harm`, else info when missing.
+    #[serde(default)]
+    pub severity: Option<Severity>,
+    /// What loaders do with such a checkpoint. A finding is an error when a loader that the user named or that wrote the
+    /// checkpoint has an effect, and a warning when only another loader has one.
+    #[serde(default)]
+    #[cfg_attr(test, schemars(with = "Vec<effect::EffectKeys>"))]
+    pub effects: Vec<Effect>,
+    /// Harm of the fault besides what loaders do; every finding is an error.
+    #[serde(default)]
+    pub harm: Option<Harm>,
+    /// What is wrong, as one line.
     pub summary: String,
-    /// Why it matters: what a loader does with it.
+    /// The consequence, in whole sentences: what a loader does.
     pub why: String,
-    /// Architectures it is about; empty for all.
+    /// Architectures that the rule applies to; all when empty.
     #[serde(default)]
     pub applies: Vec<String>,
-    /// When it is worth asking at all; an expression that cannot be evaluated counts as no.
+    /// Condition for running the rule; an expression that cannot be evaluated counts as false.
     #[serde(default)]
     pub when: Option<Expression>,
-    /// What to look for.
+    /// The condition to check.
     pub check: Check,
-    /// The finding's sentence.
+    /// Message of a finding: the cause with names and figures, one sentence without a full stop.
     pub message: Template,
-    /// What can be done: of several, the first whose `when` holds and whose edits can be made; else its help alone.
+    /// Further facts to show below the message, one sentence each; one that cannot be rendered is left out.
+    #[serde(default)]
+    pub details: Vec<Template>,
+    /// A fix or a list of fixes. The first one applies whose `when` holds and whose edits can be made; if none can, the
+    /// first one whose `when` holds is shown as advice.
     #[serde(default, rename = "fix", deserialize_with = "fix::one_or_many")]
     #[cfg_attr(test, schemars(with = "fix::OneOrMany"))]
     pub fixes: Vec<Fix>,
-    /// Where the facts come from.
+    /// Links to the sources of the facts.
     #[serde(default)]
     pub references: Vec<String>,
-    /// The file it was read from, for a user's own rule.
+    /// Path of the file, for a rule from `--rules`.
     #[serde(skip)]
     pub origin: Option<String>,
+    /// Severity that settings give every finding.
+    #[serde(skip)]
+    pub regraded: Option<Severity>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
-/// The kinds of check. Adding a rule rarely needs another.
+impl Rule {
+    /// Severity of a finding, by whether a leading loader and whether any loader of the run has an effect.
+    #[must_use]
+    pub fn severity_given(&self, leading: bool, any: bool) -> Severity {
+        let stated = self.severity.unwrap_or(Severity::Info);
+        self.regraded.unwrap_or(match (self.harm, leading, any) {
+            (Some(_), ..) | (None, true, _) => stated.max(Severity::Error),
+            (None, false, true) => stated.max(Severity::Warning),
+            (None, false, false) => stated,
+        })
+    }
+
+    /// The highest severity that a finding of this rule can have.
+    #[must_use]
+    pub fn highest_severity(&self) -> Severity {
+        let any = !self.effects.is_empty();
+        self.severity_given(any, any)
+    }
+}
+
+/// What a rule checks.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Check {
-    /// Reports faults of some kinds.
+    /// Report faults of certain kinds.
     Fault(FaultCheck),
-    /// Reports where an expression is false.
+    /// Report where an expression is false.
     Assert(Assert),
 }
 
-/// Faults of these kinds become findings; the message sees each fault's `kind` and details as variables,
-/// and `file`, `tensor`, `pointer` of its first place.
+/// Reports faults that readers and comparisons observed.
+///
+/// Expressions and templates of the rule see the details of the fault as variables, all of them as `fault`, its `kind`, and
+/// the `file`, `tensor` and `pointer` of its first place. With `group`, `faults` lists these variables of each fault.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct FaultCheck {
-    /// Kinds of fault.
+    /// Kinds of fault to report.
     #[serde(deserialize_with = "fault_kinds")]
     pub kinds: Vec<FaultKind>,
-    /// Only faults for which this holds; it sees what the message sees.
+    /// Report only faults for which this holds.
     #[serde(default)]
     pub only: Option<Expression>,
-    /// One finding for all of them instead of one each; the message sees the first one's details and `count`.
+    /// Report all faults as one finding; the variables are those of the first fault, and `count` is their number.
     #[serde(default)]
     pub group: bool,
 }
 
 /// A condition that must hold.
 ///
-/// Expressions see the documents as `config`, `generation`, `processor`, `preprocessor`,
-/// `tokenizer_config`, `special_tokens` (null when absent or broken), `model` (the config with the
-/// class's defaults filled in), `text` (its language part), `arch`, `rows` (of the token embedding),
-/// `tokenizer` (`length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`,
-/// `highest` id), `chat_templates` (by file),
-/// `tokens` (what the processor makes of it, by the names in `rules/processors/`, with `length` and
-/// `scattered`), `processor_tokenizers`, `directory`, `has_weights`, `all_read` (every shard is there and
-/// its header was read), `loaders` (the versions it has to load under), and the functions `shape(tensor)`,
-/// `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, `stays_random(tensor)` (a loader starts it at random; null
-/// when the class is unknown). A condition that cannot be evaluated because a value is not there is not a finding.
+/// Expressions see these variables:
+/// - the documents `config`, `generation`, `processor`, `preprocessor`, `tokenizer_config` and `special_tokens`; null when
+///   missing or unreadable;
+/// - `model`: `config` with the defaults of the class filled in; `text`: its language-model part; `arch`: the name of the
+///   architecture, empty when unknown;
+/// - `rows`: rows of the token embedding;
+/// - `tokenizer`: `length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`, `highest`;
+/// - `tokens`: ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and
+///   `scattered`; `processor_tokenizers`: tokenizer classes that the processor's module names;
+/// - `chat_templates`: templates by file;
+/// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
+///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
+/// - `loaders`: versions of transformers to check for.
+///
+/// Functions are `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, and `stays_random(tensor)`:
+/// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
+/// `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
+///
+/// A condition that cannot be evaluated because a value is missing is not a finding.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Assert {
-    /// A list; the condition is asked for each element, bound as `it`.
+    /// A list; the condition is checked for each element, bound as `it`.
     #[serde(default)]
     pub each: Option<Expression>,
-    /// The condition.
+    /// The condition; a finding is reported when it is false.
     pub that: Expression,
-    /// Where to point when it does not hold.
+    /// Places that the finding points at.
     #[serde(default)]
     pub at: Vec<At>,
 }
 
-/// A place named by a rule.
+/// A place that a finding points at.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
@@ -143,37 +195,32 @@ pub struct At {
     pub tensor: Option<Template>,
 }
 
-/// Rules, by code.
+/// The rules of a run, by code.
 #[derive(Debug, Clone, Default)]
 pub struct RuleSet {
-    /// Those that are asked, sorted by code.
+    /// Selected rules, sorted by code.
     pub rules: Vec<Rule>,
-    /// Those that were not chosen.
+    /// Rules that were not selected.
     pub unselected: Vec<Rule>,
+    /// Families and retired codes.
+    pub catalogue: Catalogue,
 }
 
 impl RuleSet {
-    /// The rules inside the program.
+    /// The rules that are built into the program.
     ///
     /// # Errors
-    /// [`DataError`] naming the file and the place; the house tests see to it that there is none.
+    /// [`DataError`] when a built-in file is malformed; a test parses all of them.
     pub fn embedded() -> Result<Self, DataError> {
         let parse = |(path, text): (String, &str)| Ok((source::parse_embedded(&path, text)?, path));
-        Self::default().with(source::embedded("checks").into_iter().map(parse))
+        Self { catalogue: Catalogue::embedded()?, ..Self::default() }
+            .with(source::embedded("checks").into_iter().map(parse))
     }
 
-    /// Rules from named texts.
+    /// Adds rules parsed from pairs of path and text.
     ///
     /// # Errors
-    /// [`DataError`] for a text that is no rule, a code given twice, or a file or repair that does not exist.
-    pub fn from_files<'a>(files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
-        Self::default().and_files(files)
-    }
-
-    /// These rules and others from named texts.
-    ///
-    /// # Errors
-    /// As [`Self::from_files`]; a code or a name that these rules have is taken.
+    /// [`DataError`] for a malformed rule, a duplicate code or name, or an unknown kind of fault.
     pub fn and_files<'a>(self, files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
         self.with(files.into_iter().map(|(path, text)| {
             let rule: Rule = source::parse(&path, text)?;
@@ -181,7 +228,7 @@ impl RuleSet {
         }))
     }
 
-    /// Every rule, chosen or not.
+    /// All rules, selected or not.
     pub fn all(&self) -> impl Iterator<Item = &Rule> {
         self.rules.iter().chain(&self.unselected)
     }
@@ -191,15 +238,21 @@ impl RuleSet {
             let (rule, path) = file?;
             let wrong = |reason: String| Err(DataError::new(&path, reason));
             if !is_code(&rule.code) {
-                return wrong(format!("`{}` is no code: capitals for the family, then digits, as IDX005", rule.code));
+                return wrong(format!(
+                    "`{}` is not a code: use capitals for the family, then digits, as in IDX005",
+                    rule.code
+                ));
             }
-            for edit in rule.fixes.iter().flat_map(|f| &f.edits) {
-                if let Err(reason) = edit.check() {
+            if rule.severity.is_none() && rule.effects.is_empty() && rule.harm.is_none() {
+                return wrong(format!("{} needs a `severity`, `effects` or a `harm`", rule.code));
+            }
+            for fix in &rule.fixes {
+                if let Err(reason) = fix.check() {
                     return wrong(reason);
                 }
             }
             if let Some(twin) = self.rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
-                return wrong(format!("{} {} is already taken by {} {}", rule.code, rule.name, twin.code, twin.name));
+                return wrong(format!("{} {} is already used by {} {}", rule.code, rule.name, twin.code, twin.name));
             }
             self.rules.push(rule);
         }
@@ -208,7 +261,7 @@ impl RuleSet {
     }
 }
 
-/// Whether a rule can be chosen by this code, and by the start of it.
+/// Whether a code is a family in capitals and a number.
 fn is_code(code: &str) -> bool {
     let family = code.trim_end_matches(|c: char| c.is_ascii_digit());
     (2..=8).contains(&family.len())
@@ -227,4 +280,40 @@ fn fault_kinds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<FaultKi
         })
     };
     names.iter().map(kind).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rule(keys: &str) -> Result<Rule, DataError> {
+        let text = format!(
+            "{{ code: 'ABC001', name: 'a-b', summary: 's', why: 'w', check: {{ assert: {{ that: 'true' }} }}, message: 'm', {keys} }}"
+        );
+        let set = RuleSet::default().and_files([("ABC001.json5".to_owned(), text.as_str())])?;
+        Ok(set.find("ABC001").cloned().unwrap_or_else(|e| panic!("{e}")))
+    }
+
+    #[test]
+    fn severity_follows_from_effects() {
+        use Severity::{Error, Info, Warning};
+        let effect = "effects: [{ on: 'model', raises: 'KeyError' }]";
+        for (keys, leading, other, none) in [
+            (effect.to_owned(), Error, Warning, Info),
+            (format!("severity: 'warning', {effect}"), Error, Warning, Warning),
+            ("severity: 'warning'".to_owned(), Error, Warning, Warning),
+            ("severity: 'info'".to_owned(), Error, Warning, Info),
+            ("harm: 'integrity'".to_owned(), Error, Error, Error),
+            (format!("harm: 'security', {effect}"), Error, Error, Error),
+        ] {
+            let rule = rule(&keys).unwrap();
+            let found = [(true, true), (false, true), (false, false)].map(|(l, any)| rule.severity_given(l, any));
+            assert_eq!(found, [leading, other, none], "{keys}");
+            let regraded = Rule { regraded: Some(Info), ..rule };
+            assert_eq!(regraded.severity_given(true, true), Info, "{keys}");
+        }
+        assert_eq!(rule(effect).unwrap().highest_severity(), Error);
+        assert_eq!(rule("severity: 'warning'").unwrap().highest_severity(), Warning);
+        assert!(rule("").unwrap_err().to_string().contains("needs a `severity`"));
+    }
 }

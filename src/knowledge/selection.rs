@@ -1,19 +1,30 @@
-//! Choosing rules by code, by the start of a code, or by name.
+//! Selection of rules by code, by the start of a code, or by name.
 
 use super::rule::{Rule, RuleSet, Severity};
 use super::source::nearest;
 
-/// A word that chooses no rule.
+/// A selector that matches no rule.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no rule has the code, family or name {word}{}", .similar.as_ref().map_or_else(String::new, |s| format!("; did you mean {s}?")))]
-pub struct UnknownRule {
-    /// The word.
-    pub word: String,
-    /// The code or name nearest to it, when one is near.
-    pub similar: Option<String>,
+pub enum UnknownRule {
+    /// The code or name was retired.
+    #[error("{word} is now {now}")]
+    Moved {
+        /// The selector.
+        word: String,
+        /// The current code or name.
+        now: String,
+    },
+    /// No rule has, or ever had, the code or name.
+    #[error("no rule has the code, family or name {word}{}", .similar.as_ref().map_or_else(String::new, |s| format!("; did you mean {s}?")))]
+    Unknown {
+        /// The selector.
+        word: String,
+        /// The most similar code or name, when one is similar.
+        similar: Option<String>,
+    },
 }
 
-/// How exactly `word` names the rule: the length of the code it gives; a name gives all of it.
+/// Specificity of a selector for the rule: the length of the matched code; a name counts as the whole code.
 fn specificity(word: &str, rule: &Rule) -> Option<usize> {
     if word == rule.name {
         return Some(rule.code.len());
@@ -26,19 +37,20 @@ impl RuleSet {
     /// The rule of this code or name.
     ///
     /// # Errors
-    /// [`UnknownRule`], with the nearest one there is.
+    /// [`UnknownRule`], with the nearest code or name.
     pub fn find(&self, word: &str) -> Result<&Rule, UnknownRule> {
         let whole = |r: &&Rule| word == r.name || word.eq_ignore_ascii_case(&r.code);
         self.all().find(whole).ok_or_else(|| self.unknown(word))
     }
 
-    /// Keeps the rules that these choices, from the weakest to the last word, leave on. Without any, all are on.
+    /// Applies the choices in order of increasing precedence and keeps the enabled rules. Without choices, all rules
+    /// are enabled.
     ///
-    /// A choice that selects starts anew; one that does not changes what those before it left. Within a choice the
-    /// longer word wins where two name a rule, and `ignore` when they are equal, as in ruff.
+    /// A choice with `select` discards the choices before it; one without modifies their result. Within a choice, the
+    /// longer selector wins if two match a rule, and `ignore` wins a tie, as in ruff.
     ///
     /// # Errors
-    /// [`UnknownRule`] for a word that names no rule.
+    /// [`UnknownRule`] for a selector without a match.
     pub fn choose(&mut self, choices: &[Choice]) -> Result<(), UnknownRule> {
         for word in choices.iter().flat_map(Choice::words) {
             self.codes(word)?;
@@ -50,10 +62,10 @@ impl RuleSet {
         Ok(())
     }
 
-    /// Gives rules other severities; of two words that name a rule the longer one wins, of equal ones the later.
+    /// Changes severities of rules; if two selectors match a rule, the longer one wins, and the later one wins a tie.
     ///
     /// # Errors
-    /// [`UnknownRule`] for a word that names no rule.
+    /// [`UnknownRule`] for a selector without a match.
     pub fn regrade(&mut self, words: &[(&str, Severity)]) -> Result<(), UnknownRule> {
         for (word, _) in words {
             self.codes(word)?;
@@ -61,16 +73,16 @@ impl RuleSet {
         for rule in &mut self.rules {
             let graded = words.iter().filter_map(|(word, to)| Some((specificity(word, rule)?, *to)));
             if let Some((_, severity)) = graded.max_by_key(|(exactness, _)| *exactness) {
-                rule.severity = severity;
+                rule.regraded = Some(severity);
             }
         }
         Ok(())
     }
 
-    /// The codes of the rules that a word names, chosen or not.
+    /// The codes of the rules that a selector matches, enabled or not.
     ///
     /// # Errors
-    /// [`UnknownRule`] when there is none.
+    /// [`UnknownRule`] for a selector without a match.
     pub fn codes(&self, word: &str) -> Result<Vec<String>, UnknownRule> {
         let named = self.all().filter(|r| specificity(word, r).is_some());
         let codes: Vec<String> = named.map(|r| r.code.clone()).collect();
@@ -78,19 +90,32 @@ impl RuleSet {
     }
 
     fn unknown(&self, word: &str) -> UnknownRule {
-        let words = self.all().flat_map(|r| [r.code.as_str(), r.name.as_str()]);
-        UnknownRule { word: word.to_owned(), similar: nearest(word, words).map(str::to_owned) }
+        let word = word.to_owned();
+        if let Some(now) = self.catalogue.current(&word) {
+            return UnknownRule::Moved { now: now.to_owned(), word };
+        }
+        let number = |code: &str| number(code).map(|(family, number)| (family.to_ascii_uppercase(), number));
+        let same_number = self.all().find(|r| number(&word).is_some() && number(&r.code) == number(&word));
+        let words = || self.all().flat_map(|r| [r.code.as_str(), r.name.as_str()]);
+        let similar = same_number.map(|r| r.code.as_str()).or_else(|| nearest(&word, words())).map(str::to_owned);
+        UnknownRule::Unknown { word, similar }
     }
 }
 
-/// Which rules one place, a settings file or the command line, turns on and off.
+/// Family and number of a code; leading zeros of the number do not count.
+fn number(code: &str) -> Option<(&str, u32)> {
+    let (family, digits) = code.split_at_checked(code.find(|c: char| c.is_ascii_digit())?)?;
+    Some((family, digits.parse().ok()?))
+}
+
+/// Rules enabled and disabled by one source: a settings file or the command line.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Choice {
-    /// Only these, when it is given.
+    /// Enable only these rules.
     pub select: Option<Vec<String>>,
-    /// These as well.
+    /// Enable these rules as well.
     pub extend_select: Vec<String>,
-    /// Not these.
+    /// Disable these rules.
     pub ignore: Vec<String>,
 }
 
@@ -99,7 +124,7 @@ impl Choice {
         self.select.iter().flatten().chain(&self.extend_select).chain(&self.ignore)
     }
 
-    /// Whether the rule is on, when this choice says so.
+    /// Whether this choice enables or disables the rule; `None` when it does neither.
     fn says(&self, rule: &Rule) -> Option<bool> {
         let wanted = self.select.iter().flatten().chain(&self.extend_select);
         let wanted = wanted.filter_map(|w| specificity(w, rule)).max();
@@ -127,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longer_word_wins() {
+    fn the_longer_selector_wins() {
         let one = |select: &[&str], ignore: &[&str]| codes(&[choice(Some(select), &[], ignore)]);
         assert_eq!(one(&["JSN001"], &[]), ["JSN001"]);
         assert_eq!(one(&["non-finite-number"], &["JSN"]), ["JSN001"]);
@@ -138,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_choice_has_the_last_word() {
+    fn a_later_choice_takes_precedence() {
         let file = choice(Some(&["IDX005", "IDX006", "JSN001"]), &[], &["IDX006"]);
         assert_eq!(codes(std::slice::from_ref(&file)), ["IDX005", "JSN001"]);
         assert_eq!(codes(&[file.clone(), choice(None, &["IDX006"], &["JSN"])]), ["IDX005", "IDX006"]);
@@ -146,22 +171,26 @@ mod tests {
     }
 
     #[test]
-    fn severities_follow_the_longer_word() {
+    fn severities_follow_the_longer_selector() {
         let mut rules = RuleSet::embedded().unwrap();
         rules.regrade(&[("JSN001", Severity::Info), ("JSN", Severity::Error)]).unwrap();
-        let of = |code: &str| rules.find(code).unwrap().severity;
+        let of = |code: &str| rules.find(code).unwrap().highest_severity();
         assert_eq!((of("JSN001"), of("JSN003")), (Severity::Info, Severity::Error));
-        assert!(rules.clone().regrade(&[("JSN0O1", Severity::Info)]).unwrap_err().similar.is_some());
+        assert!(rules.clone().regrade(&[("JSN0O1", Severity::Info)]).unwrap_err().to_string().contains("did you mean"));
     }
 
     #[test]
-    fn a_misspelt_word_is_answered_with_the_nearest() {
+    fn an_unknown_selector_suggests_the_nearest() {
         let mut rules = RuleSet::embedded().unwrap();
-        assert_eq!(rules.find("shard-mising").unwrap_err().similar.as_deref(), Some("shard-missing"));
-        assert_eq!(rules.find("qqqq").unwrap_err().similar, None);
+        let error = |word: &str| rules.find(word).unwrap_err().to_string();
+        assert!(error("shard-mising").ends_with("; did you mean shard-missing?"));
+        assert!(error("JSN01").ends_with("; did you mean JSN001?"));
+        assert!(error("jsn1").ends_with("; did you mean JSN001?"));
+        assert_eq!(error("qqqq"), "no rule has the code, family or name qqqq");
+        assert_eq!(error("cfg003"), "cfg003 is now VLA001");
         assert_eq!(rules.find("idx005").unwrap().name, "shard-missing");
         assert!(rules.find("IDX").is_err());
-        // Also one that is not chosen is known.
+        // Disabled rules are found as well.
         rules.choose(&[choice(Some(&["JSN"]), &[], &[])]).unwrap();
         assert!(rules.find("IDX005").is_ok() && rules.codes("IDX").is_ok());
     }

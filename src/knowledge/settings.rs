@@ -1,4 +1,4 @@
-//! Settings: which rules are asked, how bad their findings are, and what is accepted, as a `ckpt-doctor.json5` says.
+//! Settings from `ckpt-doctor.json5`: selected rules, severities and suppressions.
 
 mod chain;
 mod find;
@@ -13,100 +13,101 @@ use super::rule::Severity;
 use super::source::{self, DataError};
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
 pub use chain::Chain;
-pub use find::{FILE, Nearest, absolute, nearest};
+pub use find::{FILE, absolute, nearest};
 pub use policy::{Policy, Suppression};
 
-/// A settings file. Paths in it start at its own folder.
+/// A settings file. Paths in it are relative to its folder.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
-    /// A settings file that this one builds on, and may overrule.
+    /// Settings file that this one extends; the values here take precedence.
     #[serde(default)]
     pub extend: Option<PathBuf>,
-    /// Only these rules: codes, starts of codes, or names.
+    /// Rules to run, all others are off: codes, starts of codes, or names.
     #[serde(default)]
     pub select: Option<Vec<String>>,
-    /// These rules as well: what `select` leaves out, here or in the file this one extends.
+    /// Rules to run in addition to `select`, here or in the extended file.
     #[serde(default, rename = "extend-select")]
     pub extend_select: Vec<String>,
-    /// All but these rules; where two words name a rule, the longer one wins.
+    /// Rules to skip; if two selectors match a rule, the longer one takes precedence.
     #[serde(default)]
     pub ignore: Vec<String>,
-    /// Severities that rules have here: `{ "JSN001": "error" }`.
+    /// Other severities for rules: `{ "JSN001": "error" }`.
     #[serde(default, deserialize_with = "ordered")]
     #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Severity>"))]
     pub severity: Vec<(String, Severity)>,
-    /// What is different in some places, by a glob from this file's folder: a folder means all that is in it, `*` stays
-    /// within a name, `**` does not.
+    /// Other settings for some paths, by a glob relative to the folder of this file: a folder matches everything in it, `*`
+    /// matches within a name, `**` across folders.
     #[serde(default, rename = "per-path", deserialize_with = "ordered")]
     #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, PerPath>"))]
     pub per_path: Vec<(String, PerPath)>,
-    /// Findings that are accepted, each with the reason.
+    /// Suppressed findings, each with a reason.
     #[serde(default)]
     pub suppress: Vec<Suppress>,
-    /// Least severity that makes the exit code 1.
+    /// Lowest severity that makes the exit code 1.
     #[serde(default, rename = "fail-on")]
     pub fail_on: Option<Severity>,
-    /// Versions to predict the load for: `["transformers==4.47.0"]`.
+    /// Versions of transformers to predict the load for: `["transformers==4.47.0"]`.
     #[serde(default, rename = "for")]
     pub versions: Option<Vec<String>>,
-    /// A folder with rules (`checks/`) and architectures (`architectures/`) of your own.
+    /// Folder with additional rules (`checks/`) and architectures (`architectures/`).
     #[serde(default)]
     pub rules: Option<PathBuf>,
-    /// A baseline, written by `--write-baseline`: findings in it are not counted.
+    /// Baseline from `--write-baseline`; its findings are not counted.
     #[serde(default)]
     pub baseline: Option<PathBuf>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
 }
 
-/// What is different in a place.
+/// Settings for some paths.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PerPath {
-    /// Rules that are silent there.
+    /// Rules to skip.
     #[serde(default)]
     pub ignore: Vec<String>,
-    /// Severities that rules have there.
+    /// Other severities for rules.
     #[serde(default, deserialize_with = "ordered")]
     #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Severity>"))]
     pub severity: Vec<(String, Severity)>,
 }
 
-/// A finding that is accepted.
+/// A suppression.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Suppress {
-    /// The rule: a code, the start of one, or a name.
+    /// Rule: a code, the start of a code, or a name.
     pub rule: String,
-    /// Where: a glob, as in `per-path`, of the checkpoint or of a file in it; everywhere when absent.
+    /// Path of the checkpoint or of a file in it, as a glob like those of `per-path`; everywhere when missing.
     #[serde(default)]
     pub path: Option<String>,
-    /// Why this is accepted. A suppression says so, or the file is refused.
+    /// Reason for the suppression; a settings file without it is rejected.
     pub reason: String,
 }
 
-/// A settings file that was read.
+/// A parsed settings file.
 #[derive(Debug, Clone)]
 pub struct SettingsSource {
-    /// As messages name it.
+    /// The name used in messages.
     pub name: String,
-    /// Its folder, absolute.
+    /// Folder of the file, absolute.
     pub dir: PathBuf,
-    /// What it says.
+    /// The parsed settings.
     pub settings: Settings,
     text: String,
 }
 
 impl SettingsSource {
-    /// Settings from their text, as if it were a file in `dir`; `name` is for messages.
+    /// Parses settings from text, as a file in `dir`; `name` is used in messages.
     ///
     /// # Errors
-    /// Says what is wrong with `text`, and where.
+    /// [`DataError`] with the position in `text`.
     pub fn parse(name: &str, dir: &Path, text: &str) -> Result<Self, DataError> {
         let settings = source::parse(name, text)?;
         Ok(Self { name: name.to_owned(), dir: absolute(dir), settings, text: text.to_owned() })
@@ -119,7 +120,7 @@ impl SettingsSource {
         Self::parse(&name, absolute(path).parent().unwrap_or(path), &text)
     }
 
-    /// An error about a word of this file.
+    /// An error about the value `word` in this file.
     pub(super) fn wrong(&self, word: &str, reason: String) -> DataError {
         DataError::about(&self.name, &self.text, word, reason)
     }

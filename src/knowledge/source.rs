@@ -3,12 +3,12 @@
 use include_dir::{Dir, include_dir};
 use serde::de::DeserializeOwned;
 
-use super::expression::{compiled_at_once, compiled_when_needed};
+use super::expression::{compile_eagerly, compile_lazily};
 use crate::checkpoint::line_column;
 
 static RULES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules");
 
-/// A data file that is not what it should be.
+/// A malformed data file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{file}{}: {reason}", .place.map_or_else(String::new, |(line, column)| format!(":{line}:{column}")))]
 pub struct DataError {
@@ -25,7 +25,7 @@ impl DataError {
         Self { file: file.to_owned(), place: None, reason: reason.into() }
     }
 
-    /// An error in `file` about a word of its `text`.
+    /// An error in `file` at the first occurrence of `word` in `text`.
     #[must_use]
     pub fn about(file: &str, text: &str, word: &str, reason: impl Into<String>) -> Self {
         let quoted = |quote: char| text.find(&format!("{quote}{word}{quote}"));
@@ -35,24 +35,24 @@ impl DataError {
     }
 }
 
-/// Nesting that a data file may have. The json5 crate recurses without a limit of its own, and a stack that overflows
-/// takes the program with it.
+/// Maximum nesting of a data file. The json5 crate recurses without a limit, so deeper nesting could overflow the
+/// stack.
 const MAX_DEPTH: usize = 64;
 
-/// Parses a JSON5 file of ours or of a user's, its expressions included.
+/// Parses a JSON5 file, and compiles its expressions at once.
 ///
 /// # Errors
 /// [`DataError`] with the parser's line and column.
 pub fn parse<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
-    compiled_at_once(|| read(path, text))
+    compile_eagerly(|| read(path, text))
 }
 
-/// Parses a file that is in the program: its expressions are known to be right, and compiled when they are needed.
+/// Parses a built-in file; its expressions are compiled at their first evaluation.
 ///
 /// # Errors
-/// As [`parse`], expressions aside.
+/// As [`parse`], except for invalid expressions.
 pub fn parse_embedded<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
-    compiled_when_needed(|| read(path, text))
+    compile_lazily(|| read(path, text))
 }
 
 fn read<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
@@ -61,13 +61,13 @@ fn read<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
     }
     json5::from_str(text).map_err(|error| {
         let place = error.position().map(|at| (at.line.saturating_add(1), at.column.saturating_add(1)));
-        let said = error.to_string();
-        let cause = place.and_then(|_| said.rsplit_once(" at ")).map_or(said.as_str(), |(cause, _)| cause);
-        DataError { file: path.to_owned(), place, reason: plainly(cause) }
+        let message = error.to_string();
+        let cause = place.and_then(|_| message.rsplit_once(" at ")).map_or(message.as_str(), |(cause, _)| cause);
+        DataError { file: path.to_owned(), place, reason: readable_cause(cause) }
     })
 }
 
-/// How deep brackets nest, those in strings and comments aside: there they could hide that others nest deeper.
+/// Maximum nesting of brackets, without those in strings and comments, which could hide deeper nesting.
 fn depth(text: &str) -> usize {
     let (mut open, mut deepest) = (0_usize, 0_usize);
     let mut rest = text.chars().peekable();
@@ -83,7 +83,7 @@ fn depth(text: &str) -> usize {
                 }
             }
             '/' if rest.peek() == Some(&'/') => {
-                // Every line terminator that JSON5 has ends a comment.
+                // In JSON5 every line terminator ends a comment.
                 rest.by_ref().find(|c| matches!(c, '\n' | '\r' | '\u{2028}' | '\u{2029}'));
             }
             '/' if rest.peek() == Some(&'*') => {
@@ -98,27 +98,27 @@ fn depth(text: &str) -> usize {
     deepest
 }
 
-/// serde's words for a key that there is not, in ours: with the nearest one there is.
-fn plainly(cause: &str) -> String {
+/// Rewrites serde's errors about keys and values, and suggests the nearest valid one.
+fn readable_cause(cause: &str) -> String {
     let quoted: Vec<&str> = cause.split('`').skip(1).step_by(2).collect();
     match (cause.starts_with("unknown field "), cause.starts_with("unknown variant "), quoted.split_first()) {
-        (true, _, Some((key, known))) => format!("there is no key `{key}`; {}", instead(key, known)),
-        (_, true, Some((word, known))) => format!("`{word}` is not a word for this; {}", instead(word, known)),
+        (true, _, Some((key, known))) => format!("unknown key `{key}`; {}", suggestion(key, known)),
+        (_, true, Some((word, known))) => format!("unknown value `{word}`; {}", suggestion(word, known)),
         _ => cause.strip_prefix("missing field").map_or_else(|| cause.to_owned(), |key| format!("missing key{key}")),
     }
 }
 
-fn instead(word: &str, known: &[&str]) -> String {
+fn suggestion(word: &str, known: &[&str]) -> String {
     match nearest(word, known.iter().copied()) {
         Some(near) => format!("did you mean `{near}`?"),
-        None => format!("known are {}", known.join(", ")),
+        None => format!("expected one of {}", known.join(", ")),
     }
 }
 
-/// Likeness, from 0 to 1, from which a word is offered instead of a misspelt one.
+/// Lowest similarity, from 0 to 1, of a suggestion.
 const NEAR: f64 = 0.75;
 
-/// The known word that is most like `word`, when one is like it at all.
+/// The known word most similar to `word`; `None` when none is similar.
 #[must_use]
 pub fn nearest<'w>(word: &str, known: impl IntoIterator<Item = &'w str>) -> Option<&'w str> {
     let likeness = |other: &str| strsim::jaro_winkler(&word.to_ascii_lowercase(), &other.to_ascii_lowercase());
@@ -150,7 +150,7 @@ pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {
     out
 }
 
-/// One embedded file, such as an alias module of a recipe.
+/// The text of one embedded file, such as a template of a recipe.
 #[must_use]
 pub fn text(path: &str) -> Option<&'static str> {
     RULES.get_file(path)?.contents_utf8()
@@ -173,17 +173,17 @@ mod tests {
 
     #[test]
     fn an_error_names_its_place_and_the_nearest_key() {
-        assert_eq!(refused("{\n  sumary: 1,\n}"), "a.json5:2:3: there is no key `sumary`; did you mean `summary`?");
-        assert_eq!(refused("{ qqq: 1 }"), "a.json5:1:3: there is no key `qqq`; known are summary");
+        assert_eq!(refused("{\n  sumary: 1,\n}"), "a.json5:2:3: unknown key `sumary`; did you mean `summary`?");
+        assert_eq!(refused("{ qqq: 1 }"), "a.json5:1:3: unknown key `qqq`; expected one of summary");
         assert_eq!(refused("{ summary: }"), "a.json5:1:12: expected value");
         assert!(refused("{}").contains("missing key `summary`"), "{}", refused("{}"));
         let about = DataError::about("a.json5", "{\n x: ['IDX']}", "IDX", "no");
         assert_eq!(about.to_string(), "a.json5:2:6: no");
     }
 
-    /// What hides brackets from a count of bytes hides them from the parser too.
+    /// Strings and comments between the brackets do not hide the nesting.
     #[test]
-    fn depth_is_bounded_whatever_stands_between_the_brackets() {
+    fn depth_is_bounded_with_text_between_the_brackets() {
         for between in ["", "'}',", "\"}\\\"}\",", "/*}*/", "/*}**}/*/", "//}\n", "/*/}*/", "/*}*///}\n", "'\\'}',"] {
             let text = format!("[{between}").repeat(100_000);
             assert_eq!(refused(&text), "a.json5: nested deeper than 64 levels", "{between}");

@@ -13,7 +13,7 @@ use crate::knowledge::recipe::{Recipe, SeamTensor};
 use crate::knowledge::{EvalError, Expression, Scope};
 use crate::report::model::ShapedName;
 
-/// Options in force, by name.
+/// Options with their values, by name.
 pub type Options = BTreeMap<String, String>;
 
 /// A donor in its role.
@@ -21,13 +21,13 @@ pub type Options = BTreeMap<String, String>;
 pub struct Donor {
     /// Role in the recipe.
     pub role: String,
-    /// What was read.
+    /// The donor's checkpoint.
     pub checkpoint: Arc<Checkpoint>,
-    /// Its config with the class's defaults filled in; null for a directory that is no checkpoint.
+    /// The config with defaults of the class filled in; null for a directory without a checkpoint.
     pub config: Value,
 }
 
-/// What the recipe's expressions see, and the donors they are about.
+/// The donors, and the scope for expressions of the recipe.
 pub(super) struct Context<'a> {
     pub(super) recipe: &'a Recipe,
     pub(super) donors: &'a [Donor],
@@ -69,7 +69,7 @@ impl<'a> Context<'a> {
         let mut opt = Map::new();
         let mut arg = Map::new();
         for (name, value) in options {
-            // `forward:PACKAGE` is the value `forward` with the argument `PACKAGE`.
+            // In `forward:PACKAGE`, `forward` is the value and `PACKAGE` its argument.
             let (head, tail) = value.split_once(':').unwrap_or((value, ""));
             opt.insert(name.clone(), json!(head));
             arg.insert(name.clone(), json!(tail));
@@ -119,7 +119,7 @@ impl Context<'_> {
                 .map_err(self.at(format!("processor {}", spec.processor)))?
                 .ok_or_else(|| {
                     MergeError::Donor(format!(
-                        "the {} donor has no vocabulary file (tokenizer.model or tokenizer.json), so the ids of the tokens to be added cannot be known; put its tokenizer files beside its config.json",
+                        "the {} donor has no vocabulary file (tokenizer.model or tokenizer.json), so the ids of the added tokens are unknown; put its tokenizer files beside its config.json",
                         spec.base
                     ))
                 })?;
@@ -130,7 +130,7 @@ impl Context<'_> {
     }
 }
 
-/// The document of that name of the first donor that has it.
+/// The document of this name from the first donor that has it.
 fn document(donors: &[Donor], name: &str) -> Option<Value> {
     donors.iter().find_map(|d| d.checkpoint.document(name)?.value.clone())
 }

@@ -1,4 +1,4 @@
-//! The donors of a merge: opening and checking them, and whether they fit the recipe.
+//! The donors of a merge: opens and checks them, and matches them with the recipe.
 
 use std::sync::Arc;
 
@@ -10,29 +10,29 @@ use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{DonorSpec, Recipe};
 use crate::report::model::Role;
-use crate::surgery::donor::AtRest;
+use crate::surgery::donor::DonorSnapshot;
 
-/// Opens and checks every donor; the second list tells later whether their files are still the same.
+/// Opens and checks every donor; the snapshots in the second list detect later changes of their files.
 pub(super) fn open(
     request: &MergeRequest,
     knowledge: &Knowledge,
     run: &mut MergeRun,
-) -> Result<(Vec<Donor>, Vec<AtRest>), PipelineError> {
+) -> Result<(Vec<Donor>, Vec<DonorSnapshot>), PipelineError> {
     let mut donors = Vec::new();
-    let mut at_rest = Vec::new();
+    let mut snapshots = Vec::new();
     for (role, dir) in &request.donors {
-        let seen = AtRest::record(dir);
+        let seen = DonorSnapshot::record(dir);
         let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
-        at_rest.push(seen?);
+        snapshots.push(seen?);
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);
         donors.push(Donor { role: role.clone(), checkpoint: Arc::clone(&checkpoint), config: outcome.config.clone() });
         run.checked.push(CheckedCheckpoint { role: Role::Donor(role.clone()), path: dir.clone(), checkpoint, outcome });
     }
-    Ok((donors, at_rest))
+    Ok((donors, snapshots))
 }
 
-/// The one recipe whose roles the donors' architectures can play.
+/// Selects the only recipe whose roles match the donors' architectures.
 pub(super) fn choose_recipe<'k>(recipes: &'k [Recipe], run: &MergeRun) -> Result<&'k Recipe, MergeError> {
     let plays = |spec: &DonorSpec| {
         run.donor(&spec.role).map_or(spec.optional, |donor| {
@@ -50,17 +50,17 @@ pub(super) fn choose_recipe<'k>(recipes: &'k [Recipe], run: &MergeRun) -> Result
             };
             let donors: Vec<String> = run.checked.iter().map(is).collect();
             let donors = donors.join(", ");
-            Err(MergeError::Donor(format!("no recipe fits these donors: {donors}; give one with --recipe")))
+            Err(MergeError::Donor(format!("no recipe fits these donors: {donors}; select one with --recipe")))
         }
         several => {
             let names: Vec<&str> = several.iter().map(|r| r.recipe.as_str()).collect();
             let names = names.join(", ");
-            Err(MergeError::Donor(format!("several recipes fit these donors: {names}; choose one with --recipe")))
+            Err(MergeError::Donor(format!("several recipes fit these donors: {names}; select one with --recipe")))
         }
     }
 }
 
-/// Fails unless the donors given are those the recipe has roles for.
+/// Fails unless the donors match the roles of the recipe.
 pub(super) fn check_roles(recipe: &Recipe, request: &MergeRequest) -> Result<(), MergeError> {
     for role in request.donors.keys() {
         if !recipe.donors.iter().any(|d| d.role == *role) {
@@ -83,14 +83,14 @@ pub(super) fn check_roles(recipe: &Recipe, request: &MergeRequest) -> Result<(),
     Ok(())
 }
 
-/// Fails unless each donor's architecture can play its role.
+/// Fails unless the architecture of each donor is allowed for its role.
 pub(super) fn check_architectures(recipe: &Recipe, run: &MergeRun) -> Result<(), MergeError> {
     for spec in recipe.donors.iter().filter(|s| !s.architectures.is_empty()) {
         let Some(donor) = run.donor(&spec.role) else { continue };
         let is = donor.outcome.architecture.as_deref();
         if !is.is_some_and(|a| spec.architectures.iter().any(|s| s == a)) {
             return Err(MergeError::Donor(format!(
-                "{}: the {} donor has to be {} ({}), this is {}",
+                "{}: the {} donor must be {} ({}), but this is {}",
                 donor.path.display(),
                 spec.role,
                 spec.architectures.join(" or "),
@@ -102,11 +102,11 @@ pub(super) fn check_architectures(recipe: &Recipe, run: &MergeRun) -> Result<(),
     Ok(())
 }
 
-/// Whether every donor is free of errors that the recipe does not tolerate; notes which are not.
+/// Whether no donor has errors, except those that the recipe tolerates; records the result.
 pub(super) fn are_sound(recipe: &Recipe, run: &mut MergeRun) -> bool {
     let mut unsound = Vec::new();
     for spec in &recipe.donors {
-        // A directory that only lends Python modules is not judged as a checkpoint.
+        // A directory that only provides Python modules is not checked as a checkpoint.
         let Some(donor) = run.donor(&spec.role).filter(|_| !spec.architectures.is_empty()) else { continue };
         let stops = |f: &&Finding| f.severity == Severity::Error && !spec.tolerates.contains(&f.code);
         let errors = donor.outcome.findings.iter().filter(stops).count();
@@ -115,8 +115,11 @@ pub(super) fn are_sound(recipe: &Recipe, run: &mut MergeRun) -> bool {
         }
     }
     let sound = unsound.is_empty();
-    let outcome =
-        if sound { count(run.checked.len(), "donor is sound", "donors are sound") } else { unsound.join(", ") };
+    let outcome = if sound {
+        count(run.checked.len(), "donor has no errors", "donors have no errors")
+    } else {
+        unsound.join(", ")
+    };
     run.note("donors", &outcome);
     sound
 }

@@ -1,4 +1,4 @@
-//! The draft of a merge: the plan, its documents, and what the report tells of it.
+//! The draft of a merge: plan, documents, and facts for the report.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -8,24 +8,24 @@ use crate::checkpoint::{Checkpoint, Document, Entry, Parts, PythonModule, Vocabu
 use crate::report::model::{ChangedTensor, Dropped, MergedFile, Seam};
 use crate::surgery::plan::{Plan, PlannedShard};
 
-/// What would be written, and the seams that prevent it.
+/// A planned merge, with the seams that prevent it.
 #[derive(Debug, Default)]
 pub(super) struct MergeDraft {
     /// The plan; incomplete when `seams` is not empty.
     pub(super) plan: Plan,
     /// Documents of the plan, for its preview.
     pub(super) documents: Vec<Document>,
-    /// Seams that do not fit.
+    /// Seams with a mismatch.
     pub(super) seams: Vec<Seam>,
     /// Tensors that are not byte copies.
     pub(super) changed: Vec<ChangedTensor>,
-    /// Donor tensors left behind.
+    /// Donor tensors that are not in the result.
     pub(super) dropped: Vec<Dropped>,
-    /// Repairs made on the way.
+    /// Repairs of donor documents.
     pub(super) repairs: Vec<String>,
-    /// What a person should know.
+    /// Notes for the report.
     pub(super) notes: Vec<String>,
-    /// Files and where they came from.
+    /// Files and their origins.
     pub(super) files: Vec<MergedFile>,
 }
 

@@ -1,4 +1,4 @@
-//! Why a merge could not be planned, or was not written.
+//! Errors of planning and of running a merge.
 
 use std::path::PathBuf;
 
@@ -6,26 +6,26 @@ use crate::checkpoint::OpenError;
 use crate::knowledge::EvalError;
 use crate::surgery::ApplyError;
 
-/// Why a recipe could not be turned into a draft. A seam that does not fit is not among these.
+/// Why a recipe could not be turned into a draft. A seam mismatch is not an error.
 #[derive(Debug, thiserror::Error)]
 pub enum MergeError {
-    /// An option the recipe does not have, or a value it does not take.
+    /// An unknown option, or an invalid value.
     #[error("{0}")]
     Option(String),
-    /// A donor lacks something the recipe cannot do without.
+    /// A donor lacks something that the recipe needs.
     #[error("{0}")]
     Donor(String),
-    /// An expression of the recipe has no value with these donors.
+    /// An expression of the recipe cannot be evaluated with these donors.
     #[error("recipe {recipe}, {place}: {error}")]
     Expression {
         /// Recipe name.
         recipe: String,
-        /// Where in the recipe.
+        /// Position in the recipe.
         place: String,
-        /// What went wrong.
+        /// The evaluation error.
         error: EvalError,
     },
-    /// The recipe itself is not right.
+    /// The recipe is faulty.
     #[error("recipe {0}")]
     Recipe(String),
 }
@@ -38,21 +38,21 @@ pub enum PipelineError {
     Donor {
         /// Role in the recipe.
         role: String,
-        /// Why it cannot be read.
+        /// The cause.
         error: OpenError,
     },
     /// The request does not fit the recipe; nothing was written.
     #[error(transparent)]
     Merge(#[from] MergeError),
-    /// The target is in the way, or writing failed; nothing has the target's name unless the message says so.
+    /// The target is not usable, or writing failed; unless the message says otherwise, the target does not exist.
     #[error(transparent)]
     Apply(#[from] ApplyError),
-    /// The result was written, and could not be read again to be checked.
+    /// The result was written, but could not be opened again for the check.
     #[error("{out} was written, but could not be opened again: {error}; run `ckpt-doctor check` on it", out = out.display())]
     Reopen {
         /// The result.
         out: PathBuf,
-        /// Why it cannot be read.
+        /// The cause.
         error: OpenError,
     },
 }

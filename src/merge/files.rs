@@ -1,4 +1,4 @@
-//! The files of a merge: documents, copies, Python modules, aliases, and the index last but for config.json.
+//! The files of a merge: documents, copies, Python modules, templates and the index; `config.json` is written last.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -48,24 +48,24 @@ pub(super) fn plan(
         files.push(PlannedFile {
             name: index.name.clone(),
             bytes: bytes_of(&index),
-            origin: "made from the shards".to_owned(),
+            origin: "generated from the shards".to_owned(),
         });
         draft.documents.push(index);
     }
-    // A loader starts at config.json: it comes last, so that even a copy cut short is not taken for a checkpoint.
+    // A loader starts at config.json. It is written last, so that an incomplete copy is not mistaken for a checkpoint.
     let (config, others): (Vec<MergedDocument>, Vec<MergedDocument>) =
         documents.into_iter().partition(|b| b.document.name == "config.json");
-    for built in others.into_iter().chain(config) {
+    for merged in others.into_iter().chain(config) {
         files.push(PlannedFile {
-            name: built.document.name.clone(),
-            bytes: bytes_of(&built.document),
-            origin: built.origin,
+            name: merged.document.name.clone(),
+            bytes: bytes_of(&merged.document),
+            origin: merged.origin,
         });
-        draft.documents.push(built.document);
+        draft.documents.push(merged.document);
     }
     let mut seen = BTreeSet::new();
     for file in &files {
-        // Two names that differ in case only are one file on some file systems.
+        // Names that differ only in case are one file on some file systems.
         if !seen.insert(file.name.to_lowercase()) {
             return Err(MergeError::Recipe(format!("{}: {} would be written twice", context.recipe.recipe, file.name)));
         }
@@ -79,7 +79,7 @@ fn bytes_of(document: &Document) -> Arc<[u8]> {
     document.text.as_deref().unwrap_or_default().as_bytes().into()
 }
 
-/// A donor's file; nothing when the donor has none of that name.
+/// A donor's file; `None` when the donor lacks it.
 fn copy_of(context: &Context<'_>, role: &str, name: &str) -> Result<Option<PlannedFile>, MergeError> {
     let Some(donor) = context.donor(role) else { return Ok(None) };
     if !donor.checkpoint.has_file(name) {
@@ -90,7 +90,7 @@ fn copy_of(context: &Context<'_>, role: &str, name: &str) -> Result<Option<Plann
     Ok(Some(PlannedFile { name: name.to_owned(), bytes: bytes.into(), origin: format!("{role} donor, unchanged") }))
 }
 
-/// The root modules and every module they import, each from the first donor that has it.
+/// The root modules and every module that they import, each from the first donor that has it.
 fn modules(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>, MergeError> {
     let mut found: BTreeMap<String, PlannedFile> = BTreeMap::new();
     let mut pending = spec.roots.clone();
@@ -128,7 +128,7 @@ fn fill_template(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFi
     })
 }
 
-/// The index, when there is more than one shard; one shard needs none.
+/// The index; `None` for a single shard, which needs no index.
 fn index(draft: &MergeDraft) -> Option<Document> {
     if draft.plan.shards.len() < 2 {
         return None;

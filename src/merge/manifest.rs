@@ -8,6 +8,7 @@ use super::context::{Donor, Options};
 use super::draft::MergeDraft;
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::recipe::Recipe;
+use crate::report::model::ToolInfo;
 use crate::surgery::ApplyError;
 use crate::surgery::donor::sha256;
 use crate::surgery::plan::TensorTransform;
@@ -25,7 +26,7 @@ pub(crate) struct Manifest {
     /// Version of this contract: 1.
     pub schema: u32,
     /// The program that made the merge.
-    pub tool: Program,
+    pub tool: ToolInfo,
     /// Name of the recipe.
     pub recipe: String,
     /// Options in effect, defaults included.
@@ -34,16 +35,6 @@ pub(crate) struct Manifest {
     pub donors: BTreeMap<String, DonorFiles>,
     /// Every tensor of the result, in the order of the shards.
     pub tensors: Vec<TensorOrigin>,
-}
-
-/// Name and version of a program.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-pub(crate) struct Program {
-    /// Always `ckpt-doctor`.
-    pub name: &'static str,
-    /// Its version.
-    pub version: &'static str,
 }
 
 /// The files of a donor that were read.
@@ -84,13 +75,13 @@ pub(crate) struct TensorOrigin {
     /// How it was made.
     pub transform: TensorTransform,
     /// The donor tensor that it was made from, or that it replaces.
-    pub source: TensorSource,
+    pub source: DonorTensor,
 }
 
 /// A tensor of a donor.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
-pub(crate) struct TensorSource {
+pub(crate) struct DonorTensor {
     /// Role of the donor.
     pub donor: String,
     /// Name in the donor.
@@ -100,9 +91,9 @@ pub(crate) struct TensorSource {
 }
 
 /// The manifest of a planned merge. With `all_bytes` whole shards are hashed, otherwise only their headers.
-///
+/// The manifest of a planned merge. With `all_bytes`, whole shards are hashed, otherwise only their headers.
 /// # Errors
-/// When a donor's file cannot be read, or a signal asked to stop.
+/// When a donor's file cannot be read, or a signal arrived.
 pub(super) fn manifest(
     recipe: &Recipe,
     options: &Options,
@@ -119,12 +110,12 @@ pub(super) fn manifest(
             dtype: t.dtype.name().to_owned(),
             shape: t.shape.clone(),
             transform: t.source.transform(),
-            source: TensorSource { donor: from.donor.clone(), name: from.name.clone(), shape: from.shape.clone() },
+            source: DonorTensor { donor: from.donor.clone(), name: from.name.clone(), shape: from.shape.clone() },
         }
     });
     Ok(Manifest {
         schema: 1,
-        tool: Program { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") },
+        tool: ToolInfo::this(),
         recipe: recipe.recipe.clone(),
         options: options.clone(),
         donors: donors.iter().map(files).collect::<Result<_, ApplyError>>()?,

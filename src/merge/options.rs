@@ -1,4 +1,4 @@
-//! Options of a recipe: those given, checked, and defaults for the others.
+//! Options of a recipe: validates the given ones, and adds defaults for the others.
 
 use std::collections::BTreeMap;
 
@@ -6,13 +6,13 @@ use super::context::Options;
 use super::error::MergeError;
 use crate::knowledge::recipe::{OptionSpec, Recipe};
 
-/// Largest shard when a recipe has no such option: what `save_pretrained` uses.
+/// Shard size of a recipe without this option: the default of `save_pretrained`.
 pub(super) const DEFAULT_SHARD: u64 = 5_000_000_000;
 
-/// Options in force: those given, checked, and the recipe's defaults for the rest.
+/// The options with their values: the given ones, and the recipe's defaults for the others.
 ///
 /// # Errors
-/// [`MergeError::Option`] for a name the recipe does not have or a value it does not take.
+/// [`MergeError::Option`] for an unknown name or an invalid value.
 pub(super) fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Result<Options, MergeError> {
     for name in given.keys() {
         if !recipe.options.iter().any(|o| o.name == *name) {
@@ -37,7 +37,7 @@ fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
         return parse_size(value).map(drop);
     }
     let takes = |v: &String| match v.strip_suffix(':') {
-        // What follows the colon goes into a Python import: a dotted module path and nothing else.
+        // The argument after the colon becomes part of a Python import, so it must be a dotted module path.
         Some(head) => value.strip_prefix(head).and_then(|t| t.strip_prefix(':')).is_some_and(is_module_path),
         None => v == value,
     };

@@ -1,6 +1,6 @@
-//! A recipe and its donors become a draft: the plan, and the seams that do not fit.
+//! Turns a recipe and its donors into a draft: the plan, and the seams with a mismatch.
 //!
-//! Nothing here writes, and nothing here judges a checkpoint: the pipeline checks donors and preview with the rules.
+//! Nothing is written or checked here: [`super::run`] checks the donors and the preview.
 
 use serde_json::Value;
 
@@ -15,7 +15,7 @@ use crate::report::model::Seam;
 /// Turns a recipe into a draft: seams, documents, tensors, files, notes.
 ///
 /// # Errors
-/// A [`MergeError`] when the recipe cannot be followed at all with these donors and options.
+/// A [`MergeError`] when the recipe cannot be applied to these donors and options.
 pub(super) fn plan(
     recipe: &Recipe,
     donors: &[Donor],

@@ -1,4 +1,4 @@
-//! A merge under way: the checkpoints it has checked and the record for its report.
+//! State of a merge: the checkpoints checked so far, and the record for the report.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,29 +12,29 @@ use crate::knowledge::recipe::Recipe;
 use crate::report::Report;
 use crate::report::model::{CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
 
-/// What a merge is asked to do.
+/// A request for a merge.
 #[derive(Debug, Clone)]
 pub struct MergeRequest {
-    /// The recipe; chosen by the donors' architectures when absent.
+    /// The recipe; selected by the donors' architectures when `None`.
     pub recipe: Option<Recipe>,
-    /// Role to directory, as given.
+    /// Directories of the donors, by role, as given.
     pub donors: BTreeMap<String, PathBuf>,
-    /// Options as given.
+    /// Options, as given.
     pub options: BTreeMap<String, String>,
-    /// Directory to make.
+    /// Directory to create.
     pub out: PathBuf,
-    /// Stop before anything is written.
+    /// Whether to stop before writing.
     pub dry_run: bool,
-    /// Hash every byte of the donors for the manifest, not only documents and headers.
+    /// Whether to hash all bytes of the donors for the manifest, not only documents and headers.
     pub hash: bool,
 }
 
-/// A checkpoint that was checked on the way.
+/// A checkpoint that the merge has checked.
 #[derive(Debug, Clone)]
 pub struct CheckedCheckpoint {
-    /// What it is in this merge.
+    /// Role in this merge.
     pub role: Role,
-    /// As the user named it.
+    /// The path as given by the user.
     pub path: PathBuf,
     /// The checkpoint.
     pub checkpoint: Arc<Checkpoint>,
@@ -42,7 +42,7 @@ pub struct CheckedCheckpoint {
     pub outcome: Outcome,
 }
 
-/// A merge: how far it came, and what every stage found.
+/// A merge run: the checked checkpoints and the record for the reports.
 #[derive(Debug, Clone, Default)]
 pub struct MergeRun {
     /// Checkpoints in the order they were checked.
@@ -52,30 +52,30 @@ pub struct MergeRun {
 }
 
 impl MergeRun {
-    /// A run that has done nothing yet.
+    /// A run before its first stage.
     pub(super) fn new(request: &MergeRequest) -> Self {
         let donors = request.donors.iter().map(|(role, dir)| (role.clone(), dir.display().to_string())).collect();
         let record = MergeReport { out: request.out.display().to_string(), donors, ..MergeReport::default() };
         Self { checked: Vec::new(), record }
     }
 
-    /// The donor in a role of the recipe, once it was checked.
+    /// The donor in a role of the recipe; `None` before it was checked.
     pub(super) fn donor(&self, role: &str) -> Option<&CheckedCheckpoint> {
         self.checked.iter().find(|c| matches!(&c.role, Role::Donor(own) if own == role))
     }
 
-    /// Adds the line about one stage.
+    /// Records the outcome of one stage.
     pub(super) fn note(&mut self, name: &str, outcome: &str) {
         self.record.stages.push(StageOutcome { name: name.to_owned(), outcome: outcome.to_owned() });
     }
 
-    /// The run, ended with `stage`.
+    /// Ends the run at `stage`.
     pub(super) fn end(mut self, stage: MergeStage) -> Self {
         self.record.stage = Some(stage);
         self
     }
 
-    /// Records what is planned.
+    /// Copies the facts of the draft into the record.
     pub(super) fn record_draft(&mut self, draft: &MergeDraft) {
         let record = &mut self.record;
         record.seams.clone_from(&draft.seams);
@@ -93,7 +93,7 @@ impl MergeRun {
         }
     }
 
-    /// Checks the planned or the written checkpoint and notes the verdict; false when it has errors.
+    /// Checks the planned or written checkpoint, and records the verdict; returns false when it has errors.
     pub(super) fn check(&mut self, role: Role, path: &Path, checkpoint: Checkpoint, knowledge: &Knowledge) -> bool {
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);
@@ -115,7 +115,7 @@ impl MergeRun {
         self.report_with(|path| path.display().to_string())
     }
 
-    /// The report with directories named by their last component, for the file that travels with the result.
+    /// The report with only the last component of each directory, for the file inside the result.
     pub(super) fn portable_report(&self) -> Report {
         self.report_with(|path| match path.file_name() {
             Some(name) => name.to_string_lossy().into_owned(),

@@ -1,4 +1,4 @@
-//! Which tensors the result has, where each comes from, and whether it fits.
+//! The tensors of the result: their origin, transform and shape.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -24,7 +24,7 @@ struct TensorRule<'a> {
     fit: TensorTransform,
 }
 
-/// A donor tensor that the recipe takes, under its name in the result.
+/// A donor tensor that the recipe selects, with its name in the result.
 struct TakenTensor<'a> {
     name: String,
     donor: &'a Donor,
@@ -33,7 +33,7 @@ struct TakenTensor<'a> {
     rule: &'a TensorRule<'a>,
 }
 
-/// Plans the shards of the result; tensors that do not fit become seams of the draft.
+/// Plans the shards of the result; shape mismatches become seams of the draft.
 pub(super) fn plan(
     context: &Context<'_>,
     documents: &[MergedDocument],
@@ -66,13 +66,13 @@ pub(super) fn plan(
             Err(why) => draft.seams.push(misfit(context, &taken, shape, &why)),
         }
     }
-    // The class's own order, so that shards are cut where save_pretrained would cut them.
+    // In the order of the class, so that shards are split where save_pretrained would split them.
     tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
     draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
     Ok(())
 }
 
-/// The tensors that the recipe takes, and those it leaves behind.
+/// The tensors that the recipe selects, and the others.
 fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTensor<'a>>, Vec<Dropped>) {
     let mut taken = Vec::new();
     let mut dropped: BTreeMap<(String, String, String), usize> = BTreeMap::new();
@@ -88,7 +88,7 @@ fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTenso
                     taken.push(TakenTensor { name, donor, shard, tensor, rule });
                 }
                 other => {
-                    let (pattern, why) = other.map_or(("", "no entry of the recipe names them"), |r| {
+                    let (pattern, why) = other.map_or(("", "no entry of the recipe matches them"), |r| {
                         (r.spec.names.as_str(), r.spec.drop.as_deref().unwrap_or_default())
                     });
                     let key = (donor.role.clone(), pattern.to_owned(), why.to_owned());
@@ -102,7 +102,7 @@ fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTenso
     (taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect())
 }
 
-/// The planned tensor; one that is not a byte copy is also listed in the draft.
+/// The planned tensor; if it is not a byte copy, the draft lists it as changed.
 fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft: &mut MergeDraft) -> PlannedTensor {
     let TakenTensor { name, tensor, .. } = taken;
     if !matches!(source, TensorSource::Copy(_)) {
@@ -147,7 +147,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
     Ok(out)
 }
 
-/// Position and shape of each tensor the class would build from the planned config.
+/// Position and shape of each tensor that the class has with the planned config.
 fn expected_shapes<'n>(
     library: &Library,
     config: Option<&Value>,
@@ -162,7 +162,7 @@ fn expected_shapes<'n>(
     })
 }
 
-/// How a tensor becomes one of `shape`, or why it cannot.
+/// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used.
 fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
     let from = TensorRef {
@@ -185,7 +185,7 @@ fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String
         TensorTransform::Copy => Err(String::new()),
         TensorTransform::Reinit => Ok(TensorSource::Reinit { instead_of: from }),
         TensorTransform::Pad if nests => Ok(TensorSource::Pad(from)),
-        TensorTransform::Pad => Err("padding cannot make it smaller".to_owned()),
+        TensorTransform::Pad => Err("padding cannot shrink a tensor".to_owned()),
         TensorTransform::GrowRows if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
             Ok(TensorSource::GrowRows(from))
         }
@@ -193,12 +193,12 @@ fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String
     }
 }
 
-/// The seam for a tensor that does not fit.
+/// The seam for a tensor with a shape mismatch.
 fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why: &str) -> Seam {
     let TakenTensor { name, donor, tensor, rule, .. } = taken;
     Seam {
         message: format!(
-            "{} of the {} donor is {:?}, {} has to be {needed:?}{}{why}",
+            "{} of the {} donor is {:?}, {} must be {needed:?}{}{why}",
             tensor.name,
             donor.role,
             tensor.shape,

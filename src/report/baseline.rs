@@ -1,7 +1,7 @@
-//! A baseline: findings that were there when it was written, and are not counted since.
+//! A baseline: a file with known findings, which are not counted.
 //!
-//! A finding is known by its fingerprint, the same as in SARIF and for GitLab but for the path, which starts at the
-//! baseline's folder: the file travels with what it is about.
+//! A finding is identified by its fingerprint. It is the fingerprint of SARIF and GitLab reports, except that the path
+//! is relative to the folder of the baseline, so that both can be moved together.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
@@ -16,59 +16,60 @@ use crate::check::finding::Accepted;
 use crate::knowledge::settings::absolute;
 use crate::knowledge::source::{self, DataError};
 
-/// Version of the form of the file.
+/// Version of the file format.
 const SCHEMA: u32 = 1;
 
-/// The file.
+/// A baseline file.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Baseline {
     schema: u32,
-    /// By checkpoint, rule and message.
+    /// Sorted by checkpoint, rule and message.
     findings: Vec<BaselineEntry>,
     /// Path or URL of a JSON Schema, for editors; the program keeps it and ignores it.
     #[serde(default, rename = "$schema", skip_serializing_if = "Option::is_none")]
     for_editors: Option<String>,
 }
 
-/// One finding. All but the fingerprint is for people.
+/// One finding. Only the fingerprint is compared; the other keys are for readers.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct BaselineEntry {
-    /// The checkpoint, from the baseline's folder.
+    /// Path of the checkpoint, relative to the folder of the baseline.
     pub path: String,
     /// Rule code.
     pub code: String,
-    /// What was said of it.
+    /// Message of the finding.
     pub message: String,
-    /// What it is known by.
+    /// Fingerprint that identifies the finding.
     fingerprint: String,
 }
 
 impl Baseline {
-    /// Reads one; `file` is for messages.
+    /// Parses a baseline; `file` is used in messages.
     ///
     /// # Errors
-    /// Says what is wrong with `text`, and where.
+    /// [`DataError`] with the position in `text`.
     pub fn parse(file: &str, text: &str) -> Result<Self, DataError> {
         let baseline: Self = source::parse(file, text)?;
         if baseline.schema == SCHEMA {
             return Ok(baseline);
         }
-        Err(DataError::new(file, format!("a baseline of version {}; {SCHEMA} is known here", baseline.schema)))
+        Err(DataError::new(file, format!("baseline version {} is unknown; expected {SCHEMA}", baseline.schema)))
     }
 
-    /// What was found in these checkpoints, for a file in `folder`.
+    /// A baseline of the findings of these checkpoints, for a file in `folder`.
     pub fn from_reports<'r>(reports: impl Iterator<Item = &'r CheckpointReport>, folder: &Path) -> Self {
         let mut findings: Vec<BaselineEntry> = reports.flat_map(|report| entries(report, folder)).collect();
         findings.sort();
         Self { schema: SCHEMA, findings, for_editors: None }
     }
 
-    /// Keeps of an older baseline what this one cannot speak of: other checkpoints, and rules that were not asked.
-    pub fn keep(&mut self, older: Self, reports: &[&CheckpointReport], folder: &Path, asked: &BTreeSet<&str>) {
+    /// Adds findings of an older baseline that this run did not check: those of other checkpoints, and of rules that
+    /// did not run.
+    pub fn keep(&mut self, older: Self, reports: &[&CheckpointReport], folder: &Path, rules: &BTreeSet<&str>) {
         let paths: BTreeSet<String> = reports.iter().map(|report| below(folder, report)).collect();
-        let other = |e: &BaselineEntry| !paths.contains(&e.path) || !asked.contains(e.code.as_str());
+        let other = |e: &BaselineEntry| !paths.contains(&e.path) || !rules.contains(e.code.as_str());
         self.findings.extend(older.findings.into_iter().filter(other));
         self.findings.sort();
         self.findings.dedup();
@@ -81,26 +82,20 @@ impl Baseline {
         json::pretty(self)
     }
 
-    /// How many findings it has.
+    /// Number of findings.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.findings.len()
     }
 
-    /// Whether it has none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.findings.is_empty()
-    }
-
-    /// Sets the findings aside that are in it; returns those in it that are gone from this checkpoint, of the rules that
-    /// were asked.
+    /// Moves findings that the baseline contains to the suppressed ones. Returns findings of the baseline that the
+    /// checkpoint no longer has, for the `rules` that ran.
     pub fn accept(
         &self,
         report: &mut CheckpointReport,
         file: &str,
         folder: &Path,
-        asked: &BTreeSet<&str>,
+        rules: &BTreeSet<&str>,
     ) -> Vec<&BaselineEntry> {
         let here = entries(report, folder);
         let known: BTreeSet<&str> = self.findings.iter().map(|e| e.fingerprint.as_str()).collect();
@@ -110,7 +105,7 @@ impl Baseline {
         let path = below(folder, report);
         let still: BTreeSet<&str> = here.iter().map(|e| e.fingerprint.as_str()).collect();
         let gone = |e: &&BaselineEntry| {
-            e.path == path && asked.contains(e.code.as_str()) && !still.contains(e.fingerprint.as_str())
+            e.path == path && rules.contains(e.code.as_str()) && !still.contains(e.fingerprint.as_str())
         };
         self.findings.iter().filter(gone).collect()
     }
@@ -131,7 +126,7 @@ fn entries(report: &CheckpointReport, folder: &Path) -> Vec<BaselineEntry> {
     report.findings.iter().map(entry).collect()
 }
 
-/// Where a checkpoint is, from `folder`.
+/// Path of a checkpoint, relative to `folder`.
 fn below(folder: &Path, report: &CheckpointReport) -> String {
     let (folder, path) = (absolute(folder), absolute(Path::new(&report.path)));
     let (mut from, mut to) = (folder.components().peekable(), path.components().peekable());

@@ -1,4 +1,4 @@
-//! From what a check found to what a report says.
+//! Builds reports from the results of checks.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,8 @@ use crate::check::{Edit, Finding, Outcome};
 use crate::checkpoint::Checkpoint;
 
 impl CheckpointReport {
-    /// The report on one checkpoint, named as the user named it.
+    /// The report on one checkpoint, with the path as given by the user.
+    #[doc(hidden)]
     #[must_use]
     pub fn new(path: impl Into<String>, role: Option<Role>, checkpoint: &Checkpoint, outcome: &Outcome) -> Self {
         let counts = Counts::new(&outcome.findings);
@@ -41,8 +42,8 @@ impl CheckpointReport {
         }
     }
 
-    /// Sets findings aside that are accepted; they are no longer counted.
-    pub fn accept(&mut self, accepted: impl Fn(usize, &Finding) -> Option<Accepted>) {
+    /// Suppresses findings for which `accepted` returns a reason; they are no longer counted.
+    pub(crate) fn accept(&mut self, accepted: impl Fn(usize, &Finding) -> Option<Accepted>) {
         for (number, finding) in std::mem::take(&mut self.findings).into_iter().enumerate() {
             match accepted(number, &finding) {
                 Some(accepted) => self.suppressed.push(Suppressed { finding, accepted }),

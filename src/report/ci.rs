@@ -1,6 +1,6 @@
-//! Formats that other programs show: what they have in common.
+//! Data shared by the formats for other programs.
 //!
-//! They take no notice of `Style`: a program that reads a report wants all of it.
+//! They ignore `Style`: a program that reads a report needs all of it.
 
 pub mod github;
 pub mod gitlab;
@@ -13,53 +13,53 @@ use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 
-use super::format::{fix, sentence};
+use super::format::{advice, sentence};
 use super::model::{CheckpointReport, MergeReport, Report};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
 use crate::checkpoint::hex;
 
-/// Longest path written, in characters: no longer one exists on Linux.
+/// Longest path in a report, in characters; the limit of Linux.
 const PATH: usize = 4_096;
 
 /// The findings on one checkpoint, or the seams of a merge.
 pub struct Group<'a> {
-    /// What it is about, with its part in a merge.
+    /// The checkpoint or merge, with its role in a merge.
     pub title: String,
-    /// Where it is, [`tidy`].
+    /// Path of the checkpoint or merge, see [`tidy`].
     pub path: String,
-    /// Texts of its documents; none for a merge.
+    /// Texts of the documents; `None` for a merge.
     pub sources: Option<&'a BTreeMap<String, Arc<str>>>,
-    /// In the order of the report.
+    /// Items in report order.
     pub items: Vec<Item<'a>>,
-    /// Findings that are accepted, with where that is written and why.
+    /// Suppressed findings, each with the origin and reason of the suppression.
     pub suppressed: Vec<(Item<'a>, &'a Accepted)>,
 }
 
-/// What stands for a rule code at a seam.
+/// Rule code of a seam.
 pub const SEAM: &str = "seam";
 
-/// A finding, or a seam that does not fit.
+/// A finding, or a seam mismatch.
 pub struct Item<'a> {
     /// Rule code; [`SEAM`] for a seam.
     pub code: &'a str,
     /// Rule name.
     pub name: &'a str,
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
-    /// What is said of it, safe to show.
+    /// Message, escaped for display.
     pub message: String,
-    /// Where; may be empty.
+    /// Places; may be empty.
     pub locations: &'a [Location],
-    /// The fix, if there is one.
+    /// The fix, if any.
     pub fix: Option<&'a FixHint>,
-    /// The next step, safe to show.
+    /// The next step, escaped for display.
     pub help: Option<String>,
-    /// SHA-256 in hexadecimal. The same while the finding is, wherever in its file it moves; unique in a report.
+    /// SHA-256 in hexadecimal. It does not change when the finding moves within its file; unique within a report.
     pub fingerprint: String,
 }
 
-/// Everything there is to say, one group for each checkpoint and one for a merge.
+/// All findings and seams: one group for each checkpoint, and one for a merge.
 pub fn groups(report: &Report) -> Vec<Group<'_>> {
     let mut seen = BTreeMap::new();
     let mut groups: Vec<Group<'_>> = report.checkpoints.iter().map(|c| findings(c, &mut seen)).collect();
@@ -78,7 +78,7 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
         message: sentence(&finding.message),
         locations: &finding.locations,
         fix: finding.fix.as_ref(),
-        help: finding.fix.as_ref().map(fix),
+        help: finding.fix.as_ref().map(|hint| advice(hint).join("; ")),
         fingerprint: of_finding(finding, &path, &role, seen),
     };
     let items = checkpoint.findings.iter().map(&mut item).collect();
@@ -89,7 +89,7 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
 /// Fingerprint of a finding of the checkpoint at `path`.
 pub fn of_finding(finding: &Finding, path: &str, role: &str, seen: &mut BTreeMap<String, usize>) -> String {
     let mut parts = vec![path, role, &finding.code];
-    // One place is enough: a finding stays what it is when it gets a place more.
+    // Only the first place is hashed, so that an additional place does not change the fingerprint.
     if let Some(first) = finding.locations.first() {
         parts.extend([&first.file, &first.pointer, &first.tensor].map(|p| p.as_deref().unwrap_or_default()));
     }
@@ -113,7 +113,8 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
     Group { title: format!("merge {}", merge.recipe), path, sources: None, items, suppressed: Vec::new() }
 }
 
-/// Parts are hashed with their lengths, so that none can pass for another; what occurs again is numbered.
+/// Hashes the parts with their lengths, so that different parts give different hashes; repeated fingerprints are
+/// numbered.
 fn fingerprint(parts: &[&str], seen: &mut BTreeMap<String, usize>) -> String {
     let hash = |before: &str, nth: usize| {
         let mut hasher = Sha256::new();
@@ -131,7 +132,7 @@ fn fingerprint(parts: &[&str], seen: &mut BTreeMap<String, usize>) -> String {
     if nth == 0 { first } else { hash("again", nth) }
 }
 
-/// A path without empty and `.` parts, cut where no path goes on.
+/// Removes empty and `.` components of a path, and cuts it at [`PATH`] characters.
 pub fn tidy(path: &str) -> String {
     let parts: Vec<&str> = path.split('/').filter(|part| !part.is_empty() && *part != ".").collect();
     let root = if path.starts_with('/') { "/" } else { "" };
@@ -139,12 +140,12 @@ pub fn tidy(path: &str) -> String {
     if tidy.is_empty() { ".".to_owned() } else { tidy }
 }
 
-/// The file a location is in, below the directory `path`.
+/// The file of a location, below the directory `path`.
 pub fn file(path: &str, location: &Location) -> Option<String> {
     location.file.as_deref().map(|file| tidy(&format!("{path}/{file}")))
 }
 
-/// `path/file:line:column`, or what there is of it.
+/// `path/file:line:column`, without the parts that are missing.
 pub fn spot(path: &str, location: &Location) -> String {
     let mut spot = file(path, location).unwrap_or_else(|| path.to_owned());
     for n in [location.line, location.column].into_iter().map_while(|n| n) {

@@ -2,24 +2,24 @@
 
 use std::collections::BTreeMap;
 
-/// One pattern and how many names it stands for.
+/// A pattern with the number of names that it matches.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NameGroup {
-    /// A name, with `{0..25}` or `{0,3,5}` where several numbers occur.
+    /// A name, with `{0..25}` or `{0,3,5}` in place of numbers.
     pub pattern: String,
-    /// Names it stands for.
+    /// Number of names that it matches.
     pub count: usize,
 }
 
-/// Numbers that occur at one place of a name, sorted.
+/// Numbers at one position of a name, sorted.
 type NumberList = Vec<u64>;
-/// The text of a name between its numbers.
+/// The text between the numbers of a name.
 type Words = Vec<String>;
 
-/// Collapses names into patterns, in the order in which each pattern's text first occurs.
+/// Collapses names into patterns, in order of first occurrence.
 ///
-/// A pattern stands for exactly the names given: numbers are only gathered where every combination
-/// occurs. A name that occurs twice counts twice only if it has no numbers in it.
+/// A pattern matches exactly the given names: numbers are only combined if every combination occurs. A duplicate name
+/// is counted twice only if it contains no numbers.
 pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<NameGroup> {
     let mut order: Vec<Words> = Vec::new();
     let mut families: BTreeMap<Words, Vec<Vec<NumberList>>> = BTreeMap::new();
@@ -50,7 +50,7 @@ pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<NameGroup> 
     groups
 }
 
-/// Merges members that differ only in the numbers at `at`.
+/// Merges members that differ only in the numbers at position `at`.
 fn gather(members: Vec<Vec<NumberList>>, at: usize) -> Vec<Vec<NumberList>> {
     let mut alike: BTreeMap<Vec<NumberList>, NumberList> = BTreeMap::new();
     for mut member in members {
@@ -70,13 +70,13 @@ fn gather(members: Vec<Vec<NumberList>>, at: usize) -> Vec<Vec<NumberList>> {
         .collect()
 }
 
-/// Splits a name at the dotted parts that are plain numbers: n numbers, n + 1 words.
+/// Splits a name at the dotted components that are numbers: n numbers, n + 1 words.
 fn split(name: &str) -> (Words, Vec<u64>) {
     let mut words = vec![String::new()];
     let mut numbers = Vec::new();
     for (i, part) in name.split('.').enumerate() {
         let dot = if i == 0 { "" } else { "." };
-        // `007` and numbers beyond u64 would not be spelled back as they were: they stay text.
+        // `007` and numbers beyond u64 would be printed differently, so they stay text.
         let number = part.parse::<u64>().ok().filter(|n| n.to_string() == part);
         if let Some(word) = words.last_mut() {
             word.push_str(dot);
@@ -109,7 +109,7 @@ fn pattern(words: &[String], numbers: &[NumberList]) -> String {
     out
 }
 
-/// `0..3,5`: both ends are included.
+/// `0..3,5`: both ends are inclusive.
 fn ranges(numbers: &[u64]) -> String {
     const PIECES: usize = 8;
     let mut runs: Vec<(u64, u64)> = Vec::new();

@@ -1,4 +1,4 @@
-//! One line for each finding, for editors, `grep` and logs.
+//! One line per finding, for editors, `grep` and logs.
 
 use std::fmt::Write as _;
 

@@ -1,4 +1,4 @@
-//! What a repair would change: a unified diff for each text, a table for each shard.
+//! The changes of a repair: a unified diff for each text, a table for each shard.
 
 use std::fmt::Write as _;
 
@@ -11,14 +11,14 @@ use crate::check::Location;
 use crate::surgery::plan::PlannedShard;
 use crate::surgery::repair::{Content, Repair};
 
-/// Longest line shown, in characters; a longer one is shown around the place where it changes.
+/// Maximum length of a line, in characters; a longer line is cut around its first difference.
 const LINE: usize = 300;
-/// Texts of more bytes are not compared line by line.
+/// Larger texts, in bytes, are not compared line by line.
 const TEXT: usize = 8 << 20;
-/// Rows of a table of tensors.
+/// Maximum number of rows in a table of tensors.
 const ROWS: usize = 40;
 
-/// The difference that a repair of the checkpoint named `path` makes, as text that is safe to show.
+/// The changes that a repair makes in the checkpoint `path`, escaped for display.
 #[must_use]
 pub fn render(path: &str, repair: &Repair) -> String {
     let mut out = String::new();
@@ -49,7 +49,7 @@ fn text(out: &mut String, at: &str, old: Option<&str>, new: &str) {
         let _ok = writeln!(out, "{}", hunk.header());
         let changes: Vec<_> = hunk.iter_changes().collect();
         for (i, change) in changes.iter().enumerate() {
-            // The line that takes this one's place, or whose place it takes, shows where they differ.
+            // The line is compared with its neighbour in the diff to find the first difference.
             let other = [i.checked_add(1), i.checked_sub(1)].into_iter().flatten().filter_map(|j| changes.get(j));
             let other = other.filter(|c| c.tag() != change.tag()).map(similar::Change::value).next();
             let _ok = writeln!(out, "{}{}", change.tag(), shown(change.value(), other.unwrap_or_default()));
@@ -60,7 +60,7 @@ fn text(out: &mut String, at: &str, old: Option<&str>, new: &str) {
     }
 }
 
-/// A line, safe to show, and cut around the first character that the other has not.
+/// A line, escaped for display, and cut around the first character that differs from `other`.
 fn shown(line: &str, other: &str) -> String {
     let line = line.strip_suffix('\n').unwrap_or(line);
     let same = line.chars().zip(other.chars()).take_while(|(a, b)| a == b).count();
@@ -104,7 +104,7 @@ fn shard(out: &mut String, at: &str, repair: &Repair, new: &PlannedShard) {
         table.add_row([more.as_str(), "", ""]);
     }
     if table.row_count() == 0 {
-        table.add_row(["header", "", "written anew, the tensors as they are"]);
+        table.add_row(["header", "", "rewritten, tensors unchanged"]);
     }
     let _ok = writeln!(out, "{table}");
 }

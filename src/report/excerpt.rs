@@ -1,6 +1,6 @@
-//! Cuts the neighbourhood of a place out of a source text.
+//! Cuts an excerpt around a place out of a source text.
 //!
-//! The result is small whatever the source is: a `tokenizer.json` may be 20 MB on one line.
+//! The size of the result is limited: a `tokenizer.json` may have 20 MB on one line.
 
 use std::ops::Range;
 
@@ -10,28 +10,28 @@ use super::format::hostile;
 const BEFORE: usize = 60;
 /// Bytes kept after the start of the last mark of a long line.
 const AFTER: usize = 120;
-/// Marks further apart than this do not share an excerpt.
+/// Spans further apart than this, in bytes, get separate excerpts.
 const APART: usize = 400;
 
-/// A piece of a source with marks on it, safe to show.
+/// An excerpt of a source with marked ranges, escaped for display.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Excerpt {
-    /// The piece; `…` stands where a line was cut.
+    /// The text; `…` marks the places where a line was cut.
     pub text: String,
-    /// Byte ranges in `text`, one for each span, within one line each.
+    /// Byte ranges in `text`, one per span, each within one line.
     pub marks: Vec<Range<usize>>,
     /// Whether the first line lacks its start.
     pub cut_left: bool,
 }
 
-/// Whether a span can be shown together with an earlier one.
+/// Whether a span can share an excerpt with an earlier one.
 pub fn near(first: &Range<usize>, next: &Range<usize>) -> bool {
     next.start.checked_sub(first.start).is_some_and(|distance| distance <= APART)
 }
 
-/// Cuts out the lines around `spans`, which are in order and [`near`] one another.
+/// Cuts out the lines around `spans`, which are sorted and pairwise [`near`].
 ///
-/// `None` when there is no span or one lies outside the source.
+/// `None` without spans, or when a span lies outside the source.
 pub fn cut(source: &str, spans: &[Range<usize>]) -> Option<Excerpt> {
     let (first, last) = (spans.first()?.start, spans.last()?.start);
     if last > source.len() || spans.iter().any(|s| s.start < first || s.start > last) {
@@ -44,7 +44,7 @@ pub fn cut(source: &str, spans: &[Range<usize>]) -> Option<Excerpt> {
         Some(at) => (from.saturating_add(at).saturating_add(1), false),
         None => (from, from > 0),
     };
-    // Excerpts start at a line's start where that is close enough.
+    // Excerpts start at the start of a line if it is close enough.
     let cut_left = cut_left && !source.get(..begin)?.ends_with('\n');
     let (end, cut_right) = match tail.find('\n') {
         Some(at) => (last.saturating_add(at), false),
@@ -63,7 +63,7 @@ pub fn cut(source: &str, spans: &[Range<usize>]) -> Option<Excerpt> {
             if start.is_none() && at >= span.start {
                 *start = Some(text.len());
             }
-            // A mark ends with its span, but never beyond its line.
+            // A mark ends with its span or with its line, whichever comes first.
             if stop.is_none() && start.is_some_and(|s| s < text.len()) && (at >= span.end || c == '\n' || c == '\r') {
                 *stop = Some(text.len());
             }
@@ -87,7 +87,7 @@ pub fn cut(source: &str, spans: &[Range<usize>]) -> Option<Excerpt> {
 #[allow(
     clippy::arithmetic_side_effects,
     clippy::single_range_in_vec_init,
-    reason = "a list of one span is meant, and tests may panic"
+    reason = "a list with one span is intended, and tests may panic"
 )]
 mod tests {
     use super::cut;

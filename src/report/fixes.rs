@@ -1,4 +1,4 @@
-//! What can be fixed, and what was: marks at findings, a list for each checkpoint, a line at the end.
+//! Fixes in reports: marks at fixable findings, the fixes made in each checkpoint, the closing line.
 
 use std::fmt::Write as _;
 
@@ -6,14 +6,14 @@ use super::format::{name, plural, sentence};
 use super::model::{CheckpointReport, Fixing, Report};
 use crate::check::{Finding, Safety};
 
-/// The mark of a finding that `--fix` would do something about, as ruff has it; else nothing.
+/// `[*] `, as in ruff, for a finding that `--fix` can fix.
 pub(super) fn mark(finding: &Finding, fixing: Option<Fixing>) -> &'static str {
     let permitted = |fixing: Fixing| finding.fix.as_ref().is_some_and(|fix| fix.is_permitted(fixing.unsafe_fixes));
-    // After the fixes are made, what is left was tried and is told below.
+    // After `--fix`, fixes of remaining findings were tried and withdrawn; `section` lists them.
     if fixing.is_some_and(|fixing| !fixing.made && permitted(fixing)) { "[*] " } else { "" }
 }
 
-/// What was done about a checkpoint, and what was tried and taken back.
+/// The fixes applied to a checkpoint, and those that were rolled back.
 pub(super) fn section(checkpoint: &CheckpointReport) -> String {
     let mut out = String::new();
     for (many, (code, file, title)) in
@@ -29,7 +29,7 @@ pub(super) fn section(checkpoint: &CheckpointReport) -> String {
     out
 }
 
-/// Equal lines once, with how many there are.
+/// Groups equal lines, with the size of each group.
 fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
     let mut counted: Vec<(usize, T)> = Vec::new();
     for line in lines {
@@ -42,7 +42,7 @@ fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
     counted.into_iter().map(|(n, line)| (many(n), line)).collect()
 }
 
-/// The closing line; `None` where there is nothing to say.
+/// The number of fixes that were applied or can be applied; `None` without fixes.
 pub(super) fn closing(report: &Report) -> Option<String> {
     let fixing = report.checkpoints.iter().find_map(|c| c.fixing)?;
     let fixes = || report.checkpoints.iter().flat_map(|c| &c.findings).filter_map(|f| f.fix.as_ref());
@@ -58,13 +58,13 @@ pub(super) fn closing(report: &Report) -> Option<String> {
     let option = if fixing.unsafe_fixes { "--fix --unsafe-fixes" } else { "--fix" };
     match (permitted, hidden) {
         (0, 0) => None,
-        (0, hidden) => Some(format!("No fixes with {option}; {hidden} with --unsafe-fixes")),
+        (0, hidden) => Some(format!("{hidden} fixable with {option} --unsafe-fixes")),
         (n, 0) => Some(format!("[*] {n} fixable with {option}")),
         (n, hidden) => Some(format!("[*] {n} fixable with {option}; {hidden} more with --unsafe-fixes")),
     }
 }
 
-/// What was fixed, for a run that says nothing of the rest.
+/// The fixes that were applied, for `--fix-only`.
 #[must_use]
 pub fn made(checkpoints: &[CheckpointReport]) -> String {
     let mut out = String::new();
@@ -77,11 +77,11 @@ pub fn made(checkpoints: &[CheckpointReport]) -> String {
     out
 }
 
-/// What a run without a report says of the fixes alone.
+/// The number of fixes shown by `--diff`.
 #[must_use]
 pub fn would(fixed: usize, files: usize) -> String {
     match fixed {
-        0 => "No fixes to make".to_owned(),
+        0 => "No fixes available".to_owned(),
         n => format!(
             "Would make {} in {}",
             if n == 1 { "1 fix".to_owned() } else { format!("{n} fixes") },

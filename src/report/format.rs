@@ -1,42 +1,35 @@
-//! Formatting shared by the renderers: counts, sizes, shapes, evidence, and "and N more".
+//! Formatting shared by the renderers: counts, sizes, shapes, and lists cut to "and N more".
 
-use std::collections::BTreeMap;
-
-use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::collapse::{NameGroup, collapse};
 use super::model::{Counts, MergeReport, MergeStage, Report};
 use crate::check::load::{LoadReport, SilentReason};
-use crate::check::{Finding, FixHint, Location, Safety};
+use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
+pub use crate::checkpoint::file_size as bytes;
 
-/// Longest name shown, in characters.
+/// Maximum length of a name, in characters.
 const NAME: usize = 160;
-/// Longest sentence shown, in characters.
+/// Maximum length of a sentence, in characters.
 const SENTENCE: usize = 1_000;
-/// Longest evidence value shown, in characters.
-const VALUE: usize = 200;
-/// Most evidence values shown for one finding.
-const VALUES: usize = 8;
-/// Most items shown of a list within evidence.
-const ITEMS: usize = 6;
 
-/// A name from a checkpoint, safe to show.
+/// A name from a checkpoint, escaped for display.
 pub fn name(text: &str) -> String {
     escape(text, NAME)
 }
 
-/// A sentence that may quote a checkpoint, safe to show.
+/// A sentence that may quote a checkpoint, escaped for display.
 pub fn sentence(text: &str) -> String {
     escape(text, SENTENCE)
 }
 
-/// Whether a character steers a terminal, or hides or reorders text.
+/// Whether a character controls a terminal, or hides or reorders text.
 pub fn hostile(c: char) -> bool {
     c.is_control() || (!c.is_ascii() && !escape(c.encode_utf8(&mut [0; 4]), 1).starts_with(c))
 }
 
-/// Breaks text at spaces so that lines stay below `width` characters where words allow it.
+/// Breaks text at spaces into lines shorter than `width` characters, except for longer words.
 pub fn wrap(text: &str, width: Option<usize>) -> String {
     let Some(width) = width else { return text.to_owned() };
     let mut out = String::new();
@@ -60,7 +53,7 @@ pub fn plural(n: usize, noun: &str) -> String {
     if n == 1 { format!("1 {noun}") } else { format!("{n} {noun}s") }
 }
 
-/// `2 errors, 1 warning, 3 info`; empty when there is nothing to count.
+/// `2 errors, 1 warning, 3 info`; empty without findings.
 pub fn counts(counts: Counts) -> String {
     let mut parts = Vec::new();
     if counts.error > 0 {
@@ -75,30 +68,6 @@ pub fn counts(counts: Counts) -> String {
     parts.join(", ")
 }
 
-/// A size in decimal units, three digits: `8.06 GB`.
-pub fn bytes(n: u64) -> String {
-    const UNITS: [(&str, u64); 5] = [
-        ("PB", 1_000_000_000_000_000),
-        ("TB", 1_000_000_000_000),
-        ("GB", 1_000_000_000),
-        ("MB", 1_000_000),
-        ("kB", 1_000),
-    ];
-    let Some((unit, size)) = UNITS.into_iter().find(|(_, size)| n >= *size) else {
-        return format!("{n} B");
-    };
-    let size = u128::from(size);
-    let hundredths = u128::from(n).saturating_mul(100).saturating_add(size / 2).checked_div(size).unwrap_or_default();
-    let (whole, rest) = (hundredths / 100, hundredths % 100);
-    if whole >= 100 {
-        format!("{whole} {unit}")
-    } else if whole >= 10 {
-        format!("{whole}.{} {unit}", rest / 10)
-    } else {
-        format!("{whole}.{rest:02} {unit}")
-    }
-}
-
 /// `[2304, 1152]`.
 pub fn shape(dims: &[u64]) -> String {
     const DIMS: usize = 12;
@@ -107,7 +76,7 @@ pub fn shape(dims: &[u64]) -> String {
     format!("[{}]", parts.join(", "))
 }
 
-/// `path/file`, or what there is of it.
+/// `path/file`, or `path` without a file.
 pub fn place(path: &str, location: Option<&Location>) -> String {
     match location.and_then(|l| l.file.as_deref()) {
         Some(file) if path.is_empty() || path == "." => name(file),
@@ -116,15 +85,21 @@ pub fn place(path: &str, location: Option<&Location>) -> String {
     }
 }
 
-/// The tensors among locations, numbered ones collapsed, at most `cap` lines and how many more.
-pub fn tensors(locations: &[Location], cap: usize) -> Vec<String> {
-    let groups = collapse(locations.iter().filter_map(|l| l.tensor.as_deref()));
+/// The tensors of a finding, with numbered names collapsed; at most `cap` lines, then the number of further ones. None when
+/// the message names all of them.
+pub fn tensors(message: &str, locations: &[Location], cap: usize) -> Vec<String> {
+    let names: Vec<&str> = locations.iter().filter_map(|l| l.tensor.as_deref()).collect();
+    let words: BTreeSet<&str> = message.split([' ', ',', ';', ':']).collect();
+    if names.iter().all(|name| words.contains(name)) {
+        return Vec::new();
+    }
+    let groups = collapse(names);
     let mut lines: Vec<String> = groups.iter().take(cap).map(|g| name(&g.pattern)).collect();
     lines.extend(more(groups.len(), cap));
     lines
 }
 
-/// Name pattern, stored and expected shape of the tensors that do not match; alike ones together.
+/// Name pattern, stored shape and expected shape of mismatched tensors, grouped by shapes.
 pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
     let mut alike: BTreeMap<(&[u64], &[u64]), Vec<&str>> = BTreeMap::new();
     for m in &load.mismatched {
@@ -136,7 +111,7 @@ pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
     rows.collect()
 }
 
-/// Silent tensors by reason, in words.
+/// Tensors that load incorrectly without a message, grouped by reason.
 pub fn silent(load: &LoadReport) -> Vec<(String, Vec<NameGroup>)> {
     let mut reasons: BTreeMap<SilentReason, Vec<&str>> = BTreeMap::new();
     for one in &load.silent {
@@ -145,10 +120,10 @@ pub fn silent(load: &LoadReport) -> Vec<(String, Vec<NameGroup>)> {
     reasons.into_iter().map(|(reason, names)| (silence(reason).to_owned(), collapse(names))).collect()
 }
 
-/// Why a tensor loads wrong without a message, in words.
+/// Describes a reason.
 const fn silence(reason: SilentReason) -> &'static str {
     match reason {
-        SilentReason::IndexedButAbsent => "in the index and in no shard, so it stays randomly initialised",
+        SilentReason::IndexedButAbsent => "in the index, but in no shard, so it stays randomly initialised",
         SilentReason::PrefixHijack => {
             "one stray key with the base-model prefix, so every tensor is randomly initialised"
         }
@@ -156,7 +131,7 @@ const fn silence(reason: SilentReason) -> &'static str {
     }
 }
 
-/// The verdict over everything, as sentences without the last full stop.
+/// The verdict of a run, without the final full stop.
 pub fn summary(report: &Report) -> String {
     let found = counts(report.summary.counts);
     let checkpoints = plural(report.summary.checkpoints, "checkpoint");
@@ -173,7 +148,7 @@ pub fn summary(report: &Report) -> String {
     }
 }
 
-/// How a merge ended; `None` in the report that is written with the result.
+/// Describes the end of a merge; `None` in the report that is written into the result.
 fn outcome(merge: &MergeReport) -> Option<String> {
     let size = || format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
     Some(match merge.stage? {
@@ -181,34 +156,25 @@ fn outcome(merge: &MergeReport) -> Option<String> {
             let verb = if merge.seams.len() == 1 { "does" } else { "do" };
             format!("Nothing written: {} {verb} not fit", plural(merge.seams.len(), "seam"))
         }
-        MergeStage::Donors => "Nothing written: a donor is not sound".to_owned(),
-        MergeStage::Planned => "Nothing written: the planned checkpoint is not sound".to_owned(),
-        MergeStage::DryRun => format!("Nothing written, as asked: {} planned", size()),
+        MergeStage::Donors => "Nothing written: a donor has errors".to_owned(),
+        MergeStage::Planned => "Nothing written: the planned checkpoint has errors".to_owned(),
+        MergeStage::DryRun => format!("Nothing written (--dry-run): {} planned", size()),
         MergeStage::Written => format!("Written: {}", size()),
     })
 }
 
-/// What the message leaves unsaid: `key = value` for each piece of evidence whose value it does not quote.
-pub fn evidence(finding: &Finding) -> Vec<String> {
-    let mut unsaid: Vec<String> = finding
-        .evidence
-        .iter()
-        .map(|(key, v)| (key, v, value(v)))
-        .filter(|(_, v, text)| !quotes(&finding.message, v.as_str().unwrap_or(text)))
-        .map(|(key, _, text)| format!("{} = {text}", name(key)))
-        .collect();
-    let rest = more(unsaid.len(), VALUES);
-    unsaid.truncate(VALUES);
-    unsaid.extend(rest);
-    unsaid
+/// The details of a finding, escaped for display.
+pub fn details(finding: &Finding) -> Vec<String> {
+    finding.details.iter().map(|detail| sentence(detail)).collect()
 }
 
-/// The findings to show, at most `cap` of each code, and how many of which code are left out.
+/// At most `cap` findings of each code, and the number of omitted findings by code.
 pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, usize)>) {
     let mut shown = Vec::new();
     let mut seen: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
     for finding in findings {
         let (kept, hidden) = seen.entry(&finding.code).or_default();
+        *hidden = hidden.saturating_add(usize::try_from(finding.hidden).unwrap_or(usize::MAX));
         if *kept < cap {
             *kept = kept.saturating_add(1);
             shown.push(finding);
@@ -220,15 +186,15 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
     (shown, hidden.collect())
 }
 
-/// Findings that say the same of several places, as one each.
+/// Merges consecutive findings that differ only in their places.
 pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     let mut together: Vec<Finding> = Vec::new();
     for finding in findings {
-        let step = |f: &Finding| f.fix.as_ref().map(|fix| (fix.safety, fix.title.clone()));
+        let step = |f: &Finding| f.fix.as_ref().map(advice);
         let same = |last: &Finding| {
             (&last.code, last.severity, &last.message) == (&finding.code, finding.severity, &finding.message)
                 && step(last) == step(finding)
-                && evidence(last) == evidence(finding)
+                && last.details == finding.details
         };
         match together.last_mut() {
             Some(last) if same(last) => last.locations.extend(finding.locations.iter().cloned()),
@@ -238,7 +204,7 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     together
 }
 
-/// Load reports of which the loaders say the same, together.
+/// Groups load reports with the same content.
 pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
     let mut together: Vec<Vec<&LoadReport>> = Vec::new();
     for load in loads {
@@ -250,49 +216,26 @@ pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
     together
 }
 
-/// `transformers 4.51.3 (judged as 4.47.0) and 5.23.0`.
+/// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
 pub fn versions(loaders: &[&LoadReport]) -> String {
     let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
     format!("transformers {}", versions.join(" and "))
 }
 
-/// `and 3 more`, when a list of `total` is cut at `cap`.
+/// `and 3 more`, for a list of `total` items cut at `cap`.
 pub fn more(total: usize, cap: usize) -> Option<String> {
     total.checked_sub(cap).filter(|n| *n > 0).map(|n| format!("and {n} more"))
 }
 
-/// The step a fix proposes, with what kind of fix it is when it is not a manual one.
-pub fn fix(hint: &FixHint) -> String {
-    let title = sentence(&hint.title);
-    if hint.safety == Safety::Manual { title } else { format!("{title} ({} fix)", hint.safety.name()) }
-}
-
-fn value(v: &Value) -> String {
-    match v {
-        Value::String(s) => escape(s, VALUE),
-        Value::Array(items) => {
-            let mut parts: Vec<String> = items.iter().take(ITEMS).map(value).collect();
-            parts.extend(more(items.len(), ITEMS));
-            let text = parts.join(", ");
-            if items.iter().all(Value::is_string) { text } else { format!("[{text}]") }
-        }
-        other => escape(&other.to_string(), VALUE),
-    }
-}
-
-/// Whether `message` holds `text` as a word of its own.
-fn quotes(message: &str, text: &str) -> bool {
-    let joins = |c: Option<char>| c.is_some_and(|c| c.is_alphanumeric() || c == '_');
-    !text.is_empty()
-        && message.match_indices(text).any(|(at, _)| {
-            let (before, after) = message.split_at(at);
-            !joins(before.chars().next_back()) && !joins(after.strip_prefix(text).and_then(|rest| rest.chars().next()))
-        })
+/// The edits of a fix with their safety, then the advice for a person.
+pub fn advice(hint: &FixHint) -> Vec<String> {
+    let title = hint.title.as_ref().map(|title| format!("{} ({} fix)", sentence(title), hint.safety.name()));
+    title.into_iter().chain(hint.help.as_deref().map(sentence)).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{bytes, quotes, wrap};
+    use super::{bytes, wrap};
 
     #[test]
     fn lines_are_broken_at_spaces_alone() {
@@ -305,12 +248,5 @@ mod tests {
     fn sizes_keep_three_digits() {
         let shown: Vec<String> = [0, 999, 1_000, 12_345, 999_999, 8_055_709_462, u64::MAX].map(bytes).into();
         assert_eq!(shown, ["0 B", "999 B", "1.00 kB", "12.3 kB", "1000 kB", "8.06 GB", "18446 PB"]);
-    }
-
-    #[test]
-    fn a_figure_inside_a_longer_one_is_not_quoted() {
-        assert!(quotes("7 heads do not divide 4096", "4096"));
-        assert!(!quotes("7 heads do not divide 4096", "40"));
-        assert!(!quotes("anything", ""));
     }
 }

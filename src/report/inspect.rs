@@ -1,4 +1,4 @@
-//! What `inspect` says: for people, or as JSON.
+//! Renders the result of `inspect`, for people or as JSON.
 
 use std::fmt::Write as _;
 
@@ -23,7 +23,7 @@ pub(crate) struct InspectDocument<'a> {
     inspection: &'a Inspection,
 }
 
-/// The whole of an inspection as JSON (`schema` 1).
+/// A complete inspection as JSON (`schema` 1).
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection) -> String {
     pretty(&InspectDocument { schema: 1, tool: ToolInfo::this(), path, inspection })
@@ -95,18 +95,18 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
     let paint = Paint(style.color);
     let _ok = match &inspection.config {
         None => writeln!(out, "\n  class: no config.json"),
-        Some(said) => {
+        Some(config) => {
             let or = |text: &Option<String>, none: &str| text.as_deref().map_or_else(|| none.to_owned(), name);
             let _ok = write!(
                 out,
                 "\n  class by config: {} (model_type {})",
-                paint.strong(&or(&said.class, "none")),
-                or(&said.model_type, "none")
+                paint.strong(&or(&config.class, "none")),
+                or(&config.model_type, "none")
             );
-            if let Some(version) = &said.transformers_version {
+            if let Some(version) = &config.transformers_version {
                 let _ok = write!(out, ", written by transformers {}", name(version));
             }
-            if let Some(method) = &said.quantization {
+            if let Some(method) = &config.quantization {
                 let _ok = write!(out, ", quantised with {}", name(method));
             }
             writeln!(out)
@@ -169,7 +169,7 @@ fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
     }
 }
 
-/// What the config says, marked where the tensors say otherwise or it says nothing.
+/// The value in the config, marked if the tensors contradict it, or in parentheses if the config does not set it.
 fn config_value(vote: &Vote) -> String {
     let value = name(&vote.config_value.to_string());
     let value = if vote.given { value } else { format!("({value})") };
@@ -188,7 +188,7 @@ fn indented(out: &mut String, text: &str) {
 }
 
 fn percent(share: f64) -> String {
-    // 99.96 % is not all.
+    // Rounded down, so that 99.96 % is not printed as 100 %.
     let tenths = (share * 1000.0).floor() / 10.0;
     if tenths >= 100.0 { "100 %".to_owned() } else { format!("{tenths:.1} %") }
 }

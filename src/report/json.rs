@@ -1,4 +1,4 @@
-//! The JSON contract: complete and indented, or a line for each finding.
+//! The JSON contract: complete and indented, or one line per finding.
 
 use std::fmt::Write as _;
 
@@ -12,23 +12,24 @@ pub fn render(report: &Report) -> String {
     pretty(report)
 }
 
-/// Any JSON, indented and safe to show.
+/// Serialises a value as indented JSON, escaped for display.
 pub fn pretty<T: Serialize>(value: &T) -> String {
     harmless(&written(serde_json::to_string_pretty(value)))
 }
 
-/// A finding in a line of its own; the summary is the last line.
+/// One finding per line, with the summary last.
 ///
-/// Every line is an object, and `type` says of what: `finding`, `seam` or `summary`. Keys are those of the contract.
+/// Every line is an object whose `type` is `finding`, `seam` or `summary`. The other keys are those of the JSON
+/// contract.
 pub fn lines(report: &Report) -> String {
     let mut lines = Vec::new();
     for checkpoint in &report.checkpoints {
         let (path, role) = (&checkpoint.path, checkpoint.role.as_ref());
-        let line = |finding| JsonLine { r#type: LineKind::Finding, path, role, said: finding };
+        let line = |finding| JsonLine { r#type: LineKind::Finding, path, role, content: finding };
         lines.extend(checkpoint.findings.iter().map(|f| written(serde_json::to_string(&line(f)))));
     }
     if let Some(merge) = &report.merge {
-        let line = |seam| JsonLine { r#type: LineKind::Seam, path: &merge.out, role: None, said: seam };
+        let line = |seam| JsonLine { r#type: LineKind::Seam, path: &merge.out, role: None, content: seam };
         lines.extend(merge.seams.iter().map(|s| written(serde_json::to_string(&line(s)))));
     }
     let summary =
@@ -37,7 +38,7 @@ pub fn lines(report: &Report) -> String {
     harmless(&lines.join("\n"))
 }
 
-/// What a line tells of.
+/// Type of a line.
 #[derive(Serialize)]
 #[serde(rename_all = "lowercase")]
 enum LineKind {
@@ -49,12 +50,12 @@ enum LineKind {
 #[derive(Serialize)]
 struct JsonLine<'a, T> {
     r#type: LineKind,
-    /// The checkpoint, as the user named it; for a seam, where the merge was to go.
+    /// The checkpoint, as given by the user; for a seam, the output directory of the merge.
     path: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
     role: Option<&'a Role>,
     #[serde(flatten)]
-    said: &'a T,
+    content: &'a T,
 }
 
 #[derive(Serialize)]
@@ -69,16 +70,16 @@ struct SummaryLine<'a> {
 fn written(json: serde_json::Result<String>) -> String {
     match json {
         Ok(text) => text,
-        // Maps here have string keys and every number is finite, so this is for readers only.
+        // Cannot happen: maps in reports have string keys, and all numbers are finite.
         Err(error) => format!("{{\"error\": \"{}\"}}", error.to_string().escape_default()),
     }
 }
 
-/// Spells characters that steer a terminal or reorder text as `\u` escapes: the same JSON, safe to show.
+/// Writes characters that control a terminal or reorder text as `\u` escapes; the JSON value does not change.
 fn harmless(json: &str) -> String {
     let mut out = String::with_capacity(json.len().saturating_add(1));
     for c in json.chars() {
-        // serde_json has escaped everything below U+0020, so a line break here is layout.
+        // serde_json escapes line breaks in strings, so a line break here is layout.
         if c != '\n' && hostile(c) {
             for unit in c.encode_utf16(&mut [0; 2]) {
                 let _infallible = write!(out, "\\u{unit:04x}");

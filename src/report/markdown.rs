@@ -1,10 +1,10 @@
-//! Markdown. What it says depends on the checkpoints alone: no times, and for a merge no directories,
-//! because `merge-report.md` travels with the merged checkpoint and must come out the same anywhere.
+//! Renders reports as Markdown. The output contains no times and, for a merge, no directories, so that
+//! `merge-report.md` inside a merged checkpoint is reproducible.
 
 use std::fmt::Write as _;
 
 use super::collapse::{NameGroup, collapse};
-use super::format::{self, bytes, capped, evidence, fix, more, name, plural, sentence, shape, summary, tensors};
+use super::format::{self, advice, bytes, capped, details, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
 use crate::check::load::LoadReport;
 use crate::check::{Finding, Location};
@@ -71,15 +71,14 @@ fn render_finding(out: &mut String, finding: &Finding) {
     if let Some(more) = more(places.len(), PLACES) {
         let _ok = writeln!(out, "- {more}");
     }
-    for tensor in tensors(&finding.locations, PLACES) {
+    for tensor in tensors(&finding.message, &finding.locations, PLACES) {
         let _ok = writeln!(out, "- tensor: {}", code(&tensor));
     }
-    let figures = evidence(finding);
-    if !figures.is_empty() {
-        let _ok = writeln!(out, "- note: {}", text(&figures.join("; ")));
+    for detail in details(finding) {
+        let _ok = writeln!(out, "- note: {}", text(&detail));
     }
-    if let Some(hint) = &finding.fix {
-        let _ok = writeln!(out, "- help: {}", text(&fix(hint)));
+    for step in finding.fix.iter().flat_map(advice) {
+        let _ok = writeln!(out, "- help: {}", text(&step));
     }
 }
 
@@ -161,7 +160,7 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
     }
 }
 
-/// The tensors of a merge: how they are made, and which are left behind.
+/// The tensors of a merge: their transforms, and those that were dropped.
 fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
     if !merge.transforms.is_empty() {
         let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
@@ -184,7 +183,7 @@ fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
     }
 }
 
-/// A list of sentences under a title, if there are any.
+/// A titled list of sentences; nothing for an empty list.
 fn sentences(out: &mut String, title: &str, sentences: &[String], cap: usize) {
     if sentences.is_empty() {
         return;
@@ -229,7 +228,7 @@ fn seams(out: &mut String, merge: &MergeReport, cap: usize) {
     }
 }
 
-/// A table of at most `cap` rows; cells are Markdown already, but for pipes.
+/// A table of at most `cap` rows; cells are Markdown, except that pipes are not escaped yet.
 fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N]], cap: usize) {
     let _ok = writeln!(out, "\n| {} |\n|{}", header.join(" | "), " --- |".repeat(N));
     for row in rows.iter().take(cap) {
@@ -241,7 +240,7 @@ fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N
     }
 }
 
-/// The last part of a path.
+/// The last component of a path.
 fn last(path: &str) -> &str {
     path.trim_end_matches('/').rsplit('/').next().unwrap_or(path)
 }
@@ -250,19 +249,19 @@ fn text_name(raw: &str) -> String {
     text(&name(raw))
 }
 
-/// Text that means only itself: every character Markdown or HTML could act on is escaped (pipes by [`table`]).
+/// Escapes every character that Markdown or HTML would interpret, except pipes (see [`table`]).
 fn text(plain: &str) -> String {
     let mut out = String::with_capacity(plain.len());
     let mut before = ' ';
     let mut chars = plain.chars().peekable();
     while let Some(c) = chars.next() {
         match c {
-            // Within a word an underscore is only an underscore.
+            // An underscore inside a word has no effect in Markdown.
             '_' if before.is_alphanumeric() && chars.peek().is_some_and(|c| c.is_alphanumeric()) => out.push(c),
             '&' => out.push_str("&amp;"),
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
-            // An at sign makes a mention.
+            // An at sign would create a mention.
             '@' => out.push_str("&#64;"),
             '\\' | '`' | '*' | '_' | '[' | ']' | '#' | '~' | '!' | '$' => out.extend(['\\', c]),
             c => out.push(c),
@@ -273,7 +272,7 @@ fn text(plain: &str) -> String {
     out.replace("://", ":&#8203;//").replace("www.", "www&#46;")
 }
 
-/// A code span of a text without line breaks.
+/// A code span for a text without line breaks.
 fn code(plain: &str) -> String {
     let longest = plain.split(|c| c != '`').map(str::len).max().unwrap_or(0);
     let fence = "`".repeat(longest.saturating_add(1));

@@ -10,6 +10,7 @@ use crate::surgery::plan::TensorTransform;
 /// The record of a merge.
 #[derive(Debug, Clone, Default, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct MergeReport {
     /// Recipe name.
     pub recipe: String,
@@ -47,6 +48,7 @@ pub struct MergeReport {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum MergeStage {
     /// A donor has errors that the recipe does not tolerate; nothing was written.
     Donors,
@@ -54,7 +56,7 @@ pub enum MergeStage {
     Seam,
     /// The planned checkpoint has errors; nothing was written.
     Planned,
-    /// The plan is sound, and `--dry-run` asked for no more.
+    /// The plan has no errors, and `--dry-run` ended the merge.
     DryRun,
     /// The result was written.
     Written,
@@ -63,6 +65,7 @@ pub enum MergeStage {
 /// What a checkpoint is in a merge. Reports spell it `donor vision`, `planned`, `written`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[cfg_attr(test, derive(schemars::JsonSchema), schemars(with = "String"))]
+#[non_exhaustive]
 pub enum Role {
     /// A donor, by its role in the recipe.
     Donor(String),
@@ -101,6 +104,7 @@ pub struct StageOutcome {
 /// A seam that does not fit: two parts that must agree and do not.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Seam {
     /// The mismatch, in one sentence.
     pub message: String,
@@ -143,6 +147,7 @@ pub struct ChangedTensor {
 /// Donor tensors that the result does not contain.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Dropped {
     /// Donor role.
     pub donor: String,

@@ -16,6 +16,7 @@ pub use crate::surgery::repair::{Fixed, Withdrawn};
 /// The report of one run. Serialised, it is the JSON contract (`schema` 2).
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Report {
     /// Version of this contract.
     pub schema: u32,
@@ -43,8 +44,9 @@ impl Report {
 }
 
 /// Name and version of the program.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct ToolInfo {
     /// Always `ckpt-doctor`.
     pub name: &'static str,
@@ -55,7 +57,7 @@ pub struct ToolInfo {
 impl ToolInfo {
     /// This program.
     #[must_use]
-    pub const fn this() -> Self {
+    pub(crate) const fn this() -> Self {
         Self { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") }
     }
 }
@@ -63,6 +65,7 @@ impl ToolInfo {
 /// The report of one checkpoint.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct CheckpointReport {
     /// The path, as the user wrote it.
     pub path: String,
@@ -140,7 +143,7 @@ impl From<Severity> for Verdict {
     }
 }
 
-/// What the run was asked to do about findings.
+/// Fix options of the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fixing {
     /// Whether unsafe fixes count as well.
@@ -165,13 +168,13 @@ impl Counts {
     /// Counts findings.
     #[must_use]
     pub fn new(findings: &[Finding]) -> Self {
-        let n = |s| findings.iter().filter(|f| f.severity == s).count();
+        let n = |s| findings.iter().filter(|f| f.severity == s).fold(0, |n: usize, f| n.saturating_add(f.count()));
         Self { error: n(Severity::Error), warning: n(Severity::Warning), info: n(Severity::Info) }
     }
 
     /// Both together.
     #[must_use]
-    pub const fn plus(self, other: Self) -> Self {
+    pub(crate) const fn plus(self, other: Self) -> Self {
         Self {
             error: self.error.saturating_add(other.error),
             warning: self.warning.saturating_add(other.warning),
@@ -203,6 +206,7 @@ impl Counts {
 /// Totals over all checkpoints.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Summary {
     /// Number of checkpoints.
     pub checkpoints: usize,

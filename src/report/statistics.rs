@@ -1,4 +1,4 @@
-//! How often each rule spoke, instead of what it said.
+//! Counts the findings of each rule.
 
 use std::collections::BTreeMap;
 
@@ -19,16 +19,14 @@ struct RuleCount<'a> {
     fix: Option<&'a str>,
 }
 
-/// A line for each rule, the most frequent first: a table for `full` and `concise`, an array for `json`. The other formats
-/// have no place for it.
+/// One line per rule, the most frequent first: a table for `full` and `concise`, an array for `json`. `None` for the
+/// other formats.
 #[must_use]
 pub fn statistics(report: &Report, format: Format) -> Option<String> {
     let mut counts: BTreeMap<(&str, Severity), (usize, &Finding)> = BTreeMap::new();
     for finding in report.checkpoints.iter().flat_map(|c| &c.findings) {
         let (count, _) = counts.entry((&finding.code, finding.severity)).or_insert((0, finding));
-        // The last of many says how many more there are.
-        let more = finding.evidence.get("more").and_then(serde_json::Value::as_u64).unwrap_or(0);
-        *count = count.saturating_add(1).saturating_add(usize::try_from(more).unwrap_or(usize::MAX));
+        *count = count.saturating_add(finding.count());
     }
     let mut lines: Vec<RuleCount<'_>> = counts
         .into_iter()

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-/// How a report is written down.
+/// Format of a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Format {
     /// For a terminal: source excerpts and tables.
@@ -13,7 +13,7 @@ pub enum Format {
     Concise,
     /// The JSON contract, complete.
     Json,
-    /// The findings of the JSON contract, one object a line, and a summary in the last.
+    /// The findings of the JSON contract, one object per line, with a summary in the last line.
     Jsonl,
     /// Workflow commands that GitHub Actions shows beside the files.
     Github,
@@ -23,7 +23,7 @@ pub enum Format {
     Junit,
     /// SARIF 2.1.0, for code scanning.
     Sarif,
-    /// Markdown that is the same wherever it was made: no times, no directories.
+    /// Markdown without times and directories.
     Markdown,
 }
 
@@ -41,7 +41,7 @@ impl Format {
         Self::Markdown,
     ];
 
-    /// The word for it on the command line.
+    /// The name on the command line.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -64,7 +64,7 @@ impl fmt::Display for Format {
     }
 }
 
-/// A word that names no format.
+/// An unknown format name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{0}` is not an output format; known are full, concise, json, jsonl, github, gitlab, junit, sarif, markdown")]
 pub struct UnknownFormat(String);
@@ -77,14 +77,14 @@ impl FromStr for Format {
     }
 }
 
-/// How text for people is laid out. Formats for programs take no notice of it.
+/// Layout of the formats for people; formats for programs ignore it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Style {
     /// Whether to use ANSI colours (`full` only).
     pub color: bool,
-    /// Width of the terminal in columns; `None` when there is none.
+    /// Width of the terminal in columns; `None` without a terminal.
     pub width: Option<usize>,
-    /// Longest list that is shown in full; what is beyond it becomes "and N more".
+    /// Maximum length of a list; further items become "and N more".
     pub cap: usize,
 }
 

@@ -1,6 +1,6 @@
-//! The report for people at a terminal: source excerpts, tables, one verdict line at the end.
+//! The report for a terminal: source excerpts and tables, with a line for the verdict at the end.
 
-mod finding;
+pub(super) mod finding;
 pub(super) mod load;
 mod merge;
 pub(super) mod paint;
@@ -41,7 +41,7 @@ pub fn render(report: &Report, style: Style) -> String {
     out
 }
 
-/// Whether a checkpoint has the findings of the one above it: what was planned is usually what was written.
+/// Whether a checkpoint has the same findings as the one above it, as the planned and the written one usually do.
 fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
     !checkpoint.findings.is_empty()
         && (&above.path, &above.findings, &above.loads) == (&checkpoint.path, &checkpoint.findings, &checkpoint.loads)
@@ -62,9 +62,9 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
     let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
     let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
-    let said: Vec<String> = settings.into_iter().chain(suppressed).collect();
-    if !said.is_empty() {
-        let _ok = writeln!(out, "  {}", paint.quiet(&said.join(", ")));
+    let notes: Vec<String> = settings.into_iter().chain(suppressed).collect();
+    if !notes.is_empty() {
+        let _ok = writeln!(out, "  {}", paint.quiet(&notes.join(", ")));
     }
 }
 

@@ -1,43 +1,47 @@
-//! The one writer: a plan becomes a directory, by one rename, or nothing is there at all.
+//! Writes a plan as a directory, published by one rename.
 //!
-//! Everything is written into a [`Staging`] directory beside the target and synced before the rename, so
-//! nothing under the final name ever exists half-done.
+//! All files are written into a [`Staging`] directory beside the target and synced before the rename, so the target
+//! never exists incomplete.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use super::donor::{AtRest, DonorFile};
+use super::donor::{DonorFile, DonorSnapshot};
 use super::error::{ApplyError, io_at};
 use super::plan::{Plan, PlannedShard, PlannedTensor, TensorRef, TensorSource};
 use super::staging::Staging;
 use super::stop::interrupted;
-use super::system::{ask_for_room, copy_in_kernel, create, with_figures};
+use super::system::{check_space, copy_in_kernel, create, with_figures};
 use super::transform;
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::open_regular;
 
-/// Writes `plan` as the directory `out` (a path from [`super::check_target`]); `progress` hears of bytes written.
+/// Writes `plan` as the directory `out` (a path from [`super::check_target`]); `progress` receives the bytes written.
 ///
-/// The `donors` must still be as they were seen, or nothing is published.
+/// Fails when a donor no longer matches its snapshot.
 ///
 /// # Errors
-/// An [`ApplyError`]; then the target is as it was and the staging directory is gone, unless the error says
-/// otherwise.
-pub fn apply(plan: &Plan, donors: &[AtRest], out: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+/// An [`ApplyError`]; unless it says otherwise, the target is unchanged and the staging directory is removed.
+pub fn apply(
+    plan: &Plan,
+    donors: &[DonorSnapshot],
+    out: &Path,
+    progress: &mut dyn FnMut(u64),
+) -> Result<(), ApplyError> {
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let files = plan.files.iter().map(|f| f.bytes.len() as u64);
     let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
     let explained = |error| with_figures(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
-    // Not before: what a killed run left may be what fills the disk, and is cleared now.
-    let written = ask_for_room(parent, &sizes)
+    // After `Staging::new`, which removes the files of a killed run: these may fill the disk.
+    let written = check_space(parent, &sizes)
         .and_then(|()| write(plan, staging.content(), progress))
-        .and_then(|()| donors.iter().try_for_each(AtRest::unchanged))
+        .and_then(|()| donors.iter().try_for_each(DonorSnapshot::unchanged))
         .and_then(|()| interrupted())
         .and_then(|()| staging.publish(out));
     match (written, staging.discard()) {
-        (Ok(()), _) => Ok(()), // what may be left is a marker that the next run removes
+        (Ok(()), _) => Ok(()), // a remaining marker is removed by the next run
         (Err(error), Ok(())) => Err(explained(error)),
         (Err(error), Err((path, why))) => Err(ApplyError::Left { error: Box::new(explained(error)), path, why }),
     }
@@ -67,7 +71,7 @@ pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn 
     for tensor in &shard.tensors {
         interrupted()?;
         let from = tensor.source.donor();
-        // Neighbouring tensors mostly share a donor file: keep it open.
+        // Adjacent tensors are usually in the same donor file, so it stays open.
         if donor.as_ref().is_none_or(|d| d.path != from.path) {
             donor = Some(DonorFile::open(&from.path)?);
         }
@@ -76,18 +80,18 @@ pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn 
         }
     }
     let want = shard.file_len();
-    let is = out.metadata().map_err(io_at(path, "looking at"))?.len();
+    let is = out.metadata().map_err(io_at(path, "reading metadata"))?.len();
     if is != want {
-        let error = io::Error::other(format!("wrote {is} bytes where the header says {want}"));
+        let error = io::Error::other(format!("wrote {is} bytes, but the header declares {want}"));
         return Err(io_at(path, "writing")(error));
     }
     out.sync_all().map_err(io_at(path, "syncing"))?;
-    // `out` is write-only so that nothing is read back by accident.
+    // The file is write-only and opened again for the verification.
     let written = open_regular(path, u64::MAX).map_err(|e| io_at(path, "opening")(io::Error::other(e)))?;
     accepted_by_safetensors(&written.file).map_err(io_at(path, "verifying"))
 }
 
-/// Bytes moved between two checks for a signal.
+/// Bytes copied between two checks for a signal.
 const SLICE: u64 = 64 * 1024 * 1024;
 
 fn write_tensor(
@@ -140,7 +144,7 @@ fn write_tensor(
     }
 }
 
-/// Copies a byte range: inside the kernel where it can, else through a buffer.
+/// Copies a byte range, inside the kernel if supported, otherwise through a buffer.
 fn copy_range(
     out: &mut File,
     path: &Path,
@@ -154,7 +158,7 @@ fn copy_range(
     while left > 0 {
         interrupted()?;
         let in_kernel = if buffer.is_empty() {
-            copy_in_kernel(donor.file(), at, out, left.min(SLICE)).map_err(io_at(path, "copying from a donor to it"))?
+            copy_in_kernel(donor.file(), at, out, left.min(SLICE)).map_err(io_at(path, "copying from a donor"))?
         } else {
             None
         };
@@ -173,5 +177,5 @@ fn copy_range(
     Ok(())
 }
 
-/// Bytes moved at a time where the kernel cannot copy by itself.
+/// Bytes copied at a time when the kernel cannot copy.
 const BUFFER: u64 = 1024 * 1024;

@@ -1,4 +1,4 @@
-//! The changed files of a repair: what a repair in place and a repaired copy have in common.
+//! The changed files of a repair; shared by repairs in place and repaired copies.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -12,7 +12,7 @@ use super::system::{create, look, with_figures};
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
 use crate::checkpoint::{FaultKind, Shard};
 
-/// Makes sure that a file is still what the repair was planned for.
+/// Fails when a file no longer matches the checkpoint for which the repair was planned.
 pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> Result<(), RepairError> {
     let original = &repair.original;
     let there = look(path)?;
@@ -40,7 +40,7 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
                         false
                     }
                 },
-                // Not UTF-8, so that the text is not kept.
+                // The text of a file that is not UTF-8 is not kept; only its size is compared.
                 None => there.is_some_and(|m| m.len() == entry.size),
             }
         }
@@ -52,7 +52,7 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
     }
 }
 
-/// Writes a file that is not there yet, and makes it durable.
+/// Writes a new file and syncs it.
 pub(super) fn write_content(path: &Path, content: &Content, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
     match content {
         Content::Shard(shard) => write_shard(path, shard, progress)?,
@@ -66,7 +66,7 @@ pub(super) fn write_content(path: &Path, content: &Content, progress: &mut dyn F
     Ok(())
 }
 
-/// Gives an error of the system its figures, in the words of a repair.
+/// Converts an error of the system into an error of a repair, with the bytes needed and free.
 pub(super) fn explain_error(error: RepairError, dir: &Path, repair: &Repair) -> RepairError {
     let RepairError::Apply(error) = error else { return error };
     match with_figures(error, dir, &repair.sizes()) {

@@ -1,4 +1,4 @@
-//! Donors while they are read: opened for reading only, and at rest.
+//! Donors: read-only access, and detection of changes.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,17 +14,17 @@ use super::system::{names, retry};
 use crate::checkpoint::hex;
 use crate::checkpoint::open::{Identity, Opened, open_regular};
 
-/// The files of a directory, and which ones they were when a run began.
+/// The identities of a directory's files at the start of a run.
 ///
-/// A run reads a donor several times: headers and documents first, their hashes and the tensors' bytes later.
-/// What it writes is of one piece only if the donor stayed the same from the first to the last.
+/// A run reads a donor several times: first headers and documents, later hashes and tensors. The result is only
+/// consistent if the donor does not change in between.
 #[derive(Debug, Clone, Default)]
-pub struct AtRest {
+pub struct DonorSnapshot {
     files: BTreeMap<PathBuf, Identity>,
 }
 
-impl AtRest {
-    /// Looks at the regular files in `dir`; hidden ones are the business of other tools.
+impl DonorSnapshot {
+    /// Records the regular files in `dir`, except hidden ones, which belong to other tools.
     ///
     /// # Errors
     /// [`ApplyError::Io`] when the directory cannot be listed, and [`ApplyError::Interrupted`].
@@ -34,7 +34,7 @@ impl AtRest {
         for name in names(dir).map_err(io_at(dir, "listing"))? {
             let path = dir.join(&name);
             let hidden = name.as_encoded_bytes().starts_with(b".");
-            // Through links: what is read is what they lead to. One that leads nowhere is for the rules to judge.
+            // Links are followed, because readers follow them. Rules report broken links.
             if let Ok(metadata) = fs::metadata(&path)
                 && metadata.is_file()
                 && !hidden
@@ -45,29 +45,29 @@ impl AtRest {
         Ok(Self { files })
     }
 
-    /// Whether every file is the one it was.
+    /// Fails when a file has changed since the snapshot.
     ///
     /// # Errors
-    /// [`ApplyError::Changed`] with the first that is not.
+    /// [`ApplyError::Changed`] for the first such file.
     pub fn unchanged(&self) -> Result<(), ApplyError> {
         for (path, was) in &self.files {
             let changed = |reason: &str| ApplyError::Changed { path: path.clone(), reason: reason.to_owned() };
             match fs::metadata(path) {
                 Ok(now) if Identity::from_metadata(&now) == *was => {}
-                Ok(now) if now.len() < was.size => return Err(changed("was cut short")),
+                Ok(now) if now.len() < was.size => return Err(changed("was truncated")),
                 Ok(_) => return Err(changed("changed")),
                 Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(changed("was removed")),
-                Err(e) => return Err(io_at(path, "looking at")(e)),
+                Err(e) => return Err(io_at(path, "reading metadata")(e)),
             }
         }
         Ok(())
     }
 }
 
-/// A donor's file that tensors are read from.
+/// A donor's file from which tensors are read.
 ///
-/// Always by positioned reads or copies inside the kernel, never through a map: a file that is cut short while
-/// it is mapped ends the process with SIGBUS.
+/// Reads are positioned or copies inside the kernel. The file is never mapped: truncating a mapped file ends the
+/// process with SIGBUS.
 pub(super) struct DonorFile {
     pub(super) path: PathBuf,
     opened: Opened,
@@ -88,20 +88,20 @@ impl DonorFile {
         self.opened.file.read_exact_at(buf, at)
     }
 
-    /// An error of a read: a short one means that the donor was cut off under us.
+    /// Converts a read error: an unexpected end means that the donor was truncated during the run.
     pub(super) fn read_error(&self, error: io::Error) -> ApplyError {
         if error.kind() == io::ErrorKind::UnexpectedEof {
-            ApplyError::Changed { path: self.path.clone(), reason: "was cut short".to_owned() }
+            ApplyError::Changed { path: self.path.clone(), reason: "was truncated".to_owned() }
         } else {
             io_at(&self.path, "reading")(error)
         }
     }
 }
 
-/// SHA-256 of a donor's file, in hexadecimal; for the manifest of a merge.
+/// SHA-256 of a donor's file in hexadecimal, for the manifest of a merge.
 ///
 /// # Errors
-/// [`ApplyError::Changed`] when the file cannot be opened any more, [`ApplyError::Io`] when reading fails, and
+/// [`ApplyError::Changed`] when the file can no longer be opened, [`ApplyError::Io`] when reading fails, and
 /// [`ApplyError::Interrupted`].
 pub fn sha256(path: &Path) -> Result<String, ApplyError> {
     let mut donor = DonorFile::open(path)?;

@@ -1,17 +1,17 @@
-//! Errors while writing a checkpoint; each text ends with the next step.
+//! Errors while writing a checkpoint; each message ends with the next step.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why a plan was not written. Nothing has the target's name then, but for [`ApplyError::Unsynced`].
+/// Why a plan was not written. The target then does not exist, except with [`ApplyError::Unsynced`].
 #[derive(Debug, thiserror::Error)]
 pub enum ApplyError {
-    /// The target is in the way.
+    /// The target cannot be used.
     #[error("{path}: {reason}; choose a directory that does not exist yet or is empty", path = path.display())]
     Target {
         /// The target.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
     /// The target and a donor overlap.
@@ -19,184 +19,184 @@ pub enum ApplyError {
     Donor {
         /// The target.
         path: PathBuf,
-        /// How they overlap.
+        /// Kind of overlap.
         reason: String,
     },
-    /// Another run holds the staging directory.
+    /// Another run has locked the staging directory.
     #[error("{path}: another run is writing there ({holder}); wait for it or choose another directory", path = path.display())]
     Busy {
         /// The target.
         path: PathBuf,
-        /// Who holds it.
+        /// The process of the other run.
         holder: String,
     },
-    /// Not enough room: by the estimate, or found while writing.
-    #[error("{path}: {cause}: need {need} bytes, have {have}; free some, or write to another disk", path = path.display())]
+    /// Not enough space, by the estimate or while writing.
+    #[error("{path}: {cause}: need {need} bytes, have {have}; free some space or write to another disk", path = path.display())]
     Space {
-        /// What was being written, or the directory that would hold the target.
+        /// The file being written, or the parent of the target.
         path: PathBuf,
-        /// `no space`, or what the system said.
+        /// `no space`, or the system's error.
         cause: String,
         /// Bytes still to be written.
         need: u64,
         /// Bytes free.
         have: u64,
     },
-    /// No more files can be made, however small they are.
-    #[error("{path}: {doing}: {error}: need {need} files, have {have} (inodes); remove some, or write to another disk", path = path.display())]
+    /// The file system cannot hold more files.
+    #[error("{path}: {doing}: {error}: need {need} files, have {have} (inodes); remove some files or write to another disk", path = path.display())]
     Files {
-        /// What was being made.
+        /// The file being created.
         path: PathBuf,
-        /// What was being done.
+        /// The operation.
         doing: &'static str,
-        /// What the system said.
+        /// The system's error.
         error: io::Error,
-        /// Files to be made.
+        /// Number of files to create.
         need: u64,
-        /// Files that can be made.
+        /// Number of files that can be created.
         have: u64,
     },
-    /// One file is larger than may be.
-    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that limit, or use smaller shards", path = path.display())]
+    /// A file exceeds a limit on its size.
+    #[error("{path}: the file would be too large: need {need} bytes, {limit}; raise that limit or use smaller shards", path = path.display())]
     FileSize {
         /// The file.
         path: PathBuf,
-        /// Its size when it is whole.
+        /// Its full size.
         need: u64,
-        /// Whose limit it is.
+        /// The limit and its origin.
         limit: String,
     },
-    /// A donor changed while it was read.
-    #[error("{path}: {reason} while it was being read; nothing was written, retry once nothing else modifies it", path = path.display())]
+    /// A donor changed during the run.
+    #[error("{path}: {reason} during the run; nothing was written, retry once nothing else modifies it", path = path.display())]
     Changed {
         /// The donor's file.
         path: PathBuf,
-        /// What changed.
+        /// The change.
         reason: String,
     },
-    /// A signal, such as that of Ctrl-C.
+    /// A signal such as SIGINT from Ctrl-C.
     #[error("interrupted; nothing was written")]
     Interrupted,
-    /// Anything the system says.
+    /// Any other error of the system.
     #[error("{path}: {doing}: {error}", path = path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What was being done.
+        /// The operation.
         doing: &'static str,
-        /// What the system said.
+        /// The system's error.
         error: io::Error,
     },
-    /// Writing failed, and so did removing what was written until then.
+    /// Writing failed, and the incomplete files could not be removed.
     #[error("{error}; {path} could not be removed ({why}); the next run with the same target tries again", path = path.display())]
     Left {
-        /// What went wrong first.
+        /// The first error.
         error: Box<Self>,
         /// The staging directory.
         path: PathBuf,
-        /// What the system said to its removal.
+        /// Error of the removal.
         why: io::Error,
     },
-    /// The target has its name, and can neither be made durable nor be taken back.
-    #[error("{path}: is complete, but may not survive a power failure: syncing its parent directory failed: {error}", path = path.display())]
+    /// The target is complete, but its name could neither be synced nor removed.
+    #[error("{path}: syncing the parent directory: {error}; the directory is complete, but may be lost on a power failure", path = path.display())]
     Unsynced {
         /// The target.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         error: io::Error,
     },
 }
 
-/// Why a repair was not written or undone.
+/// Why a repair was not written or not undone.
 #[derive(Debug, thiserror::Error)]
 pub enum RepairError {
-    /// A file that would change is a symbolic link, as all files of the hub's cache are.
+    /// A file to change is a symbolic link, like all files of the hub cache.
     #[error("{path} is a symbolic link to {target}, and its target is never written to; \
              `--fix --output DIR` makes a repaired copy", path = path.display(), target = target.display())]
     Linked {
         /// The link.
         path: PathBuf,
-        /// What it says.
+        /// Its target.
         target: PathBuf,
     },
-    /// The directory cannot be written to.
+    /// The directory is not writable.
     #[error("{path} cannot be written to ({error}); `--fix --output DIR` makes a repaired copy elsewhere", path = path.display())]
     ReadOnly {
         /// The directory.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         error: io::Error,
     },
-    /// A new file could not be given the owner of the old one.
+    /// A new file could not be given the owner of the original.
     #[error("{path} is owned by another user, and its replacement cannot be given that owner ({error}); \
              `--fix --output DIR` makes a repaired copy", path = path.display())]
     Owner {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         error: io::Error,
     },
-    /// Another run works there.
+    /// Another run has locked the checkpoint.
     #[error("{path}: another run is repairing this checkpoint ({holder}); wait for it", path = path.display())]
     Busy {
         /// The checkpoint.
         path: PathBuf,
-        /// Who it is.
+        /// The process of the other run.
         holder: String,
     },
-    /// Not enough room.
-    #[error("{path}: {cause}: need {need} bytes, have {have}; free some, or use `--fix --output DIR` on another disk", path = path.display())]
+    /// Not enough space.
+    #[error("{path}: {cause}: need {need} bytes, have {have}; free some space or use `--fix --output DIR` on another disk", path = path.display())]
     Space {
         /// The checkpoint.
         path: PathBuf,
-        /// `no space`, or what the system said.
+        /// `no space`, or the system's error.
         cause: String,
-        /// Bytes the new files take.
+        /// Bytes needed for the new files.
         need: u64,
         /// Bytes free.
         have: u64,
     },
-    /// A file is not what it was when the repair was planned.
-    #[error("{path} changed while the repair was planned; nothing was written; retry once nothing else is modifying it", path = path.display())]
+    /// A file changed after the repair was planned.
+    #[error("{path} changed while the repair was planned; nothing was written, retry once nothing else modifies it", path = path.display())]
     ChangedWhilePlanned {
         /// The file.
         path: PathBuf,
     },
-    /// A file is not what the repair made of it.
+    /// A file changed after the repair.
     #[error("{path} has changed since the repair, so it was not restored; its original is in {originals}",
         path = path.display(), originals = originals.display())]
     ChangedSinceRepair {
         /// The file.
         path: PathBuf,
-        /// Where the originals are.
+        /// The folder with the originals.
         originals: PathBuf,
     },
-    /// There is no repair to undo.
+    /// The checkpoint has no repair to undo.
     #[error("{path} has no repair to undo", path = path.display())]
     NothingToUndo {
         /// The checkpoint.
         path: PathBuf,
     },
-    /// The journal was not written by this program.
+    /// The journal is invalid or of an unknown version.
     #[error("{path} cannot be used: {reason}", path = path.display())]
     UnusableJournal {
         /// The journal.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
-    /// Something went wrong while files were put in place, and taking it back did too.
-    #[error("{error}; writing is not finished: remove the cause, then run `ckpt-doctor undo` or `check --fix`")]
+    /// Replacing the files failed, and so did restoring the originals.
+    #[error("{error}; the repair is incomplete: remove the cause, then run `ckpt-doctor undo` or `check --fix`")]
     Unfinished {
-        /// What went wrong.
+        /// The error.
         error: Box<RepairError>,
     },
-    /// Whatever else goes wrong with files.
+    /// Any other error of writing files.
     #[error(transparent)]
     Apply(#[from] ApplyError),
 }
 
-/// Turns an error of the system into [`ApplyError::Io`]: `doing` is what was done to `path`.
+/// Turns an error of the system into [`ApplyError::Io`]; `doing` names the operation on `path`.
 pub(super) fn io_at(path: &Path, doing: &'static str) -> impl FnOnce(io::Error) -> ApplyError {
     move |error| ApplyError::Io { path: path.to_owned(), doing, error }
 }

@@ -1,7 +1,7 @@
-//! The lock on a directory that one run at a time may work in: a file in it that says who does.
+//! A lock on a directory for a single run: a file that contains the process of the run.
 //!
-//! The kernel frees it, whatever ends the run. It is on a file and not on the directory, because NFS locks only what
-//! is open for writing.
+//! The kernel releases the lock when the process ends. A file is locked instead of the directory, because NFS only
+//! locks files that are open for writing.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write};
@@ -14,19 +14,30 @@ use super::error::{ApplyError, io_at};
 use super::system::{custom, retry};
 use crate::checkpoint::open::read_capped;
 
-/// What came of asking for a lock.
+/// Result of locking.
 pub(super) enum Lock {
-    /// This run has it.
-    Ours(File),
-    /// Another run has it: what that one says of itself.
+    /// This run has the lock.
+    Ours(LockFile),
+    /// Another run has the lock; its process, from the file.
     Theirs(String),
-    /// The file or its directory went away meanwhile, with the run that had it.
+    /// The file or its directory was removed by the run that had it.
     Gone,
-    /// There are no locks on this file system; Lustre, for one, may be mounted so.
-    Unknown(File),
+    /// The file system does not support locks; Lustre, for one, may be mounted without.
+    Unknown(LockFile),
 }
 
-/// Asks for the lock on the file `path`, which is made when it is not there.
+/// An open lock file. It is unlocked explicitly when it is dropped: a child process that is being started holds a copy of
+/// the descriptor until it runs its program, and would keep the lock for that time.
+pub(super) struct LockFile(File);
+
+impl Drop for LockFile {
+    fn drop(&mut self) {
+        // An error would only mean that the file system has no locks.
+        let _unlocked = self.0.unlock();
+    }
+}
+
+/// Locks the file `path`; creates it when missing.
 ///
 /// # Errors
 /// [`ApplyError::Io`].
@@ -42,18 +53,20 @@ pub(super) fn take(path: &Path) -> Result<Lock, ApplyError> {
             Ok(()) => break,
             Err(TryLockError::WouldBlock) => return Ok(Lock::Theirs(holder(path))),
             Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Interrupted => {}
-            Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => return Ok(Lock::Unknown(file)),
+            Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
+                return Ok(Lock::Unknown(LockFile(file)));
+            }
             Err(TryLockError::Error(e)) => return Err(io_at(path, "locking")(e)),
         }
     }
-    let held = file.metadata().map_err(io_at(path, "looking at"))?;
-    // A run that ended between our open and our lock has removed it: what we hold then has no name any more.
+    let held = file.metadata().map_err(io_at(path, "reading metadata"))?;
+    // A run that ended between opening and locking has removed the file, so this lock is on a deleted file.
     let same = fs::symlink_metadata(path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
-    Ok(if same { Lock::Ours(file) } else { Lock::Gone })
+    Ok(if same { Lock::Ours(LockFile(file)) } else { Lock::Gone })
 }
 
-/// Writes into the locked file who works here.
-pub(super) fn sign(file: &mut File) -> io::Result<()> {
+/// Writes the process of this run into the locked file.
+pub(super) fn sign(LockFile(file): &mut LockFile) -> io::Result<()> {
     let host = rustix::system::uname();
     let signature = format!("process {} on {}", std::process::id(), host.nodename().to_string_lossy());
     retry(|| file.set_len(0))?;

@@ -1,4 +1,4 @@
-//! A repaired copy beside the untouched original: changed files are written, all others linked.
+//! A repaired copy of a checkpoint: changed files are written, all others linked.
 
 use std::fs;
 use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsupported};
@@ -6,29 +6,29 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
 use super::changes::{check_unchanged, explain_error, write_content};
-use super::donor::AtRest;
+use super::donor::DonorSnapshot;
 use super::error::{ApplyError, RepairError, io_at};
 use super::repair::Repair;
 use super::staging::Staging;
 use super::stop::interrupted;
-use super::system::{ask_for_room, retry};
+use super::system::{check_space, retry};
 use super::target::check_target;
 
-/// Makes the directory `out`: the repaired checkpoint, its unchanged files as hard links to the original's or, on
-/// another file system, as symbolic links. Hidden files stay behind.
+/// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's or, on
+/// another file system, symbolic links. Hidden files are not copied.
 ///
-/// `progress` hears of bytes written.
+/// `progress` receives the bytes written.
 ///
 /// # Errors
-/// A [`RepairError`]; then there is no new directory.
+/// A [`RepairError`]; then the directory was not created.
 pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<PathBuf, RepairError> {
     let original = &repair.original;
     let out = check_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
-    let donor = AtRest::record(&original.root)?;
+    let donor = DonorSnapshot::record(&original.root)?;
     let explained = |error| explain_error(error, parent, repair);
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
-    let written = ask_for_room(parent, &repair.sizes())
+    let written = check_space(parent, &repair.sizes())
         .map_err(RepairError::from)
         .and_then(|()| fill(repair, staging.content(), progress))
         .and_then(|()| Ok(donor.unchanged()?))
@@ -36,7 +36,7 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
         .and_then(|()| Ok(staging.publish(&out)?))
         .map_err(explained);
     match (written, staging.discard()) {
-        (Ok(()), _) => Ok(out), // what may be left is a marker that the next run removes
+        (Ok(()), _) => Ok(out), // a remaining marker is removed by the next run
         (Err(error), _) => Err(error),
     }
 }
@@ -54,14 +54,14 @@ fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<()
     Ok(())
 }
 
-/// Gives what `from` leads to a second name; a link that leads nowhere stays behind.
+/// Links the target of `from` under a second name; a broken link is skipped.
 fn link(from: &Path, to: &Path) -> Result<(), ApplyError> {
     let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
-    let is_file = fs::metadata(&real).map_err(io_at(from, "looking at"))?.is_file();
+    let is_file = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?.is_file();
     if is_file {
         match retry(|| fs::hard_link(&real, to)) {
             Ok(()) => return Ok(()),
-            // Another file system, no links, or somebody else's file: a symbolic link can be made.
+            // Another file system, no hard links, or a file of another user: use a symbolic link.
             Err(e) if matches!(e.kind(), CrossesDevices | PermissionDenied | Unsupported | TooManyLinks) => {}
             Err(e) => return Err(io_at(to, "linking")(e)),
         }

@@ -1,7 +1,7 @@
-//! A plan: every file and tensor of a checkpoint that does not exist yet, and where each comes from.
+//! A plan: every file and tensor of a checkpoint to be written, with their sources.
 //!
-//! A plan costs nothing to make: tensors are byte ranges of donors, never bytes. [`Plan::preview`]
-//! turns it into a [`Checkpoint`], so the same rules judge what has not been written.
+//! Making a plan reads no tensor bytes: tensors are byte ranges of donors. A merge turns its plan into a checkpoint
+//! ([`PlannedShard::preview`]), so that the same rules check it before it is written.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ use crate::checkpoint::{Dtype, Shard, Tensor, byte_len};
 /// A checkpoint to be written.
 #[derive(Debug, Clone, Default)]
 pub struct Plan {
-    /// Files other than shards, in the order they are written; `config.json` comes last.
+    /// Files other than shards, in writing order; `config.json` comes last.
     pub files: Vec<PlannedFile>,
     /// Shards in order.
     pub shards: Vec<PlannedShard>,
@@ -27,7 +27,7 @@ pub struct PlannedFile {
     pub name: String,
     /// Its bytes.
     pub bytes: Arc<[u8]>,
-    /// Where it came from, for the report.
+    /// Origin, for the report.
     pub origin: String,
 }
 
@@ -36,9 +36,9 @@ pub struct PlannedFile {
 pub struct PlannedShard {
     /// Name in the target directory.
     pub name: String,
-    /// Tensors in the order their bytes are written.
+    /// Tensors in the order of their bytes.
     pub tensors: Vec<PlannedTensor>,
-    /// `__metadata__`; transformers does not open a shard without a `format` in it.
+    /// `__metadata__`; transformers refuses a shard without `format` in it.
     pub metadata: BTreeMap<String, String>,
 }
 
@@ -57,16 +57,16 @@ pub struct PlannedTensor {
     pub dtype: Dtype,
     /// Shape in the result.
     pub shape: Vec<u64>,
-    /// How its bytes are made.
+    /// Source of its bytes.
     pub source: TensorSource,
 }
 
-/// A tensor of a donor: where its bytes lie.
+/// A tensor of a donor, with its byte range.
 #[derive(Debug, Clone)]
 pub struct TensorRef {
     /// Donor role.
     pub donor: String,
-    /// File the bytes are in.
+    /// File that contains the bytes.
     pub path: PathBuf,
     /// Name in the donor.
     pub name: String,
@@ -74,30 +74,31 @@ pub struct TensorRef {
     pub shape: Vec<u64>,
     /// First byte, from the start of the file.
     pub offset: u64,
-    /// Bytes.
+    /// Number of bytes.
     pub len: u64,
 }
 
-/// How the bytes of a tensor are made.
+/// Source of a tensor's bytes.
 #[derive(Debug, Clone)]
 pub enum TensorSource {
-    /// The donor's bytes as they are.
+    /// The donor's bytes, unchanged.
     Copy(TensorRef),
     /// The donor's values in the leading corner of a larger shape, zeros elsewhere.
     Pad(TensorRef),
-    /// The donor's rows, then rows that hold the mean of the donor's rows.
+    /// The donor's rows, then rows with the mean of the donor's rows.
     GrowRows(TensorRef),
     /// Seeded normal values with standard deviation 0.02; zeros for vectors (biases).
     Reinit {
-        /// The tensor whose place it takes.
+        /// The tensor that it replaces.
         instead_of: TensorRef,
     },
 }
 
-/// How the bytes of a tensor are made: a [`TensorSource`] without the donor tensor.
+/// How the bytes of a tensor are made from those of a donor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum TensorTransform {
     /// The donor's bytes as they are.
     Copy,
@@ -110,7 +111,7 @@ pub enum TensorTransform {
 }
 
 impl TensorTransform {
-    /// The word for it in recipes, options and reports.
+    /// The name in recipes, options and reports.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -123,7 +124,7 @@ impl TensorTransform {
 }
 
 impl TensorSource {
-    /// How the bytes are made.
+    /// The transform of this source.
     #[must_use]
     pub const fn transform(&self) -> TensorTransform {
         match self {
@@ -134,7 +135,7 @@ impl TensorSource {
         }
     }
 
-    /// The donor tensor it starts from, or stands in for.
+    /// The donor tensor that is transformed or replaced.
     #[must_use]
     pub const fn donor(&self) -> &TensorRef {
         match self {
@@ -144,30 +145,24 @@ impl TensorSource {
 }
 
 impl PlannedTensor {
-    /// Bytes in the result.
+    /// Number of bytes in the result.
     ///
-    /// Shapes of a plan come from checked headers and bounded architectures; one whose product
-    /// overflows is counted as the largest size there is, which no disk has room for.
+    /// Shapes of a plan come from checked headers and architectures with limits; an overflow is counted as the largest
+    /// size, which no disk can hold.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         byte_len(self.dtype, &self.shape).unwrap_or(u64::MAX)
-    }
-
-    /// Whether it has no bytes.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 }
 
 impl PlannedShard {
-    /// Bytes of tensor data.
+    /// Number of bytes of the tensor data.
     #[must_use]
     pub fn data_len(&self) -> u64 {
         self.tensors.iter().fold(0, |n, t| n.saturating_add(t.len()))
     }
 
-    /// Bytes of the file, header and data.
+    /// Number of bytes of the file, header and data.
     #[must_use]
     pub fn file_len(&self) -> u64 {
         (self.header().len() as u64).saturating_add(self.data_len())
@@ -175,7 +170,7 @@ impl PlannedShard {
 
     /// The header: length prefix and JSON, padded with spaces so that the data starts on a multiple of eight.
     ///
-    /// Key order is `__metadata__`, then the tensors in file order: the same plan gives the same bytes.
+    /// Keys are `__metadata__`, then the tensors in file order: equal plans give equal bytes.
     #[must_use]
     pub fn header(&self) -> Vec<u8> {
         #[derive(Serialize)]
@@ -184,7 +179,7 @@ impl PlannedShard {
             shape: &'a [u64],
             data_offsets: [u64; 2],
         }
-        // Strings and integers always serialise.
+        // Serialising strings and integers cannot fail.
         let metadata = serde_json::to_string(&self.metadata).unwrap_or_default();
         let mut json = format!(r#"{{"__metadata__":{metadata}"#);
         let mut at = 0_u64;
@@ -234,17 +229,11 @@ impl PlannedShard {
 }
 
 impl Plan {
-    /// Bytes the result takes.
+    /// Number of bytes of all files.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         let files = self.files.iter().fold(0_u64, |n, f| n.saturating_add(f.bytes.len() as u64));
         self.shards.iter().fold(files, |n, s| n.saturating_add(s.file_len()))
-    }
-
-    /// Whether there is nothing to write.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.files.is_empty() && self.shards.is_empty()
     }
 
     /// All tensors, shard by shard.
@@ -252,7 +241,7 @@ impl Plan {
         self.shards.iter().flat_map(|s| s.tensors.iter().map(move |t| (s, t)))
     }
 
-    /// Bytes of tensor data.
+    /// Number of bytes of the tensor data.
     #[must_use]
     pub fn tensor_bytes(&self) -> u64 {
         self.shards.iter().fold(0, |n, s| n.saturating_add(s.data_len()))
@@ -261,9 +250,9 @@ impl Plan {
 
 /// Distributes tensors over shards of at most `limit` bytes each, in order, and names the shards.
 ///
-/// The greedy rule is `huggingface_hub`'s (`split_state_dict_into_shards_factory`): a tensor starts a new
-/// shard when it would push the current one over the limit; one shard is called `model.safetensors`.
-/// Within a shard the widest type comes first, then names in order, as the safetensors crate writes them.
+/// A tensor starts a new shard when it would exceed the limit of the current one; a single shard is named
+/// `model.safetensors`. Within a shard, wider types come first, then names in order, as the safetensors crate writes
+/// them. Source: `split_state_dict_into_shards_factory` in `huggingface_hub`.
 #[must_use]
 pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard> {
     let mut groups: Vec<Vec<PlannedTensor>> = Vec::new();

@@ -1,7 +1,7 @@
-//! Fixes become one repair: planned on the checkpoint in memory, judged by the same rules, written once.
+//! Combines fixes into one repair: planned on the checkpoint in memory, checked by the same rules, written once.
 //!
-//! Fixes are made in rounds, as in ruff: those that do not touch one another together, then the rules are asked again,
-//! until nothing is left to do. A fix that does not help, or that brings about an error of another kind, is withdrawn.
+//! Fixes are applied in rounds, as in ruff: fixes that do not overlap are applied together, then the rules run again,
+//! until no fix is left. A fix is withdrawn when its finding remains, or when it introduces another error.
 
 mod draft;
 mod planner;
@@ -19,6 +19,7 @@ pub use planner::plan;
 /// A finding whose fix was applied.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Fixed {
     /// Code of the rule.
     pub code: String,
@@ -28,7 +29,7 @@ pub struct Fixed {
     pub file: Option<String>,
     /// Message of the finding.
     pub message: String,
-    /// How safe the fix is.
+    /// Safety of the fix.
     pub safety: Safety,
     /// What the fix did.
     pub title: String,
@@ -37,6 +38,7 @@ pub struct Fixed {
 /// A fix that was tried and rolled back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[non_exhaustive]
 pub struct Withdrawn {
     /// Code of the rule.
     pub code: String,
@@ -49,57 +51,49 @@ pub struct Withdrawn {
 /// A file that the repair changes.
 #[derive(Debug, Clone)]
 pub struct Change {
-    /// Its name.
+    /// File name.
     pub name: String,
-    /// What it will hold.
+    /// New content.
     pub new: Content,
 }
 
-/// What a changed file will hold.
+/// New content of a changed file.
 #[derive(Debug, Clone)]
 pub enum Content {
     /// Text.
     Text(Arc<str>),
-    /// Tensors of the original under another header.
+    /// Tensors of the original under a new header.
     Shard(PlannedShard),
 }
 
 impl Content {
-    /// Bytes it takes.
+    /// Number of bytes.
     #[must_use]
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         match self {
             Self::Text(text) => text.len() as u64,
             Self::Shard(shard) => shard.file_len(),
         }
     }
-
-    /// Whether it holds nothing.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
 }
 
-/// What a repair would do, and what comes of it.
+/// A planned repair and its result.
 #[derive(Debug, Clone)]
 pub struct Repair {
-    /// The checkpoint as it is.
+    /// The checkpoint before the repair.
     pub original: Arc<Checkpoint>,
-    /// As it will be.
-    pub planned: Arc<Checkpoint>,
-    /// What the rules say of it as it will be.
+    /// Result of checking the repaired checkpoint.
     pub outcome: Outcome,
-    /// The findings whose fixes are made.
+    /// Findings with applied fixes.
     pub fixed: Vec<Fixed>,
-    /// Fixes that were tried and not kept.
+    /// Fixes that were tried and rolled back.
     pub withdrawn: Vec<Withdrawn>,
     /// The files that change, by name.
     pub changes: Vec<Change>,
 }
 
 impl Repair {
-    /// Bytes of each file that is to be written.
+    /// Size of each file to write.
     pub(super) fn sizes(&self) -> Vec<u64> {
         self.changes.iter().map(|change| change.new.len()).collect()
     }

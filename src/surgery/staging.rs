@@ -1,25 +1,25 @@
-//! The staging directory: where a checkpoint is written before it gets its name.
+//! The staging directory, in which a checkpoint is written before it is renamed to the target.
 //!
-//! `.NAME.partial` beside the target holds a marker that says who works on it, and `content`, which becomes
-//! the target by one rename. The marker is locked while a run works there, so a second run sees the lock (the
-//! kernel frees it, whatever ends the first), and a run after a crash clears what the marker shows to be ours.
-//! A directory of that name without the marker is somebody's data and is left alone.
+//! `.NAME.partial` beside the target contains a marker file and `content`, which becomes the target by one rename. The
+//! marker contains the process of the run and is locked, so that a second run fails; the kernel releases the lock when
+//! the process ends. After a crash, the next run recognises the directory by its marker and clears it. A directory of
+//! that name without the marker is user data and is not touched.
 #![expect(clippy::disallowed_methods, reason = "this module and apply.rs are where checkpoints are written")]
 
-use std::fs::{self, File};
+use std::fs;
 use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::error::{ApplyError, io_at};
-use super::lock::{self, Lock};
+use super::lock::{self, Lock, LockFile};
 pub(super) use super::system::sync_dir;
 use super::system::{names, remove_dir, remove_dir_all, remove_file, retry};
 
 const MARKER: &str = "ckpt-doctor-owner";
 const CONTENT: &str = "content";
 
-/// Where the staging directory of `out` is.
+/// Path of the staging directory of `out`.
 pub(super) fn staging_path(out: &Path) -> PathBuf {
     let mut name = std::ffi::OsString::from(".");
     name.push(out.file_name().unwrap_or_default());
@@ -27,23 +27,23 @@ pub(super) fn staging_path(out: &Path) -> PathBuf {
     out.with_file_name(name)
 }
 
-/// A locked staging directory; dropped without [`Staging::discard`] it is removed all the same.
+/// A locked staging directory; removed on drop, or by [`Staging::discard`].
 pub(super) struct Staging {
     path: PathBuf,
     content: PathBuf,
-    lock: File,
-    /// The marker is gone, and with it the right to touch what is there.
+    lock: LockFile,
+    /// The marker is removed, so the directory must not be touched any more.
     over: bool,
 }
 
 impl Staging {
-    /// Makes and locks the staging directory of `out`.
+    /// Creates and locks the staging directory of `out`.
     ///
     /// # Errors
-    /// [`ApplyError::Busy`] when another run has it, [`ApplyError::Target`] when it is not ours to clear.
+    /// [`ApplyError::Busy`] when another run has locked it, [`ApplyError::Target`] when it is not a staging directory.
     pub(super) fn new(out: &Path) -> Result<Self, ApplyError> {
         let path = staging_path(out);
-        // Three rounds: a run that ends between our steps takes the directory or the marker with it.
+        // Three attempts: a run that ends between these steps may remove the directory or the marker.
         for _ in 0..3 {
             let made = match retry(|| fs::create_dir(&path)) {
                 Ok(()) => true,
@@ -55,17 +55,17 @@ impl Staging {
                 Ok(None) => {}
                 Err(error) => {
                     if made {
-                        // It stays when another run is quicker and works there: then it is not empty.
+                        // Fails when another run works in the directory: then it is not empty.
                         let _ = remove_dir(&path);
                     }
                     return Err(error);
                 }
             }
         }
-        Err(ApplyError::Busy { path: out.to_owned(), holder: "it ended just now".to_owned() })
+        Err(ApplyError::Busy { path: out.to_owned(), holder: "it has just ended".to_owned() })
     }
 
-    /// Locks the marker in `path`; `None` when the directory went away meanwhile.
+    /// Locks the marker in `path`; `None` when the directory was removed meanwhile.
     fn lock(out: &Path, path: &Path, made: bool) -> Result<Option<Self>, ApplyError> {
         if !made && !is_ours(path)? {
             return Ok(None);
@@ -75,11 +75,11 @@ impl Staging {
             Ok(Lock::Ours(lock)) => lock,
             Ok(Lock::Theirs(holder)) => return Err(ApplyError::Busy { path: out.to_owned(), holder }),
             Ok(Lock::Gone) => return Ok(None),
-            // Who made the directory has it to itself.
+            // Without lock support, only the run that created the directory may use it.
             Ok(Lock::Unknown(lock)) if made => lock,
             Ok(Lock::Unknown(_)) => {
-                let reason = "is there, and without locks on this file system nobody can tell whether a run is still \
-                              writing; remove it if none is";
+                let reason = "exists, and this file system has no locks that would show whether a run is still writing; \
+                              remove it if no run is";
                 return Err(ApplyError::Target { path: path.to_owned(), reason: reason.to_owned() });
             }
             Err(error) => {
@@ -90,7 +90,7 @@ impl Staging {
             }
         };
         let content = path.join(CONTENT);
-        // From here on whatever fails removes the directory: it is ours.
+        // From here on every error removes the directory.
         let mut staging = Self { path: path.to_owned(), content, lock, over: false };
         remove_dir_all(&staging.content).map_err(io_at(&staging.content, "removing"))?;
         lock::sign(&mut staging.lock).map_err(io_at(&marker, "writing"))?;
@@ -98,18 +98,18 @@ impl Staging {
         Ok(Some(staging))
     }
 
-    /// Where files are written.
+    /// Directory for the files of the checkpoint.
     pub(super) fn content(&self) -> &Path {
         &self.content
     }
 
-    /// Makes the content durable and gives it its name.
+    /// Syncs the content and renames it to the target.
     ///
     /// # Errors
-    /// [`ApplyError::Io`]; a failed sync is a failure, never retried, and the name is taken back.
+    /// [`ApplyError::Io`]; a failed sync is never retried, and the target is removed again.
     pub(super) fn publish(&self, out: &Path) -> Result<(), ApplyError> {
         sync_dir(&self.content)?;
-        // rename(2) replaces an empty directory and refuses any other: exactly the rule for the target.
+        // rename(2) replaces an empty directory and refuses any other, as required for the target.
         retry(|| fs::rename(&self.content, out)).map_err(io_at(out, "publishing"))?;
         let synced = out.parent().map_or(Ok(()), sync_dir);
         match synced {
@@ -120,21 +120,21 @@ impl Staging {
         }
     }
 
-    /// Removes the staging directory with all that is in it.
+    /// Removes the staging directory with its content.
     ///
     /// # Errors
-    /// Its path, and what the system said.
+    /// The path of the directory and the system's error.
     pub(super) fn discard(mut self) -> Result<(), (PathBuf, io::Error)> {
         self.remove().map_err(|why| (self.path.clone(), why))
     }
 
-    /// The marker goes last, so that what is left is still known to be ours.
+    /// The marker is removed last, so that an incomplete removal can be continued.
     fn remove(&mut self) -> io::Result<()> {
         if self.over {
             return Ok(());
         }
         remove_dir_all(&self.content)?;
-        // Without its marker the directory is anybody's: the next run may begin in it before we remove it.
+        // Without the marker, another run may start in the directory before it is removed.
         self.over = true;
         remove_file(&self.path.join(MARKER))?;
         match remove_dir(&self.path) {
@@ -146,20 +146,20 @@ impl Staging {
 
 impl Drop for Staging {
     fn drop(&mut self) {
-        // For panics and early errors; after `discard` there is nothing left to do.
+        // After panics and early errors; does nothing after `discard`.
         let _ = self.remove();
     }
 }
 
-/// Whether the directory is one that a run of ours left behind or works in; `false` when it is gone.
+/// Whether the directory is a staging directory; `false` when it is missing.
 fn is_ours(path: &Path) -> Result<bool, ApplyError> {
     let not_ours = |reason: &str| ApplyError::Target {
         path: path.to_owned(),
-        reason: format!("{reason}, and ckpt-doctor works under this name; move it away"),
+        reason: format!("{reason}, but ckpt-doctor needs this name; rename or remove it"),
     };
     let metadata = match fs::symlink_metadata(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(false),
-        other => other.map_err(io_at(path, "looking at"))?,
+        other => other.map_err(io_at(path, "reading metadata"))?,
     };
     if !metadata.is_dir() {
         return Err(not_ours("is not a directory"));
@@ -173,7 +173,7 @@ fn is_ours(path: &Path) -> Result<bool, ApplyError> {
         other => other.map_err(io_at(path, "listing"))?,
     };
     if !(names.is_empty() || names.iter().any(|n| n == MARKER)) || names.iter().any(|n| n != MARKER && n != CONTENT) {
-        return Err(not_ours("was not made by ckpt-doctor"));
+        return Err(not_ours("was not created by ckpt-doctor"));
     }
     Ok(true)
 }

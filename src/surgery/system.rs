@@ -1,5 +1,4 @@
-//! Calls to the system as the writer needs them: tried again when a signal cut them short, synced, and with
-//! room asked for first.
+//! System calls of the writers: retried after signals, synced, and with checks for free space.
 #![expect(clippy::disallowed_methods, reason = "the writer's own calls")]
 
 use std::ffi::OsString;
@@ -14,8 +13,8 @@ use rustix::process::{Resource, getrlimit};
 
 use super::error::{ApplyError, io_at};
 
-/// Calls again what a signal interrupted. The standard library does so for reads, writes, opens and syncs of
-/// files, not for the rest; some network file systems interrupt those too.
+/// Repeats a call that a signal interrupted. The standard library repeats reads, writes, opens and syncs of files, but
+/// not other calls, which some network file systems interrupt as well.
 pub(super) fn retry<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T> {
     loop {
         match call() {
@@ -25,84 +24,87 @@ pub(super) fn retry<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T>
     }
 }
 
-/// `flags` as the standard library takes them.
+/// `flags` for the standard library.
 pub(super) fn custom(flags: OFlags) -> i32 {
     i32::try_from(flags.bits()).unwrap_or_default()
 }
 
-/// Makes a file that must not exist yet, with the mode that the umask leaves.
+/// Creates a new file with the mode given by the umask.
 pub(super) fn create(path: &Path) -> Result<File, ApplyError> {
     let mut options = OpenOptions::new();
     let options = options.write(true).create_new(true).custom_flags(custom(OFlags::NOFOLLOW));
     options.open(path).map_err(io_at(path, "creating"))
 }
 
-/// Makes the names in a directory durable.
+/// Syncs the entries of a directory.
 pub(super) fn sync_dir(path: &Path) -> Result<(), ApplyError> {
     File::open(path).and_then(|d| retry(|| d.sync_all())).map_err(io_at(path, "syncing"))
 }
 
-/// Removes a directory and what is in it; one that is not there is as good as removed.
+/// Removes a directory and its content; a missing directory is not an error.
 pub(super) fn remove_dir_all(path: &Path) -> io::Result<()> {
-    absent_is_fine(retry(|| fs::remove_dir_all(path)))
+    ignore_missing(retry(|| fs::remove_dir_all(path)))
 }
 
-/// Removes a file; one that is not there is as good as removed.
+/// Removes a file; a missing file is not an error.
 pub(super) fn remove_file(path: &Path) -> io::Result<()> {
-    absent_is_fine(retry(|| fs::remove_file(path)))
+    ignore_missing(retry(|| fs::remove_file(path)))
 }
 
-/// Removes an empty directory; one that is not there is as good as removed.
+/// Removes an empty directory; a missing directory is not an error.
 pub(super) fn remove_dir(path: &Path) -> io::Result<()> {
-    absent_is_fine(retry(|| fs::remove_dir(path)))
+    ignore_missing(retry(|| fs::remove_dir(path)))
 }
 
-/// The metadata of `path`, links not followed; `None` when nothing has this name.
+/// The metadata of `path` without following links; `None` when it does not exist.
 pub(super) fn look(path: &Path) -> Result<Option<Metadata>, ApplyError> {
     match fs::symlink_metadata(path) {
         Ok(metadata) => Ok(Some(metadata)),
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-        Err(e) => Err(io_at(path, "looking at")(e)),
+        Err(e) => Err(io_at(path, "reading metadata")(e)),
     }
 }
 
-/// Names in a directory, in no order.
+/// Names in a directory, unsorted.
 pub(super) fn names(path: &Path) -> io::Result<Vec<OsString>> {
     retry(|| fs::read_dir(path))?.map(|entry| entry.map(|e| e.file_name())).collect()
 }
 
-fn absent_is_fine(removed: io::Result<()>) -> io::Result<()> {
+fn ignore_missing(removed: io::Result<()>) -> io::Result<()> {
     match removed {
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
         other => other,
     }
 }
 
-/// What a file system says of its room.
+/// Free space of a file system.
 struct Room {
     /// Bytes free for this user.
     bytes: u64,
     /// Size of a block.
     block: u64,
-    /// Files that can still be made; `None` where there is no limit to them.
+    /// Number of files that can be created; `None` without a limit.
     files: Option<u64>,
 }
 
-/// The room on the file system of `dir`; `None` where it does not say, as some network ones do not.
+/// Free space on the file system of `dir`; `None` when it is not reported, as on some network file systems.
 fn room(dir: &Path) -> Result<Option<Room>, ApplyError> {
-    let says = rustix::io::retry_on_intr(|| rustix::fs::statvfs(dir))
-        .map_err(|e| io_at(dir, "asking for free space")(e.into()))?;
-    let block = says.f_frsize.max(1);
-    let room =
-        Room { bytes: says.f_bavail.saturating_mul(block), block, files: (says.f_files > 0).then_some(says.f_ffree) };
-    Ok((says.f_blocks > 0).then_some(room))
+    let stats = rustix::io::retry_on_intr(|| rustix::fs::statvfs(dir))
+        .map_err(|e| io_at(dir, "querying free space")(e.into()))?;
+    let block = stats.f_frsize.max(1);
+    let room = Room {
+        bytes: stats.f_bavail.saturating_mul(block),
+        block,
+        files: (stats.f_files > 0).then_some(stats.f_ffree),
+    };
+    Ok((stats.f_blocks > 0).then_some(room))
 }
 
-/// Refuses files of these sizes that will not fit into `dir`, before the first byte of them is written.
+/// Fails when files of these sizes do not fit into `dir`, before any of them is written.
 ///
-/// Each file takes whole blocks. What else a file system needs is its own affair, so this can be a little too
-/// hopeful: [`with_figures`] has the word when writing fails.
-pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> {
+/// Each file takes whole blocks. Metadata of the file system is not counted, so writing can still fail; see
+/// [`with_figures`].
+pub(super) fn check_space(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> {
     let Some(room) = room(dir)? else { return Ok(()) };
     let blocks = sizes.iter().fold(0_u64, |n, size| n.saturating_add(size.div_ceil(room.block)));
     let need = blocks.saturating_mul(room.block);
@@ -112,8 +114,8 @@ pub(super) fn ask_for_room(dir: &Path, sizes: &[u64]) -> Result<(), ApplyError> 
     Ok(())
 }
 
-/// Gives an error of the system its figures: files of these sizes were to be written into `dir`, and this is the room
-/// there is. To be asked when what was written is removed again.
+/// Adds figures to an error of the system: the sizes of the files to write into `dir`, and the space that is free. Call
+/// it after the written files were removed.
 pub(super) fn with_figures(error: ApplyError, dir: &Path, sizes: &[u64]) -> ApplyError {
     let ApplyError::Io { path, doing, error } = error else { return error };
     match Errno::from_io_error(&error) {
@@ -130,7 +132,7 @@ pub(super) fn with_figures(error: ApplyError, dir: &Path, sizes: &[u64]) -> Appl
         Some(Errno::FBIG) => {
             let limit = match getrlimit(Resource::Fsize).current {
                 Some(limit) => format!("this process may write {limit} (ulimit -f)"),
-                None => "the file system takes no file of that size".to_owned(),
+                None => "the file system does not support this size".to_owned(),
             };
             ApplyError::FileSize { path, need: sizes.iter().copied().max().unwrap_or_default(), limit }
         }
@@ -138,7 +140,7 @@ pub(super) fn with_figures(error: ApplyError, dir: &Path, sizes: &[u64]) -> Appl
     }
 }
 
-/// Whether something is mounted there; `false` where the kernel does not tell (before Linux 5.8).
+/// Whether the path is a mount point; `false` when the kernel does not report it (before Linux 5.8).
 #[cfg(target_os = "linux")]
 pub(super) fn is_mount_point(path: &Path) -> bool {
     use rustix::fs::{AtFlags, CWD, StatxAttributes, StatxFlags, statx};
@@ -151,13 +153,13 @@ pub(super) fn is_mount_point(_: &Path) -> bool {
     false
 }
 
-/// Moves up to `len` bytes inside the kernel, from `at` in `from` to where `to` stands; file systems that can share
-/// blocks move none at all. `None` when this kernel or these two file systems cannot do it.
+/// Copies up to `len` bytes inside the kernel, from offset `at` of `from` to the current offset of `to`; file systems
+/// with shared blocks copy no data. `None` when the kernel or these file systems do not support it.
 #[cfg(target_os = "linux")]
 pub(super) fn copy_in_kernel(from: &File, mut at: u64, to: &File, len: u64) -> io::Result<Option<u64>> {
     let len = usize::try_from(len).unwrap_or(usize::MAX);
     match rustix::io::retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut at), to, None, len)) {
-        // Some file systems say 0 where they cannot; at the end of the file a plain read will say so too.
+        // Some file systems return 0 for unsupported; at the end of the file a plain read reports the end.
         Ok(0) | Err(Errno::NOSYS | Errno::XDEV | Errno::INVAL | Errno::OPNOTSUPP | Errno::PERM | Errno::BADF) => {
             Ok(None)
         }

@@ -1,4 +1,4 @@
-//! Where a checkpoint may be written: a place of its own, apart from every donor.
+//! Checks the output directory: it must be free and must not overlap a donor.
 
 use std::fs;
 use std::io;
@@ -9,19 +9,19 @@ use super::error::{ApplyError, io_at};
 use super::staging::staging_path;
 use super::system::is_mount_point;
 
-/// Checks that `out` may become a new directory: absent or empty, and apart from every donor.
+/// Checks that `out` can become a new directory: missing or empty, and not overlapping a donor.
 ///
-/// Returns the path it will have, with every link of its parent resolved.
+/// Returns the resulting path with the links of its parent resolved.
 ///
 /// # Errors
-/// [`ApplyError::Target`] and [`ApplyError::Donor`]; [`ApplyError::Io`] when a path cannot be looked at.
+/// [`ApplyError::Target`] and [`ApplyError::Donor`]; [`ApplyError::Io`] when the metadata of a path cannot be read.
 pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError> {
     let target = |reason: &str| ApplyError::Target { path: out.to_owned(), reason: reason.to_owned() };
     let real = match fs::symlink_metadata(out) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => resolve_absent(out)?,
-        Err(e) => return Err(io_at(out, "looking at")(e)),
+        Err(e) => return Err(io_at(out, "reading metadata")(e)),
         Ok(m) if m.is_symlink() => {
-            // A link to a donor deserves the clearer message.
+            // For a link to a donor, the error about the overlap is clearer.
             if let Ok(real) = fs::canonicalize(out) {
                 apart(out, &real, donors)?;
             }
@@ -35,7 +35,7 @@ pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError>
                 return Err(target("is a directory with files in it"));
             }
             if is_mount_point(&real) {
-                return Err(target("is a mount point, which cannot be replaced by a rename; choose a directory in it"));
+                return Err(target("is a mount point, which a rename cannot replace"));
             }
             real
         }
@@ -43,13 +43,13 @@ pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError>
     apart(out, &real, donors)?;
     let staging = staging_path(&real);
     if donors.iter().any(|donor| fs::canonicalize(donor).is_ok_and(|d| d.starts_with(&staging))) {
-        let reason = format!("its staging directory {} holds a donor", staging.display());
+        let reason = format!("its staging directory {} contains a donor", staging.display());
         return Err(ApplyError::Donor { path: out.to_owned(), reason });
     }
     Ok(real)
 }
 
-/// The path of what does not exist yet, in a directory that does.
+/// Resolves a path that does not exist, in a directory that does.
 fn resolve_absent(out: &Path) -> Result<PathBuf, ApplyError> {
     let target = |reason: String| ApplyError::Target { path: out.to_owned(), reason };
     let parent = match out.parent() {
@@ -63,12 +63,12 @@ fn resolve_absent(out: &Path) -> Result<PathBuf, ApplyError> {
     if !real_parent.is_dir() {
         return Err(target("its parent is not a directory".to_owned()));
     }
-    // `no/such/..` has no name: its last step leads somewhere else.
+    // `no/such/..` has no file name, because its last component is not a name.
     let name = out.file_name().ok_or_else(|| target("does not exist".to_owned()))?;
     Ok(real_parent.join(name))
 }
 
-/// Compares by device and inode, so that bind mounts and other detours are seen as well.
+/// Compares device and inode, which also detects bind mounts.
 fn apart(out: &Path, real: &Path, donors: &[&Path]) -> Result<(), ApplyError> {
     let identity = |path: &Path| fs::metadata(path).ok().map(|m| (m.dev(), m.ino()));
     let within = |path: &Path, other: &Path| {

@@ -1,6 +1,6 @@
-//! Tensors that are not byte copies: padding, more rows, fresh values.
+//! Tensors that are not byte copies: padding, added rows, reinitialised values.
 //!
-//! Each function streams into a writer and holds at most a few rows, whatever the tensor's size.
+//! Each function streams into a writer and keeps at most a few rows in memory.
 
 use std::io::{self, Write};
 
@@ -12,10 +12,10 @@ use sha2::{Digest, Sha256};
 
 use crate::checkpoint::Dtype;
 
-/// Standard deviation of fresh weights: transformers' usual `initializer_range`.
+/// Standard deviation of reinitialised weights: the usual `initializer_range` of transformers.
 const INIT_STD: f64 = 0.02;
 
-/// Whether values of `dtype` can be made here, not only copied.
+/// Whether values of `dtype` can be computed, not only copied.
 #[must_use]
 pub const fn can_compute(dtype: Dtype) -> bool {
     matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64)
@@ -32,7 +32,7 @@ fn encode(dtype: Dtype, value: f64, out: &mut Vec<u8>) {
     }
 }
 
-/// Decodes the values of whole elements; a partial element at the end is ignored.
+/// Decodes whole elements; a partial element at the end is ignored.
 fn decode(dtype: Dtype, bytes: &[u8]) -> Vec<f64> {
     fn each<const N: usize>(bytes: &[u8], f: impl Fn([u8; N]) -> f64) -> Vec<f64> {
         bytes.as_chunks::<N>().0.iter().map(|c| f(*c)).collect()
@@ -45,7 +45,7 @@ fn decode(dtype: Dtype, bytes: &[u8]) -> Vec<f64> {
     }
 }
 
-/// Reads one run of bytes of the donor tensor: `read(offset within the tensor, buffer)`.
+/// Reads bytes of the donor tensor: `read(offset within the tensor, buffer)`.
 pub type ReadAt<'a> = dyn FnMut(u64, &mut [u8]) -> io::Result<()> + 'a;
 
 /// Writes `count` zero bytes.
@@ -73,13 +73,13 @@ fn copy(read: &mut ReadAt<'_>, mut offset: u64, mut len: u64, out: &mut dyn Writ
     Ok(())
 }
 
-/// Writes `from`-shaped values into the leading corner of a `to`-shaped tensor of zeros.
+/// Writes a tensor of shape `to`: the donor's values, of shape `from`, in the leading corner, zeros elsewhere.
 ///
-/// `elem` is the element width in bytes. `to` must have the rank of `from` and be at least as large in
-/// every dimension; the planner sees to that.
+/// `elem` is the element width in bytes. `to` must have the rank of `from` and be at least as large in every dimension,
+/// which the planner ensures.
 ///
 /// # Errors
-/// Whatever reading or writing says; [`io::ErrorKind::InvalidInput`] for shapes that do not nest.
+/// Errors of reading or writing; [`io::ErrorKind::InvalidInput`] for shapes that do not nest.
 pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut dyn Write) -> io::Result<()> {
     fn inner(
         read: &mut ReadAt<'_>,
@@ -91,7 +91,7 @@ pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut
     ) -> io::Result<()> {
         let stride = |dims: &[u64]| dims.iter().fold(elem, |n, d| n.saturating_mul(*d));
         match (from.split_first(), to.split_first()) {
-            // Equal from here on: one run of bytes.
+            // The remaining dimensions are equal: one range of bytes.
             _ if from == to => {
                 let len = stride(from);
                 copy(read, *at, len, out)?;
@@ -121,11 +121,11 @@ pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut
 
 /// Copies `rows` rows of `width` elements and appends `more` rows, each the mean of the copied ones.
 ///
-/// The mean is transformers' own starting point for added tokens (`mean_resizing`), without its noise,
-/// so that two runs give the same bytes.
+/// transformers initialises added tokens with the same mean plus noise (`mean_resizing`). Without noise, two runs give
+/// the same bytes.
 ///
 /// # Errors
-/// Whatever reading or writing says.
+/// Errors of reading or writing.
 pub fn grow_rows(
     read: &mut ReadAt<'_>,
     dtype: Dtype,
@@ -158,12 +158,12 @@ pub fn grow_rows(
     Ok(())
 }
 
-/// Writes fresh values: normal with standard deviation 0.02 for matrices, zeros for vectors.
+/// Writes reinitialised values: normal with standard deviation 0.02 for matrices, zeros for vectors.
 ///
-/// The stream is seeded by the tensor's name alone, so a build is reproducible.
+/// The generator is seeded with the tensor's name, so that merges are reproducible.
 ///
 /// # Errors
-/// Whatever writing says.
+/// Errors of writing.
 pub fn reinit(name: &str, dtype: Dtype, shape: &[u64], out: &mut dyn Write) -> io::Result<()> {
     let count = shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
     if shape.len() < 2 {

@@ -1,7 +1,7 @@
-//! The strict oracle: the reference implementation of the format has the last word on what was written.
+//! Verifies written shards with the reference implementation of the format.
 //!
-//! This is the one module that maps files into memory. What it maps lies in this run's own locked staging
-//! directory, so nobody cuts it short while it is mapped.
+//! This is the only module that maps files into memory. It maps files in this run's locked staging directory, which no
+//! other run truncates.
 
 use std::fs::File;
 use std::io;
@@ -11,14 +11,18 @@ use memmap2::Mmap;
 use safetensors::SafeTensors;
 use safetensors::tensor::Metadata;
 
-/// Reads a written shard with the safetensors crate, whose checks are the format's definition.
+/// Reads a written shard with the safetensors crate, whose checks define the format.
 ///
-/// Nothing but the header is touched, whatever the size of the file. Where a file cannot be mapped (some
-/// network file systems, a limit on memory) the crate gets the header alone.
+/// Only the header is read, independent of the size of the file. When the file cannot be mapped (some network file
+/// systems, a limit on memory), the crate gets the header alone.
 ///
 /// # Errors
+/// When the file cannot be read, or when the crate refuses it.
 /// When the file cannot be read, or the crate refuses it.
-#[expect(unsafe_code, reason = "mapping a file is unsafe because others may change it; nobody else has this one")]
+#[expect(
+    unsafe_code,
+    reason = "mapping a file is unsafe because others may change it; this one is in a locked directory"
+)]
 pub fn accepted_by_safetensors(file: &File) -> io::Result<()> {
     // SAFETY: the caller has just written this file into a directory it has locked; it is not changed while mapped.
     let map = unsafe { Mmap::map(file) };
@@ -28,7 +32,7 @@ pub fn accepted_by_safetensors(file: &File) -> io::Result<()> {
     }
 }
 
-/// The same checks on the header alone, and the length of the file against it.
+/// Runs the same checks on the header, and compares its offsets with the length of the file.
 fn header_accepted(file: &File) -> io::Result<()> {
     let mut prefix = [0; 8];
     file.read_exact_at(&mut prefix, 0)?;
@@ -37,7 +41,11 @@ fn header_accepted(file: &File) -> io::Result<()> {
     file.read_exact_at(&mut header, 8)?;
     let metadata: Metadata = serde_json::from_slice(&header)?;
     let end = (metadata.data_len() as u64).saturating_add(stated).saturating_add(8);
-    if end == file.metadata()?.len() { Ok(()) } else { Err(io::Error::other("the header and the length disagree")) }
+    if end == file.metadata()?.len() {
+        Ok(())
+    } else {
+        Err(io::Error::other("the header does not match the file length"))
+    }
 }
 
 #[cfg(test)]
@@ -45,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_a_map_the_verdict_is_the_same() {
+    fn verification_is_the_same_without_a_map() {
         let header = br#"{"a":{"dtype":"U8","shape":[2],"data_offsets":[0,2]}}"#;
         let wrong = br#"{"a":{"dtype":"U8","shape":[3],"data_offsets":[0,2]}}"#;
         let mut whole = (header.len() as u64).to_le_bytes().to_vec();

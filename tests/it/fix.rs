@@ -1,4 +1,4 @@
-//! Fixes on every fixture: made, made again, and undone.
+//! Fixes on every fixture: applied, applied again, and undone.
 
 mod cli;
 mod edits;
@@ -17,7 +17,7 @@ use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::surgery::RepairError;
 use ckpt_doctor::surgery::repair::{Repair, plan};
 
-/// What can be seen of a directory: names, kinds, bytes, modes and times.
+/// The state of a directory: names, kinds, bytes, modes and times.
 fn seen(dir: &Path) -> BTreeMap<String, (u32, i64, i64, Vec<u8>)> {
     let mut seen = BTreeMap::new();
     for entry in fs::read_dir(dir).expect("a directory") {
@@ -41,7 +41,7 @@ fn planned(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Outcome, Repair) {
     (outcome.clone(), plan(&checkpoint, outcome, true, &|c| check(c, knowledge)))
 }
 
-/// The codes of these findings, with how often when it is more than once.
+/// The codes of these findings, with a count if more than one.
 fn codes<'f>(codes: impl Iterator<Item = &'f String>) -> String {
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for code in codes {
@@ -55,25 +55,25 @@ fn is_automatic(finding: &Finding) -> bool {
     finding.fix.as_ref().is_some_and(|fix| fix.safety != Safety::Manual)
 }
 
-/// What the repair of one fixture comes to, in a line; nothing where nothing can be done.
+/// Repairs one fixture and describes the result in a line; `None` without fixes.
 ///
-/// A fix that is promised is made and kept, and rids the checkpoint of its finding: what cannot be repaired says so
-/// before anybody asks for it. What is left over is for a person to do.
+/// An offered fix is applied, kept, and removes its finding; a finding whose fix cannot be applied offers none. The
+/// remaining findings need a person.
 fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<String>, String> {
     let before = seen(dir);
     let (outcome, repair) = planned(dir, deep, knowledge);
     if let Some(w) = repair.withdrawn.first() {
-        return Err(format!("{} promises to {} and cannot: {}", w.code, w.title, w.reason));
+        return Err(format!("{} offers to {}, but is withdrawn: {}", w.code, w.title, w.reason));
     }
     if repair.changes.is_empty() {
         return match outcome.findings.iter().find(|f| is_automatic(f)) {
-            Some(finding) => Err(format!("{} promises a fix that is not made", finding.code)),
+            Some(finding) => Err(format!("{} offers a fix that is not applied", finding.code)),
             None => Ok(None),
         };
     }
     let fixed = codes(repair.fixed.iter().map(|f| &f.code));
     match ckpt_doctor::surgery::journal::write(&repair, &mut |_| {}) {
-        // FIFOs and links in a fixture are left alone.
+        // FIFOs and links in a fixture are not repaired.
         Err(RepairError::Linked { .. }) => return Ok(Some(format!("{fixed} (linked)"))),
         other => other.map_err(|e| format!("writing: {e}"))?,
     }
@@ -85,7 +85,7 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
         return Err(format!("a second run would change {} files", again.changes.len()));
     }
     if let Some(left) = after.findings.iter().find(|f| is_automatic(f)) {
-        return Err(format!("{} is left over: {}", left.code, left.message));
+        return Err(format!("{} remains: {}", left.code, left.message));
     }
     ckpt_doctor::surgery::journal::undo(dir).map_err(|e| format!("undo: {e}"))?;
     if seen(dir) != before {

@@ -1,9 +1,9 @@
-//! A corpus of hostile and damaged checkpoints, and what the program says of each.
+//! A corpus of hostile and damaged checkpoints, with the verdict of the program on each.
 //!
-//! The rows are hazards seen in published models, upstream's own attacks and crash reports: C the container, P index and
-//! paths, D download state, J JSON, X code from the model, F file system. A case is written by a few lines of code and
-//! judged by the program itself, in a process of its own: within limits of CPU and memory, without a file opened beside
-//! the checkpoint, a program started or a byte written. The verdicts are kept as a snapshot.
+//! The rows are hazards from published models, and upstream's own attacks and crash reports: C the container, P index
+//! and paths, D download state, J JSON, X code from the model, F file system. A few lines of code write a case. The
+//! program checks it in a process of its own: within limits of CPU and memory, without opening a file outside the
+//! checkpoint, starting a program or writing a byte. The verdicts are kept as a snapshot.
 
 mod code;
 mod container;
@@ -28,14 +28,14 @@ pub struct Case {
     /// Row of the hazards: `C1`.
     row: &'static str,
     name: String,
-    /// Codes that have to be among the findings; for none, there must be none above info.
+    /// Codes that must be among the findings; if empty, no finding may be above info.
     wanted: Vec<&'static str>,
-    /// Part of the place that a finding of each code has to name: a file, a tensor, a pointer.
+    /// Part of a place that a finding of each code must name: a file, a tensor, a pointer.
     at: &'static str,
     make: Box<dyn Fn(&Dir) + Send + Sync>,
 }
 
-/// A case that has to be reported.
+/// A case that must be reported.
 fn case(
     row: &'static str,
     name: impl Into<String>,
@@ -46,15 +46,15 @@ fn case(
     Case { row, name: name.into(), wanted: wanted.split_whitespace().collect(), at, make: Box::new(make) }
 }
 
-/// A case whose findings are as the table of verdicts has them: what matters is that it ends, within the limits.
+/// A case with any findings: only the limits are tested. The table of verdicts records the findings.
 fn bounded(row: &'static str, name: impl Into<String>, make: impl Fn(&Dir) + Send + Sync + 'static) -> Case {
     case(row, name, ANYTHING, "", make)
 }
 
-/// Stands for the codes of a case that may have any, or none.
+/// In place of codes: any findings are allowed.
 const ANYTHING: &str = "*";
 
-/// A case that is odd and right.
+/// A case that is unusual but valid.
 fn clean(row: &'static str, name: impl Into<String>, make: impl Fn(&Dir) + Send + Sync + 'static) -> Case {
     case(row, name, "", "", make)
 }
@@ -76,7 +76,7 @@ fn cases() -> Vec<Case> {
     cases
 }
 
-/// Runs every case, some at a time, and returns the verdicts in order.
+/// Runs all cases in parallel, and returns the results in order.
 fn judge<T: Send>(cases: &[Case], judge: impl Fn(&Bench, usize, &Case) -> T + Sync) -> Vec<T> {
     let bench = Bench::new();
     let pending = Mutex::new(cases.iter().enumerate());
@@ -100,7 +100,7 @@ fn judge<T: Send>(cases: &[Case], judge: impl Fn(&Bench, usize, &Case) -> T + Sy
 }
 
 #[test]
-fn every_hazard_gets_its_verdict() {
+fn every_hazard_is_checked() {
     let cases = cases();
     assert!(cases.len() >= 250, "{} cases", cases.len());
     let verdicts = judge(&cases, |bench, number, case| bench.judge(number, &*case.make));
@@ -118,11 +118,12 @@ fn every_hazard_gets_its_verdict() {
     snapshot!("hostile-verdicts", table);
 }
 
-/// The rows that say what `check` must report: each has a case.
+/// Each row that `check` must report has a case.
 #[test]
 fn every_row_has_a_case() {
     let rows = [("C", 1..=15), ("P", 1..=9), ("D", 1..=6), ("J", 1..=8), ("X", 1..=4), ("F", 1..=5), ("F", 13..=13)];
-    // What needs the weights read (D5: their hash) or a file that changes meanwhile (F2, F3) is tested elsewhere.
+    // Hazards that need the weights read (D5: their hash) or a file that changes during the read (F2, F3) have tests
+    // elsewhere.
     let elsewhere = ["D5", "F2", "F3"];
     let cases = cases();
     for (letter, numbers) in rows {

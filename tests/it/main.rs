@@ -1,6 +1,6 @@
 //! All integration tests, in one binary: it links the library once.
 //!
-//! `cargo test --test it merge::` runs one area. `tests/README.md` says what each is about.
+//! `cargo test --test it merge::` runs one area. `tests/README.md` describes the areas.
 
 #![allow(
     clippy::arithmetic_side_effects,
@@ -10,7 +10,7 @@
     clippy::indexing_slicing,
     clippy::print_stdout,
     clippy::unwrap_used,
-    reason = "a test that panics has failed, as it should"
+    reason = "a panic fails the test"
 )]
 #![allow(clippy::disallowed_methods, reason = "tests read the project's files and write temporary directories")]
 
@@ -22,9 +22,11 @@ mod docs;
 mod fix;
 mod hostile;
 mod house;
+mod library;
 mod load;
 mod merge;
 mod mutation;
+mod pages;
 mod readers;
 mod reports;
 mod rules;

@@ -1,4 +1,4 @@
-//! `build-merged` from the outside: what it writes, what it refuses, and that donors stay as they are.
+//! `build-merged` from the outside: what it writes, what it refuses, and unchanged donors.
 
 mod refused;
 mod writing;
@@ -57,7 +57,7 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// What is in a directory, hidden names too: nothing may be left behind by a run that failed.
+/// Names in a directory, including hidden ones: a failed run must leave nothing.
 fn names(dir: &Path) -> Vec<String> {
     let mut names: Vec<String> =
         fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
@@ -70,7 +70,7 @@ fn json(output: &Output) -> Value {
 }
 
 #[test]
-fn the_default_merge_is_written_whole_and_checks_clean() {
+fn the_default_merge_is_complete_and_checks_clean() {
     let work = TempDir::new().unwrap();
     let before = (state(&donor("spatialvla-tiny")), state(&donor("llava3d-tiny")));
     let out = work.path().join("merged");
@@ -101,7 +101,7 @@ fn the_default_merge_is_written_whole_and_checks_clean() {
     );
     let check = doctor(&["check", out.to_str().unwrap(), "--fail-on", "warning"]);
     assert_eq!(check.status.code(), Some(0), "{}", text(&check));
-    // Strict JSON throughout, though the donor has Infinity.
+    // All documents are strict JSON, although the donor contains Infinity.
     for (name, bytes) in content(&out).iter().filter(|(n, _)| n.ends_with(".json")) {
         serde_json::from_slice::<Value>(bytes).unwrap_or_else(|e| panic!("{name}: {e}"));
     }
@@ -152,7 +152,7 @@ fn the_same_merge_gives_the_same_bytes() {
         assert_eq!(tiny(out, &["--set", "projector=reinit", "--set", "tokenizer=baked"]).status.code(), Some(0));
     }
     let (mut a, mut b) = (content(&a), content(&b));
-    // The report names the directory it describes.
+    // The report contains the name of the directory.
     a.remove("merge-report.md");
     b.remove("merge-report.md");
     assert!(a == b);
@@ -235,7 +235,7 @@ fn forwarding_aliases_need_no_modules_of_the_donor() {
 }
 
 #[test]
-fn a_dry_run_writes_nothing_and_tells_the_plan() {
+fn a_dry_run_writes_nothing_and_reports_the_plan() {
     let work = TempDir::new().unwrap();
     let run = tiny(&work.path().join("out"), &["--dry-run", "--output-format", "json"]);
     assert_eq!(run.status.code(), Some(0), "{}", text(&run));

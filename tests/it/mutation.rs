@@ -1,7 +1,7 @@
-//! Mutations of sound files: whatever they come out as, the readers' laws hold, and the checks do not panic.
+//! Mutations of sound files: the readers' invariants hold, and the checks do not panic.
 //!
-//! The inputs follow from a seed. `cargo test` tries some thousands; with `CKPT_DOCTOR_MUTATIONS=200000`, as CI has it,
-//! that many.
+//! The inputs follow from a seed. `cargo test` runs some thousands; `CKPT_DOCTOR_MUTATIONS=200000`, as in CI, sets the
+//! number.
 
 mod mutate;
 
@@ -18,9 +18,9 @@ use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{Format, Report, Style, render};
 use mutate::Mutator;
 
-/// Inputs of a plain `cargo test`.
+/// Number of inputs in a plain `cargo test`.
 const FEW: usize = 2_000;
-/// Of so many inputs one goes through all the checks and a renderer: that takes a hundred times as long.
+/// One in this many inputs goes through all checks and a renderer, which takes a hundred times as long.
 const CHECKED: usize = 100;
 
 /// A sound file.
@@ -29,7 +29,7 @@ struct Seed {
     bytes: Vec<u8>,
 }
 
-/// The files of a checkpoint that are read, with the weights cut down to the header.
+/// The files of a checkpoint, with weights truncated to the header.
 fn seeds(base: &str) -> Vec<Seed> {
     let dir = tempfile::TempDir::new().unwrap();
     crate::support::make_base(base, dir.path());
@@ -38,7 +38,7 @@ fn seeds(base: &str) -> Vec<Seed> {
         let entry = entry.unwrap();
         let name = entry.file_name().into_string().unwrap();
         let bytes = fs::read(entry.path()).unwrap();
-        // Of what is larger than this a mutation changes too little to be seen.
+        // In larger files, a mutation is unlikely to change anything that is read.
         if bytes.len() < 1 << 20 {
             seeds.push(Seed { name, bytes });
         }
@@ -47,7 +47,7 @@ fn seeds(base: &str) -> Vec<Seed> {
     seeds
 }
 
-/// The laws for a file of this name.
+/// Checks the invariants of a file with this name.
 fn hold(name: &str, bytes: &[u8]) {
     if name.ends_with(".safetensors") {
         crate::support::invariants::header::hold(bytes);
@@ -64,7 +64,7 @@ fn hold(name: &str, bytes: &[u8]) {
     }
 }
 
-/// The checkpoint with one file changed, checked and reported.
+/// Changes one file of the checkpoint, then checks it and renders a report.
 fn look(seeds: &[Seed], changed: usize, bytes: &[u8], knowledge: &Knowledge, format: Format) {
     let mut parts = Parts::default();
     for (at, seed) in seeds.iter().enumerate() {
@@ -87,7 +87,7 @@ fn look(seeds: &[Seed], changed: usize, bytes: &[u8], knowledge: &Knowledge, for
 }
 
 #[test]
-fn whatever_becomes_of_a_file_the_laws_hold() {
+fn invariants_hold_for_mutated_files() {
     let wanted = std::env::var("CKPT_DOCTOR_MUTATIONS").map_or(FEW, |n| n.parse().expect("a number"));
     let bases: Vec<Vec<Seed>> =
         ["llama", "llama-sharded", "llama-gptq", "lora", "spatialvla"].map(seeds).into_iter().collect();

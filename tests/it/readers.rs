@@ -1,7 +1,6 @@
-//! What the reading room says of hostile, damaged and merely odd input.
+//! Faults of the readers on hostile, damaged and unusual input.
 //!
-//! Each table gives bytes and the exact set of fault kinds they must come out as; an empty set is a
-//! promise that an oddity is clean.
+//! Each table lists bytes with the exact set of expected fault kinds; an empty set means that unusual input is valid.
 
 use std::collections::BTreeSet;
 
@@ -28,7 +27,7 @@ impl Case {
     }
 }
 
-/// Compares every row, and reports all that differ at once.
+/// Compares all rows, and reports every difference at once.
 fn hold(cases: &[Case]) {
     let mut wrong = Vec::new();
     for case in cases {

@@ -1,4 +1,4 @@
-//! What each format makes of reports written by hand.
+//! Each format, rendered from hand-written reports.
 
 mod formats;
 mod samples;
@@ -34,12 +34,12 @@ fn findings() {
 }
 
 #[test]
-fn fixes_of_text_are_replacements_in_sarif() {
+fn text_fixes_are_replacements_in_sarif() {
     snapshot!("report-fixable-sarif", show(&samples::fixable(), Format::Sarif));
 }
 
 #[test]
-fn long_lists_are_capped_but_in_json() {
+fn long_lists_are_capped_except_in_json() {
     let report = samples::long_lists();
     for format in [Format::Full, Format::Concise, Format::Markdown] {
         snapshot!(format!("report-long-{format}"), show(&report, format));
@@ -50,7 +50,7 @@ fn long_lists_are_capped_but_in_json() {
 }
 
 #[test]
-fn hostile_strings_are_harmless() {
+fn hostile_strings_are_escaped() {
     let report = samples::hostile();
     for format in Format::ALL {
         let shown = show(&report, format);
@@ -67,17 +67,17 @@ fn hostile_strings_are_harmless() {
 }
 
 #[test]
-fn merge_that_worked() {
+fn merge_that_succeeded() {
     snapshots("merge", &samples::merge_ok());
 }
 
 #[test]
-fn merge_with_a_seam_that_does_not_fit() {
+fn merge_with_a_seam_mismatch() {
     snapshots("seam", &samples::merge_seam());
 }
 
 #[test]
-fn colours_only_when_asked_and_never_in_the_words() {
+fn colours_are_optional_and_never_in_the_text() {
     let report = samples::findings();
     let plain = show(&report, Format::Full);
     let colored = render(&report, Format::Full, Style { color: true, ..PLAIN });
@@ -103,7 +103,7 @@ fn tables_fit_the_width() {
 }
 
 #[test]
-fn a_report_says_the_same_wherever_the_donors_are() {
+fn a_report_does_not_depend_on_the_location_of_the_donors() {
     let here = samples::merge_ok();
     let mut there = samples::merge_ok();
     let merge = there.merge.as_mut().unwrap();
@@ -118,7 +118,7 @@ fn a_report_says_the_same_wherever_the_donors_are() {
 }
 
 #[test]
-fn formats_are_spelled_as_they_are_read() {
+fn format_names_parse() {
     for format in Format::ALL {
         assert_eq!(format.to_string().parse(), Ok(format));
     }
@@ -128,9 +128,9 @@ fn formats_are_spelled_as_they_are_read() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Spans, names and sources come from files nobody vouches for: any of them renders, in bounds or not.
+    /// Spans, names and sources come from untrusted files: all of them render, in bounds or not.
     #[test]
-    fn whatever_a_checkpoint_holds_is_rendered(
+    fn any_checkpoint_is_rendered(
         source in "(\\PC|\\n|\\r|\\t|\u{1b}|字){0,200}",
         spans in proptest::collection::vec((0_usize..700, 0_usize..300), 0..5),
         names in proptest::collection::vec("(\\PC|\\.|[0-9]|字|\n){0,40}", 0..6),

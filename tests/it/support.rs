@@ -1,14 +1,13 @@
-//! Fixtures: a sound base, a few changes, and what has to be said of the result.
+//! Fixtures: a sound base, changes, and the expected findings.
 //!
-//! A case is one small JSON5 file. `fixtures/rules/<CODE>/<case>.json5` trips its rule; `fixtures/sound/<case>.json5`
-//! is odd and right. The checkpoint itself is made in a temporary directory, so that no broken weights lie in the
-//! repository.
+//! A case is one small JSON5 file. The rule must report `fixtures/rules/<CODE>/<case>.json5`;
+//! `fixtures/sound/<case>.json5` is unusual but valid. The checkpoint itself is created in a temporary directory, so
+//! that the repository contains no broken weights.
 
 mod base;
 mod change;
 pub mod data;
 pub mod invariants;
-pub mod keys;
 mod weights;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,12 +16,14 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Outcome, check, unused_suppressions};
+use ckpt_doctor::check::{Outcome, Safety, check, unused_suppressions};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, SettingsSource};
 use ckpt_doctor::knowledge::{Knowledge, Library, source};
+use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::{self, Style};
 use serde::Deserialize;
 
 pub use base::{BASES, copy};
@@ -46,26 +47,26 @@ pub struct Case {
     /// `JSN001/infinity`, or `sound/padded-header`.
     #[serde(skip)]
     pub name: String,
-    /// Rule that has to speak; none for a sound case.
+    /// The rule that must report the case; `None` for a sound case.
     #[serde(skip)]
     pub code: Option<String>,
     /// One of [`BASES`].
     base: String,
-    /// Applied in order.
+    /// Changes, in order.
     #[serde(default)]
     changes: Vec<Change>,
-    /// Whether the tensors' bytes are read, as `check --deep` does. Those of sound cases always are.
+    /// Whether to read the tensors' bytes, as `check --deep` does; always for sound cases.
     #[serde(default)]
     pub deep: bool,
-    /// Settings to check it under.
+    /// Settings for the check.
     #[serde(default)]
-    settings: Option<serde_json::Value>,
-    /// What has to be said; absent for a sound case.
+    pub settings: Option<serde_json::Value>,
+    /// The expected finding; `None` for a sound case.
     #[serde(default)]
     pub expect: Option<Expect>,
 }
 
-/// What the rule has to say; fields left out may be anything.
+/// The expected finding; missing fields may have any value.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Expect {
@@ -78,22 +79,27 @@ pub struct Expect {
     pub pointer: Option<String>,
     #[serde(default)]
     pub line: Option<usize>,
-    /// A part of the message.
+    /// Part of the message.
     #[serde(default)]
     pub says: Option<String>,
-    /// How many findings of the rule; one when absent.
+    /// Number of findings of the rule; one when missing.
     #[serde(default)]
     pub count: Option<usize>,
+    /// Safety of the fix.
+    #[serde(default)]
+    pub fix: Option<Safety>,
 }
 
-/// A case and what was found.
+/// A case and the result of checking it.
 pub struct Tried {
     pub case: Case,
     pub outcome: Outcome,
-    /// Codes found in the base alone.
+    /// Codes of findings on the unchanged base.
     pub before: BTreeSet<String>,
     /// Kinds of the faults that readers and comparisons produced.
     pub kinds: BTreeSet<FaultKind>,
+    /// The first finding of the case's own rule, as `check` prints it.
+    pub example: String,
 }
 
 impl Tried {
@@ -102,7 +108,7 @@ impl Tried {
         self.outcome.findings.iter().filter(|f| Some(&f.code) == self.case.code.as_ref()).collect()
     }
 
-    /// Every code found, with how often when it is more than once.
+    /// Every code found, with a count if more than one.
     pub fn codes(&self) -> String {
         let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
         for finding in &self.outcome.findings {
@@ -136,10 +142,11 @@ pub fn files(folder: &Path, ending: &str) -> Vec<PathBuf> {
     found
 }
 
-/// The rules as they are on disk, so that one can be tried without compiling.
+/// The rules on disk, so that a change needs no compilation.
 pub fn rules() -> RuleSet {
     let texts = texts("rules/checks");
-    RuleSet::from_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
+    RuleSet::default()
+        .and_files(texts.iter().map(|(path, text)| (path.clone(), text.as_str())))
         .unwrap_or_else(|e| panic!("{e}"))
 }
 
@@ -152,13 +159,13 @@ pub fn texts(folder: &str) -> Vec<(String, String)> {
     files(&project().join(folder), ".json5").into_iter().map(read).collect()
 }
 
-/// All that a checker knows.
+/// All knowledge of a checker.
 pub fn knowledge() -> Knowledge {
     Knowledge::with(rules(), Library::embedded()).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// What is found in a directory under settings that lie in the folder above it.
-fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> Outcome {
+/// Checks a directory under settings in the folder above it.
+fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let above = dir.parent().expect("a folder above");
     let source =
         SettingsSource::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
@@ -166,9 +173,9 @@ fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> 
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
     let mut outcome = check(&checkpoint, &knowledge);
-    let unused = unused_suppressions(&knowledge, &[(checkpoint, &outcome)], &[above.to_owned()]);
+    let unused = unused_suppressions(&knowledge, &[(Arc::clone(&checkpoint), &outcome)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
-    outcome
+    (checkpoint, outcome)
 }
 
 /// Makes one of [`BASES`].
@@ -210,7 +217,7 @@ pub fn cases() -> Vec<Case> {
     cases
 }
 
-/// Every case, made and checked, once for all tests of a binary.
+/// Every case, built and checked; computed once.
 pub fn tried() -> &'static [Tried] {
     static TRIED: OnceLock<Vec<Tried>> = OnceLock::new();
     TRIED.get_or_init(try_all)
@@ -218,11 +225,25 @@ pub fn tried() -> &'static [Tried] {
 
 /// Opens and checks a directory.
 pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
+    open(dir, deep, knowledge).1
+}
+
+fn open(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let mut checkpoint = Checkpoint::open(dir).expect("a directory");
     if deep {
         checkpoint.read_contents();
     }
-    check(&Arc::new(checkpoint), knowledge)
+    let checkpoint = Arc::new(checkpoint);
+    let outcome = check(&checkpoint, knowledge);
+    (checkpoint, outcome)
+}
+
+/// The first finding of the rule as `check` prints it.
+fn example(code: &str, checkpoint: &Checkpoint, outcome: &Outcome) -> Option<String> {
+    let finding = outcome.findings.iter().find(|f| f.code == code)?;
+    let report = CheckpointReport::new("model", None, checkpoint, outcome);
+    let text = report::render_finding(finding, &report, Style { width: Some(100), ..Style::default() });
+    Some(text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n"))
 }
 
 /// A defect in one of the two models.
@@ -231,12 +252,12 @@ pub struct Seeded {
     pub model: &'static str,
     pub code: String,
     pub says: String,
-    /// Rules that truly follow from the defect too.
+    /// Further rules that report a consequence of the defect.
     pub also: Vec<String>,
     pub count: usize,
 }
 
-/// All of them, with what was found.
+/// All defects, with their outcomes.
 pub struct AllSeeded {
     pub defects: usize,
     pub tried: Vec<(Seeded, Outcome)>,
@@ -272,7 +293,7 @@ struct SeededCase {
     count: Option<usize>,
 }
 
-/// Makes and checks every defect of `fixtures/seeded.json5`, once.
+/// Builds and checks every defect of `fixtures/seeded.json5`, once.
 pub fn seeded() -> &'static AllSeeded {
     static SEEDED: OnceLock<AllSeeded> = OnceLock::new();
     SEEDED.get_or_init(|| {
@@ -319,11 +340,17 @@ fn with_kinds() -> Knowledge {
     knowledge
 }
 
-/// Takes the findings of the rules of [`with_kinds`] out of an outcome.
+/// Removes the findings of the rules of [`with_kinds`] from an outcome.
 fn take_kinds(outcome: &mut Outcome) -> BTreeSet<FaultKind> {
     let (kinds, findings) = outcome.findings.drain(..).partition(|f| f.code.starts_with(KIND));
     outcome.findings = findings;
-    let kind = |f: Finding| FaultKind::from_name(&f.message).unwrap_or_else(|| panic!("{} is a kind", f.message));
+    let kind = |f: Finding| {
+        FaultKind::ALL
+            .iter()
+            .copied()
+            .find(|kind| kind.name() == f.message)
+            .unwrap_or_else(|| panic!("{} is a kind", f.message))
+    };
     Vec::into_iter(kinds).map(kind).collect()
 }
 
@@ -333,17 +360,18 @@ fn try_all() -> Vec<Tried> {
     let tried = on_every_case(&knowledge, |bases, case, made| {
         let codes = |dir: &PathBuf| look(dir, true, &knowledge).findings.into_iter().map(|f| f.code).collect();
         let before = before.get_or_init(|| bases.iter().map(|(name, dir)| (*name, codes(dir))).collect());
-        let mut outcome = match &case.settings {
+        let (checkpoint, mut outcome) = match &case.settings {
             Some(settings) => under(settings, made, with_kinds()),
-            None => look(made, case.deep, &observing),
+            None => open(made, case.deep, &observing),
         };
         let kinds = take_kinds(&mut outcome);
-        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds }
+        let example = case.code.as_ref().and_then(|code| example(code, &checkpoint, &outcome)).unwrap_or_default();
+        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds, example }
     });
     tried.into_iter().map(|(_, tried)| tried).collect()
 }
 
-/// Makes every case in a temporary directory and looks at it, on several threads; in the order of the cases.
+/// Builds every case in a temporary directory and calls `look` on it, on several threads; results are in case order.
 pub fn on_every_case<T: Send>(
     knowledge: &Knowledge,
     look: impl Fn(&BTreeMap<&'static str, PathBuf>, &Case, &Path) -> T + Sync,
@@ -351,7 +379,7 @@ pub fn on_every_case<T: Send>(
     on_cases(knowledge, |_| true, look)
 }
 
-/// The same for the cases whose names are wanted.
+/// As [`on_every_case`], for the wanted case names.
 pub fn on_cases<T: Send>(
     knowledge: &Knowledge,
     wanted: impl Fn(&str) -> bool,
@@ -382,7 +410,7 @@ pub fn on_cases<T: Send>(
     done.into_inner().expect("no panic").into_values().collect()
 }
 
-/// Makes a checkpoint of a base and changes, which are written as in a case, below `room`.
+/// Builds a checkpoint below `room` from a base and changes in the format of a case.
 pub fn made(base: &'static str, changes: &str, room: &Path) -> PathBuf {
     let bases = base::make_all(&room.join("bases"), &[base], &knowledge());
     let changes: Vec<Change> = source::parse("the changes", changes).unwrap_or_else(|e| panic!("{e}"));

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""What is promised of writing, while things go wrong: failing calls, full disks, kills, signals, changing donors, two
-runs at once. After each: inputs untouched, the target absent, old or complete, nothing left behind, the next run whole.
+"""Writing under adverse conditions: failing calls, full disks, kills, signals, changing donors, two runs at once. After
+each: inputs unchanged, the target missing, old or complete, no other files left, and the next run complete.
 
     crash.py [--full] [--seed N] [PART...]
 
-Without --full each part is a sample that fits into CI. It needs Linux and strace; small disks need user namespaces or
-root, and are said not to have been run where neither is to be had. It stops at the first promise that was not kept and
-says how to see it again; the directory stays. The last line is `N passed, M failed`.
+Without --full, each part runs a sample that fits into CI. The script needs Linux and strace. Small disks need user
+namespaces or root; without them, the part is reported as not run. The script stops at the first failure, prints the
+command that repeats it, and keeps the directory. The last line is `N passed, M failed`.
 """
 
 import argparse
@@ -28,8 +28,8 @@ from jobs import JOBS
 from order import Unordered, durable
 from pressure import Pressure
 
-# What the system may say to a call, and the words the message then has.
-SAYS = {
+# Text of the error message for each error of a call.
+MESSAGES = {
     "ENOSPC": "No space left on device",
     "EDQUOT": "Disk quota exceeded",
     "EIO": "Input/output error",
@@ -38,7 +38,7 @@ SAYS = {
     "EROFS": "Read-only file system",
     "ENOSYS": "Function not implemented",
 }
-# What no run may stumble over: the call is made again, or the same is done in another way.
+# Errors that a run must survive: it repeats the call, or uses another one.
 HARMLESS = ("EINTR", "EXDEV", "EINVAL", "EOPNOTSUPP", "ENODEV", "ENOMEM")
 ROOM = ("ENOSPC", "EDQUOT", "EIO")
 FAULTS = {
@@ -64,7 +64,7 @@ class Crash(Pressure):
         return items if len(items) <= most else self.rng.sample(items, most)
 
     def each(self, job, cases, work):
-        """`work` on every case, in as many places as there are processors. Returns the results in no order."""
+        """Runs `work` on every case, in one place per processor. Returns the results unsorted."""
         places = queue.Queue()
         for place in job.places(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()):
             places.put(place)
@@ -74,7 +74,7 @@ class Crash(Pressure):
             try:
                 return work(place, *case)
             except Broken as broken:
-                raise Broken(f"{broken}\n    again: {place.command}") from broken
+                raise Broken(f"{broken}\n    repeat: {place.command}") from broken
             finally:
                 places.put(place)
 
@@ -85,32 +85,32 @@ class Crash(Pressure):
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def say(self, line):
+    def report(self, line):
         self.figures.append(line)
         print(line, flush=True)
 
-    # Every call of the phase that writes, made to fail.
+    # Every call of the writing phase fails.
 
     def faults(self):
-        """Each kind of call has its errors; each call of the phase is made to fail with each of its kind."""
+        """Each call of the phase fails with each error of its kind."""
         for job in self.jobs:
             calls, first, last = job.calls()
             cases = []
             for call in calls[first : last + 1]:
-                # The standard library takes it for impossible that a directory cannot be closed, and so do we.
+                # The standard library assumes that closing a directory cannot fail.
                 errors = () if call.name == "close" and call.is_directory else FAULTS.get(call.kind, ())
                 for error in errors:
                     cases.append((call, f"error={error}"))
                 if call.name in ("write", "copy_file_range", "pread64"):
-                    cases.append((call, "retval=0"))  # nothing moved, no error: an end of file, a full device
-            # One copy is like the next; everything else is tried in full.
+                    cases.append((call, "retval=0"))  # no bytes and no error: an end of file, a full device
+            # Copies are alike, so a sample is enough; all other calls are tested.
             some = [c for c in cases if c[0].name not in ("copy_file_range", "pread64")]
             same = [c for c in cases if c[0].name in ("copy_file_range", "pread64")]
             if not self.full:
                 some = self.sample(some, 120 if job.name == "build" else 80)
             some += self.sample(same, 400 if self.full else 30)
             ended = sum(self.each(job, some, self.fault))
-            self.say(f"{job.name}: {len(some)} injected faults ({ended} ended in an error, {len(some) - ended} did no harm)")
+            self.report(f"{job.name}: {len(some)} injected faults ({ended} ended with an error, {len(some) - ended} without effect)")
 
     def fault(self, job, call, what):
         job.reset()
@@ -119,7 +119,7 @@ class Crash(Pressure):
         where = f"{job.name} with {what} at {call}"
         try:
             removing = call.name in REMOVES
-            # The report comes after the target has its name.
+            # The report is printed after the target is complete.
             job.promises(outcome, before, done_is_fine=bool(call.printed), left_is_fine=removing)
             self.words(outcome, call, what, job.takes_room)
             if removing or outcome.code != 0:
@@ -130,11 +130,11 @@ class Crash(Pressure):
 
     @staticmethod
     def words(outcome, call, what, takes_room):
-        """Whether the message says what a user has to know."""
+        """Checks that the message names the cause and the file."""
         error = what.partition("=")[2]
         if error in HARMLESS and outcome.code != 0:
-            raise Broken(f"exit {outcome.code} after {error}\n{outcome.said}")
-        # What the lock of a repair says is for a message only, and may fail.
+            raise Broken(f"exit {outcome.code} after {error}\n{outcome.output}")
+        # The text in the lock of a repair is only for a message, so writing it may fail.
         written = call.kind in WRITES and not call.printed and not call.text.split(">")[0].endswith("/lock")
         if outcome.code == 0:
             if what.startswith("error=") and written and error not in HARMLESS:
@@ -142,26 +142,26 @@ class Crash(Pressure):
             return
         wanted = ["error:"]
         if what.startswith("error="):
-            wanted.append(SAYS[error])
+            wanted.append(MESSAGES[error])
             if written and takes_room and error in ("ENOSPC", "EDQUOT", "EFBIG"):
                 wanted.append("need ")
             if written and takes_room and error in ("ENOSPC", "EDQUOT"):
                 wanted.append("have ")
-        said = outcome.said
-        missing = [word for word in wanted if word not in said]
-        if not call.printed and not any(Path(p).name in said for p in call.paths):
+        output = outcome.output
+        missing = [word for word in wanted if word not in output]
+        if not call.printed and not any(Path(p).name in output for p in call.paths):
             missing.append(f"one of {call.paths}")
         if missing:
-            raise Broken(f"the message lacks {missing}\n{said}")
+            raise Broken(f"the message lacks {missing}\n{output}")
 
-    # Killed.
+    # Kills.
 
     def kills(self):
-        """SIGKILL on entering each call of the phase that writes, and at random moments."""
+        """SIGKILL on entry to each call of the writing phase, and at random moments."""
         for job in self.jobs:
             calls, first, last = job.calls()
             phase = calls[first : min(last + 30, len(calls))]
-            # Between two changes the disk looks the same: the call after a change stands for all until the next.
+            # The disk does not change between two changing calls, so one call after each is enough.
             after = [b for a, b in zip(phase, phase[1:], strict=False) if a.changes]
             must = list({(c.name, c.nth): c for c in [*[c for c in phase if c.changes], *after]}.values())
             rest = [c for c in phase if not c.changes]
@@ -173,7 +173,7 @@ class Crash(Pressure):
             at_random = Counter(self.each(job, moments, self.kill_after))
             for how, states in (("at calls", at_calls), ("at random moments", at_random)):
                 counts = ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
-                self.say(f"{job.name}: {states.total()} SIGKILLs {how} (the target was then: {counts})")
+                self.report(f"{job.name}: {states.total()} SIGKILLs {how} (states of the target: {counts})")
 
     def kill(self, job, call):
         job.reset()
@@ -181,7 +181,7 @@ class Crash(Pressure):
         outcome = job.inject(call, "signal=KILL")
         try:
             if outcome.code != -signal.SIGKILL:
-                raise Broken(f"was not killed: exit {outcome.code}\n{outcome.said}")
+                raise Broken(f"was not killed: exit {outcome.code}\n{outcome.output}")
             return self.after_kill(job, before)
         except Broken as broken:
             raise Broken(f"{job.name} killed at {call}: {broken}") from broken
@@ -199,15 +199,15 @@ class Crash(Pressure):
     @staticmethod
     def after_kill(job, before):
         if job.inputs() != before:
-            raise Broken("an input was touched")
+            raise Broken("an input was changed")
         state = job.state()
         job.recovers()
         return state
 
-    # Asked to stop.
+    # Signals.
 
     def signals(self):
-        """SIGINT, SIGTERM and SIGHUP on entering a call: 128 + N and nothing left, or all was done already."""
+        """SIGINT, SIGTERM and SIGHUP on entry to a call: exit code 128 + N without remains, or a complete target."""
         for job in self.jobs:
             calls, first, last = job.calls()
             phase = calls[first : last + 1]
@@ -220,7 +220,7 @@ class Crash(Pressure):
             job.promises(ignored, before)
             job.reset()
             self.nohup(job, changes[len(changes) // 2])
-            self.say(f"{job.name}: {len(chosen)} signals INT, TERM, HUP ({stopped} stopped it, the others came too late)")
+            self.report(f"{job.name}: {len(chosen)} signals INT, TERM, HUP ({stopped} stopped the run, the others arrived too late)")
 
     def interrupt(self, job, call, name):
         job.reset()
@@ -231,8 +231,8 @@ class Crash(Pressure):
             if outcome.code == 0:
                 return 0
             want = 128 + getattr(signal, f"SIG{name}")
-            if outcome.code != want or "interrupted" not in outcome.said:
-                raise Broken(f"exit {outcome.code}, not {want}\n{outcome.said}")
+            if outcome.code != want or "interrupted" not in outcome.output:
+                raise Broken(f"exit {outcome.code}, not {want}\n{outcome.output}")
             job.recovers()
             return 1
         except Broken as broken:
@@ -240,24 +240,24 @@ class Crash(Pressure):
 
     @staticmethod
     def nohup(job, call):
-        """A run that was started to ignore SIGHUP goes on."""
+        """A run that ignores SIGHUP continues."""
         process, pid = stopped_at(job, call, ["sh", "-c", 'trap "" HUP; exec "$@"', "sh", *job.argv()])
         outcome = go_on(process, pid, signal.SIGHUP)
         if outcome.code != 0 or job.state() != "complete":
-            raise Broken(f"SIGHUP ended a run under nohup: exit {outcome.code}\n{outcome.said}")
+            raise Broken(f"SIGHUP ended a run under nohup: exit {outcome.code}\n{outcome.output}")
         job.reset()
 
-    # The order in which things are made durable.
+    # The order of syncs.
 
     def order(self):
-        """Bytes before names, names before the end; see order.py."""
+        """Bytes are synced before names, and names before the end; see order.py."""
         for job in self.jobs:
             job.reset()
             outcome = job.strace("-y", "-s", "0")
             facts = durable(outcome.log, job.place)
             if not facts["names"] or facts["names"] != facts["synced"]:
                 raise Broken(f"{job.name}: {facts}")
-            self.say(f"{job.name}: {facts['files']} files were synced before they got {facts['names']} names, and those after")
+            self.report(f"{job.name}: {facts['files']} files were synced before they got {facts['names']} names, and the names afterwards")
             job.reset()
 
 
@@ -266,7 +266,7 @@ PARTS = ["faults", "kills", "signals", "limits", "order", "changes", "rounds", "
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--full", action="store_true", help="every call, and the counts of a release")
+    parser.add_argument("--full", action="store_true", help="test every call, with the counts of a release")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--job", action="append", choices=[job.name for job in JOBS], help="only these kinds of run")
     parser.add_argument("part", nargs="*", metavar="PART", help=", ".join(PARTS))
@@ -287,7 +287,7 @@ def main():
         print(f"FAILED {broken}")
         for job in jobs:
             if job.command:
-                print(f"    again: {job.command}")
+                print(f"    repeat: {job.command}")
         print(f"    kept: {place}\n{passed} passed, 1 failed")
         sys.exit(1)
     shutil.rmtree(place)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What `expect` says of recorded configs against what the class had. Needs neither torch nor transformers.
+"""Output of `expect` for recorded configs, compared with the recorded classes. Needs neither torch nor transformers.
 
     derived.py DIRECTORY      with sample.jsonl and omitted-keys.jsonl
 
-A record is a class, its config.json, the version of transformers, and what the class built from that config has: names
-and shapes, ties, buffers, patterns it does not report, conversions. Ends with a line per class that is not exact.
+A record contains a class, its config.json, the version of transformers, and the facts of the class built from that config:
+names and shapes, ties, buffers, ignored patterns, conversions. The script ends with one line per class that differs.
 """
 
 import json
@@ -28,9 +28,9 @@ def records(directory):
     return out
 
 
-def answers(version, asked):
+def answers(version, entries):
     with tempfile.NamedTemporaryFile("w", suffix=".jsonl") as file:
-        for _, record in asked:
+        for _, record in entries:
             file.write(json.dumps({"config": record["config"], "class": record["class"]}) + "\n")
         file.flush()
         _, out, _ = doctor("expect", "--for", f"transformers=={version}", "--output-format", "jsonl", f"@{file.name}")
@@ -38,16 +38,16 @@ def answers(version, asked):
 
 
 def facts(record):
-    """What is recorded, in the form of the answer; a file of records need not have all of it."""
+    """The recorded facts, in the form of the answer; a file of records may omit some."""
     yield "tensors", {name: shape for name, (_, shape) in record["state_dict"].items()}, lambda a: a["tensors"]
-    if not record.get("load_assumed"):  # those were never built: their buffers are not recorded
+    if not record.get("load_assumed"):  # never built, so without recorded buffers
         yield "buffers", sorted(record["non_persistent_buffers"]), lambda a: sorted(a["buffers"])
     yield "base_model_prefix", record["base_model_prefix"], lambda a: a["base_model_prefix"]
     if "tied" in record:
         yield "tied", sorted(map(sorted, record["tied"])), lambda a: sorted(map(sorted, a["tied"]))
-    for recorded, said in PATTERNS.items():
+    for recorded, key in PATTERNS.items():
         if recorded in record:
-            yield said, sorted(record[recorded]), lambda a, said=said: sorted(a[said])
+            yield key, sorted(record[recorded]), lambda a, key=key: sorted(a[key])
     if record.get("conversions") is not None:
         yield "conversions", list(map(conversion, record["conversions"])), lambda a: list(map(conversion, a["conversions"]))
 
@@ -72,14 +72,14 @@ def main():
     if len(sys.argv) != 2:
         sys.exit(__doc__)
     tally, wrong, total = Tally(), defaultdict(set), defaultdict(int)
-    for version, asked in sorted(records(sys.argv[1]).items()):
-        said = answers(version, asked)
-        tally.equal(len(said), len(asked), f"answers under {version}")
-        for (where, record), answer in zip(asked, said):
+    for version, entries in sorted(records(sys.argv[1]).items()):
+        results = answers(version, entries)
+        tally.equal(len(results), len(entries), f"answers under {version}")
+        for (where, record), answer in zip(entries, results):
             name = f"{record['class']} {version}"
             total[name] += 1
             if "no architecture is known" in answer.get("error", ""):
-                wrong[name].add("not known")
+                wrong[name].add("unknown")
                 continue
             if "error" in answer:
                 tally.expect(False, f"{where} {name}", answer["error"])

@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
 """Configs as a hub has them, family by family: what `expect` says against what the class itself has.
 
-    families.py FOLDER... [--classes N] [--seed S] [--list]
+    families.py FOLDER... [--classes N] [--seed S] [--list] [--save]
 
 Each FOLDER has one version of transformers, for the Python that runs this. Of the classes shipped for it N are drawn. Each is
 given configs that say keys by another name, alone and beside the key; keys that only the source asks for; files without
 what is computed; and files that another of the versions saved. The class is built without its weights, and its tensors,
 ties and buffers are those that `expect` foresees, or `expect` says that it does not know. Where it is neither, it is wrong.
+
+`--save` adds the configs of classes that are wrong to the cache of the derivation, as draws of the seed `found`:
+`derive_architectures.py verify --seeds a,found` then names the corner, or drops the class.
 """
 
 import argparse
@@ -68,12 +71,22 @@ def run(folder, out, seed, names, others=None):
     return [json.loads(line) for line in Path(out).read_text().splitlines()]
 
 
+def keep(version, name, rows):
+    """Adds records to those that the derivation verifies the class on."""
+    from derive import store
+    from derive.output import write_json
+
+    path = Path(os.environ["DERIVE_CACHE"]) / version / "unseen" / "found" / f"{name}.json.gz"
+    write_json(path, (store.read(path) if path.exists() else []) + rows)
+
+
 def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("folder", nargs="+")
     p.add_argument("--classes", type=int, default=24)
     p.add_argument("--seed", type=int, default=random.randrange(10**6))
     p.add_argument("--list", action="store_true", help="say of each wrong one how it is")
+    p.add_argument("--save", action="store_true", help="keep what was wrong for the next verification (DERIVE_CACHE)")
     p.add_argument("--worker", help=argparse.SUPPRESS)
     p.add_argument("--names", help=argparse.SUPPRESS)
     p.add_argument("--others", default="{}", help=argparse.SUPPRESS)
@@ -106,12 +119,18 @@ def main():
         for version, rows in records.items():
             asked = [(each["class"], r) for each in rows for r in each["rows"]]
             answers = program.expect(None, version, [(name, r["config"]) for name, r in asked])
+            wrong = set()
             for (name, r), answer in zip(asked, answers):
                 said = judged(r, answer)
                 what = said if said in ("exact", "not predicted", "raises", "builds") else "wrong"
                 counts[version, family(r["kind"]), what] += 1
-                if a.list and what == "wrong":
-                    print(f"{version} {name} {r['kind']}: {said}"[:220])
+                if what == "wrong":
+                    wrong.add(name)
+                    if a.list:
+                        print(f"{version} {name} {r['kind']}: {said}"[:220])
+            if a.save:
+                for name in wrong:
+                    keep(version, name, [r for n, r in asked if n == name])
     for version in folders:
         for name in ("aliases", "getattr keys", "dropped derived keys", "files of another version", "others"):
             each = {what: counts[version, name, what] for what in ("exact", "not predicted", "wrong", "raises", "builds")}

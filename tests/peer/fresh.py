@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Predicted load reports against loads made on the spot, of classes and configs that no other test has seen.
+"""Predicted load reports, compared with new loads of classes and configs that no other test uses.
 
     fresh.py RECORDER FOLDER... [--classes N] [--seed S]
 
 Each FOLDER has one version of transformers, for the Python that runs this. RECORDER is a script that writes, with `--out
-FILE.jsonl.gz --only REGEX --seed S`, a record for each class, as recorded.py reads them. The classes are drawn from those
-shipped for that version; the seed, printed first, says which, and the configs and changes made of them.
+FILE.jsonl.gz --only REGEX --seed S`, a record for each class in the format of recorded.py. The classes are drawn from those
+shipped for that version. The seed, printed first, determines the classes, their configs and the changes.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from derive.table import provenance  # noqa: E402
 
 
 def record(recorder, folder, names, seed, work):
-    """A file of records of these classes, made by the version in that folder."""
+    """Records of these classes, written by the version in that folder."""
     out = Path(work) / f"{re.sub('[^A-Za-z0-9]', '-', folder)}.jsonl.gz"
     only = f"^(?:{'|'.join(map(re.escape, names))})$"
     command = [sys.executable, recorder, "--out", out, "--only", only, "--seed", str(seed), "--n", "1", "--n-other", "1", "--mutations", "5"]
@@ -55,8 +55,8 @@ def main():
 
     def judge(case, entry):
         what, each, _, load = case
-        told, why = agreement(each, entry, load) or (False, "no prediction")
-        shares.count(what, each, told, why)
+        agrees, why = agreement(each, entry, load) or (False, "no prediction")
+        shares.count(what, each, agrees, why)
 
     shipped, _ = provenance()
     with workplace() as work:
@@ -64,7 +64,7 @@ def main():
             version = version_in(folder)
             names = random.Random(a.seed).sample(sorted(shipped[version]), a.classes)
             records = list(read(record(a.recorder, folder, names, a.seed, work)))
-            # Some classes are in no mapping that the recorder walks.
+            # Some classes are in none of the mappings that the recorder uses.
             print(f"{version}: {len(records)} of {len(names)} classes recorded")
             tally.expect(len(records) >= 0.7 * len(names), f"{version}: too few records")
             hold((load for where, each in records for load in loads(where, each)), judge)

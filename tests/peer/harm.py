@@ -1,6 +1,6 @@
-"""What crash.py does harm with: a place with donors and a target, the program under strace, and the promises.
+"""Tools of crash.py: a directory with donors and a target, the program under strace, and the invariants of a run.
 
-Linux only. strace makes the N-th call of a kind fail, or sends a signal there, without a change to the program.
+Linux only. strace makes the N-th call of a kind fail, or sends a signal at it; the program itself is not modified.
 """
 
 import contextlib
@@ -15,10 +15,10 @@ from pathlib import Path
 
 PROGRAM = os.environ.get("CKPT_DOCTOR", "ckpt-doctor")
 LINE = re.compile(r"(\d+) +(\w+)\((.*)")
-# What the kernel logs of a call that another thread cut in two.
+# Log line of a call that another thread interrupted.
 RESUMED = re.compile(r"(\d+) +<\.\.\. (\w+) resumed>")
 RESULT = re.compile(r"\) += (-?\d+)[^=]*$")
-# Opens that the dynamic linker and the runtime do are no business of ours: everything before this call.
+# Calls that change files. Earlier calls belong to the dynamic linker and the runtime.
 CHANGES = {
     "mkdir", "mkdirat", "rename", "renameat", "renameat2", "link", "linkat", "symlink", "symlinkat", "unlink", "unlinkat",
     "rmdir", "write", "pwrite64", "writev", "copy_file_range", "sendfile", "splice", "ftruncate", "fallocate", "fsync",
@@ -27,11 +27,11 @@ CHANGES = {
 
 
 class Broken(Exception):
-    """A promise that was not kept."""
+    """A violated invariant."""
 
 
 class Call:
-    """The N-th call of its name in a run."""
+    """The N-th call of this name in a run."""
 
     def __init__(self, name, nth, text):
         self.name, self.nth, self.text = name, nth, text
@@ -44,7 +44,7 @@ class Call:
 
     @property
     def kind(self):
-        """Its name, or what it does where that matters more."""
+        """The name of the call, or its effect if that matters more."""
         if self.creates:
             return "creating"
         return "mapping" if self.name == "mmap" and "safetensors" in self.text else self.name
@@ -55,12 +55,12 @@ class Call:
 
     @property
     def paths(self):
-        """Paths in the arguments: given ones, and those that strace shows for descriptors."""
+        """Paths in the arguments, and those that strace shows for descriptors."""
         return re.findall(r'(?:"|\d<)(/[^">]*)', self.text)
 
     @property
     def is_directory(self):
-        """As far as names tell: none of ours has a suffix."""
+        """By the name: directories in these tests have no suffix."""
         return bool(self.paths) and not Path(self.paths[-1]).suffix.strip(".0123456789") or self.paths[-1].endswith(".partial")
 
     @property
@@ -72,7 +72,7 @@ class Call:
 
 
 def tree(directory):
-    """What a directory holds, to the byte: name to mode and content."""
+    """Content of a directory: mode and bytes by name."""
     found = {}
     for path in sorted(Path(directory).rglob("*")):
         name = str(path.relative_to(directory))
@@ -87,7 +87,7 @@ def tree(directory):
 
 
 def identity(directory):
-    """Which files there are and which they are. A write would show in the change time, which nobody can set."""
+    """Identity of each file. A write changes the change time, which cannot be set back."""
     found = {}
     for path in sorted([directory, *Path(directory).rglob("*")]):
         s = path.lstat()
@@ -96,18 +96,18 @@ def identity(directory):
 
 
 class Outcome:
-    def __init__(self, code, said, log=""):
-        self.code, self.said, self.log = code, said, log
+    def __init__(self, code, output, log=""):
+        self.code, self.output, self.log = code, output, log
 
 
 class Job:
-    """One kind of run, in a place of its own."""
+    """One kind of run, in its own directory."""
 
     name = ""
     takes_room = True
     husk = frozenset()  # may stay where removing failed: empty, and used by the next run
-    blocks_first = 1  # taken before it asks for room: the marker
-    blocks_more = 0  # asked for besides the files
+    blocks_first = 1  # used before the check for free space: the marker
+    blocks_more = 0  # needed in addition to the files
 
     def __init__(self, place):
         self.place = Path(place)
@@ -119,11 +119,11 @@ class Job:
         self.measure()
 
     def measure(self):
-        """What a run comes to that nobody disturbs."""
+        """Records the result of an undisturbed run."""
         self.reset()
         first = self.run()
         if first.code != 0:
-            raise Broken(f"{self.name} undisturbed: exit {first.code}\n{first.said}")
+            raise Broken(f"{self.name} undisturbed: exit {first.code}\n{first.output}")
         self.complete = self.target()
         self.sizes = self.written()
         if self.left_over():
@@ -131,32 +131,32 @@ class Job:
         self.reset()
 
     def places(self, count):
-        """This one, and more of its kind beside it."""
+        """This place, and further ones of the same kind beside it."""
         while len(self.twins) + 1 < count:
             self.twins.append(type(self)(f"{self.place}-{len(self.twins) + 2}"))
         return [self, *self.twins][:count]
 
-    # The kinds say what follows.
+    # Overridden by the kinds.
 
     def lay(self):
-        """Puts what the run starts from."""
+        """Creates the initial state."""
 
     def reset(self):
-        """Makes the target what it was before a run."""
+        """Restores the target to its state before a run."""
 
     def argv(self):
         raise NotImplementedError
 
     def target(self):
-        """The target as it is, in a form to compare."""
+        """The state of the target, for comparison."""
         raise NotImplementedError
 
     def left_over(self):
-        """Names that are neither input nor target."""
+        """Names of files that belong neither to the inputs nor to the target."""
         raise NotImplementedError
 
     def inputs(self):
-        """What no run may touch."""
+        """Files that no run may change."""
         raise NotImplementedError
 
     def written(self):
@@ -164,30 +164,30 @@ class Job:
         raise NotImplementedError
 
     def held(self, changes):
-        """Those of the calls at which the lock is held and says by whom."""
+        """The calls during which the run holds the signed lock."""
         raise NotImplementedError
 
     def again(self):
-        """Makes way for a run after one that came to its end."""
+        """Prepares for another run after a finished one."""
         self.reset()
 
-    # The rest is common.
+    # Shared by all kinds.
 
     def state(self):
-        """`old` or `complete`; what is neither is half."""
+        """`old` or `complete`; any other state is incomplete."""
         now = self.target()
         if now == self.complete:
             return "complete"
         if now == self.old:
             return "old"
-        raise Broken(f"the target is half: {describe(now, self.complete)}")
+        raise Broken(f"the target is incomplete: {describe(now, self.complete)}")
 
     def run(self, **options):
         done = subprocess.run(self.argv(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
         return Outcome(done.returncode, done.stdout)
 
     def strace(self, *options, argv=None, **more):
-        """Runs under strace; the log is what the options asked for."""
+        """Runs under strace; the options select the log."""
         log = self.place / "strace.log"
         command = ["strace", "-f", "-qq", "-o", str(log), *options, "--", *(argv or self.argv())]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **more)
@@ -197,18 +197,18 @@ class Job:
         return outcome
 
     def inject(self, call, what):
-        """One run in which `what` happens at `call`; says whether it did."""
+        """One run with `what` injected at `call`; fails if the injection did not happen."""
         outcome = self.strace("-e", f"trace={call.name}", "-e", f"inject={call.name}:{what}:when={call.nth}")
         if "signal=" not in what and "(INJECTED)" not in outcome.log:
-            raise Broken(f"strace injected nothing at {call}: the program does not do the same twice")
+            raise Broken(f"strace injected nothing at {call}: the calls of two runs differ")
         return outcome
 
     def calls(self):
-        """All calls of an undisturbed run, and where those that write begin and end."""
-        self.reset()  # what the harm before left is not to be found repaired
+        """All calls of an undisturbed run, with the range of the writing phase."""
+        self.reset()  # removes remains of earlier tests
         outcome = self.strace("-y", "-s", "8")
         if outcome.code != 0:
-            raise Broken(f"{self.name} under strace: exit {outcome.code}\n{outcome.said}")
+            raise Broken(f"{self.name} under strace: exit {outcome.code}\n{outcome.output}")
         self.reset()
         seen, calls, processes = {}, [], set()
         for line in outcome.log.splitlines():
@@ -218,13 +218,13 @@ class Job:
                 seen[found[2]] = seen.get(found[2], 0) + 1
                 calls.append(Call(found[2], seen[found[2]], found[3]))
         if len(processes) != 1 and not os.environ.get("RELAX"):
-            raise Broken("the program has threads, and strace counts calls by thread: teach this script which one writes")
+            raise Broken("the program has several threads, but strace counts calls by thread; select the writing one here")
         ours = [i for i, call in enumerate(calls) if call.changes and not call.printed]
         return calls, ours[0], ours[-1]
 
     @contextlib.contextmanager
     def disk(self, options):
-        """A disk of its own for what it writes."""
+        """Mounts a separate disk for the output."""
         subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", str(self.work)], check=True)
         try:
             self.reset()
@@ -233,38 +233,38 @@ class Job:
             subprocess.run(["umount", "--lazy", str(self.work)], check=True)
 
     def promises(self, outcome, before, done_is_fine=True, left_is_fine=False):
-        """What holds after any run that came to an end by itself."""
+        """Checks the invariants after a run that ended by itself."""
         if self.inputs() != before:
-            raise Broken("an input was touched")
+            raise Broken("an input was changed")
         state = self.state()
         if outcome.code == 0 and state != "complete":
-            raise Broken("exit 0, and the target is not complete")
+            raise Broken("exit 0, but the target is not complete")
         if outcome.code < 0 or outcome.code in (101, 134, 139):
-            raise Broken(f"ended by a signal or a panic: {outcome.code}\n{outcome.said}")
-        if outcome.code != 0 and state == "complete" and not done_is_fine and "is not finished" not in outcome.said:
-            raise Broken(f"exit {outcome.code}, and yet the target is there\n{outcome.said}")
-        if state == "pending" and "is not finished" not in outcome.said:
-            raise Broken(f"half done, and the message does not say so\n{outcome.said}")
-        if set(self.left_over()) - self.husk and not left_is_fine and "is not finished" not in outcome.said:
-            raise Broken(f"left behind: {self.left_over()}\n{outcome.said}")
+            raise Broken(f"ended by a signal or a panic: {outcome.code}\n{outcome.output}")
+        if outcome.code != 0 and state == "complete" and not done_is_fine and "is incomplete" not in outcome.output:
+            raise Broken(f"exit {outcome.code}, but the target exists\n{outcome.output}")
+        if state == "pending" and "is incomplete" not in outcome.output:
+            raise Broken(f"incomplete, but the message does not state it\n{outcome.output}")
+        if set(self.left_over()) - self.husk and not left_is_fine and "is incomplete" not in outcome.output:
+            raise Broken(f"remains: {self.left_over()}\n{outcome.output}")
         return state
 
     def recovers(self):
-        """The next run does all its work, whatever the last one left."""
+        """Checks that the next run completes after any remains of the last one."""
         if self.state() == "complete":
             self.again()
         before = self.inputs()
         outcome = self.run()
         if outcome.code != 0 or self.state() != "complete" or self.left_over():
-            raise Broken(f"the next run: exit {outcome.code}, {self.state()}, left {self.left_over()}\n{outcome.said}")
+            raise Broken(f"the next run: exit {outcome.code}, {self.state()}, left {self.left_over()}\n{outcome.output}")
         if self.inputs() != before:
-            raise Broken("the next run touched an input")
+            raise Broken("the next run changed an input")
         self.reset()
 
 
 def describe(now, complete):
     if now is None or complete is None:
-        return "there where it should not be" if now else "not there"
+        return "exists, but should not" if now else "missing"
     missing = sorted(complete.keys() - now.keys())
     extra = sorted(now.keys() - complete.keys())
     other = sorted(n for n in now.keys() & complete.keys() if now[n] != complete[n])
@@ -272,9 +272,9 @@ def describe(now, complete):
 
 
 def stopped_at(job, call, argv=None):
-    """Starts a run that stops itself at a call, and waits until it has. Returns the process of strace and the run's id.
+    """Starts a run that stops at a call, and waits for the stop. Returns the process of strace and the id of the run.
 
-    Nothing here depends on speed: the program sleeps until it is sent SIGCONT.
+    The test does not depend on speed: the program sleeps until SIGCONT.
     """
     log = job.place / "stop.log"
     log.unlink(missing_ok=True)
@@ -290,9 +290,9 @@ def stopped_at(job, call, argv=None):
 
 
 def go_on(process, pid, with_signal=None):
-    """Lets it run to its end."""
+    """Continues a stopped run to its end."""
     if with_signal:
         os.kill(pid, with_signal)
     os.kill(pid, signal.SIGCONT)
-    said = process.communicate()[0]
-    return Outcome(process.returncode, said)
+    output = process.communicate()[0]
+    return Outcome(process.returncode, output)

@@ -1,4 +1,4 @@
-"""The kinds of run that crash.py harms: what they start from, and what tells old from complete."""
+"""The kinds of run in crash.py: their initial state, and the recognition of an old and a complete target."""
 
 import contextlib
 import json
@@ -12,7 +12,7 @@ from peer import DONORS, INDEX
 
 
 def without_format(shard):
-    """The shard with a header that has no `__metadata__`."""
+    """The shard with a header without `__metadata__`."""
     length = int.from_bytes(shard[:8], "little")
     header = json.loads(shard[8 : 8 + length])
     header.pop("__metadata__")
@@ -21,7 +21,7 @@ def without_format(shard):
 
 
 def damaged(directory):
-    """A checkpoint that lacks its index, and has a byte order mark and a shard without a format."""
+    """A checkpoint without an index, with a byte order mark and a shard without a format."""
     shutil.copytree(DONORS / "llava3d-tiny", directory)
     (directory / INDEX).unlink()
     tokenizer = directory / "tokenizer_config.json"
@@ -30,7 +30,7 @@ def damaged(directory):
     shard.write_bytes(without_format(shard.read_bytes()))
     tokenizer.chmod(0o600)
     shard.chmod(0o640)
-    with contextlib.suppress(OSError):  # only root can, and only where there are others
+    with contextlib.suppress(OSError):  # only root can change the owner, and only to an existing one
         os.chown(shard, 1234, 1234)
 
 
@@ -73,7 +73,7 @@ class Build(Job):
 
 
 class Repair(Job):
-    """`check --fix` of a checkpoint that lacks its index, and has a byte order mark and a shard without a format."""
+    """`check --fix` of a checkpoint without an index, with a byte order mark and a shard without a format."""
 
     name = "fix"
     blocks_first = 2  # .gitignore and the lock
@@ -107,7 +107,7 @@ class Repair(Job):
         return (self.kept / "journal.json").exists()
 
     def state(self):
-        """Files are renamed one by one, so a kill can leave some old and some new: then a journal says so."""
+        """Files are renamed one by one, so a kill can leave old and new files together with a journal."""
         try:
             return super().state()
         except Broken:
@@ -131,13 +131,13 @@ class Repair(Job):
         return changes[locked + 1 : -8]
 
     def again(self):
-        """A second run is no other than the first, but for there being nothing left to do."""
+        """A second run needs no preparation: it finds nothing to do."""
 
     def recovers(self):
         if self.state() == "pending":
             seen = subprocess.run([PROGRAM, "check", str(self.model)], capture_output=True, text=True)
             if seen.returncode != 1 or "FIL010" not in seen.stdout:
-                raise Broken(f"check does not say that a run was interrupted: exit {seen.returncode}\n{seen.stdout}")
+                raise Broken(f"check does not report the interrupted run: exit {seen.returncode}\n{seen.stdout}")
         super().recovers()
 
 
@@ -145,7 +145,7 @@ class Undo(Repair):
     """`undo` of that repair."""
 
     name = "undo"
-    takes_room = False  # but for its journal
+    takes_room = False  # except for its journal
     husk = frozenset({".gitignore", "lock", "undo"})
     race_codes = ([0, 2],)
 
@@ -179,7 +179,7 @@ class Overlay(Build):
         self.out = self.work / "repaired"
 
     def inputs(self):
-        """Files get a second name in the copy, and with it a new count of names and time of change."""
+        """Hard links in the copy change the link count and the change time of files."""
         return {path: (*s[:3], *s[4:5], *s[6:]) for path, s in identity(self.donors).items()}
 
     def written(self):

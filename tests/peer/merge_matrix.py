@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Every combination of the options of spatialvla-llava3d: what must stop stops, what must load loads.
+"""Every combination of the options of spatialvla-llava3d: each one stops at the expected seam, or loads.
 
     merge_matrix.py [VISION LANGUAGE [CODE]]
 
-The donors are the fixture's unless given; CODE is a directory to take SpatialVLA's Python modules from.
+The donors default to those of the fixtures; CODE is a directory with SpatialVLA's Python modules.
 """
 
 import itertools
@@ -31,7 +31,7 @@ MODULES = (
 
 
 def blame(choice):
-    """The options a refusal may name; none means that the merge must succeed."""
+    """The options that a refusal may name; without any, the merge must succeed."""
     found = []
     if choice["projector"] == "keep":
         found.append("projector")
@@ -51,7 +51,7 @@ def build(donors, out, settings):
 
 
 def faults_on_loading(directory):
-    """Open a merged directory the way a user does; what is wrong with it, in words."""
+    """Opens a merged directory as a user does; returns the problems."""
     import numpy
     import torch
     from PIL import Image
@@ -61,7 +61,7 @@ def faults_on_loading(directory):
     path, wrong = str(directory), []
     config = AutoConfig.from_pretrained(path, trust_remote_code=True)
     cls = get_class_from_dynamic_module(config.auto_map["AutoModel"], path)
-    # SpatialVLA's own from_pretrained cannot hand the loading report through.
+    # SpatialVLA's from_pretrained does not return the loading report.
     _, info = PreTrainedModel.from_pretrained.__func__(cls, path, config=config, output_loading_info=True)
     wrong += [f"{kind} {names[:3]} of {len(names)}" for kind, names in info.items() if names]
 
@@ -95,12 +95,12 @@ def faults_on_loading(directory):
     if not torch.isfinite(logits).all() or logits.shape[-1] != rows:
         wrong.append(f"logits: {list(logits.shape)}, finite: {bool(torch.isfinite(logits).all())}")
     if made.shape[1] <= inputs["input_ids"].shape[1]:
-        wrong.append("generate made nothing")
+        wrong.append("generate returned no tokens")
     return wrong
 
 
 def second_opinion(directory):
-    """The workplace's own loader script, where there is one."""
+    """Problems found by an independent loader script, if ../shared has one."""
     script = SHARED / "tools" / "load_merged.py"
     if not script.exists():
         return None
@@ -111,10 +111,10 @@ def second_opinion(directory):
 
 
 def judge(tally, what, out):
-    """A merge that was written: `check` is content, and so is the loader."""
+    """Checks and loads a written merge."""
     entries, code = check(out)
     verdict, findings = (next(iter(entries.values()))[key] for key in ("verdict", "findings"))
-    ok = tally.expect(code == 0 and verdict in ("clean", "info"), f"{what}: check says {verdict}, exit {code}",
+    ok = tally.expect(code == 0 and verdict in ("clean", "info"), f"{what}: verdict {verdict}, exit {code}",
                       json.dumps(findings)[:1500])
     try:
         wrong = faults_on_loading(out)
@@ -128,7 +128,7 @@ def judge(tally, what, out):
 
 
 def forwarded(tally, donors, work, out):
-    """alias=forward: no donor modules in the output, the classes come from an installed package."""
+    """alias=forward: the output has no donor modules, and the classes come from an installed package."""
     package = work / "site" / "spatialvla_here"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
@@ -155,20 +155,20 @@ def main():
             what = " ".join(f"{k}={v}" for k, v in choice.items())
             to_blame = blame(choice)
             code, stdout, stderr = build(donors, out, choice)
-            said = (stdout + stderr)[-1500:]
+            output = (stdout + stderr)[-1500:]
             if to_blame:
                 ok = tally.equal(code, 1, f"{what}: exit code")
-                ok &= tally.expect(not out.exists(), f"{what}: refused, and yet something was written")
+                ok &= tally.expect(not out.exists(), f"{what}: refused, but something was written")
                 ok &= tally.expect(any(f"{name}=" in stdout + stderr for name in to_blame),
-                                   f"{what}: the refusal names no setting of {to_blame}", said)
+                                   f"{what}: the refusal names no setting of {to_blame}", output)
                 result = "stops" if ok else "WRONG"
             else:
-                ok = tally.expect(code == 0, f"{what}: exit {code}", said) and judge(tally, what, out)
+                ok = tally.expect(code == 0, f"{what}: exit {code}", output) and judge(tally, what, out)
                 result = "loads" if ok else "WRONG"
             table.append((*values, result))
             shutil.rmtree(out, ignore_errors=True)
         forwarded(tally, donors, work, work / "forwarded")
-        tally.equal([p.name for p in work.iterdir() if p.name.startswith(".")], [], "left behind beside the outputs")
+        tally.equal([p.name for p in work.iterdir() if p.name.startswith(".")], [], "other files beside the outputs")
     widths = [max(map(len, column)) for column in zip(OPTIONS, *(row[:-1] for row in table))]
     for row in [(*OPTIONS, "result"), *table]:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 6))))

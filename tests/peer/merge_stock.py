@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Merge a PaliGemma and a Llama, both written by save_pretrained, and open the result in stock transformers."""
+"""Merges a PaliGemma and a Llama, both written by save_pretrained, and opens the result in stock transformers."""
 
 import json
 
@@ -52,7 +52,7 @@ def save_llama(path, work, width, tied):
 
 
 def compare_tensors(tally, what, vision, language, out, padded):
-    """Everything that is a donor's must be the donor's, byte for byte; grown matrices begin with the donor's rows."""
+    """Compares the tensors: copied ones are equal to the donor's, and grown matrices begin with the donor's rows."""
     from_vision = {k: t for k, t in read_tensors(vision).items() if not k.startswith("language_model.")}
     from_language = {f"language_model.{k}": t for k, t in read_tensors(language).items()}
     want, got = {**from_vision, **from_language}, read_tensors(out)
@@ -61,12 +61,12 @@ def compare_tensors(tally, what, vision, language, out, padded):
     for name in sorted(set(got) & set(want)):
         (dtype, shape, data), (want_dtype, want_shape, want_data) = got[name], want[name]
         if shape == want_shape:
-            same += tally.expect((dtype, data) == (want_dtype, want_data), f"{what}: {name} is not the donor's")
+            same += tally.expect((dtype, data) == (want_dtype, want_data), f"{what}: {name} differs from the donor")
         else:
             allowed = ("language_model.model.embed_tokens.weight", "language_model.lm_head.weight") + padded
             begins = dtype == want_dtype and shape[1:] == want_shape[1:] and data.startswith(want_data)
             grown += tally.expect(name in allowed and begins, f"{what}: {name} {want_shape} became {shape}")
-    print(f"{what}: {same} tensors are the donor's byte for byte, {grown} begin with the donor's rows")
+    print(f"{what}: {same} tensors are equal to the donor's, {grown} begin with the donor's rows")
 
 
 def open_stock(tally, what, language, out):
@@ -96,7 +96,7 @@ def open_stock(tally, what, language, out):
         made = model.generate(**inputs, max_new_tokens=3, do_sample=False)
     tally.expect(torch.isfinite(logits).all(), f"{what}: logits are not finite")
     tally.equal(logits.shape[-1], rows, f"{what}: width of the logits")
-    tally.expect(made.shape[1] > inputs["input_ids"].shape[1], f"{what}: generate made nothing")
+    tally.expect(made.shape[1] > inputs["input_ids"].shape[1], f"{what}: generate returned no tokens")
 
 
 def merge(vision, language, out, *settings):
@@ -131,18 +131,18 @@ def main():
             compare_tensors(tally, what, work / "paligemma", work / language, out, padded)
             open_stock(tally, what, work / language, out)
 
-        # A projector of one width in front of a language model of another: stop at the seam, write nothing.
+        # The widths of projector and language model differ: the merge must stop at the seam.
         out = work / "merged-seam"
         code, stdout, stderr = merge(work / "paligemma", work / "llama-wide", out)
-        said = stdout + stderr
+        output = stdout + stderr
         tally.equal(code, 1, "widths differ: exit code")
-        tally.expect(not out.exists(), "widths differ: something was written")
+        tally.expect(not out.exists(), "widths differ: a target was written")
         for word in ("multi_modal_projector.linear.weight", "64", "96", "projector=pad"):
-            tally.expect(word in said, f"widths differ: the message does not name {word}", said[-2000:])
+            tally.expect(word in output, f"widths differ: the message lacks {word}", output[-2000:])
         for path, data in before.items():
             tally.expect(path.read_bytes() == data, f"{path.name} of {path.parent.name} was changed")
         left = [p.name for p in work.iterdir() if p.name.startswith(".")]
-        tally.equal(left, [], "left behind beside the output")
+        tally.equal(left, [], "other files beside the output")
     tally.finish()
 
 

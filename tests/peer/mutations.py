@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""The predicted load report against the loader's own, on tiny checkpoints with one thing changed.
+"""Predicted load reports, compared with the loader's own, on tiny checkpoints with one change.
 
-For stock classes, and for SpatialVLA's through the fixture's modules: save, change the files, let `check` predict and
-from_pretrained report what is missing, unexpected and mismatched. Where the loader raises, `check` must have an error.
+For stock classes, and for SpatialVLA's classes from the fixture's modules: save a model and change its files, then compare
+the prediction of `check` with the missing, unexpected and mismatched keys of from_pretrained. If the loader raises, `check`
+must report an error.
 
-    mutations.py [SEED]        which tensors are changed depends on the seed (default 0)
+    mutations.py [SEED]        the seed (default 0) selects the changed tensors
 """
 
 import json
@@ -257,7 +258,7 @@ SHARDED = [index_other_shard, index_ghost, index_ghost_unknown, index_forgets, i
            no_metadata, stale_single_file]
 
 
-# What is mutated: name -> a function that saves it.
+# Models: name -> a function that saves the model.
 
 VISION = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=28,
               patch_size=14)
@@ -303,14 +304,14 @@ def stock():
 
 
 def loader_report(cls, directory):
-    """What the loader says: three sorted lists, or the exception."""
+    """The report of the loader: three sorted lists, or the exception."""
     from transformers import PreTrainedModel
 
     try:
-        # Not cls.from_pretrained: SpatialVLA's own does more after loading, which a broken model may not survive.
+        # SpatialVLA's own from_pretrained runs more code after loading, which may fail on a broken model.
         _, info = PreTrainedModel.from_pretrained.__func__(
             cls, str(directory), output_loading_info=True, ignore_mismatched_sizes=True)
-    except Exception as error:  # whatever it is, it did not load
+    except Exception as error:  # any exception counts as a failed load
         return f"{type(error).__name__}: {error}"
     return {
         "missing": sorted(info["missing_keys"]),
@@ -320,7 +321,7 @@ def loader_report(cls, directory):
 
 
 def prediction(entry, loader="4.47.0"):
-    """What `check` predicts for this loader; None when it does not know the class there."""
+    """The prediction of `check` for this loader; None if the class is unknown."""
     return next((load for load in entry["loads"] if load["loader"] == loader), None)
 
 
@@ -334,7 +335,7 @@ def predicted_report(entry, loader="4.47.0"):
 
 
 def differences(got, want):
-    """The entries that are in one list only, a few of each."""
+    """Entries of only one list, a few of each."""
     lines = []
     for kind in want:
         for sign, here, there in (("+", got, want), ("-", want, got)):
@@ -345,7 +346,7 @@ def differences(got, want):
 
 
 def compare(tally, name, cls, base, work, seed):
-    """All mutations of one checkpoint: written first, then one `check` over all of them, then the loader one by one."""
+    """Writes all mutations of one checkpoint, runs one `check` on all of them, and loads each one."""
     made = []
     for mutate in ANY + (SHARDED if read_index(base) else []):
         c = Checkpoint(base)
@@ -362,17 +363,17 @@ def compare(tally, name, cls, base, work, seed):
         if not tally.expect(entry, f"{what}: not in the report"):
             continue
         if isinstance(want, str):
-            raised += tally.expect(errors(entry), f"{what}: the loader raises, check finds no error", want[:300])
+            raised += tally.expect(errors(entry), f"{what}: the loader raises, but check finds no error", want[:300])
         else:
             got = predicted_report(entry)
             agreed += tally.expect(got == want, f"{what}: load report", differences(got, want))
             if kind == "unchanged":
                 tally.equal(errors(entry), [], f"{what}: errors")
-            told = json.dumps(prediction(entry)["silent"])
+            silent_keys = json.dumps(prediction(entry)["silent"])
             for key in silent:
-                tally.expect(json.dumps(key)[1:-1] in told, f"{what}: {key} is not listed as silent", told[:300])
+                tally.expect(json.dumps(key)[1:-1] in silent_keys, f"{what}: {key} is not listed as silent", silent_keys[:300])
         shutil.rmtree(out)
-    print(f"{name}: {agreed} reports agree, {raised} the loader refuses and check finds at fault", flush=True)
+    print(f"{name}: {agreed} reports agree, {raised} fail to load and have errors in check", flush=True)
 
 
 def main():
@@ -390,7 +391,7 @@ def main():
         fixture = DONORS / "spatialvla-tiny"
         cls = get_class_from_dynamic_module("modeling_spatialvla.SpatialVLAForConditionalGeneration", str(fixture))
         compare(tally, "spatialvla", cls, fixture, work, seed)
-        # No released transformers knows llava_llama, so there is nothing to compare with but a clean report.
+        # No released transformers has llava_llama, so the report must be clean.
         entry = next(iter(check(DONORS / "llava3d-tiny")[0].values()))
         want = {"missing": [], "unexpected": [], "mismatched": []}
         tally.equal(predicted_report(entry), want, "llava3d-tiny: load report")

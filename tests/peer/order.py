@@ -1,8 +1,7 @@
-"""Reads off a trace whether what gets its final name would outlive a power failure at any moment.
+"""Checks in a trace that files with their final names would survive a power failure at any moment.
 
-The model is that of POSIX: bytes are durable after fsync of their file, names after fsync of their directory. So a file
-must be synced before it is renamed or linked, a directory with all that is in it as well, and afterwards the directory
-that holds the new name.
+The model is that of POSIX: bytes are durable after fsync of their file, names after fsync of their directory. A file must be
+synced before it is renamed or linked, a directory together with its content, and afterwards the directory with the new name.
 """
 
 import re
@@ -14,7 +13,7 @@ STRING = re.compile(r'"((?:[^"\\]|\\.)*)"')
 
 
 class Unordered(Exception):
-    """A name was given before its bytes were safe."""
+    """A file got its name before its bytes were synced."""
 
 
 def parent(path):
@@ -22,7 +21,7 @@ def parent(path):
 
 
 class Disk:
-    """What is not yet durable."""
+    """Bytes and names that are not synced yet."""
 
     def __init__(self, place):
         self.place = str(place)
@@ -46,15 +45,15 @@ class Disk:
         self.names.pop(path, None)
         self.synced += len(self.given.pop(path, ()))
 
-    def give(self, old, new, moved):
-        """`old` becomes `new`, by a rename or a link."""
+    def give(self, old, new, renamed):
+        """Gives `old` the name `new`, by a rename or a link."""
         unsafe = self.below(self.bytes, old) + self.below(self.names, old)
         if unsafe:
             raise Unordered(f"{new} got its name before these were synced: {unsafe}")
         self.names_given += 1
         self.given.setdefault(parent(new), set()).add(new)
         self.make(new)
-        if moved:
+        if renamed:
             self.names.setdefault(parent(old), set()).add(old)
 
     def remove(self, path):

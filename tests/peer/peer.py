@@ -1,7 +1,7 @@
-"""What the peer scripts share. Standard library only: a script imports the loader it asks by itself.
+"""Functions shared by the peer scripts. Standard library only: each script imports its loader itself.
 
-A peer script holds the built binary, given by CKPT_DOCTOR, against a real loader. It prints what does not agree and, as
-its last line, `N passed, M failed`.
+A peer script compares the binary given by CKPT_DOCTOR with a real loader. It prints every difference and, as its last line,
+`N passed, M failed`.
 """
 
 import json
@@ -14,7 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 DONORS = ROOT / "fixtures" / "donors"
-SHARED = ROOT.parent / "shared"  # more material, where there is some
+SHARED = ROOT.parent / "shared"  # additional data, if it exists
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -22,7 +22,7 @@ os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
 
 
 def quiet():
-    """After the imports: no progress bars, and a loader that collects garbage after each shard need not walk torch."""
+    """Call after the imports: disables progress bars, and excludes torch from garbage collection after each shard."""
     import gc
     import warnings
 
@@ -35,7 +35,7 @@ def quiet():
 
 
 class Tally:
-    """Counts what agreed; says at once what did not."""
+    """Counts passed checks, and prints failed ones at once."""
 
     def __init__(self):
         self.passed = self.failed = 0
@@ -57,11 +57,11 @@ class Tally:
 
 
 class workplace:
-    """A directory that is removed afterwards; KEEP=1 leaves it and says where it is."""
+    """A temporary directory; KEEP=1 keeps it and prints its path."""
 
     def __enter__(self):
         self.path = Path(tempfile.mkdtemp(prefix="peer-"))
-        # transformers copies a checkpoint's modules here before it imports them.
+        # transformers copies the modules of a checkpoint here before importing them.
         os.environ["HF_MODULES_CACHE"] = str(self.path / "modules")
         return self.path
 
@@ -73,7 +73,7 @@ class workplace:
 
 
 def doctor(*arguments):
-    """Run the binary: exit code, stdout, stderr."""
+    """Runs the binary; returns exit code, stdout and stderr."""
     binary = os.environ.get("CKPT_DOCTOR")
     if not binary:
         sys.exit("CKPT_DOCTOR must name the built binary")
@@ -82,7 +82,7 @@ def doctor(*arguments):
 
 
 def check(*paths):
-    """`check` over directories: {path: its entry in the report}, exit code."""
+    """Runs `check` on directories; returns {path: entry of the report} and the exit code."""
     code, out, err = doctor("check", *paths, "--output-format", "json")
     try:
         report = json.loads(out)
@@ -95,7 +95,7 @@ def errors(entry):
     return [f"{f['code']} {f['message']}" for f in entry["findings"] if f["severity"] == "error"]
 
 
-# Checkpoints as plain data: {shard file: {tensor name: (dtype, shape, bytes)}} and an index, if there is one.
+# Checkpoints as plain data: {shard file: {tensor name: (dtype, shape, bytes)}} and an optional index.
 
 INDEX = "model.safetensors.index.json"
 WIDTH = {"C64": 8, "F64": 8, "I64": 8, "F32": 4, "I32": 4, "F16": 2, "BF16": 2, "I16": 2, "F8_E4M3": 1, "F8_E5M2": 1, "I8": 1, "U8": 1, "BOOL": 1}
@@ -127,7 +127,7 @@ def write_shard(path, tensors):
 
 
 def write_holes(path, tensors):
-    """A file with the header of `tensors`, name -> (dtype, shape), and no data written."""
+    """Writes a sparse file with a header for `tensors`, name -> (dtype, shape)."""
     header, at = {"__metadata__": {"format": "pt"}}, 0
     for name, (dtype, shape) in tensors.items():
         size = WIDTH[dtype]
@@ -147,7 +147,7 @@ def read_index(directory):
 
 
 def read_tensors(directory):
-    """Every stored tensor, whichever file it is in."""
+    """All stored tensors of all files."""
     return {
         name: tensor
         for path in sorted(Path(directory).glob("*.safetensors"))
@@ -156,7 +156,7 @@ def read_tensors(directory):
 
 
 def tiny_sentencepiece(directory, name, vocab_size, **ids):
-    """Train a small sentencepiece model and return its path."""
+    """Trains a small sentencepiece model and returns its path."""
     import random
 
     import sentencepiece

@@ -1,9 +1,9 @@
-"""The hooks under the real pre-commit, in a scratch git repository with a model directory.
+"""Runs the hooks under the real pre-commit, in a scratch git repository with a model directory.
 
     pre_commit.py SOURCE
 
-SOURCE is a copy of this project's files; it is made a git repository, which the `language: rust` hook is installed from.
-The program that the `language: system` hook finds is the one that CKPT_DOCTOR names.
+SOURCE is a copy of this project's files. The script turns it into a git repository, from which the `language: rust` hook is
+installed. The `language: system` hook runs the program given by CKPT_DOCTOR.
 """
 
 import json
@@ -21,10 +21,10 @@ GIT = ["git", "-c", "user.name=CI", "-c", "user.email=ci@example.invalid", "-c",
 
 def run(*command, cwd, ok=True):
     done = subprocess.run([str(c) for c in command], cwd=cwd, env=ENV, capture_output=True, text=True)
-    said = done.stdout + done.stderr
+    output = done.stdout + done.stderr
     if (done.returncode == 0) != ok:
-        sys.exit(f"{' '.join(map(str, command))}: exit {done.returncode}\n{said}")
-    return said
+        sys.exit(f"{' '.join(map(str, command))}: exit {done.returncode}\n{output}")
+    return output
 
 
 def git(*args, cwd, ok=True):
@@ -48,10 +48,10 @@ def configure(repo, source, rev, hook, args=()):
     run(sys.executable, "-m", "pre_commit", "install", cwd=repo)
 
 
-def expect(said, *words):
+def expect(output, *words):
     for word in words:
-        if word not in said:
-            sys.exit(f"not said: {word}\n{said}")
+        if word not in output:
+            sys.exit(f"missing in the output: {word}\n{output}")
 
 
 def main(files, room):
@@ -66,7 +66,7 @@ def main(files, room):
     shutil.copytree(files / "fixtures/donors/llava3d-tiny", model)
     repo.joinpath("package.json").write_text("{}\n")
     configure(repo, source, rev, "ckpt-doctor-system")
-    commit(repo, "a sound model, and a document that belongs to none")
+    commit(repo, "a sound model, and a document outside of models")
 
     index = model / "model.safetensors.index.json"
     sound = index.read_text()
@@ -77,27 +77,29 @@ def main(files, room):
     head = git("rev-parse", "HEAD", cwd=repo)
     expect(commit(repo, "broken", ok=False), "Failed", "error[", "model-00009-of-00009.safetensors")
     if git("rev-parse", "HEAD", cwd=repo) != head:
-        sys.exit("the broken commit was made")
-    if "--fix " in run(DOCTOR, "check", "--help", cwd=repo):
-        configure(repo, source, rev, "ckpt-doctor-system", ["--fix"])
-        expect(commit(repo, "broken", ok=False), "files were modified by this hook")
-        commit(repo, "repaired by the hook")
-        configure(repo, source, rev, "ckpt-doctor-system")
-        print("a broken index is repaired by --fix in the hook")
-    else:
-        index.write_text(sound)
+        sys.exit("the commit was accepted although the model is broken")
+    # A tensor under the wrong shard is what --fix repairs.
+    wrong = json.loads(sound)
+    shards = sorted(set(wrong["weight_map"].values()))
+    wrong["weight_map"][name] = next(shard for shard in shards if shard != wrong["weight_map"][name])
+    index.write_text(json.dumps(wrong, indent=2))
+    configure(repo, source, rev, "ckpt-doctor-system", ["--fix"])
+    expect(commit(repo, "wrong", ok=False), "files were modified by this hook", "fixed IDX008")
+    commit(repo, "repaired by the hook")
+    configure(repo, source, rev, "ckpt-doctor-system")
+    print("a wrong index is repaired by --fix in the hook")
     run("git", "checkout", "-q", "HEAD", "--", ".", cwd=repo)
-    print("a commit that breaks a model is refused")
+    print("a commit with a broken model is refused")
 
-    # One that deletes a shard: pre-commit passes no file that is gone, but the index changes along with it.
+    # A commit that deletes a shard: pre-commit passes no deleted file, but it passes the changed index.
     shard = sorted(model.glob("*.safetensors"))[0]
     kept = json.loads(index.read_text())
     shard.unlink()
     index.write_text(json.dumps(kept))
-    expect(commit(repo, "a shard less", ok=False), shard.name)
+    expect(commit(repo, "a deleted shard", ok=False), shard.name)
     git("checkout", "-q", "-f", "HEAD", cwd=repo)
 
-    # What GIT_LFS_SKIP_SMUDGE=1 leaves: pointers, which are as they should be where git-lfs is at work.
+    # Pointers, as left by GIT_LFS_SKIP_SMUDGE=1, are intended where git-lfs is installed.
     other = repo / "models" / "b"
     shutil.copytree(model, other)
     other.joinpath(".gitattributes").write_text("*.safetensors filter=lfs diff=lfs merge=lfs -text\n")
@@ -113,7 +115,7 @@ def main(files, room):
     run(sys.executable, "-m", "pre_commit", "run", "--all-files", cwd=repo)
     index.write_text(json.dumps(broken, indent=2))
     expect(commit(repo, "broken", ok=False), "Failed", "model-00009-of-00009.safetensors")
-    print("the hook that pre-commit builds says the same")
+    print("the hook that pre-commit builds reports the same")
 
 
 if __name__ == "__main__":

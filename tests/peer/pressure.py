@@ -1,4 +1,4 @@
-"""The parts of crash.py in which others do harm: limits and full disks, donors that change, a second run."""
+"""Parts of crash.py with external causes: limits and full disks, changing donors, a second run."""
 
 import os
 import resource
@@ -12,7 +12,7 @@ from harm import Broken, Outcome, go_on, stopped_at
 
 SIZES = 8
 
-# What a run does between having the lock and having said so in it.
+# Calls of a run between locking the file and signing it.
 LOCKING = {"ftruncate", "write", "pwrite64"}
 
 
@@ -48,7 +48,7 @@ def become_fifo(path):
 
 
 HARMS = {
-    "cut short": cut,
+    "truncated": cut,
     "emptied": lambda path: os.truncate(path, 0),
     "one byte more": append,
     "last byte changed": overwrite,
@@ -60,12 +60,12 @@ HARMS = {
 
 
 class Pressure:
-    """Expects of its heir the jobs, `full`, `rng`, `sample`, `each` and `say`."""
+    """Mixin: the class provides the jobs, `full`, `rng`, `sample`, `each` and `report`."""
 
     # Limits.
 
     def limits(self):
-        """A file size limit is a message, not a death by SIGXFSZ; a write cut short by one that is lifted goes on."""
+        """A file size limit gives a message instead of SIGXFSZ; a short write continues once the limit is lifted."""
         for job in (j for j in self.jobs if j.takes_room):
             sizes = sorted(size for size in job.sizes if size > 1000)
             limits = [size - 1 - self.rng.randrange(size // 2) for size in self.sample(sizes, SIZES)]
@@ -76,14 +76,14 @@ class Pressure:
                 job.command = f"ulimit -f (bytes {limit}): {' '.join(job.argv())}"
                 job.promises(outcome, before, done_is_fine=False)
                 for word in ("too large", "need ", f"may write {limit} (ulimit -f)"):
-                    if outcome.code == 0 or word not in outcome.said:
-                        raise Broken(f"limit {limit}: exit {outcome.code}, lacks {word!r}\n{outcome.said}")
+                    if outcome.code == 0 or word not in outcome.output:
+                        raise Broken(f"limit {limit}: exit {outcome.code}, lacks {word!r}\n{outcome.output}")
                 job.recovers()
             short = self.short_writes(job)
-            self.say(f"{job.name}: {len(limits)} file size limits refused, {short} writes cut short that went on")
+            self.report(f"{job.name}: {len(limits)} file size limits refused, {short} short writes continued")
 
     def short_writes(self, job):
-        """A limit in the middle of a write cuts it short; lifted while the program is stopped there, the rest follows."""
+        """A limit in the middle of a write makes it short. It is lifted while the program is stopped, and the write continues."""
         calls, first, last = job.calls()
         ends, cut = {}, []
         for call in calls[first : last + 1]:
@@ -91,7 +91,7 @@ class Pressure:
                 path = call.paths[-1]
                 begin = ends.get(path, 0)
                 ends[path] = begin + call.result
-                # Whichever write crosses the limit first is the one that is cut short.
+                # The first write that crosses the limit is the short one.
                 if call.result > 1 and begin + call.result // 2 >= max([0, *(e for p, e in ends.items() if p != path)]):
                     cut.append((call, begin + call.result // 2))
         chosen = self.sample(cut, 50 if self.full else 5)
@@ -102,15 +102,15 @@ class Pressure:
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
             outcome = go_on(process, pid)
             if outcome.code != 0:
-                raise Broken(f"a short {call} was not completed: exit {outcome.code}\n{outcome.said}")
+                raise Broken(f"a short {call} was not completed: exit {outcome.code}\n{outcome.output}")
             job.promises(outcome, before)
         job.reset()
         return len(chosen)
 
-    # Donors that change under the reader.
+    # Donors that change during the run.
 
     def changes(self):
-        """A donor is cut short, changed, replaced or removed while its tensors are read."""
+        """A donor is truncated, changed, replaced or removed while its tensors are read."""
         for job in (j for j in self.jobs if j.name == "build"):
             calls, first, last = job.calls()
             reads = [c for c in calls[first : last + 1] if c.name in ("copy_file_range", "pread64") and not c.creates]
@@ -123,7 +123,7 @@ class Pressure:
                 victim = being_read if i % 2 == 0 else self.rng.choice(others)
                 harm = list(HARMS.items())[0 if i % 4 < 2 else i % len(HARMS)]
                 self.change(job, call, victim, *harm)
-            self.say(f"{job.name}: {rounds} donors cut short, changed or removed under way")
+            self.report(f"{job.name}: {rounds} donors truncated, changed or removed during the run")
 
     @staticmethod
     def change(job, call, victim, what, harm):
@@ -136,9 +136,9 @@ class Pressure:
         outcome = go_on(process, pid)
         try:
             job.promises(outcome, after, done_is_fine=False)
-            for word in ("nothing was written", victim.name, "while it was being read"):
-                if outcome.code == 0 or word not in outcome.said:
-                    raise Broken(f"exit {outcome.code}, lacks {word!r}\n{outcome.said}")
+            for word in ("nothing was written", victim.name, "during the run"):
+                if outcome.code == 0 or word not in outcome.output:
+                    raise Broken(f"exit {outcome.code}, lacks {word!r}\n{outcome.output}")
         finally:
             if victim.is_dir():
                 victim.rmdir()
@@ -150,7 +150,7 @@ class Pressure:
     # Two runs at once.
 
     def rounds(self):
-        """One wins, the other says who holds the lock or what is there; the result is whole."""
+        """One run succeeds, the other names the process with the lock or the existing target; the result is complete."""
         for job in self.jobs:
             calls, first, last = job.calls()
             held = job.held([c for c in calls[first : last + 1] if c.changes])
@@ -159,7 +159,7 @@ class Pressure:
                 self.second_run(job, self.rng.choice(held))
             for _ in range(rounds):
                 self.race(job)
-            self.say(f"{job.name}: {rounds} rounds against a run that holds the lock, {rounds} races of two")
+            self.report(f"{job.name}: {rounds} rounds against a run that holds the lock, {rounds} races of two")
 
     @staticmethod
     def second_run(job, call):
@@ -168,12 +168,12 @@ class Pressure:
         process, pid = stopped_at(job, call)
         second = job.run()
         outcome = go_on(process, pid)
-        # A run that was stopped while it writes its name into the lock has none there yet.
-        named = f"process {pid} " in second.said or (call.name in LOCKING and "just started" in second.said)
+        # A run stopped before it signed the lock is not named yet.
+        named = f"process {pid} " in second.output or (call.name in LOCKING and "just started" in second.output)
         if second.code != 2 or not named:
-            raise Broken(f"the second run: exit {second.code}, and does not name process {pid}\n{second.said}")
+            raise Broken(f"the second run: exit {second.code}, but does not name process {pid}\n{second.output}")
         if outcome.code != 0:
-            raise Broken(f"the first run was disturbed: exit {outcome.code}\n{outcome.said}")
+            raise Broken(f"the first run was disturbed: exit {outcome.code}\n{outcome.output}")
         job.promises(outcome, before)
 
     def race(self, job):
@@ -187,20 +187,20 @@ class Pressure:
         outcomes = [Outcome(None, run.communicate()[0]) for run in runs]
         codes = sorted(run.returncode for run in runs)
         if codes not in job.race_codes:
-            raise Broken(f"exits {codes}\n" + "\n".join(o.said for o in outcomes))
+            raise Broken(f"exits {codes}\n" + "\n".join(o.output for o in outcomes))
         job.promises(Outcome(0, ""), before)
 
     # Small disks.
 
     def disks(self):
-        """A disk of its own, in a mount namespace that ends with the process: nothing stays mounted."""
+        """Runs on small disks in a mount namespace, which ends with the process, so that nothing stays mounted."""
         command = ["unshare", "-Urm", sys.executable, str(Path(__file__).with_name("crash.py")), "--seed", str(self.rng.randrange(1 << 30)),
                    *(word for job in self.jobs for word in ("--job", job.name)), "small-disks"]  # fmt: skip
         possible = subprocess.run(["unshare", "-Urm", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True, text=True)
         if possible.returncode != 0:
-            self.say(f"NOT RUN: small disks: no mounts here ({possible.stderr.strip()})")
+            self.report(f"NOT RUN: small disks: mounts are not permitted ({possible.stderr.strip()})")
             if os.geteuid() == 0:
-                raise Broken("root has to be able to mount a tmpfs; without mounts the small disks are not tested")
+                raise Broken("root must be able to mount a tmpfs; without mounts, small disks are not tested")
             return
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
         print(done.stdout.rstrip().rpartition("\n")[0], flush=True)
@@ -214,7 +214,7 @@ class Pressure:
             with job.disk("size=64m"):
                 job.measure()  # on another disk than its input
                 calls = job.calls()[0]
-                asked = [call for call in calls if call.name == "statfs"][-1]
+                statfs = [call for call in calls if call.name == "statfs"][-1]
                 there = os.statvfs(job.work)
                 used, inodes = there.f_blocks - there.f_bavail, there.f_files - there.f_ffree
             need = sum(-(-size // page) for size in job.sizes) + job.blocks_more
@@ -228,16 +228,16 @@ class Pressure:
             refused = 0
             for free in [0, 1, 2, need // 4, need // 2, need - job.blocks_more, need - 1, need]:
                 with job.disk(f"size={(used + need * 2) * page}"):
-                    refused += self.filled_meanwhile(job, asked, free * page)
+                    refused += self.filled_meanwhile(job, statfs, free * page)
             with job.disk(f"nr_inodes={inodes + 4}"):
                 before = job.inputs()
                 outcome = job.run()
                 job.command = f"nr_inodes={inodes + 4}: {' '.join(job.argv())}"
                 job.promises(outcome, before, done_is_fine=False)
-                if outcome.code != 2 or "files, have " not in outcome.said:
-                    raise Broken(f"without inodes: exit {outcome.code}\n{outcome.said}")
-            self.say(f"{job.name}: 8 disk sizes around the need of {need * page} bytes (4 refused, 4 enough)")
-            self.say(f"{job.name}: 8 disks filled by another while it runs ({refused} refused), 1 without inodes")
+                if outcome.code != 2 or "files, have " not in outcome.output:
+                    raise Broken(f"without inodes: exit {outcome.code}\n{outcome.output}")
+            self.report(f"{job.name}: 8 disk sizes around the need of {need * page} bytes (4 refused, 4 enough)")
+            self.report(f"{job.name}: 8 disks filled by another process during the run ({refused} refused), 1 without inodes")
 
     @staticmethod
     def small_disk(job, size, need):
@@ -246,13 +246,13 @@ class Pressure:
         outcome = job.run()
         job.promises(outcome, before, done_is_fine=False)
         words = ("no space", f"need {need} bytes", "have ")
-        if outcome.code != 0 and not all(word in outcome.said for word in words):
-            raise Broken(f"size {size}: the message lacks one of {words}\n{outcome.said}")
+        if outcome.code != 0 and not all(word in outcome.output for word in words):
+            raise Broken(f"size {size}: the message lacks one of {words}\n{outcome.output}")
         return outcome.code == 0
 
     @staticmethod
     def filled_meanwhile(job, call, free):
-        """The estimate says yes, and then another process takes the room."""
+        """Another process fills the disk after the check for free space."""
         before = job.inputs()
         process, pid = stopped_at(job, call)
         ballast = job.work / "ballast"
@@ -263,6 +263,6 @@ class Pressure:
         ballast.unlink()
         job.command += f"; while it is stopped, a file of {size} bytes fills the disk up to {free}"
         job.promises(outcome, before, done_is_fine=False)
-        if outcome.code != 0 and not all(w in outcome.said for w in ("No space left on device", "need ", "have ")):
-            raise Broken(f"{free} bytes left: {outcome.said}")
+        if outcome.code != 0 and not all(w in outcome.output for w in ("No space left on device", "need ", "have ")):
+            raise Broken(f"{free} bytes left: {outcome.output}")
         return outcome.code != 0

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""The readers of shards and documents against Python's own, on sound files with a few bytes changed.
+"""Errors about shards and documents, compared with Python's readers, on sound files with a few changed bytes.
 
-What safetensors or `json` refuses, `check` must have an error for; what they accept, it may only call an error for a
-reason in the lists below.
+If safetensors or `json` refuses a file, `check` must report an error; if they accept it, `check` may only report errors for
+a reason in the lists below.
 
     readers.py [SEED] [COUNT]        COUNT files of each kind (default 1500)
 """
@@ -13,18 +13,18 @@ import sys
 
 from peer import Tally, check, workplace
 
-# Errors about shards that safetensors opens, and why they are errors.
+# Errors about shards that safetensors accepts, each with the reason.
 STRICTER_ON_SHARDS = {
-    "SAF006": "the format forbids equal names; the crate behind Python's package keeps one of them without a word",
-    "SAF009": "transformers asks for `format`, the container does not",
+    "SAF006": "the format forbids equal names; the crate behind Python's package silently keeps one of them",
+    "SAF009": "transformers requires `format`, the container does not",
     "SAF011": "serde also reads an entry from an array",
 }
 
-# Errors about documents that Python's json reads.
+# Errors about documents that Python's json accepts.
 STRICTER_ON_DOCUMENTS = {
     "JSN009": "deeper than 127: serde_json and the tokenizers library stop there, Python some levels later",
     "JSN010": "1e400 is infinite to Python and an error to others",
-    "JSN012": "any value is JSON; a config has to be an object",
+    "JSN012": "any value is JSON; a config must be an object",
 }
 
 PIECES = [
@@ -42,7 +42,7 @@ DOCUMENT = (
     b'{\n  "model_type": "unheard",\n  "architectures": ["Unheard"],\n  "a": [1, -2.5e-06, true, null, "\\u00e9"],\n'
     b'  "b": {"c": {}, "d": [[]]},\n  "e": 1000000000000000019884624838656\n}\n'
 )
-# Sound ones, and for each reason above one that needs it.
+# Sound headers, and one header for each reason above.
 HEADERS = [HEADER] * 9 + [
     HEADER.replace(b'"c":{', b'"b":{"dtype":"I16","shape":[4],"data_offsets":[24,32]},"c":{'),
     HEADER.replace(b'{"dtype":"BF16","shape":[4],"data_offsets":[24,32]}', b'["BF16",[4],[24,32]]'),
@@ -73,7 +73,7 @@ def mutate(rng, text):
 
 
 def opens(path):
-    """What safetensors says of a shard: nothing, or why not."""
+    """The error of safetensors for a shard; None if it opens."""
     from safetensors import safe_open
 
     try:
@@ -86,7 +86,7 @@ def opens(path):
 
 
 def loads(text):
-    """What Python's json says of a document, opened as transformers opens it: nothing, or why not."""
+    """The error of Python's json for a document, opened as transformers opens it; None if it parses."""
     try:
         json.loads(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:
@@ -97,9 +97,9 @@ def loads(text):
 def compare(tally, what, entry, file, refusal, stricter):
     errors = {f["code"] for f in entry["findings"] if f["severity"] == "error" and f["locations"][0]["file"] == file}
     if refusal:
-        tally.expect(errors, f"{what}: no error, and Python says {refusal}")
+        tally.expect(errors, f"{what}: no error, but Python reports {refusal}")
     else:
-        tally.expect(errors <= set(stricter), f"{what}: Python reads it", sorted(errors - set(stricter)))
+        tally.expect(errors <= set(stricter), f"{what}: errors, but Python reads it", sorted(errors - set(stricter)))
     return bool(refusal), errors
 
 
@@ -135,8 +135,8 @@ def main():
                     if not no:
                         seen |= errors
     print(f"refused by Python: {refused}")
-    # A reason that explains nothing any more is to be taken off its list.
-    tally.equal(seen, {*STRICTER_ON_SHARDS, *STRICTER_ON_DOCUMENTS}, "the reasons that were needed")
+    # Every reason must be needed; remove others from the lists.
+    tally.equal(seen, {*STRICTER_ON_SHARDS, *STRICTER_ON_DOCUMENTS}, "needed reasons")
     tally.finish()
 
 

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Real model directories: every error and warning is one that real-models.json says is true. Needs no loader.
+"""Checks real model directories: real-models.json confirms every error and warning. Needs no loader.
 
     real_models.py DIRECTORY [--write]
 
-DIRECTORY holds copies of the small files of published models: documents, and no weights. What the collection left out is
-missing in the copy and not in the original; the list says which findings are about that. Where there is an index, the
-names it has are held against those of the class, and its total_size against the bytes of the class's tensors; the table
-that is printed says how they agree, and the list why where they do not. With --write, findings that are not in the list
-are added to it, for somebody to say why they are true.
+DIRECTORY contains copies of the small files of published models: documents, but no weights. Files that the collection omits
+are missing in the copy, but not in the original; the list marks findings about them. For a directory with an index, the
+script compares the names in the index with those of the class, and total_size with the bytes of the class's tensors. It
+prints a table of the results; the list gives the reason for each difference. With --write, findings that are not in the list
+are added, without the reason.
 """
 
 import json
@@ -22,13 +22,13 @@ WIDTH = {"bfloat16": 2, "float16": 2, "float32": 4}
 
 
 def place(finding):
-    """Where a finding points first, as the list spells it."""
+    """The first place of a finding, in the format of the list."""
     first = (finding["locations"] or [{}])[0]
     return ":".join(str(first[key]) for key in ("file", "pointer", "tensor") if first.get(key))
 
 
 def index(directory):
-    """Names and total_size of the index, if there is one."""
+    """Names and total_size of the index; None without an index."""
     for name in ("model.safetensors.index.json", "pytorch_model.bin.index.json"):
         if (directory / name).exists():
             found = json.loads((directory / name).read_text())
@@ -37,7 +37,7 @@ def index(directory):
 
 
 def size(directory, names, loader):
-    """Bytes of the class's tensors that the index names, in the type that the config states; None for no plain class."""
+    """Bytes of the class's tensors in the index, with the dtype of the config; None if unknown."""
     config = json.loads((directory / "config.json").read_text())
     width = WIDTH.get(config.get("torch_dtype") or config.get("dtype"))
     status, out, _ = doctor("expect", directory, "--for", f"transformers=={loader}", "--output-format", "json")
@@ -46,7 +46,7 @@ def size(directory, names, loader):
     built = json.loads(out)[0]
     here = {name for name in built["tensors"] if name in names}
     if len(here) * 2 < len(built["tensors"]):
-        # transformers 5 has other names in the model than in the file.
+        # In transformers 5, names in the model differ from those in the file.
         here = built["tensors"].keys() - {name for name, _ in built.get("tied", [])}
     return sum(width * prod(built["tensors"][name]) for name in here)
 
@@ -78,13 +78,13 @@ def main():
         computed = size(directory, names, load["loader"]) if load else None
         exact = agree and stated is not None and computed == stated
         why = sizes.pop(directory.name, "")
-        tally.expect(bool(exact) != bool(why), f"{directory.name}: an index that agrees needs no reason, another needs one")
-        said = "yes" if agree else "not known" if load is None else "no"
-        rows.append((directory.name, report["architecture"] or "not known", said, stated, computed, why))
+        tally.expect(bool(exact) != bool(why), f"{directory.name}: exactly the indexes that differ need a reason")
+        verdict = "yes" if agree else "unknown" if load is None else "no"
+        rows.append((directory.name, report["architecture"] or "unknown", verdict, stated, computed, why))
     for key in sorted(known.keys() - seen):
-        tally.expect(False, f"{' '.join(key)}: in {LIST.name}, and not found")
+        tally.expect(False, f"{' '.join(key)}: in {LIST.name}, but not reported")
     for name in sizes:
-        tally.expect(False, f"{name}: in {LIST.name}, and has no index")
+        tally.expect(False, f"{name}: in {LIST.name}, but has no index")
     print("| directory | architecture | names agree | total_size | class | why |\n|---|---|---|---:|---:|---|")
     for row in rows:
         print("|", " | ".join("" if cell is None else str(cell) for cell in row), "|")

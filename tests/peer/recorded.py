@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Predicted load reports against recorded ones. Needs neither torch nor transformers.
+"""Predicted load reports, compared with recorded ones. Needs neither torch nor transformers.
 
-    recorded.py FILE... [--summary JSON]      records, one a line, gzip or not; a directory: its sample.jsonl and omitted-keys.jsonl
+    recorded.py FILE... [--summary JSON]      records, one per line, optionally gzipped; a directory stands for its
+                                              sample.jsonl and omitted-keys.jsonl
 
-The summary is what docs/architectures.md says of loads: tools/derive/loads.json.
+The summary is the data about loads in docs/architectures.md: tools/derive/loads.json.
 
-A record is a class, its config.json, the tensors in its file as name -> [dtype, shape], and what the loader said of that
-file and of changed copies of it. The weights are holes: only headers count.
+A record contains a class, its config.json, the tensors of its file as name -> [dtype, shape], and the loader's reports for
+that file and for changed copies of it. The files contain no data, because only headers are read.
 """
 
 import argparse
@@ -18,19 +19,19 @@ from pathlib import Path
 from mutations import differences, predicted_report, prediction
 from peer import Tally, check, errors, workplace, write_holes
 
-# Classes that have to be known, and right to the last name.
+# Classes that must be known, with an exact prediction for this version.
 FIRM_VERSION = "4.47.0"
 FIRM = {
     "LlamaForCausalLM", "Gemma2ForCausalLM", "SiglipVisionModel", "CLIPVisionModel", "PaliGemmaForConditionalGeneration",
     "LlavaForConditionalGeneration", "ZoeDepthForDepthEstimation",
 }
 
-SHARE = 0.95  # of the loads of known classes that have to agree
+SHARE = 0.95  # minimum share of matching loads of known classes
 BATCH = 400  # directories that are on disk at a time
 
 
 def changed(tensors, mutation):
-    """A copy of the file's tensors with the mutation applied, in the order the records define."""
+    """A copy of the file's tensors with the mutation applied, in the order of the records."""
     tensors = dict(tensors)
     for name in mutation.get("drop", []):
         del tensors[name]
@@ -43,7 +44,7 @@ def changed(tensors, mutation):
 
 
 def read(file):
-    """The records of a file, each with where it stands."""
+    """The records of a file, each with its position."""
     with (gzip.open if str(file).endswith(".gz") else open)(file, "rt") as lines:
         for number, line in enumerate(lines, 1):
             record = json.loads(line)
@@ -51,7 +52,7 @@ def read(file):
 
 
 def loads(what, record):
-    """(what, record, tensors, the loader's report) for each load of a record; none when it was too large to be loaded."""
+    """(what, record, tensors, the loader's report) for each load of a record; none if the model was too large."""
     if record["saved"] is not None:
         yield f"{what} as saved", record, record["saved"], record["load"]
         for mutation in record["mutations"]:
@@ -59,7 +60,7 @@ def loads(what, record):
 
 
 def agreement(record, entry, load):
-    """None when no prediction was made, else whether it is the loader's, and how it differs."""
+    """None without a prediction, otherwise whether it equals the loader's report, and the difference."""
     version = record["transformers_version"]
     got = predicted_report(entry, version)
     if "error" in load:
@@ -72,7 +73,7 @@ def agreement(record, entry, load):
 
 
 def hold(cases, judge):
-    """Makes a checkpoint of each case, `check`s them, and gives `judge` each with its entry in the report."""
+    """Writes a checkpoint for each case, runs `check`, and calls `judge` with each case and its entry in the report."""
     cases = list(cases)
     for at in range(0, len(cases), BATCH):
         with workplace() as work:
@@ -84,7 +85,7 @@ def hold(cases, judge):
                 write_holes(out / "model.safetensors", case[2])
                 made.append(out)
             entries = {}
-            # Asked for by name: a config need not say which version wrote it.
+            # The version is given, because a config may not name the one that wrote it.
             for version in sorted({case[1]["transformers_version"] for case in cases[at : at + BATCH]}):
                 its = [out for out, case in zip(made, cases[at : at + BATCH]) if case[1]["transformers_version"] == version]
                 entries |= check("--for", f"transformers=={version}", *its)[0]
@@ -93,19 +94,19 @@ def hold(cases, judge):
 
 
 class Shares:
-    """How many loads of each version, and of each kind of change, agree; says which do not."""
+    """Counts matching loads by version and kind of change; prints the others."""
 
     def __init__(self, tally):
         self.tally, self.agreed, self.compared = tally, Counter(), Counter()
         self.classes = defaultdict(set)
         self.differ = defaultdict(lambda: defaultdict(list))
 
-    def count(self, what, record, told, why):
+    def count(self, what, record, agrees, why):
         version = record["transformers_version"]
         self.compared[version] += 1
-        self.agreed[version] += told
+        self.agreed[version] += agrees
         self.classes[version].add(record["class"])
-        if not told:
+        if not agrees:
             self.differ[version][record["class"]].append(what.split(maxsplit=3)[3])
             print(f"differs: {what}: {why}"[:300])
 
@@ -139,14 +140,14 @@ def main():
     def judge(case, entry):
         what, record, _, load = case
         firm = record["transformers_version"] == FIRM_VERSION and record["class"] in FIRM
-        said = agreement(record, entry, load)
-        if said is None and firm:
-            said = bool("error" in load and errors(entry)), "no prediction"
-        if said is None:
-            return  # not known here, and nobody said it has to be
-        shares.count(what, record, *said)
+        result = agreement(record, entry, load)
+        if result is None and firm:
+            result = bool("error" in load and errors(entry)), "no prediction"
+        if result is None:
+            return  # unknown, and not among the required classes
+        shares.count(what, record, *result)
         if firm:
-            tally.expect(said[0], f"{what}: load report", said[1])
+            tally.expect(result[0], f"{what}: load report", result[1])
 
     hold((load for file in files for where, record in read(file) for load in loads(where, record)), judge)
     shares.close()

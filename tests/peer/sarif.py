@@ -1,9 +1,9 @@
-"""SARIF against the schema that OASIS has published for 2.1.0.
+"""Validates SARIF output against the schema that OASIS published for 2.1.0.
 
     sarif.py
 
-The logs are those of the snapshots of `tests/report.rs` and those that the program named by CKPT_DOCTOR writes of tiny
-checkpoints, sound and broken. The schema is the one in the crate serde-sarif, which cargo fetches and nobody builds.
+The logs are the snapshots of `tests/it/reports.rs`, and the output of the program given by CKPT_DOCTOR for tiny checkpoints,
+sound and broken. The schema is part of the crate serde-sarif, which cargo downloads but does not build.
 """
 
 import copy
@@ -25,27 +25,27 @@ SHA256 = "af47e7b67f24efe74076621fd3a5fbe7398add9e84fe820c971219a385895cea"
 
 
 def schema(room):
-    """The published schema: cargo holds the crate against the registry's checksum, and this against its own."""
+    """The published schema. cargo verifies the checksum of the crate, and this function that of the schema."""
     (room / "src").mkdir(parents=True)
     (room / "src/lib.rs").touch()
     (room / "Cargo.toml").write_text(CRATE)
     command = ["cargo", "metadata", "--format-version", "1"]
-    told = json.loads(subprocess.run(command, cwd=room, check=True, capture_output=True).stdout)
-    [crate] = [package for package in told["packages"] if package["name"] == "serde-sarif"]
+    metadata = json.loads(subprocess.run(command, cwd=room, check=True, capture_output=True).stdout)
+    [crate] = [package for package in metadata["packages"] if package["name"] == "serde-sarif"]
     text = Path(crate["manifest_path"]).with_name("src").joinpath("schema.json").read_bytes()
     if hashlib.sha256(text).hexdigest() != SHA256:
-        sys.exit("the crate's schema is another one")
+        sys.exit("the schema of the crate has changed")
     return json.loads(text)
 
 
 def snapshots():
-    """The logs that the renderer's tests hold on to, by the snapshot's name."""
-    for path in sorted(PROJECT.joinpath("tests/snapshots").glob("report__*-sarif.snap")):
+    """The logs in the snapshots, by file name."""
+    for path in sorted(PROJECT.joinpath("tests/snapshots").glob("report-*-sarif.snap")):
         yield path.name, json.loads(path.read_text().split("\n---\n", 1)[1])
 
 
 def broken(model):
-    """A checkpoint with findings of every severity: fixes of text and of a shard, one accepted, a name to be encoded."""
+    """A checkpoint with findings of every severity: text fixes, a fix of a shard, a suppression, and a name with special characters."""
     shutil.copytree(PROJECT / "fixtures/donors/spatialvla-tiny", model)
     config = model / "config.json"
     value = json.loads(config.read_text())
@@ -53,12 +53,12 @@ def broken(model):
     config.write_text(json.dumps(value, indent=2) + "\n,")
     (model / "generation_config.json").write_text('{"größe": NaN,}\n')
     (model / "preprocessor_config.json").unlink(missing_ok=True)
-    settings = {"suppress": [{"rule": "JSN001", "reason": "the numbers are not read: [see](there)"}]}
+    settings = {"suppress": [{"rule": "JSN001", "reason": "the numbers are not used: [see](there)"}]}
     model.parent.joinpath("ckpt-doctor.json5").write_text(json.dumps(settings))
 
 
 def written(room):
-    """Logs of the program itself, by its arguments."""
+    """Logs printed by the program, by its arguments."""
     model = room / "a model, 50% [größe]"
     broken(model)
     donors = sorted(str(path) for path in PROJECT.joinpath("fixtures/donors").iterdir())
@@ -88,12 +88,12 @@ def main():
             count["suppressions"] += "suppressions" in result
     if not all(count.values()):
         sys.exit(f"nothing to validate: {count}")
-    # A validator that accepts anything would have accepted all of this.
+    # The validator must reject an invalid log.
     wrong = copy.deepcopy(next(log for _, log in logs if '"fixes"' in json.dumps(log)))
     fixed = next(result for result in wrong["runs"][0]["results"] if "fixes" in result)
     del fixed["fixes"][0]["artifactChanges"][0]["replacements"][0]["deletedRegion"]
     if validator.is_valid(wrong):
-        sys.exit("a replacement of nothing is valid")
+        sys.exit("the validator accepts a replacement without a deleted region")
     print(f"{len(logs)} logs are valid: {', '.join(f'{n} {what}' for what, n in count.items())}")
 
 

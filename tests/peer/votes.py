@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Votes on config values, against records of what transformers built. Needs neither torch nor transformers.
+"""Inferred config values, compared with records of models built by transformers. Needs neither torch nor transformers.
 
     votes.py DIRECTORY      with sample.jsonl
 
-Of each record whose class is known one number of config.json is changed at a time, and `inspect` is asked what the tensors
-say of it. A change that no tensor shows (the class has the same names and shapes with it) does not count. Half of the others
-have to be restored at least; the figure itself is printed.
+For each record of a known class, the script changes one number of config.json at a time and runs `inspect`. A change without
+effect on names and shapes does not count. At least half of the other changes must be restored; the share is printed.
 """
 
 import copy
@@ -20,7 +19,7 @@ FLOOR = 0.5
 
 
 def numbers(value, pointer=""):
-    """Pointers to the whole numbers of a config, but for ids of tokens and labels."""
+    """Pointers to the integers of a config, except ids of tokens and labels."""
     for key, inner in value.items():
         if isinstance(inner, dict) and key not in ("id2label", "label2id"):
             yield from numbers(inner, f"{pointer}/{key}")
@@ -51,7 +50,7 @@ def main():
             write_holes(out / "model.safetensors", record["saved"])
             (out / "config.json").write_text(json.dumps(record["config"]))
             sound = inspect(out)
-            # A class that is not known under this version is none to vote for.
+            # Classes that are unknown for this version are skipped.
             fit = (sound.get("votes") or {}).get("after", {"stored": 0, "found": -1})
             if sound["classes"][:1] == [] or sound["classes"][0]["class"] != record["class"] or fit["found"] != fit["stored"]:
                 continue
@@ -64,14 +63,14 @@ def main():
                 right = holder[key]
                 holder[key] = right * 2
                 (out / "config.json").write_text(json.dumps(config))
-                said = inspect(out).get("votes")
-                if not said:
+                votes = inspect(out).get("votes")
+                if not votes:
                     tally["refused"] += 1
                     continue
-                before, after = said["before"], said["after"]
+                before, after = votes["before"], votes["after"]
                 if before == sound["votes"]["before"]:
                     continue
-                voted = {v["pointer"]: v["voted_value"] for v in said["votes"]}
+                voted = {v["pointer"]: v["voted_value"] for v in votes["votes"]}
                 exact = after["mismatched"] == 0 and after["found"] == after["expected"] == after["stored"]
                 what = "restored" if voted.get(pointer) == right else "explained otherwise" if exact else "not restored"
                 tally[what] += 1

@@ -1,13 +1,13 @@
-"""SpatialVLA's model class around the language model that `text_config` names.
+"""SpatialVLA's model class with the language model of `text_config`.
 
-SpatialVLA builds a Gemma 2 unless it is handed a language model; here it is handed one. Tensor names, the forward
-pass and the hook after loading are SpatialVLA's own.
+SpatialVLA builds a Gemma 2 unless a language model is passed to it; this class passes one. Tensor names, the forward
+pass and the hook after loading are those of SpatialVLA.
 """
 
 from transformers import AutoModelForCausalLM
 
-# transformers copies only the files that this one imports by itself, relatively and by name. The first two are
-# imported by modeling_spatialvla.py: without these lines they would stay behind, and loading would not find them.
+# transformers copies only the files that this module imports directly. modeling_spatialvla.py imports the first two;
+# without these lines they would not be copied, and loading would raise FileNotFoundError.
 from .configuration_spatialvla import SpatialVLAConfig  # noqa: F401
 from .modeling_gemma2 import Gemma2ForCausalLM  # noqa: F401
 from .modeling_spatialvla import SpatialVLAForConditionalGeneration as _SpatialVLA

@@ -3,22 +3,22 @@
     language_model.model.model.layers.N.*      language_model.model.lm_head.weight
     multi_modal_projector.weight               multi_modal_projector.bias
 
-The layout has neither spatial tokens nor a depth model: SpatialVLA's hook after loading looks for the embedding one
-level higher than it is here.
+The layout supports neither spatial tokens nor a depth network: SpatialVLA's hook after loading expects the embedding
+one level higher.
 """
 
 from torch import nn
 from transformers import AutoModelForCausalLM
 
-# transformers copies only the files that this one imports by itself, relatively and by name. The first two are
-# imported by modeling_spatialvla.py: without these lines they would stay behind, and loading would not find them.
+# transformers copies only the files that this module imports directly. modeling_spatialvla.py imports the first two;
+# without these lines they would not be copied, and loading would raise FileNotFoundError.
 from .configuration_spatialvla import SpatialVLAConfig  # noqa: F401
 from .modeling_gemma2 import Gemma2ForCausalLM  # noqa: F401
 from .modeling_spatialvla import SpatialVLAForConditionalGeneration as _SpatialVLA
 
 
 class WrappedLanguageModel(nn.Module):
-    """A causal language model held in `.model`; everything SpatialVLA asks of it is passed on."""
+    """A causal language model in the attribute `.model`; forwards all attributes that SpatialVLA uses."""
 
     def __init__(self, model):
         super().__init__()

@@ -1,11 +1,11 @@
 """SpatialVLA's processor over a Llama tokenizer.
 
-The class names are what matters: under SpatialVLA's own, AutoProcessor wraps the Llama vocabulary in Gemma's
-tokenizer, which says nothing and gives other ids.
+Only the class names differ: with those of SpatialVLA, AutoProcessor wraps the Llama vocabulary in Gemma's tokenizer,
+which raises no error and gives other ids.
 """
 
-# transformers copies only the files that this one imports by itself, relatively and by name. The first is imported
-# by processing_spatialvla.py: without this line it would stay behind, and loading would not find it.
+# transformers copies only the files that this module imports directly. processing_spatialvla.py imports the first;
+# without this line it would not be copied, and loading would raise FileNotFoundError.
 from .action_tokenizer import SpatialActionTokenizer  # noqa: F401
 from .processing_spatialvla import SpatialVLAProcessor as _SpatialVLAProcessor
 

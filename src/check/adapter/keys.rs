@@ -2,7 +2,7 @@
 
 use crate::checkpoint::adapter::PREFIX;
 
-/// What a tensor is to its module.
+/// The part that a tensor has in its module.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum MatrixRole {
     A,
@@ -64,7 +64,7 @@ impl<'n> AdapterKey<'n> {
             bare.split_once(&format!(".{word}."))
                 .is_some_and(|(_, rest)| word.contains("embedding") || rest.contains('.'))
         });
-        if named { Self::Foreign("the name of an adapter is in it") } else { Self::Whole(bare) }
+        if named { Self::Foreign("its name contains the name of an adapter") } else { Self::Whole(bare) }
     }
 }
 
@@ -81,8 +81,14 @@ mod tests {
             ("base_model.model.wte.lora_embedding_B", lora("wte", MatrixRole::EmbeddingB)),
             ("base_model.model.q.lora_magnitude_vector", lora("q", MatrixRole::Magnitude)),
             ("base_model.model.lm_head.weight", AdapterKey::Whole("lm_head.weight")),
-            ("base_model.model.q.lora_A.default.weight", AdapterKey::Foreign("the name of an adapter is in it")),
-            ("base_model.model.wte.lora_embedding_A.default", AdapterKey::Foreign("the name of an adapter is in it")),
+            (
+                "base_model.model.q.lora_A.default.weight",
+                AdapterKey::Foreign("its name contains the name of an adapter"),
+            ),
+            (
+                "base_model.model.wte.lora_embedding_A.default",
+                AdapterKey::Foreign("its name contains the name of an adapter"),
+            ),
             ("h.0.c_attn.lora_A.weight", AdapterKey::Foreign("it does not start with base_model.model.")),
         ] {
             assert_eq!(AdapterKey::parse(name), key, "{name}");

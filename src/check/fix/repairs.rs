@@ -1,6 +1,6 @@
 //! Repairs that need more than an expression, by the names rules use.
 //!
-//! Each says which edits would do, or nothing where the checkpoint does not hold what it takes.
+//! Each returns its edits, or `None` when the checkpoint lacks what they need.
 
 use std::collections::BTreeSet;
 
@@ -16,11 +16,12 @@ use crate::check::index::{by_tensor, numbered, readable, shard_names, similar};
 use crate::checkpoint::{Checkpoint, FaultKind, INDEX_NAME, Shard};
 use crate::knowledge::rule::BuiltInRepair;
 
-/// The edits of a repair; `None` where the checkpoint does not hold what it needs.
+/// The edits of a repair; `None` when the checkpoint lacks what they need.
 pub(super) fn run(repair: BuiltInRepair, site: &Site<'_>) -> Option<Vec<Edit>> {
     match repair {
         BuiltInRepair::AddAutoClass => modules::add_auto_class(site),
         BuiltInRepair::AddImports => modules::add_imports(site),
+        BuiltInRepair::ClampInfinity => texts::clamp_infinity(site),
         BuiltInRepair::CutNulBytes => texts::cut_nul_bytes(site),
         BuiltInRepair::DropEqualKey => texts::drop_equal_key(site),
         BuiltInRepair::FillTokenHoles => tokens::fill_token_holes(site.checkpoint()),
@@ -34,13 +35,13 @@ pub(super) fn run(repair: BuiltInRepair, site: &Site<'_>) -> Option<Vec<Edit>> {
     }
 }
 
-/// The index from the headers, when every shard that belongs to it is there and can be read.
+/// The index rebuilt from the headers, if all its shards exist and were read.
 fn rebuild_index(checkpoint: &Checkpoint) -> Option<Edit> {
     let usable = checkpoint.index.as_ref().filter(|index| !index.weight_map.is_empty());
     let (file, shards) = match usable {
         Some(index) => {
-            // Without an absent shard its tensors would vanish from the index, and nobody would miss them. One that
-            // is there under a name that differs in case only counts under the name it has.
+            // The tensors of a missing shard would vanish from the index unnoticed. A shard whose name differs only in
+            // case counts under the name of its file.
             let there =
                 |name: &str| if checkpoint.has_file(name) { Some(name.to_owned()) } else { twin(checkpoint, name) };
             let named: BTreeSet<&str> = index.weight_map.values().map(String::as_str).collect();
@@ -53,7 +54,7 @@ fn rebuild_index(checkpoint: &Checkpoint) -> Option<Edit> {
     if shards.is_empty() || !shards.iter().all(whole) {
         return None;
     }
-    // Which of two tensors of one name is meant only an index can say.
+    // Only an index decides between two tensors of one name.
     let said = |tensor: &str| usable.is_some_and(|index| index.weight_map.contains_key(tensor));
     let twice = by_tensor(checkpoint)
         .into_iter()
@@ -97,12 +98,12 @@ const OF_THE_HEADER: [FaultKind; 7] = [
     FaultKind::TrailingBytes,
 ];
 
-/// Whether nothing is lost when the shard is written with a header made from what was read of the old one.
+/// Whether a header rebuilt from the entries that were read loses nothing of the old one.
 fn is_rewritable(shard: &Shard) -> bool {
     is_whole(shard) && shard.faults.iter().all(|f| OF_THE_HEADER.contains(&f.kind))
 }
 
-/// Writes the header of every shard that the finding names anew.
+/// Rewrites the header of every shard that the finding names.
 fn write_headers(site: &Site<'_>) -> Option<Vec<Edit>> {
     let files: BTreeSet<&str> = site.fault?.places.iter().filter_map(|p| p.file.as_deref()).collect();
     if files.is_empty() || !files.iter().all(|file| site.checkpoint().shards.get(*file).is_some_and(is_rewritable)) {

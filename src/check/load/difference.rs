@@ -1,7 +1,7 @@
-//! What loads under one version of transformers and not under another.
+//! Checkpoints that load under one version of transformers but not under another.
 
 use super::LoadReport;
-use super::{Stored, listed};
+use super::Stored;
 use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Expected, Loader};
 
@@ -10,7 +10,7 @@ use crate::knowledge::{Expected, Loader};
 pub struct Judged<'a> {
     /// The prediction.
     pub report: &'a LoadReport,
-    /// What the loader builds.
+    /// The class that the loader builds.
     pub expected: &'a Expected,
 }
 
@@ -21,33 +21,33 @@ pub fn difference(loads: Judged<'_>, other: Judged<'_>, stored: &Stored) -> Opti
         return None;
     }
     let report = other.report;
-    // What the index promises and no shard has is the index's fault.
-    let missing: Vec<String> = report.missing.iter().filter(|name| !stored.is_absent(name)).cloned().collect();
+    // A key that the index lists and no shard contains is a fault of the index.
+    let missing: Vec<&str> = report.missing.iter().map(String::as_str).filter(|name| !stored.is_absent(name)).collect();
     if missing.is_empty() && report.mismatched.is_empty() && report.raises.is_none() {
         return None;
     }
-    let mismatched: Vec<String> = report.mismatched.iter().map(|m| m.name.clone()).collect();
-    let (what, names) = match (&report.raises, missing.as_slice()) {
-        (Some(raises), _) => (format!("the load raises {raises}"), [].as_slice()),
-        (None, []) => (format!("the load raises: {} of another shape", tensors(&mismatched)), mismatched.as_slice()),
-        (None, missing) => (format!("{} would start random", tensors(missing)), missing),
+    let fault =
+        Fault::new(FaultKind::LoadsDiffer).with("loads", loads.report.version()).with("loader", report.version());
+    let fault = fault.under(other.expected.loader.version());
+    let mut fault = match &report.raises {
+        Some(exception) => fault.with("raises", exception.as_str()),
+        None if missing.is_empty() => named(fault, "mismatched", report.mismatched.iter().map(|m| m.name.as_str())),
+        None => named(fault, "missing", missing.into_iter()),
     };
-    let mut fault = Fault::new(FaultKind::LoadsDiffer)
-        .with("loads", loads.report.version())
-        .with("loader", report.version())
-        .with("what", what);
     if let Some(reason) = reason(loads.expected, other, stored) {
         fault = fault.with("reason", reason);
     }
-    fault.places = names.iter().take(super::NAMES_SHOWN).map(Place::tensor).collect();
     Some(fault)
 }
 
-fn tensors(names: &[String]) -> String {
-    format!("{} tensor{} ({})", names.len(), if names.len() == 1 { "" } else { "s" }, listed(names))
+/// Adds a list of tensors under `key`, and each of them as a place.
+fn named<'n>(fault: Fault, key: &str, names: impl Iterator<Item = &'n str>) -> Fault {
+    let names: Vec<&str> = names.collect();
+    let fault = fault.with(key, names.clone());
+    names.into_iter().fold(fault, |fault, name| fault.at(Place::tensor(name)))
 }
 
-/// The step in which the two versions differ, when it can be told.
+/// The step in which the two versions differ, if it is known; the rule puts it into words.
 fn reason(loads: &Expected, other: Judged<'_>, stored: &Stored) -> Option<&'static str> {
     let old_norms = |name: &str| name.contains("gamma") || name.contains("beta");
     let only_there = || {
@@ -58,16 +58,15 @@ fn reason(loads: &Expected, other: Judged<'_>, stored: &Stored) -> Option<&'stat
         None
     } else if stored.names().any(old_norms) {
         Some(match other.expected.loader {
-            Loader::V4_47_0 => "4.47 renames gamma and beta in every name",
-            Loader::V4_57_6 => "4.57 renames gamma and beta only after LayerNorm",
-            Loader::V5_23_0 => "5.x renames gamma and beta only after LayerNorm",
+            Loader::V4_47_0 => "gamma-renamed-everywhere",
+            Loader::V4_57_6 | Loader::V5_23_0 => "gamma-renamed-after-layer-norm",
         })
     } else if other.expected.loader.major() == 4
         && stored.names().any(|name| loads.tensors.contains_key(name) && !other.expected.tensors.contains_key(name))
     {
-        Some("the names are those of 5.x, and 4.x converts none")
+        Some("names-of-5")
     } else if only_there() {
-        Some("the class has other tensors there")
+        Some("class-differs")
     } else {
         None
     }

@@ -7,12 +7,12 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::LoadReport;
-use super::{Stored, predict};
+use super::{Stored, build, predict};
 use crate::checkpoint::{Fault, FaultKind, Place};
-use crate::knowledge::Expected;
+use crate::knowledge::{Architecture, Expected};
 
 /// Stored names from which prefixes are guessed.
 const SAMPLES: usize = 48;
@@ -28,7 +28,9 @@ const PAIRS: usize = 64;
 pub struct Moved {
     /// The tensors, renamed.
     pub stored: Stored,
-    /// What the loader would say of them.
+    /// The class, built for the renamed tensors.
+    pub expected: Expected,
+    /// The load of the renamed tensors.
     pub report: LoadReport,
     /// One for each prefix.
     pub faults: Vec<Fault>,
@@ -36,18 +38,38 @@ pub struct Moved {
 
 /// Finds prefixes under which tensors of the class lie; `None` when there are none, or renaming does not help.
 #[must_use]
-pub fn moved(expected: &Expected, stored: &Stored, report: &LoadReport) -> Option<Moved> {
-    let mut found = Moved { stored: stored.clone(), report: report.clone(), faults: Vec::new() };
+pub fn moved(
+    architecture: Architecture<'_>,
+    config: &Value,
+    expected: &Expected,
+    stored: &Stored,
+    report: &LoadReport,
+) -> Option<Moved> {
+    let mut found =
+        Moved { stored: stored.clone(), expected: expected.clone(), report: report.clone(), faults: Vec::new() };
     for _ in 0..ROUNDS {
-        if found.report.missing.is_empty() || found.report.unexpected.is_empty() {
+        let listed = !found.report.missing.is_empty() && !found.report.unexpected.is_empty();
+        if !listed && found.report.raises.is_none() {
             break;
         }
-        let Some(step) = best(expected, &found.stored) else { break };
+        let Some(mut step) = best(&found.expected, &found.stored) else { break };
+        if architecture.reads_tensors() {
+            // With all of them renamed, the class may have more of these tensors.
+            let strays = strays(&found.expected, &found.stored);
+            let strays: Vec<String> = strays.filter(|n| n.starts_with(&step.from)).map(str::to_owned).collect();
+            let renamed = found.stored.under(&strays, &step.from, &step.to);
+            if let Ok(expected) = build(architecture, config, &renamed) {
+                step.names = arriving(&expected, &found.stored, &step.from, &step.to);
+                found.expected = expected;
+            }
+        }
         let renamed = found.stored.under(&step.names, &step.from, &step.to);
-        let report = predict(expected, &renamed);
+        let report = predict(&found.expected, &renamed);
         let cleared = size(&found.report).saturating_sub(size(&report));
-        // Each tensor was reported as missing and as unexpected, or was at least one of them.
-        if cleared < step.names.len() {
+        // Each tensor was reported as missing and as unexpected, or was at least one of them; a loader that raised reported
+        // none.
+        let loads = found.report.raises.is_some() && report.is_whole();
+        if cleared < step.names.len() && !loads {
             break;
         }
         // Those that an earlier step has moved were under other names before.
@@ -76,8 +98,8 @@ impl Step {
             .with("to", self.to.as_str())
             .with("count", self.names.len())
             .with("prefixes", json!(self.prefixes(stored)))
-            .with("names", super::listed(&self.names));
-        fault.places = self.names.iter().take(super::NAMES_SHOWN).map(Place::tensor).collect();
+            .with("names", json!(self.names));
+        fault.places = self.names.iter().map(Place::tensor).collect();
         fault
     }
 
@@ -118,7 +140,7 @@ impl Step {
 fn best(expected: &Expected, stored: &Stored) -> Option<Step> {
     let here: BTreeSet<&str> = stored.names().collect();
     let wanted: BTreeSet<&str> = expected.tensors.keys().map(String::as_str).filter(|n| !here.contains(n)).collect();
-    let strays: Vec<&str> = here.iter().copied().filter(|n| !expected.tensors.contains_key(*n)).collect();
+    let strays: Vec<&str> = strays(expected, stored).collect();
     let mut pairs: BTreeMap<(&str, &str), usize> = BTreeMap::new();
     let step = strays.len().div_ceil(SAMPLES).max(1);
     for stray in strays.iter().step_by(step) {
@@ -144,9 +166,22 @@ fn best(expected: &Expected, stored: &Stored) -> Option<Step> {
     if count < 2 {
         return None;
     }
-    let arrives = |n: &&str| n.strip_prefix(from).is_some_and(|rest| wanted.contains(&*format!("{to}{rest}")));
-    let names = strays.into_iter().filter(arrives).map(str::to_owned).collect();
-    Some(Step { from: from.to_owned(), to: to.to_owned(), names })
+    Some(Step { from: from.to_owned(), to: to.to_owned(), names: arriving(expected, stored, from, to) })
+}
+
+/// Stored names that the class does not have.
+fn strays<'s>(expected: &Expected, stored: &'s Stored) -> impl Iterator<Item = &'s str> {
+    stored.names().filter(|name| !expected.tensors.contains_key(*name))
+}
+
+/// Stored names that become missing names of the class when they start with `to` in place of `from`.
+fn arriving(expected: &Expected, stored: &Stored, from: &str, to: &str) -> Vec<String> {
+    let here: BTreeSet<&str> = stored.names().collect();
+    let arrives = |name: &&str| {
+        let renamed = name.strip_prefix(from).map(|rest| format!("{to}{rest}"));
+        renamed.is_some_and(|name| expected.tensors.contains_key(&name) && !here.contains(&*name))
+    };
+    strays(expected, stored).filter(arrives).map(str::to_owned).collect()
 }
 
 /// A name taken apart after each of its first dots, and before the first; never behind a number, which is a place in a

@@ -5,6 +5,7 @@ use serde::Serialize;
 /// Lists of what a loader would say of the state dict; names are spelled as it spells them.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct LoadReport {
     /// Version of transformers that was read for this prediction: `4.47.0`.
     pub loader: String,
@@ -33,22 +34,22 @@ impl LoadReport {
 
     /// Whether a tensor of the class keeps its random start, reported or not.
     #[must_use]
-    pub fn leaves_random(&self, name: &str) -> bool {
+    pub(crate) fn leaves_random(&self, name: &str) -> bool {
         let absent = |silent: &Silent| silent.reason == SilentReason::IndexedButAbsent && silent.name == name;
         self.missing.iter().any(|missing| missing == name) || self.silent.iter().any(absent)
     }
 
     /// Whether two loaders say the same.
     #[must_use]
-    pub fn agrees(&self, other: &Self) -> bool {
+    pub(crate) fn agrees(&self, other: &Self) -> bool {
         let said = |r: &Self| Self { loader: String::new(), stands_for: None, ..r.clone() };
         said(self) == said(other)
     }
 
-    /// The version it is for: `5.23.0`, or `4.51.3 (judged as 4.47.0)`.
+    /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.
     #[must_use]
     pub fn version(&self) -> String {
-        let version = |asked: &String| format!("{asked} (judged as {})", self.loader);
+        let version = |asked: &String| format!("{asked} (predicted as {})", self.loader);
         self.stands_for.as_ref().map_or_else(|| self.loader.clone(), version)
     }
 }
@@ -68,6 +69,7 @@ pub struct Mismatch {
 /// A tensor that loads wrong without any message.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Silent {
     /// State-dict name.
     pub name: String,
@@ -82,6 +84,7 @@ pub struct Silent {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum SilentReason {
     /// The index maps it and no shard contains it: it stays randomly initialised.
     IndexedButAbsent,

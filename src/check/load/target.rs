@@ -1,61 +1,105 @@
-//! Which loaders are asked.
+//! The versions of transformers that a load is predicted for.
 
 use serde_json::Value;
 
 use crate::knowledge::{Architecture, Library, Loader};
 
-/// A version of transformers that a load report is wanted for, and the known loader that stands for it.
+/// A version of transformers to predict the load for, and the known loader that is nearest to it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Target {
     /// The loader.
     pub loader: Loader,
     /// The version, where it is not the loader's own.
     pub stands_for: Option<String>,
-    /// All versions that it was asked for.
+    /// All versions that it is judged for.
     pub versions: Vec<String>,
-    /// Whether the checkpoint has to load there; where it does not, that it loads elsewhere is what counts.
+    /// Whether the checkpoint must load there. For another target, only the fact that it does not load is reported.
     pub leads: bool,
 }
 
 impl Target {
+    /// The version that is judged: the one that the loader stands for, or else its own.
+    #[must_use]
+    pub fn version(&self) -> &str {
+        self.stands_for.as_deref().unwrap_or(self.loader.version())
+    }
+
     fn new(loader: Loader, version: &str, leads: bool) -> Self {
         let stands_for = (version != loader.version()).then(|| version.to_owned());
         Self { loader, stands_for, versions: vec![version.to_owned()], leads }
     }
 
-    /// Makes it the one that counts, in place of the loader of `version`, which does not know the class.
+    /// Lets it lead in place of the loader of `version`, which does not know the class.
     pub(in crate::check) fn lead(&mut self, version: Option<&str>) {
         self.leads = true;
         self.stands_for = version.filter(|v| *v != self.loader.version()).map(str::to_owned);
     }
 }
 
-/// The loaders to ask, each with the class it builds for this config.
+/// The versions to judge, each with whether it leads: those that the user named; without any, the version that wrote
+/// config.json, which leads, and the newest known one.
+fn versions<'v>(config: Option<&'v Value>, named: &'v [String]) -> Vec<(&'v str, bool)> {
+    let wrote = config.and_then(|config| config.get("transformers_version")).and_then(Value::as_str);
+    match (named, wrote) {
+        ([], Some(version)) => vec![(version, true), (Loader::NEWEST.version(), false)],
+        ([], None) => vec![(Loader::NEWEST.version(), true)],
+        (named, _) => named.iter().map(|version| (version.as_str(), true)).collect(),
+    }
+}
+
+/// The targets of a checkpoint of any class: the nearest loader of each version.
+pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<Target> {
+    let mut targets: Vec<Target> = Vec::new();
+    for (version, leads) in versions(config, named) {
+        let loader = Loader::nearest(version);
+        match targets.iter_mut().find(|target| target.loader == loader) {
+            Some(target) => target.versions.push(version.to_owned()),
+            None => targets.push(Target::new(loader, version, leads)),
+        }
+    }
+    targets
+}
+
+/// The targets of a run: the [`wanted`] ones, as the prediction of loads changed them.
 ///
-/// Those of the versions `asked` for; without any, the one of the version that wrote config.json, and the newest. A
-/// class that is known for other loaders than these is judged as those build it.
+/// A loader that does not have the class still reads the documents, so it stays, unless another one was chosen for its
+/// version.
+pub(in crate::check) fn of_run(config: Option<&Value>, named: &[String], predicted: Vec<Target>) -> Vec<Target> {
+    let is_same = |one: &Target, other: &Target| {
+        one.loader == other.loader || one.versions.iter().any(|version| other.versions.contains(version))
+    };
+    let mut targets = wanted(config, named);
+    targets.retain(|target| !predicted.iter().any(|other| is_same(target, other)));
+    targets.extend(predicted);
+    let order = versions(config, named);
+    targets.sort_by_key(|target| {
+        let position = order.iter().position(|(version, _)| target.versions.iter().any(|v| v == version));
+        (!target.leads, position.unwrap_or(order.len()))
+    });
+    targets
+}
+
+/// The targets whose loader has the class of this config, each with the architecture of that class. `names` are the stored
+/// keys, which decide between classes of one name.
+///
+/// When the user named no version and no leading loader has the class, another loader that has it leads.
 #[must_use]
 pub fn targets<'l>(
     library: &'l Library,
     config: &Value,
     names: &[&str],
-    asked: &[String],
+    named: &[String],
 ) -> Vec<(Target, Architecture<'l>)> {
     let version = config.get("transformers_version").and_then(Value::as_str);
-    let versions: Vec<(&str, bool)> = match (asked, version) {
-        ([], Some(version)) => vec![(version, true), (Loader::NEWEST.version(), false)],
-        ([], None) => vec![(Loader::NEWEST.version(), true)],
-        (asked, _) => asked.iter().map(|version| (version.as_str(), true)).collect(),
-    };
     let mut known: Vec<(Target, Architecture<'l>)> = Vec::new();
-    for (version, leads) in versions {
+    for (version, leads) in versions(Some(config), named) {
         let Some((loader, architecture)) = library.stands_for(version, config, names) else { continue };
         match known.iter_mut().find(|(target, _)| target.loader == loader) {
             Some((target, _)) => target.versions.push(version.to_owned()),
             None => known.push((Target::new(loader, version, leads), architecture)),
         }
     }
-    if asked.is_empty() && !known.iter().any(|(target, _)| target.leads) {
+    if named.is_empty() && !known.iter().any(|(target, _)| target.leads) {
         if known.is_empty() {
             let built = |loader| Some((loader, library.find(config, names.iter().copied(), loader)?));
             let other = Loader::ALL.into_iter().find_map(built);

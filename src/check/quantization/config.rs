@@ -1,4 +1,4 @@
-//! What config.json says of quantisation, against the other documents and against plain sight.
+//! Compares the quantisation that config.json declares with the other documents and with the tensor names.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use super::module;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::quantization::{Scheme, block};
 
-/// What AutoGPTQ and AutoAWQ write beside config.json.
+/// Documents that AutoGPTQ and AutoAWQ write beside config.json.
 const BESIDE: [&str; 2] = ["quantize_config.json", "quant_config.json"];
 
 /// Parameters that decide shapes or the meaning of values, and how else they are spelled.
@@ -21,7 +21,7 @@ const PARAMETERS: [(&str, &str); 6] = [
     ("quant_method", "quant_method"),
 ];
 
-/// A config whose scheme is not known here.
+/// The fault of a config with an unknown scheme.
 pub(super) fn unknown(method: &str, config: &Value) -> Fault {
     let pointer = block(config).map_or("", |(pointer, _)| pointer);
     Fault::new(FaultKind::UnknownQuantization).at(Place::file("config.json").pointer(pointer)).with("method", method)
@@ -54,7 +54,7 @@ pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
     faults
 }
 
-/// Names that nothing explains and that are a scheme's, under a config that says of none.
+/// The fault of tensors with the endings of a scheme, under a config that declares none.
 #[must_use]
 pub fn undeclared<'n>(schemes: &[Scheme], names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
     let names: BTreeSet<&str> = names.into_iter().collect();

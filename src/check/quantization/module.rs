@@ -7,7 +7,7 @@ use crate::check::load::Stored;
 use crate::checkpoint::{Checkpoint, Dtype};
 use crate::knowledge::quantization::{Scheme, Shapes, StoredPart};
 
-/// What is known of a stored tensor; an index alone tells neither.
+/// The known facts of a stored tensor; both are unknown when only an index was read.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Held<'c> {
     pub(super) shape: Option<&'c [u64]>,
@@ -33,7 +33,7 @@ impl<'c> TensorLookup<'c> {
     }
 }
 
-/// A module whose values are stored by a scheme, and which of the scheme's tensors are there, by its order.
+/// A module whose values are stored by a scheme, with the tensors of the scheme that it has, in the order of the scheme.
 #[derive(Debug)]
 pub(super) struct StoredModule<'c> {
     /// Its name: that of the plain tensor without the scheme's ending.
@@ -42,12 +42,12 @@ pub(super) struct StoredModule<'c> {
 }
 
 impl StoredModule<'_> {
-    /// Endings of the tensors that are there.
+    /// Endings of the stored tensors.
     pub(super) fn endings<'s>(&self, scheme: &'s Scheme) -> Vec<&'s str> {
         scheme.endings().zip(&self.held).filter_map(|(ending, held)| held.is_some().then_some(ending)).collect()
     }
 
-    /// Shapes of the tensors that are there, as far as they are known.
+    /// Shapes of the stored tensors, where they are known.
     pub(super) fn shapes(&self) -> Shapes {
         self.held.iter().map(|held| Some(held.as_ref()?.shape?.to_vec())).collect()
     }
@@ -55,15 +55,15 @@ impl StoredModule<'_> {
 
 /// The modules of a scheme among these tensors, by name.
 ///
-/// A module is one whose first tensor, which holds the values, is stored; where that keeps its plain name another one
-/// has to be there too. `plain` says whether a class has a tensor of that name: such a one is nobody's scale.
+/// A module is recognised by its first tensor, which holds the values. If that tensor keeps its plain name, another one
+/// must be stored too. `plain` returns whether a class has a tensor of that name, which is then not a scale.
 pub(super) fn group<'c>(
     scheme: &Scheme,
     tensors: &TensorLookup<'c>,
     plain: impl Fn(&str) -> bool,
 ) -> Vec<StoredModule<'c>> {
     let mut endings: Vec<(usize, &str)> = scheme.endings().enumerate().collect();
-    // `_scale_inv` before `_scale`; the plain ending is not told from any other tensor's here.
+    // `_scale_inv` before `_scale`; the plain ending is that of any other tensor too.
     endings.sort_by_key(|(_, ending)| std::cmp::Reverse(ending.len()));
     endings.retain(|(_, ending)| *ending != scheme.plain);
     let mut names: BTreeSet<&str> = BTreeSet::new();
@@ -108,7 +108,7 @@ pub(super) fn kind(name: &str) -> String {
     name.split('.').map(segment).collect::<Vec<_>>().join(".")
 }
 
-/// The scheme whose tensors these are, and a module of it; for names that nothing explains.
+/// The scheme whose endings unexplained names have, and a module of it.
 ///
 /// Only a module that has all that its scheme requires is taken for one.
 #[must_use]

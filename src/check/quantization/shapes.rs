@@ -1,4 +1,4 @@
-//! Quantised modules against what their plain shapes ask for.
+//! Compares the shapes of quantised modules with those that their plain shapes imply.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use super::skipped::SkippedModules;
 use crate::knowledge::Expected;
 use crate::knowledge::quantization::{AppliedScheme, Scheme, Shapes};
 
-/// What became of a module.
+/// The state in which a module is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ModuleState {
     /// Stored by the scheme.
@@ -27,9 +27,9 @@ pub(super) struct QuantizedModule<'c> {
     pub(super) state: ModuleState,
     /// The shape its plain tensor would have, where it is known.
     pub(super) plain: Option<Vec<u64>>,
-    /// The class says so, not only the stored shapes.
+    /// Whether the plain shape comes from the class, and not from the stored shapes.
     pub(super) of_class: bool,
-    /// Shapes that the plain one asks for.
+    /// Shapes that the plain shape implies.
     pub(super) shapes: Shapes,
     pub(super) required: Vec<bool>,
 }
@@ -41,7 +41,7 @@ impl<'c> QuantizedModule<'c> {
         parts.filter(|((_, held), required)| **required && held.is_none()).map(|((ending, _), _)| ending)
     }
 
-    /// Tensors whose shape is not what it should be: ending, stored, expected.
+    /// Tensors of another shape than expected: ending, stored, expected.
     pub(super) fn misshapen<'s>(&'s self, scheme: &'s Scheme) -> impl Iterator<Item = (&'s str, &'c [u64], &'s [u64])> {
         let parts = scheme.endings().zip(&self.module.held).zip(&self.shapes);
         parts.filter_map(|((ending, held), expected)| {
@@ -64,12 +64,12 @@ pub(super) struct ModuleShapes<'j> {
     pub(super) skipped: &'j SkippedModules<'j>,
 }
 
-/// Plain shape of a module, the shapes it asks for, and how many stored ones differ.
+/// Plain shape of a module, the shapes that it implies, and how many stored ones differ.
 type ShapeFit = (Option<Vec<u64>>, Shapes, usize);
 
-/// What one choice of parameters makes of all modules.
+/// The result of one choice of parameters for all modules.
 struct Attempt {
-    /// Plain shape, and the shapes it asks for; by the order of the modules.
+    /// Plain shape and the shapes that it implies, in the order of the modules.
     shapes: Vec<(Option<Vec<u64>>, Shapes)>,
     /// Tensors that have another shape.
     wrong: usize,
@@ -100,7 +100,7 @@ impl ModuleShapes<'_> {
         (judged.collect(), fits.map(|(name, ..)| name))
     }
 
-    /// A module that is stored plainly, to be told what it lacks.
+    /// A module that is stored plainly although the scheme covers it.
     pub(super) fn left_plain<'c>(&self, module: StoredModule<'c>) -> QuantizedModule<'c> {
         let required = self.applied.required(&module.endings(self.applied.scheme()));
         QuantizedModule {
@@ -113,7 +113,7 @@ impl ModuleShapes<'_> {
         }
     }
 
-    /// Another value of one parameter by which all shapes fit: what it is called, and what it makes of the modules.
+    /// Another value of one parameter that fits all shapes: its name, and its result for the modules.
     fn fitting_parameter(
         &self,
         found: &[StoredModule<'_>],
@@ -134,7 +134,7 @@ impl ModuleShapes<'_> {
     fn attempt(&self, found: &[StoredModule<'_>], classes: &[Option<&[u64]>], values: &[Value]) -> Attempt {
         let mut attempt = Attempt { shapes: Vec::with_capacity(found.len()), wrong: 0 };
         let says = self.applied.says_shapes();
-        // Layers repeat: a few shapes stand for thousands of modules.
+        // Layers repeat, so thousands of modules have a few distinct shapes.
         let mut seen: BTreeMap<(Option<&[u64]>, Shapes), ShapeFit> = BTreeMap::new();
         for (module, class) in found.iter().zip(classes) {
             let stored = module.shapes();
@@ -150,7 +150,7 @@ impl ModuleShapes<'_> {
         attempt
     }
 
-    /// Plain shape, the shapes it asks for, and how many stored ones differ.
+    /// Plain shape, the shapes that it implies, and how many stored ones differ.
     fn fit(&self, values: &[Value], class: Option<&[u64]>, stored: &Shapes) -> ShapeFit {
         let wrong = |shapes: &Shapes| {
             let pairs = shapes.iter().zip(stored).filter_map(|(e, s)| Some((e.as_deref()?, s.as_deref()?)));

@@ -1,4 +1,4 @@
-//! What a config leaves plain.
+//! The modules that a config excludes from quantisation.
 //!
 //! Loaders match such lists in ways of their own: 4.47 takes a pattern that ends a segment anywhere in the name, 5.23 a
 //! regular expression at the start or a literal end, compressed-tensors whole names or `re:…`. So there are two
@@ -36,7 +36,7 @@ impl<'a> SkippedModules<'a> {
         Self { patterns, modules: applied.scheme().skipped_are_modules }
     }
 
-    /// The pattern by which every loader leaves this module plain.
+    /// The pattern that excludes this module for every loader.
     pub(super) fn covers(&self, module: &str) -> Option<&'a str> {
         self.patterns.iter().find_map(|pattern| match pattern {
             SkipPattern::Text(text) => {

@@ -10,18 +10,18 @@ use crate::check::load::{LoadReport, SilentReason};
 use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Architecture, Expected};
 
-/// Why a load report is as it is.
+/// The config values that cause what a load report lists.
 #[derive(Debug, Clone)]
 pub struct Explanation {
     /// The values of the config that stored tensors contradict, and that explain some of the report.
     pub votes: Vec<Vote>,
-    /// What the report would be if these were corrected.
+    /// The report after these were corrected.
     pub rest: LoadReport,
 }
 
-/// Explains a load report that is not clean by values of the config; `None` where that does not help.
+/// Explains a load report that is not clean by config values; `None` when no value explains any of it.
 ///
-/// Only what stored tensors say counts: where they are missing it is the config that may be right.
+/// Only stored tensors count: where they are missing, the config may be right.
 #[must_use]
 pub fn explain(
     architecture: Architecture<'_>,
@@ -36,16 +36,15 @@ pub fn explain(
     if found == 0 || renamed || config.get("quantization_config").is_some_and(Value::is_object) {
         return None;
     }
-    let evidence = stored.evidence();
     let outcome = run(architecture, config, stored, true)?;
     let votes: Vec<Vote> = outcome.outvoted().filter(|v| v.votes_for > v.votes_against).cloned().collect();
     let values: Vec<(String, Value)> = votes.iter().map(|v| (v.pointer.clone(), v.voted_value.clone())).collect();
     let mut corrected = put_all(config, &expected.config, &values);
-    let built = architecture.expect_given(&corrected, &evidence).ok().or_else(|| {
+    let built = load::build(architecture, &corrected, stored).ok().or_else(|| {
         for (pointer, value) in &values {
             stretch(&mut corrected, &expected.config, pointer, value);
         }
-        architecture.expect_given(&corrected, &evidence).ok()
+        load::build(architecture, &corrected, stored).ok()
     })?;
     let rest = load::predict(&built, stored);
     (size(&rest) < found && !votes.is_empty()).then_some(Explanation { votes, rest })
@@ -67,7 +66,7 @@ pub fn fault(vote: &Vote) -> Fault {
         .with("agree", vote.votes_for)
         .with("total", vote.votes_for.saturating_add(vote.votes_against));
     let named: Vec<String> = vote.evidence.iter().map(ToString::to_string).collect();
-    fault = fault.with("names", named.join(", "));
+    fault = fault.with("names", named);
     fault.places.extend(vote.evidence.iter().map(|w| Place::tensor(&*w.tensor)));
     fault
 }

@@ -1,4 +1,4 @@
-//! What one value of a config decides: found by changing it and looking at what the class builds then.
+//! The tensors that one config value decides, found by changing it and building the class again.
 //!
 //! Nothing here reads the expressions of an architecture. Whatever they say, two builds show which names and which
 //! dimensions follow a value, and how.
@@ -36,15 +36,25 @@ pub(super) struct ProbedKey {
     pub pointer: String,
     /// Its value now, given or by default.
     pub value: Value,
-    /// The value it was changed to, and what the class builds then.
+    /// The changed value, and the class built with it.
     pub other: Value,
     pub built: Expected,
 }
 
 /// The values that names or shapes depend on, found by changing many at once and splitting where something changed.
 pub(super) fn keys(space: &Space<'_>, config: &Value, base: &Expected) -> Vec<ProbedKey> {
+    keys_among(space, config, base, space.shaping(&base.config))
+}
+
+/// As [`keys`], of the values at these pointers only.
+pub(super) fn keys_among(
+    space: &Space<'_>,
+    config: &Value,
+    base: &Expected,
+    pointers: impl IntoIterator<Item = String>,
+) -> Vec<ProbedKey> {
     let mut kinds: BTreeMap<u8, Vec<(String, Value, Value)>> = BTreeMap::new();
-    for pointer in space.shaping(&base.config) {
+    for pointer in pointers {
         let Some(value) = base.config.pointer(&pointer) else { continue };
         let Some(other) = other(value) else { continue };
         let kind = match value {
@@ -123,7 +133,7 @@ pub(super) fn dimensions<'e>(a: &'e Expected, b: &'e Expected) -> impl Iterator<
     )
 }
 
-/// How many dimensions or names speak for each value.
+/// The number of dimensions or names that imply each value.
 pub(super) type Tally = BTreeMap<u64, usize>;
 
 /// The values of `key` that would make stored dimensions come out, taking each as a linear function of it.
@@ -167,7 +177,7 @@ fn linear(value: u64, other: u64, d: Dimension<'_>, stored: u64) -> Option<u64> 
     u64::try_from(wanted).ok().filter(|n| *n > 0)
 }
 
-/// The values of a count that stored names ask for: one more layer for each number beyond those built.
+/// The values of a count that stored names imply: one more layer for each number beyond those built.
 pub(super) fn by_names(numbered: &Numbered, key: &ProbedKey, base: &Expected) -> Tally {
     let mut tally = Tally::new();
     let (Some(value), Some(other)) = (key.value.as_u64(), key.other.as_u64()) else { return tally };

@@ -9,7 +9,7 @@ use super::vote::{Fit, Votes};
 use crate::check::load::Stored;
 use crate::knowledge::Architecture;
 
-/// Times the stored names are spelled anew after the config has changed.
+/// Most times the stored names are renamed again after the config has changed.
 const PASSES: usize = 3;
 
 /// Lets the stored tensors vote on the values of `config` for a class; `None` when the class cannot be built from it
@@ -19,7 +19,7 @@ pub fn vote(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> 
     run(architecture, config, stored, false)
 }
 
-/// As [`vote`]; with `changed`, values are only counted if one had to change.
+/// As [`vote`]; with `changed`, only votes on the values that had to change.
 pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Stored, changed: bool) -> Option<Votes> {
     let mut space = Space::new(architecture, stored);
     let mut state = SearchState::new(&mut space, config.clone())?;
@@ -28,15 +28,15 @@ pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Store
     for _ in 0..PASSES {
         let distance = state.distance;
         state = solve::solve(&space, state);
-        // What the loader renames depends on what the class has: more layers, more names that it knows.
+        // The loader renames keys that the class has, so a class with more layers renames more.
         let found = state.distance < distance && space.rename(&state.built);
         if !found {
             break;
         }
         state.distance = space.distance(&state.built);
     }
-    let (votes, undecided) = if changed && state.changed.is_empty() {
-        (Vec::new(), Vec::new())
+    let (votes, undecided) = if changed {
+        (tally::votes_on_changes(&space, &state, config, &said), Vec::new())
     } else {
         tally::votes(&space, &state, config, &said)
     };

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use super::probe::{ProbedKey, Tally, by_dimensions, by_names, dimensions, keys, stored_dimension};
+use super::probe::{ProbedKey, Tally, by_dimensions, by_names, dimensions, keys, keys_among, stored_dimension};
 use super::space::{Space, with};
 use crate::checkpoint::pointer;
 use crate::knowledge::Expected;
@@ -16,7 +16,7 @@ const CANDIDATES: usize = 3;
 /// Values beyond this are not searched; it bounds the steps of the search too.
 const LARGEST: u64 = 1 << 32;
 
-/// A config, and what the class builds from it.
+/// A config, and the class built from it.
 #[derive(Clone)]
 pub(super) struct SearchState {
     pub config: Value,
@@ -56,7 +56,7 @@ impl SearchState {
     }
 }
 
-/// `config` with some values replaced; what is not there on the way is taken from `resolved`.
+/// `config` with some values replaced; missing parents are taken from `resolved`.
 pub(super) fn put_all(config: &Value, resolved: &Value, values: &[(String, Value)]) -> Value {
     let mut config = config.clone();
     for (pointer, value) in values {
@@ -125,7 +125,12 @@ pub(super) fn solve(space: &Space<'_>, start: SearchState) -> SearchState {
         }
         let found = keys(space, &state.config, &state.built);
         state = directly(space, &found, state);
-        let found = if state.distance < before { keys(space, &state.config, &state.built) } else { found };
+        let found = if state.distance < before {
+            // The next round looks for others that now matter.
+            keys_among(space, &state.config, &state.built, found.into_iter().map(|key| key.pointer))
+        } else {
+            found
+        };
         state = one_by_one(space, &found, state);
         if state.distance >= before {
             break;
@@ -215,7 +220,7 @@ fn candidates(space: &Space<'_>, key: &ProbedKey, state: &SearchState) -> Vec<Va
             let (_, mut tally) = by_dimensions(space, key, &state.built);
             merge(&mut tally, by_names(&space.numbered, key, &state.built));
             let mut values = most(tally, key.value.as_u64());
-            // Tensors that are there because the key has a value at all, and are not stored.
+            // Tensors that exist in the class only because the key has a value, and are not stored.
             let lost = |name: &String| {
                 key.built.tensors.get(name) != state.built.tensors.get(name) && !space.stored.contains(name)
             };

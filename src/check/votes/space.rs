@@ -1,4 +1,4 @@
-//! The space that votes search: configs of one class, and how far what each builds is from what is stored.
+//! The search space of votes: configs of one class, and the distance of the class that each builds from the stored tensors.
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -12,18 +12,18 @@ use crate::knowledge::{Architecture, Evidence, Expected};
 /// Tensors that may be built in one search: it tries a few hundred configs, and a mixture of experts has tens of
 /// thousands of tensors.
 const BUDGET: usize = 3_000_000;
-/// What a build costs beside its tensors, in tensors.
+/// Fixed cost of a build, in tensors.
 const OVERHEAD: usize = 40;
-/// Most values of a config that are looked at; a label map may have thousands.
+/// Most values of a config that are varied; a label map may have thousands.
 const LEAVES: usize = 600;
-/// Longest list whose elements are looked at one by one.
+/// Longest list whose elements are varied one by one.
 const LIST: usize = 64;
 
 /// One class and one set of stored tensors.
 pub(super) struct Space<'a> {
     architecture: Architecture<'a>,
     files: &'a Stored,
-    /// Stored tensors, as the file spells them.
+    /// Stored tensors as [`load::build`] presents them to the class.
     evidence: Evidence,
     /// Stored tensors, as the class spells them.
     pub stored: Evidence,
@@ -35,7 +35,7 @@ pub(super) struct Space<'a> {
 }
 
 impl<'a> Space<'a> {
-    /// The names are those of the file until [`Self::rename`] is told what the class has.
+    /// The names are those of the file until [`Self::rename`] is called with the class.
     pub fn new(architecture: Architecture<'a>, files: &'a Stored) -> Self {
         let evidence = files.evidence();
         let numbered = Numbered::from_names(evidence.iter().map(|(name, _)| name));
@@ -48,13 +48,16 @@ impl<'a> Space<'a> {
         let stored = load::in_model(expected, self.files);
         let changed = !stored.iter().eq(self.stored.iter());
         if changed {
+            if self.architecture.reads_tensors() {
+                self.evidence = load::spelled(expected, self.files);
+            }
             self.numbered = Numbered::from_names(stored.iter().map(|(name, _)| name));
             self.stored = stored;
         }
         changed
     }
 
-    /// Learns from a config which of its keys the class knows: those that are filled in when all are left out.
+    /// Collects the keys that the class knows: those with a default when all are left out.
     pub fn learn(&mut self, config: &Value) {
         let mut bare = Value::Object(Map::new());
         for pointer in leaves(config).iter().filter(|p| p.ends_with("model_type")) {
@@ -77,7 +80,7 @@ impl<'a> Space<'a> {
         pointers
     }
 
-    /// What the class builds from `config`; `None` when it refuses, or when enough was tried.
+    /// The class built from `config`; `None` when that is impossible, or the budget is spent.
     pub fn build(&self, config: &Value) -> Option<Expected> {
         if self.exhausted() {
             return None;
@@ -98,7 +101,7 @@ impl<'a> Space<'a> {
     /// How far `expected` is from the store: 0 where every name and dimension agrees.
     ///
     /// A dimension that differs counts 2, a name on one side only a little more than all its dimensions, so that
-    /// nothing is gained by making a tensor vanish because its shape is wrong.
+    /// removing a tensor is never better than correcting its shape.
     pub fn distance(&self, expected: &Expected) -> u64 {
         let mut there = BTreeSet::new();
         for (name, tensor) in &expected.tensors {
@@ -123,7 +126,7 @@ impl<'a> Space<'a> {
                 None if there.contains(name.as_str()) => 0,
                 None => weight(&tensor.shape),
             };
-            // A file of tied tensors has one of them; two say, a little, that they are not tied.
+            // A file of tied tensors has one of them; two are weak evidence that they are not tied.
             let twice = u64::from(
                 tensor.tied_to.as_ref().is_some_and(|to| self.stored.contains(name) && self.stored.contains(to)),
             );
@@ -164,7 +167,7 @@ pub(in crate::check) fn leaves(config: &Value) -> Vec<String> {
 }
 
 fn collect(value: &Value, pointer: &mut String, found: &mut Vec<String>) {
-    /// Keys whose values are names or settings of tokens and generation, never of tensors.
+    /// Keys that never shape tensors: labels, tokens, generation.
     const APART: [&str; 5] = ["id2label", "label2id", "auto_map", "task_specific_params", "quantization_config"];
     let mut step = |key: &str, value: &Value, found: &mut Vec<String>| {
         let before = pointer.len();
@@ -189,7 +192,7 @@ fn collect(value: &Value, pointer: &mut String, found: &mut Vec<String>) {
     }
 }
 
-/// `config` with the value at `pointer` replaced. What is not there on the way is taken from `resolved`, the same
+/// `config` with the value at `pointer` replaced. Missing parents are taken from `resolved`, the same
 /// config with all defaults filled in.
 pub(in crate::check) fn with(config: &Value, resolved: &Value, pointer: &str, value: Value) -> Value {
     let mut config = config.clone();

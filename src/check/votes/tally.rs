@@ -1,10 +1,10 @@
-//! The evidence: which tensors speak for the value of each key, which against it, and what none can decide.
+//! Counts, for each key, the tensors that agree with its value and those that disagree, and finds undetermined keys.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::probe::{ProbedKey, dimensions, keys, stored_dimension};
+use super::probe::{ProbedKey, dimensions, keys, keys_among, stored_dimension};
 use super::solve::SearchState;
 use super::space::{Space, with};
 use super::vote::{Undecided, Vote, Witness};
@@ -13,7 +13,21 @@ use crate::knowledge::Expected;
 /// Tensors named for one vote.
 const WITNESSES: usize = 3;
 
-/// The votes on every value that shapes the class.
+/// The votes on the values that the search changed.
+pub(super) fn votes_on_changes(space: &Space<'_>, state: &SearchState, given: &Value, said: &Value) -> Vec<Vote> {
+    let state = &pinned(space, state);
+    let keys = keys_among(space, &state.config, &state.built, state.changed.iter().cloned());
+    keys.iter().map(|key| vote(space, key, state, given, said)).collect()
+}
+
+/// The state with computed values written out, so that each value is independent: `head_dim` no longer follows
+/// `hidden_size`.
+fn pinned(space: &Space<'_>, state: &SearchState) -> SearchState {
+    let pinned = SearchState::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
+    pinned.map_or_else(|| state.clone(), |pinned| SearchState { changed: state.changed.clone(), ..pinned })
+}
+
+/// The votes on every value that shapes the class, and the values that no tensor decides.
 ///
 /// `said` is the config as it was given with defaults filled in, `given` that without them.
 pub(super) fn votes(
@@ -22,10 +36,7 @@ pub(super) fn votes(
     given: &Value,
     said: &Value,
 ) -> (Vec<Vote>, Vec<Undecided>) {
-    // With computed values written out each value stands for itself: `head_dim` no longer follows `hidden_size`.
-    let pinned = SearchState::at(space, state.built.config.clone()).filter(|s| s.built.tensors == state.built.tensors);
-    let state =
-        &pinned.map_or_else(|| state.clone(), |pinned| SearchState { changed: state.changed.clone(), ..pinned });
+    let state = &pinned(space, state);
     let keys = keys(space, &state.config, &state.built);
     let undecided = undecided(&keys, state);
     let loose: BTreeSet<&str> = undecided.iter().flat_map(|u| &u.pointers).map(String::as_str).collect();
@@ -52,7 +63,7 @@ fn vote(space: &Space<'_>, key: &ProbedKey, state: &SearchState, given: &Value, 
     let evidence = ballot.witnesses(space, &state.built, &key.value);
     let against: BTreeSet<&str> = ballot.differ.iter().map(|(name, _)| *name).collect();
     let agree: BTreeSet<&str> = ballot.agree.iter().map(|(name, _)| *name).filter(|n| !against.contains(n)).collect();
-    // A value that nobody changed follows from others: what it was before they changed is not what the config says.
+    // A value that the search did not change may follow from others, so its earlier value is not that of the config.
     let before = if state.changed.contains(&key.pointer) { said.pointer(&key.pointer) } else { Some(&key.value) };
     Vote {
         pointer: key.pointer.clone(),
@@ -73,7 +84,7 @@ struct Ballot<'e> {
 }
 
 impl<'e> Ballot<'e> {
-    /// What differs between the class as voted and the class with another value: the store agrees with one.
+    /// The differences between the class with the voted value and with another one; the stored tensors agree with one.
     ///
     /// A name that is not stored is no evidence: it may have been lost.
     fn count(&mut self, space: &'e Space<'_>, voted: &'e Expected, other: &Expected) {

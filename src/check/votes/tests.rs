@@ -72,7 +72,7 @@ fn votes_name_their_witnesses() {
     assert_eq!(named, ["model.embed_tokens.weight [340, 64]", "lm_head.weight [340, 64]"]);
     let fault = fault(vote);
     assert_eq!((fault.kind, fault.places[0].pointer.as_deref()), (FaultKind::ConfigOutvoted, Some("/vocab_size")));
-    assert_eq!(fault.detail["names"], json!("model.embed_tokens.weight [340, 64], lm_head.weight [340, 64]"));
+    assert_eq!(fault.detail["names"], json!(["model.embed_tokens.weight [340, 64]", "lm_head.weight [340, 64]"]));
 }
 
 #[test]

@@ -110,6 +110,7 @@ impl Fit {
     }
 
     /// Whether every name and shape agrees.
+    #[cfg(any(test, feature = "internals"))]
     #[must_use]
     pub const fn is_exact(&self) -> bool {
         self.found == self.expected && self.found == self.stored && self.mismatched == 0
@@ -140,7 +141,7 @@ pub struct Votes {
 }
 
 impl Votes {
-    /// Puts what a vote says into another config; a list it is an element of comes along whole.
+    /// Writes the voted value into another config; for an element of a list, the whole list.
     pub fn apply(&self, vote: &Vote, config: &mut Value) {
         let ends = vote.pointer.match_indices('/').map(|(at, _)| at).skip(1);
         let outer = ends.filter_map(|end| vote.pointer.get(..end));

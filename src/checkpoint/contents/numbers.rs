@@ -1,13 +1,13 @@
-//! Numbers that are none: NaN and infinity, by the bits of each element type.
+//! Counts NaN and infinite elements, by the bit patterns of each dtype.
 
 use super::super::{Dtype, Fault, FaultKind, Place, Shard, Tensor};
 
-/// Counts of one tensor.
+/// Counts for one tensor.
 pub(super) struct NonFiniteCounter {
     dtype: Dtype,
     nan: u64,
     infinite: u64,
-    /// Number of the first such element.
+    /// Position of the first such element.
     first: Option<u64>,
     seen: u64,
 }
@@ -17,7 +17,7 @@ impl NonFiniteCounter {
         Self { dtype, nan: 0, infinite: 0, first: None, seen: 0 }
     }
 
-    /// Looks at bytes that start and end with an element.
+    /// Counts the elements in `bytes`, which must start and end on an element.
     pub(super) fn add(&mut self, bytes: &[u8]) {
         match self.dtype {
             Dtype::BF16 => self.wide(bytes, 0x7f80, |b| u16::from_le_bytes(b).into()),
@@ -25,8 +25,8 @@ impl NonFiniteCounter {
             Dtype::F32 | Dtype::C64 => self.wide(bytes, 0x7f80_0000, |b| u32::from_le_bytes(b).into()),
             Dtype::F64 => self.wide(bytes, 0x7ff0_0000_0000_0000, u64::from_le_bytes),
             Dtype::F8_E5M2 => self.wide(bytes, 0x7c, |[b]: [u8; 1]| b.into()),
-            // These have no infinity, and one or two patterns for what is not a number. Source: OCP 8-bit floating
-            // point specification; ml_dtypes for the FNUZ variants.
+            // These dtypes have no infinity, and one or two patterns for NaN. Source: OCP 8-bit floating point
+            // specification; ml_dtypes for the FNUZ variants.
             Dtype::F8_E4M3 => self.narrow(bytes, |b| b & 0x7f == 0x7f),
             Dtype::F8_E4M3FNUZ | Dtype::F8_E5M2FNUZ => self.narrow(bytes, |b| b == 0x80),
             Dtype::F8_E8M0 => self.narrow(bytes, |b| b == 0xff),
@@ -34,11 +34,11 @@ impl NonFiniteCounter {
         }
     }
 
-    /// IEEE formats: all bits of the exponent are set; the fraction tells infinity from what is not a number.
+    /// IEEE formats: all exponent bits are set; the fraction is zero for infinity and nonzero for NaN.
     fn wide<const N: usize>(&mut self, bytes: &[u8], exponent: u64, bits: impl Fn([u8; N]) -> u64) {
         let (elements, _) = bytes.as_chunks::<N>();
         let special = |element: &[u8; N]| bits(*element) & exponent == exponent;
-        // Nearly always there is none, and this loop is the one that the compiler makes fast.
+        // Most tensors have none, and the compiler vectorises this loop.
         if elements.iter().filter(|e| special(e)).count() > 0 {
             let fraction = (exponent & exponent.wrapping_neg()).wrapping_sub(1);
             for (number, element) in elements.iter().enumerate().filter(|(_, e)| special(e)) {
@@ -81,7 +81,7 @@ mod tests {
 
     fn counts(dtype: Dtype, bytes: &[u8]) -> (u64, u64, Option<u64>) {
         let mut numbers = NonFiniteCounter::new(dtype);
-        // In two pieces, as a large tensor comes.
+        // In two pieces, as a large tensor arrives.
         let (one, two) = bytes.split_at(8);
         numbers.add(one);
         numbers.add(two);

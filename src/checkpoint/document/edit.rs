@@ -1,7 +1,7 @@
-//! Edits of a JSON text as splices: every byte that is not edited stays as it is.
+//! Edits of a JSON text as splices: every other byte stays unchanged.
 //!
-//! A round trip through a JSON library would turn `1e-06` into `1e-6`, lose one of two equal keys and lay the whole
-//! document out anew. What is put in follows the layout of its neighbours instead.
+//! A round trip through a JSON library would turn `1e-06` into `1e-6`, drop one of two duplicate keys and reformat the
+//! whole document. Inserted text follows the layout of its neighbours instead.
 
 use std::ops::Range;
 
@@ -20,9 +20,9 @@ use container::Container;
 use layout::Layout;
 
 impl Document {
-    /// The edit that gives the place at a JSON pointer this value; members and objects that are not there are added.
+    /// The edit that sets the value at a JSON pointer; missing members and objects are added.
     ///
-    /// `None` when the text is not JSON as far as needed, or the pointer leads through something else.
+    /// `None` when the text is not JSON up to that place, or when the pointer leads through a scalar.
     #[must_use]
     pub fn set(&self, pointer: &str, value: &Value) -> Option<Splice> {
         let text = self.text.as_deref()?;
@@ -31,7 +31,7 @@ impl Document {
         let mut at = start_of(text);
         for (depth, step) in steps.iter().enumerate() {
             let Some(container) = Container::read(text, at) else {
-                // `null` stands for the object that is not there yet.
+                // `null` stands for a missing object.
                 let range = super::value_at(text, at)?;
                 let rest = steps.get(depth..)?;
                 let is_null = text.get(range.clone()) == Some("null");
@@ -49,7 +49,7 @@ impl Document {
         Some(layout.replaced(text, super::value_at(text, at)?, value))
     }
 
-    /// The edit that takes the member at a JSON pointer away; `None` when there is none.
+    /// The edit that removes the member at a JSON pointer; `None` when it does not exist.
     #[must_use]
     pub fn remove(&self, pointer: &str) -> Option<Splice> {
         let text = self.text.as_deref()?;
@@ -58,7 +58,7 @@ impl Document {
         Some(without(&parent, index))
     }
 
-    /// The edit that takes away the member whose key stands at byte `at`, in the object at the parent of `pointer`.
+    /// The edit that removes the member whose key starts at byte `at`, in the object at the parent of `pointer`.
     #[must_use]
     pub fn remove_at(&self, pointer: &str, at: usize) -> Option<Splice> {
         let text = self.text.as_deref()?;
@@ -67,7 +67,8 @@ impl Document {
         Some(without(&parent, index))
     }
 
-    /// The edits that rename members of the object at a JSON pointer; `rename` says which, and to what.
+    /// The edits that rename members of the object at a JSON pointer; `rename` returns the new name, or `None` to keep
+    /// the old one.
     #[must_use]
     pub fn rename_keys(&self, pointer: &str, rename: impl Fn(&str) -> Option<String>) -> Option<Vec<Splice>> {
         let text = self.text.as_deref()?;
@@ -90,12 +91,12 @@ fn start_of(text: &str) -> usize {
     if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 }
 }
 
-/// The value inside an object for each step.
+/// Wraps the value in one object per step.
 fn nested(steps: &[String], value: &Value) -> Value {
     steps.iter().rev().fold(value.clone(), |inner, step| Value::Object([(step.clone(), inner)].into_iter().collect()))
 }
 
-/// Takes a member away with the comma and the space that belong to it.
+/// Removes a member with its comma and the space around it.
 fn without(container: &Container, index: usize) -> Splice {
     let Range { start, end } = &container.range;
     let before = index.checked_sub(1).and_then(|i| container.members.get(i));

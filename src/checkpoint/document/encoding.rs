@@ -1,4 +1,4 @@
-//! From bytes to text: which encoding a document is in, and whether that is the right one.
+//! Decodes the bytes of a document, and reports an encoding other than UTF-8.
 
 use std::borrow::Cow;
 
@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::checkpoint::{Fault, FaultKind, Place};
 
-/// Text made from a document's bytes.
+/// Text of a document, and whether it equals the bytes of the file.
 pub(super) struct Decoded<'a> {
     pub(super) text: Cow<'a, str>,
     /// Whether `text` is the file's bytes unchanged.
@@ -14,7 +14,7 @@ pub(super) struct Decoded<'a> {
     pub(super) faults: Vec<Fault>,
 }
 
-/// Decodes as UTF-8, or as what the bytes plainly are instead.
+/// Decodes as UTF-8, or as UTF-16 or UTF-32 when the bytes show it.
 pub(super) fn decode<'a>(name: &str, bytes: &'a [u8]) -> Decoded<'a> {
     if let Some((encoding, text)) = wide(bytes) {
         let fault = Fault::new(FaultKind::WrongEncoding).at(Place::file(name)).with("encoding", encoding);
@@ -37,7 +37,7 @@ pub(super) fn decode<'a>(name: &str, bytes: &'a [u8]) -> Decoded<'a> {
     }
 }
 
-/// UTF-16 and UTF-32, by their byte-order mark or by where the NUL bytes of ASCII text fall.
+/// Decodes UTF-16 and UTF-32, recognised by a byte-order mark or by the positions of NUL bytes in ASCII text.
 pub(super) fn wide(bytes: &[u8]) -> Option<(&'static str, String)> {
     let (encoding, skip) = match bytes {
         [0xff, 0xfe, 0, 0, ..] => ("UTF-32LE", 4),

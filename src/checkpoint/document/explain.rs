@@ -1,8 +1,8 @@
-//! Why a text is not JSON, when it is more than a slip.
+//! Explains why a text is not JSON, for causes larger than a slip.
 
 use std::ops::Range;
 
-/// Lines that a version-control merge leaves behind when its conflict is not resolved.
+/// Conflict markers of an unresolved merge in version control.
 pub(super) fn conflict_markers(text: &str) -> Vec<(Range<usize>, &'static str)> {
     const MARKERS: [&str; 4] = ["<<<<<<<", "|||||||", "=======", ">>>>>>>"];
     let mut found = Vec::new();
@@ -19,7 +19,7 @@ pub(super) fn conflict_markers(text: &str) -> Vec<(Range<usize>, &'static str)> 
     found
 }
 
-/// The text with these ranges turned into spaces, so that every other byte stays where it was.
+/// Replaces these ranges with spaces, so that all other bytes keep their offsets.
 pub(super) fn blank(text: &str, ranges: &[(Range<usize>, &'static str)]) -> String {
     let mut out = String::with_capacity(text.len());
     let mut from = 0;
@@ -42,11 +42,11 @@ pub(super) fn ini_section(text: &str) -> Option<&str> {
     (starts_well && setting && name.chars().all(plain)).then_some(name)
 }
 
-/// What follows the one value of a document, in a few words.
+/// Describes the text after the end of a document's value.
 pub(super) fn trailing(text: &str) -> &'static str {
     match text.trim_start().chars().next() {
         Some('{' | '[') => "a second JSON value",
-        Some('}' | ']') => "a closing bracket too many",
+        Some('}' | ']') => "an extra closing bracket",
         Some(',') => "a comma",
         Some('\0') => "NUL bytes",
         _ => "other text",

@@ -1,4 +1,4 @@
-//! Finds places in a text: the bytes of a value, the line of a byte.
+//! Finds places in a text: the byte range of a value, the line of a byte.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -6,18 +6,18 @@ use std::ops::Range;
 use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
 
-/// Finds many places in one text. Each container on the way to one is read once, and so is the text for its lines:
-/// a hundred findings in a document of one line and fifty megabytes would otherwise read it some thousand times.
+/// Finds many places in one text. Each container on the way is scanned once, and line breaks are counted once. Without
+/// this, a hundred findings in a one-line document of fifty megabytes would scan it some thousand times.
 #[derive(Debug)]
 pub struct Locator<'t> {
     text: &'t str,
-    /// Members of the containers looked into, by where these begin.
+    /// Members of the containers scanned so far, by the offset of the container.
     containers: HashMap<usize, LocatedMembers>,
-    /// Line, start of the line and characters before it in the line, for every [`STRIDE`] bytes.
+    /// Line number, start of the line, and characters since then, for every [`STRIDE`] bytes.
     lines: Vec<Mark>,
 }
 
-/// Where a member stands.
+/// Byte ranges of a member.
 #[derive(Debug, Clone)]
 struct MemberSpans {
     key: Option<Range<usize>>,
@@ -26,12 +26,12 @@ struct MemberSpans {
 
 #[derive(Debug)]
 enum LocatedMembers {
-    /// By key; of equal keys the last.
+    /// By key; of duplicate keys the last.
     Object(HashMap<String, MemberSpans>),
     Array(Vec<Range<usize>>),
 }
 
-/// What stands before a byte of the text.
+/// Line and column at one byte of the text.
 #[derive(Debug, Clone, Copy, Default)]
 struct Mark {
     line_breaks: usize,
@@ -43,7 +43,7 @@ struct Mark {
 const STRIDE: usize = 4096;
 
 impl<'t> Locator<'t> {
-    /// Looks for places in `text`; reads nothing yet.
+    /// A locator for `text`; scans nothing yet.
     #[must_use]
     pub fn new(text: &'t str) -> Self {
         Self { text, containers: HashMap::new(), lines: Vec::new() }
@@ -54,7 +54,7 @@ impl<'t> Locator<'t> {
         self.find(pointer).map(|found| found.value)
     }
 
-    /// Byte range of the key, quotes included, that the last step of a JSON pointer names.
+    /// Byte range of the key, quotes included, for the last step of a JSON pointer.
     pub fn key(&mut self, pointer: &str) -> Option<Range<usize>> {
         self.find(pointer)?.key
     }
@@ -98,7 +98,7 @@ impl Mark {
         let line = memchr::memrchr(b'\n', bytes);
         let breaks = memchr::memchr_iter(b'\n', bytes).count();
         let rest = line.map_or(bytes, |at| bytes.get(at.saturating_add(1)..).unwrap_or_default());
-        // A character begins with any byte but those that continue one.
+        // Bytes 0x80 to 0xbf continue a character; all others begin one.
         let characters = rest.iter().filter(|b| (**b & 0xc0) != 0x80).count();
         Self {
             line_breaks: self.line_breaks.saturating_add(breaks),

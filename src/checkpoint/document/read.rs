@@ -1,4 +1,4 @@
-//! From text to value and faults, in one pass.
+//! Parses a document in one pass, into a value and faults.
 
 use std::ops::Range;
 
@@ -15,11 +15,12 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 
 mod build;
 mod duplicates;
+mod spelling;
 
 use build::{ValueBuilder, is_huge};
 use duplicates::Duplicates;
 
-/// Parts of documents that are left out of the value: what a tokenizer holds in less space.
+/// Parts of documents omitted from the value, because the tokenizer holds them in less space.
 fn left_out(name: &str) -> Vec<&'static str> {
     match name {
         "tokenizer.json" => vec!["/model/vocab", "/model/merges"],
@@ -29,7 +30,7 @@ fn left_out(name: &str) -> Vec<&'static str> {
 }
 
 impl Document {
-    /// Reads a document. Never fails: what is wrong becomes a fault.
+    /// Parses a document. Never fails: every problem becomes a fault.
     #[must_use]
     pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
         parse(name.into(), bytes)
@@ -60,7 +61,7 @@ fn parse(name: String, bytes: &[u8]) -> Document {
     Document { name, text, value, left_out, faults: faults.into_vec() }
 }
 
-/// Files that were never meant to be this document.
+/// Recognises files that are not JSON documents: empty, LFS pointers, NUL bytes, other formats.
 fn not_json_at_all(name: &str, bytes: &[u8]) -> Option<Fault> {
     let place = Place::file(name);
     if bytes.trim_ascii().is_empty() {
@@ -95,13 +96,13 @@ struct DocumentReader<'n> {
 }
 
 impl DocumentReader<'_> {
-    /// A place at `span`, when spans mean anything in this document.
+    /// A place at `span`; the file alone when spans of the text are not offsets of the file.
     fn place(&self, span: Range<usize>) -> Place {
         let place = Place::file(self.name);
         if self.verbatim { place.span(span) } else { place }
     }
 
-    /// Reports NUL bytes, and returns the text before them when nothing but NULs follows.
+    /// Reports NUL bytes, and returns the text before them if only NUL bytes follow.
     fn cut_nul_bytes<'t>(&mut self, text: &'t str) -> &'t str {
         let Some(first) = text.find('\0') else { return text };
         let count = text.bytes().filter(|b| *b == 0).count();
@@ -110,7 +111,7 @@ impl DocumentReader<'_> {
         text.get(..first).filter(|_| text.trim_end_matches('\0').len() == first).unwrap_or(text)
     }
 
-    /// Reads the text, or what is left of it when conflict markers are taken out.
+    /// Parses the text, or the rest of it without conflict markers.
     fn read(&mut self, text: &str) -> Option<Value> {
         let (value, error) = self.pass(text);
         let Some(error) = error else { return value };
@@ -120,7 +121,7 @@ impl DocumentReader<'_> {
                 let fault = Fault::new(FaultKind::MergeConflictMarker).at(self.place(span.clone()));
                 self.faults.push(fault.with("marker", *marker));
             }
-            // The second pass only serves the value; its faults would be consequences of the markers.
+            // The second pass only produces the value; its faults would be consequences of the markers.
             let faults = std::mem::take(&mut self.faults);
             let (value, error) = self.pass(&explain::blank(text, &markers));
             self.faults = faults;
@@ -130,7 +131,7 @@ impl DocumentReader<'_> {
         value.filter(|_| error.kind == ScanErrorKind::Trailing)
     }
 
-    /// One pass over the text: the value, if it came to its end, and what ended the pass early.
+    /// Scans the text once: returns the value, if complete, and the error that ended the pass early.
     fn pass(&mut self, text: &str) -> (Option<Value>, Option<ScanError>) {
         let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
         let mut scanner = Scanner::lenient(text, start);
@@ -185,7 +186,7 @@ impl DocumentReader<'_> {
         self.faults.push(fault.at(place));
     }
 
-    /// Turns what ended a pass early into a fault.
+    /// Turns the error that ended a pass into a fault.
     fn push_scan_fault(&mut self, text: &str, error: &ScanError) {
         let found = text.get(error.span.clone()).unwrap_or_default().trim_end();
         let place = self.place(error.span.start..error.span.start.saturating_add(found.len()));

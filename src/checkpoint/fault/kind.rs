@@ -1,10 +1,11 @@
-//! The kinds of fault: one list, in which a kind has its name and the stage that produces it.
+//! The kinds of fault: one list with the name of each kind and the stage that produces it.
 
 use std::fmt;
 
 use serde::{Serialize, Serializer};
 
 /// The stage that produces faults of a kind.
+#[cfg(feature = "internals")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FaultSource {
     /// The readers in `checkpoint`, from one file.
@@ -19,6 +20,7 @@ macro_rules! fault_kinds {
         /// A kind of fault. Rules in `rules/checks/` select faults by [`FaultKind::name`].
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[cfg_attr(test, derive(schemars::JsonSchema), schemars(rename_all = "kebab-case"))]
+        #[non_exhaustive]
         pub enum FaultKind {
             $($(
                 #[doc = concat!("`", $name, "`")]
@@ -30,7 +32,7 @@ macro_rules! fault_kinds {
             /// Every kind: those of the readers first, each group sorted by name.
             pub const ALL: &[Self] = &[$($(Self::$variant,)*)*];
 
-            /// The name that rules and reports use: `header-not-json`.
+            /// The name in rules and reports: `header-not-json`.
             #[must_use]
             pub const fn name(self) -> &'static str {
                 match self {
@@ -39,6 +41,7 @@ macro_rules! fault_kinds {
             }
 
             /// The stage that produces faults of this kind.
+            #[cfg(feature = "internals")]
             #[must_use]
             pub const fn source(self) -> FaultSource {
                 match self {
@@ -191,7 +194,7 @@ fault_kinds! {
 }
 
 impl FaultKind {
-    /// The kind of this name; `None` when there is none.
+    /// The kind of this name; `None` for an unknown name.
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|kind| kind.name() == name)

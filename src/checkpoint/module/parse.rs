@@ -9,17 +9,17 @@ use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::{Fault, FaultKind, Place};
 
-/// Most syntax nodes looked at: some 3 MB of honest Python, ten times the largest module known.
+/// Maximum number of syntax nodes visited: some 3 MB of ordinary Python, ten times the largest known module.
 const MAX_NODES: usize = 1_000_000;
 
-/// Most bytes parsed, ten times as many as modules of models have: a syntax tree takes some 140 bytes for each byte of
-/// brackets or one-letter statements.
+/// Maximum number of bytes parsed, ten times the size of published modules: a syntax tree takes some 140 bytes for each
+/// byte of brackets or one-letter statements.
 const MAX_BYTES: usize = 512 << 10;
 
-/// How often the parser may ask whether to go on. It asks about every hundred steps.
+/// Maximum number of progress callbacks of the parser, which come about every hundred steps.
 const MAX_PROGRESS: usize = 200_000;
 
-/// Where a statement stands.
+/// Context of a statement.
 #[derive(Debug, Clone, Copy, Default)]
 struct StatementContext {
     guarded: bool,
@@ -28,7 +28,7 @@ struct StatementContext {
 }
 
 impl PythonModule {
-    /// Reads a module. Never fails: what is wrong becomes a fault.
+    /// Parses a module. Never fails: every problem becomes a fault.
     #[must_use]
     pub fn parse(name: impl Into<String>, bytes: &[u8]) -> Self {
         parse(name.into(), bytes)
@@ -60,7 +60,7 @@ fn parse(name: String, bytes: &[u8]) -> PythonModule {
     module
 }
 
-/// The syntax tree, `None` when it would take too long to make.
+/// The syntax tree; `None` when parsing exceeds [`MAX_PROGRESS`].
 fn tree_of(text: &str) -> Option<Tree> {
     let mut parser = Parser::new();
     parser.set_language(&tree_sitter_python::LANGUAGE.into()).ok()?;
@@ -84,7 +84,7 @@ impl<'a> ModuleReader<'a> {
     /// Visits every node, without recursion.
     fn walk(&mut self, tree: &Tree) {
         let mut cursor = tree.walk();
-        // The scope each open node gives to its children.
+        // The context that each open node gives to its children.
         let mut scopes = vec![StatementContext::default()];
         for _ in 0..MAX_NODES {
             let node = cursor.node();
@@ -119,11 +119,11 @@ impl<'a> ModuleReader<'a> {
         self.text.get(node.byte_range()).unwrap_or_default()
     }
 
-    /// Takes what a node says; the scope for its children, or `None` when they say nothing.
+    /// Records the facts of one node; returns the context for its children, or `None` to skip them.
     fn visit(&mut self, node: Node<'_>, scope: StatementContext) -> Option<StatementContext> {
         if node.is_error() || node.is_missing() {
             let start = node.start_byte();
-            // An error node can span the rest of the file; its beginning is where to look.
+            // An error node can span the rest of the file; the mistake is near its beginning.
             let rest = self.text.get(node.byte_range()).unwrap_or_default();
             let len = rest.find('\n').unwrap_or(rest.len());
             let place = Place::file(&*self.module.name).span(start..start.saturating_add(len));
@@ -162,14 +162,14 @@ impl<'a> ModuleReader<'a> {
                 if let Some(left) = node.child_by_field_name("left").filter(|_| top) {
                     self.bind(left);
                 }
-                // `a = b = c` nests on the right.
+                // In `a = b = c`, the second assignment is the right operand.
                 Some(scope)
             }
             _ => Some(scope),
         }
     }
 
-    /// Notes the names an assignment binds: a name, or a flat list of names.
+    /// Records the names that an assignment binds: a name, or a flat list of names.
     fn bind(&mut self, target: Node<'_>) {
         if target.kind() == "identifier" {
             let name = self.str(target).to_owned();
@@ -212,7 +212,7 @@ impl<'a> ModuleReader<'a> {
         });
     }
 
-    /// The strings that a class body assigns to `name`; the last assignment counts.
+    /// The strings assigned to `name` in a class body; the last assignment counts.
     fn attribute(&self, body: Node<'_>, name: &str) -> Option<Vec<String>> {
         let mut cursor = body.walk();
         let mut found = None;
@@ -242,7 +242,7 @@ impl<'a> ModuleReader<'a> {
         }
     }
 
-    /// The content of a plain string literal; `None` for one with escapes or insertions.
+    /// The content of a plain string literal; `None` for one with escapes or interpolation.
     fn string(&self, node: Node<'_>) -> Option<String> {
         if node.kind() != "string" {
             return None;

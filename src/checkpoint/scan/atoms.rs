@@ -1,4 +1,4 @@
-//! Words, numbers and strings.
+//! Scans words, numbers and strings.
 
 use super::{JsonString, ScanError, Scanner, SlipKind, Token};
 
@@ -107,7 +107,7 @@ impl<'a> Scanner<'a> {
         Ok(JsonString { raw: self.text.get(start..at).unwrap_or_default(), escaped })
     }
 
-    /// Bytes of the escape at `at`, checked.
+    /// Length of the escape at `at`; fails when it is invalid.
     fn escape_len(&self, at: usize, quote: u8) -> Result<usize, ScanError> {
         let after = at.saturating_add(1);
         match self.byte(after) {

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-/// A string as it stands in the text, without its quotes.
+/// A string of the text as written, without its quotes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct JsonString<'a> {
     pub(super) raw: &'a str,
@@ -10,7 +10,7 @@ pub(crate) struct JsonString<'a> {
 }
 
 impl<'a> JsonString<'a> {
-    /// The string after unescaping, and whether it held a lone surrogate (replaced by U+FFFD).
+    /// The unescaped string, and whether it contained an unpaired surrogate (replaced by U+FFFD).
     pub(crate) fn decode(self) -> (Cow<'a, str>, bool) {
         if self.escaped { unescape(self.raw) } else { (Cow::Borrowed(self.raw), false) }
     }

@@ -1,13 +1,14 @@
-//! Element types of the format.
+//! Element types of the safetensors format.
 
 use std::fmt;
 
 /// Element types of the safetensors format, as of safetensors 0.8 (22 of them).
 ///
 /// Source: `safetensors::Dtype` in safetensors 0.8.0.
-#[allow(missing_docs, reason = "each name says all there is")]
+#[allow(missing_docs, reason = "the names are those of the format")]
 #[allow(non_camel_case_types, reason = "the names are the format's own spelling")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub enum Dtype {
     BOOL,
     F4,
@@ -34,7 +35,7 @@ pub enum Dtype {
 }
 
 impl Dtype {
-    /// All element types, in the format's alignment order (narrowest first).
+    /// All element types, in the alignment order of the format (narrowest first).
     pub const ALL: [Self; 22] = [
         Self::BOOL,
         Self::F4,
@@ -80,13 +81,13 @@ impl Dtype {
         }
     }
 
-    /// The type of this spelling; the format is case-sensitive.
+    /// The type with this name; case-sensitive, like the format.
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|d| d.name() == name)
     }
 
-    /// The format's spelling.
+    /// The name in the format.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {

@@ -1,4 +1,4 @@
-//! Reads a safetensors header: all of its faults, with the names of the tensors they belong to.
+//! Reads a safetensors header, and reports all of its faults with the names of their tensors.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -15,14 +15,14 @@ use crate::checkpoint::{Fault, FaultKind};
 
 mod fields;
 
-/// `format` values that transformers opens. Source: `load_state_dict` in transformers 4.47.0.
+/// `format` values that transformers accepts. Source: `load_state_dict` in transformers 4.47.0.
 const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
 
 impl Shard {
     /// Reads a header from the first bytes of a file of `file_len` bytes.
     ///
-    /// `head` must hold the length field and the header it states, if the file does; of a file that
-    /// is no safetensors file the first few hundred bytes tell what it is.
+    /// `head` must contain the length field and the header it states, if the file does. For a file of another format,
+    /// the first few hundred bytes are enough to recognise it.
     #[must_use]
     pub fn parse(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
         let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
@@ -30,7 +30,7 @@ impl Shard {
     }
 }
 
-/// Fills in `shard`, which has its name and length, from the first bytes of the file.
+/// Fills in `shard`, which already has its name and length, from the first bytes of the file.
 fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     let (header, data_start) = match frame(&shard, head) {
         Ok(frame) => frame,
@@ -55,7 +55,7 @@ fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
         faults.push(not_json(&shard, reason, span.start));
     }
-    // What follows the object is padding; any other error leaves entries unread.
+    // Text after the object is padding; any other error leaves entries unread.
     let unread = error.as_ref().is_some_and(|error| error.kind != ScanErrorKind::Trailing);
     faults.extend(error.map(|error| scan_fault(&shard, text, error)));
     if !unread {
@@ -93,7 +93,7 @@ fn header_text<'h>(shard: &Shard, header: &'h [u8], faults: &mut Faults) -> Opti
     }
 }
 
-/// The fault behind what ended the reading of the object.
+/// The fault for the error that ended the read of the object.
 fn scan_fault(shard: &Shard, text: &str, error: ScanError) -> Fault {
     let start = error.span.start;
     match error.kind {
@@ -124,7 +124,7 @@ fn padding(shard: &Shard, what: &str) -> Fault {
     Fault::new(FaultKind::HeaderPaddingNotSpaces).at(shard.place()).with("what", what)
 }
 
-/// The header's bytes and where the data region starts, if the file is framed like a safetensors file.
+/// The header's bytes and the start of the data region, if the length field is valid.
 fn frame<'a>(shard: &Shard, head: &'a [u8]) -> Result<(&'a [u8], u64), Box<Fault>> {
     let fault = |kind| Fault::new(kind).at(shard.place());
     let file_len = shard.file_len;
@@ -160,14 +160,14 @@ fn frame<'a>(shard: &Shard, head: &'a [u8]) -> Result<(&'a [u8], u64), Box<Fault
     Ok((header, end))
 }
 
-/// What a file is whose length field makes no sense.
+/// Describes a file whose length field is not plausible for a safetensors file.
 fn other_format(head: &[u8]) -> Option<String> {
     if let Some(what) = looks_like(head) {
         return Some(what.to_owned());
     }
     let sample = head.get(..head.len().min(512)).unwrap_or_default();
     if sample.iter().all(|b| *b == 0) {
-        return Some("nothing but NUL bytes".to_owned());
+        return Some("only NUL bytes".to_owned());
     }
     let text = sample.iter().all(|b| matches!(b, b' '..=b'~' | b'\t' | b'\n' | b'\r'));
     let start = || escape(&String::from_utf8_lossy(sample).trim().chars().take(60).collect::<String>(), 60);
@@ -178,11 +178,11 @@ fn other_format(head: &[u8]) -> Option<String> {
     }
 }
 
-/// Most entries read of one header, tensors and metadata apart; the largest models have some hundred
-/// thousand over all shards, and each takes more memory than its bytes.
+/// Maximum number of entries read of one header, counting tensors and metadata apart. The largest models have some
+/// hundred thousand over all shards, and each entry takes more memory than its bytes.
 const MAX_ENTRIES: usize = 200_000;
 
-/// What `__metadata__` held.
+/// Content of `__metadata__`.
 enum HeaderMetadata {
     Absent,
     Null,
@@ -200,7 +200,7 @@ fn check_format(shard: &Shard, metadata: &HeaderMetadata, faults: &mut Faults) {
     }
 }
 
-/// Keeps the last of equal names, as Python does, and reports the others.
+/// Keeps the last of duplicate names, as Python does, and reports the others.
 fn without_duplicates(shard: &Shard, entries: Vec<HeaderEntry>, faults: &mut Faults) -> Vec<HeaderEntry> {
     let mut drop = vec![false; entries.len()];
     let mut last: HashMap<&str, usize> = HashMap::with_capacity(entries.len());
@@ -224,14 +224,14 @@ struct HeaderReader<'s, 't> {
     metadata: HeaderMetadata,
 }
 
-/// Why a header of too many entries is not read on.
+/// Reason for abandoning a header with too many entries.
 const TOO_MANY: &str = "too many entries";
 
 fn too_many() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), span: 0..0 }
 }
 
-/// A header that stops in the middle.
+/// The error for a header that ends early.
 fn ended() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax("the header ends too early"), span: 0..0 }
 }
@@ -265,7 +265,7 @@ impl<'t> HeaderReader<'_, 't> {
                 self.read_entry(name.into_owned())?;
             }
         }
-        // Anything but space after the object is an error of the scanner.
+        // The scanner reports text after the object, other than space, as an error.
         self.scanner.next().map(|_| ())
     }
 
@@ -317,7 +317,7 @@ impl<'t> HeaderReader<'_, 't> {
 
     fn check_name(&mut self, name: &str, lone: bool) {
         let reason = if lone {
-            "it has a lone surrogate"
+            "it has an unpaired surrogate escape"
         } else if name.is_empty() {
             "it is empty"
         } else if name.len() > 1024 {

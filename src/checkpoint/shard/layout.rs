@@ -1,11 +1,11 @@
-//! Whether the tensors of a header fill the data region: each byte once, and no byte besides.
+//! Checks that the tensors of a header cover the data region: each byte exactly once.
 
 use super::Shard;
 use super::entry::HeaderEntry;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::{Fault, FaultKind};
 
-/// Reports every fault of sizes and places.
+/// Reports all faults of tensor sizes and offsets.
 pub(super) fn check(shard: &Shard, entries: &[HeaderEntry], faults: &mut Faults) {
     for entry in entries {
         check_size(shard, entry, faults);
@@ -15,7 +15,7 @@ pub(super) fn check(shard: &Shard, entries: &[HeaderEntry], faults: &mut Faults)
         .filter_map(|e| e.offsets.filter(|(begin, end)| begin <= end).map(|(begin, end)| (begin, end, e)))
         .collect();
     ranges.sort_by_key(|(begin, end, _)| (*begin, *end));
-    // Bytes that a malformed entry may own are not known to be unowned.
+    // Holes and trailing bytes are only certain when all entries could be read.
     let all_known = ranges.len() == entries.len() && !shard.unread;
 
     let mut filled = 0_u64;
@@ -56,7 +56,7 @@ pub(super) fn check(shard: &Shard, entries: &[HeaderEntry], faults: &mut Faults)
     }
 }
 
-/// Whether dtype and shape explain the bytes of one entry.
+/// Checks that dtype and shape match the byte length of one entry.
 fn check_size(shard: &Shard, entry: &HeaderEntry, faults: &mut Faults) {
     let fault = |kind| Fault::new(kind).at(shard.place().in_tensor(entry.name.clone()));
     if let Some((begin, end)) = entry.offsets

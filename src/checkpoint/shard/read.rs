@@ -1,4 +1,4 @@
-//! Gets a shard's header off the disk, and no more than that.
+//! Reads the header of a shard from disk.
 
 use std::os::unix::fs::FileExt as _;
 use std::path::Path;
@@ -12,24 +12,29 @@ use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::{Fault, FaultKind, Place};
 
-/// Enough to recognise what a file is, and most tiny headers whole.
+/// Enough bytes to recognise a file format, and to hold most small headers whole.
 const SAMPLE: u64 = 4096;
 
 impl Shard {
-    /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: what is
-    /// wrong becomes a fault.
+    /// Reads the header of the file `name` in `dir`, which must be a plain file name. Never fails: every problem
+    /// becomes a fault.
+    #[doc(hidden)]
     #[must_use]
     pub fn read(dir: &Path, name: &str) -> Self {
-        read(dir, name)
+        match open_regular(&dir.join(name), u64::MAX) {
+            Ok(opened) => read(name, &opened),
+            Err(error) => Self::unread(name, error.fault(name)),
+        }
+    }
+
+    /// Reads the header of an open file. Never fails: what is wrong becomes a fault.
+    pub(crate) fn read_opened(name: &str, opened: &Opened) -> Self {
+        read(name, opened)
     }
 }
 
-fn read(dir: &Path, name: &str) -> Shard {
-    let opened = match open_regular(&dir.join(name), u64::MAX) {
-        Ok(opened) => opened,
-        Err(error) => return Shard::unread(name, error.fault(name)),
-    };
-    let head = match read_head(&opened) {
+fn read(name: &str, opened: &Opened) -> Shard {
+    let head = match read_head(opened) {
         Ok(head) => head,
         Err(error) => {
             let fault = Fault::new(FaultKind::UnreadableFile).at(Place::file(name)).with("reason", error.to_string());
@@ -37,27 +42,28 @@ fn read(dir: &Path, name: &str) -> Shard {
         }
     };
     let mut shard = Shard::parse(name, opened.identity.size, &head);
-    name_trailing_bytes(&mut shard, &opened);
-    shard.faults.extend(unwritten_tail(&shard, &opened));
+    name_trailing_bytes(&mut shard, opened);
+    shard.faults.extend(unwritten_tail(&shard, opened));
     shard
 }
 
-/// Bytes before a hole that may be zero and were written: the largest block of a usual file system.
+/// Size of the largest block of a usual file system: bytes before a hole that may be zero although they were written.
 const BLOCK: u64 = 64 << 10;
-/// Stretches of a file that are looked at for its last hole.
+/// Maximum number of data stretches examined to find the last hole of a file.
 const STRETCHES: usize = 10_000;
 
-/// The end of a sound shard that was never written, as the file system tells it: space that was set aside by a download
-/// that stopped, or lost with the power. Every check of the structure passes such a file.
+/// The fault of a shard whose end was never written, according to the file system's holes. A stopped download that
+/// preallocated the file leaves such an end, and so does a power failure. All checks of the structure pass on such a
+/// file.
 fn unwritten_tail(shard: &Shard, opened: &Opened) -> Option<Fault> {
     if shard.unread || !shard.faults.is_empty() {
         return None;
     }
-    // The file's own offset means nothing: everything is read at positions.
+    // `seek` moves the offset of the file, which no reader uses: all reads are positioned.
     let mut at = shard.data_start;
     for _ in 0..STRETCHES {
         let hole = rustix::fs::seek(&opened.file, SeekFrom::Hole(at)).ok()?;
-        // Every file ends in a hole of no bytes.
+        // Every file has an implicit hole at its end.
         if hole >= shard.file_len {
             return None;
         }
@@ -73,7 +79,8 @@ fn unwritten_tail(shard: &Shard, opened: &Opened) -> Option<Fault> {
     None
 }
 
-/// Where the zeros begin that a hole goes on with, counted in the data: the block before it was written whole.
+/// Start of the zeros that end in the hole, counted in the data. The block before the hole was written whole, so its
+/// last bytes may be zeros as well.
 fn written(opened: &Opened, data_start: u64, hole: u64) -> Option<u64> {
     let end = hole.saturating_sub(data_start);
     let mut block = vec![0; usize::try_from(end.min(BLOCK)).ok()?];
@@ -100,7 +107,7 @@ fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
     Ok(head)
 }
 
-/// Adds what the bytes behind the last tensor look like, when they are recognisable.
+/// Adds the format of the bytes behind the last tensor, if recognised.
 fn name_trailing_bytes(shard: &mut Shard, opened: &Opened) {
     for fault in shard.faults.iter_mut().filter(|f| f.kind == FaultKind::TrailingBytes) {
         let Some(count) = fault.detail.get("count").and_then(serde_json::Value::as_u64) else { continue };

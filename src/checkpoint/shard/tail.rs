@@ -3,8 +3,8 @@
 use super::{Dtype, Shard, Tensor};
 use crate::checkpoint::{Fault, FaultKind};
 
-/// The fault of a shard whose last bytes from `from` on, counted in its data, are zero: when at least one whole matrix
-/// lies there, or the end of one. A bias may be zero, and so may be the second factor of a LoRA that was not trained.
+/// The fault of a shard whose bytes from `from` on, counted in its data, are zero. `None` unless these bytes contain a
+/// whole matrix or the end of one: a bias may be zero, and so may the second factor of an untrained LoRA.
 pub(crate) fn zero_tail(shard: &Shard, tensors: &[&Tensor], from: u64) -> Option<Fault> {
     let zero = |t: &&&Tensor| t.begin >= from && !t.is_empty();
     let matrix = |t: &&Tensor| t.shape.len() > 1 && !t.name.contains("lora_B") && !t.name.contains("lora_embedding_B");
@@ -17,7 +17,7 @@ pub(crate) fn zero_tail(shard: &Shard, tensors: &[&Tensor], from: u64) -> Option
     Some(fault.with("partly", whole.is_none()))
 }
 
-/// Whether the values of a matrix end within one of its rows, and at least a row of zeros follows. Rows that are zero
+/// Whether the nonzero values of a matrix end within a row, and at least a row of zeros follows. Rows that are zero
 /// from their start are padding.
 fn ends_within(tensor: &Tensor, from: u64) -> bool {
     let is_float = matches!(tensor.dtype, Dtype::BF16 | Dtype::F16 | Dtype::F32 | Dtype::F64);

@@ -1,6 +1,6 @@
 //! The pieces of a sentencepiece model: a bounded walk over its protocol buffer.
 
-/// More pieces than any vocabulary has.
+/// Maximum number of pieces, above that of any published vocabulary.
 const MAX_PIECES: usize = 1_500_000;
 
 /// Piece strings in id order. Source: `ModelProto` (field 1, repeated `SentencePiece`) and
@@ -65,7 +65,7 @@ fn varint(rest: &mut &[u8]) -> Result<u64, &'static str> {
     for shift in (0..64).step_by(7) {
         let (byte, left) = rest.split_first().ok_or("it ends in the middle of a number")?;
         *rest = left;
-        // Bits beyond the 64th are dropped, as protobuf's own readers do.
+        // Bits beyond the 64th are dropped, as in protobuf's own readers.
         value |= u64::from(byte & 0x7f) << shift;
         if byte & 0x80 == 0 {
             return Ok(value);

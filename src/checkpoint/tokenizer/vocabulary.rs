@@ -6,7 +6,7 @@ use super::super::Document;
 use super::super::scan::{Scanner, Token};
 use super::sentencepiece;
 
-/// Most tokens that are read; the largest published vocabulary has 901 629 (XLM-V).
+/// Maximum number of tokens read; the largest published vocabulary has 901 629 (XLM-V).
 const MAX_TOKENS: usize = 1_500_000;
 const TOO_MANY: &str = "it has more than a million and a half tokens";
 
@@ -16,16 +16,15 @@ pub struct Vocabulary {
     arena: String,
     /// Start and end in `arena`, and the id; sorted by token, each token once.
     tokens: Vec<(u32, u32, u32)>,
-    /// Highest id and one, or the number of tokens; whichever a list says.
+    /// Number of distinct tokens.
     len: u64,
 }
 
 impl Vocabulary {
-    /// Reads a vocabulary file that is no JSON document: `vocab.txt` (a token a line) or a
-    /// sentencepiece model.
+    /// Reads a vocabulary file that is not JSON: `vocab.txt` (one token per line) or a sentencepiece model.
     ///
     /// # Errors
-    /// With the reason, when the bytes are neither.
+    /// The reason, when the bytes are neither.
     pub fn parse(name: &str, bytes: &[u8]) -> Result<Self, &'static str> {
         if name == "vocab.txt" {
             let text = std::str::from_utf8(bytes).map_err(|_| "it is not UTF-8")?;
@@ -34,21 +33,21 @@ impl Vocabulary {
         Self::collect(sentencepiece::pieces(bytes)?.into_iter().zip(0..))
     }
 
-    /// Reads the vocabulary at `pointer` of a document: an object of ids by token, or a list of pairs
-    /// of token and score.
+    /// Reads the vocabulary at `pointer` of a document: an object of ids by token, or a list of pairs of token and
+    /// score.
     ///
     /// # Errors
-    /// With the reason, when it is more than is read of one.
-    pub(super) fn of_document(document: &Document, pointer: &str) -> Result<Option<Self>, &'static str> {
+    /// The reason, when the vocabulary exceeds [`MAX_TOKENS`] or 4 GiB.
+    pub(super) fn from_document(document: &Document, pointer: &str) -> Result<Option<Self>, &'static str> {
         let mut many = false;
         let entries = Self::entries(document, pointer, &mut many);
         if many { Err(TOO_MANY) } else { entries.map(Self::collect).transpose() }
     }
 
-    /// Tokens and ids in the order of the text; `many` says that there are too many of them.
+    /// Tokens and ids in text order; sets `many` when there are more than [`MAX_TOKENS`].
     fn entries<'d>(document: &'d Document, pointer: &str, many: &mut bool) -> Option<Vec<(Cow<'d, str>, u32)>> {
         let text = document.text.as_deref()?;
-        // A document that was not understood has no value, and no vocabulary either.
+        // A document that could not be parsed has no value, and so no vocabulary.
         document.value.as_ref()?;
         let span = document.locate(pointer)?;
         let mut scanner = Scanner::lenient(text, span.start);
@@ -104,7 +103,7 @@ impl Vocabulary {
         let Self { arena, tokens, .. } = &mut vocabulary;
         let text = |t: &(u32, u32, u32)| token(arena, *t);
         tokens.sort_by(|a, b| text(a).cmp(text(b)).then(a.0.cmp(&b.0)));
-        // Of equal tokens the last counts, as in a Python dict.
+        // Of duplicate tokens the last counts, as in a Python dict.
         tokens.reverse();
         tokens.dedup_by(|a, b| text(a) == text(b));
         tokens.reverse();
@@ -112,13 +111,13 @@ impl Vocabulary {
         Ok(vocabulary)
     }
 
-    /// How many different tokens there are.
+    /// Number of distinct tokens.
     #[must_use]
     pub const fn len(&self) -> u64 {
         self.len
     }
 
-    /// Whether there is none.
+    /// Whether the vocabulary has no tokens.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.len == 0
@@ -131,7 +130,7 @@ impl Vocabulary {
         self.tokens.get(at).map(|t| u64::from(t.2))
     }
 
-    /// Highest id, if there is any token.
+    /// Highest id; `None` without tokens.
     #[must_use]
     pub fn max_id(&self) -> Option<u64> {
         self.tokens.iter().map(|t| u64::from(t.2)).max()

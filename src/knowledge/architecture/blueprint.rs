@@ -24,11 +24,13 @@ pub(crate) struct Blueprint {
     /// Its name, the file's stem.
     pub architecture: String,
     /// One line on what it is.
+    #[expect(dead_code, reason = "for readers of the file")]
     pub summary: String,
     /// `model_type` values of the config class.
     #[serde(default)]
     pub model_types: Vec<String>,
     /// Where the facts come from.
+    #[expect(dead_code, reason = "for readers of the file")]
     pub sources: Vec<String>,
     /// Loaders the file speaks for.
     pub loaders: Vec<Loader>,
@@ -133,6 +135,14 @@ pub(crate) struct ConfigClass {
     #[serde(default, deserialize_with = "ordered")]
     #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, SubConfig>"))]
     pub configs: Vec<(String, SubConfig)>,
+}
+
+impl ConfigClass {
+    /// Whether the type of a key excludes null; `false` for a key without a type.
+    pub fn forbids_null(&self, key: &str) -> bool {
+        let of_key = |(_, keys): &(&FieldType, &String)| keys.split(' ').any(|k| k == key);
+        self.types.iter().find(of_key).is_some_and(|(kind, _)| !kind.takes(&Value::Null))
+    }
 }
 
 /// How the config inside a config gets its values. In `absent` and `set` a string that starts with `=` is an

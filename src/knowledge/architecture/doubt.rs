@@ -43,21 +43,25 @@ pub(super) fn unread_keys(
     let mut found = Vec::new();
     let unread =
         |class: &ConfigClass, key: &str, value: &Value| class.unvaried.get(key).is_some_and(|assumed| value != assumed);
-    walk(library, file, loader, config, &mut Vec::new(), &mut |class, config, path| {
+    walk(library, file, loader, config, &mut Vec::new(), &mut |file, config, path| {
+        let class = file.config(loader);
         let keys = config.iter().filter(|(key, value)| unread(class, key, value)).map(|(key, _)| key);
         found.extend(keys.map(|key| Doubt::UnreadKey(pointer(path, key))));
     });
     found
 }
 
-/// The keys of a config, and of those in it, that are null where the class has a value of its own.
+/// The keys of a config, and of those in it, that are null where the class has a value of its own, except keys that a
+/// loader with typed configs does not let be null.
 ///
 /// Called for a config that the description failed on: a class may well take the null, as one that does not read it.
 pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config: &Map<String, Value>) -> Vec<Doubt> {
     let mut found = Vec::new();
-    walk(library, file, loader, config, &mut Vec::new(), &mut |class, config, path| {
+    walk(library, file, loader, config, &mut Vec::new(), &mut |file, config, path| {
+        let class = file.config(loader);
         let own = |key: &str| class.defaults.get(key).is_some_and(|value| !value.is_null());
         let keys = config.iter().filter(|(key, value)| value.is_null() && own(key)).map(|(key, _)| key);
+        let keys = keys.filter(|key| !Loader::ALL.into_iter().any(|loader| file.config(loader).forbids_null(key)));
         found.extend(keys.map(|key| Doubt::Null(pointer(path, key))));
     });
     found
@@ -73,10 +77,10 @@ fn walk<'c>(
     loader: Loader,
     config: &'c Map<String, Value>,
     path: &mut Vec<&'c str>,
-    look: &mut impl FnMut(&ConfigClass, &Map<String, Value>, &[&str]),
+    look: &mut impl FnMut(&Blueprint, &Map<String, Value>, &[&str]),
 ) {
     let class = file.config(loader);
-    look(class, config, path);
+    look(file, config, path);
     if path.len() >= DEPTH_CAP {
         return;
     }

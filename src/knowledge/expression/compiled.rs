@@ -1,4 +1,4 @@
-//! Expressions: parsed when they are read or when they are first evaluated.
+//! Expressions: compiled while their file is parsed, or at the first evaluation.
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -14,49 +14,49 @@ use super::program::Program;
 use super::scope::{self, Scope};
 use super::steps;
 
-/// Characters of an evaluation error that are kept: the crate prints whole operands.
+/// Maximum length of an evaluation error in characters: the crate prints whole operands.
 const MESSAGE_CAP: usize = 300;
 
-/// An expression that could not be evaluated; it names the expression and the cause.
+/// An expression that could not be evaluated, with the cause.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{source_text}`: {cause}")]
 pub struct EvalError {
     /// The expression as written.
     pub source_text: String,
-    /// What went wrong, capped.
+    /// The cause, capped.
     pub cause: String,
 }
 
-/// A text that is not an expression.
+/// A text that is not a valid expression.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{source_text}` is not an expression: {cause}")]
 pub struct ParseError {
     /// The text.
     pub source_text: String,
-    /// The parser's message, with its place in the text.
+    /// The parser's message, with the position in the text.
     pub cause: String,
 }
 
 /// A CEL expression. Cloning is cheap.
 ///
-/// In the program's own data files there are thousands of them, of which a run needs a few: one that is read from a
-/// file may be compiled when it is first evaluated.
+/// The built-in data files contain thousands of expressions, and a run needs a few, so those are compiled at their
+/// first evaluation.
 #[derive(Clone)]
 pub struct Expression(Arc<Inner>);
 
 struct Inner {
     source: Box<str>,
-    /// Whether it comes from a user's file, and its steps are counted.
+    /// Whether the expression comes from a user's file, so that its steps are counted.
     counted: bool,
     program: OnceLock<Result<Program, String>>,
 }
 
-/// How the file at hand is read; serde has no way to hand this down.
+/// How the current file is parsed; serde cannot pass this to a deserialiser.
 #[derive(Default)]
 struct Reading {
-    /// Whether an expression that is none is an error of the file, with its place.
+    /// Whether an invalid expression is an error of the file, with its position.
     at_once: bool,
-    /// The file's expressions so far: equal ones are compiled once.
+    /// Expressions of the file so far; duplicates are compiled once.
     seen: Option<HashMap<Box<str>, Expression>>,
 }
 
@@ -64,18 +64,18 @@ thread_local! {
     static READING: RefCell<Reading> = RefCell::default();
 }
 
-/// Reads a data file whose author wants to know what in it is no expression.
-pub(crate) fn compiled_at_once<T>(read: impl FnOnce() -> T) -> T {
+/// Parses a user's data file with `read`: an invalid expression is an error with its position.
+pub(crate) fn compile_eagerly<T>(read: impl FnOnce() -> T) -> T {
     reading(true, read)
 }
 
-/// Reads a data file whose expressions are known to be right: they are compiled when they are evaluated.
-pub(crate) fn compiled_when_needed<T>(read: impl FnOnce() -> T) -> T {
+/// Parses a built-in data file with `read`: its expressions are compiled at their first evaluation.
+pub(crate) fn compile_lazily<T>(read: impl FnOnce() -> T) -> T {
     reading(false, read)
 }
 
 fn reading<T>(at_once: bool, read: impl FnOnce() -> T) -> T {
-    /// Also after a panic the next file is read as it wishes.
+    /// Restores the outer mode, also after a panic.
     struct RestoreReading(Reading);
     impl Drop for RestoreReading {
         fn drop(&mut self) {
@@ -90,7 +90,7 @@ impl Expression {
     /// Parses `source`.
     ///
     /// # Errors
-    /// When it is not CEL.
+    /// [`ParseError`] when the text is not valid CEL.
     pub fn parse(source: &str) -> Result<Self, ParseError> {
         let expression = Self(Arc::new(Inner { source: source.into(), counted: true, program: OnceLock::new() }));
         match expression.program() {
@@ -99,8 +99,8 @@ impl Expression {
         }
     }
 
-    /// An expression of the file that is being read.
-    pub(super) fn written(source: &str) -> Result<Self, ParseError> {
+    /// The expression for a text of the file that is being parsed.
+    pub(super) fn from_data_file(source: &str) -> Result<Self, ParseError> {
         let (at_once, seen) =
             READING.with_borrow(|r| (r.at_once, r.seen.as_ref().and_then(|seen| seen.get(source).cloned())));
         if let Some(seen) = seen {
@@ -120,28 +120,28 @@ impl Expression {
         program.as_ref().map_err(String::as_str)
     }
 
-    /// The text it was parsed from.
+    /// The source text.
     #[must_use]
     pub fn source(&self) -> &str {
         &self.0.source
     }
 
-    /// Variables the expression mentions, sorted; those bound by its own macros are included.
+    /// Variables in the expression, sorted, including those bound by its macros.
     #[must_use]
     pub fn variables(&self) -> Vec<String> {
         self.program().map_or_else(|_| Vec::new(), Program::variables)
     }
 
-    /// Evaluates to a JSON value; objects come back with sorted keys.
+    /// Evaluates to a JSON value; objects have sorted keys.
     ///
     /// # Errors
-    /// On a missing key or variable, an overflow, a division by zero, a type that does not fit.
+    /// On a missing key or variable, an overflow, a division by zero, or a type mismatch.
     pub fn eval(&self, scope: &Scope<'_>) -> Result<Value, EvalError> {
         let value = self.value(scope)?;
-        scope::to_json(&value).ok_or_else(|| self.error(&"the result has no JSON form"))
+        scope::to_json(&value).ok_or_else(|| self.error(&"the result cannot be converted to JSON"))
     }
 
-    /// Evaluates and binds the result in the scope it was evaluated in.
+    /// Evaluates the expression and binds the result to `name` in the same scope.
     ///
     /// # Errors
     /// As [`Self::eval`].
@@ -175,7 +175,7 @@ impl Expression {
         let value = self.value(scope)?;
         match value {
             Cel::Int(n @ 0..=0x20_0000_0000_0000) => Ok(n.unsigned_abs()),
-            _ => Err(self.unfit("a size of 0 to 2^53", &value)),
+            _ => Err(self.unfit("an integer from 0 to 2^53", &value)),
         }
     }
 
@@ -217,6 +217,6 @@ impl fmt::Debug for Expression {
 impl<'de> Deserialize<'de> for Expression {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let source = Cow::<str>::deserialize(deserializer)?;
-        Self::written(&source).map_err(serde::de::Error::custom)
+        Self::from_data_file(&source).map_err(serde::de::Error::custom)
     }
 }

@@ -1,15 +1,18 @@
-//! Functions of the data files that CEL does not have.
+//! Functions for the expressions of data files, in addition to those of CEL.
 
 use cel::common::types::{CelNull, CelString};
 use cel::common::value::Val;
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 use serde_json::Value;
 
-use super::scope::Scope;
+use super::scope::{Scope, plain};
 use super::steps;
+use crate::checkpoint::file_size;
 
-/// Longest list `range` makes.
+/// Maximum length of a list from `range`.
 const RANGE_CAP: i64 = 100_000;
+/// Maximum number of items that `join` prints.
+const JOIN_CAP: usize = 5;
 
 type FunctionResult = Result<Value, String>;
 
@@ -41,6 +44,12 @@ fn register(scope: &mut Scope<'static>) {
     scope.function("keys", keys);
     scope.function("split", split);
     scope.function("zpad", zpad);
+    scope.function("join", join);
+    scope.function("plural", plural);
+    scope.function("filesize", |a| match a {
+        [n] => n.as_u64().map(|n| file_size(n).into()).ok_or_else(|| "filesize(n) takes a number of bytes".to_owned()),
+        _ => Err("filesize(n) takes one number".to_owned()),
+    });
     scope.function("glob", |a| match a {
         [Value::String(name), Value::String(pattern)] => Ok(glob(name, pattern).into()),
         _ => Err("glob(name, pattern) takes two strings".to_owned()),
@@ -70,7 +79,7 @@ fn pow(arguments: &[Value]) -> FunctionResult {
     base.checked_pow(exponent).map(Value::from).ok_or_else(|| format!("{base}^{exponent} overflows"))
 }
 
-/// The whole part of an integer's square root.
+/// The integer part of an integer's square root.
 fn isqrt(arguments: &[Value]) -> FunctionResult {
     match arguments {
         [n] => {
@@ -96,7 +105,7 @@ fn round(arguments: &[Value], to: fn(f64) -> f64) -> FunctionResult {
         [Value::Number(n)] if n.is_i64() => Ok(Value::Number(n.clone())),
         [Value::Number(n)] => {
             let rounded = n.as_f64().map_or(f64::NAN, to);
-            // 2^53: beyond it a double is no longer exact, and no size is that large.
+            // Up to 2^53 a double is exact, and no size is larger.
             if rounded.abs() <= 9_007_199_254_740_992.0 {
                 #[expect(clippy::cast_possible_truncation, reason = "whole and within 2^53")]
                 let whole = rounded as i64;
@@ -137,6 +146,26 @@ fn zpad(arguments: &[Value]) -> FunctionResult {
             _ => Err("zpad(n, width) takes two integers from 0, the width up to 64".to_owned()),
         },
         _ => Err("zpad(n, width) takes two integers".to_owned()),
+    }
+}
+
+/// `join(list)`: `a, b, c`, or `a, b, c, d, e and 3 more`.
+fn join(arguments: &[Value]) -> FunctionResult {
+    let [Value::Array(items)] = arguments else { return Err("join(list) takes one list".to_owned()) };
+    let shown = items.iter().take(JOIN_CAP).map(plain).collect::<Vec<_>>().join(", ");
+    match items.len().checked_sub(JOIN_CAP) {
+        None | Some(0) => Ok(shown.into()),
+        Some(more) => Ok(format!("{shown} and {more} more").into()),
+    }
+}
+
+/// `plural(n, 'tensor')`: `1 tensor`, `2 tensors`.
+fn plural(arguments: &[Value]) -> FunctionResult {
+    match arguments {
+        [n, Value::String(noun)] if n.is_number() => {
+            Ok(format!("{n} {noun}{}", if n.as_u64() == Some(1) { "" } else { "s" }).into())
+        }
+        _ => Err("plural(n, noun) takes a number and a string".to_owned()),
     }
 }
 

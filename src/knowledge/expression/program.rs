@@ -1,4 +1,4 @@
-//! What an expression is compiled to.
+//! The compiled form of an expression.
 
 use cel::common::ast::IdedExpr;
 use cel::common::types::CelString;
@@ -8,24 +8,24 @@ use cel::{Context, ExecutionError, Value as Cel};
 use super::scope::ENV;
 use super::steps;
 
-/// Most expressions of the data files are a number, a flag, or a path such as `c.hidden_size`: those need neither CEL's
-/// parser, which is slow, nor its interpreter.
+/// A compiled expression. Most expressions of the data files are a number, a flag, or a path such as `c.hidden_size`:
+/// these skip CEL's parser, which is slow, and its interpreter.
 pub(super) enum Program {
     /// An integer, `true` or `false`.
     Constant(Cel),
-    /// A variable, and the keys that are followed from it.
+    /// A variable, and the keys to follow from it.
     Path { variable: String, keys: Vec<CelString<'static>> },
-    /// Anything else.
+    /// Any other expression of a built-in file.
     General(cel::Program),
-    /// Anything else in a user's file: as it was parsed, and with its loops counted.
+    /// Any other expression of a user's file: as parsed, and with counted loops.
     Counted(cel::Program, Box<IdedExpr>),
 }
 
-/// Words that are no variables.
+/// Words that are not variables.
 const RESERVED: [&str; 4] = ["true", "false", "null", "in"];
 
 impl Program {
-    /// The cause is CEL's message, with its place in the text.
+    /// Fails with CEL's message, including the column.
     pub fn compile(source: &str, counted: bool) -> Result<Self, String> {
         if let Some(simple) = Self::constant(source).or_else(|| Self::path(source)) {
             return Ok(simple);
@@ -81,7 +81,7 @@ impl Program {
         }
     }
 
-    /// Variables it mentions, sorted.
+    /// Variables in the expression, sorted.
     pub fn variables(&self) -> Vec<String> {
         match self {
             Self::Constant(_) => Vec::new(),

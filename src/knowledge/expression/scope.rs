@@ -1,4 +1,4 @@
-//! The names an expression can use, and the way between JSON and CEL values.
+//! Names bound for expressions, and conversion between JSON and CEL values.
 
 use std::collections::HashMap;
 use std::sync::{Arc, LazyLock};
@@ -13,14 +13,14 @@ pub(super) static ENV: LazyLock<Arc<Env>> = LazyLock::new(|| Arc::new(Env::stdli
 
 /// An evaluation environment: variables and functions.
 ///
-/// A root scope (`Scope::new`) holds functions and the big values; [`Scope::child`] borrows it and adds
-/// variables of its own, so that a loop index costs one small allocation.
+/// A root scope (`Scope::new`) holds functions and large values. [`Scope::child`] borrows it and binds further
+/// variables, so that a loop index costs one small allocation.
 pub struct Scope<'p> {
     context: Context<'p, 'static>,
 }
 
 impl Scope<'static> {
-    /// A root scope with the standard functions of CEL alone; [`Scope::new`] adds those of the data files.
+    /// A root scope with CEL's standard functions only; [`Scope::new`] adds those of the data files.
     pub(super) fn bare() -> Self {
         Self { context: Context::with_env(Arc::clone(&ENV)) }
     }
@@ -30,13 +30,14 @@ impl Scope<'static> {
     /// It can be called as `name(a, b)` and as `a.name(b)`.
     ///
     /// # Panics
-    /// When `name` is one of CEL's own functions, which would shadow it.
+    /// When `name` is one of CEL's own functions, which it would shadow.
     pub fn function(&mut self, name: &str, f: impl Fn(&[Value]) -> Result<Value, String> + Send + Sync + 'static) {
         let call = move |context: &FunctionContext| -> Result<Cel, ExecutionError> {
             let mut arguments = Vec::new();
             for argument in context.this.iter().chain(&context.args) {
                 let value = Cel::try_from(argument.as_ref())?;
-                arguments.push(to_json(&value).ok_or_else(|| context.error("an argument has no JSON form"))?);
+                arguments
+                    .push(to_json(&value).ok_or_else(|| context.error("an argument cannot be converted to JSON"))?);
             }
             f(&arguments).map(|value| to_cel(&value)).map_err(|cause| context.error(cause))
         };
@@ -51,17 +52,6 @@ impl Scope<'static> {
         self.function(name, move |arguments| match arguments {
             [Value::String(s)] => Ok(f(s)),
             _ => Err("one string expected".to_owned()),
-        });
-    }
-
-    /// Adds a function of no argument.
-    ///
-    /// # Panics
-    /// When `name` is one of CEL's own functions.
-    pub fn function0(&mut self, name: &str, f: impl Fn() -> Value + Send + Sync + 'static) {
-        self.function(name, move |arguments| match arguments {
-            [] => Ok(f()),
-            _ => Err("no argument expected".to_owned()),
         });
     }
 
@@ -89,7 +79,7 @@ impl Scope<'static> {
 impl Scope<'_> {
     /// Binds a variable. Integers become `int`, or `double` beyond 64 bits; objects become maps; null stays null.
     ///
-    /// The value is converted here, once; expressions then borrow it.
+    /// The value is converted once; expressions borrow the result.
     pub fn bind(&mut self, name: &str, value: &Value) {
         self.bind_val(name, to_val(value));
     }
@@ -102,7 +92,7 @@ impl Scope<'_> {
         }
     }
 
-    /// Binds an object without the detour of a [`Value`].
+    /// Binds an object without converting it to a [`Value`] first.
     pub(crate) fn bind_map(&mut self, name: &str, map: &Map<String, Value>) {
         self.bind_val(name, map_to_val(map));
     }
@@ -111,13 +101,13 @@ impl Scope<'_> {
         self.context.add_variable_as_val(name, value);
     }
 
-    /// A scope inside this one: sees everything of it, binds names of its own.
+    /// A nested scope: reads names of this one, and binds its own.
     #[must_use]
     pub fn child(&self) -> Scope<'_> {
         Scope { context: self.context.new_inner_scope() }
     }
 
-    /// A variable that is bound here or further out; `None` when there is none, or it has no form in JSON.
+    /// A variable bound here or in an outer scope; `None` when it is unbound or cannot be converted to JSON.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<Value> {
         to_json(&Cel::try_from(self.context.get_variable(name)?.as_ref()).ok()?)
@@ -148,7 +138,7 @@ fn map_to_val(map: &Map<String, Value>) -> Box<dyn Val> {
     Box::new(CelMap::from(map))
 }
 
-/// The CEL value of a JSON value, for what functions return.
+/// Converts JSON to CEL, for results of functions.
 pub(super) fn to_cel(value: &Value) -> Cel {
     match value {
         Value::Null => Cel::Null,
@@ -163,7 +153,7 @@ pub(super) fn to_cel(value: &Value) -> Cel {
     }
 }
 
-/// The JSON value of a CEL value: non-finite numbers become null, objects have sorted keys.
+/// Converts CEL to JSON: non-finite numbers become null, objects get sorted keys.
 pub(super) fn to_json(value: &Cel) -> Option<Value> {
     Some(match value {
         Cel::Null => Value::Null,
@@ -174,7 +164,7 @@ pub(super) fn to_json(value: &Cel) -> Option<Value> {
         Cel::String(s) => Value::String(s.to_string()),
         Cel::List(items) => Value::Array(items.iter().map(to_json).collect::<Option<_>>()?),
         Cel::Map(map) => {
-            // The crate's map has no order; sorted keys make every run alike.
+            // The crate's map has no order; sorted keys keep the output deterministic.
             let mut entries: Vec<_> = map.map.iter().map(|(k, v)| (k.to_string(), v)).collect();
             entries.sort_by(|a, b| a.0.cmp(&b.0));
             Value::Object(entries.into_iter().map(|(k, v)| Some((k, to_json(v)?))).collect::<Option<_>>()?)
@@ -183,7 +173,7 @@ pub(super) fn to_json(value: &Cel) -> Option<Value> {
     })
 }
 
-/// A value as it stands in a sentence.
+/// A value as printed in a sentence.
 pub(super) fn plain(value: &Value) -> String {
     match value {
         Value::String(s) => s.clone(),

@@ -1,8 +1,8 @@
-//! Bounds on what a user's own rule may take.
+//! Limits for the evaluation of a user's rules.
 //!
-//! CEL ends always, but loops within loops over a document's lists end late, and the crate has no limit of its own. So
-//! the loops of such a rule are parsed into ones that count: the list that a loop goes over, and each value that it
-//! gathers, pass through a function that no source text can name.
+//! CEL always terminates, but nested loops over a document's lists can take very long, and the crate has no limit. The
+//! loops of a user's rule are therefore rewritten to count steps: the list of a loop and each collected value pass
+//! through a function that source text cannot name.
 
 use std::cell::Cell;
 use std::time::{Duration, Instant};
@@ -12,13 +12,13 @@ use cel::{ExecutionError, FunctionContext, Value as Cel};
 
 use super::scope::Scope;
 
-/// Name of the function; `@` is in no identifier.
+/// Name of the function; identifiers cannot contain `@`.
 const COUNT: &str = "@count";
 
-/// For what counts as one step and is long: to compare two lists of a million in each round of a loop.
+/// Time limit, for single steps that take long, such as comparing two lists of a million elements.
 const LONGEST: Duration = Duration::from_mins(1);
 
-/// Steps that are left, and until when.
+/// Remaining steps, and the time at which evaluation stops.
 #[derive(Clone, Copy)]
 struct Limit {
     steps: u64,
@@ -29,8 +29,8 @@ thread_local! {
     static LIMIT: Cell<Option<Limit>> = const { Cell::new(None) };
 }
 
-/// Runs `work`, in which expressions may take so many steps, and says whether they took them all. Any evaluation after
-/// that fails, so the result is then worth nothing.
+/// Runs `work` with a limit of `steps` for its expressions; also returns whether the limit was reached. From then on
+/// every evaluation fails, so the result must be discarded.
 pub(crate) fn within<T>(steps: u64, work: impl FnOnce() -> T) -> (T, bool) {
     struct RestoreLimit(Option<Limit>);
     impl Drop for RestoreLimit {
@@ -44,13 +44,13 @@ pub(crate) fn within<T>(steps: u64, work: impl FnOnce() -> T) -> (T, bool) {
     (result, LIMIT.get().is_some_and(|limit| limit.steps == 0))
 }
 
-/// Takes steps, where they are counted.
+/// Counts steps, if a limit is set.
 pub(super) fn spend(steps: u64) -> Result<(), String> {
     let Some(limit) = LIMIT.get() else { return Ok(()) };
     let left = limit.steps.saturating_sub(steps);
     let left = if Instant::now() > limit.until { 0 } else { left };
     LIMIT.set(Some(Limit { steps: left, ..limit }));
-    if left == 0 { Err("this takes too many steps".to_owned()) } else { Ok(()) }
+    if left == 0 { Err("evaluation limit exceeded".to_owned()) } else { Ok(()) }
 }
 
 pub(super) fn register(scope: &mut Scope<'static>) {
@@ -62,7 +62,7 @@ pub(super) fn register(scope: &mut Scope<'static>) {
     });
 }
 
-/// Values in a value, itself included; a string has as many as it has words of eight bytes.
+/// Number of nested values, including the value itself; a string counts as its number of eight-byte words.
 fn size(value: &Cel) -> u64 {
     let sum = |sizes: &mut dyn Iterator<Item = u64>| sizes.fold(1_u64, u64::saturating_add);
     match value {
@@ -73,7 +73,7 @@ fn size(value: &Cel) -> u64 {
     }
 }
 
-/// The expression with loops that count.
+/// Rewrites the expression so that its loops count steps.
 pub(super) fn count(expression: &IdedExpr) -> IdedExpr {
     let mut counted = expression.clone();
     visit(&mut counted);
@@ -91,8 +91,8 @@ fn visit(expression: &mut IdedExpr) {
                 visit(part);
             }
             wrap(&mut l.iter_range);
-            // `all` and `exists` go on after an element that fails; where they ask whether to go on, nothing is forgiven.
-            // `map` and `filter` do not ask, and are only fast as long as that is a plain `true`.
+            // `all` and `exists` ignore errors of single elements, but not an error in the loop condition. `map` and
+            // `filter` have no condition, and CEL runs them fast only while it is a literal `true`.
             if !matches!(l.loop_cond.expr, Expr::Literal(_)) {
                 wrap(&mut l.loop_cond);
             }
@@ -116,7 +116,7 @@ fn entry(entry: &mut EntryExpr) {
     }
 }
 
-/// The values that `map` and `filter` append to what they gather, `@result + [value]`, with a guard or without.
+/// The values that `map` and `filter` append to their result, `@result + [value]`, with or without a filter.
 fn gathered<'e>(step: &'e mut IdedExpr, gathering: &str) -> Option<&'e mut Vec<IdedExpr>> {
     let Expr::Call(call) = &mut step.expr else { return None };
     if call.func_name == operators::CONDITIONAL {
@@ -145,7 +145,7 @@ mod tests {
     use crate::knowledge::Expression;
 
     #[test]
-    fn counted_loops_say_the_same() {
+    fn counted_loops_give_the_same_results() {
         let mut scope = Scope::new();
         scope.bind("l", &json!([1, 2, 3]));
         scope.bind("m", &json!({ "a": [1], "b": [] }));
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_take_for_ever_is_stopped() {
+    fn an_endless_evaluation_is_stopped() {
         let scope = Scope::new();
         let many = "range(1000)";
         for source in [
@@ -173,7 +173,7 @@ mod tests {
         ] {
             let expression = Expression::parse(&source).unwrap();
             let (result, stopped) = within(20_000, || expression.eval_bool(&scope));
-            assert!(stopped && result.unwrap_err().to_string().contains("too many steps"), "{source}");
+            assert!(stopped && result.unwrap_err().to_string().contains("evaluation limit"), "{source}");
         }
         let (result, stopped) = within(1_000, || Expression::parse("[1, 2].all(x, x > 0)").unwrap().eval_bool(&scope));
         assert!(result.unwrap() && !stopped);

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Deserializer};
 
-use super::compiled::{EvalError, Expression, ParseError, compiled_at_once};
+use super::compiled::{EvalError, Expression, ParseError};
 use super::scope::{Scope, plain};
 
 /// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
@@ -22,27 +22,38 @@ enum Piece {
 }
 
 impl Template {
-    /// The text with `0` for every placeholder: the outline of a name.
+    /// The text with `0` for each placeholder.
     #[must_use]
     pub fn outline(&self) -> String {
-        self.pieces.iter().map(|piece| if let Piece::Text(text) = piece { text } else { "0" }).collect()
+        self.with_placeholders("0")
+    }
+
+    /// The text with `…` for each placeholder, for documentation.
+    #[must_use]
+    pub fn prose(&self) -> String {
+        self.with_placeholders("…")
+    }
+
+    fn with_placeholders(&self, placeholder: &str) -> String {
+        self.pieces.iter().map(|piece| if let Piece::Text(text) = piece { text } else { placeholder }).collect()
     }
 
     /// Parses `source`.
     ///
     /// # Errors
-    /// When a brace has no partner, or a placeholder is not an expression.
+    /// When a brace is unmatched, or a placeholder is not an expression.
+    #[cfg(any(test, feature = "internals"))]
     pub fn parse(source: &str) -> Result<Self, ParseError> {
-        compiled_at_once(|| Self::written(source))
+        super::compile_eagerly(|| Self::from_data_file(source))
     }
 
-    fn written(source: &str) -> Result<Self, ParseError> {
+    fn from_data_file(source: &str) -> Result<Self, ParseError> {
         let mut pieces = Vec::new();
         let mut text = String::new();
         let mut rest = source;
         let unpaired = |brace| ParseError {
             source_text: source.to_owned(),
-            cause: format!("`{brace}` has no partner; write it twice for a literal one"),
+            cause: format!("unmatched `{brace}`; double it for a literal brace"),
         };
         while let Some(at) = rest.find(['{', '}']) {
             let (before, tail) = rest.split_at(at);
@@ -59,7 +70,7 @@ impl Template {
                     pieces.push(Piece::Text(std::mem::take(&mut text)));
                 }
                 let (expression, after) = body.split_at(end);
-                pieces.push(Piece::Value(Expression::written(expression)?));
+                pieces.push(Piece::Value(Expression::from_data_file(expression)?));
                 rest = after.strip_prefix('}').unwrap_or(after);
             } else {
                 return Err(unpaired('}'));
@@ -72,13 +83,14 @@ impl Template {
         Ok(Self { source: source.to_owned(), pieces })
     }
 
-    /// The text it was parsed from.
+    /// The source text.
     #[must_use]
     pub fn source(&self) -> &str {
         &self.source
     }
 
-    /// The expressions in its placeholders, in order.
+    /// The expressions of its placeholders, in order.
+    #[cfg(any(test, feature = "internals"))]
     pub fn expressions(&self) -> impl Iterator<Item = &Expression> {
         self.pieces.iter().filter_map(|piece| match piece {
             Piece::Value(expression) => Some(expression),
@@ -86,14 +98,15 @@ impl Template {
         })
     }
 
-    /// The text with its values: strings bare, lists as `[2304, 1152]`. A placeholder that fails becomes `?`.
+    /// The text with evaluated placeholders: strings without quotes, lists as `[2304, 1152]`. A placeholder that fails
+    /// becomes `?`.
     #[must_use]
     pub fn render(&self, scope: &Scope<'_>) -> String {
         self.fill(|expression| Ok(expression.eval(scope).map_or_else(|_| "?".to_owned(), |v| plain(&v))))
             .unwrap_or_default()
     }
 
-    /// As [`Self::render`], but a placeholder that fails is an error.
+    /// As [`Self::render`], but fails when a placeholder fails.
     ///
     /// # Errors
     /// When a placeholder cannot be evaluated.
@@ -113,7 +126,7 @@ impl Template {
     }
 }
 
-/// Where the placeholder that `body` starts in ends, past nested braces and quoted strings.
+/// Position of the brace that ends the placeholder at the start of `body`, skipping nested braces and quoted strings.
 fn closing_brace(body: &str) -> Option<usize> {
     let mut open = 0_usize;
     let mut quote = None;
@@ -150,6 +163,6 @@ impl fmt::Debug for Template {
 impl<'de> Deserialize<'de> for Template {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let source = Cow::<str>::deserialize(deserializer)?;
-        Self::written(&source).map_err(serde::de::Error::custom)
+        Self::from_data_file(&source).map_err(serde::de::Error::custom)
     }
 }

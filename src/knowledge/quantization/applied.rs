@@ -5,23 +5,23 @@ use serde_json::{Map, Value};
 use super::Scheme;
 use crate::knowledge::Scope;
 
-/// Shapes of a module's tensors by the order of the scheme's; `None` where any is right.
+/// Shapes of a module's tensors in the order of [`Scheme::tensors`]; `None` where any shape is valid.
 pub type Shapes = Vec<Option<Vec<u64>>>;
 
-/// A scheme with the parameters that one config gives it.
+/// A scheme with the parameters of one config.
 pub struct AppliedScheme<'k> {
     scheme: &'k Scheme,
     block: Value,
     pointer: &'static str,
     /// Binds `config`, `q` and the functions; parameters are bound in scopes inside it.
     scope: Scope<'static>,
-    /// By the order of the scheme's.
+    /// Values of the parameters, in the order of [`Scheme::parameters`].
     values: Vec<Value>,
 }
 
 impl<'k> AppliedScheme<'k> {
     pub(super) fn new(scheme: &'k Scheme, config: &Value, (pointer, block): (&'static str, &Value)) -> Self {
-        // Where both of MLX's blocks stand, modules with parameters of their own are in the older one.
+        // MLX writes two equal blocks; only the older one, `quantization`, contains parameters of single modules.
         let block = if scheme.overrides { config.get("quantization").unwrap_or(block) } else { block }.clone();
         let mut scope = Scope::new();
         scope.bind("config", config);
@@ -48,49 +48,49 @@ impl<'k> AppliedScheme<'k> {
         self.scheme
     }
 
-    /// JSON pointer to that block.
+    /// JSON pointer to the quantisation block of the config.
     #[must_use]
     pub const fn pointer(&self) -> &'static str {
         self.pointer
     }
 
-    /// Whether modules of one kind are stored alike in every layer.
+    /// Whether modules of one kind are stored alike in all layers.
     #[must_use]
     pub fn all_alike(&self) -> bool {
         let alike = self.scheme.all_alike.as_ref();
         alike.is_none_or(|alike| alike.eval_bool(&self.inner(&self.values)).unwrap_or(false))
     }
 
-    /// Values of the parameters, by the order of the scheme's.
+    /// Values of the parameters, in the order of [`Scheme::parameters`].
     #[must_use]
     pub fn values(&self) -> &[Value] {
         &self.values
     }
 
-    /// Values for one module, when the config gives it its own.
+    /// Values for one module; `None` unless the config sets them for this module.
     #[must_use]
     pub fn overridden(&self, module: &str) -> Option<Vec<Value>> {
         let own = self.scheme.overrides.then(|| self.block.get(module)).flatten()?;
         own.is_object().then(|| self.parameters(Some(own)))
     }
 
-    /// Whether shapes follow from the config.
+    /// Whether the config determines the shapes.
     #[must_use]
     pub fn says_shapes(&self) -> bool {
         let condition = self.scheme.shapes_when.as_ref();
-        // A parameter that cannot be computed leaves nothing to compare with.
+        // Shapes cannot be checked when a parameter with alternatives cannot be computed.
         self.values.iter().zip(&self.scheme.parameters).all(|(value, p)| !value.is_null() || p.others.is_empty())
             && condition.is_none_or(|c| c.eval_bool(&self.inner(&self.values)).unwrap_or(false))
     }
 
-    /// What is left plain, as the config lists it.
+    /// Modules that the config excludes from quantisation.
     #[must_use]
     pub fn skipped(&self) -> Vec<&str> {
         let lists = self.scheme.skipped.iter().filter_map(|key| self.block.get(key)?.as_array());
         lists.flatten().filter_map(Value::as_str).collect()
     }
 
-    /// Shapes of a module's tensors by its plain shape, or by what [`Self::plain_shape`] could tell of it.
+    /// Shapes of a module's tensors, from its plain shape or from the result of [`Self::plain_shape`].
     #[must_use]
     pub fn shapes(&self, values: &[Value], plain: &[u64]) -> Shapes {
         let mut scope = self.inner(values);
@@ -111,7 +111,7 @@ impl<'k> AppliedScheme<'k> {
         self.scheme.tensors.iter().map(|part| part.shape.as_ref()?.eval(&scope).ok().and_then(shape)).collect()
     }
 
-    /// Which of a module's tensors have to be there, given those that are.
+    /// Which tensors the module needs, in the order of [`Scheme::tensors`]; `held` lists the endings that it has.
     #[must_use]
     pub fn required(&self, held: &[&str]) -> Vec<bool> {
         let mut scope = self.inner(&self.values);
@@ -122,7 +122,7 @@ impl<'k> AppliedScheme<'k> {
         self.scheme.tensors.iter().map(required).collect()
     }
 
-    /// The plain shape behind stored shapes, when they say it; of one dimension when they say only how many values there are.
+    /// The plain shape, computed from stored shapes; one dimension when they determine only the number of values.
     #[must_use]
     pub fn plain_shape(&self, values: &[Value], stored: &Shapes) -> Option<Vec<u64>> {
         let mut scope = self.inner(values);
@@ -148,7 +148,7 @@ impl<'k> AppliedScheme<'k> {
         values
     }
 
-    /// A scope with these values of the parameters.
+    /// A scope in which the parameters have these values.
     fn inner(&self, values: &[Value]) -> Scope<'_> {
         let mut scope = self.scope.child();
         for (parameter, value) in self.scheme.parameters.iter().zip(values) {

@@ -10,15 +10,15 @@ use crate::knowledge::Scope;
 pub enum DeclaredScheme<'k> {
     /// Not quantised.
     Plain,
-    /// A scheme that is not among the known ones, by the name that the config gives it.
+    /// An unknown scheme, with the name that the config gives it.
     Unknown(String),
     /// A known scheme.
     Known(Box<AppliedScheme<'k>>),
 }
 
-/// The block of a config.json that is about quantisation, and the JSON pointer to it.
+/// The quantisation block of a config.json, with its JSON pointer.
 ///
-/// MLX writes `quantization` and, since 2024, the same again as `quantization_config`; compositions may have it in
+/// MLX writes `quantization` and, since 2024, the same block as `quantization_config`; compositions may have it in
 /// their text part. Source: `get_hf_quantizer` of transformers 5.23.0, `load_model` of mlx-lm.
 #[must_use]
 pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
@@ -27,7 +27,7 @@ pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
         .find_map(|pointer| Some((pointer, config.pointer(pointer).filter(|block| block.is_object())?)))
 }
 
-/// The scheme that a config declares, one of `schemes` where it is known.
+/// The scheme that a config declares, if it is one of `schemes`.
 #[must_use]
 pub fn declared_scheme<'k>(config: &Value, schemes: &'k [Scheme]) -> DeclaredScheme<'k> {
     let Some((pointer, block)) = block(config) else { return DeclaredScheme::Plain };
@@ -41,12 +41,12 @@ pub fn declared_scheme<'k>(config: &Value, schemes: &'k [Scheme]) -> DeclaredSch
     }
 }
 
-/// What a config calls a scheme that is not known.
+/// Name of an unknown scheme in the config.
 fn method(block: &Value) -> String {
     let text = |key: &str| block.get(key).and_then(Value::as_str);
     match (text("quant_method"), text("format")) {
         (Some(method), Some(format)) => format!("{method} ({format})"),
         (Some(method), None) => method.to_owned(),
-        (None, _) => "a method it does not name".to_owned(),
+        (None, _) => "an unnamed method".to_owned(),
     }
 }

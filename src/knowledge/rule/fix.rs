@@ -1,4 +1,4 @@
-//! The `fix` of a rule: what can be done, how safe that is, and the edits that do it.
+//! Fixes of a rule: safety, title, advice, and the edits that `check --fix` makes.
 
 use std::fmt;
 
@@ -8,16 +8,16 @@ use serde::{Deserialize, Deserializer, Serialize};
 use super::super::expression::{Expression, Template};
 use super::super::source;
 
-/// How safe a fix is, as ruff grades it.
+/// Safety of a fix, with the grades of ruff.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Safety {
-    /// Restores bookkeeping; every tensor and value a loader reads stays.
+    /// Restores bookkeeping: every tensor and every value that a loader reads stays, and no trace of a loss is erased.
     Safe,
-    /// Changes what a loader would compute, on strong evidence.
+    /// Changes what a loader reads or runs, on strong evidence; applied with `--unsafe-fixes`.
     Unsafe,
-    /// The information is not here; the exact next step is shown.
+    /// Needs information that the checkpoint does not contain; `help` states the next step.
     Manual,
 }
 
@@ -33,72 +33,94 @@ impl Safety {
     }
 }
 
-/// What can be done about a finding.
+/// A fix of a rule.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Fix {
-    /// How safe it is.
+    /// Safety of the edits; `manual` without edits.
     pub safety: Safety,
-    /// The step, as an imperative sentence.
-    pub help: Template,
-    /// When this is the fix; it sees what the message sees, and what cannot be evaluated counts as no.
+    /// What the edits do, as an imperative; required with edits. `check --fix` prints it as what was done.
+    #[serde(default)]
+    pub title: Option<Template>,
+    /// What a person should do, as an imperative; required without edits. With edits: what to do besides them.
+    #[serde(default)]
+    pub help: Option<Template>,
+    /// Condition for this fix; an expression that cannot be evaluated counts as false.
     #[serde(default)]
     pub when: Option<Expression>,
     /// A list; the edits are made for each element, bound as `one`.
     #[serde(default)]
     pub each: Option<Expression>,
-    /// What `check --fix` does; none for a manual fix. All of them are made, or none.
+    /// What `check --fix` does: all of these edits, or none.
     #[serde(default)]
     pub edits: Vec<EditSpec>,
 }
 
-/// An edit as a rule gives it. Names and expressions see what the message sees.
+impl Fix {
+    /// Checks that title, help, safety and edits belong together, and that the edits refer to what exists.
+    pub(super) fn check(&self) -> Result<(), String> {
+        match (self.edits.is_empty(), self.safety == Safety::Manual) {
+            (true, false) => return Err(format!("a fix without edits is manual, not {}", self.safety.name())),
+            (false, true) => return Err("a manual fix has no edits".to_owned()),
+            _ => {}
+        }
+        match (self.edits.is_empty(), &self.title, &self.help) {
+            (true, Some(_), _) => return Err("a fix without edits has a `help` and no `title`".to_owned()),
+            (true, None, None) => return Err("a fix without edits needs a `help`: what a person should do".to_owned()),
+            (false, None, _) => return Err("a fix with edits needs a `title`: what the edits do".to_owned()),
+            _ => {}
+        }
+        self.edits.iter().try_for_each(EditSpec::check)
+    }
+}
+
+/// An edit of a fix. Its templates and expressions see the variables of the message.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum EditSpec {
-    /// Gives a value of a JSON document another, or adds it.
+    /// Sets a value of a JSON document; adds it when missing.
     Set {
         /// File name.
         file: Template,
-        /// JSON pointer; what a name in it has of `~` and `/` is written `~0` and `~1`.
+        /// JSON pointer (RFC 6901).
         pointer: Template,
-        /// The value.
+        /// The new value.
         to: Expression,
     },
-    /// Takes a member of a JSON document away.
+    /// Removes a member of a JSON document.
     Remove {
         /// File name.
         file: Template,
         /// JSON pointer.
         pointer: Template,
     },
-    /// Puts text in place of the characters that the finding points at.
+    /// Replaces the characters that the finding points at.
     Replace {
-        /// The text; empty to take them away.
+        /// The new text; empty to delete them.
         with: Template,
     },
-    /// Gives tensors whose names start so another start, in the shards and in the index: pairs of how names start and how
-    /// they start afterwards, of which the first that fits a name counts.
+    /// Replaces prefixes of tensor names, in the shards and in the index: a list of pairs of old and new prefix, of which
+    /// the first that matches a name applies.
     Rename(Expression),
-    /// Adds a file from `rules/recipes/`, under a name that must be free.
+    /// Adds a file from `rules/recipes/`; the checkpoint must not have a file of that name.
     Write {
         /// File name.
         file: Template,
         /// Path below `rules/recipes/`.
         text: String,
     },
-    /// A repair that needs more than an expression.
+    /// Runs one of the repairs that need more than an expression.
     Repair(BuiltInRepair),
 }
 
 impl EditSpec {
-    /// Whether what it names exists; the error says what does not.
-    pub(super) fn check(&self) -> Result<(), String> {
+    /// Checks that a repair or a file that the edit names exists.
+    fn check(&self) -> Result<(), String> {
         match self {
             Self::Write { text, .. } if source::text(&format!("recipes/{text}")).is_none() => {
-                Err(format!("no such file: rules/recipes/{text}"))
+                Err(format!("missing file: rules/recipes/{text}"))
             }
             _ => Ok(()),
         }
@@ -114,6 +136,8 @@ pub enum BuiltInRepair {
     AddAutoClass,
     /// Adds to a module the imports of the modules that it imports.
     AddImports,
+    /// Replaces `Infinity` with the largest float32.
+    ClampInfinity,
     /// Cuts off the NUL bytes at the end of a document.
     CutNulBytes,
     /// Removes the second of two equal members, key and value.
@@ -130,11 +154,13 @@ pub enum BuiltInRepair {
     WriteHeader,
 }
 
+#[cfg(feature = "internals")]
 impl BuiltInRepair {
     /// Every repair, in the order of their names.
     pub const ALL: &[Self] = &[
         Self::AddAutoClass,
         Self::AddImports,
+        Self::ClampInfinity,
         Self::CutNulBytes,
         Self::DropEqualKey,
         Self::FillTokenHoles,
@@ -145,7 +171,7 @@ impl BuiltInRepair {
     ];
 }
 
-/// The two ways to write fixes, for the schema.
+/// A fix or a list of fixes.
 #[cfg(test)]
 #[derive(schemars::JsonSchema)]
 #[schemars(untagged)]
@@ -155,9 +181,9 @@ pub(super) enum OneOrMany {
     Many(Vec<Fix>),
 }
 
-/// The fixes of a rule: one, or a list of which the first that fits is taken.
+/// Deserialises the `fix` of a rule: one fix or a list.
 pub(super) fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Fix>, D::Error> {
-    // An untagged enum would do, but its errors have neither line nor cause.
+    // The errors of an untagged enum have neither line nor cause.
     struct Fixes;
     impl<'de> Visitor<'de> for Fixes {
         type Value = Vec<Fix>;

@@ -1,24 +1,24 @@
-//! A settings file together with those it extends.
+//! A settings file together with the files that it extends.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use super::SettingsSource;
 use super::policy::Policy;
-use crate::knowledge::loader::asked;
+use crate::knowledge::loader::parse_requirement;
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::selection::{Choice, UnknownRule};
 use crate::knowledge::source::DataError;
 
-/// A settings file and those it extends; the one that has the last word comes last.
+/// A settings file and the files that it extends, in order of increasing precedence.
 #[derive(Debug, Clone, Default)]
 pub struct Chain(pub Vec<SettingsSource>);
 
 impl Chain {
-    /// Reads a settings file and what it extends.
+    /// Reads a settings file and the files that it extends.
     ///
     /// # Errors
-    /// A file that cannot be read or is no settings file, and files that extend one another in a circle.
+    /// A file that is unreadable or malformed, and a cycle of files that extend each other.
     pub fn load(path: &Path) -> Result<Self, DataError> {
         let mut chain: Vec<SettingsSource> = Vec::new();
         let mut seen = BTreeSet::new();
@@ -37,24 +37,24 @@ impl Chain {
         Ok(Self(chain))
     }
 
-    /// What the file with the last word says, of those that say anything.
-    fn last<'s, T>(&'s self, of: impl Fn(&'s SettingsSource) -> Option<T>) -> Option<T> {
-        self.0.iter().rev().find_map(of)
+    /// The value from the file with the highest precedence that sets it.
+    fn last<'s, T>(&'s self, value: impl Fn(&'s SettingsSource) -> Option<T>) -> Option<T> {
+        self.0.iter().rev().find_map(value)
     }
 
-    /// Least severity that fails.
+    /// Lowest severity that makes the exit code 1.
     #[must_use]
     pub fn fail_on(&self) -> Option<Severity> {
         self.last(|s| s.settings.fail_on)
     }
 
-    /// Folder of the user's own rules.
+    /// Folder with the user's rules.
     #[must_use]
     pub fn rules(&self) -> Option<PathBuf> {
         self.last(|s| s.settings.rules.as_ref().map(|rules| s.dir.join(rules)))
     }
 
-    /// The baseline.
+    /// Path of the baseline.
     #[must_use]
     pub fn baseline(&self) -> Option<PathBuf> {
         self.last(|s| s.settings.baseline.as_ref().map(|baseline| s.dir.join(baseline)))
@@ -63,33 +63,34 @@ impl Chain {
     /// Versions to predict the load for.
     ///
     /// # Errors
-    /// A word that is no version of transformers.
+    /// A text that is not a requirement such as `transformers==4.47.0`.
     pub fn versions(&self) -> Result<Vec<String>, DataError> {
         let Some((source, versions)) = self.last(|s| Some((s, s.settings.versions.as_ref()?))) else {
             return Ok(Vec::new());
         };
-        let read = |text: &String| asked(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
+        let read = |text: &String| parse_requirement(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
         versions.iter().map(read).collect()
     }
 
-    /// Chooses and grades the rules, `typed` having the last word, and says what becomes of single findings.
+    /// Selects rules and sets their severities; the command line, `typed`, takes precedence over the files. Returns the
+    /// policy for single findings.
     ///
     /// # Errors
-    /// A word that names no rule, a glob that is none, a suppression without a reason.
+    /// An unknown rule, an invalid glob, or a suppression without a reason.
     pub fn govern(&self, rules: &mut RuleSet, typed: Choice) -> Result<Policy, DataError> {
         let mut choices = Vec::new();
         for source in &self.0 {
-            let said = &source.settings;
-            let places = said.per_path.iter().flat_map(|(_, p)| p.ignore.iter().chain(words(&p.severity)));
-            let choosing = said.select.iter().flatten().chain(&said.extend_select).chain(&said.ignore);
-            let others = words(&said.severity).chain(said.suppress.iter().map(|s| &s.rule));
+            let settings = &source.settings;
+            let places = settings.per_path.iter().flat_map(|(_, p)| p.ignore.iter().chain(words(&p.severity)));
+            let choosing = settings.select.iter().flatten().chain(&settings.extend_select).chain(&settings.ignore);
+            let others = words(&settings.severity).chain(settings.suppress.iter().map(|s| &s.rule));
             for word in choosing.chain(others).chain(places) {
                 rules.codes(word).map_err(|e| source.wrong(word, e.to_string()))?;
             }
             choices.push(Choice {
-                select: said.select.clone(),
-                extend_select: said.extend_select.clone(),
-                ignore: said.ignore.clone(),
+                select: settings.select.clone(),
+                extend_select: settings.extend_select.clone(),
+                ignore: settings.ignore.clone(),
             });
         }
         choices.push(typed);

@@ -1,4 +1,4 @@
-//! Which settings file is for which checkpoint.
+//! Finds the settings file for a checkpoint.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -7,19 +7,19 @@ use crate::checkpoint::is_checkpoint;
 /// Name of a settings file.
 pub const FILE: &str = "ckpt-doctor.json5";
 
-/// What there is for a checkpoint.
+/// Result of the search for a settings file.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Nearest {
-    /// The file to go by.
+    /// The settings file to use.
     pub file: Option<PathBuf>,
-    /// A nearer one that is not gone by, because it lies among the files of a checkpoint.
-    pub passed_over: Option<PathBuf>,
+    /// A nearer file that is ignored, because it is in a checkpoint directory.
+    pub ignored: Option<PathBuf>,
 }
 
-/// The nearest settings file in the folders above a checkpoint.
+/// Finds the nearest settings file in the folders above a checkpoint.
 ///
-/// A file among those of a checkpoint is passed over: it came with the download, and what is looked at has no say in
-/// how it is looked at.
+/// A file inside a checkpoint directory is ignored: it may come with the download, and a downloaded file must not
+/// change how the checkpoint is checked.
 #[must_use]
 pub fn nearest(checkpoint: &Path) -> Nearest {
     let mut found = Nearest::default();
@@ -32,15 +32,15 @@ pub fn nearest(checkpoint: &Path) -> Nearest {
             found.file = Some(file);
             break;
         }
-        found.passed_over.get_or_insert(file);
+        found.ignored.get_or_insert(file);
     }
     found
 }
 
-/// The path from the root, symbolic links as they are: what lies above a link is above what it leads to.
+/// The path from the root, with symbolic links kept: settings above a link apply to its target.
 #[must_use]
 pub fn absolute(path: &Path) -> PathBuf {
-    // Only the system knows what `..` after a link means.
+    // Only the file system resolves `..` after a symbolic link.
     let plain = || std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let back = path.components().any(|part| part == Component::ParentDir);
     if back { path.canonicalize().unwrap_or_else(|_| plain()) } else { plain() }

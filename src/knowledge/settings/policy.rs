@@ -1,4 +1,4 @@
-//! What settings say of single findings: other severities in some places, silence in others, and what is accepted.
+//! Effect of settings on single findings: severities by path, rules ignored by path, and suppressions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -10,15 +10,15 @@ use super::find::absolute;
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::source::DataError;
 
-/// What becomes of findings, by their rule and place.
+/// Severities and suppressions of findings, by rule and place.
 #[derive(Debug, Clone, Default)]
 pub struct Policy {
     places: Vec<AreaSettings>,
-    /// What is accepted, in the order it was written.
+    /// Suppressions, in file order.
     pub suppressions: Vec<Suppression>,
 }
 
-/// Other severities, and silence, in some place.
+/// Severities and ignored rules for some paths.
 #[derive(Debug, Clone)]
 struct AreaSettings {
     area: Area,
@@ -26,82 +26,82 @@ struct AreaSettings {
     severity: BTreeMap<String, Severity>,
 }
 
-/// Findings that are accepted.
+/// A suppression of findings.
 #[derive(Debug, Clone)]
 pub struct Suppression {
     /// Codes of its rules.
     pub codes: BTreeSet<String>,
-    /// The rule as it was written.
+    /// The rule as written in the file.
     pub rule: String,
-    /// Where, as it was written.
+    /// The path as written in the file.
     pub path: Option<String>,
-    /// Why.
+    /// Reason for the suppression.
     pub reason: String,
-    /// `ckpt-doctor.json5: suppress[0]`.
+    /// Position of the entry: `ckpt-doctor.json5: suppress[0]`.
     pub written: String,
     area: Area,
 }
 
-/// The files that a glob is about.
+/// The files that a glob matches.
 #[derive(Debug, Clone)]
 struct Area {
-    /// Where the glob starts, absolute.
+    /// Folder at which the glob starts, absolute.
     dir: PathBuf,
-    /// None for everything below `dir`.
+    /// `None` for everything below `dir`.
     glob: Option<GlobMatcher>,
-    /// The folders before its first wildcard, absolute.
+    /// The folders before the first wildcard, absolute.
     base: PathBuf,
 }
 
 impl Policy {
-    /// What the sources say, of which a later one has the last word.
+    /// Builds the policy from settings files in order of increasing precedence.
     pub(super) fn from_sources(sources: &[SettingsSource], rules: &RuleSet) -> Result<Self, DataError> {
         let mut policy = Self::default();
         for source in sources {
             let codes = |word: &String| rules.codes(word).map_err(|e| source.wrong(word, e.to_string()));
-            for (glob, said) in &source.settings.per_path {
+            for (glob, settings) in &source.settings.per_path {
                 let mut place = AreaSettings {
                     area: Area::new(source, Some(glob))?,
                     ignore: BTreeSet::new(),
                     severity: BTreeMap::new(),
                 };
-                for word in &said.ignore {
+                for word in &settings.ignore {
                     place.ignore.extend(codes(word)?);
                 }
-                // Short words first: a code has the last word over its family.
-                let mut graded: Vec<&(String, Severity)> = said.severity.iter().collect();
+                // Shorter selectors first, so that a code overrides its family.
+                let mut graded: Vec<&(String, Severity)> = settings.severity.iter().collect();
                 graded.sort_by_key(|(word, _)| word.len());
                 for (word, severity) in graded {
                     place.severity.extend(codes(word)?.into_iter().map(|code| (code, *severity)));
                 }
                 policy.places.push(place);
             }
-            for (number, said) in source.settings.suppress.iter().enumerate() {
-                if said.reason.trim().is_empty() {
-                    let reason = format!("suppress[{number}] of {} has no reason; say why it is accepted", said.rule);
-                    return Err(source.wrong(&said.rule, reason));
+            for (number, entry) in source.settings.suppress.iter().enumerate() {
+                if entry.reason.trim().is_empty() {
+                    let reason = format!("suppress[{number}] of {} has no reason; add one", entry.rule);
+                    return Err(source.wrong(&entry.rule, reason));
                 }
                 policy.suppressions.push(Suppression {
-                    codes: codes(&said.rule)?.into_iter().collect(),
-                    rule: said.rule.clone(),
-                    path: said.path.clone(),
-                    reason: said.reason.clone(),
+                    codes: codes(&entry.rule)?.into_iter().collect(),
+                    rule: entry.rule.clone(),
+                    path: entry.path.clone(),
+                    reason: entry.reason.clone(),
                     written: format!("{}: suppress[{number}]", source.name),
-                    area: Area::new(source, said.path.as_ref())?,
+                    area: Area::new(source, entry.path.as_ref())?,
                 });
             }
         }
         Ok(policy)
     }
 
-    /// Whether it leaves every finding as it is.
+    /// Whether the policy leaves every finding unchanged.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.places.is_empty() && self.suppressions.is_empty()
     }
 
-    /// The severity of a rule's finding in `file` of the checkpoint at `root`, if settings give it another one; none at
-    /// all where the rule is to be silent.
+    /// The severity of a rule's finding in `file` of the checkpoint at `root`, which is `severity` unless settings
+    /// change it; `None` when settings ignore the rule there.
     #[must_use]
     pub fn grade(&self, root: &Path, file: Option<&str>, code: &str, severity: Severity) -> Option<Severity> {
         let here = || self.places.iter().filter(|place| place.area.holds(root, file));
@@ -111,7 +111,8 @@ impl Policy {
         Some(here().filter_map(|place| place.severity.get(code)).next_back().copied().unwrap_or(severity))
     }
 
-    /// The suppression of a rule's finding in `file` of the checkpoint at `root`: its number.
+    /// Index in [`Self::suppressions`] of the first entry that matches a rule's finding in `file` of the checkpoint at
+    /// `root`.
     #[must_use]
     pub fn suppression(&self, root: &Path, file: Option<&str>, code: &str) -> Option<usize> {
         self.suppressions.iter().position(|s| s.codes.contains(code) && s.area.holds(root, file))
@@ -119,12 +120,12 @@ impl Policy {
 }
 
 impl Suppression {
-    /// Whether it is about the checkpoint at `root`, or about one of these files in it.
+    /// Whether it matches the checkpoint at `root` or one of these files in it.
     pub fn concerns<'f>(&self, root: &Path, mut files: impl Iterator<Item = &'f str>) -> bool {
         self.area.holds(root, None) || files.any(|file| self.area.holds(root, Some(file)))
     }
 
-    /// The folders before the first wildcard of its glob: everything it is about lies below.
+    /// The folders before the first wildcard of its glob; all matches are below.
     #[must_use]
     pub fn base(&self) -> &Path {
         &self.area.base
@@ -156,11 +157,11 @@ impl Area {
         let plain = |part: &&str| !part.contains(['*', '?', '[', '{', '\\']);
         let base = rest.split('/').take_while(plain).fold(dir.clone(), |base, part| base.join(part));
         let glob = GlobBuilder::new(rest).literal_separator(true).build();
-        let glob = glob.map_err(|e| source.wrong(written, format!("`{written}` is no glob: {}", e.kind())))?;
+        let glob = glob.map_err(|e| source.wrong(written, format!("`{written}` is not a valid glob: {}", e.kind())))?;
         Ok(Self { dir, glob: Some(glob.compile_matcher()), base })
     }
 
-    /// Whether the checkpoint at `root` lies in it, or this file of the checkpoint.
+    /// Whether the area contains the checkpoint at `root` or this file of it.
     fn holds(&self, root: &Path, file: Option<&str>) -> bool {
         let root = absolute(root);
         let Ok(below) = root.strip_prefix(&self.dir) else { return false };

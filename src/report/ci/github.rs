@@ -1,4 +1,4 @@
-//! Workflow commands of GitHub Actions: a line for each finding, shown beside the file.
+//! Workflow commands of GitHub Actions: one line per finding, displayed beside the file.
 //!
 //! <https://docs.github.com/en/actions/reference/workflow-commands-for-github-actions>; the escapes are those of
 //! `@actions/core`.
@@ -39,7 +39,7 @@ fn command(out: &mut String, group: &Group<'_>, item: &Item<'_>) {
             }
         }
     } else {
-        // Without a file the annotation stands at the top of the run, so the words say what it is about.
+        // Without a file, the annotation is displayed at the top of the run, so the message names the checkpoint.
         let _infallible = write!(message, "{}: ", escape(&group.title, PATH));
     }
     message.push_str(&item.message);
@@ -49,12 +49,12 @@ fn command(out: &mut String, group: &Group<'_>, item: &Item<'_>) {
     let _infallible = writeln!(out, "title={}::{}", property(&name(item.code)), data(&message));
 }
 
-/// What stands after the second `::`.
+/// Escapes the message, after the second `::`.
 fn data(text: &str) -> String {
     text.replace('%', "%25").replace('\r', "%0D").replace('\n', "%0A")
 }
 
-/// A value between the first `::` and the second.
+/// Escapes a value between the first `::` and the second.
 fn property(text: &str) -> String {
     data(text).replace(':', "%3A").replace(',', "%2C")
 }
@@ -64,7 +64,7 @@ mod tests {
     use super::{data, property};
 
     #[test]
-    fn what_ends_a_value_is_escaped_once() {
+    fn delimiters_are_escaped_once() {
         assert_eq!(data("100%0A, a:b\r\n"), "100%250A, a:b%0D%0A");
         assert_eq!(property("a::b,c%2C"), "a%3A%3Ab%2Cc%252C");
     }

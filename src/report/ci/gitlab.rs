@@ -36,7 +36,7 @@ pub fn render(report: &Report) -> String {
         for item in group.items {
             let first = item.locations.first();
             let path = first.and_then(|l| file(&group.path, l)).unwrap_or_else(|| group.path.clone());
-            // A line is required; a file without lines and a whole directory begin at the first.
+            // A line is required; files without lines and directories get line 1.
             let begin = first.and_then(|l| l.line).unwrap_or(1);
             let severity = match item.severity {
                 Severity::Error => "major",

@@ -1,7 +1,7 @@
 //! `JUnit` XML: a test suite for each checkpoint, a test case for each finding.
 //!
-//! Errors and warnings are failures; what is only worth knowing is a skipped test, which fails nothing. A clean
-//! checkpoint is one test that passed. No times are written: there are none to tell.
+//! Errors and warnings are failures; findings of severity info are skipped tests. A checkpoint without findings is one
+//! passed test. Times are omitted, because none are measured.
 
 use std::fmt::Write as _;
 
@@ -13,7 +13,7 @@ use crate::checkpoint::escape;
 use crate::report::Report;
 use crate::report::format::{more, name, tensors};
 
-/// Most places told of one finding.
+/// Maximum number of places printed for one finding.
 const PLACES: usize = 100;
 
 pub fn render(report: &Report) -> String {
@@ -30,7 +30,7 @@ pub fn render(report: &Report) -> String {
     }
     let mut text = match out.to_string() {
         Ok(text) => text,
-        // Writing to memory does not fail, so this is for readers only.
+        // Writing to memory cannot fail.
         Err(error) => format!("<!-- {} -->", words(&error.to_string()).replace("--", "- ")),
     };
     if !text.ends_with('\n') {
@@ -44,7 +44,10 @@ fn case(group: &Group<'_>, item: &Item<'_>) -> TestCase {
         Severity::Error | Severity::Warning => TestCaseStatus::non_success(NonSuccessKind::Failure),
         Severity::Info => TestCaseStatus::skipped(),
     };
-    status.set_type(item.severity.name()).set_message(legal(&item.message)).set_description(legal(&told(group, item)));
+    status
+        .set_type(item.severity.name())
+        .set_message(legal(&item.message))
+        .set_description(legal(&description(group, item)));
     let first = item.locations.first();
     let place = first.and_then(|l| file(&group.path, l)).unwrap_or_else(|| group.path.clone());
     let mut case = TestCase::new(legal(&format!("{} {}", name(item.code), name(item.name))), status);
@@ -52,8 +55,8 @@ fn case(group: &Group<'_>, item: &Item<'_>) -> TestCase {
     case
 }
 
-/// The whole finding in lines.
-fn told(group: &Group<'_>, item: &Item<'_>) -> String {
+/// The complete finding, one line for each part.
+fn description(group: &Group<'_>, item: &Item<'_>) -> String {
     let mut out = item.message.clone();
     let mut places: Vec<String> = item.locations.iter().map(|l| escape(&spot(&group.path, l), PATH)).collect();
     places.dedup();
@@ -63,7 +66,7 @@ fn told(group: &Group<'_>, item: &Item<'_>) -> String {
     if let Some(more) = more(places.len(), PLACES) {
         let _infallible = write!(out, "\n{more}");
     }
-    for tensor in tensors(item.locations, PLACES) {
+    for tensor in tensors(&item.message, item.locations, PLACES) {
         let _infallible = write!(out, "\ntensor {tensor}");
     }
     if let Some(help) = &item.help {
@@ -76,7 +79,7 @@ fn words(text: &str) -> String {
     legal(&escape(text, PATH))
 }
 
-/// Text without the two characters no XML holds that [`escape`] leaves as they are.
+/// Removes the two characters that XML forbids and [`escape`] does not replace.
 fn legal(text: &str) -> String {
     text.replace(['\u{fffe}', '\u{ffff}'], "\u{fffd}")
 }

@@ -1,6 +1,6 @@
-//! SARIF 2.1.0, the format code scanning services take.
+//! SARIF 2.1.0, the format of code scanning services.
 //!
-//! <https://docs.oasis-open.org/sarif/sarif/v2.1.0/sarif-v2.1.0.html>; the numbers below are its sections.
+//! <https://docs.oasis-open.org/sarif/sarif/v2.1.0/sarif-v2.1.0.html>; numbers in comments refer to its sections.
 
 mod fixes;
 mod parts;
@@ -17,7 +17,7 @@ use crate::report::{Report, json};
 use parts::{ArtifactLocation, ROOT, SarifText, artifact_at, text};
 
 const SCHEMA: &str = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json";
-/// Most locations of one result: GitHub takes no more.
+/// Maximum number of locations of one result, a limit of GitHub.
 const LOCATIONS: usize = 1_000;
 #[derive(Serialize)]
 struct SarifLog {
@@ -78,7 +78,7 @@ struct SarifResult {
     fixes: Vec<fixes::SarifFix>,
 }
 
-/// Why a result is not counted (3.35); `external`, because it is not written beside what it is about.
+/// Reason for suppressing a result (3.35); `external`, because it is not in the checked file.
 #[derive(Serialize)]
 struct SarifSuppression {
     kind: &'static str,
@@ -148,7 +148,7 @@ pub fn render(report: &Report) -> String {
         original_uri_base_ids.insert(ROOT, SarifBase { uri: "file:///" });
     }
     let tool = SarifTool { driver: SarifDriver { name: report.tool.name, version: report.tool.version, rules } };
-    // Columns of findings count characters (3.14.17).
+    // Columns count characters (3.14.17).
     let run = SarifRun { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results };
     json::pretty(&SarifLog { schema: SCHEMA, version: "2.1.0", runs: [run] })
 }
@@ -171,7 +171,7 @@ fn rule(id: String, item: &Item<'_>) -> SarifRule {
     let why = if item.code == SEAM {
         String::new()
     } else {
-        format!("`ckpt-doctor explain {id}` says what it means and what to do.")
+        format!("`ckpt-doctor explain {id}` explains its meaning and the next step.")
     };
     let step = item.help.iter().map(|step| format!("{step}. "));
     let help = step.chain([why]).collect::<String>().trim_end().to_owned();
@@ -180,7 +180,7 @@ fn rule(id: String, item: &Item<'_>) -> SarifRule {
     SarifRule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
 }
 
-/// The places of a finding, tensors of the same place together; the checkpoint if it has none.
+/// The places of a finding, with tensors grouped by file position; the checkpoint if the finding has no place.
 fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<SarifLocation> {
     let mut places: Vec<SarifLocation> = Vec::new();
     for location in item.locations.iter().take(LOCATIONS) {

@@ -1,4 +1,4 @@
-//! One finding, with the places it points at.
+//! Renders one finding with its places.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -8,14 +8,14 @@ use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer,
 use super::super::Style;
 use super::super::excerpt::{cut, near};
 use super::super::fixes::mark;
-use super::super::format::{evidence, fix, more, name, place, sentence, tensors, wrap};
+use super::super::format::{advice, details, more, name, place, sentence, tensors, wrap};
 use super::super::model::CheckpointReport;
 use crate::check::{Finding, Location, Severity};
 use crate::checkpoint::line_column;
 
-/// Most places shown for one finding.
+/// Maximum number of places shown for one finding.
 const PLACES: usize = 6;
-/// Columns that stand before the text of a note, with room for line numbers of four digits.
+/// Columns before the text of a note, with room for line numbers of four digits.
 const INDENT: usize = 16;
 
 pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) -> String {
@@ -37,33 +37,32 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
     if let Some(more) = more(places.len(), PLACES) {
         group = group.element(note("places", more));
     }
-    for text in tensors(&finding.locations, PLACES) {
+    for text in tensors(&finding.message, &finding.locations, PLACES) {
         group = group.element(note("tensor", text));
     }
     group = group.element(note("rule", name(&finding.name)));
-    let figures = evidence(finding);
-    if !figures.is_empty() {
-        group = group.element(note("note", figures.join("; ")));
+    for detail in details(finding) {
+        group = group.element(note("note", detail));
     }
-    if let Some(hint) = &finding.fix {
-        group = group.element(Level::HELP.message(wrap(&fix(hint), width)));
+    for step in finding.fix.iter().flat_map(advice) {
+        group = group.element(Level::HELP.message(wrap(&step, width)));
     }
     let renderer = if style.color { Renderer::styled() } else { Renderer::plain() };
     let mut text = renderer.term_width(style.width.unwrap_or(140)).render(&[group]);
     for (wrong, right) in shown.iter().filter_map(|one| one.column.as_ref()) {
         text = text.replacen(wrong, right, 1);
     }
-    // Without a line number to align with, arrows and notes would stand at the left margin.
+    // Without line numbers for alignment, arrows and notes would start at the left margin.
     if shown.iter().all(|one| !one.excerpt) { text.replace('\n', "\n ") } else { text }
 }
 
-/// One place: the locations that share an excerpt, or one location without any.
+/// One place: locations that share an excerpt, or a single location without one.
 struct FilePlaces<'a> {
     locations: Vec<&'a Location>,
     source: Option<&'a str>,
 }
 
-/// Locations in their order, neighbours in one file together, a file without a span once.
+/// Groups locations in order: neighbours in one file together, and a file without a span once.
 fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<FilePlaces<'a>> {
     let mut places: Vec<FilePlaces<'a>> = Vec::new();
     let mut bare = BTreeSet::new();
@@ -91,12 +90,12 @@ fn shares(place: &FilePlaces<'_>, location: &Location) -> bool {
     }
 }
 
-/// What a place comes to.
+/// A rendered place.
 struct Shown {
     elements: Vec<Element<'static>>,
-    /// Whether an excerpt is among them.
+    /// Whether it contains an excerpt.
     excerpt: bool,
-    /// `path:line:column` as it will come out and as it has to be, where a line was cut at the left.
+    /// `path:line:column` as rendered and as corrected, if a line was cut at the left.
     column: Option<(String, String)>,
 }
 

@@ -1,4 +1,5 @@
-//! The predicted load report: the keys a loader would report, and those it would load wrong without a warning.
+//! The predicted load report: the keys that a loader would report, and those that it would load incorrectly without a
+//! warning.
 
 use std::fmt::Write as _;
 
@@ -10,7 +11,7 @@ use super::super::format::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
 use crate::check::load::LoadReport;
 
-/// Renders one load report for loaders that agree on it.
+/// Renders the load report of loaders with the same result.
 pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
     let Some(load) = loaders.first() else { return };
     let paint = Paint(style.color);
@@ -58,7 +59,7 @@ fn list(out: &mut String, title: &str, groups: &[NameGroup], style: Style) {
     }
 }
 
-/// A table of at most `style.cap` rows, two columns in from the left.
+/// A table of at most `style.cap` rows, indented by two columns.
 pub fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N]], style: Style) {
     const INDENT: usize = 2;
     let mut table = Table::new();

@@ -55,8 +55,8 @@ fn stages(out: &mut String, merge: &MergeReport, style: Style) {
 
 fn render_seam(out: &mut String, seam: &Seam, style: Style) {
     let paint = Paint(style.color);
-    let said = hang(&sentence(&seam.message), 4, style);
-    let title = format!("{}:\n    {}", paint.verdict(Verdict::Error, "error[seam]"), paint.strong(&said));
+    let message = hang(&sentence(&seam.message), 4, style);
+    let title = format!("{}:\n    {}", paint.verdict(Verdict::Error, "error[seam]"), paint.strong(&message));
     let _ok = writeln!(out, "\n  {title}");
     let mut rows = Vec::new();
     let mut row = |what: &str, part: &ShapedName, needed: Option<&[u64]>| {
@@ -119,7 +119,7 @@ fn list(out: &mut String, title: &str, total: usize, style: Style, shown: Vec<St
     }
 }
 
-/// Wraps text that starts `indent` columns in, so that the lines after the first start there too.
+/// Wraps text that starts at column `indent`, so that the following lines start there as well.
 fn hang(text: &str, indent: usize, style: Style) -> String {
     wrap(text, style.width.map(|w| w.saturating_sub(indent))).replace('\n', &format!("\n{:indent$}", ""))
 }

@@ -1,10 +1,10 @@
-//! Colours, or none.
+//! Colours for text on a terminal.
 
 use annotate_snippets::renderer::{AnsiColor, Effects, Style};
 
 use crate::report::model::Verdict;
 
-/// Paints text when it holds `true`.
+/// Colours text when it is `true`.
 #[derive(Debug, Clone, Copy)]
 pub struct Paint(pub bool);
 
@@ -14,12 +14,12 @@ impl Paint {
         self.with(Style::new().effects(Effects::BOLD), text)
     }
 
-    /// What can be skipped.
+    /// Secondary text.
     pub fn quiet(self, text: &str) -> String {
         self.with(Style::new().effects(Effects::DIMMED), text)
     }
 
-    /// A way out.
+    /// Advice.
     pub fn help(self, text: &str) -> String {
         self.with(AnsiColor::BrightCyan.on_default().effects(Effects::BOLD), text)
     }

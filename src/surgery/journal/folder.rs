@@ -1,7 +1,7 @@
-//! The folder `.ckpt-doctor` of a checkpoint, locked.
+//! The locked folder `.ckpt-doctor` of a checkpoint.
 #![expect(clippy::disallowed_methods, reason = "surgery is where checkpoints are written")]
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -9,46 +9,47 @@ use super::record::Journal;
 use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
-use crate::surgery::lock::{self, Lock};
+use crate::surgery::lock::{self, Lock, LockFile};
 use crate::surgery::system::{self, create, look, retry, sync_dir, with_figures};
 
-/// Says that the folder is nothing for version control, as caches of other tools say it.
-const IGNORE: (&str, &str) = (".gitignore", "# made by ckpt-doctor, so that a repair can be undone\n*\n");
+/// Excludes the folder from version control, as caches of other tools do.
+const IGNORE: (&str, &str) = (".gitignore", "# created by ckpt-doctor for undoing repairs\n*\n");
 
-/// Where new files are staged.
+/// Folder of staged files.
 const NEW: &str = "new";
 
-/// The journal before it counts.
+/// The journal while it is being written.
 const DRAFT: &str = "journal.json.part";
 
-/// Says who works in the folder, and is locked meanwhile.
+/// The lock file; contains the process of the run.
 const LOCK: &str = "lock";
 
-/// The version of the journal that this program writes and reads.
+/// Version of the journal format.
 pub(super) const VERSION: u32 = 1;
 
-/// The folder, locked for as long as this lives.
+/// The folder; the lock is held while this value exists.
 pub(super) struct Folder {
     pub(super) root: PathBuf,
     path: PathBuf,
-    _lock: File,
+    _lock: LockFile,
 }
 
 impl Folder {
-    /// Whether a run that was interrupted left anything.
-    pub(super) fn left_over(root: &Path) -> bool {
+    /// Whether an interrupted run left files.
+    pub(super) fn has_remains(root: &Path) -> bool {
         let path = root.join(REPAIR_FOLDER);
         [REPAIR_JOURNAL, DRAFT, NEW].iter().any(|name| fs::symlink_metadata(path.join(name)).is_ok())
     }
 
-    /// Locks the folder of a checkpoint; `None` when it has none.
+    /// Locks the folder of a checkpoint; `None` when the folder does not exist.
     pub(super) fn open(root: &Path) -> Result<Option<Self>, RepairError> {
         let path = root.join(REPAIR_FOLDER);
         only_folders(&path)?;
         match lock::take(&path.join(LOCK))? {
-            // Without locks one run at a time is what the user has to see to.
+            // Without lock support, users must not run two repairs at once.
             Lock::Ours(mut lock) | Lock::Unknown(mut lock) => {
-                // It is for the message of another run only, and may fail on a full disk, where `undo` may help.
+                // The signature is only for the message of other runs. Writing it may fail on a full disk, where `undo`
+                // may still help.
                 let _ = lock::sign(&mut lock);
                 Ok(Some(Self { root: root.to_owned(), path, _lock: lock }))
             }
@@ -57,7 +58,7 @@ impl Folder {
         }
     }
 
-    /// Locks the folder of a checkpoint, and makes it when there is none.
+    /// Locks the folder of a checkpoint; creates it when missing.
     pub(super) fn create(root: &Path) -> Result<Self, RepairError> {
         let path = root.join(REPAIR_FOLDER);
         for _ in 0..8 {
@@ -74,7 +75,7 @@ impl Folder {
             }
             match Self::open(root) {
                 Ok(None) => {}
-                Ok(Some(folder)) => return folder.for_version_control(),
+                Ok(Some(folder)) => return folder.write_gitignore(),
                 Err(error) => {
                     if new && !matches!(error, RepairError::Busy { .. }) {
                         let _ = system::remove_file(&path.join(LOCK));
@@ -84,10 +85,10 @@ impl Folder {
                 }
             }
         }
-        Err(RepairError::Busy { path: root.to_owned(), holder: "it ended just now".to_owned() })
+        Err(RepairError::Busy { path: root.to_owned(), holder: "it has just ended".to_owned() })
     }
 
-    fn for_version_control(self) -> Result<Self, RepairError> {
+    fn write_gitignore(self) -> Result<Self, RepairError> {
         let (name, text) = IGNORE;
         let path = self.path.join(name);
         let write = || -> Result<(), RepairError> {
@@ -106,32 +107,32 @@ impl Folder {
         }
     }
 
-    /// Where new files are staged.
+    /// Folder of staged files.
     pub(super) fn staged(&self) -> PathBuf {
         self.path.join(NEW)
     }
 
-    /// Where the originals of a repair are kept.
+    /// Folder of the originals of a repair.
     pub(super) fn originals(&self, number: u32) -> PathBuf {
         self.path.join("undo").join(number.to_string())
     }
 
-    /// The journal of a repair that is done.
+    /// Journal of a finished repair.
     pub(super) fn done(&self, number: u32) -> PathBuf {
         self.path.join("undo").join(format!("{number}.json"))
     }
 
-    /// The journal of what is under way.
+    /// Journal of the current repair or undo.
     pub(super) fn journal(&self) -> PathBuf {
         self.path.join(REPAIR_JOURNAL)
     }
 
-    /// What is under way, if anything is.
+    /// The journal of an interrupted repair or undo; `None` when there is none.
     pub(super) fn pending(&self) -> Result<Option<Journal>, RepairError> {
         Self::read_journal(&self.journal())
     }
 
-    /// A journal; `None` when there is none of this name.
+    /// Reads a journal; `None` when the file is missing.
     pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>, RepairError> {
         let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
         let bytes = match read_capped(path, JSON_CAP) {
@@ -140,16 +141,16 @@ impl Folder {
         };
         let journal: Journal = serde_json::from_slice(&bytes).map_err(|e| unusable(e.to_string()))?;
         if journal.version != VERSION {
-            return Err(unusable(format!("version {} is not known", journal.version)));
+            return Err(unusable(format!("version {} is unknown", journal.version)));
         }
-        // Whoever wrote it: nothing outside the checkpoint is touched.
+        // The checkpoint may come from elsewhere: nothing outside it may be changed.
         match journal.files.iter().find(|f| !is_plain_file_name(&f.name) || f.name.starts_with('.')) {
-            Some(file) => Err(unusable(format!("{:?} is no plain file name", file.name))),
+            Some(file) => Err(unusable(format!("{:?} is not a plain file name", file.name))),
             None => Ok(Some(journal)),
         }
     }
 
-    /// Writes the journal of what begins now; from here on the next run would finish it.
+    /// Writes the journal; from here on the next run would finish the repair.
     pub(super) fn begin(&self, journal: &Journal) -> Result<(), RepairError> {
         let path = self.journal();
         let draft = self.path.join(DRAFT);
@@ -164,14 +165,14 @@ impl Folder {
             sync_dir(&self.root)
         };
         write().map_err(|error| {
-            // Nothing is changed yet. What cannot be removed is finished by the next run.
+            // Nothing has changed yet. If the journal cannot be removed, the next run finishes the repair.
             let _ = system::remove_file(&path);
             let _ = system::remove_file(&draft);
             with_figures(error, &self.root, &[text.len() as u64]).into()
         })
     }
 
-    /// Makes a folder in this one, and durable.
+    /// Creates and syncs a folder inside this one.
     pub(super) fn folder(&self, path: &Path) -> Result<(), RepairError> {
         let inner = path.strip_prefix(&self.path).unwrap_or(Path::new(""));
         let mut made = self.path.clone();
@@ -189,7 +190,7 @@ impl Folder {
         Ok(())
     }
 
-    /// Numbers of the repairs that can be undone, latest last.
+    /// Numbers of the repairs that can be undone, in ascending order.
     pub(super) fn numbers(&self) -> Result<Vec<u32>, RepairError> {
         let undo = self.path.join("undo");
         let mut numbers = Vec::new();
@@ -200,7 +201,7 @@ impl Folder {
         Ok(numbers)
     }
 
-    /// Removes what a run left that was killed before it had a journal.
+    /// Removes files of a run that was killed before it wrote a journal.
     pub(super) fn clear(&self) -> Result<(), RepairError> {
         remove_tree(&self.staged())?;
         remove_file(&self.path.join(DRAFT))?;
@@ -213,14 +214,14 @@ impl Folder {
         Ok(())
     }
 
-    /// Removes the folder when nothing can be undone any more. Best effort: an empty folder harms nobody.
+    /// Removes the folder when no repair can be undone. Errors are ignored: an empty folder is harmless.
     pub(super) fn tidy(&self) {
         if self.numbers().is_ok_and(|numbers| numbers.is_empty()) && !self.journal().exists() && self.clear().is_ok() {
             let _ = system::remove_dir(&self.path.join("undo"));
             let others = names(&self.path).unwrap_or_default().into_iter().any(|name| name != IGNORE.0 && name != LOCK);
             if !others {
                 let _ = system::remove_file(&self.path.join(IGNORE.0));
-                // Last: without it the next run may begin, and then the folder stays.
+                // The lock goes last: without it another run may begin, and then the folder stays.
                 let _ = system::remove_file(&self.path.join(LOCK));
                 let _ = system::remove_dir(&self.path);
             }
@@ -228,8 +229,7 @@ impl Folder {
     }
 }
 
-/// Refuses links where folders are made: through them a checkpoint from elsewhere could have files moved that are not
-/// its own.
+/// Refuses symbolic links in place of folders: through them, a checkpoint from elsewhere could move files outside it.
 fn only_folders(path: &Path) -> Result<(), RepairError> {
     let undo = path.join("undo");
     let mut folders = vec![path.to_owned(), path.join(NEW), undo.clone()];
@@ -244,7 +244,7 @@ fn only_folders(path: &Path) -> Result<(), RepairError> {
     Ok(())
 }
 
-/// Names in a folder; none when it is not there.
+/// Names in a folder; empty when it is missing.
 fn names(path: &Path) -> Result<Vec<String>, RepairError> {
     let names = match system::names(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),

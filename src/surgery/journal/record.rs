@@ -1,8 +1,8 @@
-//! The journal of a repair, as `journal.json` and `undo/N.json` hold it.
+//! The journal of a repair, the content of `journal.json` and `undo/N.json`.
 
 use serde::{Deserialize, Serialize};
 
-/// What a journal is about.
+/// Kind of change that a journal describes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum JournalKind {
@@ -10,13 +10,13 @@ pub(super) enum JournalKind {
     Undo,
 }
 
-/// A repair, as it is written down.
+/// The serialised journal of a repair.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Journal {
     pub(super) version: u32,
     pub(super) kind: JournalKind,
-    /// Number of the repair: the latest is undone first.
+    /// Number of the repair; the highest is undone first.
     pub(super) number: u32,
     pub(super) files: Vec<JournaledFile>,
 }
@@ -26,12 +26,12 @@ pub(super) struct Journal {
 #[serde(deny_unknown_fields)]
 pub(super) struct JournaledFile {
     pub(super) name: String,
-    /// What was there; null when nothing was.
+    /// The file before the repair; null when it did not exist.
     pub(super) old: Option<OldFile>,
     pub(super) new: NewFile,
 }
 
-/// A file before the repair. Its bytes lie in `undo/`, so that no hash is needed to tell that they are the same.
+/// A file before the repair. The original itself is kept in `undo/`, so no hash is needed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct OldFile {

@@ -1,4 +1,4 @@
-//! Finishes or takes back a repair that was interrupted.
+//! Recovers from an interrupted repair.
 
 use std::path::Path;
 
@@ -7,22 +7,22 @@ use super::record::JournalKind;
 use super::replay::Replay;
 use crate::surgery::error::RepairError;
 
-/// What became of a repair that was interrupted.
+/// Outcome of the recovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Recovered {
-    /// It is complete now.
+    /// The repair was completed.
     Finished,
-    /// The checkpoint is as it was before.
-    TakenBack,
+    /// The checkpoint is in its state before the repair.
+    RolledBack,
 }
 
-/// Finishes or takes back a repair that was interrupted; `None` when there is none.
+/// Finishes or rolls back an interrupted repair; `None` when there is none.
 ///
 /// # Errors
-/// A [`RepairError`]; then everything is as it was, the journal included.
+/// A [`RepairError`]; the journal stays, so that the next run can continue.
 pub fn recover(root: &Path) -> Result<Option<Recovered>, RepairError> {
-    // What is read only, and has nothing left over, needs no lock.
-    if !Folder::left_over(root) {
+    // A directory without remains needs no lock, so it may be read-only.
+    if !Folder::has_remains(root) {
         return Ok(None);
     }
     match Folder::open(root)? {
@@ -51,8 +51,8 @@ pub(super) fn recover_in(folder: &Folder) -> Result<Option<Recovered>, RepairErr
             Recovered::Finished
         }
         JournalKind::Repair => {
-            replay.take_back()?;
-            Recovered::TakenBack
+            replay.roll_back()?;
+            Recovered::RolledBack
         }
     };
     Ok(Some(recovered))

@@ -1,4 +1,4 @@
-//! The steps of a journal. Each may have been made already: a run may have been killed after any of them.
+//! The steps of a journal. Each step may already be done, because a run can be killed after any of them.
 #![expect(clippy::disallowed_methods, reason = "surgery is where checkpoints are written")]
 
 use std::fs::{self, Metadata};
@@ -16,7 +16,7 @@ use crate::checkpoint::open::open_regular;
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::system::{look, retry, sync_dir};
 
-/// A journal and the folder it lies in.
+/// A journal and its folder.
 pub(super) struct Replay<'a> {
     folder: &'a Folder,
     journal: &'a Journal,
@@ -43,7 +43,7 @@ impl<'a> Replay<'a> {
         self.originals().join(&entry.name)
     }
 
-    /// Whether everything is there that it takes to finish a repair.
+    /// Whether all files needed to finish the repair are present and unchanged.
     pub(super) fn can_finish(&self) -> Result<bool, RepairError> {
         for entry in &self.journal.files {
             let target = self.target(entry);
@@ -64,16 +64,16 @@ impl<'a> Replay<'a> {
         Ok(true)
     }
 
-    /// Keeps the originals, puts the new files in their places, and files the journal.
+    /// Links the originals, moves the new files into place, and archives the journal.
     pub(super) fn finish(&self) -> Result<(), RepairError> {
         self.folder.folder(&self.originals())?;
         for entry in &self.journal.files {
             let (target, original) = (self.target(entry), self.original(entry));
             if entry.old.is_some() && look(&self.staged(entry))?.is_some() && look(&original)?.is_none() {
-                keep(&target, &original).map_err(io_at(&target, "keeping the original"))?;
+                keep(&target, &original).map_err(io_at(&target, "linking the original"))?;
             }
         }
-        // Only when the originals are safe may anything take their places.
+        // The originals must be durable before they are replaced.
         sync_dir(&self.originals())?;
         sync_dir(&self.folder.root)?;
         for entry in &self.journal.files {
@@ -95,8 +95,8 @@ impl<'a> Replay<'a> {
         remove_tree(&self.folder.staged())
     }
 
-    /// Puts the originals back that a repair has moved, and forgets it.
-    pub(super) fn take_back(&self) -> Result<(), RepairError> {
+    /// Restores the originals that a repair has replaced, and removes its files.
+    pub(super) fn roll_back(&self) -> Result<(), RepairError> {
         let mut back = Vec::new();
         for entry in &self.journal.files {
             let (target, original) = (self.target(entry), self.original(entry));
@@ -113,7 +113,7 @@ impl<'a> Replay<'a> {
         for entry in back {
             let (target, original) = (self.target(entry), self.original(entry));
             if entry.old.is_some() {
-                retry(|| fs::rename(&original, &target)).map_err(io_at(&target, "putting back"))?;
+                retry(|| fs::rename(&original, &target)).map_err(io_at(&target, "restoring"))?;
             } else {
                 remove_file(&target)?;
             }
@@ -122,13 +122,13 @@ impl<'a> Replay<'a> {
         self.forget()
     }
 
-    /// Whether the repair's own file stands in its place.
+    /// Whether the target is the repair's new file.
     fn is_new(&self, entry: &JournaledFile) -> Result<bool, RepairError> {
         let published = look(&self.staged(entry))?.is_none();
         Ok(published && entry.new.matches(&self.target(entry))?)
     }
 
-    /// The first file that is not what the repair made of it, or whose original is gone.
+    /// The first file that changed after the repair, or whose original is missing.
     pub(super) fn changed(&self) -> Result<Option<PathBuf>, RepairError> {
         for entry in &self.journal.files {
             let kept = look(&self.original(entry))?.map(|m| m.len());
@@ -142,7 +142,7 @@ impl<'a> Replay<'a> {
         Ok(None)
     }
 
-    /// Undoes a repair that is done; files that are back already are passed over.
+    /// Undoes a finished repair; files that are already restored are skipped.
     pub(super) fn restore(&self) -> Result<(), RepairError> {
         for entry in &self.journal.files {
             let (target, original) = (self.target(entry), self.original(entry));
@@ -151,14 +151,14 @@ impl<'a> Replay<'a> {
                     remove_file(&target)?;
                 }
             } else if look(&original)?.is_some() {
-                retry(|| fs::rename(&original, &target)).map_err(io_at(&target, "putting back"))?;
+                retry(|| fs::rename(&original, &target)).map_err(io_at(&target, "restoring"))?;
             }
         }
         sync_dir(&self.folder.root)?;
         self.forget()
     }
 
-    /// Removes all that is left of a repair, the journal last.
+    /// Removes all files of a repair, the journal last.
     fn forget(&self) -> Result<(), RepairError> {
         remove_tree(&self.folder.staged())?;
         remove_file(&self.folder.done(self.journal.number))?;
@@ -169,7 +169,7 @@ impl<'a> Replay<'a> {
     }
 }
 
-/// Keeps a file under a second name, so that it never lacks its first; or moves it where links are not to be had.
+/// Links a file under a second name, so that the first always exists; moves it if links are not supported.
 fn keep(target: &Path, original: &Path) -> io::Result<()> {
     retry(|| fs::hard_link(target, original)).or_else(|e| match e.kind() {
         io::ErrorKind::PermissionDenied | io::ErrorKind::Unsupported | io::ErrorKind::TooManyLinks => {
@@ -179,10 +179,10 @@ fn keep(target: &Path, original: &Path) -> io::Result<()> {
     })
 }
 
-/// Gives a file a name that must be free.
+/// Renames a file; fails if the new name exists.
 fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
     match rustix::io::retry_on_intr(|| renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE)) {
-        // Some file systems do not know the flag.
+        // Some file systems do not support the flag.
         Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) if fs::symlink_metadata(to).is_err() => {
             retry(|| fs::rename(from, to))
         }
@@ -197,7 +197,7 @@ impl OldFile {
 }
 
 impl NewFile {
-    /// Reads a file to its end.
+    /// Hashes a file.
     pub(super) fn hash(path: &Path) -> Result<Self, RepairError> {
         let opened = open_regular(path, u64::MAX).map_err(|e| io_at(path, "reading")(io::Error::other(e)))?;
         let mut hasher = Hasher(Sha256::new());
@@ -205,7 +205,7 @@ impl NewFile {
         Ok(Self { len, sha256: hex(&hasher.0.finalize()) })
     }
 
-    /// Whether the file at `path` is this one.
+    /// Whether the file at `path` has this hash and size.
     fn matches(&self, path: &Path) -> Result<bool, RepairError> {
         let is_file = look(path)?.is_some_and(|m| m.is_file() && m.len() == self.len);
         Ok(is_file && Self::hash(path)? == *self)

@@ -1,4 +1,4 @@
-//! `undo`: the latest repair is taken back, byte for byte.
+//! `undo`: restores the files before the latest repair, byte for byte.
 
 use std::path::Path;
 
@@ -9,30 +9,30 @@ use super::replay::Replay;
 use crate::surgery::error::RepairError;
 use crate::surgery::stop::interrupted;
 
-/// What was undone.
+/// Result of an undo.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Undone {
-    /// Files that are as they were before.
+    /// Files that were restored.
     pub restored: Vec<String>,
-    /// Files that the repair had added, and that are gone.
+    /// Files that the repair had added and that were removed.
     pub removed: Vec<String>,
-    /// Repairs before this one, that can be undone next.
+    /// Number of earlier repairs that can still be undone.
     pub left: usize,
 }
 
-/// Undoes the latest repair of a checkpoint. One that was interrupted is finished or taken back first.
+/// Undoes the latest repair of a checkpoint. An interrupted repair is finished or rolled back first.
 ///
 /// # Errors
-/// [`RepairError::NothingToUndo`] when there is none, [`RepairError::ChangedSinceRepair`] when a file is no longer what the repair
-/// made of it; then nothing is touched.
+/// [`RepairError::NothingToUndo`] without a repair, [`RepairError::ChangedSinceRepair`] when a file changed after the
+/// repair; then no file is changed.
 pub fn undo(root: &Path) -> Result<Undone, RepairError> {
     let Some(folder) = Folder::open(root)? else { return Err(RepairError::NothingToUndo { path: root.to_owned() }) };
     let pending = folder.pending()?;
     let recovered = recover_in(&folder)?;
     if let Some(journal) = pending
-        && (journal.kind == JournalKind::Undo || recovered == Some(Recovered::TakenBack))
+        && (journal.kind == JournalKind::Undo || recovered == Some(Recovered::RolledBack))
     {
-        // That was the undoing that is asked for.
+        // The recovery has finished an interrupted undo, which is the requested one.
         return Ok(undone(&folder, &journal));
     }
     let numbers = folder.numbers()?;

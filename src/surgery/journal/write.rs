@@ -8,18 +8,18 @@ use super::folder::{Folder, VERSION};
 use super::record::{Journal, JournalKind, JournaledFile, NewFile, OldFile};
 use super::replay::Replay;
 use crate::surgery::changes::{check_unchanged, explain_error, write_content};
-use crate::surgery::donor::AtRest;
+use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::repair::Repair;
 use crate::surgery::stop::interrupted;
-use crate::surgery::system::{ask_for_room, look, retry, sync_dir};
+use crate::surgery::system::{check_space, look, retry, sync_dir};
 
-/// Writes the changed files of a repair in place of the originals, all of them or none.
+/// Replaces the changed files of a repair, all of them or none.
 ///
-/// `progress` hears of bytes written. Call [`super::recover`] before the checkpoint is opened.
+/// `progress` receives the bytes written. Call [`super::recover`] before the checkpoint is opened.
 ///
 /// # Errors
-/// A [`RepairError`]; then the checkpoint is as it was, but for [`RepairError::Unfinished`], which says so.
+/// A [`RepairError`]; then the checkpoint is unchanged, except with [`RepairError::Unfinished`].
 pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
     let root = &repair.original.root;
     for change in &repair.changes {
@@ -33,30 +33,30 @@ pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<(), Repai
     let written = stage(repair, &folder, progress).and_then(|journal| {
         folder.begin(&journal)?;
         let replay = Replay::new(&folder, &journal);
-        replay.finish().map_err(|error| match replay.take_back() {
+        replay.finish().map_err(|error| match replay.roll_back() {
             Ok(()) => error,
             Err(_) => RepairError::Unfinished { error: Box::new(error) },
         })
     });
     if written.is_err() && !folder.journal().exists() {
-        // What went wrong is what the caller hears; the next run would clear this too.
+        // The first error is reported; the next run would clear the folder as well.
         let _ = folder.clear();
     }
     folder.tidy();
     written.map_err(|error| explain_error(error, root, repair))
 }
 
-/// Writes the new files where they do not count yet.
+/// Stages the new files.
 fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Result<Journal, RepairError> {
     let root = &repair.original.root;
-    let donor = AtRest::record(root)?;
+    let donor = DonorSnapshot::record(root)?;
     if folder.pending()?.is_some() {
-        return Err(RepairError::Busy { path: root.clone(), holder: "one that was interrupted".to_owned() });
+        return Err(RepairError::Busy { path: root.clone(), holder: "an interrupted run".to_owned() });
     }
     folder.clear()?;
-    // And a block for each: the journal, the new files' folder, and two for the originals.
+    // One more block each for the journal and for the folder of new files, and two for the originals.
     let sizes: Vec<u64> = repair.sizes().into_iter().chain([1; 4]).collect();
-    ask_for_room(root, &sizes)?;
+    check_space(root, &sizes)?;
     let number = folder.numbers()?.last().map_or(1, |n| n.saturating_add(1));
     let staging = folder.staged();
     folder.folder(&staging)?;
@@ -82,15 +82,15 @@ fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Res
     Ok(Journal { version: VERSION, kind: JournalKind::Repair, number, files })
 }
 
-/// Gives a new file the owner and the mode of the old one.
+/// Gives a new file the owner and the mode of the original.
 fn copy_owner_and_mode(path: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
-    let new = fs::metadata(path).map_err(io_at(path, "looking at"))?;
+    let new = fs::metadata(path).map_err(io_at(path, "reading metadata"))?;
     if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
         retry(|| std::os::unix::fs::chown(path, Some(old.uid()), Some(old.gid())))
             .map_err(|error| RepairError::Owner { path: path.to_owned(), error })?;
     }
-    // After the owner: changing that may take bits away.
+    // After the owner, because changing the owner may clear mode bits.
     retry(|| fs::set_permissions(path, Permissions::from_mode(old.mode() & 0o7777)))
-        .map_err(io_at(path, "setting the mode of"))?;
+        .map_err(io_at(path, "setting permissions"))?;
     Ok(fs::File::open(path).and_then(|f| f.sync_all()).map_err(io_at(path, "syncing"))?)
 }

@@ -1,4 +1,4 @@
-//! The repaired checkpoint before it is written: changed texts and shards over the original.
+//! The repaired checkpoint in memory: changed texts and shards over the original.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -10,29 +10,29 @@ use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
 use crate::checkpoint::{Checkpoint, Document, Parts, PythonModule, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
-/// What became of the edits of one fix.
+/// Result of applying the edits of one fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Made {
-    /// They are made.
+    /// All edits are applied.
     All,
-    /// Another fix of this round works at the same place: the next round decides.
+    /// Another fix of this round changes the same place: try again in the next round.
     Later,
-    /// They cannot be made, or change nothing.
+    /// The edits cannot be applied, or change nothing.
     Nothing,
 }
 
-/// How this round has touched a file.
+/// How this round has changed a file.
 #[derive(Debug, Clone)]
 enum Touch {
-    /// Splices of the text that the round began with.
+    /// Splices of the text at the start of the round.
     Splices(Vec<Splice>),
-    /// Values at these pointers; the text is changed already.
+    /// Values at these pointers; the text already has the changes.
     Pointers(Vec<String>),
-    /// All of it.
+    /// The whole file.
     Whole,
 }
 
-/// A file before a fix was tried.
+/// State of a file before a fix, for rolling it back.
 struct FileState {
     file: String,
     text: Option<Arc<str>>,
@@ -40,18 +40,18 @@ struct FileState {
     touch: Option<Touch>,
 }
 
-/// A checkpoint with some of its files changed.
+/// A checkpoint with some changed files.
 #[derive(Debug, Clone)]
 pub(super) struct RepairDraft {
     original: Arc<Checkpoint>,
-    /// As it was when the round began.
+    /// The checkpoint at the start of the round.
     current: Arc<Checkpoint>,
     /// Changed documents and modules.
     pub(super) texts: BTreeMap<String, Arc<str>>,
     /// Shards with a new header.
     pub(super) shards: BTreeMap<String, Arc<PlannedShard>>,
     touched: BTreeMap<String, Touch>,
-    /// Edits of whole files that this round has made: several findings may ask for the same.
+    /// Edits of whole files in this round; several findings may have the same edit.
     made: Vec<Edit>,
 }
 
@@ -67,12 +67,12 @@ impl RepairDraft {
         }
     }
 
-    /// The checkpoint as it was when the round began.
+    /// The checkpoint at the start of the round.
     pub(super) fn current(&self) -> &Arc<Checkpoint> {
         &self.current
     }
 
-    /// Makes all edits of a fix, or none.
+    /// Applies all edits of a fix, or none.
     pub(super) fn make(&mut self, edits: &[Edit]) -> Made {
         let (before, whole) = (self.before(edits), self.made.len());
         let failed = edits.iter().map(|edit| self.make_one(edit)).find(|made| *made != Made::All);
@@ -83,7 +83,7 @@ impl RepairDraft {
         failed.unwrap_or(Made::All)
     }
 
-    /// What is known of the files that these edits touch.
+    /// State of the files that these edits change.
     fn before(&self, edits: &[Edit]) -> Vec<FileState> {
         let files: BTreeSet<String> = edits.iter().flat_map(|edit| self.files(edit)).collect();
         let state = |file: String| FileState {
@@ -109,7 +109,7 @@ impl RepairDraft {
         }
     }
 
-    /// The files that an edit changes, or takes for itself.
+    /// The files that an edit changes or claims.
     fn files(&self, edit: &Edit) -> Vec<String> {
         match edit {
             Edit::Splice { file, .. }
@@ -126,7 +126,7 @@ impl RepairDraft {
         }
     }
 
-    /// Ends the round: the checkpoint with everything made so far.
+    /// Ends the round: builds the checkpoint with all edits applied.
     pub(super) fn finish(&mut self) -> Option<()> {
         for (file, touch) in std::mem::take(&mut self.touched) {
             if let Touch::Splices(splices) = touch {
@@ -148,7 +148,7 @@ impl RepairDraft {
         Some(())
     }
 
-    /// The text of a document or module as it is now.
+    /// Current text of a document or module.
     fn text(&self, file: &str) -> Option<Arc<str>> {
         let document = || self.current.document(file)?.text.clone();
         let module = || self.current.modules.get(file)?.text.clone();
@@ -177,7 +177,7 @@ impl RepairDraft {
         Made::All
     }
 
-    /// Takes whole files for one edit, unless this round has touched one of them.
+    /// Claims whole files for one edit, unless this round has changed one of them.
     fn claim(&mut self, files: Vec<String>) -> bool {
         let free = files.iter().all(|file| !self.touched.contains_key(file));
         if free {
@@ -239,18 +239,18 @@ impl RepairDraft {
     fn index(&mut self, file: &str, shards: &[String]) -> Option<()> {
         let old = self.current.document(file).and_then(|d| d.value.as_ref());
         let entries = |key: &str| old.and_then(|v| v.get(key)).and_then(Value::as_object).cloned().unwrap_or_default();
-        let said = self.current.index.as_ref().map(|index| &index.weight_map);
-        let mut map: BTreeMap<String, String> = said.cloned().unwrap_or_default();
+        let listed = self.current.index.as_ref().map(|index| &index.weight_map);
+        let mut map: BTreeMap<String, String> = listed.cloned().unwrap_or_default();
         let named: BTreeSet<&String> = shards.iter().collect();
         let mut bytes = 0_u64;
         for shard in shards {
             let shard = self.current.shards.get(shard)?;
             for tensor in &shard.tensors {
                 bytes = bytes.saturating_add(tensor.len());
-                // Of two shards that have it the one stays that the index says.
-                let right = map.get(&tensor.name).is_some_and(|said| {
-                    named.contains(said)
-                        && self.current.shards.get(said).is_some_and(|s| s.tensor(&tensor.name).is_some())
+                // If two shards contain the tensor, the entry of the index stays.
+                let right = map.get(&tensor.name).is_some_and(|listed| {
+                    named.contains(listed)
+                        && self.current.shards.get(listed).is_some_and(|s| s.tensor(&tensor.name).is_some())
                 });
                 if !right {
                     map.insert(tensor.name.clone(), shard.name.clone());
@@ -258,7 +258,10 @@ impl RepairDraft {
             }
         }
         let mut metadata = entries("metadata");
-        metadata.insert("total_size".to_owned(), json!(bytes));
+        // A total_size that differs from the tensors may be the only trace of a lost one: IDX014 reports it.
+        if self.current.index.as_ref().is_none_or(|index| index.total_bytes().is_none()) {
+            metadata.insert("total_size".to_owned(), json!(bytes));
+        }
         let mut root = entries("");
         if let Some(Value::Object(old)) = old {
             root.extend(old.clone());
@@ -266,11 +269,15 @@ impl RepairDraft {
         root.insert("metadata".to_owned(), Value::Object(metadata));
         let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k, Value::String(v))).collect();
         root.insert("weight_map".to_owned(), Value::Object(map));
-        let text = Document::from_value(file, Value::Object(root)).text?;
+        let mut new = Document::from_value(file, Value::Object(root));
+        if let Some(old) = self.current.document(file) {
+            new = new.with_numbers_of(old, "");
+        }
+        let text = new.text?;
         self.write(file, &text)
     }
 
-    /// The shard with its bytes where they are in the original.
+    /// The shard as a plan, with its bytes at their offsets in the original file.
     fn planned(&self, file: &str) -> Option<PlannedShard> {
         if let Some(planned) = self.shards.get(file) {
             return Some(PlannedShard::clone(planned));
@@ -330,7 +337,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fix_that_fails_leaves_nothing_behind() {
+    fn a_failed_fix_changes_nothing() {
         let dir = tempfile::tempdir().expect("a directory");
         std::fs::write(dir.path().join("config.json"), r#"{"a": 1, "b": 2}"#).expect("a file");
         let checkpoint = Arc::new(Checkpoint::open(dir.path()).expect("a checkpoint"));

@@ -1,4 +1,4 @@
-//! `check` from the outside: which directories, which places, which exit code.
+//! `check` from the outside: directories, places, exit codes.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 #[test]
-fn infinity_and_missing_modules_are_named_with_their_places() {
+fn infinity_and_missing_modules_are_reported_with_their_places() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("spatialvla-tiny");
     copy(&donor("spatialvla-tiny"), &dir);
@@ -69,7 +69,7 @@ fn infinity_and_missing_modules_are_named_with_their_places() {
 }
 
 #[test]
-fn directories_are_searched_and_files_mean_their_checkpoint() {
+fn directories_are_searched_and_files_stand_for_their_checkpoint() {
     let work = TempDir::new().unwrap();
     let zoo = work.path().join("zoo");
     copy(&donor("llava3d-tiny"), &zoo.join("a"));
@@ -84,7 +84,7 @@ fn directories_are_searched_and_files_mean_their_checkpoint() {
     // pre-commit passes files, several of one checkpoint.
     let (config, index) = (a.join("config.json"), a.join("model.safetensors.index.json"));
     assert_eq!(paths(&[config.to_str().unwrap(), index.to_str().unwrap()]), names(&[&a]));
-    // Beside those of other checkpoints, of none, and one that the commit deletes.
+    // Together with files of other checkpoints, of none, and one that the commit deletes.
     let (readme, gone) = (zoo.join("README.md"), b.join("model-00001-of-00002.safetensors"));
     fs::write(&readme, "").unwrap();
     let mixed = [readme.to_str().unwrap(), config.to_str().unwrap(), gone.to_str().unwrap()];
@@ -94,11 +94,11 @@ fn directories_are_searched_and_files_mean_their_checkpoint() {
 }
 
 #[test]
-fn exit_codes_follow_the_severity_asked_for() {
+fn exit_codes_follow_fail_on() {
     let vision = donor("spatialvla-tiny");
     let vision = vision.to_str().unwrap();
     let code = |args: &[&str]| doctor(&[&["check", vision], args].concat()).status.code();
-    // The published oddities are warnings: below the default of errors.
+    // The known faults of the published checkpoint are warnings: below the default of errors.
     assert_eq!(code(&[]), Some(0));
     assert_eq!(code(&["--fail-on", "warning"]), Some(1));
     assert_eq!(code(&["--fail-on", "info"]), Some(1));
@@ -130,7 +130,7 @@ fn reports_can_be_written_beside_the_terminal() {
 }
 
 #[test]
-fn a_fifo_does_not_hang_and_hostile_names_do_not_reach_the_terminal() {
+fn a_fifo_does_not_block_and_hostile_names_are_escaped() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("c");
     copy(&donor("llava3d-tiny"), &dir);
@@ -157,7 +157,7 @@ fn rules_can_be_chosen_listed_and_explained() {
         findings.iter().map(|f| f["code"].as_str().unwrap().to_owned()).collect()
     };
     assert_eq!(codes(&["--select", "JSN"]), ["JSN001", "JSN001", "JSN001"]);
-    assert_eq!(codes(&["--ignore", "non-finite-number,PRC"]), Vec::<String>::new());
+    assert_eq!(codes(&["--ignore", "non-finite-number,VLA"]), Vec::<String>::new());
     let wrong = doctor(&["check", vision, "--ignore", "non-finite-numbr"]);
     assert_eq!(wrong.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&wrong.stderr).contains("did you mean non-finite-number?"));
@@ -168,15 +168,43 @@ fn rules_can_be_chosen_listed_and_explained() {
     let one = doctor(&["explain", "shard-missing"]);
     assert_eq!(one.status.code(), Some(0));
     snapshot!("cli-explain", String::from_utf8(one.stdout).unwrap());
-    assert_eq!(doctor(&["explain", "IDX999"]).status.code(), Some(2));
+    let family = doctor(&["explain", "idx"]);
+    let family = String::from_utf8(family.stdout).unwrap();
+    assert!(family.starts_with("IDX: The index and its shards\n\nIDX001 "), "{family}");
+    let words = ["IDX005", "error", "shard-missing", "a", "shard", "is", "missing"];
+    assert!(family.lines().any(|l| l.split_whitespace().eq(words)), "{family}");
+    for (word, hint) in [("IDX999", "no rule"), ("IDX05", "did you mean IDX005?"), ("CFG003", "CFG003 is now VLA001")] {
+        for args in [["explain", word].as_slice(), &["check", vision, "--select", word]] {
+            let refused = doctor(args);
+            assert_eq!(refused.status.code(), Some(2), "{args:?}");
+            let error = String::from_utf8(refused.stderr).unwrap();
+            assert!(error.contains(hint), "{error}");
+        }
+    }
+}
+
+/// No page contains an expression of a template.
+#[test]
+fn every_rule_is_explained_with_an_example() {
+    let rules = ckpt_doctor::knowledge::rule::RuleSet::embedded().unwrap();
+    for rule in rules.all() {
+        let page = String::from_utf8(doctor(&["explain", &rule.code]).stdout).unwrap();
+        // The finding of the example can have a lower severity than others of its rule.
+        let example = ["info", "warning", "error"].map(|level| format!("\nExample\n  {level}[{}]: ", rule.code));
+        assert!(example.iter().any(|start| page.contains(start)), "{page}");
+        let texts = rule.fixes.iter().flat_map(|fix| [&fix.title, &fix.help]).flatten();
+        for expression in texts.chain([&rule.message]).flat_map(ckpt_doctor::knowledge::Template::expressions) {
+            assert!(!page.contains(&format!("{{{expression}}}")), "{page}");
+        }
+    }
 }
 
 #[test]
-fn the_load_is_predicted_for_the_versions_asked_for() {
+fn the_load_is_predicted_for_the_given_versions() {
     let work = TempDir::new().unwrap();
     let dir = work.path().join("llama");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/bases/llama"), &dir);
-    // A file of one tensor: what matters is who speaks, not what is missing.
+    // A file with one tensor: only the versions in the report matter.
     let header = br#"{"model.norm.weight":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}"#;
     let bytes = [&(header.len() as u64).to_le_bytes()[..], header, &[0; 4]].concat();
     fs::write(dir.join("model.safetensors"), bytes).unwrap();
@@ -194,27 +222,27 @@ fn the_load_is_predicted_for_the_versions_asked_for() {
 
     let shown = doctor(&[&["check", dir.to_str().unwrap()], &both[..]].concat());
     let shown = String::from_utf8(shown.stdout).unwrap();
-    assert!(shown.contains("predicted load by transformers 5.1.0 (judged as 5.23.0) and 4.47.0:"), "{shown}");
+    assert!(shown.contains("predicted load by transformers 5.1.0 (predicted as 5.23.0) and 4.47.0:"), "{shown}");
 
-    for wrong in ["5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
+    for wrong in ["v5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
         let output = doctor(&["check", dir.to_str().unwrap(), "--for", wrong]);
         assert_eq!(output.status.code(), Some(2), "{wrong}");
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert!(said.contains("known are 4.47.0, 5.23.0"), "{said}");
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert!(errors.contains("known versions are 4.47.0, 4.57.6, 5.23.0"), "{errors}");
     }
-    // A class of custom code that was read for one version only.
+    // A class of custom code, known for one version only.
     let spatialvla = donor("spatialvla-tiny");
     let (_, report) =
         report(&["check", spatialvla.to_str().unwrap(), "--for", "transformers==5.23.0", "--output-format", "json"]);
     assert_eq!(report["checkpoints"][0]["loads"], json!([]));
     let findings = report["checkpoints"][0]["findings"].as_array().unwrap();
     let unknown = findings.iter().find(|f| f["code"] == "ARC001").unwrap();
-    assert!(unknown["message"].as_str().unwrap().contains("not known here for transformers 5.23.0"));
+    assert!(unknown["message"].as_str().unwrap().contains(" under transformers 5.23.0;"));
 }
 
-/// Gemma 3 text inside PaliGemma: transformers 4.47.0 has no such model type, 5.23.0 has.
+/// Gemma 3 text inside PaliGemma: the model type exists in transformers 5.23.0, but not in 4.47.0.
 #[test]
-fn a_part_that_only_another_loader_knows_is_judged_as_that_one_builds_it() {
+fn a_part_of_another_loader_is_built_as_by_that_loader() {
     let dir = tempfile::tempdir().unwrap();
     let config = json!({
         "architectures": ["PaliGemmaForConditionalGeneration"], "model_type": "paligemma", "transformers_version": "4.57.0",

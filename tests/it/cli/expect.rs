@@ -1,4 +1,4 @@
-//! `expect` from the outside: what is printed of a class, and of a config that cannot be built.
+//! `expect` from the outside: the tensors of a class, and errors for an invalid config.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::Command;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// Runs `expect` in `dir`; what it printed, and the exit code.
+/// Runs `expect` in `dir`; returns its output and exit code.
 fn expect(dir: &Path, args: &[&str]) -> (String, Option<i32>) {
     let output = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).arg("expect").args(args).current_dir(dir).output();
     let output = output.unwrap();
@@ -33,9 +33,9 @@ fn a_config_is_printed_as_the_tensors_of_its_class() {
     let (json, code) = expect(dir, &["tiny/config.json", "--for", "transformers==5.9.1", "--output-format", "json"]);
     assert_eq!(code, Some(0));
     snapshot!("expect-json", json);
-    let (wrong, code) = expect(dir, &["tiny", "--for", "5.9.1"]);
+    let (wrong, code) = expect(dir, &["tiny", "--for", "torch==2.0"]);
     assert_eq!(code, Some(2));
-    assert!(wrong.contains("write it as transformers==VERSION"), "{wrong}");
+    assert!(wrong.contains("expected VERSION or transformers==VERSION"), "{wrong}");
     let (wrong, code) = expect(dir, &["nothing"]);
     assert_eq!((code, wrong.as_str()), (Some(2), "error: nothing does not exist\n"));
 }
@@ -69,7 +69,7 @@ fn a_line_that_fails_does_not_stop_the_others() {
 }
 
 #[test]
-fn rules_of_a_folder_are_known_too() {
+fn architectures_of_a_rules_folder_are_used() {
     let work = TempDir::new().unwrap();
     let dir = work.path();
     let folder = dir.join("mine/architectures");

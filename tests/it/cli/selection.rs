@@ -1,4 +1,4 @@
-//! Which rules are asked and what becomes of their findings: settings, suppressions, baselines, a user's own rules.
+//! Selection and suppression: settings, suppressions, baselines, a user's own rules.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// A folder with the tiny SpatialVLA under `models/vla`: three JSN001 in its `processor_config.json`, one PRC009.
+/// A folder with the tiny SpatialVLA under `models/vla`: three JSN001 in its `processor_config.json`, one VLA024.
 fn zoo() -> TempDir {
     let zoo = TempDir::new().unwrap();
     let to = zoo.path().join("models/vla");
@@ -25,12 +25,12 @@ fn doctor(dir: &Path, args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).current_dir(dir).args(args).output().unwrap()
 }
 
-/// What it says in both streams, and the exit code.
-fn said(dir: &Path, args: &[&str]) -> String {
+/// Both output streams and the exit code.
+fn transcript(dir: &Path, args: &[&str]) -> String {
     let output = doctor(dir, args);
     let text = |bytes: Vec<u8>| {
         let text = String::from_utf8(bytes).unwrap();
-        // Settings are found under their whole path.
+        // Messages contain the whole path of settings.
         text.replace(&format!("{}/", dir.canonicalize().unwrap().display()), "")
             .replace(&format!("{}/", dir.display()), "")
     };
@@ -38,7 +38,7 @@ fn said(dir: &Path, args: &[&str]) -> String {
     format!("$ ckpt-doctor {}\n{out}--- stderr\n{err}--- exit {}\n", args.join(" "), output.status.code().unwrap())
 }
 
-/// `CODE severity` of each finding, and of each that is suppressed.
+/// `CODE severity` of each finding, and of each suppressed finding.
 fn found(dir: &Path, args: &[&str]) -> (Vec<String>, Vec<String>) {
     let args = [&["check", "models", "--output-format", "json"], args].concat();
     let output = doctor(dir, &args);
@@ -58,30 +58,30 @@ fn settings(dir: &Path, text: &str) {
 const INFINITY: [&str; 3] = ["JSN001 warning"; 3];
 
 #[test]
-fn the_nearest_file_upward_decides_and_the_command_line_has_the_last_word() {
+fn the_nearest_settings_file_applies_and_the_command_line_overrides_it() {
     let zoo = zoo();
     let root = zoo.path();
-    assert_eq!(found(root, &["--isolated"]).0, [&["PRC009 info"], &INFINITY[..]].concat());
-    settings(root, r#"{ select: ["PRC"], "fail-on": "info" }"#);
-    assert_eq!(found(root, &[]).0, ["PRC009 info"]);
+    assert_eq!(found(root, &["--isolated"]).0, [&["VLA024 info"], &INFINITY[..]].concat());
+    settings(root, r#"{ select: ["VLA"], "fail-on": "info" }"#);
+    assert_eq!(found(root, &[]).0, ["VLA024 info"]);
     assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
     assert_eq!(doctor(root, &["check", "models", "--fail-on", "error"]).status.code(), Some(0));
     assert_eq!(found(root, &["--extend-select", "JSN"]).0.len(), 4);
     assert_eq!(found(root, &["--select", "JSN"]).0, INFINITY);
-    assert_eq!(found(root, &["--isolated", "--ignore", "JSN"]).0, ["PRC009 info"]);
-    // A nearer file takes the place of the one above, which it may extend.
+    assert_eq!(found(root, &["--isolated", "--ignore", "JSN"]).0, ["VLA024 info"]);
+    // A nearer file replaces the one above, unless it extends it.
     settings(&root.join("models"), r#"{ severity: { "non-finite-number": "error" } }"#);
-    assert_eq!(found(root, &[]).0, [&["PRC009 info"], &["JSN001 error"; 3][..]].concat());
+    assert_eq!(found(root, &[]).0, [&["VLA024 info"], &["JSN001 error"; 3][..]].concat());
     settings(
         &root.join("models"),
         r#"{ extend: "../ckpt-doctor.json5", "extend-select": ["JSN001"], severity: { JSN: "error" } }"#,
     );
     assert_eq!(found(root, &[]).0.len(), 4);
     assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
-    // From wherever it is asked.
+    // The working directory does not matter.
     let here = doctor(&root.join("models/vla"), &["check", "--output-format", "concise"]);
     assert_eq!(String::from_utf8(here.stdout).unwrap().lines().count(), 4);
-    // Another file by name; its paths start at its folder.
+    // Another file given by name; its paths start at its folder.
     fs::create_dir(root.join("ci")).unwrap();
     fs::write(
         root.join("ci/strict.json5"),
@@ -93,47 +93,47 @@ fn the_nearest_file_upward_decides_and_the_command_line_has_the_last_word() {
     assert_eq!(both.status.code(), Some(2));
 }
 
-/// A download has no say in how it is looked at.
+/// Downloaded files must not change how they are checked.
 #[test]
-fn settings_among_the_files_of_a_checkpoint_are_passed_over() {
+fn settings_inside_a_checkpoint_are_ignored() {
     let zoo = zoo();
     let (root, vla) = (zoo.path(), zoo.path().join("models/vla"));
-    settings(&vla, "{ ignore: ['JSN', 'PRC'] }");
-    settings(root, "{ ignore: ['PRC'] }");
+    settings(&vla, "{ ignore: ['JSN', 'VLA'] }");
+    settings(root, "{ ignore: ['VLA'] }");
     assert_eq!(found(root, &[]).0, INFINITY);
-    snapshot!("selection-passed-over", said(root, &["check", "models", "--output-format", "concise"]));
+    snapshot!("selection-passed-over", transcript(root, &["check", "models", "--output-format", "concise"]));
     assert_eq!(found(root, &["--config", "models/vla/ckpt-doctor.json5"]).0, Vec::<String>::new());
-    // Not even for a checkpoint in a folder of the checkpoint.
+    // Neither for a checkpoint in a folder of the checkpoint.
     fs::create_dir(vla.join("inner")).unwrap();
     fs::copy(vla.join("config.json"), vla.join("inner/config.json")).unwrap();
-    let inner = said(root, &["check", "models/vla/inner", "--output-format", "concise"]);
+    let inner = transcript(root, &["check", "models/vla/inner", "--output-format", "concise"]);
     assert!(inner.contains("models/vla/ckpt-doctor.json5 is inside a checkpoint and is ignored"), "{inner}");
 }
 
 #[test]
-fn places_have_rules_of_their_own() {
+fn settings_can_differ_by_path() {
     let zoo = zoo();
     let root = zoo.path();
     let with = |per_path: &str| {
         settings(root, &format!("{{ 'per-path': {per_path} }}"));
         found(root, &[]).0
     };
-    assert_eq!(with("{ '**/processor_config.json': { ignore: ['JSN001'] } }"), ["PRC009 info"]);
-    assert_eq!(with("{ 'models': { ignore: ['JSN001', 'PRC'] } }"), Vec::<String>::new());
+    assert_eq!(with("{ '**/processor_config.json': { ignore: ['JSN001'] } }"), ["VLA024 info"]);
+    assert_eq!(with("{ 'models': { ignore: ['JSN001', 'VLA'] } }"), Vec::<String>::new());
     assert_eq!(
-        with("{ 'models/*': { ignore: ['JSN'], severity: { PRC009: 'error', PRC: 'info' } } }"),
-        ["PRC009 error"]
+        with("{ 'models/*': { ignore: ['JSN'], severity: { VLA024: 'error', VLA: 'info' } } }"),
+        ["VLA024 error"]
     );
     assert_eq!(
-        with("{ 'models/other': { ignore: ['JSN001', 'PRC'] }, 'm*': { severity: { PRC: 'warning' } } }")[0],
-        "PRC009 warning"
+        with("{ 'models/other': { ignore: ['JSN001', 'VLA'] }, 'm*': { severity: { VLA: 'warning' } } }")[0],
+        "VLA024 warning"
     );
-    // `*` stays within a name, and a glob starts at the file's folder.
+    // `*` matches within a name, and a glob starts at the folder of its file.
     assert_eq!(with("{ '*.json': { ignore: ['JSN'] }, 'vla': { ignore: ['JSN'] } }").len(), 4);
 }
 
 #[test]
-fn what_is_wrong_in_settings_is_named_with_its_place() {
+fn errors_in_settings_have_a_position() {
     let zoo = zoo();
     let root = zoo.path();
     fs::write(root.join("circle.json5"), "{ extend: 'ckpt-doctor.json5' }").unwrap();
@@ -148,7 +148,7 @@ fn what_is_wrong_in_settings_is_named_with_its_place() {
         "{ severity: { JSN999: 'error' } }",
         "{ 'per-path': { 'a/[': { ignore: ['JSN001'] } } }",
         "{ 'per-path': { 'a': { ignore: ['nonfinite-number'] } } }",
-        "{ for: ['4.47.0'] }",
+        "{ for: ['torch==2.0'] }",
         "{ 'fail-on': 'eror' }",
         "{ rules: 'no-such-folder' }",
         "{ baseline: 'none.json' }",
@@ -157,20 +157,20 @@ fn what_is_wrong_in_settings_is_named_with_its_place() {
         "{ select: ['JSN'",
     ] {
         settings(root, text);
-        shown.push_str(&format!("{text}\n{}\n", said(root, &["check", "models"])));
+        shown.push_str(&format!("{text}\n{}\n", transcript(root, &["check", "models"])));
     }
     settings(root, &"[".repeat(1_000_000));
-    shown.push_str(&said(root, &["check", "models"]));
+    shown.push_str(&transcript(root, &["check", "models"]));
     snapshot!("selection-settings-wrong", shown);
     assert!(!shown.contains("--- exit 0") && !shown.contains("--- exit 1"), "{shown}");
-    // A FIFO under the name does not hang.
+    // A FIFO under this name does not block.
     fs::remove_file(root.join("ckpt-doctor.json5")).unwrap();
     assert!(Command::new("mkfifo").arg(root.join("ckpt-doctor.json5")).status().unwrap().success());
     assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(2));
 }
 
 #[test]
-fn what_is_accepted_is_not_counted_and_says_why() {
+fn suppressed_findings_are_not_counted_and_have_a_reason() {
     let zoo = zoo();
     let root = zoo.path();
     settings(
@@ -185,9 +185,9 @@ fn what_is_accepted_is_not_counted_and_says_why() {
     );
     assert_eq!(
         found(root, &[]),
-        (vec!["PRC009 info".to_owned(), "SUP001 warning".to_owned()], INFINITY.map(str::to_owned).to_vec())
+        (vec!["VLA024 info".to_owned(), "SUP001 warning".to_owned()], INFINITY.map(str::to_owned).to_vec())
     );
-    snapshot!("selection-suppressed", said(root, &["check", "models"]));
+    snapshot!("selection-suppressed", transcript(root, &["check", "models"]));
     let json = doctor(root, &["check", "models", "--output-format", "json"]);
     let report: Value = serde_json::from_slice(&json.stdout).unwrap();
     assert_eq!(report["summary"]["suppressed"], 3);
@@ -205,9 +205,9 @@ fn what_is_accepted_is_not_counted_and_says_why() {
     }
 }
 
-/// It may be needed where nobody looked.
+/// It may apply to checkpoints that were not checked.
 #[test]
-fn a_suppression_is_unused_only_when_all_it_is_about_was_looked_at() {
+fn a_suppression_is_unused_only_if_all_its_paths_were_checked() {
     let zoo = zoo();
     let root = zoo.path();
     fs::create_dir_all(root.join("models/other")).unwrap();
@@ -217,7 +217,7 @@ fn a_suppression_is_unused_only_when_all_it_is_about_was_looked_at() {
         let output = doctor(root, &[&["check", "--output-format", "concise"], args].concat());
         String::from_utf8(output.stdout).unwrap().matches("SUP001").count()
     };
-    // Used in one, looked for in both.
+    // Used in one checkpoint, unused in the other.
     assert_eq!(unused("rule: 'JSN001'", &["models"]), 0);
     assert_eq!(unused("rule: 'LFS001'", &["models"]), 0, "below models is not all that lies below the file");
     assert_eq!(unused("rule: 'LFS001'", &["."]), 1);
@@ -232,35 +232,35 @@ fn a_suppression_is_unused_only_when_all_it_is_about_was_looked_at() {
 }
 
 #[test]
-fn a_baseline_sets_aside_what_was_there() {
+fn a_baseline_suppresses_earlier_findings() {
     let zoo = zoo();
     let root = zoo.path();
     let check = ["check", "models", "--output-format", "concise", "--fail-on", "warning", "--baseline", "known.json"];
-    assert!(said(root, &check).contains("--write-baseline creates it"));
-    let mut shown = said(root, &[&check[..], &["--write-baseline"]].concat());
+    assert!(transcript(root, &check).contains("--write-baseline creates it"));
+    let mut shown = transcript(root, &[&check[..], &["--write-baseline"]].concat());
     shown.push_str(&fs::read_to_string(root.join("known.json")).unwrap());
-    shown.push_str(&said(root, &check));
-    // One is repaired, and another one is new.
+    shown.push_str(&transcript(root, &check));
+    // One finding is fixed, and another one is new.
     let file = root.join("models/vla/processor_config.json");
     let text = fs::read_to_string(&file).unwrap().replacen("Infinity", "0.0", 1);
     fs::write(&file, text).unwrap();
     fs::write(root.join("models/vla/stray.safetensors"), "").unwrap();
-    shown.push_str(&said(root, &check));
-    // Rules that were not asked, and checkpoints that were not looked at, stay in it.
-    shown.push_str(&said(root, &[&check[..], &["--select", "FIL", "--write-baseline"]].concat()));
+    shown.push_str(&transcript(root, &check));
+    // Findings of rules that did not run, and of checkpoints that were not checked, stay in the baseline.
+    shown.push_str(&transcript(root, &[&check[..], &["--select", "FIL", "--write-baseline"]].concat()));
     snapshot!("selection-baseline", shown);
     let codes = fs::read_to_string(root.join("known.json")).unwrap();
-    assert!(codes.contains("JSN001") && codes.contains("PRC009"), "{codes}");
-    // Wherever it is asked from, and by a setting.
+    assert!(codes.contains("JSN001") && codes.contains("VLA024"), "{codes}");
+    // From any working directory, and by a setting.
     settings(root, "{ baseline: 'known.json' }");
     let from = doctor(&root.join("models"), &["check", "vla", "--output-format", "json"]);
     let report: Value = serde_json::from_slice(&from.stdout).unwrap();
     assert_eq!(report["checkpoints"][0]["suppressed"].as_array().unwrap().len(), report["summary"]["suppressed"]);
     assert!(report["summary"]["suppressed"].as_u64() >= Some(3), "{report}");
-    let none = said(root, &["check", "models", "--isolated", "--write-baseline"]);
+    let none = transcript(root, &["check", "models", "--isolated", "--write-baseline"]);
     assert!(none.contains("no baseline file given") && none.contains("exit 2"), "{none}");
     fs::write(root.join("known.json"), json!({ "schema": 2, "findings": [] }).to_string()).unwrap();
-    assert!(said(root, &check).contains("a baseline of version 2; 1 is known here"));
+    assert!(transcript(root, &check).contains("baseline version 2 is unknown; expected 1"));
 }
 
 #[test]
@@ -268,18 +268,18 @@ fn findings_can_be_counted_by_rule() {
     let zoo = zoo();
     let mut shown = String::new();
     for format in ["full", "json", "sarif"] {
-        shown.push_str(&said(zoo.path(), &["check", "models", "--statistics", "--output-format", format]));
+        shown.push_str(&transcript(zoo.path(), &["check", "models", "--statistics", "--output-format", format]));
     }
     settings(zoo.path(), "{ select: [] }");
-    shown.push_str(&said(zoo.path(), &["check", "models", "--statistics"]));
+    shown.push_str(&transcript(zoo.path(), &["check", "models", "--statistics"]));
     snapshot!("selection-statistics", shown);
 }
 
 #[test]
-fn it_can_say_why_a_rule_was_not_asked() {
+fn verbose_explains_skipped_rules() {
     let zoo = zoo();
     let args = ["check", "models", "-v", "--output-format", "concise", "--ignore", "SAF,IDX,JSN,ADP,LFS,FIL"];
-    snapshot!("selection-verbose", said(zoo.path(), &args));
+    snapshot!("selection-verbose", transcript(zoo.path(), &args));
 }
 
 const OWN: &str = r#"{
@@ -293,19 +293,19 @@ const OWN: &str = r#"{
 }"#;
 
 #[test]
-fn rules_of_ones_own_are_asked_listed_and_explained() {
+fn rules_of_the_user_run_and_are_listed_and_explained() {
     let zoo = zoo();
     let root = zoo.path();
     fs::create_dir_all(root.join("own/checks/acme")).unwrap();
     let file = root.join("own/checks/acme/ACME001.json5");
     fs::write(&file, OWN).unwrap();
     assert_eq!(found(root, &["--rules", "own", "--select", "ACME"]).0, ["ACME001 warning"]);
-    let list = said(root, &["rules", "--rules", "own"]);
+    let list = transcript(root, &["rules", "--rules", "own"]);
     assert!(list.contains("ACME001  warning  model-without-licence") && list.contains("IDX005"), "{list}");
-    // As settings have it, without a word on the command line.
+    // From the settings, without an option on the command line.
     settings(root, "{ rules: 'own', severity: { ACME: 'error' }, select: ['ACME'] }");
     assert_eq!(found(root, &[]).0, ["ACME001 error"]);
-    let mut shown = said(root, &["explain", "model-without-licence"]);
+    let mut shown = transcript(root, &["explain", "model-without-licence"]);
     for (from, to) in [
         ("ACME001", "IDX005"),
         ("model-without-licence", "shard-missing"),
@@ -319,7 +319,7 @@ fn rules_of_ones_own_are_asked_listed_and_explained() {
         fs::write(&file, OWN.replace(from, to)).unwrap();
         shown.push_str(&format!(
             "{from} → {to}\n{}",
-            said(
+            transcript(
                 root,
                 &[
                     "check",
@@ -342,7 +342,7 @@ fn rules_of_ones_own_are_asked_listed_and_explained() {
         shown.push('\n');
     }
     fs::remove_file(&file).unwrap();
-    shown.push_str(&said(root, &["rules", "--isolated", "--rules", "own"]));
+    shown.push_str(&transcript(root, &["rules", "--isolated", "--rules", "own"]));
     snapshot!("selection-own-rules", shown);
 }
 
@@ -351,15 +351,15 @@ fn init_writes_settings_that_change_nothing_and_overwrites_nothing() {
     let zoo = zoo();
     let root = zoo.path();
     let before = found(root, &["--isolated"]);
-    let mut shown = said(root, &["init", "--pre-commit"]);
+    let mut shown = transcript(root, &["init", "--pre-commit"]);
     assert_eq!(found(root, &[]), before);
-    shown.push_str(&said(root, &["init"]));
+    shown.push_str(&transcript(root, &["init"]));
     fs::remove_file(root.join("ckpt-doctor.json5")).unwrap();
-    shown.push_str(&said(root, &["init", "--pre-commit"]));
+    shown.push_str(&transcript(root, &["init", "--pre-commit"]));
     assert!(!root.join("ckpt-doctor.json5").exists(), "all or nothing");
-    shown.push_str(&said(root, &["init", "nowhere"]));
+    shown.push_str(&transcript(root, &["init", "nowhere"]));
     snapshot!("selection-init", shown);
-    // What is commented out is right too.
+    // The commented lines are valid settings as well.
     fs::create_dir_all(root.join("rules/checks")).unwrap();
     fs::write(root.join("rules/checks/a.json5"), OWN).unwrap();
     assert_eq!(doctor(root, &["init"]).status.code(), Some(0));

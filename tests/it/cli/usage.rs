@@ -1,4 +1,4 @@
-//! Help texts, tips for words of other tools, and paths as the user wrote them.
+//! Help texts, tips for mistyped words, and paths as given by the user.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -28,7 +28,7 @@ fn every_command_has_its_help() {
 }
 
 #[test]
-fn words_of_other_tools_get_a_tip() {
+fn commands_of_other_tools_get_a_tip() {
     for (word, tip) in [("fix", "check --fix"), ("validate", "check"), ("diff", "check --diff")] {
         let output = doctor(project(), &[word]);
         let errors = String::from_utf8(output.stderr).unwrap();
@@ -37,6 +37,8 @@ fn words_of_other_tools_get_a_tip() {
     }
     let errors = String::from_utf8(doctor(project(), &["chekc"]).stderr).unwrap();
     assert!(errors.contains("similar subcommand exists: 'check'"), "{errors}");
+    let errors = String::from_utf8(doctor(project(), &["check", "--fxi"]).stderr).unwrap();
+    assert!(errors.contains("similar argument exists: '--fix'\n"), "{errors}");
 }
 
 /// The record of a dry run.

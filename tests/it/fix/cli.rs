@@ -1,4 +1,4 @@
-//! `check --fix` and `undo` as they are typed.
+//! `check --fix` and `undo` from the outside.
 
 use std::path::Path;
 use std::process::Command;
@@ -9,7 +9,7 @@ use tempfile::TempDir;
 use super::seen;
 use crate::support;
 
-/// A checkpoint with fixes of every kind: text, a config value, an index, a shard's header, and one by hand.
+/// A checkpoint with fixes of every kind: text, a config value, an index, a shard's header, and a manual one.
 fn broken() -> TempDir {
     let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
     let changes = r#"[
@@ -24,7 +24,7 @@ fn broken() -> TempDir {
     room
 }
 
-/// Runs the program in `room`: its exit code and what it prints.
+/// Runs the program in `room`; returns its exit code and output.
 fn doctor(room: &Path, args: &[&str]) -> (i32, String) {
     let program = env!("CARGO_BIN_EXE_ckpt-doctor");
     let output = Command::new(program).args(args).current_dir(room).output().expect("it runs");
@@ -33,7 +33,7 @@ fn doctor(room: &Path, args: &[&str]) -> (i32, String) {
 }
 
 #[test]
-fn fixes_are_offered_shown_made_and_undone() {
+fn fixes_are_offered_shown_applied_and_undone() {
     let room = broken();
     let model = room.path().join("model");
     let before = seen(&model);

@@ -1,4 +1,4 @@
-//! Edits of real documents: what is not edited stays, byte for byte.
+//! Edits of real documents: all other bytes stay unchanged.
 
 use std::fs;
 use std::sync::LazyLock;
@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use crate::support;
 
-/// Every JSON document of the fixtures that is small enough to be edited often.
+/// Every JSON document of the fixtures that is small enough for many edits.
 fn documents() -> &'static [Document] {
     static ALL: LazyLock<Vec<Document>> = LazyLock::new(read);
     &ALL
@@ -26,7 +26,7 @@ fn read() -> Vec<Document> {
     all.into_iter().filter(|d| d.left_out.is_empty() && d.text.as_ref().is_some_and(|t| t.len() < 12_000)).collect()
 }
 
-/// JSON pointers of every value, the document's own first.
+/// JSON pointers of every value, starting with the document itself.
 fn pointers(value: &Value, at: &str, out: &mut Vec<String>) {
     out.push(at.to_owned());
     match value {
@@ -44,7 +44,7 @@ fn pointers(value: &Value, at: &str, out: &mut Vec<String>) {
     }
 }
 
-/// The same document in other layouts: as it is, with CRLF, in one line as Python and as Rust write it.
+/// The same document in other layouts: unchanged, with CRLF, on one line as Python or as Rust writes it.
 fn laid_out(document: &Document, layout: usize) -> Document {
     let text = document.text.as_deref().expect("text");
     let value = document.value.as_ref().expect("a value");
@@ -98,7 +98,7 @@ proptest! {
         let mut expected = document.value.clone().expect("a value");
         *expected.pointer_mut(pointer).expect("there") = value;
         prop_assert_eq!(edited(&document, &splice).value, Some(expected));
-        // Nothing but the value's own bytes goes.
+        // Only the bytes of the value are removed.
         prop_assert_eq!(Some(splice.range), document.locate(pointer));
     }
 
@@ -116,7 +116,7 @@ proptest! {
         let member = if deep { json!({ "inner": value }) } else { value };
         expected.pointer_mut(parent).and_then(Value::as_object_mut).expect("there").insert("new key".to_owned(), member);
         prop_assert_eq!(edited(&document, &splice).value, Some(expected));
-        // Where there are members, nothing goes at all.
+        // If the container has members, nothing is removed.
         let empty = document.get(parent).and_then(Value::as_object).is_some_and(serde_json::Map::is_empty);
         prop_assert!(empty || splice.range.is_empty());
     }

@@ -1,4 +1,4 @@
-//! Repairs that are interrupted, refused, or made beside the original.
+//! Repairs that are interrupted or refused, and repaired copies.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,7 +16,7 @@ use tempfile::TempDir;
 use super::seen;
 use crate::support;
 
-/// A checkpoint of which one file has to change and one is missing.
+/// A checkpoint with one file to change and one to add.
 fn broken() -> (TempDir, PathBuf) {
     let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
     let changes =
@@ -35,14 +35,14 @@ fn repair(dir: &Path) -> Repair {
     repair
 }
 
-/// Name and content of every file but the hidden ones.
+/// Name and content of every file, except hidden ones.
 fn contents(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     seen(dir).into_iter().filter(|(name, _)| !name.starts_with('.')).map(|(name, seen)| (name, seen.3)).collect()
 }
 
-/// Every state that a killed run can leave, and what becomes of it.
+/// Every state that a killed run can leave, and the result of the recovery.
 #[test]
-fn an_interrupted_repair_is_finished_or_taken_back() {
+fn an_interrupted_repair_is_finished_or_rolled_back() {
     let (_room, dir) = broken();
     let before = contents(&dir);
     let repair = repair(&dir);
@@ -58,7 +58,7 @@ fn an_interrupted_repair_is_finished_or_taken_back() {
     for step in 0..=7 {
         for damaged in [false, true] {
             // 0: staged, no journal. 1: the journal. 2: the original linked. 3, 4: each file replaced. 5: the journal
-            // filed. 6: the staging folder gone. 7: nothing done at all.
+            // archived. 6: the staging folder removed. 7: unchanged.
             let staging = folder.join("new");
             if step < 7 {
                 fs::create_dir_all(&staging).expect("a folder");
@@ -86,7 +86,7 @@ fn an_interrupted_repair_is_finished_or_taken_back() {
             if step == 6 {
                 fs::remove_dir_all(&staging).expect("removed");
             }
-            // A staged file that was cut short cannot be used.
+            // A truncated staged file cannot be used.
             let cut = staging.join("model.safetensors.index.json");
             let damaged = damaged && cut.exists();
             if damaged {
@@ -97,7 +97,7 @@ fn an_interrupted_repair_is_finished_or_taken_back() {
             assert_eq!(found.iter().any(|f| f.code == "FIL010"), (1..5).contains(&step), "step {step}");
             let recovered = journal::recover(&dir).expect("recovered");
             let (outcome, files) = match step {
-                1..=3 if damaged => (Some(Recovered::TakenBack), &before),
+                1..=3 if damaged => (Some(Recovered::RolledBack), &before),
                 1..=4 => (Some(Recovered::Finished), &after),
                 5 | 6 => (None, &after),
                 _ => (None, &before),
@@ -127,7 +127,7 @@ fn an_undo_that_was_interrupted_is_finished() {
 }
 
 #[test]
-fn what_changed_since_is_left_alone() {
+fn files_changed_after_a_repair_are_not_restored() {
     let (_room, dir) = broken();
     journal::write(&repair(&dir), &mut |_| {}).expect("written");
     fs::write(dir.join("config.json"), "{}").expect("a file");
@@ -139,7 +139,7 @@ fn what_changed_since_is_left_alone() {
 }
 
 #[test]
-fn a_file_that_changes_meanwhile_stops_the_repair() {
+fn a_file_that_changes_during_planning_stops_the_repair() {
     let (_room, dir) = broken();
     let repair = repair(&dir);
     fs::write(dir.join("config.json"), "{}").expect("a file");

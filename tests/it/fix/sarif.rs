@@ -1,4 +1,4 @@
-//! Fixes in SARIF: a viewer that makes the replacements gets what `--fix` writes.
+//! Fixes in SARIF: applying the replacements gives the same text as `--fix`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,10 +16,10 @@ use serde_json::Value;
 use super::codes;
 use crate::support;
 
-/// Families whose rules are about texts.
+/// Families whose rules check texts.
 const OF_TEXTS: [&str; 8] = ["AUT", "CFG", "GEN", "IDX", "JSN", "PRC", "SEC", "TOK"];
 
-/// The byte at a line and column as SARIF counts them here: from one, in characters, the line's end behind its last.
+/// The byte at a line and column: both start at 1, columns count characters, and the line end follows the last one.
 fn offset(text: &str, line: &Value, column: &Value) -> usize {
     let number = |value: &Value| usize::try_from(value.as_u64().expect("a number")).expect("a small one") - 1;
     let before: usize = text.split_inclusive('\n').take(number(line)).map(str::len).sum();
@@ -27,7 +27,7 @@ fn offset(text: &str, line: &Value, column: &Value) -> usize {
     before + places.nth(number(column)).expect("a column of the text")
 }
 
-/// A text with its replacements made, all of them of the text as it was.
+/// Applies replacements, all of them relative to the original text.
 fn replaced(text: &str, change: &Value) -> String {
     let mut replacements: Vec<(usize, usize, &str)> = Vec::new();
     for replacement in change["replacements"].as_array().expect("a list") {
@@ -46,7 +46,7 @@ fn replaced(text: &str, change: &Value) -> String {
     out + &text[at..]
 }
 
-/// Holds each finding's fix in SARIF against what is written when it alone is fixed; the codes that have one.
+/// Compares each finding's fix in SARIF with the result of applying only this fix; returns the codes with a fix.
 fn compared(dir: &Path, knowledge: &Knowledge) -> Vec<String> {
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
     let outcome = check(&checkpoint, knowledge);
@@ -81,7 +81,7 @@ fn compared(dir: &Path, knowledge: &Knowledge) -> Vec<String> {
 }
 
 #[test]
-fn replacements_make_what_a_fix_writes() {
+fn replacements_equal_the_written_fix() {
     let knowledge = support::knowledge();
     let of_texts = |name: &str| OF_TEXTS.iter().any(|family| name.starts_with(family));
     let compared = support::on_cases(&knowledge, of_texts, |_, _, dir| compared(dir, &knowledge));

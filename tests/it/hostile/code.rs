@@ -4,10 +4,11 @@ use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
+use super::run::large;
 use super::{Case, bounded, case};
 
 const MODULE: &str = "modeling_x.py";
-/// Everything that a module can do while it is imported.
+/// Everything that a module can do during import.
 const PAYLOAD: &str = "import os, subprocess, urllib.request\nopen('../pwned', 'w').write('x')\nos.system('touch ../pwned')\n\
     subprocess.run(['sh', '-c', 'touch ../pwned'])\nclass XModel:\n    def __init_subclass__(cls):\n        exec('1')\n";
 
@@ -15,7 +16,7 @@ pub fn cases() -> Vec<Case> {
     [payloads(), switches(), auto_maps(), exhausting()].into_iter().flatten().collect()
 }
 
-/// X1: nothing is run.
+/// X1: no code runs.
 fn payloads() -> Vec<Case> {
     vec![
         bounded("X1", "a module with a payload", |d| {
@@ -43,7 +44,7 @@ fn payloads() -> Vec<Case> {
     ]
 }
 
-/// X2: keys that make a loader fetch or run code.
+/// X2: config keys that make a loader download or run code.
 fn switches() -> Vec<Case> {
     let set = |key: &'static str, value: Value| {
         case("X2", key, "SEC001", "config.json", move |d| d.set(&format!("/{key}"), &value))
@@ -57,7 +58,7 @@ fn switches() -> Vec<Case> {
     ]
 }
 
-/// X3: strings of `auto_map`, which are paths.
+/// X3: strings of `auto_map`, used as paths.
 fn auto_maps() -> Vec<Case> {
     let of = |name: &str, codes, value: Value| {
         case("X3", name, codes, "config.json", move |d| d.set("/auto_map", &json!({ "AutoModelForCausalLM": value })))
@@ -81,7 +82,7 @@ fn auto_maps() -> Vec<Case> {
         of("a megabyte", "AUT001", json!(format!("{}.X", "m".repeat(200)))),
         case("X3", "auto_map a string", "AUT003", "config.json", |d| d.set("/auto_map", &json!("modeling_x.X"))),
         case("X3", "ninety thousand entries", "AUT003 AUT004", "config.json", |d| {
-            let entries = (0..90_000).map(|i| (format!("Auto{i}"), json!(format!("../evil{i}.X"))));
+            let entries = (0..large(90_000)).map(|i| (format!("Auto{i}"), json!(format!("../evil{i}.X"))));
             d.set("/auto_map", &Value::Object(entries.collect()));
         }),
         case("X3", "a module that is a FIFO", "FIL001", MODULE, |d| {

@@ -1,9 +1,10 @@
 //! Rows C: the safetensors container.
 
 use super::place::{SHARD, entry, file, header, nested};
+use super::run::large;
 use super::{Case, case, clean};
 
-/// A whole shard of one tensor `a` of four bytes.
+/// A whole shard with one tensor `a` of four bytes.
 fn plain() -> Vec<u8> {
     file(header(&entry("a", "F32", "[1]", 0, 4)), 4)
 }
@@ -17,7 +18,7 @@ pub fn cases() -> Vec<Case> {
     [lengths(), sizes(), twice(), layout(), types(), text(), metadata(), names()].into_iter().flatten().collect()
 }
 
-/// C1: what the first eight bytes say.
+/// C1: the header length in the first eight bytes.
 fn lengths() -> Vec<Case> {
     let stated = |name: &str, bytes: Vec<u8>| case("C1", name, "SAF001", SHARD, move |d| d.shard(&bytes));
     let mut swapped = plain();
@@ -92,7 +93,7 @@ fn sizes() -> Vec<Case> {
     ]
 }
 
-/// C4: one name, two meanings.
+/// C4: duplicate names.
 fn twice() -> Vec<Case> {
     let a = entry("a", "F32", "[1]", 0, 4);
     let two = |name: &str, other: String| {
@@ -125,7 +126,7 @@ fn twice() -> Vec<Case> {
     ]
 }
 
-/// C5, C6, C7: bytes of several tensors, of none, and that are not there.
+/// C5, C6, C7: overlapping bytes, holes and missing bytes.
 fn layout() -> Vec<Case> {
     let of = |row, name: &str, code, at, entries: String, data| {
         case(row, name, code, at, move |d| d.tensors(&entries, data))
@@ -200,7 +201,7 @@ fn types() -> Vec<Case> {
     ]
 }
 
-/// C10, C12: what the header is made of.
+/// C10, C12: the text of the header.
 fn text() -> Vec<Case> {
     let around = |name: &str, before: &'static str, after: &'static str| {
         case("C10", name, "SAF005", SHARD, move |d| {
@@ -222,10 +223,10 @@ fn text() -> Vec<Case> {
         is("C10", "a list", "[]".to_owned()),
         is("C10", "half an object", "{\"a\":".to_owned()),
         is("C10", "a comma too many", "{\"__metadata__\":{\"format\":\"pt\"},}".to_owned()),
-        is("C10", "NaN in a part nobody reads", inside("NaN")),
-        is("C10", "1e999 in a part nobody reads", inside("1e999")),
-        is("C10", "half a surrogate in a part nobody reads", inside(r#""\ud800""#)),
-        deep("nested in a part nobody reads", inside(&nested("[", "]", many))),
+        is("C10", "NaN in an unused part", inside("NaN")),
+        is("C10", "1e999 in an unused part", inside("1e999")),
+        is("C10", "half a surrogate in an unused part", inside(r#""\ud800""#)),
+        deep("nested in an unused part", inside(&nested("[", "]", many))),
         deep("objects", inside(&nested("{\"a\":", "}", many))),
         deep("nested in the shape", header(&entry("a", "U8", &nested("[", "]", many), 0, 1))),
         deep("nested in __metadata__", format!("{{\"__metadata__\":{}}}", nested("[", "]", many))),
@@ -253,13 +254,13 @@ fn metadata() -> Vec<Case> {
         is("an object inside", "SAF007", r#"{"format":"pt","config":{"a":1}}"#),
         is("used as a tensor", "SAF007", r#"{"dtype":"U8","shape":[1],"data_offsets":[0,1]}"#),
         is("no format", "SAF009", "{}"),
-        is("a format nobody opens", "SAF009", r#"{"format":"\u001b]0;x\u0007"}"#),
+        is("an unknown format", "SAF009", r#"{"format":"\u001b]0;x\u0007"}"#),
         is("half a surrogate", "SAF007 SAF004", r#"{"format":"pt","x":"\ud800"}"#),
         is("half a surrogate in a key", "SAF004", r#"{"format":"pt","\ud800":"x"}"#),
     ]
 }
 
-/// C13: names that make trouble where they are shown or used.
+/// C13: names that cause problems in output or as paths.
 fn names() -> Vec<Case> {
     let named = |name: &str, spelling: &str| {
         let entry = entry(spelling, "U8", "[1]", 0, 1);
@@ -281,7 +282,8 @@ fn names() -> Vec<Case> {
             d.tensors(&entry("a\u{202e}b\u{200b}c\u{e0041}", "U8", "[1]", 0, 1), 1);
         }),
         case("C13", "a hundred thousand escape codes", "SAF020", SHARD, |d| {
-            let entries: Vec<_> = (0..100_000).map(|i| entry(&format!(r"\u001b[{i}m"), "U8", "[0]", 0, 0)).collect();
+            let entries: Vec<_> =
+                (0..large(100_000)).map(|i| entry(&format!(r"\u001b[{i}m"), "U8", "[0]", 0, 0)).collect();
             d.tensors(&entries.join(","), 0);
         }),
     ]

@@ -1,9 +1,9 @@
-//! Rows D: downloads that went wrong, and files that are something else.
+//! Rows D: failed downloads, and files of another format.
 
 use super::place::{INDEX, SHARD, entry, file, header};
 use super::{Case, bounded, case};
 
-/// What git-lfs leaves where it fetched nothing.
+/// A pointer that git-lfs leaves without downloading the content.
 const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:\
     4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 4976698672\n";
 
@@ -41,7 +41,7 @@ fn pointers() -> Vec<Case> {
     ]
 }
 
-/// D2, D3: downloads that were not finished.
+/// D2, D3: unfinished downloads.
 fn unfinished() -> Vec<Case> {
     let beside = |name: &'static str| {
         case("D2", name, "FIL005", name, move |d| {
@@ -80,7 +80,7 @@ fn unfinished() -> Vec<Case> {
     ]
 }
 
-/// D4: something else under the name of a shard or a document.
+/// D4: other formats under the name of a shard or a document.
 fn others() -> Vec<Case> {
     let files: [(&str, &[u8]); 14] = [
         ("web page", b"<!DOCTYPE html>\n<html><head><title>Sign in</title></head></html>"),

@@ -1,6 +1,7 @@
 //! Rows J1 to J6 and J8: documents as text.
 
 use super::place::{Dir, INDEX, nested};
+use super::run::large;
 use super::{Case, bounded, case, clean};
 
 const CONFIG: &str = "config.json";
@@ -55,7 +56,7 @@ fn depth() -> Vec<Case> {
     ]
 }
 
-/// J2: nesting under a key that nobody reads.
+/// J2: nesting under a key that no reader uses.
 fn ignored() -> Vec<Case> {
     let under = |name: &str, file: &'static str, depth| {
         case("J2", name, "JSN009", file, move |d| {
@@ -147,7 +148,7 @@ fn encodings() -> Vec<Case> {
     ]
 }
 
-/// J5: equal keys.
+/// J5: duplicate keys.
 fn doubles() -> Vec<Case> {
     let is = |name: &str, at, text: &str| config("J5", name, "JSN002", at, text);
     vec![
@@ -164,7 +165,7 @@ fn doubles() -> Vec<Case> {
     ]
 }
 
-/// What hands do to JSON, and what is left of a merge.
+/// Slips of hand-written JSON, and markers of a merge.
 fn slips() -> Vec<Case> {
     let is = |name: &str, code, text: &str| config("J3", name, code, CONFIG, text);
     vec![
@@ -182,7 +183,7 @@ fn slips() -> Vec<Case> {
     ]
 }
 
-/// J8: what does not fit into memory.
+/// J8: documents that do not fit into memory.
 fn size() -> Vec<Case> {
     let sparse = |name: &'static str| {
         case("J8", format!("6 GiB {name}"), "FIL003", name, move |d| {
@@ -244,6 +245,8 @@ fn size() -> Vec<Case> {
             d.llama();
             d.put("vocab.txt", "\n".repeat(30_000_000));
         }),
-        bounded("J8", "60 MB of spaces", |d| d.config(format!("{{{}\"model_type\":\"x\"}}", " ".repeat(60_000_000)))),
+        bounded("J8", "60 MB of spaces", |d| {
+            d.config(format!("{{{}\"model_type\":\"x\"}}", " ".repeat(large(60_000_000))));
+        }),
     ]
 }

@@ -1,6 +1,7 @@
-//! Rows P: the index, and every string that could become a path.
+//! Rows P: the index, and all strings used as paths.
 
 use super::place::{Dir, INDEX, SHARD, entry, file, header, numbered};
+use super::run::large;
 use super::{Case, case, clean};
 
 /// The two members of a sound `weight_map`.
@@ -10,7 +11,7 @@ pub fn cases() -> Vec<Case> {
     [strings(), links(), shards(), sizes(), doubles(), many()].into_iter().flatten().collect()
 }
 
-/// P1: values of `weight_map` that are no plain names. Those that lead somewhere lead to files that are watched.
+/// P1: values of `weight_map` that are not plain names. Existing targets are watched.
 fn strings() -> Vec<Case> {
     let to = |name: &str, path: &str| {
         let members = format!(r#"{SOUND}, "c": "{path}""#);
@@ -83,7 +84,7 @@ fn links() -> Vec<Case> {
     ]
 }
 
-/// A snapshot of the hub cache: nothing but links to blobs.
+/// A snapshot of the hub cache, which consists of links to blobs.
 pub fn hub_cache(d: &Dir) {
     d.small();
     let blobs = d.root.join("../blobs");
@@ -96,7 +97,7 @@ pub fn hub_cache(d: &Dir) {
     }
 }
 
-/// P3, P4, P5, P8: which shards there are.
+/// P3, P4, P5, P8: missing and additional shards.
 fn shards() -> Vec<Case> {
     let map = |row, name: &str, code, at, members: &'static str| case(row, name, code, at, move |d| d.map(members));
     let one = || file(header(&entry("a", "U8", "[4]", 0, 4)), 4);
@@ -184,7 +185,7 @@ fn sizes() -> Vec<Case> {
     ]
 }
 
-/// P7: keys twice, and an index that is none.
+/// P7: duplicate keys, and an invalid index.
 fn doubles() -> Vec<Case> {
     let is = |name: &str, code, text: String| case("P7", name, code, INDEX, move |d| d.index(&text));
     let meta = r#""metadata": {"total_size": 8}"#;
@@ -205,7 +206,7 @@ fn doubles() -> Vec<Case> {
 /// P9: a hundred thousand findings.
 fn many() -> Vec<Case> {
     let members = |value: fn(usize) -> String| {
-        let members = (0..100_000).map(|i| format!(r#""t{i}": "{}""#, value(i)));
+        let members = (0..large(100_000)).map(|i| format!(r#""t{i}": "{}""#, value(i)));
         members.collect::<Vec<_>>().join(", ")
     };
     let of = |name: &str, code, value: fn(usize) -> String| {

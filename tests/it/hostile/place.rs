@@ -1,4 +1,4 @@
-//! Where a case is built: a checkpoint, and around it what must not be touched.
+//! The directory of a case: a checkpoint, and files around it that must not be touched.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -15,16 +15,16 @@ pub const SHARD: &str = "model.safetensors";
 /// The index.
 pub const INDEX: &str = "model.safetensors.index.json";
 
-/// A case's directory.
+/// Directory of a case.
 pub struct Dir {
     /// The checkpoint.
     pub root: PathBuf,
-    /// The directory around it, with files that a path out of the checkpoint could reach.
+    /// The directory around it, with files that a path could reach from inside the checkpoint.
     pub outer: PathBuf,
 }
 
 impl Dir {
-    /// Makes the surroundings below `room`, and an empty checkpoint.
+    /// Creates the surroundings below `room`, and an empty checkpoint.
     pub fn new(room: &Path) -> Self {
         let outer = room.join("outer");
         let root = outer.join("checkpoint");
@@ -41,36 +41,36 @@ impl Dir {
         fs::write(self.root.join(name), bytes).unwrap();
     }
 
-    /// A checkpoint of a class that is not known, with one tensor: what is said of it is said of the case.
+    /// A checkpoint of an unknown class with one tensor, so that all findings are about the case.
     pub fn small(&self) {
         self.put("config.json", r#"{"architectures": ["Unheard"], "model_type": "unheard"}"#);
         self.entries(&entry("a", "U8", "[1]", 0, 1), 1);
     }
 
-    /// The small one, with another config.
+    /// The small checkpoint with another config.
     pub fn config(&self, text: impl AsRef<[u8]>) {
         self.small();
         self.put("config.json", text);
     }
 
-    /// The small one, with this shard.
+    /// The small checkpoint with this shard.
     pub fn shard(&self, bytes: impl AsRef<[u8]>) {
         self.small();
         self.put(SHARD, bytes);
     }
 
-    /// A shard of these entries and so many bytes of data.
+    /// Writes a shard with these entries and `data` bytes.
     pub fn entries(&self, entries: &str, data: usize) {
         self.put(SHARD, file(header(entries), data));
     }
 
-    /// The small one, with a shard of these entries.
+    /// The small checkpoint with a shard of these entries.
     pub fn tensors(&self, entries: &str, data: usize) {
         self.small();
         self.entries(entries, data);
     }
 
-    /// The small one in two shards, with this index.
+    /// The small checkpoint in two shards with this index.
     pub fn index(&self, text: impl AsRef<[u8]>) {
         self.small();
         fs::remove_file(self.root.join(SHARD)).unwrap();
@@ -80,12 +80,12 @@ impl Dir {
         self.put(INDEX, text);
     }
 
-    /// The small one in two shards, whose index has these members in its `weight_map`.
+    /// The small checkpoint in two shards, with these members in the `weight_map`.
     pub fn map(&self, members: &str) {
         self.index(format!(r#"{{"metadata": {{"total_size": 8}}, "weight_map": {{{members}}}}}"#));
     }
 
-    /// A whole tiny Llama, tokenizer included.
+    /// A complete tiny Llama, including a tokenizer.
     pub fn llama(&self) {
         static BASE: LazyLock<TempDir> = LazyLock::new(|| {
             let dir = TempDir::new().unwrap();
@@ -95,7 +95,7 @@ impl Dir {
         support::copy(BASE.path(), &self.root);
     }
 
-    /// The Llama, with a value of its config set; `null` is a value too.
+    /// The Llama with a value of its config changed; `null` is a value too.
     pub fn set(&self, pointer: &str, value: &Value) {
         self.llama();
         self.edit("config.json", pointer, value);
@@ -111,25 +111,25 @@ impl Dir {
         fs::write(path, serde_json::to_string_pretty(&document).unwrap()).unwrap();
     }
 
-    /// Puts a symbolic link there.
+    /// Creates a symbolic link.
     pub fn link(&self, name: &str, target: impl AsRef<Path>) {
         let _ = fs::remove_file(self.root.join(name));
         std::os::unix::fs::symlink(target, self.root.join(name)).unwrap();
     }
 
-    /// Puts a FIFO there.
+    /// Creates a FIFO.
     pub fn fifo(&self, name: &str) {
         let _ = fs::remove_file(self.root.join(name));
         mknodat(CWD, self.root.join(name), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
     }
 
-    /// Puts a directory there.
+    /// Creates a directory.
     pub fn folder(&self, name: &str) {
         let _ = fs::remove_file(self.root.join(name));
         fs::create_dir(self.root.join(name)).unwrap();
     }
 
-    /// A file of so many bytes, none of them stored.
+    /// Creates a sparse file of this size.
     pub fn sparse(&self, name: &str, bytes: u64) {
         File::create(self.root.join(name)).unwrap().set_len(bytes).unwrap();
     }
@@ -145,7 +145,7 @@ pub fn numbered(number: usize) -> String {
     format!("model-{number:05}-of-00002.safetensors")
 }
 
-/// A file of this header and so many bytes of data.
+/// A file with this header and `data` bytes.
 pub fn file(header: impl AsRef<[u8]>, data: usize) -> Vec<u8> {
     let header = header.as_ref();
     let mut bytes = u64::try_from(header.len()).unwrap().to_le_bytes().to_vec();
@@ -154,7 +154,7 @@ pub fn file(header: impl AsRef<[u8]>, data: usize) -> Vec<u8> {
     bytes
 }
 
-/// A header of these entries.
+/// A header with these entries.
 pub fn header(entries: &str) -> String {
     format!(r#"{{"__metadata__":{{"format":"pt"}},{entries}}}"#)
 }
@@ -164,7 +164,7 @@ pub fn entry(name: &str, dtype: &str, shape: &str, begin: u64, end: u64) -> Stri
     format!(r#""{name}":{{"dtype":"{dtype}","shape":{shape},"data_offsets":[{begin},{end}]}}"#)
 }
 
-/// So many brackets, and as many that close them.
+/// `depth` opening brackets, then as many closing ones.
 pub fn nested(open: &str, close: &str, depth: usize) -> String {
     format!("{}0{}", open.repeat(depth), close.repeat(depth))
 }

@@ -1,4 +1,4 @@
-//! Runs the program on a case, within limits, and watches what it does.
+//! Runs the program on a case within limits, and observes its effects.
 
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
@@ -17,29 +17,29 @@ use tempfile::TempDir;
 use super::ANYTHING;
 use super::place::Dir;
 
-/// Address space of one run, for each checkpoint it looks at.
+/// Limit of the address space for each checkpoint of a run.
 const MEMORY_KIB: u64 = 256 << 10;
-/// Seconds of CPU of one run, for each checkpoint it looks at: of the program as it is built for tests.
+/// Limit of CPU seconds for each checkpoint of a run, for the test build.
 const CPU: u64 = 20;
-/// After so long it hangs, however busy the machine is.
+/// Wall-clock limit: a longer run hangs, on any machine.
 const PATIENCE: Duration = Duration::from_mins(2);
-/// Most bytes on the terminal for one checkpoint.
+/// Maximum number of bytes printed for one checkpoint.
 const SCREEN: usize = 64 << 10;
-/// Programs that something in a checkpoint might want to have run.
+/// Programs that content of a checkpoint might start.
 const PROGRAMS: [&str; 8] = ["python", "python3", "sh", "bash", "git", "git-lfs", "curl", "wget"];
 
-/// What the cases have in common.
+/// Data shared by all cases.
 pub struct Bench {
     temporary: TempDir,
 }
 
-/// What came of a run.
+/// Result of a run.
 pub struct Verdict {
     status: Option<ExitStatus>,
-    /// What was found.
+    /// The findings.
     report: Value,
     terminal: Vec<u8>,
-    /// Files beside the checkpoint that were opened, and what was written into it.
+    /// Files outside the checkpoint that were opened, and files written inside it.
     touched: Vec<String>,
 }
 
@@ -64,13 +64,13 @@ impl Bench {
         verdict
     }
 
-    /// A directory of its own for one case.
+    /// Creates a directory for one case.
     pub fn room(&self, name: &str) -> PathBuf {
         self.temporary.path().join(name)
     }
 
-    /// Runs the program on so many checkpoints, and watches this one, what is around it and the programs it must not
-    /// start.
+    /// Runs the program on `checkpoints` checkpoints, and watches this one, its surroundings, and the programs that
+    /// must not start.
     pub fn watch(&self, room: &Path, dir: &Dir, checkpoints: u64, args: &[&OsStr]) -> Verdict {
         let programs = self.temporary.path().join("bin");
         let watch = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC).unwrap();
@@ -88,7 +88,7 @@ impl Bench {
         let mut events = Reader::new(&watch, &mut buffer);
         while let Ok(event) = events.next() {
             let name = event.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-            // Directories are looked at, the case's own among them.
+            // Directories may be listed, including that of the case.
             if !event.events().contains(ReadFlags::ISDIR) {
                 touched.push(format!("{name:?} {:?}", event.events()));
             }
@@ -102,12 +102,18 @@ impl Bench {
     }
 }
 
-/// An optimised program to run instead, as CI has it: it has every case as a donor, and two seconds.
+/// Path of an optimised program for CI: it runs every case as a donor, with a limit of two seconds.
 pub fn optimised() -> Option<OsString> {
     std::env::var_os("CKPT_DOCTOR_OPTIMISED")
 }
 
-/// The exit status, or none of what did not end. The shell sets the limits and becomes the program.
+/// The size of a large case: as given for an optimised program, and a tenth for the test build, which reads ten times
+/// slower. The verdicts are the same.
+pub fn large(size: usize) -> usize {
+    if optimised().is_some() { size } else { size / 10 }
+}
+
+/// The exit status; `None` if the run did not end. The shell sets the limits and is replaced by the program.
 fn run(args: &[&OsStr], checkpoints: u64, out: &Path, report: &Path, programs: &Path) -> Option<ExitStatus> {
     let optimised = optimised();
     let cpu = checkpoints * if optimised.is_some() { 2 } else { CPU };
@@ -145,7 +151,7 @@ impl Verdict {
         self.report["checkpoints"].as_array().into_iter().flatten().flat_map(|c| c["findings"].as_array().unwrap())
     }
 
-    /// The exit code, or what else became of the process.
+    /// The exit code, or the signal or timeout that ended the process.
     pub fn exit(&self) -> String {
         match self.status.map(|s| (s.code(), s.signal())) {
             None => "hangs".to_owned(),
@@ -154,7 +160,7 @@ impl Verdict {
         }
     }
 
-    /// Every code found, with how often when it is more than once.
+    /// Every code found, with a count if more than one.
     pub fn codes(&self) -> String {
         let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
         for finding in self.findings() {
@@ -164,7 +170,7 @@ impl Verdict {
         words.collect::<Vec<_>>().join(" ")
     }
 
-    /// What a failed case shows.
+    /// Description of a failed case.
     pub fn shown(&self) -> String {
         let mut lines = vec![format!("exit {}: {}", self.exit(), self.codes())];
         lines.extend(self.findings().take(4).map(|f| format!("{} {} {}", f["code"], f["message"], f["locations"])));
@@ -172,7 +178,7 @@ impl Verdict {
         lines.join("\n    ")
     }
 
-    /// What is wrong with the verdict.
+    /// Problems of the verdict.
     pub fn complaints(&self, wanted: &[&str], at: &str) -> Vec<String> {
         let mut complaints = Vec::new();
         let mut hold = |is: bool, what: &str| {
@@ -190,14 +196,14 @@ impl Verdict {
             hold(own.iter().any(|f| names(f, at)), &format!("{code} does not name {at}"));
         }
         for finding in self.findings().filter(|f| f["severity"] != "info") {
-            let help = finding["fix"]["title"].as_str().unwrap_or_default();
-            hold(!help.is_empty(), &format!("{} says no next step", finding["code"]));
+            let step = ["title", "help"].into_iter().find_map(|key| finding["fix"][key].as_str()).unwrap_or_default();
+            hold(!step.is_empty(), &format!("{} has neither a fix nor help", finding["code"]));
         }
         complaints.extend(self.conduct());
         complaints
     }
 
-    /// What is wrong with how the program behaves, whatever it finds.
+    /// Problems of the program's behaviour, independent of its findings.
     pub fn conduct(&self) -> Vec<String> {
         let text = self.text();
         let held = [
@@ -209,20 +215,20 @@ impl Verdict {
         held.into_iter().filter(|(is, _)| !is).map(|(_, what)| what).collect()
     }
 
-    /// What came out on the terminal.
+    /// The output on the terminal.
     pub fn text(&self) -> String {
         String::from_utf8_lossy(&self.terminal).into_owned()
     }
 }
 
-/// Whether a finding names the place, as one of its locations or in its sentence.
+/// Whether a finding contains `at` in one of its locations or in its message.
 fn names(finding: &Value, at: &str) -> bool {
     let has = |value: &Value| value.as_str().is_some_and(|text| text.contains(at));
     let located = |l: &Value| ["file", "tensor", "pointer"].iter().any(|key| has(&l[*key]));
     at.is_empty() || finding["locations"].as_array().unwrap().iter().any(located) || has(&finding["message"])
 }
 
-/// Whether a character steers a terminal, or hides or reorders text.
+/// Whether a character controls a terminal, or hides or reorders text.
 fn steers(c: char) -> bool {
     c.is_control() || escape(c.encode_utf8(&mut [0; 4]), 1).contains("\\u{")
 }

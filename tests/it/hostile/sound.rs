@@ -1,4 +1,4 @@
-//! Rows C14, C15 and F13: odd, and right.
+//! Rows C14, C15 and F13: unusual but valid.
 
 use ckpt_doctor::checkpoint::Dtype;
 
@@ -33,7 +33,7 @@ pub fn cases() -> Vec<Case> {
         tensors("eight dimensions", entry("a", "U8", "[1,1,1,1,1,1,1,1]", 0, 1), 1),
         tensors("escapes in a name", bytes(r"\u006d\u006fdel", 0, 1), 1),
         tensors(
-            "keys that nobody asks for",
+            "unknown keys",
             r#""a":{"dtype":"U8","shape":[1],"data_offsets":[0,1],"x":{"y":[1.5,null]}}"#.to_owned(),
             1,
         ),
@@ -42,7 +42,7 @@ pub fn cases() -> Vec<Case> {
         raw("white space everywhere", file(one.replace(',', " ,\r\n ").replace(':', " : "), 1)),
         raw("unaligned header", file(format!("{one} "), 1)),
         raw("twenty megabytes of padding", file(format!("{one}{}", " ".repeat(20_000_000)), 1)),
-        raw("nothing but metadata", file(r#"{"__metadata__":{"format":"pt"}}"#, 0)),
+        raw("metadata without tensors", file(r#"{"__metadata__":{"format":"pt"}}"#, 0)),
         raw(
             "much metadata",
             file(

@@ -1,17 +1,18 @@
-//! Rows F: what is no file, names that are odd, and loops.
+//! Rows F: entries that are not files, unusual names, and loops.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt as _;
 use std::os::unix::net::UnixListener;
 
 use super::place::{Dir, INDEX, SHARD, entry, file, header};
+use super::run::large;
 use super::{Case, bounded, case, clean};
 
 pub fn cases() -> Vec<Case> {
     [irregular(), names(), loops()].into_iter().flatten().collect()
 }
 
-/// F1: what would hang a reader, or be read for ever.
+/// F1: entries that would block a reader or never end.
 fn irregular() -> Vec<Case> {
     let files = [
         "config.json",
@@ -39,7 +40,7 @@ fn irregular() -> Vec<Case> {
     for name in ["config.json", "tokenizer.json", SHARD] {
         add("socket", name, |d, name| {
             let _ = std::fs::remove_file(d.root.join(name));
-            // A path longer than a socket's address may be: the name is relative to the directory.
+            // An absolute path would exceed the limit of a socket's address, so the name is relative to the directory.
             let listener = UnixListener::bind(d.root.join("s")).unwrap();
             std::fs::rename(d.root.join("s"), d.root.join(name)).unwrap();
             drop(listener);
@@ -87,7 +88,7 @@ fn names() -> Vec<Case> {
         }),
         bounded("F4", "twenty thousand files", |d| {
             d.small();
-            for i in 0..20_000 {
+            for i in 0..large(20_000) {
                 d.put(&format!("{i}.txt"), "");
             }
         }),
@@ -98,7 +99,7 @@ fn names() -> Vec<Case> {
     ]
 }
 
-/// F5, F13: links in circles, and a directory nobody may write to.
+/// F5, F13: link loops, and a directory without write permission.
 fn loops() -> Vec<Case> {
     vec![
         case("F5", "a shard that is itself", "FIL002", SHARD, |d| {

@@ -1,4 +1,4 @@
-//! Row J7: values that a config must not have, on a class that is known.
+//! Row J7: invalid config values, on a known class.
 
 use serde_json::{Value, json};
 
@@ -24,7 +24,7 @@ pub fn cases() -> Vec<Case> {
         set("the largest integer", "ARC002", "/hidden_size", json!(i64::MAX)),
         set("the smallest integer", "ARC002", "/hidden_size", json!(i64::MIN)),
     ];
-    // The same bad values for everything that sizes are made of.
+    // The same invalid values for every key that determines sizes.
     let keys =
         ["hidden_size", "num_attention_heads", "num_key_value_heads", "head_dim", "intermediate_size", "vocab_size"];
     let values = [

@@ -3,6 +3,7 @@
 use ckpt_doctor::knowledge::{Doubt, Evidence, Expected, Library, Loader, Refusal};
 use serde_json::{Value, json};
 
+use super::total_bytes;
 use crate::support::data::{Map, config, map, records};
 
 fn expect(config: &Value, stored: &Map) -> Expected {
@@ -17,7 +18,7 @@ fn shapes(expected: &Expected) -> Map {
     expected.tensors.iter().map(|(name, tensor)| (name.clone(), tensor.shape.clone())).collect()
 }
 
-/// Compares in small pieces: a diff of a thousand lines helps nobody.
+/// Compares in small pieces, because a diff of a thousand lines is not readable.
 fn assert_same(expected: &Map, stored: &Map, what: &str) {
     let missing: Vec<_> = expected.keys().filter(|n| !stored.contains_key(*n)).take(9).collect();
     let unexpected: Vec<_> = stored.keys().filter(|n| !expected.contains_key(*n)).take(9).collect();
@@ -28,13 +29,13 @@ fn assert_same(expected: &Map, stored: &Map, what: &str) {
     );
 }
 
-/// From the config alone, and again with the stored names at hand.
+/// Builds from the config alone, and again with the stored names as evidence.
 fn assert_predicted(config: &Value, name: &str, tensors: usize, bytes: u64) {
     let stored = map(name);
     for evidence in [&Map::new(), &stored] {
         let expected = expect(config, evidence);
         assert_same(&shapes(&expected), &stored, name);
-        assert_eq!((expected.tensors.len(), expected.total_bytes(2)), (tensors, Some(bytes)), "{name}");
+        assert_eq!((expected.tensors.len(), total_bytes(&expected, 2)), (tensors, Some(bytes)), "{name}");
     }
 }
 
@@ -67,14 +68,14 @@ fn wrapped_names_choose_the_wrapped_layout() {
 }
 
 #[test]
-fn a_language_model_without_its_vision_tower_is_as_good() {
+fn a_language_model_without_its_vision_tower_is_complete() {
     let config = config("llava3d-7b");
     let mut stored = map("llava3d-7b");
     stored.retain(|name, _| !name.starts_with("model.vision_tower."));
     let mut expected = expect(&config, &stored);
     expected.drop_absent_groups(|name| stored.contains_key(name));
     assert_same(&shapes(&expected), &stored, "without the tower");
-    assert_eq!((expected.tensors.len(), expected.total_bytes(2)), (307, Some(13_554_513_920)));
+    assert_eq!((expected.tensors.len(), total_bytes(&expected, 2)), (307, Some(13_554_513_920)));
 }
 
 #[test]
@@ -115,30 +116,30 @@ fn a_base_class_has_the_names_of_its_base_module() {
 }
 
 #[test]
-fn hostile_configs_are_refused_in_a_sentence() {
+fn hostile_configs_are_refused_with_a_message() {
     let llama = |patch: Value| {
         let mut config = json!({ "architectures": ["LlamaForCausalLM"], "model_type": "llama" });
         config.as_object_mut().expect("object").extend(patch.as_object().expect("object").clone());
         Library::embedded().find(&config, [], Loader::V4_47_0).expect("llama").expect(&config)
     };
-    for (patch, says) in [
+    for (patch, message) in [
         (json!({ "num_hidden_layers": 2_147_483_648_u64 }), "more than 60000 tensors"),
         (json!({ "num_hidden_layers": 199_999 }), "more than 60000 tensors"),
         (json!({ "num_attention_heads": 0 }), "num_attention_heads is 0"),
         (json!({ "num_attention_heads": null }), "num_attention_heads"),
-        (json!({ "hidden_size": -1 }), "size of 0 to 2^53"),
+        (json!({ "hidden_size": -1 }), "integer from 0 to 2^53"),
         (json!({ "hidden_size": "4096" }), "hidden_size"),
         (
             json!({ "hidden_size": 9_223_372_036_854_775_807_i64, "head_dim": 128, "num_attention_heads": 1 }),
-            "size of 0 to 2^53",
+            "integer from 0 to 2^53",
         ),
         (json!({ "num_key_value_heads": 9_223_372_036_854_775_807_i64 }), "verflow"),
-        (json!({ "vocab_size": 1e300 }), "size of 0 to 2^53"),
+        (json!({ "vocab_size": 1e300 }), "integer from 0 to 2^53"),
     ] {
         let refusal = llama(patch.clone()).expect_err(&patch.to_string()).to_string();
-        assert!(refusal.contains(says), "{patch}: {refusal}");
+        assert!(refusal.contains(message), "{patch}: {refusal}");
     }
-    assert!(Library::embedded().architecture("llama").expect("llama").expect(&json!([1])).is_err());
+    assert!(Library::embedded().class("LlamaForCausalLM", Loader::NEWEST).expect("llama").expect(&json!([1])).is_err());
 }
 
 #[test]
@@ -147,26 +148,26 @@ fn compositions_name_the_part_that_cannot_be_built() {
     let refuse = |config: Value| {
         library.find(&config, [], Loader::V4_47_0).expect("known").expect(&config).expect_err("refused").to_string()
     };
-    let said = refuse(
+    let refusal = refuse(
         json!({ "model_type": "spatialvla", "text_config": { "model_type": "mamba" } , "use_vision_zoe": false }),
     );
-    assert_eq!(said, "text_config (model type mamba) is not known here");
-    // Its defaults look into the part, and fail first.
-    let said = refuse(json!({ "model_type": "llava", "text_config": { "model_type": "mamba_9" } }));
-    assert_eq!(said, "text_config (model type mamba_9) is not known here");
-    let said = refuse(json!({ "model_type": "spatialvla", "vision_zoe_config": null }));
-    assert_eq!(said, "`vision_zoe_config` is absent");
-    let said = refuse(json!({ "model_type": "llava", "vision_config": { "patch_size": 0 } }));
-    assert!(said.starts_with("vision_config: ") && said.contains("patch_size"), "{said}");
-    let said = refuse(
+    assert_eq!(refusal, "text_config (model type mamba) is not known here");
+    // Its defaults are evaluated on the part, and fail first.
+    let refusal = refuse(json!({ "model_type": "llava", "text_config": { "model_type": "mamba_9" } }));
+    assert_eq!(refusal, "text_config (model type mamba_9) is not known here");
+    let refusal = refuse(json!({ "model_type": "spatialvla", "vision_zoe_config": null }));
+    assert_eq!(refusal, "`vision_zoe_config` is absent");
+    let refusal = refuse(json!({ "model_type": "llava", "vision_config": { "patch_size": 0 } }));
+    assert!(refusal.starts_with("vision_config: ") && refusal.contains("patch_size"), "{refusal}");
+    let refusal = refuse(
         json!({ "model_type": "zoedepth", "bin_configurations": [{ "name": "x".repeat(2000), "n_bins": 1 }, { "name": "y", "n_bins": 1 }],
         "num_patch_transformer_layers": 0, "patch_transformer_hidden_size": 8 , "patch_transformer_intermediate_size": 8 }),
     );
-    assert!(said.contains("a tensor name of"), "{said}");
+    assert!(refusal.contains("a tensor name of"), "{refusal}");
 }
 
 #[test]
-fn the_class_decides_and_model_type_where_it_cannot() {
+fn the_class_decides_before_the_model_type() {
     let library = Library::embedded();
     let found = |config: Value| library.find(&config, [], Loader::V4_47_0).map(|a| a.name().to_owned());
     let some = |name: &str| Some(name.to_owned());
@@ -196,13 +197,13 @@ fn a_user_adds_an_architecture_or_replaces_one() {
     let endless = r#"{ architecture: "m", summary: "", sources: [], loaders: ["4.47.0"],
         classes: [{ class: "M", tensors: { "": { part: { class: "M" } } } }] }"#;
     library.add("m.json5", endless).expect("parses");
-    let refused = library.architecture("m").expect("added").expect(&json!({})).expect_err("a part of itself");
+    let refused = library.class("M", Loader::V4_47_0).expect("added").expect(&json!({})).expect_err("a part of itself");
     assert_eq!(refused.to_string(), "parts are nested more than 8 deep");
     let error = library.add("mlp.json5", &text.replace("bias", "bais")).expect_err("misspelt");
     assert!(error.to_string().contains("bais"), "{error}");
 }
 
-/// Two files in the way derived ones are written: a composition whose parts differ by loader.
+/// Two files in the form of derived ones: a composition whose parts differ by loader.
 fn small_library() -> Library {
     let mut library = Library::embedded();
     library
@@ -298,8 +299,8 @@ fn a_composition_takes_its_parts_as_each_loader_builds_them() {
     assert_eq!((new.ignore_missing, new.ignore_unexpected), (vec!["position_ids".to_owned()], vec!["junk".to_owned()]));
     let steps: Vec<(&str, Option<&str>)> =
         new.conversions.iter().map(|c| (c.from[0].as_str(), c.scope.as_deref())).collect();
-    // By class; by a class that shares another's rows; its part by model type, since that was not how the part's
-    // surroundings were found; a group by model type, and nothing for what is inside it.
+    // The part is found by class; by a class that shares another's tensors; by model type; a group is found by model
+    // type, without its inner parts.
     assert_eq!(
         steps[..4],
         [("^a", Some("")), ("old", Some("tower")), ("old", Some("tower.body")), ("old", Some("side"))],

@@ -1,5 +1,5 @@
-//! The loaders themselves, apart from the architectures: each record says what a model has, and what its loader said of
-//! the file that was saved and of changed copies of it.
+//! Predicted loads, compared with records of the loaders. Each record has the tensors of a model, and the loader's
+//! messages for the saved file and for changed copies of it.
 //!
 //! `CKPT_DOCTOR_RECORDS=FILE.jsonl` adds records that are not in the repository.
 
@@ -24,7 +24,7 @@ struct Record {
     #[serde(default)]
     config: Value,
     state_dict: Specs,
-    /// `None` where the model was too large to be saved.
+    /// `None` if the model was too large to be saved.
     saved: Option<Specs>,
     tied: Vec<Vec<String>>,
     /// Target to source, in transformers 5.
@@ -43,7 +43,7 @@ struct Record {
     mutations: Vec<Mutation>,
 }
 
-/// A conversion with its scope, which files of architectures do not state.
+/// A conversion with its scope, which architecture files omit.
 #[derive(Deserialize)]
 struct Row {
     #[serde(flatten)]
@@ -87,7 +87,7 @@ impl Record {
             Loader::ALL.into_iter().find(|l| l.version() == self.transformers_version).expect("a known loader");
         let prefix = format!("{}.", self.base_model_prefix);
         let tied_to = |name: &String| match loader {
-            // Names of one storage: the first stands for the others.
+            // For names with the same storage, the first one is saved.
             Loader::V4_47_0 | Loader::V4_57_6 => {
                 let first = self.tied.iter().find(|group| group.contains(name))?.first()?;
                 (first != name).then(|| first.clone())
@@ -127,20 +127,21 @@ impl Mutation {
         for (name, (_, shape)) in &self.reshape {
             out.insert(name.clone(), shape.clone());
         }
-        let moved: Vec<_> = self.rename.iter().map(|(old, new)| (new.clone(), out.remove(old))).collect();
-        out.extend(moved.into_iter().filter_map(|(new, shape)| Some((new, shape?))));
+        let renamed: Vec<_> = self.rename.iter().map(|(old, new)| (new.clone(), out.remove(old))).collect();
+        out.extend(renamed.into_iter().filter_map(|(new, shape)| Some((new, shape?))));
         out.extend(shapes(&self.add));
         out
     }
 }
 
-/// What differs between the prediction and what the loader said.
+/// Differences between the prediction and the loader's messages.
 fn difference(report: &LoadReport, load: &Load) -> Option<String> {
     if let Some(error) = &load.error {
         let sizes = error.contains("size mismatch") && !report.mismatched.is_empty();
-        // The exception's text; what follows in ours names the cause.
-        let told = report.raises.as_ref().is_some_and(|r| error.starts_with(r.split(" (").next().unwrap_or_default()));
-        return (!sizes && !told).then(|| format!("loader raises {error:.300}, predicted {:?}", report.raises));
+        // The exception's text; our prediction adds the cause in brackets.
+        let same_error =
+            report.raises.as_ref().is_some_and(|r| error.starts_with(r.split(" (").next().unwrap_or_default()));
+        return (!sizes && !same_error).then(|| format!("loader raises {error:.300}, predicted {:?}", report.raises));
     }
     if let Some(raises) = &report.raises {
         return Some(format!("predicted {raises}"));
@@ -149,24 +150,24 @@ fn difference(report: &LoadReport, load: &Load) -> Option<String> {
     let predicted: BTreeSet<_> =
         report.mismatched.iter().map(|m| (m.name.clone(), m.stored.clone(), m.expected.clone())).collect();
     let lists = [("missing", &report.missing, &load.missing), ("unexpected", &report.unexpected, &load.unexpected)];
-    let mut said: Vec<String> = Vec::new();
+    let mut differences: Vec<String> = Vec::new();
     for (list, ours, theirs) in lists {
         let (ours, theirs): (BTreeSet<_>, BTreeSet<_>) = (ours.iter().collect(), theirs.iter().collect());
         for (sign, only) in [("+", ours.difference(&theirs)), ("-", theirs.difference(&ours))] {
             let only: Vec<_> = only.take(3).collect();
             if !only.is_empty() {
-                said.push(format!("{sign} {list} {only:?}"));
+                differences.push(format!("{sign} {list} {only:?}"));
             }
         }
     }
     if mismatched != predicted {
-        said.push(format!("mismatched {predicted:?}, not {mismatched:?}"));
+        differences.push(format!("mismatched {predicted:?}, not {mismatched:?}"));
     }
-    (!said.is_empty()).then(|| said.join("; "))
+    (!differences.is_empty()).then(|| differences.join("; "))
 }
 
 #[test]
-fn each_loader_says_the_same_of_every_saved_model_and_mutation() {
+fn predictions_match_each_loader_on_saved_models_and_mutations() {
     let own = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/data/loader/records.jsonl");
     let files = std::iter::once(own).chain(std::env::var_os("CKPT_DOCTOR_RECORDS").map(PathBuf::from));
     let mut agreed: BTreeMap<(String, String), (usize, usize)> = BTreeMap::new();

@@ -1,4 +1,4 @@
-//! Predicted load reports against what transformers 4.47.0 said of the same files.
+//! Predicted load reports, compared with the messages of transformers 4.47.0 for the same files.
 
 use ckpt_doctor::check::load::LoadReport;
 use ckpt_doctor::check::load::{Stored, predict};
@@ -6,7 +6,7 @@ use ckpt_doctor::knowledge::{Library, Loader};
 
 use crate::support::data::{Load, Map, Record, records};
 
-/// Compares one report; `None` when the loader says the same.
+/// Compares one report; `None` when it matches.
 fn difference(record: &Record, stored: Map, load: &Load) -> Option<String> {
     let library = Library::embedded();
     let stored = Stored::from_shapes(stored);
@@ -27,7 +27,7 @@ fn difference(record: &Record, stored: Map, load: &Load) -> Option<String> {
 }
 
 #[test]
-fn the_loader_says_the_same_of_every_saved_model_and_mutation() {
+fn predictions_match_the_loader_on_the_sample() {
     let (mut loads, mut wrong) = (0, Vec::new());
     for record in records("sample") {
         let saved = record.saved();

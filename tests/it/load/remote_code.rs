@@ -1,16 +1,17 @@
-//! Architectures whose code comes with the checkpoint, against what that code builds.
+//! Architectures with custom code, compared with the tensors that this code builds.
 //!
-//! `remote-code.jsonl` has a line for each model that was built from its own code on torch's meta device, under
-//! transformers 4.47.0. No code of those repositories is here: a line is a config, and names and shapes.
+//! Each line of `remote-code.jsonl` is a model built from its own code on torch's meta device, under transformers
+//! 4.47.0. A line contains a config with names and shapes, but no code of the repositories.
 
 use std::collections::BTreeSet;
 
 use ckpt_doctor::knowledge::{Expected, Library, Loader};
 use serde_json::{Value, json};
 
+use super::total_bytes;
 use crate::support::data::{Map, Record, records};
 
-/// Decoders of transformers that a part may be, for as long as the program does not know them itself.
+/// Decoders of transformers that a part may have and that the library lacks.
 const DECODERS: [(&str, &str); 2] = [
     (
         "Qwen2ForCausalLM",
@@ -95,7 +96,7 @@ fn shapes(expected: &Expected) -> Map {
     expected.tensors.iter().map(|(name, tensor)| (name.clone(), tensor.shape.clone())).collect()
 }
 
-/// The record of the class whose config has this at a JSON pointer.
+/// The record of the class with this config value at a JSON pointer.
 fn record(class: &str, pointer: &str, value: &Value) -> Record {
     let mut all = records("remote-code").into_iter();
     all.find(|r| r.class == class && r.config.pointer(pointer) == Some(value)).expect("a record")
@@ -113,7 +114,8 @@ fn every_class_builds_what_its_own_code_builds() {
         assert!(differ.is_empty() && lacking.is_empty(), "{}: differ {differ:#?}, lacking {lacking:#?}", record.config);
         let ties = expected.tensors.iter().filter_map(|(n, t)| Some(vec![n.clone(), t.tied_to.clone()?]));
         assert_eq!(ties.collect::<Vec<_>>(), record.tied, "{}", record.config);
-        // InternVL brings a copy of Phi-3 whose rotary buffers are none; the class of transformers that stands for it has them.
+        // InternVL contains a copy of Phi-3 whose rotary embeddings are not buffers; in the class of transformers they
+        // are.
         let copied = record.config.pointer("/llm_config/model_type") == Some(&"phi3".into());
         if let Some(buffers) = record.buffers.filter(|_| !copied) {
             assert_eq!(expected.buffers.into_iter().collect::<Vec<_>>(), buffers, "{}", record.config);
@@ -144,8 +146,8 @@ fn every_class_builds_what_its_own_code_builds() {
 
 #[test]
 fn published_indexes_have_the_bytes_that_follow_from_the_config() {
-    // `metadata.total_size` of the published index, two bytes an element. ChatGLM-6B stores its layer norms with four,
-    // and its head although it is the embedding.
+    // `metadata.total_size` of the published index, with two bytes per element. ChatGLM-6B stores its layer norms with
+    // four bytes, and stores the tied head as well.
     let (norms, head) = (4096 * (28 * 4 + 2) * 2, 150_528 * 4096 * 2);
     for (class, pointer, value, total) in [
         ("ChatGLMModel", "/seq_length", json!(8192), 12_487_168_064),
@@ -154,16 +156,16 @@ fn published_indexes_have_the_bytes_that_follow_from_the_config() {
         ("InternLM2ForCausalLM", "/vocab_size", json!(92_544), 15_475_417_088),
         ("MiniCPMV", "/vocab_size", json!(122_753), 6_869_931_584),
         ("OpenVLAForActionPrediction", "/text_config/vocab_size", json!(32_064), 15_082_474_368),
-        // Quantised, so its index gives the number of parameters.
+        // The index of a quantised model states the number of parameters.
         ("MolmoForCausalLM", "/vocab_size", json!(152_064), 2 * 8_021_025_280),
     ] {
         let expected = expect(&record(class, pointer, &value).config);
-        assert_eq!(expected.total_bytes(2), Some(total), "{class} {value}");
+        assert_eq!(total_bytes(&expected, 2), Some(total), "{class} {value}");
     }
 }
 
 #[test]
-fn one_class_name_means_what_the_config_shows() {
+fn the_config_distinguishes_classes_of_one_name() {
     let named = |class: &str, model_type: &str, more: Value| {
         let mut config = json!({ "architectures": [class], "model_type": model_type, "auto_map": {} });
         config.as_object_mut().expect("object").extend(more.as_object().expect("object").clone());
@@ -195,7 +197,7 @@ fn remote_code_is_known_for_the_loaders_it_was_built_with() {
     let config = json!({ "architectures": ["InternLM2ForCausalLM"], "model_type": "internlm2", "auto_map": {} });
     assert_eq!(found(&config, Loader::V4_47_0).as_deref(), Some("internlm2"));
     assert_eq!(found(&config, Loader::V5_23_0), None, "its code raises there");
-    // transformers 5 has these two itself, with other tensors.
+    // transformers 5 has its own classes of these names, with other tensors.
     for (class, model_type, own) in [
         ("Florence2ForConditionalGeneration", "florence2", "florence2_remote"),
         ("DeepseekV2ForCausalLM", "deepseek_v2", "deepseek_v2_remote"),
@@ -217,7 +219,7 @@ fn transformers_5_does_not_tie_what_remote_code_does_not_declare() {
 }
 
 #[test]
-fn remote_configs_are_refused_in_a_sentence() {
+fn remote_configs_are_refused_with_a_message() {
     let refuse = |config: Value| {
         let library = Library::embedded();
         let architecture = library.find(&config, [], Loader::V4_47_0).expect("known");

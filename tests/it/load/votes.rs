@@ -1,4 +1,5 @@
-//! Config values and classes from tensors alone, on the maps of real and tiny checkpoints, and `inspect` from the outside.
+//! Config values and classes inferred from tensors, on the maps of real and tiny checkpoints, and `inspect` from the
+//! outside.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -22,7 +23,7 @@ fn votes(config: &Value, map: &Map) -> Votes {
     vote(architecture, config, &stored).expect("built")
 }
 
-/// A checkpoint of these tensors and no document at all.
+/// A checkpoint with these tensors and no documents.
 fn bare(map: Map) -> Checkpoint {
     let tensor = |(name, shape)| Tensor { name, dtype: Dtype::BF16, shape, begin: 0, end: 0 };
     let shard = Shard {
@@ -34,7 +35,7 @@ fn bare(map: Map) -> Checkpoint {
 }
 
 #[test]
-fn a_donor_with_one_wrong_value_says_the_right_one() {
+fn the_right_value_is_inferred_for_a_wrong_one() {
     for (name, pointers) in [
         (
             "spatialvla-tiny",
@@ -75,28 +76,28 @@ fn a_donor_with_one_wrong_value_says_the_right_one() {
                 None => json!(!value.as_bool().expect("a flag")),
             };
             let votes = votes(&wrong, &stored);
-            let said: Vec<_> = votes.outvoted().map(|v| (v.pointer.as_str(), &v.voted_value)).collect();
-            assert_eq!(said, [(*pointer, right.pointer(pointer).expect("there"))], "{name}");
+            let inferred: Vec<_> = votes.outvoted().map(|v| (v.pointer.as_str(), &v.voted_value)).collect();
+            assert_eq!(inferred, [(*pointer, right.pointer(pointer).expect("there"))], "{name}");
         }
     }
 }
 
-/// What the tensors prove is what the real config says, wherever that says it.
-fn assert_agrees(proven: &Value, said: &Value, place: &str) {
-    match (proven, said) {
+/// Inferred values equal those of the real config, for all keys that it sets.
+fn assert_agrees(proven: &Value, config: &Value, place: &str) {
+    match (proven, config) {
         (_, Value::Null) => {}
-        (Value::Object(proven), Value::Object(said)) => {
+        (Value::Object(proven), Value::Object(config)) => {
             for (key, value) in proven {
-                assert_agrees(value, said.get(key).unwrap_or(&Value::Null), &format!("{place}/{key}"));
+                assert_agrees(value, config.get(key).unwrap_or(&Value::Null), &format!("{place}/{key}"));
             }
         }
-        (Value::Array(proven), Value::Array(said)) => {
-            assert_eq!(proven.len(), said.len(), "{place}");
-            for (i, (proven, said)) in proven.iter().zip(said).enumerate() {
-                assert_agrees(proven, said, &format!("{place}/{i}"));
+        (Value::Array(proven), Value::Array(config)) => {
+            assert_eq!(proven.len(), config.len(), "{place}");
+            for (i, (proven, config)) in proven.iter().zip(config).enumerate() {
+                assert_agrees(proven, config, &format!("{place}/{i}"));
             }
         }
-        _ => assert_eq!(proven, said, "{place}"),
+        _ => assert_eq!(proven, config, "{place}"),
     }
 }
 
@@ -117,14 +118,14 @@ fn without_a_config_class_and_values_are_found() {
 }
 
 #[test]
-fn names_like_no_class_are_said_to_be() {
+fn names_unlike_any_class_are_reported() {
     let found = inspect(&bare(Map::from([("a.b".to_owned(), vec![2])])), &Library::embedded());
     assert_eq!((found.classes.len(), found.proven.is_null()), (0, true));
     assert_eq!(found.notes, ["no known class has tensor names like these"]);
 }
 
 #[test]
-fn an_explanation_leaves_what_it_does_not_explain() {
+fn unexplained_tensors_remain_in_the_report() {
     let library = Library::embedded();
     let mut config = config("llava3d-tiny");
     config["vocab_size"] = json!(341);
@@ -171,7 +172,7 @@ fn copy(work: &TempDir, name: &str, change: impl FnOnce(&mut Value)) {
     }
 }
 
-/// Without the classes that come after the best: every new architecture file changes those.
+/// Removes the classes after the best one: every new architecture file changes them.
 fn without_others(shown: &str, format: &str) -> String {
     if format == "full" {
         let lines = shown.lines().filter(|line| !line.starts_with("    next: "));
@@ -183,7 +184,7 @@ fn without_others(shown: &str, format: &str) -> String {
 }
 
 #[test]
-fn inspect_says_what_a_checkpoint_is() {
+fn inspect_summarises_a_checkpoint() {
     let work = TempDir::new().unwrap();
     let shots = |what: &str| {
         for format in ["full", "json"] {
@@ -210,7 +211,7 @@ fn a_shard_alone_and_a_shard_of_a_checkpoint() {
 }
 
 #[test]
-fn hostile_names_do_not_reach_the_terminal() {
+fn hostile_names_are_escaped() {
     let work = TempDir::new().unwrap();
     let header = json!({ "a\u{1b}[2J\u{202e}.b": { "dtype": "F32", "shape": [1], "data_offsets": [0, 4] },
         "model.norm.weight": { "dtype": "F32", "shape": [9_007_199_254_740_993_u64, 0], "data_offsets": [4, 4] } });

@@ -1,4 +1,4 @@
-//! What `build-merged` refuses, and what it does not take along.
+//! Merges that `build-merged` refuses, and content that it does not copy.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use tempfile::TempDir;
 use super::{copy, donor, merge, names, state, text, tiny};
 
 #[test]
-fn a_target_in_the_way_is_refused() {
+fn an_occupied_target_is_refused() {
     let work = TempDir::new().unwrap();
     let vision = work.path().join("vision");
     copy(&donor("spatialvla-tiny"), &vision);
@@ -37,26 +37,26 @@ fn a_target_in_the_way_is_refused() {
     }
     assert_eq!(before, state(&vision));
     assert_eq!(names(work.path()), ["file", "full", "link", "vision"]);
-    // An empty directory is as good as none.
+    // An empty directory is a valid target.
     let empty = work.path().join("empty");
     fs::create_dir(&empty).unwrap();
     assert_eq!(merge(&vision, &donor("llava3d-tiny"), &empty, &[]).status.code(), Some(0));
 }
 
-/// What is done to a donor.
+/// A change of a donor.
 type Damage = fn(&Path);
 
 #[test]
-fn a_damaged_donor_stops_the_merge_and_says_why() {
+fn a_damaged_donor_stops_the_merge_with_a_reason() {
     let work = TempDir::new().unwrap();
     let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n";
     let cases: [(&str, Damage, &[&str]); 5] = [
         (
             "missing",
             |d| fs::remove_file(d.join("model-00002-of-00005.safetensors")).unwrap(),
-            &["model-00002-of-00005.safetensors", "not there"],
+            &["model-00002-of-00005.safetensors", "is missing"],
         ),
-        ("pointer", |_| {}, &["model-00003-of-00005.safetensors", "git-lfs pointer", "git lfs pull"]),
+        ("pointer", |_| {}, &["model-00003-of-00005.safetensors", "Git LFS pointer", "git lfs pull"]),
         (
             "fifo",
             |d| {
@@ -72,7 +72,7 @@ fn a_damaged_donor_stops_the_merge_and_says_why() {
                 let bytes = fs::read(&path).unwrap();
                 fs::write(&path, &bytes[..bytes.len() - 100]).unwrap();
             },
-            &["model-00004-of-00005.safetensors", "cut short", "100"],
+            &["model-00004-of-00005.safetensors", "truncated", "100"],
         ),
         ("broken-json", |d| fs::write(d.join("config.json"), "{\"model_type\": ").unwrap(), &["config.json"]),
     ];
@@ -94,7 +94,7 @@ fn a_damaged_donor_stops_the_merge_and_says_why() {
 }
 
 #[test]
-fn a_donor_document_that_says_two_things_is_refused() {
+fn a_donor_document_with_a_duplicate_key_is_refused() {
     let work = TempDir::new().unwrap();
     let language = work.path().join("language");
     copy(&donor("llava3d-tiny"), &language);
@@ -104,14 +104,14 @@ fn a_donor_document_that_says_two_things_is_refused() {
     let out = work.path().join("out");
     let run = merge(&donor("spatialvla-tiny"), &language, &out, &[]);
     assert_eq!(run.status.code(), Some(2), "{}", text(&run));
-    for word in ["language", "config.json", "rms_norm_eps", "twice"] {
+    for word in ["language", "config.json", "rms_norm_eps", "duplicate key"] {
         assert!(text(&run).contains(word), "{word}: {}", text(&run));
     }
     assert_eq!(names(work.path()), ["language"]);
 }
 
 #[test]
-fn keys_that_switch_on_code_never_travel() {
+fn keys_that_run_code_are_never_copied() {
     let work = TempDir::new().unwrap();
     let language = work.path().join("language");
     copy(&donor("llava3d-tiny"), &language);
@@ -131,7 +131,7 @@ fn keys_that_switch_on_code_never_travel() {
 }
 
 #[test]
-fn bad_requests_end_with_two_and_a_sentence() {
+fn bad_requests_exit_with_2_and_a_message() {
     let work = TempDir::new().unwrap();
     let out = work.path().join("out");
     let (vision, language) = (donor("spatialvla-tiny"), donor("llava3d-tiny"));
@@ -141,7 +141,7 @@ fn bad_requests_end_with_two_and_a_sentence() {
         (&["--set", "shard-size=big"], "is not a size"),
         (&["--set", "alias=forward:os;rm"], "is not one of"),
         (&["--recipe", "nonesuch"], "nonesuch: unknown recipe"),
-        (&["--recipe", "paligemma-llama"], "has to be paligemma"),
+        (&["--recipe", "paligemma-llama"], "must be paligemma"),
     ];
     for (more, reason) in cases {
         let run = merge(&vision, &language, &out, more);
@@ -149,7 +149,7 @@ fn bad_requests_end_with_two_and_a_sentence() {
         assert!(text(&run).contains(reason), "{more:?}: {}", text(&run));
         assert!(!out.exists());
     }
-    // The roles the other way round: no recipe fits.
+    // With swapped roles, no recipe fits.
     let run = merge(&language, &vision, &out, &[]);
     assert_eq!(run.status.code(), Some(2));
     assert!(text(&run).contains("no recipe fits"), "{}", text(&run));
@@ -159,7 +159,7 @@ fn bad_requests_end_with_two_and_a_sentence() {
 fn a_seam_names_both_tensors_both_shapes_and_the_options() {
     let work = TempDir::new().unwrap();
     let run = tiny(&work.path().join("out"), &["--set", "projector=keep"]);
-    let said = text(&run);
+    let output = text(&run);
     assert_eq!(run.status.code(), Some(1));
     for word in [
         "multi_modal_projector.linear.weight",
@@ -170,6 +170,6 @@ fn a_seam_names_both_tensors_both_shapes_and_the_options() {
         "--set projector=pad",
         "--set projector=reinit",
     ] {
-        assert!(said.contains(word), "{word} is not in\n{said}");
+        assert!(output.contains(word), "{word} is not in\n{output}");
     }
 }

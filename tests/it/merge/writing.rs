@@ -1,6 +1,6 @@
-//! Where and how a checkpoint is written: targets that are refused, modes, locks, signals.
+//! Writing a merged checkpoint: refused targets, modes, locks, signals.
 //!
-//! What needs failing calls, full disks and kills at a given call is in `tests/peer/crash.py`.
+//! Failing calls, full disks and kills at each system call are tested in `tests/peer/crash.py`.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
@@ -13,7 +13,7 @@ use tempfile::TempDir;
 
 use super::{copy, donor, names, text, tiny};
 
-/// A merge of the donors in `work`, or of the fixtures where it has none.
+/// A merge of the donors in `work`; the fixtures replace missing ones.
 fn merge(work: &Path, out: &Path) -> Command {
     let place = |name: &str| if work.join(name).exists() { work.join(name) } else { donor(name) };
     let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
@@ -33,8 +33,30 @@ fn the_current_directory_is_a_target_when_it_is_empty() {
     assert_eq!(names(work.path()), ["here"]);
 }
 
+/// Numbers that no 64 bits hold as they are written, in a document that a merge edits and in one that it grafts.
 #[test]
-fn a_detour_to_a_donor_is_seen() {
+fn numbers_are_written_as_the_donors_spell_them() {
+    let work = TempDir::new().unwrap();
+    let mut numbers = Vec::new();
+    for (name, value) in [("spatialvla-tiny", "1000000000000000019884624838656"), ("llava3d-tiny", "1.50E-07")] {
+        let place = work.path().join(name);
+        copy(&donor(name), &place);
+        let config = fs::read_to_string(place.join("config.json")).unwrap();
+        let key = name.replace('-', "_");
+        fs::write(place.join("config.json"), config.replacen('{', &format!("{{\"{key}\": {value},"), 1)).unwrap();
+        numbers.push(format!("\"{key}\": {value},"));
+    }
+    let run = merge(work.path(), Path::new("out")).output().unwrap();
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let config = fs::read_to_string(work.path().join("out/config.json")).unwrap();
+    for number in numbers.iter().chain([&"\"rms_norm_eps\": 1e-05".to_owned(), &"\"batch_norm_eps\": 1e-05".to_owned()])
+    {
+        assert!(config.contains(number), "{number} in {config}");
+    }
+}
+
+#[test]
+fn a_link_to_a_donor_is_detected() {
     let work = TempDir::new().unwrap();
     copy(&donor("spatialvla-tiny"), &work.path().join("spatialvla-tiny"));
     symlink(work.path(), work.path().join("around")).unwrap();
@@ -55,7 +77,7 @@ fn a_detour_to_a_donor_is_seen() {
     assert_eq!(names(&work.path().join("spatialvla-tiny")), names(&donor("spatialvla-tiny")));
 }
 
-/// Clearing it would remove the donor.
+/// Clearing the staging directory would remove the donor.
 #[test]
 fn a_donor_inside_the_staging_directory_is_refused() {
     let work = TempDir::new().unwrap();
@@ -68,12 +90,12 @@ fn a_donor_inside_the_staging_directory_is_refused() {
     command.arg("--language").arg(donor("llava3d-tiny")).arg("--out").arg(work.path().join("out"));
     let run = command.output().unwrap();
     assert_eq!(run.status.code(), Some(2), "{}", text(&run));
-    assert!(text(&run).contains("holds a donor"), "{}", text(&run));
+    assert!(text(&run).contains("contains a donor"), "{}", text(&run));
     assert_eq!(names(&staging.join("content")), names(&donor("spatialvla-tiny")));
 }
 
 #[test]
-fn what_is_in_the_place_of_the_staging_directory_stays() {
+fn other_files_under_the_staging_name_stay() {
     let work = TempDir::new().unwrap();
     let (staging, elsewhere) = (work.path().join(".out.partial"), work.path().join("elsewhere"));
     fs::create_dir(&elsewhere).unwrap();
@@ -93,7 +115,7 @@ fn what_is_in_the_place_of_the_staging_directory_stays() {
     }
 }
 
-/// A link in the staging directory of a crashed run is removed as a link.
+/// A link in the staging directory of a killed run is removed as a link.
 #[test]
 fn clearing_does_not_follow_links() {
     let work = TempDir::new().unwrap();
@@ -128,9 +150,9 @@ fn modes_follow_the_umask() {
     }
 }
 
-/// Whenever the signal comes: nothing is left, or all is there.
+/// At any time of the signal, the target is either complete or missing.
 #[test]
-fn a_signal_leaves_nothing_or_everything() {
+fn a_signal_leaves_no_target_or_a_complete_one() {
     let work = TempDir::new().unwrap();
     let out = work.path().join("out");
     for (signal, number) in [("INT", 2), ("TERM", 15)] {
@@ -144,7 +166,7 @@ fn a_signal_leaves_nothing_or_everything() {
                     assert_eq!(names(work.path()), ["out"], "after {delay} ms");
                     fs::remove_dir_all(&out).unwrap();
                 }
-                // Before the handler is set up there is nothing to clean up.
+                // Before the handlers are installed, nothing was written.
                 (None, Some(ended)) => assert_eq!(ended, number),
                 (code, _) => {
                     assert_eq!(code, Some(128 + number), "{}", text(&run));
@@ -156,15 +178,15 @@ fn a_signal_leaves_nothing_or_everything() {
     }
 }
 
-/// Standard error that cannot be written to is nobody's loss.
+/// A failing standard error must not stop the run.
 #[test]
-fn a_full_standard_error_is_no_panic() {
+fn a_full_standard_error_does_not_panic() {
     let full = || Stdio::from(fs::OpenOptions::new().write(true).open("/dev/full").unwrap());
     let work = TempDir::new().unwrap();
     let out = work.path().join("out");
     let run = merge(work.path(), Path::new("no/such/parent")).stderr(full()).output().unwrap();
     assert_eq!(run.status.code(), Some(2));
-    // The report cannot be printed: what was written is there, and the message says so.
+    // Printing the report fails, but the checkpoint is written, and the error states this.
     let run = merge(work.path(), &out).stdout(full()).output().unwrap();
     assert_eq!(run.status.code(), Some(2));
     assert!(text(&run).contains("is written, but the report could not be"), "{}", text(&run));
@@ -172,7 +194,7 @@ fn a_full_standard_error_is_no_panic() {
 }
 
 #[test]
-fn staging_of_a_crashed_run_is_cleared_and_anybody_elses_is_not() {
+fn only_the_staging_directory_of_a_killed_run_is_cleared() {
     let work = TempDir::new().unwrap();
     let stale = work.path().join(".out.partial");
     fs::create_dir_all(stale.join("content")).unwrap();
@@ -192,7 +214,7 @@ fn staging_of_a_crashed_run_is_cleared_and_anybody_elses_is_not() {
 }
 
 #[test]
-fn a_run_under_way_is_respected() {
+fn a_running_merge_is_not_disturbed() {
     let work = TempDir::new().unwrap();
     let staging = work.path().join(".out.partial");
     fs::create_dir(&staging).unwrap();

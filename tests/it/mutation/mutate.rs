@@ -1,6 +1,6 @@
-//! Changes bytes the way disks, hands and attackers do.
+//! Random changes of bytes, like those by disks, editors and attackers.
 
-/// What is put in: brackets, literals, encodings, figures at the edge of a type.
+/// Text to insert: brackets, literals, encodings, numbers at the limits of a type.
 const PIECES: &[&[u8]] = &[
     b"{",
     b"}",
@@ -56,11 +56,11 @@ const PIECES: &[&[u8]] = &[
     b"f'{",
 ];
 
-/// A source of changes that follows from its seed.
+/// A generator of changes, determined by its seed.
 pub struct Mutator(u64);
 
 impl Mutator {
-    /// The source of this seed.
+    /// A generator with this seed.
     pub fn new(seed: u64) -> Self {
         Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x2545_f491_4f6c_dd1d) | 1)
     }
@@ -73,18 +73,18 @@ impl Mutator {
         self.0
     }
 
-    /// A number below `end`; 0 below 0.
+    /// A number less than `end`; 0 if `end` is 0.
     pub fn below(&mut self, end: usize) -> usize {
         usize::try_from(self.next() >> 1).map_or(0, |n| n.checked_rem(end).unwrap_or(0))
     }
 
-    /// The bytes after one to four changes; `other` is another file, to take parts from.
+    /// Returns `bytes` after one to four changes; `other` is another file whose parts may be inserted.
     pub fn mutate(&mut self, bytes: &[u8], other: &[u8]) -> Vec<u8> {
         let mut bytes = bytes.to_vec();
         for _ in 0..=self.below(4) {
             self.change(&mut bytes, other);
         }
-        // Half of the broken headers would otherwise end at a length that no longer fits.
+        // Without this, half of the changed headers would fail because of their length.
         if self.below(2) == 0 {
             mend_length(&mut bytes);
         }
@@ -92,7 +92,7 @@ impl Mutator {
     }
 
     fn change(&mut self, bytes: &mut Vec<u8>, other: &[u8]) {
-        // Headers and the keys that matter stand at the beginning.
+        // Headers and important keys are at the start of a file.
         let reach = if self.below(2) == 0 { bytes.len().min(600) } else { bytes.len() };
         let at = self.below(reach + 1).min(bytes.len());
         let end = (at + self.below(12)).min(bytes.len());
@@ -127,7 +127,7 @@ impl Mutator {
         }
     }
 
-    /// Changes the number that comes next.
+    /// Changes the next number in the text.
     fn number(&mut self, bytes: &mut Vec<u8>, at: usize) {
         let Some(start) = bytes[at..].iter().position(u8::is_ascii_digit).map(|n| at + n) else { return };
         let len = bytes[start..].iter().take_while(|b| b.is_ascii_digit()).count();
@@ -144,12 +144,12 @@ impl Mutator {
     }
 }
 
-/// Sets the length field of a shard to where its header now ends, if it still has one.
+/// Sets the length field of a shard to the end of its header, if the header has an end.
 fn mend_length(bytes: &mut [u8]) {
     if bytes.get(8) != Some(&b'{') {
         return;
     }
-    // The header of every seed ends in these brackets, and spaces.
+    // The header of every seed ends with these brackets, followed by spaces.
     let Some(end) = bytes.windows(3).rposition(|w| w == b"]}}").map(|n| n + 3) else { return };
     let spaces = bytes[end..].iter().take_while(|b| **b == b' ').count();
     let length = (end + spaces - 8) as u64;

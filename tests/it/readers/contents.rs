@@ -1,4 +1,4 @@
-//! Bytes of tensors, read on demand.
+//! Reading the bytes of tensors.
 
 use std::fs;
 use std::path::Path;
@@ -10,14 +10,14 @@ use super::{Case, hold};
 
 const NAME: &str = "model.safetensors";
 
-/// Writes a shard of one tensor `w` of 4 by 8 numbers in two bytes each.
+/// Writes a shard with one tensor `w` of shape 4 × 8, two bytes per element.
 fn write(file: &Path, data: &[u8; 64]) {
     let header = br#"{"__metadata__":{"format":"pt"},"w":{"dtype":"BF16","shape":[4,8],"data_offsets":[0,64]}}"#;
     let length = u64::try_from(header.len()).unwrap().to_le_bytes();
     fs::write(file, [&length[..], header, data].concat()).unwrap();
 }
 
-/// What is found in a directory that is changed between opening it and reading the tensors.
+/// Faults of a directory that changes between opening it and reading the tensors.
 fn faults(before: impl Fn(&Path), after: impl Fn(&Path)) -> Vec<Fault> {
     let dir = tempfile::tempdir().unwrap();
     before(dir.path());
@@ -54,18 +54,22 @@ fn cases() -> Vec<Case> {
             &[FaultKind::ContentsUnread],
             faults(|dir| write(&dir.join(NAME), &[1; 64]), cut),
         ),
-        Case::new("another content than the cache says", &[FaultKind::ContentHashDiffers], faults(cached, |_| ())),
+        Case::new(
+            "content that differs from its name in the cache",
+            &[FaultKind::ContentHashDiffers],
+            faults(cached, |_| ()),
+        ),
     ]
 }
 
 #[test]
-fn each_content_is_named() {
+fn faults_of_contents() {
     hold(&CASES);
 }
 
-/// Space that was set aside and never written, as the file system tells it; where it cannot tell, nothing is said.
+/// Preallocated space that was never written, as reported by the file system; without support, there is no fault.
 #[test]
-fn a_hole_at_the_end_is_seen_without_reading() {
+fn a_hole_at_the_end_is_detected_without_reading() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join(NAME);
     let header = br#"{"__metadata__":{"format":"pt"},"v":{"dtype":"U8","shape":[1024,1024],"data_offsets":[0,1048576]},"w":{"dtype":"U8","shape":[1024,1024],"data_offsets":[1048576,2097152]}}"#;

@@ -1,4 +1,4 @@
-//! Rows F, P and D of the hazards: the directory and what is in it.
+//! Rows F, P and D of the hazards: directories and their entries.
 
 use std::fs::{self, File};
 use std::os::unix::fs::symlink;
@@ -17,7 +17,7 @@ use tempfile::TempDir;
 use super::shards::file;
 use super::{Case, hold};
 
-/// A checkpoint of one file.
+/// A checkpoint with one file.
 pub fn open_with(name: &str, bytes: &[u8]) -> Checkpoint {
     let dir = TempDir::new().unwrap();
     fs::write(dir.path().join(name), bytes).unwrap();
@@ -29,7 +29,7 @@ fn fifo(path: &Path) {
     rustix::fs::mknodat(rustix::fs::CWD, path, rustix::fs::FileType::Fifo, mode, 0).unwrap();
 }
 
-/// A sparse file: it takes no room on the disk.
+/// A sparse file, which takes no space on disk.
 fn sparse(path: &Path, size: u64) {
     File::create(path).unwrap().set_len(size).unwrap();
 }
@@ -83,7 +83,7 @@ fn cases() -> Vec<Case> {
         case("folder shard", &[FaultKind::NotARegularFile], &|root| folder(&root.join("model.safetensors"))),
         case("device", &[FaultKind::NotARegularFile], &|root| symlink("/dev/zero", root.join("config.json")).unwrap()),
         case("socket", &[FaultKind::NotARegularFile], &|root| {
-            // The path of a socket is short by nature; the folder's own may not be.
+            // The address of a socket is limited in length; the path of the directory may exceed it.
             drop(UnixListener::bind(root.join("config.json")).unwrap());
         }),
         case("dangling", &[FaultKind::DanglingSymlink], &|root| {
@@ -103,7 +103,7 @@ fn cases() -> Vec<Case> {
             fs::write(root.join("model.safetensors.aria2"), "x").unwrap();
         }),
         case("unreadable", &[FaultKind::UnreadableFile], &|root| {
-            // A name longer than the system takes, behind a link: an error of no other kind.
+            // A link to a name longer than the system's limit: an error without a kind of its own.
             symlink("x".repeat(300), root.join("config.json")).unwrap();
         }),
     ]
@@ -124,7 +124,7 @@ fn only_the_directory_itself_can_fail_to_open() {
 }
 
 #[test]
-fn no_file_is_opened_because_another_names_it() {
+fn no_file_is_opened_because_another_refers_to_it() {
     let dir = TempDir::new().unwrap();
     let outside = dir.path().join("secret.safetensors");
     fs::write(&outside, file(br#"{"__metadata__":{"format":"pt"}}"#, 0)).unwrap();
@@ -141,7 +141,7 @@ fn no_file_is_opened_because_another_names_it() {
 }
 
 #[test]
-fn entries_say_what_they_are() {
+fn entries_have_kinds() {
     let dir = TempDir::new().unwrap();
     let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:abc\nsize 77\n";
     fs::write(dir.path().join("pytorch_model.bin"), pointer).unwrap();
@@ -158,7 +158,7 @@ fn entries_say_what_they_are() {
 }
 
 #[test]
-fn what_follows_the_last_tensor_is_named() {
+fn the_format_of_trailing_bytes_is_named() {
     let mut bytes = file(br#"{"__metadata__":{"format":"pt"}}"#, 0);
     bytes.extend(b"PK\x03\x04appended");
     let checkpoint = open_with("model.safetensors", &bytes);
@@ -203,7 +203,7 @@ fn checkpoints_are_found_below_a_folder_and_around_a_file() {
     symlink(root, root.join("d/loop")).unwrap();
     assert_eq!(find_checkpoints(root), [root.join("a"), root.join("b/c")]);
     assert_eq!(find_checkpoints(&root.join("a/config.json")), [root.join("a")]);
-    // The nearest one above, in the same work tree; a note in a folder that is none belongs to nobody.
+    // The nearest checkpoint above, in the same work tree; a file in another folder belongs to none.
     assert_eq!(find_checkpoints(&root.join("b/c/onnx/config.json")), [root.join("b/c/onnx")]);
     fs::create_dir(root.join("a/extra")).unwrap();
     fs::write(root.join("a/extra/notes.txt"), "").unwrap();
@@ -216,7 +216,7 @@ fn checkpoints_are_found_below_a_folder_and_around_a_file() {
 }
 
 #[test]
-fn plain_file_names_and_others() {
+fn plain_file_names_are_recognised() {
     for name in ["model.safetensors", "a b", "modèle.json", &"x".repeat(255)] {
         assert!(is_plain_file_name(name), "{name}");
     }
@@ -232,7 +232,7 @@ fn reading_stops_at_the_cap() {
     fs::write(&path, [b'x'; 100]).unwrap();
     assert!(matches!(open_regular(&path, 99), Err(OpenError::TooLarge { size: 100, cap: 99, .. })));
     let opened = open_regular(&path, 100).unwrap();
-    // The file grows between the check and the reading.
+    // The file grows between the check and the read.
     fs::write(&path, [b'x'; 200]).unwrap();
     assert!(matches!(opened.read_all(&path), Err(OpenError::TooLarge { cap: 100, .. })));
     assert_eq!(read_capped(&path, JSON_CAP).unwrap().len(), 200);

@@ -60,7 +60,7 @@ fn cases() -> Vec<Case> {
     };
     let nested = "(".repeat(100_000);
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n";
-    // More syntax than is read of one module, within the size that is read.
+    // More syntax nodes than the limit, within the size limit.
     let endless = "a;".repeat(400_000);
     vec![
         case("plain", &[], SOURCE.as_bytes()),
@@ -118,7 +118,7 @@ fn names_a_module_defines() {
     for name in ["XModel", "Alias", "a", "b", "Llama", "Y", "nn", "helper", "action_tokenizer"] {
         assert_eq!(module.defines(name), Some(true), "{name}");
     }
-    // A star import may bind anything; without one an absent name is absent.
+    // A star import may bind any name; without one, a missing name is undefined.
     assert_eq!(module.defines("Fake"), None);
     let module = PythonModule::parse("m.py", b"class A: pass\n");
     assert_eq!(module.defines("Fake"), Some(false));

@@ -1,4 +1,4 @@
-//! Laws over random input, with `serde_json` and `safetensors` as oracles.
+//! Invariants on random input, with `serde_json` and `safetensors` as oracles.
 
 use std::collections::HashMap;
 
@@ -28,7 +28,7 @@ fn json() -> impl Strategy<Value = Value> {
     })
 }
 
-/// Text in which little is left of a document: bytes changed, cut out, put in.
+/// Bytes after random changes, deletions and insertions.
 fn mutated(bytes: Vec<u8>) -> impl Strategy<Value = Vec<u8>> {
     let piece = prop::sample::select(vec![
         &b","[..],
@@ -80,7 +80,7 @@ fn tensors() -> impl Strategy<Value = Vec<(String, Dtype, Vec<usize>)>> {
     prop::collection::vec(one, 0..6).prop_map(|mut list| {
         list.sort();
         list.dedup_by(|a, b| a.0 == b.0);
-        // Half a byte cannot be stored.
+        // Elements of four bits need an even number to fill whole bytes.
         list.retain(|(_, dtype, shape)| *dtype != Dtype::F4 || shape.iter().product::<usize>() % 2 == 0);
         list
     })
@@ -139,7 +139,7 @@ proptest! {
         if document.faults.is_empty() {
             prop_assert_eq!(&strict, &document.value);
         }
-        // What strict JSON says is what we read, whatever we have to say about it (huge numbers aside).
+        // The value is the same as in strict JSON, with any faults (except huge numbers).
         if let Some(strict) = strict && !document.faults.iter().any(|f| f.kind == FaultKind::HugeNumber) {
             prop_assert_eq!(document.value, Some(strict));
         }
@@ -149,7 +149,7 @@ proptest! {
     }
 
     #[test]
-    fn no_bytes_are_too_much(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn arbitrary_bytes_are_read(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let _ = Document::parse("tokenizer.json", &bytes);
         let _ = Document::parse("vocab.json", &bytes);
         let _ = Vocabulary::parse("tokenizer.model", &bytes);

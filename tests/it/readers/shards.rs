@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::{Case, hold};
 
-/// A file of this header and `data` zero bytes.
+/// A file with this header and `data` zero bytes.
 pub fn file(header: &[u8], data: usize) -> Vec<u8> {
     let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
     bytes.extend(header);
@@ -55,7 +55,7 @@ fn cases() -> Vec<Case> {
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n";
     let name = |name: &str| of(&entry(name, "U8", "[1]", 0, 1), 1);
     vec![
-        // C14: clean oddities.
+        // C14: unusual but valid.
         raw("plain", &[], &file(good.as_bytes(), 4)),
         raw("leading space", &[], &with(" \n", "")),
         raw("20 MB padding", &[], &with("", &" ".repeat(20_000_000))),
@@ -213,7 +213,7 @@ fn cases() -> Vec<Case> {
         case("path", &[FaultKind::OddTensorName], name("../../x")),
         case("1 MiB", &[FaultKind::OddTensorName], name(&"x".repeat(1 << 20))),
         case("lone surrogate", &[FaultKind::OddTensorName, FaultKind::HeaderNotJson], name("\\ud800")),
-        // D1, D4: something else.
+        // D1, D4: other formats.
         raw("pointer", &[FaultKind::LfsPointer], pointer),
         raw("web page", &[FaultKind::NotSafetensors], b"<!DOCTYPE html>\n<html><head><title>Sign in</title>"),
         raw("JSON error", &[FaultKind::NotSafetensors], br#"{"error":"Repository not found"}"#),
@@ -227,7 +227,7 @@ fn cases() -> Vec<Case> {
 }
 
 #[test]
-fn each_fault_of_the_container_is_named() {
+fn faults_of_the_container() {
     hold(&CASES);
 }
 
@@ -248,7 +248,7 @@ fn faults_name_file_tensor_and_figures() {
 }
 
 #[test]
-fn every_fault_of_a_header_is_reported_not_the_first_alone() {
+fn all_faults_of_a_header_are_reported() {
     let entries = [
         entry("a", "F99", "[1]", 0, 4),
         entry("b", "F32", "[2]", 4, 8),
@@ -271,7 +271,7 @@ fn every_fault_of_a_header_is_reported_not_the_first_alone() {
 }
 
 #[test]
-fn entries_keep_header_order_and_the_last_of_two_wins() {
+fn entries_keep_header_order_and_the_last_duplicate() {
     let entries =
         [entry("b", "U8", "[4]", 0, 4), entry("a", "U8", "[1]", 4, 5), entry("b", "F32", "[1]", 0, 4)].join(",");
     let shard = read(&file(format!("{{{entries}}}").as_bytes(), 5));
@@ -284,7 +284,7 @@ fn a_hundred_thousand_faults_are_capped_and_counted() {
     let entries: Vec<_> = (0..100_000).map(|i| entry(&format!("t{i}"), "F32", "[1]", 0, 4)).collect();
     let faults = of(&entries.join(","), 4);
     assert_eq!(faults.len(), 64);
-    assert_eq!(faults.last().unwrap().detail["more"], json!(99_999 - 64));
+    assert_eq!(faults.last().unwrap().hidden, 99_999 - 64);
 }
 
 #[test]

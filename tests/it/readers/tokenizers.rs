@@ -10,18 +10,18 @@ use serde_json::json;
 use super::directories::open_with;
 use super::{Case, hold};
 
-/// A sentencepiece model of these pieces.
+/// A sentencepiece model with these pieces.
 pub fn sentencepiece(pieces: &[&str]) -> Vec<u8> {
     let mut bytes = Vec::new();
     for piece in pieces {
-        // field 1: the string; field 2: a float score; field 3: the type.
+        // Field 1: the string; field 2: a float score; field 3: the type.
         let mut message = vec![0x0a, piece.len() as u8];
         message.extend(piece.as_bytes());
         message.extend([0x15, 0, 0, 0x80, 0x3f, 0x18, 1]);
         bytes.extend([0x0a, message.len() as u8]);
         bytes.extend(message);
     }
-    // field 2: the trainer's settings, skipped.
+    // Field 2: the trainer's settings, skipped.
     bytes.extend([0x12, 2, 0xff, 0xff]);
     bytes
 }
@@ -81,7 +81,7 @@ fn a_slow_tokenizer_counts_pieces_stated_tokens_and_missing_special_ones() {
     );
     assert_eq!(tokenizer.source.as_deref(), Some("tokenizer.model"));
     assert_eq!(tokenizer.base().unwrap().len(), 4);
-    // 4 pieces, <image>, <x>, <pad>; added_tokens.json does not count beside a decoder.
+    // 4 pieces, <image>, <x>, <pad>; added_tokens.json is ignored beside a decoder.
     assert_eq!(tokenizer.length(), Some(7));
     assert_eq!(tokenizer.id_of("<image>"), Some(4));
     assert_eq!(tokenizer.id_of("a"), Some(3));
@@ -103,7 +103,7 @@ fn a_fast_tokenizer_keeps_its_own_ids_and_appends_the_rest() {
     assert_eq!(tokenizer.id_of("<image>"), Some(3));
     assert_eq!(tokenizer.id_of("<late>"), Some(4));
     assert_eq!(tokenizer.id_of("é"), Some(2));
-    // The vocabulary is left out of the value, and nothing else is.
+    // Only the vocabulary is omitted from the value.
     assert_eq!(documents[0].get("/model/vocab"), Some(&json!({})));
     assert_eq!(documents[0].get("/model/type"), Some(&json!("BPE")));
     assert_eq!(documents[0].left_out, ["/model/vocab", "/model/merges"]);
@@ -121,7 +121,7 @@ fn add_prefix_space_makes_llama_take_the_sentencepiece_model() {
 }
 
 #[test]
-fn nothing_is_said_of_the_length_of_a_vocabulary_that_could_not_be_read() {
+fn an_unreadable_vocabulary_has_no_length() {
     let broken = Document::parse("tokenizer.json", b"{\"model\": {\"vocab\": {\"a\": 0");
     let config = document("tokenizer_config.json", &json!({"added_tokens_decoder": {"5": {"content": "<x>"}}}));
     let tokenizer = tokenizer(vec![broken, config], None);

@@ -1,4 +1,4 @@
-//! What programs make of the formats written for them.
+//! Formats for other programs, parsed as those programs do.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use super::{samples, show};
 
-/// Every sample, and how many findings and seams there are in it.
+/// Every sample, with its number of findings and seams.
 fn all() -> [(&'static str, Report, usize); 7] {
     [
         ("clean", samples::clean(), 0),
@@ -48,12 +48,12 @@ fn jsonl_is_the_contract_in_lines() {
         for (key, value) in whole["summary"].as_object().unwrap() {
             assert_eq!(&last[key], value, "{name}");
         }
-        let said = whole["checkpoints"]
+        let findings = whole["checkpoints"]
             .as_array()
             .unwrap()
             .iter()
             .flat_map(|c| c["findings"].as_array().unwrap().iter().map(|finding| (&c["path"], finding)));
-        for (line, (path, finding)) in lines.iter().filter(|l| l["type"] == "finding").zip(said) {
+        for (line, (path, finding)) in lines.iter().filter(|l| l["type"] == "finding").zip(findings) {
             assert_eq!(&line["path"], path);
             for (key, value) in finding.as_object().unwrap() {
                 assert_eq!(&line[key], value, "{name}");
@@ -62,7 +62,7 @@ fn jsonl_is_the_contract_in_lines() {
     }
 }
 
-/// Reads a workflow command as the runner does: properties end at `::`, and are split at commas.
+/// Parses a workflow command as the runner does: properties end at `::`, and are separated by commas.
 fn command(line: &str) -> (String, Vec<(String, String)>, String) {
     let undo = |text: &str| {
         text.replace("%0D", "\r").replace("%0A", "\n").replace("%3A", ":").replace("%2C", ",").replace("%25", "%")
@@ -94,7 +94,7 @@ fn github_commands_are_read_back() {
 }
 
 #[test]
-fn gitlab_has_what_it_requires() {
+fn gitlab_reports_are_valid() {
     for (name, report, count) in all() {
         let entries = parsed(&report, Format::Gitlab);
         let entries = entries.as_array().unwrap();
@@ -112,7 +112,7 @@ fn gitlab_has_what_it_requires() {
 }
 
 #[test]
-fn fingerprints_outlive_a_move_within_the_file() {
+fn fingerprints_do_not_change_with_the_line() {
     let print = |report: &Report| parsed(report, Format::Gitlab)[0]["fingerprint"].as_str().unwrap().to_owned();
     let here = print(&one("models/tiny", "config.json", "odd"));
     let mut moved = one("./models//tiny/", "config.json", "odd");
@@ -125,7 +125,7 @@ fn fingerprints_outlive_a_move_within_the_file() {
 }
 
 #[test]
-fn junit_counts_what_it_holds() {
+fn junit_counts_match_its_cases() {
     for (name, report, count) in all() {
         let text = show(&report, Format::Junit);
         let xml = roxmltree::Document::parse(&text).unwrap();
@@ -133,21 +133,21 @@ fn junit_counts_what_it_holds() {
         assert_eq!(root.tag_name().name(), "testsuites");
         let suites: Vec<_> = root.children().filter(|n| n.has_tag_name("testsuite")).collect();
         assert_eq!(suites.len(), report.checkpoints.len() + usize::from(report.merge.is_some()), "{name}");
-        let mut told = 0;
+        let mut reported = 0;
         for suite in &suites {
             let cases: Vec<_> = suite.children().filter(|n| n.has_tag_name("testcase")).collect();
             let with = |tag: &str| cases.iter().filter(|c| c.children().any(|n| n.has_tag_name(tag))).count();
-            let says = |attribute: &str| suite.attribute(attribute).unwrap().parse::<usize>().unwrap();
-            assert_eq!((says("tests"), says("failures")), (cases.len(), with("failure")), "{name}");
+            let value = |attribute: &str| suite.attribute(attribute).unwrap().parse::<usize>().unwrap();
+            assert_eq!((value("tests"), value("failures")), (cases.len(), with("failure")), "{name}");
             assert!(!cases.is_empty(), "{name}");
-            told += with("failure") + with("skipped");
+            reported += with("failure") + with("skipped");
         }
-        assert_eq!(told, count, "{name}");
+        assert_eq!(reported, count, "{name}");
     }
 }
 
 #[test]
-fn xml_holds_no_character_it_may_not() {
+fn xml_contains_only_valid_characters() {
     let every: String = (0..=0x2_ffff).filter_map(char::from_u32).filter(|c| c.len_utf8() < 4).collect();
     for chunk in every.chars().collect::<Vec<_>>().chunks(150) {
         let odd: String = chunk.iter().collect();
@@ -158,9 +158,10 @@ fn xml_holds_no_character_it_may_not() {
     }
 }
 
-/// What the text of SARIF 2.1.0 requires of the properties used here; `tests/peer/sarif.py` has the published schema.
+/// Requirements of SARIF 2.1.0 on the properties used here; `tests/peer/sarif.py` validates against the published
+/// schema.
 #[test]
-fn sarif_has_what_it_requires() {
+fn sarif_reports_are_valid() {
     for (name, report, count) in all() {
         let log = parsed(&report, Format::Sarif);
         assert_eq!(log["version"], "2.1.0");
@@ -204,7 +205,7 @@ fn sarif_has_what_it_requires() {
 }
 
 #[test]
-fn sarif_gathers_tensors_and_keeps_paths_relative() {
+fn sarif_groups_tensors_and_keeps_paths_relative() {
     let run = parsed(&samples::findings(), Format::Sarif)["runs"][0].clone();
     let wrong = run["results"].as_array().unwrap().iter().find(|r| r["ruleId"] == "IDX003").unwrap();
     assert_eq!(wrong["locations"].as_array().unwrap().len(), 1);

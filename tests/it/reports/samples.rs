@@ -1,4 +1,4 @@
-//! Reports made by hand.
+//! Hand-written reports.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -34,7 +34,7 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
     }
 }
 
-/// A finding; the evidence is an object.
+/// A finding without details; `evidence` is an object.
 pub fn finding(code: &str, name: &str, severity: Severity, message: &str, evidence: Value) -> Finding {
     let Value::Object(evidence) = evidence else { panic!("evidence is an object") };
     Finding {
@@ -42,13 +42,16 @@ pub fn finding(code: &str, name: &str, severity: Severity, message: &str, eviden
         name: name.to_owned(),
         severity,
         message: message.to_owned(),
+        details: Vec::new(),
+        effects: Vec::new(),
         locations: Vec::new(),
         evidence,
         fix: None,
+        hidden: 0,
     }
 }
 
-/// Where `what` stands in `source`, the `nth` time (from 0).
+/// The position of `what` in `source`, the `nth` occurrence (from 0).
 pub fn at(file: &str, source: &str, what: &str, nth: usize, pointer: &str) -> Location {
     let (start, _) = source.match_indices(what).nth(nth).expect("the sample holds it");
     let before = &source[..start];
@@ -65,7 +68,8 @@ pub fn at(file: &str, source: &str, what: &str, nth: usize, pointer: &str) -> Lo
 
 #[allow(clippy::unnecessary_wraps, reason = "it fills an optional field")]
 pub fn fix(safety: Safety, title: &str) -> Option<FixHint> {
-    Some(FixHint { safety, title: title.to_owned(), edits: Vec::new() })
+    let fix = FixHint::new(safety, title, Vec::new());
+    Some(if safety == Safety::Manual { fix.without_edits() } else { fix })
 }
 
 pub fn clean() -> Report {
@@ -97,7 +101,7 @@ const PROCESSOR: &str = r#"{
 const CONFIG: &str =
     "{\n  \"model_type\": \"spatialvla\",\n  \"image_token_index\": -200,\n\t\"projection_dim\": 2048\n}\n";
 
-/// Each severity, with and without a place, and every kind of load difference.
+/// Every severity, with and without a place, and every kind of load difference.
 pub fn findings() -> Report {
     let mut infinity = finding(
         "DOC007",
@@ -173,7 +177,7 @@ pub fn findings() -> Report {
     let all = vec![twin("a.json"), twin("b.json"), no_span, ids, unmapped, module, infinity, nowhere];
     let mut checkpoint =
         checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
-    // A newer loader that reads all but one of these the same way.
+    // A newer loader with the same result, except for one tensor.
     let newer = LoadReport { loader: "5.23.0".to_owned(), stands_for: None, raises: None, silent: vec![], ..load() };
     checkpoint.loads = vec![load(), newer];
     Report::new(vec![checkpoint], None)
@@ -205,7 +209,7 @@ fn load() -> LoadReport {
     }
 }
 
-/// More of everything than anyone wants to read.
+/// A document with multi-byte characters, and fixes of each kind of text edit.
 /// A document whose lines hold characters of several bytes, and fixes of each kind that is text.
 pub fn fixable() -> Report {
     const ODD: &str = "{\n  \"größe\": NaN, \"rope_theta\": -1,\n  \"字\": {\"trust_remote_code\": true}\n}\n";
@@ -226,7 +230,7 @@ pub fn fixable() -> Report {
 
     let mut header = finding("SAF009", "no-format", Severity::Error, "no shard names its format", json!({}));
     let edits = vec![Edit::Header { file: "model.safetensors".to_owned() }];
-    header.fix = Some(FixHint::new(Safety::Safe, "write the header anew", edits));
+    header.fix = Some(FixHint::new(Safety::Safe, "rewrite the header", edits));
     Report::new(vec![checkpoint("models/odd", vec![literal, value, header], &[("config.json", ODD)])], None)
 }
 
@@ -236,13 +240,10 @@ pub fn long_lists() -> Report {
             finding("IDX001", "shard-missing", Severity::Error, &format!("shard {n} is not there"), json!({ "n": n }))
         })
         .collect();
-    findings.push(finding(
-        "IDX009",
-        "names-differ",
-        Severity::Warning,
-        "names differ",
-        json!({ "names": (0..50).map(|n| format!("name-{n}")).collect::<Vec<_>>(), "dims": (0..50).collect::<Vec<_>>() }),
-    ));
+    let names: Vec<String> = (0..50).map(|n| format!("name-{n}")).collect();
+    let mut differ = finding("IDX009", "names-differ", Severity::Warning, "names differ", json!({ "names": names }));
+    differ.details = vec![names.join(", "), format!("the longest has {} characters", "name-49".len())];
+    findings.push(differ);
     let mut places = finding("DOC001", "duplicate-key", Severity::Warning, "9 keys occur twice", json!({}));
     places.locations = (0..9)
         .map(|n| Location {
@@ -264,7 +265,7 @@ pub fn long_lists() -> Report {
     Report::new(vec![checkpoint], None)
 }
 
-/// A string that tries every trick on every format.
+/// A string with special characters of every format.
 pub const HOSTILE: &str =
     "a\u{1b}[2J\u{9b}31m\u{202e}txt\n# h | `b` <img src=x onerror=alert(1)> [l](javascript:x) **b** \u{7}@all\u{2028}";
 
@@ -287,6 +288,7 @@ pub fn hostile() -> Report {
             ..Location::default()
         },
     ];
+    one.details = vec![evil.clone(), HOSTILE.to_owned()];
     one.fix = fix(Safety::Manual, HOSTILE);
     let mut checkpoint = checkpoint(HOSTILE, vec![one], &[("config.json", &source)]);
     checkpoint.architecture = Some(HOSTILE.to_owned());

@@ -1,4 +1,4 @@
-//! The failure modes that `fixtures/failure-modes.json5` lists: reported, repaired, clean, and undone byte for byte.
+//! Reports, repairs and undoes the failure modes in `fixtures/failure-modes.json5`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -19,24 +19,28 @@ use serde::Deserialize;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Modes {
-    modes: Vec<Listed>,
+    modes: Vec<Mode>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Listed {
-    mode: String,
+pub struct Mode {
+    #[serde(rename = "mode")]
+    pub name: String,
+    /// Codes of the rules that report the failure.
+    #[serde(default)]
+    pub rules: Vec<String>,
     /// Names of cases below `fixtures/rules`.
     cases: Vec<String>,
-    /// Rules whose warnings stay: what they are about does no harm.
+    /// Rules whose warnings may remain after the repair.
     #[serde(default)]
     left: Vec<String>,
-    /// Why there is none.
+    /// The part of the failure that files do not show.
     #[serde(default)]
-    why: Option<String>,
+    pub unseen: String,
 }
 
-fn modes() -> Vec<Listed> {
+pub fn modes() -> Vec<Mode> {
     let path = "fixtures/failure-modes.json5";
     let text = fs::read_to_string(project().join(path)).expect("text");
     source::parse::<Modes>(path, &text).unwrap_or_else(|e| panic!("{e}")).modes
@@ -62,7 +66,7 @@ fn shown(findings: &[Finding]) -> String {
     out
 }
 
-/// Takes one case through all of it; the error says where it went wrong.
+/// Checks, repairs and undoes one case; the error names the failed step.
 fn round_trip(code: &str, left: &[String], dir: &Path, knowledge: &Knowledge) -> Result<(), String> {
     let before = files(dir);
     let (checkpoint, broken) = looked(dir, knowledge);
@@ -104,11 +108,13 @@ fn each_mode_is_reported_repaired_and_undone() {
 }
 
 #[test]
-fn a_mode_without_a_case_says_why() {
+fn a_mode_without_a_case_states_the_reason() {
     let modes = modes();
     for mode in &modes {
-        assert!(mode.cases.is_empty() == mode.why.is_some(), "{}", mode.mode);
+        assert!(!mode.cases.is_empty() || !mode.unseen.is_empty(), "{}", mode.name);
+        let reported = |case: &String| mode.rules.iter().any(|code| case.starts_with(code.as_str()));
+        assert!(mode.cases.iter().all(reported), "{}: a case of a rule that the mode does not name", mode.name);
     }
-    let numbered = (1..=11).filter(|n| modes.iter().any(|m| m.mode.starts_with(&format!("{n} ")))).count();
+    let numbered = (1..=11).filter(|n| modes.iter().any(|m| m.name.starts_with(&format!("{n} ")))).count();
     assert_eq!(numbered, 11, "the eleven modes of docs/decisions.md");
 }

@@ -1,4 +1,5 @@
-//! Thirty-two defects in a tiny Llama and a tiny SpatialVLA (`fixtures/seeded.json5`): each is found by its cause.
+//! Thirty-two defects in a tiny Llama and a tiny SpatialVLA (`fixtures/seeded.json5`): each is reported by the rule for
+//! its cause.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -6,7 +7,7 @@ use std::fmt::Write as _;
 use crate::support::{Seeded, seeded};
 use ckpt_doctor::check::finding::{Finding, Severity};
 
-/// What was found above info, a finding a line.
+/// Findings above info, one per line.
 fn shown(findings: &[&Finding]) -> String {
     let mut out = String::new();
     for f in findings {
@@ -15,14 +16,14 @@ fn shown(findings: &[&Finding]) -> String {
     out
 }
 
-/// Why the findings are not what the defect calls for.
+/// The difference between the findings and those expected for the defect.
 fn mismatch(seeded: &Seeded, loud: &[&Finding]) -> Option<String> {
     let own: Vec<&&Finding> = loud.iter().filter(|f| f.code == seeded.code).collect();
     if own.is_empty() {
         return Some(format!("{} is silent", seeded.code));
     }
     if !own.iter().all(|f| f.message.contains(&seeded.says)) {
-        return Some(format!("{} says something else than {:?}", seeded.code, seeded.says));
+        return Some(format!("the message of {} lacks {:?}", seeded.code, seeded.says));
     }
     if own.len() != seeded.count {
         return Some(format!("{} findings of {}, not {}", own.len(), seeded.code, seeded.count));
@@ -33,7 +34,7 @@ fn mismatch(seeded: &Seeded, loud: &[&Finding]) -> Option<String> {
 }
 
 #[test]
-fn every_defect_is_found_by_its_cause() {
+fn every_defect_is_reported_by_its_cause() {
     let all = seeded();
     let mut wrong = Vec::new();
     for (seeded, outcome) in &all.tried {
@@ -44,12 +45,12 @@ fn every_defect_is_found_by_its_cause() {
     }
     assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
     assert_eq!(all.defects, 32);
-    // Two of them need a processor, which a language model alone has not.
+    // Two defects need a processor, which the Llama lacks.
     assert_eq!(all.tried.len(), 2 * 32 - 2);
 }
 
 #[test]
-fn the_sound_models_are_silent() {
+fn the_sound_models_have_no_findings() {
     for (model, outcome) in &seeded().sound {
         let loud: Vec<&Finding> = outcome.findings.iter().filter(|f| f.severity > Severity::Info).collect();
         assert!(loud.is_empty(), "{model}{}", shown(&loud));

@@ -1,4 +1,4 @@
-//! Sound checkpoints that cases start from.
+//! Sound checkpoints, on which cases are based.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,9 +16,9 @@ use super::{cases, project};
 
 /// Names of all bases.
 ///
-/// `llama` and `paligemma` are documents in `fixtures/bases` with weights made for them; `spatialvla` is the donor
-/// without the data set whose statistics have three `Infinity`; the merged ones are built from the donors; `llama-gptq`
-/// is the sound case of that name; `lora` is an adapter of the llama.
+/// `llama` and `paligemma` are documents in `fixtures/bases` with generated weights; `spatialvla` is the donor without
+/// the data set whose statistics contain three `Infinity`; the merged ones are built from the donors; `llama-gptq` is
+/// the sound case of that name; `lora` is an adapter of `llama`.
 pub const BASES: &[&str] = &[
     "llama",
     "llama-sharded",
@@ -32,7 +32,7 @@ pub const BASES: &[&str] = &[
     "merged-wrapped",
 ];
 
-/// Makes these bases below `root`.
+/// Builds these bases below `root`.
 pub fn make_all(root: &Path, names: &[&'static str], knowledge: &Knowledge) -> BTreeMap<&'static str, PathBuf> {
     names
         .iter()
@@ -44,7 +44,7 @@ pub fn make_all(root: &Path, names: &[&'static str], knowledge: &Knowledge) -> B
         .collect()
 }
 
-/// Makes one base.
+/// Builds one base.
 pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
     match name {
         "llama" => documents("llama", dir, 1, knowledge),
@@ -74,7 +74,7 @@ pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
     }
 }
 
-/// Copies the files of a directory, links as links.
+/// Copies the files of a directory; links are copied as links.
 pub fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).expect("a directory");
     for entry in fs::read_dir(from).unwrap_or_else(|e| panic!("{}: {e}", from.display())) {
@@ -83,7 +83,7 @@ pub fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// The documents of `fixtures/bases/<name>`, and the tensors that their class has.
+/// Writes the documents of `fixtures/bases/<name>`, and the tensors of their class.
 fn documents(name: &str, dir: &Path, shards: usize, knowledge: &Knowledge) {
     copy(&project().join("fixtures/bases").join(name), dir);
     let config: Value =
@@ -110,7 +110,7 @@ fn documents(name: &str, dir: &Path, shards: usize, knowledge: &Knowledge) {
     }
 }
 
-/// Two matrices of rank four for two modules of each layer.
+/// Writes two matrices of rank four for two modules of each layer.
 fn lora(dir: &Path) {
     copy(&project().join("fixtures/bases/lora"), dir);
     let mut shard = Shard::new("adapter_model.safetensors");

@@ -1,4 +1,4 @@
-//! What a case does to its base.
+//! Changes of a base by a case.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::base;
 use super::weights::{Shard, Tensor, Weights, join, split};
 
-/// One change. Those of tensors keep shards and index sound; those of headers and bytes do not.
+/// One change. Changes of tensors keep shards and index consistent; changes of headers and bytes do not.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Change {
@@ -21,19 +21,19 @@ pub enum Change {
     Move { from: String, to: String },
     /// Copies a file.
     Copy { from: String, to: String },
-    /// Writes a file, in place of what was there.
+    /// Writes a file; replaces an existing one.
     Write { file: String, bytes: Bytes },
     /// Adds to the end of a file.
     Append { file: String, bytes: Bytes },
-    /// Puts bytes before a file's own.
+    /// Prepends bytes to a file.
     Prepend { file: String, bytes: Bytes },
-    /// Takes bytes off the end.
+    /// Removes bytes from the end.
     Cut { file: String, bytes: usize },
-    /// A file of so many bytes, none of them stored.
+    /// Creates a sparse file of this size.
     Sparse { file: String, bytes: u64 },
-    /// Replaces text that stands there exactly once.
+    /// Replaces text that occurs exactly once.
     Replace { file: String, find: String, with: String },
-    /// Replaces text wherever it stands.
+    /// Replaces every occurrence of a text.
     ReplaceAll { file: String, find: String, with: String },
     /// Sets a JSON value.
     Set { file: String, at: String, to: Value },
@@ -41,16 +41,16 @@ pub enum Change {
     Drop { file: String, at: String },
     /// Stores a text file in another encoding: `utf-16le`, `utf-8-bom`.
     Encode { file: String, to: String },
-    /// Puts a FIFO there.
+    /// Creates a FIFO.
     Fifo(String),
-    /// Puts a symbolic link there.
+    /// Creates a symbolic link.
     Link { file: String, to: String },
-    /// Makes a folder of that name.
+    /// Creates a folder.
     Folder(String),
-    /// Names the checkpoint's directory.
+    /// Renames the checkpoint's directory.
     Directory(String),
 
-    /// Adds a tensor to the last shard, or to this one.
+    /// Adds a tensor to the last shard, or to the given one.
     AddTensor {
         name: String,
         shape: Vec<u64>,
@@ -59,41 +59,41 @@ pub enum Change {
         #[serde(default)]
         file: Option<String>,
     },
-    /// Removes the tensors whose name starts so.
+    /// Removes the tensors whose names have this prefix.
     DropTensors(String),
-    /// Changes how the names that start so start.
+    /// Replaces a prefix of tensor names.
     RenameTensors { from: String, to: String },
     /// Gives a tensor another shape.
     Reshape { name: String, shape: Vec<u64> },
-    /// Gives every tensor another dtype's name and width.
+    /// Changes the dtype of every tensor, in name and width.
     Retype { name: String, dtype: String },
-    /// Writes bytes into a tensor's own, from byte `at` on.
+    /// Overwrites bytes of a tensor, from byte `at` on.
     Poke { tensor: String, at: usize, bytes: Bytes },
-    /// Stores others in place of each tensor whose name ends so: ending, dtype and dimensions. These are expressions
-    /// over the `rows` and `cols` of the tensor that goes.
+    /// Replaces each tensor whose name has this ending with others: ending, dtype and dimensions. Dimensions are
+    /// expressions over `rows` and `cols` of the replaced tensor.
     Pack { ending: String, into: Vec<(String, String, Vec<String>)> },
-    /// Writes a shard of these tensors, of no index.
+    /// Writes a shard with these tensors that is not in the index.
     Shard { file: String, tensors: Vec<(String, Vec<u64>)> },
 
     /// Sets a value in a shard's header.
     Header { file: String, at: String, to: Value },
-    /// Removes a value of a shard's header.
+    /// Removes a value from a shard's header.
     HeaderDrop { file: String, at: String },
-    /// Replaces text of a shard's header, once.
+    /// Replaces text in a shard's header; it must occur once.
     HeaderReplace { file: String, find: String, with: String },
-    /// Writes a whole header before the data.
+    /// Replaces the whole header.
     HeaderBytes { file: String, bytes: Bytes },
-    /// Puts bytes before a shard's header.
+    /// Prepends bytes to a shard's header.
     HeaderPrepend { file: String, bytes: Bytes },
-    /// Writes the data of a shard anew.
+    /// Replaces the data of a shard.
     Data { file: String, bytes: Bytes },
-    /// Adds bytes to a shard's header.
+    /// Appends bytes to a shard's header.
     HeaderAppend { file: String, bytes: Bytes },
-    /// Sets the first eight bytes.
+    /// Replaces the first eight bytes.
     HeaderLength { file: String, bytes: Bytes },
 }
 
-/// Bytes: text, hexadecimal, or parts that repeat.
+/// Bytes: text, hexadecimal, or repeated parts.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(untagged)]
 pub enum Bytes {
@@ -101,7 +101,7 @@ pub enum Bytes {
     Parts(Vec<Part>),
 }
 
-/// Bytes, once or many times.
+/// Bytes, optionally repeated.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Part {
@@ -131,7 +131,7 @@ impl Bytes {
     }
 }
 
-/// Makes a case's checkpoint below `room` and returns its directory.
+/// Builds a case's checkpoint below `room` and returns its directory.
 pub fn make(case: &str, base: &Path, changes: &[Change], room: &Path) -> PathBuf {
     let named = changes.iter().find_map(|c| if let Change::Directory(name) = c { Some(name.as_str()) } else { None });
     let dir = room.join(named.unwrap_or("checkpoint"));
@@ -140,7 +140,7 @@ pub fn make(case: &str, base: &Path, changes: &[Change], room: &Path) -> PathBuf
     dir
 }
 
-/// Makes these changes, one after the other.
+/// Applies the changes in order.
 pub fn apply_all(case: &str, changes: &[Change], dir: &Path) {
     for change in changes {
         apply(change, dir).unwrap_or_else(|e| panic!("{case}: {change:?}: {e}"));

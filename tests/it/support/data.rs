@@ -1,4 +1,4 @@
-//! Reads the test data: configs, condensed tensor maps, and what transformers 4.47.0 said of small models.
+//! Reads the test data: configs, condensed tensor maps, and records of transformers 4.47.0 on small models.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -19,7 +19,7 @@ pub fn config(name: &str) -> Value {
     serde_json::from_str(&read(&format!("configs/{name}.json"))).expect("JSON")
 }
 
-/// `maps/NAME.txt`: a line is a name and a shape; `{0..25}` in a name stands for each of the numbers.
+/// `maps/NAME.txt`: each line has a name and a shape; `{0..25}` in a name expands to each of the numbers.
 pub fn map(name: &str) -> Map {
     read(&format!("maps/{name}.txt"))
         .lines()
@@ -40,7 +40,8 @@ fn expand(name: &str) -> Vec<String> {
     (from..=to).flat_map(|i| expand(&format!("{before}{i}{after}"))).collect()
 }
 
-/// One model: what transformers builds from a config, and says of mutated copies of its file.
+/// One model: the state dict that transformers builds from a config, and its load reports for mutated copies of the
+/// file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Record {
@@ -58,7 +59,7 @@ pub struct Record {
     pub mutations: Vec<Mutation>,
 }
 
-/// A change to the saved file, and what the loader said then.
+/// A change of the saved file, and the loader's report for it.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Mutation {
@@ -93,7 +94,7 @@ impl Record {
         self.state_dict.iter().flat_map(|(name, shape)| expand(name).into_iter().map(|n| (n, shape.clone()))).collect()
     }
 
-    /// What `save_pretrained` writes.
+    /// The tensors that `save_pretrained` writes.
     pub fn saved(&self) -> Map {
         let mut saved = self.state_dict();
         saved.retain(|name, _| !self.saved_omits.contains(name));

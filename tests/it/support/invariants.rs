@@ -1,8 +1,8 @@
-//! What must hold of the readers' answers whatever bytes they get.
+//! Invariants of the readers for arbitrary bytes.
 //!
-//! The mutation test and the fuzz targets state the same laws about different inputs. A law that is broken panics.
+//! The mutation test and the fuzz targets check the same invariants on different inputs. A violation panics.
 
-#![allow(dead_code, reason = "each user needs some of the laws")]
+#![allow(dead_code, reason = "each user needs some of the invariants")]
 #![allow(
     clippy::arithmetic_side_effects,
     clippy::expect_used,
@@ -19,7 +19,7 @@ pub mod module;
 
 use ckpt_doctor::checkpoint::{Fault, FaultKind, FaultSource};
 
-/// Faults are of a reader's kinds, about the file that was read, and their spans lie inside its text.
+/// Faults have a reader's kind and name the file, and their spans lie inside its text.
 pub fn faults_are_placed(faults: &[Fault], file: &str, text: Option<&str>) {
     for fault in faults {
         assert_eq!(fault.kind.source(), FaultSource::Reader, "{fault:?}");
@@ -33,7 +33,7 @@ pub fn faults_are_placed(faults: &[Fault], file: &str, text: Option<&str>) {
     }
 }
 
-/// Whether a fault of this kind is among them.
+/// Whether the faults contain this kind.
 pub fn has(faults: &[Fault], kind: FaultKind) -> bool {
     faults.iter().any(|f| f.kind == kind)
 }

@@ -1,4 +1,4 @@
-//! Shards as the tests edit them.
+//! Shards that tests can edit.
 
 use std::fs;
 use std::path::Path;
@@ -25,7 +25,7 @@ pub struct Weights {
     pub shards: Vec<Shard>,
 }
 
-/// Bytes of an element; 2 for a type that does not exist.
+/// Bytes per element; 2 for an unknown type.
 fn width(dtype: &str) -> u64 {
     match dtype {
         "F64" | "I64" | "U64" => 8,
@@ -85,14 +85,14 @@ impl Shard {
     }
 }
 
-/// Header text and data of a shard's bytes.
+/// Header text and data of a shard.
 pub fn split(bytes: &[u8]) -> (&str, &[u8]) {
     let (length, rest) = bytes.split_first_chunk::<8>().expect("eight bytes");
     let (header, data) = rest.split_at(usize::try_from(u64::from_le_bytes(*length)).expect("small"));
     (std::str::from_utf8(header).expect("text"), data)
 }
 
-/// A shard's bytes, with the header length that fits.
+/// The bytes of a shard, with the correct header length.
 pub fn join(header: &[u8], data: &[u8]) -> Vec<u8> {
     let length = u64::try_from(header.len()).expect("small").to_le_bytes();
     [&length, header, data].concat()
@@ -114,7 +114,7 @@ impl Weights {
         self.shards.iter().for_each(|s| s.write(dir));
     }
 
-    /// Writes the index that fits the shards.
+    /// Writes an index of the shards.
     pub fn write_index(&self, dir: &Path) {
         let mut map = Map::new();
         let mut total = 0;
@@ -129,7 +129,7 @@ impl Weights {
         fs::write(dir.join(INDEX), serde_json::to_string_pretty(&index).expect("JSON")).expect("write");
     }
 
-    /// Writes the shards, and the index where there was one. A shard with nothing left in it goes.
+    /// Writes the shards, and the index if there was one. Empty shards are deleted.
     pub fn write_back(&mut self, dir: &Path) {
         self.shards.retain(|shard| {
             let keep = !shard.tensors.is_empty();
@@ -144,13 +144,13 @@ impl Weights {
         }
     }
 
-    /// The shard that has this tensor.
+    /// The shard that contains this tensor.
     pub fn holder(&mut self, name: &str) -> &mut Shard {
         let found = self.shards.iter_mut().find(|s| s.tensors.iter().any(|t| t.name == name));
         found.unwrap_or_else(|| panic!("no tensor {name}"))
     }
 
-    /// Panics when no tensor's name starts so: the case would change nothing.
+    /// Panics when no tensor name has this prefix: the case would change nothing.
     pub fn assert_prefix(&self, prefix: &str) {
         let found = self.shards.iter().flat_map(|s| &s.tensors).any(|t| t.name.starts_with(prefix));
         assert!(found, "no tensor starts with {prefix}");

@@ -1,14 +1,14 @@
-"""SpatialVLA's model class around the language model that `text_config` names.
+"""SpatialVLA's model class with the language model of `text_config`.
 
-SpatialVLA builds a Gemma 2 unless it is handed a language model; here it is handed one. Tensor names, the forward
-pass and the hook after loading are SpatialVLA's own.
+SpatialVLA builds a Gemma 2 unless a language model is passed to it; this class passes one. Tensor names, the forward
+pass and the hook after loading are those of SpatialVLA.
 """
 
 from transformers import AutoModelForCausalLM
 
 from {{package}}.modeling_spatialvla import SpatialVLAForConditionalGeneration as _SpatialVLA
 
-# The very class that AutoConfig reads config.json into; AutoModel compares the two.
+# AutoModel compares this class with the one that AutoConfig builds from config.json.
 from .configuration_spatialvla_llava3d import SpatialVLAConfig
 
 

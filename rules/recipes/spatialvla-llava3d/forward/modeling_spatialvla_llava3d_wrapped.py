@@ -3,8 +3,8 @@
     language_model.model.model.layers.N.*      language_model.model.lm_head.weight
     multi_modal_projector.weight               multi_modal_projector.bias
 
-The layout has neither spatial tokens nor a depth model: SpatialVLA's hook after loading looks for the embedding one
-level higher than it is here.
+The layout supports neither spatial tokens nor a depth network: SpatialVLA's hook after loading expects the embedding
+one level higher.
 """
 
 from torch import nn
@@ -12,12 +12,12 @@ from transformers import AutoModelForCausalLM
 
 from {{package}}.modeling_spatialvla import SpatialVLAForConditionalGeneration as _SpatialVLA
 
-# The very class that AutoConfig reads config.json into; AutoModel compares the two.
+# AutoModel compares this class with the one that AutoConfig builds from config.json.
 from .configuration_spatialvla_llava3d import SpatialVLAConfig
 
 
 class WrappedLanguageModel(nn.Module):
-    """A causal language model held in `.model`; everything SpatialVLA asks of it is passed on."""
+    """A causal language model in the attribute `.model`; forwards all attributes that SpatialVLA uses."""
 
     def __init__(self, model):
         super().__init__()

@@ -1,7 +1,7 @@
 """SpatialVLA's processor, taken from the installed package `{{package}}`, over a Llama tokenizer.
 
-The class names are what matters: under SpatialVLA's own, AutoProcessor wraps the Llama vocabulary in Gemma's
-tokenizer, which says nothing and gives other ids.
+Only the class names differ: with those of SpatialVLA, AutoProcessor wraps the Llama vocabulary in Gemma's tokenizer,
+which raises no error and gives other ids.
 """
 
 from {{package}}.processing_spatialvla import SpatialVLAProcessor as _SpatialVLAProcessor

@@ -2,18 +2,20 @@
 
 use std::fmt::Write as _;
 
+use serde_json::Value;
+
 use crate::check::fix::{Edit, Site};
 use crate::check::modules::relative_modules;
 use crate::checkpoint::{Checkpoint, PythonModule};
 
-/// Makes a module import by itself what its imports import, because transformers copies only that along.
+/// Adds to a module the imports of its imports, because transformers copies only files that it imports directly.
 pub(super) fn add_imports(site: &Site<'_>) -> Option<Vec<Edit>> {
     let fault = site.fault?;
     let name = fault.detail.get("module")?.as_str()?;
     let module = site.checkpoint().modules.get(name)?;
     let text = module.text.as_deref()?;
     let mut lines = String::new();
-    for file in fault.detail.get("imports")?.as_str()?.split(", ") {
+    for file in fault.detail.get("imports")?.as_array()?.iter().filter_map(Value::as_str) {
         let stem = file.strip_suffix(".py")?;
         let imported = site.checkpoint().modules.get(file)?;
         // In a circle the import would find a module that is half made.
@@ -65,13 +67,13 @@ pub(super) fn add_auto_class(site: &Site<'_>) -> Option<Vec<Edit>> {
     let key = key.as_str()?;
     let wanted = |class: &crate::checkpoint::module::PythonClass| match key {
         "AutoConfig" => class.bases.iter().any(|base| base.rsplit('.').next() == Some("PretrainedConfig")),
-        "AutoModel" => config.pointer("/architectures/0").and_then(serde_json::Value::as_str) == Some(&*class.name),
+        "AutoModel" => config.pointer("/architectures/0").and_then(Value::as_str) == Some(&*class.name),
         _ => false,
     };
     let classes = site.checkpoint().modules.values().flat_map(|m| m.classes.iter().map(move |class| (m, class)));
     let mut found = classes.filter(|(_, class)| wanted(class));
     let (module, class) = found.next()?;
-    // Of two that would do nobody knows which.
+    // Two candidates are ambiguous.
     if found.next().is_some() {
         return None;
     }

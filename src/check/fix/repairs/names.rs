@@ -6,7 +6,7 @@ use crate::check::fix::{Edit, renamed};
 use crate::check::index::all_read;
 use crate::checkpoint::Checkpoint;
 
-/// Renames tensors by their prefixes, when the shards that have them can be written anew and no two tensors end up under
+/// Renames tensors by their prefixes, when the shards that have them can be written again and no two tensors end up under
 /// one name.
 pub(in crate::check::fix) fn rename(checkpoint: &Checkpoint, prefixes: Vec<(String, String)>) -> Option<Edit> {
     // A shard that is not here would keep its names, and the index would not.

@@ -1,6 +1,6 @@
 //! Repairs of JSON as such.
 
-use crate::check::fix::{Edit, Site};
+use crate::check::fix::{Edit, Site, clamped};
 
 /// Drops the later of two members that are equal, key and value.
 pub(super) fn drop_equal_key(site: &Site<'_>) -> Option<Vec<Edit>> {
@@ -8,6 +8,13 @@ pub(super) fn drop_equal_key(site: &Site<'_>) -> Option<Vec<Edit>> {
     let (file, pointer, key) = (place.file.clone()?, place.pointer.as_deref()?, place.span.clone()?);
     let splice = site.checkpoint().document(&file)?.remove_at(pointer, key.start)?;
     Some(vec![Edit::Splice { file, range: splice.range, text: splice.text }])
+}
+
+/// Replaces an infinity by the largest float32 of its sign.
+pub(super) fn clamp_infinity(site: &Site<'_>) -> Option<Vec<Edit>> {
+    let place = site.place()?;
+    let text = clamped(site.fault?.detail.get("literal")?.as_str()?)?.to_string();
+    Some(vec![Edit::Splice { file: place.file.clone()?, range: place.span.clone()?, text }])
 }
 
 /// Puts a string in double quotes that is in single ones.
@@ -21,7 +28,7 @@ pub(super) fn quote_string(site: &Site<'_>) -> Option<Vec<Edit>> {
     while let Some(c) = chars.next() {
         match c {
             '"' => quoted.push_str("\\\""),
-            // JSON knows every escape but this one.
+            // JSON has every escape but this one.
             '\\' => match chars.next()? {
                 '\'' => quoted.push('\''),
                 other => quoted.extend(['\\', other]),

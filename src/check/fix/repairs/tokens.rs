@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use crate::check::fix::Edit;
 use crate::checkpoint::{Checkpoint, Vocabulary};
 
-/// Adds to `added_tokens_decoder` what it leaves out and another file names, so that every id keeps its token.
+/// Adds to `added_tokens_decoder` the entries that it lacks and another file has, so that every id keeps its token.
 pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
     let tokenizer = &checkpoint.tokenizer;
     let decoder = tokenizer.added_tokens_decoder.as_ref()?;
@@ -31,7 +31,7 @@ pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
     holes.into_iter().map(edit).collect()
 }
 
-/// The entry as `save_pretrained` writes it; `tokenizer.json` says more than the others.
+/// The entry as `save_pretrained` writes it; `tokenizer.json` has more of its fields than the other files.
 fn entry(checkpoint: &Checkpoint, id: u64, content: &str) -> Value {
     let list = checkpoint.document("tokenizer.json").and_then(|d| d.get("/added_tokens")).and_then(Value::as_array);
     let full = list.into_iter().flatten().find(|token| token.get("id").and_then(Value::as_u64) == Some(id));
@@ -39,7 +39,7 @@ fn entry(checkpoint: &Checkpoint, id: u64, content: &str) -> Value {
     let flag = |name: &str, otherwise: bool| {
         full.and_then(|token| token.get(name)).and_then(Value::as_bool).unwrap_or(otherwise)
     };
-    // What an AddedToken is when nothing is said of it: normalised unless special.
+    // The default of AddedToken: normalised unless special.
     json!({
         "content": content,
         "lstrip": flag("lstrip", false),

@@ -1,4 +1,4 @@
-//! Objects and arrays as they stand in a text.
+//! Objects and arrays with the byte ranges of their members.
 
 use std::ops::Range;
 
@@ -18,7 +18,7 @@ impl DocumentMember {
     }
 }
 
-/// An object or array as it stands in the text.
+/// An object or array of the text.
 #[derive(Debug, Clone)]
 pub(super) struct Container {
     pub(super) is_object: bool,
@@ -58,7 +58,7 @@ impl Container {
         }
     }
 
-    /// Where the member stands that a reader would take: of equal keys the last.
+    /// Position of the member with this name; of duplicate keys the last one, as a reader takes it.
     pub(super) fn position(&self, step: &str) -> Option<usize> {
         self.members.iter().rposition(|m| m.name == step)
     }

@@ -1,4 +1,4 @@
-//! How a document is laid out, so that what is put in looks like what is there.
+//! Layout of a document, so that inserted text looks like its neighbours.
 
 use std::io;
 use std::ops::Range;
@@ -10,16 +10,16 @@ use serde_json::ser::{Formatter, PrettyFormatter, Serializer};
 use super::container::{Container, DocumentMember};
 use super::splice::Splice;
 
-/// The layout of a document: several lines or one.
+/// Layout: line ends and indentation.
 pub(super) struct Layout {
-    /// Line end, when the document has several lines.
+    /// Line end; `None` when the document is a single line.
     line: Option<&'static str>,
-    /// One step of indentation.
+    /// One level of indentation.
     unit: String,
 }
 
 impl Layout {
-    /// Reads it off the first line break and the indentation that follows.
+    /// Derives the layout from the first line break and the indentation that follows.
     pub(super) fn from_text(text: &str) -> Self {
         let body = text.trim();
         let line = match body.find('\n').and_then(|at| body.get(..at)) {
@@ -31,7 +31,7 @@ impl Layout {
         Self { line, unit: indent.unwrap_or("  ").to_owned() }
     }
 
-    /// The value in place of the one at `range`.
+    /// Replaces the text at `range` with the value.
     pub(super) fn replaced(&self, text: &str, range: Range<usize>, value: &Value) -> Splice {
         let was_inline = text.get(range.clone()).is_some_and(|old| old.len() > 2 && !old.contains('\n'));
         let container = text.get(range.clone()).is_some_and(|old| old.starts_with(['{', '[']));
@@ -43,7 +43,7 @@ impl Layout {
         Splice { range, text: rendered }
     }
 
-    /// A new last member.
+    /// Appends a member after the last one.
     pub(super) fn inserted(&self, text: &str, container: &Container, name: &str, value: &Value) -> Splice {
         let Some(last) = container.members.last() else { return self.first(text, container, name, value) };
         let before = container.members.iter().rev().nth(1);
@@ -67,7 +67,7 @@ impl Layout {
         Splice { range: at..at, text: format!(",{lead}{key}{value}") }
     }
 
-    /// The first member of what was empty.
+    /// Adds the first member of an empty container.
     fn first(&self, text: &str, container: &Container, name: &str, value: &Value) -> Splice {
         let key = if container.is_object { format!("{}: ", quoted(name)) } else { String::new() };
         let (open, close) = if container.is_object { ('{', '}') } else { ('[', ']') };
@@ -82,18 +82,18 @@ impl Layout {
         Splice { range: container.range.clone(), text }
     }
 
-    /// The value over several lines, where it is a container; all lines but the first are indented.
+    /// The value over several lines if it is a container; all lines but the first are indented.
     fn lines(&self, value: &Value, indent: &str) -> String {
         let mut out = Vec::new();
         let mut serializer = Serializer::with_formatter(&mut out, PrettyFormatter::with_indent(self.unit.as_bytes()));
-        // A value without maps of odd keys always serialises, and a Vec takes all of it.
+        // Serialising a JSON value to a Vec cannot fail.
         let _infallible = value.serialize(&mut serializer);
         let text = String::from_utf8(out).unwrap_or_default();
         text.replace('\n', &format!("{}{indent}", self.line.unwrap_or("\n")))
     }
 }
 
-/// The space at the start of the line that byte `at` is in.
+/// The indentation of the line that contains byte `at`.
 fn line_indent(text: &str, at: usize) -> &str {
     let start = text.get(..at).and_then(|before| before.rfind('\n')).map_or(0, |n| n.saturating_add(1));
     text.get(start..).map_or("", indent_of)
@@ -104,7 +104,7 @@ fn indent_of(line: &str) -> &str {
     line.get(..end).unwrap_or_default()
 }
 
-/// What stands between a member's key and its value.
+/// The text between a member's key and its value.
 fn colon_of<'t>(text: &'t str, member: &DocumentMember) -> &'t str {
     let between = member.key.as_ref().and_then(|key| text.get(key.end..member.value.start));
     between.filter(|b| b.trim() == ":" && !b.contains('\n')).unwrap_or(": ")
@@ -114,7 +114,7 @@ fn quoted(name: &str) -> String {
     Value::from(name).to_string()
 }
 
-/// The value in one line.
+/// The value on one line.
 fn one_line(value: &Value, colon: &str, comma: &str) -> String {
     let mut out = Vec::new();
     let mut serializer = Serializer::with_formatter(&mut out, OneLine { colon, comma });

@@ -7,14 +7,14 @@ use serde::Serialize;
 /// New text for a byte range.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Splice {
-    /// Bytes that go; empty where something is only put in.
+    /// Bytes to replace; empty for an insertion.
     pub range: Range<usize>,
-    /// What comes in their place.
+    /// The new text.
     pub text: String,
 }
 
 impl Splice {
-    /// Whether the two would change the same bytes, or put something in at the same place.
+    /// Whether both change the same bytes, or insert at the same offset.
     #[must_use]
     pub fn meets(&self, other: &Self) -> bool {
         let (a, b) = (&self.range, &other.range);
@@ -22,7 +22,7 @@ impl Splice {
     }
 }
 
-/// The text with all splices made; `None` when one lies outside it or two of them meet.
+/// Applies all splices to the text; `None` when one lies outside it or two of them meet.
 #[must_use]
 pub fn spliced(text: &str, splices: &[Splice]) -> Option<String> {
     let mut sorted: Vec<&Splice> = splices.iter().collect();

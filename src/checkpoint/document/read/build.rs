@@ -8,14 +8,14 @@ use crate::checkpoint::scan::Token;
 /// Python refuses to convert an integer of more digits (`sys.set_int_max_str_digits`, default 4300).
 const MAX_DIGITS: usize = 4300;
 
-/// Bytes of text that take as much room as a value does.
+/// Bytes of text that take as much memory as one value.
 const NODE_BYTES: usize = 100;
 
-/// Most values kept of a document of this name, long texts counted as several: a value takes 100 bytes and more, in
-/// expressions some 1000, so a 64 MiB `[0,0,0,…` would otherwise become gigabytes.
+/// Maximum number of values kept of a document of this name; a long text counts as several.
 ///
-/// An index has a value for each tensor, some hundred thousand in the largest models; no published config has a tenth of
-/// what is read of one.
+/// A value takes at least 100 bytes, and some 1000 in expressions, so a `[0,0,0,…` of 64 MiB would take gigabytes. An
+/// index has a value for each tensor, some hundred thousand in the largest models; no published config has a tenth of
+/// its limit.
 pub(super) fn most_nodes(name: &str) -> usize {
     if name.ends_with(".index.json") {
         400_000
@@ -26,11 +26,11 @@ pub(super) fn most_nodes(name: &str) -> usize {
     }
 }
 
-/// Longest JSON pointer made for a fault.
+/// Longest JSON pointer that a fault can have.
 const MAX_POINTER: usize = 4096;
 
 enum Open {
-    /// The members so far, and the key whose value comes next.
+    /// The members so far, and the key of the next value.
     Object(Map<String, Value>, String),
     Array(Vec<Value>, usize),
 }
@@ -41,7 +41,7 @@ pub(super) struct ValueBuilder {
     nodes: usize,
     most: usize,
     left_out: Vec<&'static str>,
-    /// Depth of the part being left out, when inside one.
+    /// Depth of the omitted part, when inside one.
     skipping: Option<usize>,
 }
 
@@ -50,17 +50,17 @@ impl ValueBuilder {
         Self { stack: Vec::new(), root: None, nodes: 0, most, left_out, skipping: None }
     }
 
-    /// Whether there were more values than are kept.
+    /// Whether the document has more values than the limit.
     pub(super) const fn overflowed(&self) -> bool {
         self.nodes > self.most
     }
 
-    /// The whole value; `None` when there was none or too much.
+    /// The whole value; `None` when the document is empty or exceeds the limit.
     pub(super) fn finish(self) -> Option<Value> {
         if self.overflowed() { None } else { self.root }
     }
 
-    /// JSON pointer of the value that comes next.
+    /// JSON pointer of the next value.
     pub(super) fn pointer(&self) -> Option<String> {
         let mut pointer = String::new();
         for open in &self.stack {
@@ -75,7 +75,7 @@ impl ValueBuilder {
         Some(pointer)
     }
 
-    /// JSON pointer of the innermost open container, when it is short enough to tell.
+    /// JSON pointer of the innermost open container; `None` when it is longer than [`MAX_POINTER`].
     pub(super) fn container(&self) -> Option<String> {
         self.pointer().map(|mut p| {
             p.truncate(p.rfind('/').unwrap_or(0));
@@ -83,7 +83,7 @@ impl ValueBuilder {
         })
     }
 
-    /// Takes one token.
+    /// Adds one token.
     pub(super) fn on_token(&mut self, token: &Token<'_>) {
         match token {
             Token::Key(key) => {
@@ -109,7 +109,7 @@ impl ValueBuilder {
                     None => return,
                 };
                 let inside = self.skipping.is_some_and(|depth| depth < self.stack.len());
-                // The members were left out, the container itself stays.
+                // Only the members of the container are omitted.
                 if self.skipping == Some(self.stack.len()) {
                     self.skipping = None;
                 }
@@ -157,15 +157,26 @@ impl ValueBuilder {
     }
 }
 
-/// A number as written; null when no reader could hold it.
-fn number(literal: &str) -> Value {
+/// A number as an integer or a double, whichever represents it; null when neither does.
+pub(super) fn number(literal: &str) -> Value {
     if is_huge(literal) {
         return Value::Null;
     }
-    literal.parse::<Number>().map_or(Value::Null, Value::Number)
+    let double = || Number::from_f64(literal.parse().ok()?);
+    integer(literal).or_else(double).map_or(Value::Null, Value::Number)
 }
 
-/// Whether a reader of JSON cannot hold the number: Python's integers end at [`MAX_DIGITS`], and a
+/// The integer, if 64 bits hold it.
+fn integer(literal: &str) -> Option<Number> {
+    literal.parse::<u64>().map(Number::from).or_else(|_| literal.parse::<i64>().map(Number::from)).ok()
+}
+
+/// Whether the literal is an integer that only its text holds exactly.
+pub(super) fn is_long_integer(literal: &str) -> bool {
+    !literal.contains(['.', 'e', 'E']) && integer(literal).is_none()
+}
+
+/// Whether JSON readers cannot represent the number: Python refuses integers of more than [`MAX_DIGITS`] digits, and a
 /// double becomes infinite.
 pub(super) fn is_huge(literal: &str) -> bool {
     literal.len() > MAX_DIGITS

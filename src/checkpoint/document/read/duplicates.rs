@@ -1,9 +1,9 @@
-//! Finds equal keys in one object, in little memory.
+//! Finds duplicate keys of an object in little memory.
 
 use std::hash::{BuildHasher as _, RandomState};
 use std::ops::Range;
 
-use super::build::ValueBuilder;
+use super::build::{ValueBuilder, is_long_integer};
 use crate::checkpoint::fault::KIND_CAP;
 use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
@@ -21,20 +21,20 @@ pub(super) struct Duplicate {
 /// Values larger than this are compared as text only.
 const COMPARE_CAP: usize = 1 << 20;
 
-/// Most bytes read again in one document: equal keys around ever larger values would otherwise
-/// make reading quadratic.
+/// Maximum number of bytes read again in one document: duplicate keys around ever larger values would otherwise make
+/// the read quadratic.
 const REREAD_CAP: usize = 256 << 20;
 
-/// Most duplicates looked at in one document.
+/// Maximum number of duplicates compared in one document.
 const FOUND_CAP: usize = 16 * KIND_CAP;
 
-/// Keys of all open objects, as a hash (seeded, so none can be crafted) and where the key stands:
-/// 16 bytes a key, where a map of a 256 000-word vocabulary would take as much as the text.
+/// Keys of all open objects, each as a hash and the offset of the key. The hash is seeded, so collisions cannot be
+/// crafted. A key takes 16 bytes; a map of a 256 000-word vocabulary would take as much memory as the text.
 pub(super) struct Duplicates<'t> {
     text: &'t str,
     hasher: RandomState,
     keys: Vec<(u64, usize)>,
-    /// Where each open object's keys begin in `keys`.
+    /// Position in `keys` where each open object begins.
     frames: Vec<usize>,
     found: Vec<Duplicate>,
     /// Bytes that may still be read a second time, to compare the values of equal keys.
@@ -53,7 +53,7 @@ impl<'t> Duplicates<'t> {
         }
     }
 
-    /// Takes one token; `builder` has not seen it yet.
+    /// Adds one token; call it before `builder` receives the token.
     pub(super) fn on_token(&mut self, token: &Token<'_>, span: &Range<usize>, builder: &ValueBuilder) {
         match token {
             Token::BeginObject => self.frames.push(self.keys.len()),
@@ -93,7 +93,7 @@ impl<'t> Duplicates<'t> {
         }
     }
 
-    /// What was found, in the order of the text.
+    /// The duplicates, in the order of the text.
     pub(super) fn into_found(mut self) -> Vec<Duplicate> {
         self.found.sort_by_key(|d| d.later.start);
         self.found
@@ -106,7 +106,7 @@ struct KeyedMember {
     value: Range<usize>,
 }
 
-/// Reads the member whose key stands at `at`.
+/// Reads the member whose key starts at `at`.
 fn member(text: &str, at: usize) -> Option<KeyedMember> {
     let mut scanner = Scanner::lenient(text, at);
     let (Token::String(name), key) = scanner.next().ok()?? else { return None };
@@ -129,9 +129,13 @@ fn same(a: &str, b: &str) -> bool {
         let mut scanner = Scanner::lenient(text, 0);
         let mut builder = ValueBuilder::new(Vec::new(), COMPARE_CAP);
         while let Ok(Some((token, _))) = scanner.next() {
+            // Two such integers that differ may be the same double.
+            if matches!(token, Token::Number(literal) if is_long_integer(literal)) {
+                return None;
+            }
             builder.on_token(&token);
         }
         builder.finish()
     };
-    value(a) == value(b)
+    value(a).is_some_and(|a| value(b) == Some(a))
 }

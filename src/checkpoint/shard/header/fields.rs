@@ -7,10 +7,10 @@ use crate::checkpoint::shard::entry::HeaderEntry;
 use crate::checkpoint::text::escape;
 use crate::checkpoint::{Fault, FaultKind, Place};
 
-/// More dimensions than any library has; a shape of millions of them only takes memory.
+/// Maximum rank of a tensor, above that of any library; a shape with millions of dimensions only takes memory.
 const MAX_RANK: usize = 1024;
 
-/// What became of one field.
+/// Result of reading one field.
 enum Field<T> {
     Absent,
     Bad,

@@ -1,4 +1,4 @@
-//! Fixes of a result (3.27.30), where all their edits are of text.
+//! Fixes of a result (3.27.30), if all of their edits are text edits.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use crate::check::{Edit, FixHint};
 use crate::checkpoint::{Document, Splice, line_column, spliced};
 use crate::report::format::sentence;
 
-/// Most replacements of one fix; a viewer is no place for more.
+/// Maximum number of replacements of one fix.
 const REPLACEMENTS: usize = 200;
 
 #[derive(Serialize)]
@@ -49,7 +49,7 @@ struct SarifContent {
     text: String,
 }
 
-/// The fix of a finding on the checkpoint at `path`; nothing where files have to be made or shards be written.
+/// The fix of a finding in the checkpoint at `path`; empty if it adds files or changes shards.
 pub(super) fn fixes(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<str>>) -> Vec<SarifFix> {
     let mut files: BTreeMap<&str, Vec<Splice>> = BTreeMap::new();
     for edit in hint.edits.iter().take(REPLACEMENTS.saturating_add(1)) {
@@ -61,13 +61,13 @@ pub(super) fn fixes(hint: &FixHint, path: &str, sources: &BTreeMap<String, Arc<s
     }
     let change = |(file, splices): (&str, Vec<Splice>)| {
         let source = sources.get(file)?;
-        // Edits that depend on one another are no list of replacements.
+        // Overlapping edits cannot be expressed as a list of replacements.
         spliced(source, &splices)?;
         let replacements = splices.into_iter().map(|splice| replacement(source, splice)).collect();
         Some(SarifChange { artifact_location: artifact(path, file), replacements })
     };
     let changes: Option<Vec<SarifChange>> = files.into_iter().map(change).collect();
-    let fix = |artifact_changes| SarifFix { description: text(&sentence(&hint.title)), artifact_changes };
+    let fix = |artifact_changes| SarifFix { description: text(&sentence(hint.title())), artifact_changes };
     changes.map(fix).into_iter().collect()
 }
 

@@ -1,4 +1,4 @@
-//! Texts and file locations, which results and fixes both have.
+//! Texts and file locations, used by results and fixes.
 
 use std::fmt::Write as _;
 
@@ -7,9 +7,9 @@ use serde::Serialize;
 use crate::check::Location;
 use crate::report::ci::file;
 
-/// What relative paths start from: by custom the root of the sources, which the reader knows.
+/// Base of relative paths: by convention the root of the sources, known to the reader.
 pub(super) const SOURCES: &str = "%SRCROOT%";
-/// What absolute paths start from.
+/// Base of absolute paths.
 pub(super) const ROOT: &str = "ROOT";
 
 #[derive(Serialize)]
@@ -38,7 +38,7 @@ pub(super) fn artifact_at(path: &str) -> ArtifactLocation {
     ArtifactLocation { uri, uri_base_id }
 }
 
-/// A path as a relative reference (RFC 3986): only unreserved characters and `/` stand for themselves.
+/// A path as a relative reference (RFC 3986): all characters except unreserved ones and `/` are percent-encoded.
 pub(super) fn uri(path: &str) -> String {
     let mut out = String::with_capacity(path.len());
     for byte in path.bytes() {
@@ -48,11 +48,11 @@ pub(super) fn uri(path: &str) -> String {
             let _infallible = write!(out, "%{byte:02X}");
         }
     }
-    // The directory itself is no empty reference.
+    // An empty reference would not denote the directory itself.
     if out.is_empty() { ".".to_owned() } else { out }
 }
 
-/// Plain text in which nothing is a link (3.11.6).
+/// Plain text without links (3.11.6).
 pub(super) fn text(plain: &str) -> SarifText {
     let linked = plain.contains("](");
     SarifText { text: if linked { plain.replace('[', "\\[").replace(']', "\\]") } else { plain.to_owned() } }
@@ -63,13 +63,13 @@ mod tests {
     use super::{text, uri};
 
     #[test]
-    fn every_byte_that_means_something_is_percent_encoded() {
+    fn reserved_bytes_are_percent_encoded() {
         assert_eq!(uri("a b/c:d?e#f%20[é]"), "a%20b/c%3Ad%3Fe%23f%2520%5B%C3%A9%5D");
         assert_eq!(uri(""), ".");
     }
 
     #[test]
-    fn words_make_no_link() {
+    fn text_contains_no_links() {
         assert_eq!(text("[a](javascript:x)").text, "\\[a\\](javascript:x)");
         assert_eq!(text("is [1, 2]").text, "is [1, 2]");
     }

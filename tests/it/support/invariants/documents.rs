@@ -1,4 +1,4 @@
-//! JSON documents, the index and the tokenizer, with `serde_json` as a second opinion.
+//! JSON documents, the index and the tokenizer, compared with `serde_json`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ckpt_doctor::checkpoint::{Document, FaultKind, INDEX_NAME, Index, Tokenizer, Vocabulary, is_plain_file_name};
 use serde_json::Value;
 
-/// Faults of documents that are strict JSON all the same, and why they are faults.
+/// Faults of valid strict JSON, each with its reason.
 pub const STRICT_ALL_THE_SAME: &[(FaultKind, &str)] = &[
     (FaultKind::DuplicateJsonKey, "JSON leaves open what equal keys mean; serde_json keeps the last"),
     (FaultKind::HugeNumber, "the grammar has no largest number; Python's integers and doubles do"),
@@ -14,7 +14,7 @@ pub const STRICT_ALL_THE_SAME: &[(FaultKind, &str)] = &[
     (FaultKind::JsonTooManyValues, "a value takes far more room than its text"),
 ];
 
-/// The laws for a document of this name.
+/// The invariants of a document with this name.
 pub fn hold(name: &str, bytes: &[u8]) -> Document {
     let document = Document::parse(name, bytes);
     let text = document.text.as_deref();
@@ -26,25 +26,43 @@ pub fn hold(name: &str, bytes: &[u8]) -> Document {
     match serde_json::from_slice::<Value>(bytes) {
         Ok(strict) => {
             assert!(grave.is_none(), "serde_json reads it: {grave:?}");
-            // With `arbitrary_precision` an object with a key of the crate's own becomes a number there.
-            let private = text.is_some_and(|text| text.contains("$serde_json::private"));
             let unlike = [FaultKind::HugeNumber, FaultKind::JsonTooManyValues]
                 .iter()
                 .any(|kind| super::has(&document.faults, *kind));
-            let same = document.left_out.is_empty() && !private && !unlike;
+            let same = document.left_out.is_empty() && !unlike;
             if same {
-                assert_eq!(document.value.as_ref(), Some(&strict));
+                assert!(document.value.as_ref().is_some_and(|value| is_same(value, &strict)), "{document:?} {strict}");
             }
         }
-        Err(error) => assert!(grave.is_some(), "nothing found, and serde_json says {error}"),
+        Err(error) => {
+            let huge = super::has(&document.faults, FaultKind::HugeNumber);
+            assert!(grave.is_some() || huge, "nothing found, and serde_json says {error}");
+        }
     }
     places_are_found_again(&document);
     document
 }
 
-/// A pointer leads back to the value that the span of the same place covers.
+/// Whether two values are equal, but for the last bit of a double: `serde_json` reads doubles less exactly without its
+/// feature `float_roundtrip`, and an integer of zero with a sign as a double.
+fn is_same(ours: &Value, theirs: &Value) -> bool {
+    match (ours, theirs) {
+        (Value::Number(a), Value::Number(b)) => {
+            let (x, y) = (a.as_f64().unwrap_or(f64::NAN), b.as_f64().unwrap_or(f64::NAN));
+            let close = (x - y).abs() <= x.abs() * f64::EPSILON + f64::MIN_POSITIVE;
+            a == b || close && (a.is_f64() == b.is_f64() || x == 0.0)
+        }
+        (Value::Array(a), Value::Array(b)) => a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b)),
+        (Value::Object(a), Value::Object(b)) => {
+            a.len() == b.len() && a.iter().all(|(key, a)| b.get(key).is_some_and(|b| is_same(a, b)))
+        }
+        _ => ours == theirs,
+    }
+}
+
+/// The pointer of a place gives the value that its span covers.
 fn places_are_found_again(document: &Document) {
-    // Without the markers of a merge the text has a value; with them, as it stands, it has none.
+    // The text without conflict markers has a value; the original text has none.
     let unclear = [FaultKind::DuplicateJsonKey, FaultKind::MergeConflictMarker];
     if unclear.iter().any(|kind| super::has(&document.faults, *kind)) || document.value.is_none() {
         return;
@@ -56,7 +74,7 @@ fn places_are_found_again(document: &Document) {
     }
 }
 
-/// The laws for an index.
+/// The invariants of an index.
 pub fn index(bytes: &[u8]) {
     let document = hold(INDEX_NAME, bytes);
     let index = Index::from_document(&document);
@@ -67,20 +85,20 @@ pub fn index(bytes: &[u8]) {
         assert!(is_plain_file_name(file), "{file:?} would be opened");
         assert_eq!(stated.and_then(|map| map.get(tensor)).and_then(Value::as_str), Some(file.as_str()));
     }
-    // An entry that is not taken is told of.
+    // Ignored entries are reported.
     let left = stated.map_or(0, |map| map.len() - index.weight_map.len());
-    let told =
+    let reported =
         [FaultKind::IndexUnsafePath, FaultKind::WeightMapMalformed].iter().any(|kind| super::has(&index.faults, *kind));
-    assert!(left == 0 || told);
+    assert!(left == 0 || reported);
     if let Some(total) = index.total_bytes() {
         let float = index.total_size.as_ref().and_then(Value::as_f64).expect("a number");
-        #[allow(clippy::cast_precision_loss, reason = "the float is no more precise")]
+        #[allow(clippy::cast_precision_loss, reason = "the float is not more precise")]
         let close = (float - total as f64).abs() <= float * 1e-9;
         assert!(close, "{float} and {total}");
     }
 }
 
-/// The laws for a vocabulary that is no document.
+/// The invariants of a vocabulary outside JSON documents.
 pub fn vocabulary(name: &str, bytes: &[u8]) -> Option<Vocabulary> {
     let vocabulary = Vocabulary::parse(name, bytes).ok()?;
     let mut last = None;
@@ -96,7 +114,7 @@ pub fn vocabulary(name: &str, bytes: &[u8]) -> Option<Vocabulary> {
     Some(vocabulary)
 }
 
-/// The laws for a tokenizer made of these files.
+/// The invariants of a tokenizer made of these files.
 pub fn tokenizer(files: &[(&str, &[u8])]) {
     let mut documents = BTreeMap::new();
     let mut vocabularies = BTreeMap::new();

@@ -4,10 +4,10 @@ use std::ops::Range;
 
 use ckpt_doctor::checkpoint::{FaultKind, PythonModule};
 
-/// Name under which the module is read.
+/// File name of the module.
 pub const NAME: &str = "modeling_x.py";
 
-/// The laws for a module.
+/// The invariants of a module.
 pub fn hold(bytes: &[u8]) {
     let module = PythonModule::parse(NAME, bytes);
     super::faults_are_placed(&module.faults, NAME, module.text.as_deref());

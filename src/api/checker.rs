@@ -1,0 +1,76 @@
+//! Checks of checkpoint directories.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use super::{Error, knowledge};
+use crate::check::check_for;
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::loader;
+use crate::report::model::CheckpointReport;
+
+/// Checks checkpoint directories with the rules of this crate.
+#[derive(Debug, Clone, Default)]
+pub struct Checker {
+    versions: Vec<String>,
+    deep: bool,
+}
+
+impl Checker {
+    /// A checker that predicts the load for the version of transformers that wrote the checkpoint and for the newest known
+    /// one, and that reads no tensor data.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Predicts the load for this version of transformers instead, `4.57` for example. Several calls add several versions.
+    ///
+    /// The nearest version whose source was read stands for it; [`LoadReport::loader`](crate::LoadReport::loader) names it.
+    ///
+    /// # Errors
+    /// [`Error::Version`] when the text is not a version number.
+    pub fn loader(mut self, version: &str) -> Result<Self, Error> {
+        let version = loader::parse_requirement(&format!("transformers=={version}"))
+            .map_err(|_| Error::Version(version.to_owned()))?;
+        self.versions.push(version);
+        Ok(self)
+    }
+
+    /// Whether to read all tensor data as well: finds NaN, infinities and shards of zeros.
+    #[must_use]
+    pub const fn deep(mut self, deep: bool) -> Self {
+        self.deep = deep;
+        self
+    }
+
+    /// Checks the checkpoint in this directory. Settings files and baselines are not read.
+    ///
+    /// # Errors
+    /// [`Error::Open`] when the directory cannot be read. Bad content is a finding of the report.
+    pub fn check(&self, path: impl AsRef<Path>) -> Result<CheckpointReport, Error> {
+        let path = path.as_ref();
+        let knowledge = knowledge()?;
+        let mut checkpoint = Checkpoint::open(path)?;
+        if self.deep {
+            checkpoint.read_contents();
+        }
+        let checkpoint = Arc::new(checkpoint);
+        let outcome = check_for(&checkpoint, knowledge, &self.versions);
+        Ok(CheckpointReport::new(path.display().to_string(), None, &checkpoint, &outcome))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_version_is_a_number() {
+        let checker = Checker::new().loader("4.57").and_then(|c| c.loader("5.0.0rc1")).expect("versions");
+        assert_eq!(checker.versions, ["4.57", "5.0.0rc1"]);
+        for text in ["", "main", "transformers==4.57"] {
+            assert!(matches!(Checker::new().loader(text), Err(Error::Version(version)) if version == text));
+        }
+    }
+}

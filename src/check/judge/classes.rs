@@ -1,0 +1,131 @@
+//! The first two stages: the targets of a checkpoint, and the class that each of them builds.
+
+use serde_json::Value;
+
+use super::Inputs;
+use crate::check::layers;
+use crate::check::load::{self, LoadReport, Stored, Target};
+use crate::checkpoint::{Fault, FaultKind, Place};
+use crate::knowledge::{Architecture, Doubt, Expected, Refusal};
+
+/// A target, and the architecture of the class that its loader would build.
+pub(super) struct TargetClass<'a> {
+    pub(super) target: Target,
+    pub(super) architecture: Architecture<'a>,
+}
+
+/// The same, with the class built from the config.
+pub(super) struct BuiltClass<'a> {
+    pub(super) target: Target,
+    pub(super) architecture: Architecture<'a>,
+    pub(super) class: Result<Expected, Refusal>,
+}
+
+/// The versions to predict for whose loader has the class.
+pub(super) fn resolve_targets<'a>(inputs: &Inputs<'a>) -> Vec<TargetClass<'a>> {
+    let names: Vec<&str> = inputs.stored.names().collect();
+    let targets = load::targets(&inputs.knowledge.library, inputs.config, &names, inputs.versions);
+    targets.into_iter().map(|(target, architecture)| TargetClass { target, architecture }).collect()
+}
+
+/// Builds the class of each target.
+pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a>>) -> Vec<BuiltClass<'a>> {
+    // The layout in which another version packs quantised weights is unknown.
+    let comparable = targets.into_iter().filter(|one| one.target.leads || inputs.is_plain());
+    let built = comparable.map(|TargetClass { target, architecture }| BuiltClass {
+        class: load::build(architecture, inputs.config, inputs.stored).and_then(|class| covered(class, inputs.stored)),
+        target,
+        architecture,
+    });
+    leading(inputs, built.collect())
+}
+
+/// Lets another loader lead where the one that should does not know a part, unless the user named versions.
+fn leading<'a>(inputs: &Inputs<'a>, mut built: Vec<BuiltClass<'a>>) -> Vec<BuiltClass<'a>> {
+    if inputs.versions.is_empty() && is_unknown(&built) {
+        let version = inputs.config.get("transformers_version").and_then(Value::as_str);
+        if let Some(known) = built.iter_mut().find(|one| one.class.is_ok()) {
+            known.target.lead(version);
+        }
+    }
+    built
+}
+
+/// Whether no leading loader knows the class and all of its parts, and covers this config. A class that is known and cannot
+/// be built counts as known.
+fn is_unknown(built: &[BuiltClass<'_>]) -> bool {
+    let is_gap = |refusal: &Refusal| matches!(refusal, Refusal::UnknownPart(_) | Refusal::NotCovered(_));
+    built.iter().all(|one| !one.target.leads || one.class.as_ref().is_err_and(is_gap))
+}
+
+/// The class, unless the checkpoint differs from it and the description does not cover this config: then the difference may
+/// be an error of the description.
+fn covered(class: Expected, stored: &Stored) -> Result<Expected, Refusal> {
+    let is_clean = |report: LoadReport| report.is_whole() && report.unexpected.is_empty();
+    if class.doubts.is_empty() || is_clean(load::predict(&class, stored)) {
+        return Ok(class);
+    }
+    Err(Refusal::NotCovered(class.doubts))
+}
+
+/// Faults of classes that are unknown or cannot be built from this config.
+pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
+    let mut faults = unknown(inputs, built);
+    if is_unknown(built) {
+        // A known class is better evidence than a comparison of the layers with one another.
+        faults.extend(layers::faults(inputs.stored.names()));
+    }
+    // A version that nobody named and that cannot build the class is passed over.
+    for one in built.iter().filter(|one| one.target.leads) {
+        let reason = match &one.class {
+            Err(Refusal::Impossible(reasons)) => reasons.first().cloned().unwrap_or_default(),
+            Err(refusal @ Refusal::Raises(_)) => refusal.to_string(),
+            _ => continue,
+        };
+        let fault = Fault::new(FaultKind::ConfigIncomputable)
+            .at(Place::file("config.json"))
+            .with("architecture", one.architecture.name())
+            .under(one.target.loader.version());
+        faults.push(fault.with("reason", reason));
+    }
+    faults
+}
+
+/// Faults of a class, or of a part of one, that no loader is known to build, or none of those that the user named.
+fn unknown(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
+    if inputs.versions.is_empty() {
+        return is_unknown(built)
+            .then(|| unknown_class(inputs.config, built.iter().find_map(gap)))
+            .into_iter()
+            .collect();
+    }
+    let for_version = |version: &String| {
+        let fault = match built.iter().find(|one| one.target.versions.contains(version)) {
+            Some(found) => unknown_class(inputs.config, Some(gap(found)?)),
+            None => unknown_class(inputs.config, None),
+        };
+        Some(fault.with("under", format!("transformers {version}")))
+    };
+    inputs.versions.iter().filter_map(for_version).collect()
+}
+
+/// The pointer into config.json of what is unknown of a class, and its description.
+fn gap(one: &BuiltClass<'_>) -> Option<(String, String)> {
+    let pointer = match one.class.as_ref().err()? {
+        Refusal::UnknownPart(part) if part.config.is_empty() => "/model_type".to_owned(),
+        Refusal::UnknownPart(part) => format!("/{}/model_type", part.config.replace('.', "/")),
+        Refusal::NotCovered(doubts) => doubts.iter().find_map(Doubt::pointer).unwrap_or("/model_type").to_owned(),
+        _ => return None,
+    };
+    Some((pointer, one.class.as_ref().err()?.to_string()))
+}
+
+fn unknown_class(config: &Value, gap: Option<(String, String)>) -> Fault {
+    let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).unwrap_or("none");
+    let (pointer, part) = gap.map_or(("/model_type".to_owned(), None), |(pointer, part)| (pointer, Some(part)));
+    let fault = Fault::new(FaultKind::UnknownArchitecture)
+        .at(Place::file("config.json").pointer(pointer))
+        .with("model_type", text("/model_type"))
+        .with("class", text("/architectures/0"));
+    part.into_iter().fold(fault, |fault, part| fault.with("part", part))
+}

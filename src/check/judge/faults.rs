@@ -1,0 +1,87 @@
+//! The last stage: faults of the loads, one for each cause.
+
+use serde_json::Value;
+
+use super::Inputs;
+use super::explain::ExplainedLoad;
+use super::predict::{quantised, same_bytes};
+use crate::check::load::{self, Judged, LoadReport, Stored};
+use crate::check::votes::{self, Vote};
+use crate::check::{quantization, size};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind};
+
+/// Faults of the loads: prefixes, quantised modules, the size in the index, tensors, and config values that the stored
+/// tensors contradict.
+pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[Vote]) -> Vec<Fault> {
+    let mut faults: Vec<Fault> = loads.iter().flat_map(prefixes).collect();
+    let without_class = if loads.is_empty() { quantised(inputs, None) } else { None };
+    let modules = loads.first().and_then(|load| load.prediction.quantised.as_ref()).or(without_class.as_ref());
+    faults.extend(quantization::faults(inputs.checkpoint, &inputs.scheme, modules));
+    faults.extend(total_size(inputs, loads));
+    faults.extend(tensors(loads, inputs.stored).into_iter().map(|fault| compare_tied(inputs.checkpoint, fault)));
+    faults.extend(votes.iter().map(|vote| {
+        let has_vote = |load: &&ExplainedLoad<'_>| {
+            load.votes().is_some_and(|votes| votes.iter().any(|v| v.pointer == vote.pointer))
+        };
+        loads.iter().filter(has_vote).map(ExplainedLoad::loader).fold(votes::fault(vote), Fault::under)
+    }));
+    faults
+}
+
+/// The faults of prefixes of one load.
+fn prefixes(load: &ExplainedLoad<'_>) -> impl Iterator<Item = Fault> {
+    load.prefixes.iter().map(|fault| fault.clone().under(load.loader()))
+}
+
+/// The fault of an index that states another size than the class has.
+fn total_size(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault> {
+    let leading = loads.iter().map(|load| &load.prediction).filter(|one| one.target.leads && inputs.is_plain());
+    let mut faults = leading.filter_map(|one| {
+        let report = one.report.as_ref()?;
+        size::fault(inputs.checkpoint, one.architecture, inputs.config, &one.expected, inputs.stored, report)
+    });
+    faults.next()
+}
+
+/// Faults of the tensors: for a leading loader all of them; for another one, that the checkpoint does not load there.
+fn tensors(loads: &[ExplainedLoad<'_>], stored: &Stored) -> Vec<Fault> {
+    // Loaders that agree have their faults reported once.
+    let mut distinct: Vec<(&LoadReport, Vec<&'static str>)> = Vec::new();
+    for load in loads.iter().filter(|load| load.prediction.target.leads) {
+        let Some(report) = load.unexplained() else { continue };
+        match distinct.iter_mut().find(|(one, _)| one.agrees(report)) {
+            Some((_, loaders)) => loaders.push(load.loader()),
+            None => distinct.push((report, vec![load.loader()])),
+        }
+    }
+    let under = |report: &LoadReport| (distinct.len() > 1).then(|| format!("transformers {}", report.version()));
+    let mut faults = Vec::new();
+    for (report, loaders) in &distinct {
+        let own = load::faults(report, under(report).as_deref());
+        faults.extend(own.into_iter().map(|fault| Fault { loaders: loaders.clone(), ..fault }));
+    }
+    let judged = |leads: bool| {
+        let predictions = loads.iter().map(|load| &load.prediction).filter(move |one| one.target.leads == leads);
+        predictions.filter_map(|one| Some(Judged { report: one.report.as_ref()?, expected: &one.expected }))
+    };
+    if let Some(leading) = judged(true).next() {
+        faults.extend(judged(false).filter_map(|other| load::difference(leading, other, stored)));
+    }
+    faults
+}
+
+/// Grades a tied tensor that is overwritten by its bytes, where they were read: another value is lost.
+fn compare_tied(checkpoint: &Checkpoint, fault: Fault) -> Fault {
+    let text = |key: &str| fault.detail.get(key).and_then(Value::as_str);
+    let same = text("tensor").zip(text("by")).and_then(|(tensor, by)| same_bytes(checkpoint, tensor, by));
+    if same == Some(false) { Fault { kind: FaultKind::TiedOverAnother, ..fault } } else { fault }
+}
+
+/// The fault of tensors that look quantised although the config declares no scheme.
+pub(super) fn undeclared_scheme(inputs: &Inputs<'_>, loads: &[LoadReport]) -> Option<Fault> {
+    let is_explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
+    if !inputs.is_plain() || is_explained {
+        return None;
+    }
+    quantization::undeclared(&inputs.knowledge.schemes, inputs.stored.names())
+}

@@ -1,0 +1,149 @@
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test")]
+
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::classes::{build_classes, faults as class_faults, resolve_targets};
+use super::explain::explain;
+use super::predict::predict;
+use super::*;
+use crate::checkpoint::FaultKind;
+use crate::knowledge::{Loader, Refusal};
+
+/// A donor, its config with some values changed, and its tensors under other names.
+struct Case {
+    checkpoint: Checkpoint,
+    knowledge: Knowledge,
+    config: Value,
+    stored: Stored,
+    versions: Vec<String>,
+}
+
+impl Case {
+    fn new(donor: &str) -> Self {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors").join(donor);
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        let config = checkpoint.config().unwrap().clone();
+        let stored = Stored::of(&checkpoint);
+        Self { checkpoint, knowledge: Knowledge::embedded().unwrap(), config, stored, versions: Vec::new() }
+    }
+
+    fn set(mut self, key: &str, value: Value) -> Self {
+        self.config[key] = value;
+        self
+    }
+
+    /// Every name that starts with `from` starts with `to`.
+    fn rename(mut self, from: &str, to: &str) -> Self {
+        let names: Vec<String> = self.stored.names().filter(|n| n.starts_with(from)).map(str::to_owned).collect();
+        self.stored = self.stored.under(&names, from, to);
+        self
+    }
+
+    fn versions(mut self, versions: &[&str]) -> Self {
+        self.versions = versions.iter().map(|&v| v.to_owned()).collect();
+        self
+    }
+
+    fn inputs(&self) -> Inputs<'_> {
+        let scheme = declared_scheme(&self.config, &self.knowledge.schemes);
+        Inputs {
+            checkpoint: &self.checkpoint,
+            knowledge: &self.knowledge,
+            config: &self.config,
+            stored: &self.stored,
+            versions: &self.versions,
+            scheme,
+        }
+    }
+}
+
+fn kinds(faults: &[Fault]) -> Vec<FaultKind> {
+    faults.iter().map(|fault| fault.kind).collect()
+}
+
+#[test]
+fn the_version_that_wrote_the_config_leads() {
+    let case = Case::new("spatialvla-tiny");
+    let inputs = case.inputs();
+    let targets = resolve_targets(&inputs);
+    assert!(targets.first().unwrap().target.leads);
+    assert_eq!(targets.first().unwrap().architecture.name(), "spatialvla");
+    assert!(targets.iter().skip(1).all(|one| !one.target.leads));
+}
+
+#[test]
+fn versions_that_the_user_names_all_lead() {
+    let case = Case::new("spatialvla-tiny").versions(&["4.47.0", "4.46.1"]);
+    let inputs = case.inputs();
+    let targets = resolve_targets(&inputs);
+    // Both are predicted by the same loader, once.
+    assert_eq!(targets.len(), 1);
+    assert_eq!(targets.first().unwrap().target.loader, Loader::V4_47_0);
+}
+
+#[test]
+fn an_unknown_class_and_one_that_cannot_be_built_are_different_faults() {
+    let unknown =
+        Case::new("llava3d-tiny").set("architectures", json!(["NoSuchModel"])).set("model_type", json!("none"));
+    let inputs = unknown.inputs();
+    let classes = build_classes(&inputs, resolve_targets(&inputs));
+    assert!(classes.is_empty());
+    assert_eq!(kinds(&class_faults(&inputs, &classes)), [FaultKind::UnknownArchitecture]);
+
+    let impossible = Case::new("llava3d-tiny").set("num_attention_heads", json!("many"));
+    let inputs = impossible.inputs();
+    let classes = build_classes(&inputs, resolve_targets(&inputs));
+    assert!(matches!(classes.first().unwrap().class, Err(Refusal::Impossible(_))));
+    assert_eq!(kinds(&class_faults(&inputs, &classes)), [FaultKind::ConfigIncomputable]);
+}
+
+#[test]
+fn a_class_is_built_from_tensors_under_names_that_the_loader_renames() {
+    let whole = Case::new("llava3d-tiny");
+    // A save of the base model; the size of the vision tower is in no config.
+    let bare = Case::new("llava3d-tiny").rename("model.", "");
+    let built = |case: &Case| {
+        let inputs = case.inputs();
+        let class = build_classes(&inputs, resolve_targets(&inputs)).remove(0).class;
+        class.unwrap_or_else(|refusal| panic!("{refusal:?}")).tensors.len()
+    };
+    assert_eq!(built(&whole), built(&bare));
+}
+
+#[test]
+fn a_prefix_explains_every_tensor_of_a_load() {
+    for (from, to, prefix) in [("model.", "", ""), ("", "module.", "module.")] {
+        let case = Case::new("llava3d-tiny").rename(from, to);
+        let inputs = case.inputs();
+        let predictions = predict(&inputs, build_classes(&inputs, resolve_targets(&inputs)));
+        assert!(!predictions.first().unwrap().report.as_ref().unwrap().is_whole(), "{prefix}");
+        let loads = explain(&inputs, predictions);
+        let load = loads.first().unwrap();
+        let [fault] = load.prefixes.as_slice() else { panic!("{:?}", load.prefixes) };
+        assert_eq!(fault.detail["from"], prefix);
+        let rest = load.unexplained().unwrap();
+        assert!(rest.is_whole() && rest.unexpected.is_empty(), "{rest:?}");
+    }
+}
+
+#[test]
+fn a_config_value_explains_the_tensors_that_follow_from_it() {
+    let case = Case::new("llava3d-tiny").set("num_hidden_layers", json!(3));
+    let inputs = case.inputs();
+    let loads = explain(&inputs, predict(&inputs, build_classes(&inputs, resolve_targets(&inputs))));
+    let votes = explain::distinct_votes(&loads);
+    let [vote] = votes.as_slice() else { panic!("{votes:?}") };
+    assert_eq!((vote.pointer.as_str(), &vote.voted_value), ("/num_hidden_layers", &json!(2)));
+    assert_eq!(kinds(&faults::faults(&inputs, &loads, &votes)), [FaultKind::ConfigOutvoted]);
+}
+
+#[test]
+fn nothing_stored_is_no_prediction() {
+    let mut case = Case::new("llava3d-tiny");
+    case.stored = Stored::default();
+    let inputs = case.inputs();
+    let predictions = predict(&inputs, build_classes(&inputs, resolve_targets(&inputs)));
+    assert!(predictions.iter().all(|prediction| prediction.report.is_none()));
+}
