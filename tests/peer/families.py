@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Configs as a hub has them, family by family: what `expect` says against what the class itself has.
 
-    families.py FOLDER... [--classes N] [--seed S] [--list] [--save]
+    families.py FOLDER... [--classes N] [--seed S] [--only REGEX] [--list] [--save]
 
 Each FOLDER has one version of transformers, for the Python that runs this. Of the classes shipped for it N are drawn. Each is
 given configs that say keys by another name, alone and beside the key; keys that only the source asks for; files without
@@ -16,6 +16,7 @@ import argparse
 import json
 import os
 import random
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -85,6 +86,7 @@ def main():
     p.add_argument("folder", nargs="+")
     p.add_argument("--classes", type=int, default=24)
     p.add_argument("--seed", type=int, default=random.randrange(10**6))
+    p.add_argument("--only", default="", help="regular expression on class name")
     p.add_argument("--list", action="store_true", help="say of each wrong one how it is")
     p.add_argument("--save", action="store_true", help="keep what was wrong for the next verification (DERIVE_CACHE)")
     p.add_argument("--worker", help=argparse.SUPPRESS)
@@ -100,6 +102,7 @@ def main():
     print(f"seed {a.seed}")
     program, tally, counts = Program(os.environ["CKPT_DOCTOR"]), Tally(), Counter()
     shipped, _ = provenance()
+    shipped = {version: {n for n in names if re.search(a.only, n)} for version, names in shipped.items()}
     folders = {version_in(folder): folder for folder in a.folder}
     with workplace() as work:
         rng, drawn, files = random.Random(a.seed), {}, {}

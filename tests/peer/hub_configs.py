@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """Configs of popular checkpoints as a hub has them: what is said of each is what the class has, or that it is not known.
 
-    hub_configs.py FILE FOLDER... [--loads N] [--only REGEX] [--list]
+    hub_configs.py FILE FOLDER... [--loads N] [--only REGEX] [--list] [--save]
 
 FILE has a JSON object a line, with a `config`, and where it was found. Each FOLDER has one version of transformers, for the
 Python that runs this. Every config is built at its full size, without weights, by the class it names under each version
 that has it, and compared with `expect`: names, shapes, ties and buffers. N of them are made small, each key as it stands
 there with another number, saved with weights, and loaded; what `check` foresees of the load is held against it.
+
+`--save` adds the configs of wrong classes to the cache of the derivation, as families.py does.
 """
 
 import argparse
@@ -21,9 +23,11 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+from families import keep
 from fresh import version_in
 from mutations import differences, predicted_report
 from peer import ROOT, Tally, check, workplace
+from recorded import as_detailed
 
 sys.path.insert(0, str(ROOT / "tools"))
 
@@ -89,6 +93,19 @@ def build(rows, out):
             file.flush()
 
 
+def records(rows, out):
+    """Writes the record of each config for the derivation."""
+    from derive.build import without_initialisation
+    from derive.draw import Drawer
+
+    without_initialisation()
+    with open(out, "w") as file:
+        for row in rows:
+            cls, name = class_of(row["config"])
+            record = Drawer(cls, cls.config_class, {"traced": {"absent": {}}}, 0).record(row["config"], "hub")
+            file.write(json.dumps({"class": name, "record": record}, default=str) + "\n")
+
+
 def shrunk(config, scale):
     """The same keys with smaller numbers."""
     from derive.keys import EXPERTS, HEADS, INNER, KV_HEADS, LAYERS, PER_TOKEN, POSITIONS, SMALL, VOCAB, WIDTH
@@ -144,9 +161,11 @@ def load(rows, out, work):
                     model = cls(read(cls, small))
                     model.save_pretrained(folder, safe_serialization=True)
                     del model
-                    (folder / "config.json").write_text(json.dumps(small))
+                    # A config without a class stands for the one that `AutoModel` gives.
+                    (folder / "config.json").write_text(json.dumps({**small, "architectures": [name]}))
                     _, info = cls.from_pretrained(folder, output_loading_info=True, ignore_mismatched_sizes=True)
-                    mismatched = [[n, list(a), list(b)] for n, a, b in info.get("mismatched_keys", [])]
+                    # 4.57 reports names without shapes.
+                    mismatched = [[m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])] for m in info.get("mismatched_keys", [])]
                     told.update(folder=str(folder), load={"missing": sorted(info["missing_keys"]), "unexpected": sorted(info["unexpected_keys"]), "mismatched": mismatched})
                     break
                 except Exception as e:  # it may only be that it was made too small
@@ -179,7 +198,7 @@ def main():
     if sys.argv[1:2] == ["--worker"]:
         mode, given, out, work = sys.argv[2:]
         rows = [json.loads(line) for line in Path(given).read_text().splitlines()]
-        return build(rows, out) if mode == "build" else load(rows, out, work)
+        return build(rows, out) if mode == "build" else records(rows, out) if mode == "records" else load(rows, out, work)
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("file", type=Path)
     p.add_argument("folder", nargs="+")
@@ -187,6 +206,7 @@ def main():
     p.add_argument("--only")
     p.add_argument("--seed", type=int, default=7)
     p.add_argument("--list", action="store_true", help="say what came of each")
+    p.add_argument("--save", action="store_true", help="keep what was wrong for the next verification (DERIVE_CACHE)")
     a = p.parse_args()
 
     from derive.verify import Program
@@ -200,7 +220,7 @@ def main():
             told = worker(folder, "build", rows, work)
             known = [t for t in told if not t.get("none")]
             asked = [(t["class"], rows[t["number"]]["config"]) for t in known]
-            sound = []
+            sound, wrong = [], []
             for t, answer in zip(known, program.expect(None, version, asked)):
                 row = rows[t["number"]]
                 what = said(answer)
@@ -221,6 +241,10 @@ def main():
                 if "error" not in t:
                     tally.expect(what != "wrong", f"{version} {row['id']} {t['class']}", note)
                     sound.append({**row, "number": t["number"]})
+                    wrong += [row] if what == "wrong" else []
+            if a.save and wrong:
+                for each in worker(folder, "records", wrong, work):
+                    keep(version, each["class"], [each["record"]])
             random.Random(a.seed).shuffle(sound)
             one_of = list({r["config"].get("model_type"): r for r in sound}.values())
             loaded = worker(folder, "load", one_of[: a.loads], work) if a.loads else []
@@ -232,7 +256,7 @@ def main():
                     counts[version, "loads not predicted"] += 1
                     continue
                 counts[version, "loads compared"] += 1
-                row = rows[t["number"]]
+                row, report = rows[t["number"]], as_detailed(report, t["load"])
                 tally.expect(report == t["load"], f"{version} load of {row['id']}", "" if report == t["load"] else differences(report, t["load"]))
     for (version, what), n in sorted(counts.items()):
         print(f"{version}: {n} {what}")

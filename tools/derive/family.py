@@ -14,10 +14,14 @@ from .keys import NOISE
 from .tree import Item
 
 
+# What no sample tells apart: null and unknown words are as `absolute` to every class that compares this key.
+RELATIVE = re.compile(r"(c(?:\.\w+)*\.position_embedding_type) != 'absolute'")
+
+
 def tidied(value):
     """The same with tidy expressions, 'words' in single quotes so that they need no escapes inside a string."""
     if isinstance(value, str):
-        return tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value)))
+        return RELATIVE.sub(r"(\1 == 'relative_key' || \1 == 'relative_key_query')", tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value))))
     if isinstance(value, list):
         return [tidied(v) for v in value]
     if isinstance(value, dict):
