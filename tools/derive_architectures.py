@@ -60,6 +60,14 @@ def add_verify(commands):
     p.set_defaults(run="derive.verify")
 
 
+def add_drop(commands):
+    p = commands.add_parser("drop", help="take classes that were found wrong out of rules/architectures, until the next verify")
+    p.add_argument("classes", nargs="+", metavar="VERSION:CLASS")
+    p.add_argument("--reason", default="not exact: found wrong on a config drawn later")
+    p.add_argument("--when", help="name this condition as a corner of theirs instead: c.add_adapter == true")
+    p.set_defaults(run="derive.drop")
+
+
 def add_table(commands):
     p = commands.add_parser("table", help="write docs/architectures.md from what is in the repository")
     p.add_argument("--check", action="store_true", help="only say whether it is as it should be")
@@ -70,12 +78,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
     commands = parser.add_subparsers(required=True)
-    for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_table):
+    for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_drop, add_table):
         add(commands)
     for sub in set(commands.choices.values()):                # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.cache is None and args.run != "derive.table":
+    if args.cache is None and args.run not in ("derive.table", "derive.drop"):
         parser.error("say where samples and results are kept: --cache DIR, or the environment variable DERIVE_CACHE")
     args.cache = Path(args.cache) if args.cache else None
     __import__(args.run)
