@@ -17,6 +17,7 @@ pub mod size;
 mod suppressions;
 pub mod tokens;
 pub mod variables;
+pub mod verdict;
 pub mod votes;
 
 pub use crate::knowledge::rule::Safety;

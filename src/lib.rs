@@ -5,7 +5,7 @@
 //! file.
 //!
 //! ```
-//! use ckpt_doctor::{Checker, Severity};
+//! use ckpt_doctor::{Checker, LoadVerdict, Severity};
 //!
 //! # fn main() -> Result<(), ckpt_doctor::Error> {
 //! let report = Checker::new().loader("4.57")?.check("fixtures/donors/llava3d-tiny")?;
@@ -13,7 +13,7 @@
 //!     println!("{} {}: {}", finding.code, finding.name, finding.message);
 //! }
 //! assert!(report.findings.iter().all(|finding| finding.severity < Severity::Error));
-//! assert!(report.loads.iter().all(|load| load.missing.is_empty()));
+//! assert!(report.loads.iter().all(|load| load.verdict == LoadVerdict::Loads));
 //! # Ok(())
 //! # }
 //! ```
@@ -69,6 +69,7 @@ mod schemas;
 pub use api::{Checker, Error, Merge};
 pub use check::finding::{Accepted, Suppressed};
 pub use check::load::{LoadReport, Mismatch, Silent, SilentReason};
+pub use check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad};
 pub use check::{Edit, Finding, FixHint, Location, Safety, Severity};
 pub use checkpoint::{Dtype, Fault, FaultKind, Place, Shard, Tensor};
 pub use report::model::{

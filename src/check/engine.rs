@@ -9,6 +9,7 @@ use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, Stored, Target};
 use super::outcome::Outcome;
+use super::verdict::Basis;
 use super::{adapter, index, judge, modules, policy, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place};
@@ -70,6 +71,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let targets = load::wanted(config, versions);
     let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
     scope.bind("loaders", &leading.collect());
+    scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
@@ -98,6 +100,17 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    // An effect without an object is on the one that reads the file of the fault, which may be any.
+    let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects);
+    let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
+    let basis = Basis {
+        checkpoint,
+        findings: &outcome.findings,
+        loads: &outcome.loads,
+        unpredicted: &judged.unpredicted,
+        unjudged: &unjudged.collect(),
+    };
+    outcome.verdicts = basis.verdicts(&context.targets);
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
 }

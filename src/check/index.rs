@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, adapter, pointer};
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
@@ -299,7 +299,24 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     if names.is_empty() && checkpoint.has_file("config.json") {
         return weights_elsewhere(checkpoint).into_iter().collect();
     }
-    Vec::new()
+    unread_weights(checkpoint, &names).into_iter().collect()
+}
+
+/// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
+fn is_model(checkpoint: &Checkpoint) -> bool {
+    let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
+    (has("model_type") || has("architectures")) && !has("_class_name") && !checkpoint.has_file(adapter::CONFIG)
+}
+
+/// For a model whose shards all have names that no loader reads: no weights, with these names.
+fn unread_weights(checkpoint: &Checkpoint, names: &[&str]) -> Option<Fault> {
+    let is_read = |name: &&str| matches!(*name, "pytorch_model.bin" | "pytorch_model.bin.index.json");
+    let has_pickle = checkpoint.entries.keys().any(|name| is_read(&name.as_str()));
+    if !is_model(checkpoint) || has_pickle || names.is_empty() {
+        return None;
+    }
+    let fault = Fault::new(FaultKind::NoWeights).with("model", true).with("unread", names.to_vec());
+    Some(names.iter().fold(fault, |fault, name| fault.at(Place::file(*name))))
 }
 
 /// For numbered shards without an index: the index, and the numbers that are missing.
@@ -330,7 +347,7 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
     match pickle {
         Some(name) => Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name))),
         None if checkpoint.faults.iter().any(is_reported) => None,
-        None => Some(Fault::new(FaultKind::NoWeights)),
+        None => Some(Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint))),
     }
 }
 

@@ -34,6 +34,8 @@ pub struct Judgement {
     pub loads: Vec<LoadReport>,
     /// The versions of transformers that have the class.
     pub targets: Vec<Target>,
+    /// For each other loader that was tried, why its load is not predicted.
+    pub unpredicted: Vec<(&'static str, String)>,
     /// Faults for the rules.
     pub faults: Vec<Fault>,
     /// Config values that stored tensors contradict.
@@ -70,6 +72,7 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let architecture = targets.first().map(|target| target.architecture.name().to_owned());
     let classes = classes::build_classes(&inputs, targets);
     let targets = classes.iter().map(|one| one.target.clone()).collect();
+    let unpredicted = classes::unpredicted(&inputs, &classes);
     let mut faults = classes::faults(&inputs, &classes);
     let loads = explain::explain(&inputs, predict::predict(&inputs, classes));
     let votes = explain::distinct_votes(&loads);
@@ -78,5 +81,5 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let loads: Vec<LoadReport> =
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();
     faults.extend(faults::undeclared_scheme(&inputs, &loads));
-    Judgement { architecture, config, loads, targets, faults, votes }
+    Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
 }

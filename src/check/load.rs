@@ -23,6 +23,7 @@ use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
 
 pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
+pub(crate) use report::version;
 pub use report::{LoadReport, Mismatch, Silent, SilentReason};
 pub use stored::Stored;
 pub use target::{Target, targets};

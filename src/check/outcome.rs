@@ -4,6 +4,7 @@ use serde_json::Value;
 
 use super::finding::{Finding, Skipped, Suppressed};
 use super::load::LoadReport;
+use super::verdict::PredictedLoad;
 use super::votes::Vote;
 
 /// The result of checking a checkpoint.
@@ -13,6 +14,8 @@ pub struct Outcome {
     pub architecture: Option<String>,
     /// Sorted by file, place and code.
     pub findings: Vec<Finding>,
+    /// What each loader of the run does, the leading ones first.
+    pub verdicts: Vec<PredictedLoad>,
     /// A report for each loader; none when the architecture is unknown or no tensor name was read.
     pub loads: Vec<LoadReport>,
     /// The config with the class's defaults filled in; null when the architecture is unknown.

@@ -175,6 +175,7 @@ pub struct BaselineArgs {
 #[command(after_help = "Exit codes:\n  0  no findings at or above --fail-on\n  \
 1  findings at or above --fail-on; with --diff, a fix would change something\n  \
 2  the check could not run: no checkpoint found, unreadable file, or wrong argument")]
+#[expect(clippy::struct_excessive_bools, reason = "one for each flag of the command")]
 pub struct CheckArgs {
     /// Checkpoint directories, directories that contain checkpoints, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
@@ -186,6 +187,9 @@ pub struct CheckArgs {
     /// checksums
     #[arg(long)]
     pub deep: bool,
+    /// Accept checkpoints without weights, such as copies of the documents alone; their load is not predicted
+    #[arg(long)]
+    pub metadata_only: bool,
     /// Run only these rules: codes, prefixes of codes (JSN) or names, comma-separated
     #[arg(long, value_name = "RULE", value_delimiter = ',', help_heading = "Rule selection")]
     pub select: Vec<String>,

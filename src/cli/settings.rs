@@ -34,6 +34,7 @@ pub struct Typed {
     choice: Choice,
     versions: Vec<String>,
     fail_on: Option<Severity>,
+    metadata_only: bool,
     baseline: Option<PathBuf>,
 }
 
@@ -58,6 +59,7 @@ impl Typed {
             },
             versions: args.versions.clone(),
             fail_on: args.report.fail_on.map(super::args::FailOn::severity),
+            metadata_only: args.metadata_only,
             baseline: args.baseline.baseline.clone(),
             ..Self::new(&args.settings, rules)
         }
@@ -112,7 +114,8 @@ impl SettingsResolver {
         let chain = file.as_deref().map(Chain::load).transpose()?.unwrap_or_default();
         let folder = typed.rules.clone().or_else(|| chain.rules());
         let mut rules = library::rules(folder.as_deref())?;
-        let policy = chain.govern(&mut rules, typed.choice.clone())?;
+        let mut policy = chain.govern(&mut rules, typed.choice.clone())?;
+        policy.metadata_only |= typed.metadata_only;
         let library = library::with(folder.as_deref())?;
         let versions = if typed.versions.is_empty() { chain.versions()? } else { typed.versions.clone() };
         Ok(Resolved {

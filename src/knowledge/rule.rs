@@ -161,7 +161,8 @@ pub struct FaultCheck {
 /// - `chat_templates`: templates by file;
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
-/// - `loaders`: versions of transformers to check for.
+/// - `loaders`: versions of transformers to check for;
+/// - `metadata_only`: weights may be missing.
 ///
 /// Functions are `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, and `stays_random(tensor)`:
 /// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are

@@ -48,6 +48,9 @@ pub struct Settings {
     /// Lowest severity that makes the exit code 1.
     #[serde(default, rename = "fail-on")]
     pub fail_on: Option<Severity>,
+    /// Whether weights may be missing, for copies of the documents alone; such a directory has no predicted load.
+    #[serde(default, rename = "metadata-only")]
+    pub metadata_only: Option<bool>,
     /// Versions of transformers to predict the load for: `["transformers==4.47.0"]`.
     #[serde(default, rename = "for")]
     pub versions: Option<Vec<String>>,

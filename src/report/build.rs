@@ -33,7 +33,7 @@ impl CheckpointReport {
             settings: None,
             findings: outcome.findings.clone(),
             suppressed: outcome.suppressed.clone(),
-            loads: outcome.loads.clone(),
+            loads: outcome.verdicts.clone(),
             fixed: Vec::new(),
             withdrawn: Vec::new(),
             fixing: None,

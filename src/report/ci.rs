@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 
-use super::format::{advice, sentence};
+use super::format::{advice, headline, sentence};
 use super::model::{CheckpointReport, MergeReport, Report};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
@@ -28,6 +28,8 @@ pub struct Group<'a> {
     pub title: String,
     /// Path of the checkpoint or merge, see [`tidy`].
     pub path: String,
+    /// The verdicts in one line; empty for a merge.
+    pub headline: String,
     /// Texts of the documents; `None` for a merge.
     pub sources: Option<&'a BTreeMap<String, Arc<str>>>,
     /// Items in report order.
@@ -83,7 +85,7 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
     };
     let items = checkpoint.findings.iter().map(&mut item).collect();
     let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
-    Group { title, path, sources: Some(&checkpoint.sources), items, suppressed }
+    Group { title, path, headline: headline(&checkpoint.loads), sources: Some(&checkpoint.sources), items, suppressed }
 }
 
 /// Fingerprint of a finding of the checkpoint at `path`.
@@ -110,7 +112,14 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         fingerprint: fingerprint(&[&path, SEAM, &merge.recipe, &seam.message], seen),
     });
     let items = items.collect();
-    Group { title: format!("merge {}", merge.recipe), path, sources: None, items, suppressed: Vec::new() }
+    Group {
+        title: format!("merge {}", merge.recipe),
+        path,
+        headline: String::new(),
+        sources: None,
+        items,
+        suppressed: Vec::new(),
+    }
 }
 
 /// Hashes the parts with their lengths, so that different parts give different hashes; repeated fingerprints are

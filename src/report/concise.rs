@@ -1,9 +1,9 @@
-//! One line per finding, for editors, `grep` and logs.
+//! One line for the verdicts on a checkpoint and one per finding, for editors, `grep` and logs.
 
 use std::fmt::Write as _;
 
 use super::fixes::mark;
-use super::format::{capped, more, name, place, sentence};
+use super::format::{capped, headline, more, name, place, sentence};
 use super::model::{CheckpointReport, Report};
 
 pub fn render(report: &Report, cap: usize) -> String {
@@ -27,6 +27,9 @@ pub fn render(report: &Report, cap: usize) -> String {
 }
 
 fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
+    if !checkpoint.loads.is_empty() {
+        let _ok = writeln!(out, "{}: {}", name(&checkpoint.path), headline(&checkpoint.loads));
+    }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
     for finding in shown {
         let location = finding.locations.first();

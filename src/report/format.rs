@@ -4,7 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::collapse::{NameGroup, collapse};
 use super::model::{Counts, MergeReport, MergeStage, Report};
+use crate::check::finding::Object;
 use crate::check::load::{LoadReport, SilentReason};
+use crate::check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad};
 use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
 pub use crate::checkpoint::file_size as bytes;
@@ -204,22 +206,76 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     together
 }
 
-/// Groups load reports with the same content.
-pub fn agreeing(loads: &[LoadReport]) -> Vec<Vec<&LoadReport>> {
-    let mut together: Vec<Vec<&LoadReport>> = Vec::new();
+/// The predicted load reports that differ, each with its loaders.
+pub fn agreeing(loads: &[PredictedLoad]) -> Vec<(&LoadReport, Vec<&PredictedLoad>)> {
+    let mut together: Vec<(&LoadReport, Vec<&PredictedLoad>)> = Vec::new();
     for load in loads {
-        match together.iter_mut().find(|group| group.first().is_some_and(|first| first.agrees(load))) {
-            Some(group) => group.push(load),
-            None => together.push(vec![load]),
+        let Some(report) = &load.tensors else { continue };
+        match together.iter_mut().find(|(first, _)| first.agrees(report)) {
+            Some((_, loaders)) => loaders.push(load),
+            None => together.push((report, vec![load])),
         }
     }
     together
 }
 
 /// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
-pub fn versions(loaders: &[&LoadReport]) -> String {
+pub fn versions(loaders: &[&PredictedLoad]) -> String {
     let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
     format!("transformers {}", versions.join(" and "))
+}
+
+/// The verdicts in one line, the worst first and those that are not predicted last: `raises with transformers 5.23.0; loads
+/// with 4.47.0`.
+pub fn headline(loads: &[PredictedLoad]) -> String {
+    let order = [LoadVerdict::Raises, LoadVerdict::LoadsWrong, LoadVerdict::Loads, LoadVerdict::NotPredicted];
+    let mut parts: Vec<String> = Vec::new();
+    for verdict in order {
+        let loaders = loads.iter().filter(|load| load.verdict == verdict);
+        let versions: Vec<String> = loaders.map(|load| name(&load.version())).collect();
+        if !versions.is_empty() {
+            let transformers = if parts.is_empty() { "transformers " } else { "" };
+            parts.push(format!("{} with {transformers}{}", verdict.name(), versions.join(" and ")));
+        }
+    }
+    parts.join("; ")
+}
+
+/// A sentence for each object that does not load, and for a model that is not predicted; then one for the other objects.
+pub fn objects(loads: &[PredictedLoad]) -> Vec<String> {
+    let mut lines = Vec::new();
+    let mut unjudged: Vec<&ObjectVerdict> = Vec::new();
+    let mut same: Vec<(&ObjectVerdict, Vec<&PredictedLoad>)> = Vec::new();
+    for load in loads {
+        for object in &load.objects {
+            match same.iter_mut().find(|(one, _)| *one == object) {
+                Some((_, loaders)) => loaders.push(load),
+                None => same.push((object, vec![load])),
+            }
+        }
+    }
+    let failing: Vec<Object> =
+        same.iter().filter(|(o, _)| o.verdict > LoadVerdict::NotPredicted).map(|(o, _)| o.object).collect();
+    for (object, loaders) in same {
+        let of = object.object.name();
+        let why = sentence(object.why.as_deref().unwrap_or_default());
+        match object.verdict {
+            LoadVerdict::Loads => {}
+            LoadVerdict::NotPredicted if object.object != Object::Model => unjudged.push(object),
+            verdict => {
+                let codes: Vec<String> = object.findings.iter().map(|code| name(code)).collect();
+                let codes = if codes.is_empty() { String::new() } else { format!(" ({})", codes.join(", ")) };
+                lines.push(format!("{of} {} with {}{codes}: {why}", verdict.name(), versions(&loaders)));
+            }
+        }
+    }
+    unjudged.retain(|object| !failing.contains(&object.object));
+    unjudged.dedup_by_key(|object| object.object);
+    if !unjudged.is_empty() {
+        let names: Vec<&str> = unjudged.iter().map(|object| object.object.name()).collect();
+        lines.push(format!("{} not predicted: only known faults are looked for", names.join(", ")));
+    }
+    lines
 }
 
 /// `and 3 more`, for a list of `total` items cut at `cap`.

@@ -17,15 +17,17 @@ pub fn pretty<T: Serialize>(value: &T) -> String {
     harmless(&written(serde_json::to_string_pretty(value)))
 }
 
-/// One finding per line, with the summary last.
+/// One predicted load or finding per line, with the summary last.
 ///
-/// Every line is an object whose `type` is `finding`, `seam` or `summary`. The other keys are those of the JSON
+/// Every line is an object whose `type` is `load`, `finding`, `seam` or `summary`. The other keys are those of the JSON
 /// contract.
 pub fn lines(report: &Report) -> String {
     let mut lines = Vec::new();
     for checkpoint in &report.checkpoints {
         let (path, role) = (&checkpoint.path, checkpoint.role.as_ref());
         let line = |finding| JsonLine { r#type: LineKind::Finding, path, role, content: finding };
+        let load = |load| JsonLine { r#type: LineKind::Load, path, role, content: load };
+        lines.extend(checkpoint.loads.iter().map(|l| written(serde_json::to_string(&load(l)))));
         lines.extend(checkpoint.findings.iter().map(|f| written(serde_json::to_string(&line(f)))));
     }
     if let Some(merge) = &report.merge {
@@ -42,6 +44,7 @@ pub fn lines(report: &Report) -> String {
 #[derive(Serialize)]
 #[serde(rename_all = "lowercase")]
 enum LineKind {
+    Load,
     Finding,
     Seam,
     Summary,

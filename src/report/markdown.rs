@@ -7,6 +7,7 @@ use super::collapse::{NameGroup, collapse};
 use super::format::{self, advice, bytes, capped, details, more, name, plural, sentence, shape, summary, tensors};
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
 use crate::check::load::LoadReport;
+use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Location};
 
 pub fn render(report: &Report, cap: usize) -> String {
@@ -32,8 +33,18 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
     let (tensors, size) = checkpoint.tensors;
     let verdict = checkpoint.verdict.name();
-    let _ok =
-        writeln!(out, "\n## {title}: {verdict}\n\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
+    let _ok = writeln!(out, "\n## {title}: {verdict}");
+    if !checkpoint.loads.is_empty() {
+        let _ok = writeln!(out, "\nVerdict: {}", text(&format::headline(&checkpoint.loads)));
+    }
+    let _ok = writeln!(out, "\n{architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
+    let objects = format::objects(&checkpoint.loads);
+    if !objects.is_empty() {
+        out.push('\n');
+    }
+    for line in objects {
+        let _ok = writeln!(out, "- {}", text(&line));
+    }
     if !checkpoint.suppressed.is_empty() {
         let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
     }
@@ -44,8 +55,8 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     for (code, n) in hidden {
         let _ok = writeln!(out, "\nand {n} more {}", text_name(code));
     }
-    for loaders in format::agreeing(&checkpoint.loads) {
-        render_load(out, &loaders, cap);
+    for (load, loaders) in format::agreeing(&checkpoint.loads) {
+        render_load(out, load, &loaders, cap);
     }
 }
 
@@ -95,11 +106,13 @@ fn place(location: &Location) -> Option<String> {
     (!parts.is_empty()).then(|| parts.join(" "))
 }
 
-fn render_load(out: &mut String, loaders: &[&LoadReport], cap: usize) {
-    let Some(load) = loaders.first() else { return };
+fn render_load(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], cap: usize) {
     let versions = text(&format::versions(loaders));
     let (missing, unexpected) = (load.missing.len(), load.unexpected.len());
     let (mismatched, silent) = (load.mismatched.len(), load.silent.len());
+    if [missing, unexpected, mismatched, silent] == [0; 4] {
+        return;
+    }
     let _ok = writeln!(
         out,
         "\nPredicted load by {versions}: {missing} missing, {unexpected} unexpected, {mismatched} mismatched, {silent} silent"

@@ -9,11 +9,11 @@ pub use super::merge::{
     ChangedTensor, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName, StageOutcome,
 };
 use crate::check::finding::Suppressed;
-use crate::check::load::LoadReport;
+use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
-/// The report of one run. Serialised, it is the JSON contract (`schema` 2).
+/// The report of one run. Serialised, it is the JSON contract (`schema` 3).
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
@@ -39,7 +39,7 @@ impl Report {
         let verdict = if seams { Verdict::Error } else { counts.verdict() };
         let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
         let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed };
-        Self { schema: 2, tool: ToolInfo::this(), checkpoints, merge, summary }
+        Self { schema: 3, tool: ToolInfo::this(), checkpoints, merge, summary }
     }
 }
 
@@ -86,8 +86,8 @@ pub struct CheckpointReport {
     /// Findings that settings or a baseline accept; `counts` does not include them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub suppressed: Vec<Suppressed>,
-    /// Predicted load reports, one per loader; empty if the architecture is unknown or there are no tensors.
-    pub loads: Vec<LoadReport>,
+    /// Will it load? One entry for each version of transformers of the run, those that the checkpoint must load with first.
+    pub loads: Vec<PredictedLoad>,
     /// Findings whose fixes were applied; `findings` has the remaining ones.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub fixed: Vec<Fixed>,

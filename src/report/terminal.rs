@@ -8,7 +8,7 @@ pub(super) mod paint;
 use std::fmt::Write as _;
 
 use self::paint::Paint;
-use super::format::{agreeing, alike, bytes, capped, counts, name, plural, summary};
+use super::format::{agreeing, alike, bytes, capped, counts, headline, name, objects, plural, summary, wrap};
 use super::model::{CheckpointReport, Report};
 use super::{Style, fixes};
 
@@ -17,14 +17,14 @@ pub fn render(report: &Report, style: Style) -> String {
     let mut out = String::new();
     let mut above: Option<&CheckpointReport> = None;
     for checkpoint in &report.checkpoints {
-        header(&mut out, checkpoint, paint);
+        header(&mut out, checkpoint, style);
         if above.is_some_and(|a| repeats(a, checkpoint)) {
             let _ok = writeln!(out, "  {}", paint.quiet("the same findings and the same predicted load as above"));
         } else {
             findings(&mut out, checkpoint, style);
             out.push_str(&fixes::section(checkpoint));
-            for loaders in agreeing(&checkpoint.loads) {
-                load::render(&mut out, &loaders, style);
+            for (load, loaders) in agreeing(&checkpoint.loads) {
+                load::render(&mut out, load, &loaders, style);
             }
         }
         out.push('\n');
@@ -47,16 +47,20 @@ fn repeats(above: &CheckpointReport, checkpoint: &CheckpointReport) -> bool {
         && (&above.path, &above.findings, &above.loads) == (&checkpoint.path, &checkpoint.findings, &checkpoint.loads)
 }
 
-/// `fixtures/vision (donor vision): spatialvla, 690 tensors, 1.23 MB, clean`
-fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
+/// `fixtures/vision (donor vision): loads with transformers 4.47.0`, then `spatialvla, 690 tensors, 1.23 MB, clean`, and a
+/// line for each object that does not load.
+fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
+    let paint = Paint(style.color);
     out.push_str(&paint.strong(&name(&checkpoint.path)));
     if let Some(role) = &checkpoint.role {
         let _ok = write!(out, " ({})", name(&role.to_string()));
     }
+    if !checkpoint.loads.is_empty() {
+        let _ok = write!(out, ": {}", paint.strong(&headline(&checkpoint.loads)));
+    }
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
-    let _ok = write!(out, ": {architecture}");
     let (tensors, size) = checkpoint.tensors;
-    let _ok = write!(out, ", {}, {}", plural(tensors, "tensor"), bytes(size));
+    let _ok = write!(out, "\n  {architecture}, {}, {}", plural(tensors, "tensor"), bytes(size));
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
@@ -65,6 +69,13 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, paint: Paint) {
     let notes: Vec<String> = settings.into_iter().chain(suppressed).collect();
     if !notes.is_empty() {
         let _ok = writeln!(out, "  {}", paint.quiet(&notes.join(", ")));
+    }
+    for line in objects(&checkpoint.loads) {
+        let width = style.width.map(|width| width.saturating_sub(4).max(40));
+        for (n, part) in wrap(&line, width).lines().enumerate() {
+            let indent = if n == 0 { "  " } else { "    " };
+            let _ok = writeln!(out, "{indent}{}", paint.quiet(part));
+        }
     }
 }
 

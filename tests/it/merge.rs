@@ -91,7 +91,7 @@ fn the_default_merge_is_complete_and_checks_clean() {
     assert_eq!(written["counts"]["error"], 0);
     assert_eq!(written["counts"]["warning"], 0);
     for list in ["missing", "unexpected", "mismatched", "silent"] {
-        assert_eq!(written["loads"][0][list], serde_json::json!([]), "{list}");
+        assert_eq!(written["loads"][0]["tensors"][list], serde_json::json!([]), "{list}");
     }
     assert_eq!(names(work.path()), ["merged"]);
     assert_eq!(

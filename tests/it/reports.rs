@@ -6,6 +6,7 @@ mod schemas;
 
 use ckpt_doctor::check::Location;
 use ckpt_doctor::check::load::{LoadReport, Mismatch};
+use ckpt_doctor::check::verdict::PredictedLoad;
 use ckpt_doctor::report::{Format, Report, Style, render};
 
 use proptest::prelude::*;
@@ -46,7 +47,7 @@ fn long_lists_are_capped_except_in_json() {
     }
     let json: serde_json::Value = serde_json::from_str(&show(&report, Format::Json)).unwrap();
     assert_eq!(json["checkpoints"][0]["findings"].as_array().unwrap().len(), 42);
-    assert_eq!(json["checkpoints"][0]["loads"][0]["missing"].as_array().unwrap().len(), 30);
+    assert_eq!(json["checkpoints"][0]["loads"][0]["tensors"]["missing"].as_array().unwrap().len(), 30);
 }
 
 #[test]
@@ -145,7 +146,7 @@ proptest! {
             .map(|(start, len)| Location { file: Some("config.json".to_owned()), span: Some(*start..start + len), ..Location::default() })
             .collect();
         let mismatched = names.iter().map(|n| Mismatch { name: n.clone(), stored: vec![u64::MAX; 3], expected: vec![] }).collect();
-        checkpoint.loads = vec![LoadReport { missing: names.clone(), unexpected: names, mismatched, ..LoadReport::default() }];
+        checkpoint.loads = vec![PredictedLoad::of_model(LoadReport { missing: names.clone(), unexpected: names, mismatched, ..LoadReport::default() })];
         for format in Format::ALL {
             for color in [false, true] {
                 let shown = render(&report, format, Style { color, width: Some(width), cap });

@@ -10,6 +10,7 @@ use std::fmt::Write as _;
 use crate::support::{Expect, Tried, tried};
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::check::verdict::LoadVerdict;
 use ckpt_doctor::check::{check, check_for};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, FaultSource};
 
@@ -119,6 +120,33 @@ fn messages_render_in_full() {
             })
             .collect();
         (!bad.is_empty()).then(|| shown(&bad))
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Verdicts, findings and the exit code agree: a verdict rests on findings, and an error on a verdict or a harm.
+#[test]
+fn verdicts_rest_on_findings() {
+    let rules = crate::support::rules();
+    let wrong = failures(|t| {
+        let mut bad = Vec::new();
+        for load in &t.outcome.verdicts {
+            for object in &load.objects {
+                if object.verdict > LoadVerdict::NotPredicted && object.findings.is_empty() {
+                    bad.push(format!("{} {object:?}", load.loader));
+                }
+                if object.verdict != LoadVerdict::Loads && object.why.as_deref().is_none_or(str::is_empty) {
+                    bad.push(format!("{} has no reason: {object:?}", load.loader));
+                }
+            }
+        }
+        let errors = t.outcome.findings.iter().filter(|f| f.severity == Severity::Error);
+        for finding in errors.filter(|f| rules.find(&f.code).is_ok_and(|rule| rule.harm.is_none())) {
+            if t.outcome.verdicts.iter().all(|load| load.verdict <= LoadVerdict::NotPredicted) {
+                bad.push(format!("{} is an error, and every verdict is better", finding.code));
+            }
+        }
+        (!bad.is_empty()).then(|| bad.join("\n    "))
     });
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }

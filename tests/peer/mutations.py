@@ -322,7 +322,7 @@ def loader_report(cls, directory):
 
 def prediction(entry, loader="4.47.0"):
     """The prediction of `check` for this loader; None if the class is unknown."""
-    return next((load for load in entry["loads"] if load["loader"] == loader), None)
+    return next((load["tensors"] for load in entry["loads"] if load["loader"] == loader), None)
 
 
 def predicted_report(entry, loader="4.47.0"):

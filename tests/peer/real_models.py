@@ -60,7 +60,7 @@ def main():
     sizes = {s["directory"]: s["why"] for s in listed["indexes"]}
     tally, seen, rows = Tally(), set(), []
     for directory in sorted(p for p in Path(arguments[0]).iterdir() if p.is_dir()):
-        report = json.loads(doctor("check", directory, "--output-format", "json", "--exit-zero")[1])["checkpoints"][0]
+        report = json.loads(doctor("check", directory, "--metadata-only", "--output-format", "json", "--exit-zero")[1])["checkpoints"][0]
         for finding in report["findings"]:
             if finding["severity"] == "info":
                 continue
@@ -73,8 +73,8 @@ def main():
         names, stated = index(directory)
         if names is None:
             continue
-        load = (report["loads"] or [None])[0]
-        agree = load and not (load["missing"] or load["unexpected"] or load["mismatched"])
+        load = next((load for load in report["loads"] if load["tensors"]), None)
+        agree = load and not any(load["tensors"][key] for key in ("missing", "unexpected", "mismatched"))
         computed = size(directory, names, load["loader"]) if load else None
         exact = agree and stated is not None and computed == stated
         why = sizes.pop(directory.name, "")

@@ -68,6 +68,16 @@ fn covered(class: Expected, stored: &Stored) -> Result<Expected, Refusal> {
     Err(Refusal::NotCovered(class.doubts))
 }
 
+/// For each loader that has the class, why no report of it is made; used where there is none.
+pub(super) fn unpredicted(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<(&'static str, String)> {
+    let why = |one: &BuiltClass<'_>| match &one.class {
+        Err(refusal) => refusal.to_string(),
+        Ok(_) if inputs.stored.is_empty() => "no tensor was read".to_owned(),
+        Ok(_) => "the layout of its quantised tensors is unknown".to_owned(),
+    };
+    built.iter().map(|one| (one.target.loader.version(), why(one))).collect()
+}
+
 /// Faults of classes that are unknown or cannot be built from this config.
 pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
     let mut faults = unknown(inputs, built);

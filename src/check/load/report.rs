@@ -8,9 +8,10 @@ use serde::Serialize;
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct LoadReport {
     /// Version of transformers that was read for this prediction: `4.47.0`.
+    #[serde(skip)]
     pub loader: String,
     /// The version that was asked for, or that config.json names, when this one stands for it.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(skip)]
     pub stands_for: Option<String>,
     /// Expected by the model class, not provided: newly initialised.
     pub missing: Vec<String>,
@@ -48,9 +49,8 @@ impl LoadReport {
 
     /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.
     #[must_use]
-    pub fn version(&self) -> String {
-        let version = |asked: &String| format!("{asked} (predicted as {})", self.loader);
-        self.stands_for.as_ref().map_or_else(|| self.loader.clone(), version)
+    pub(crate) fn version(&self) -> String {
+        version(&self.loader, self.stands_for.as_deref())
     }
 }
 
@@ -92,4 +92,9 @@ pub enum SilentReason {
     PrefixHijack,
     /// It is tied to another stored tensor, whose values overwrite it.
     TiedOver,
+}
+
+/// `5.23.0`, or `4.51.3 (predicted as 4.47.0)` for a loader that stands for another version.
+pub(crate) fn version(loader: &str, stands_for: Option<&str>) -> String {
+    stands_for.map_or_else(|| loader.to_owned(), |asked| format!("{asked} (predicted as {loader})"))
 }

@@ -22,6 +22,9 @@ pub enum Object {
 }
 
 impl Object {
+    /// All objects.
+    pub const ALL: [Self; 5] = [Self::Model, Self::Tokenizer, Self::Processor, Self::Generation, Self::Adapter];
+
     /// The word used in rule files and in output.
     #[must_use]
     pub const fn name(self) -> &'static str {

@@ -16,6 +16,8 @@ pub struct Policy {
     places: Vec<AreaSettings>,
     /// Suppressions, in file order.
     pub suppressions: Vec<Suppression>,
+    /// Whether weights may be missing, for copies of the documents alone.
+    pub metadata_only: bool,
 }
 
 /// Severities and ignored rules for some paths.
@@ -58,6 +60,7 @@ impl Policy {
     pub(super) fn from_sources(sources: &[SettingsSource], rules: &RuleSet) -> Result<Self, DataError> {
         let mut policy = Self::default();
         for source in sources {
+            policy.metadata_only = source.settings.metadata_only.unwrap_or(policy.metadata_only);
             let codes = |word: &String| rules.codes(word).map_err(|e| source.wrong(word, e.to_string()));
             for (glob, settings) in &source.settings.per_path {
                 let mut place = AreaSettings {

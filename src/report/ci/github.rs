@@ -14,6 +14,10 @@ use crate::report::format::name;
 pub fn render(report: &Report) -> String {
     let mut out = String::new();
     for group in groups(report) {
+        if !group.headline.is_empty() {
+            let verdict = format!("{}: {}", escape(&group.title, PATH), group.headline);
+            let _infallible = writeln!(out, "::notice title=verdict::{}", data(&verdict));
+        }
         for item in &group.items {
             command(&mut out, &group, item);
         }

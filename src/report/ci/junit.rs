@@ -5,7 +5,7 @@
 
 use std::fmt::Write as _;
 
-use quick_junit::{NonSuccessKind, TestCase, TestCaseStatus, TestSuite};
+use quick_junit::{NonSuccessKind, Property, TestCase, TestCaseStatus, TestSuite};
 
 use super::{Group, Item, PATH, file, groups, spot};
 use crate::check::Severity;
@@ -20,6 +20,9 @@ pub fn render(report: &Report) -> String {
     let mut out = quick_junit::Report::new(report.tool.name);
     for group in groups(report) {
         let mut suite = TestSuite::new(words(&group.title));
+        if !group.headline.is_empty() {
+            suite.add_property(Property::new("verdict", legal(&group.headline)));
+        }
         if group.items.is_empty() {
             let mut case = TestCase::new("clean", TestCaseStatus::success());
             case.set_classname(words(&group.path));

@@ -10,10 +10,10 @@ use super::super::collapse::{NameGroup, collapse};
 use super::super::format::{mismatched, more, name, sentence, silent, versions};
 use super::paint::Paint;
 use crate::check::load::LoadReport;
+use crate::check::verdict::PredictedLoad;
 
 /// Renders the load report of loaders with the same result.
-pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
-    let Some(load) = loaders.first() else { return };
+pub fn render(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], style: Style) {
     let paint = Paint(style.color);
     let n = [load.missing.len(), load.unexpected.len(), load.mismatched.len(), load.silent.len()];
     let line = format!(
@@ -24,8 +24,8 @@ pub fn render(out: &mut String, loaders: &[&LoadReport], style: Style) {
         n[2],
         n[3]
     );
-    if n == [0; 4] && load.raises.is_none() {
-        let _ok = writeln!(out, "  {}", paint.quiet(&line));
+    // The verdict tells of a load without differences.
+    if n == [0; 4] {
         return;
     }
     let _ok = writeln!(out, "  {}", paint.strong(&line));

@@ -80,7 +80,8 @@ fn the_nearest_settings_file_applies_and_the_command_line_overrides_it() {
     assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
     // The working directory does not matter.
     let here = doctor(&root.join("models/vla"), &["check", "--output-format", "concise"]);
-    assert_eq!(String::from_utf8(here.stdout).unwrap().lines().count(), 4);
+    // The verdict, and four findings.
+    assert_eq!(String::from_utf8(here.stdout).unwrap().lines().count(), 5);
     // Another file given by name; its paths start at its folder.
     fs::create_dir(root.join("ci")).unwrap();
     fs::write(

@@ -3,7 +3,7 @@
 use ckpt_doctor::checkpoint::Dtype;
 
 use super::place::{SHARD, entry, file, header};
-use super::{Case, clean, paths};
+use super::{Case, case, clean, paths};
 
 pub fn cases() -> Vec<Case> {
     let tensors = |name: &str, entries: String, data| clean("C14", name, move |d| d.tensors(&entries, data));
@@ -76,7 +76,7 @@ pub fn cases() -> Vec<Case> {
             ];
             d.put("adapter_model.safetensors", file(header(&entries.join(",")), 256));
         }),
-        clean("F13", "no weights", |d| {
+        case("F13", "no weights", "FIL007", "", |d| {
             d.small();
             d.remove(SHARD);
         }),

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ckpt_doctor::check::load::{LoadReport, Mismatch, Silent, SilentReason};
+use ckpt_doctor::check::verdict::PredictedLoad;
 use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
@@ -75,7 +76,7 @@ pub fn fix(safety: Safety, title: &str) -> Option<FixHint> {
 pub fn clean() -> Report {
     let mut one = checkpoint("models/tiny", vec![], &[]);
     let load = |loader: &str| LoadReport { loader: loader.to_owned(), ..LoadReport::default() };
-    one.loads = vec![load("4.47.0"), load("5.23.0")];
+    one.loads = ["4.47.0", "5.23.0"].map(|loader| PredictedLoad::of_model(load(loader))).into();
     let mut other = checkpoint("models/unknown", vec![], &[]);
     other.architecture = None;
     Report::new(vec![one, other], None)
@@ -179,7 +180,7 @@ pub fn findings() -> Report {
         checkpoint("models/tiny", all, &[("processor_config.json", PROCESSOR), ("config.json", CONFIG)]);
     // A newer loader with the same result, except for one tensor.
     let newer = LoadReport { loader: "5.23.0".to_owned(), stands_for: None, raises: None, silent: vec![], ..load() };
-    checkpoint.loads = vec![load(), newer];
+    checkpoint.loads = [load(), newer].map(PredictedLoad::of_model).into();
     Report::new(vec![checkpoint], None)
 }
 
@@ -256,12 +257,12 @@ pub fn long_lists() -> Report {
     findings.push(places);
     let mut checkpoint = checkpoint("models/long", findings, &[]);
     let odd = |what: &str| (0..30).map(|n| format!("{what}_{n}")).collect::<Vec<_>>();
-    checkpoint.loads = vec![LoadReport {
+    checkpoint.loads = vec![PredictedLoad::of_model(LoadReport {
         loader: "5.23.0".to_owned(),
         missing: odd("missing"),
         unexpected: odd("unexpected"),
         ..LoadReport::default()
-    }];
+    })];
     Report::new(vec![checkpoint], None)
 }
 
@@ -292,7 +293,7 @@ pub fn hostile() -> Report {
     one.fix = fix(Safety::Manual, HOSTILE);
     let mut checkpoint = checkpoint(HOSTILE, vec![one], &[("config.json", &source)]);
     checkpoint.architecture = Some(HOSTILE.to_owned());
-    checkpoint.loads = vec![LoadReport {
+    checkpoint.loads = vec![PredictedLoad::of_model(LoadReport {
         loader: HOSTILE.to_owned(),
         stands_for: Some(HOSTILE.to_owned()),
         missing: vec![HOSTILE.to_owned()],
@@ -300,7 +301,7 @@ pub fn hostile() -> Report {
         mismatched: vec![Mismatch { name: HOSTILE.to_owned(), stored: vec![1; 10_000], expected: vec![u64::MAX] }],
         silent: vec![Silent { name: HOSTILE.to_owned(), reason: SilentReason::TiedOver, by: Some(HOSTILE.to_owned()) }],
         ..LoadReport::default()
-    }];
+    })];
     Report::new(vec![checkpoint], None)
 }
 
@@ -374,7 +375,7 @@ pub fn merge_ok() -> Report {
         let mut part =
             if donor { checkpoint("donors/x", vec![], &[]) } else { checkpoint("out/merged", vec![note()], &[]) };
         part.role = Some(role);
-        part.loads = vec![LoadReport { loader: "4.47.0".to_owned(), ..LoadReport::default() }];
+        part.loads = vec![PredictedLoad::of_model(LoadReport { loader: "4.47.0".to_owned(), ..LoadReport::default() })];
         part
     });
     Report::new(parts.into(), Some(merge()))

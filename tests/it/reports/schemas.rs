@@ -52,13 +52,13 @@ fn printed(dir: &Path, args: &[&str]) -> Value {
 
 #[test]
 fn findings_and_loads_of_every_case_follow_the_report_schema() {
-    let (finding, load) = (definition("Finding"), definition("LoadReport"));
+    let (finding, load) = (definition("Finding"), definition("PredictedLoad"));
     for tried in tried() {
         for found in &tried.outcome.findings {
             holds(&finding, &serde_json::to_value(found).unwrap());
         }
-        for report in &tried.outcome.loads {
-            holds(&load, &serde_json::to_value(report).unwrap());
+        for verdict in &tried.outcome.verdicts {
+            holds(&load, &serde_json::to_value(verdict).unwrap());
         }
     }
 }

@@ -1,0 +1,252 @@
+//! Verdicts: will it load? For each version of transformers, and each object that a checkpoint offers.
+//!
+//! A verdict is the worst of the effects of the findings and of the predicted load report. It is never better than what
+//! was read: an object that nothing judges is not predicted.
+
+use std::collections::BTreeSet;
+
+use serde::Serialize;
+
+use super::finding::{Finding, FindingEffect};
+use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::rule::{Consequence, Object};
+
+/// The answer of one loader, the worst last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum LoadVerdict {
+    /// It loads.
+    Loads,
+    /// Nothing known here decides it.
+    NotPredicted,
+    /// It loads incorrectly and nothing is raised: with random, ignored or replaced tensors, or with wrong ids.
+    LoadsWrong,
+    /// The loader raises an exception.
+    Raises,
+}
+
+impl LoadVerdict {
+    /// The words for it in reports, before `with transformers 5.23.0`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Loads => "loads",
+            Self::NotPredicted => "not predicted",
+            Self::LoadsWrong => "loads wrong",
+            Self::Raises => "raises",
+        }
+    }
+}
+
+impl From<Consequence> for LoadVerdict {
+    fn from(consequence: Consequence) -> Self {
+        match consequence {
+            Consequence::Raises => Self::Raises,
+            Consequence::Wrong => Self::LoadsWrong,
+        }
+    }
+}
+
+/// What one loader does with one object of a checkpoint.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct ObjectVerdict {
+    /// The object.
+    pub object: Object,
+    /// The verdict.
+    pub verdict: LoadVerdict,
+    /// The exception, what becomes wrong, or why nothing is predicted; missing when the object loads.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub why: Option<String>,
+    /// Codes of the findings that it rests on, suppressed ones included.
+    #[serde(skip_serializing_if = "BTreeSet::is_empty")]
+    pub findings: BTreeSet<String>,
+}
+
+/// What one version of transformers does with a checkpoint.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct PredictedLoad {
+    /// Version of transformers that was read for this prediction: `4.47.0`.
+    pub loader: String,
+    /// The version that the user named, or that wrote config.json, when `loader` stands for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stands_for: Option<String>,
+    /// The worst verdict of the objects. One that is not predicted counts only for the model, or when nothing else is
+    /// offered.
+    pub verdict: LoadVerdict,
+    /// The objects that the checkpoint offers, the worst first.
+    pub objects: Vec<ObjectVerdict>,
+    /// The state dict compared with the class; null when it was not. Without shards, the names of the index are compared.
+    pub tensors: Option<LoadReport>,
+}
+
+impl PredictedLoad {
+    /// The load of a model alone, by its load report; for tests of the renderers.
+    #[cfg(feature = "internals")]
+    #[must_use]
+    pub fn of_model(report: LoadReport) -> Self {
+        let (verdict, why) = of_report(&report);
+        let object = ObjectVerdict { object: Object::Model, verdict, why, findings: BTreeSet::new() };
+        Self {
+            loader: report.loader.clone(),
+            stands_for: report.stands_for.clone(),
+            verdict,
+            objects: vec![object],
+            tensors: Some(report),
+        }
+    }
+
+    /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.
+    #[must_use]
+    pub fn version(&self) -> String {
+        version(&self.loader, self.stands_for.as_deref())
+    }
+}
+
+/// What verdicts are made from.
+pub(super) struct Basis<'a> {
+    pub(super) checkpoint: &'a Checkpoint,
+    /// Findings before suppressions.
+    pub(super) findings: &'a [Finding],
+    /// The predicted load reports.
+    pub(super) loads: &'a [LoadReport],
+    /// For a loader without a report, the reason.
+    pub(super) unpredicted: &'a [(&'static str, String)],
+    /// Objects that rules which were not selected could judge.
+    pub(super) unjudged: &'a BTreeSet<Object>,
+}
+
+impl Basis<'_> {
+    /// The verdicts of the targets, in their order. Called by the engine for each checkpoint.
+    pub(super) fn verdicts(&self, targets: &[Target]) -> Vec<PredictedLoad> {
+        let offered = offered(self.checkpoint);
+        let verdict = |target: &Target| {
+            let mut objects: Vec<ObjectVerdict> =
+                offered.iter().map(|object| self.object(*object, target.loader.version())).collect();
+            objects.sort_by_key(|object| (std::cmp::Reverse(object.verdict), object.object));
+            let judged = objects
+                .iter()
+                .filter(|o| o.verdict != LoadVerdict::NotPredicted || matches!(o.object, Object::Model))
+                .map(|o| o.verdict);
+            PredictedLoad {
+                loader: target.loader.version().to_owned(),
+                stands_for: target.stands_for.clone(),
+                verdict: judged.max().unwrap_or(LoadVerdict::NotPredicted),
+                tensors: self.report(target.loader.version()).cloned(),
+                objects,
+            }
+        };
+        targets.iter().map(verdict).collect()
+    }
+
+    /// Whether any tensor was read; the names of an index alone tell nothing of a load.
+    fn was_read(&self) -> bool {
+        self.checkpoint.tensors().next().is_some()
+    }
+
+    fn report(&self, loader: &str) -> Option<&LoadReport> {
+        self.loads.iter().find(|report| report.loader == loader)
+    }
+
+    fn object(&self, object: Object, loader: &str) -> ObjectVerdict {
+        let concerns = |effect: &&FindingEffect| (effect.object, effect.loader.as_str()) == (object, loader);
+        let effects = || {
+            self.findings.iter().flat_map(|finding| finding.effects.iter().filter(concerns).map(move |e| (finding, e)))
+        };
+        let (mut verdict, mut why) = self.alone(object, loader);
+        // The exception that ends the predicted load is exact; of anything else, a finding tells more.
+        let is_exact = object == Object::Model && self.report(loader).is_some_and(|report| report.raises.is_some());
+        if let Some((_, worst)) = effects().rev().max_by_key(|(_, effect)| LoadVerdict::from(effect.outcome))
+            && !is_exact
+            && LoadVerdict::from(worst.outcome) >= verdict
+        {
+            (verdict, why) = (worst.outcome.into(), Some(worst.text.clone()));
+        }
+        let findings =
+            if verdict > LoadVerdict::NotPredicted { self.causes(object, loader, verdict) } else { BTreeSet::new() };
+        ObjectVerdict { object, verdict, why, findings }
+    }
+
+    /// Codes of the findings behind a verdict: those with its consequence under the loader, or else those with another one,
+    /// because one cause may have several. Causes are searched under the leading loaders, so another loader that fails as
+    /// well without findings of its own has theirs.
+    fn causes(&self, object: Object, loader: &str, verdict: LoadVerdict) -> BTreeSet<String> {
+        let codes = |is: &dyn Fn(&FindingEffect) -> bool| -> BTreeSet<String> {
+            let concerns = |e: &FindingEffect| e.object == object && is(e);
+            let causes = self.findings.iter().filter(|finding| finding.effects.iter().any(concerns));
+            causes.map(|finding| finding.code.clone()).collect()
+        };
+        let exact = codes(&|e| e.loader == loader && LoadVerdict::from(e.outcome) == verdict);
+        let own = || Some(codes(&|e| e.loader == loader)).filter(|codes| !codes.is_empty());
+        if exact.is_empty() { own().unwrap_or_else(|| codes(&|_| true)) } else { exact }
+    }
+
+    /// The verdict on an object without the effects of findings.
+    fn alone(&self, object: Object, loader: &str) -> (LoadVerdict, Option<String>) {
+        if object != Object::Model {
+            return (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
+        }
+        if self.checkpoint.config().is_none() {
+            return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));
+        }
+        match self.report(loader) {
+            Some(_) if !self.was_read() => {
+                return (LoadVerdict::NotPredicted, Some("no tensor was read".to_owned()));
+            }
+            Some(report) => {
+                let (verdict, why) = of_report(report);
+                if verdict == LoadVerdict::Loads && self.unjudged.contains(&object) {
+                    return (LoadVerdict::NotPredicted, Some("rules that judge it are not selected".to_owned()));
+                }
+                return (verdict, why);
+            }
+            None => {}
+        }
+        let known = self.unpredicted.iter().find(|(of, _)| *of == loader).map(|(_, why)| why.clone());
+        (LoadVerdict::NotPredicted, Some(known.unwrap_or_else(|| "its class is unknown".to_owned())))
+    }
+}
+
+/// The verdict of a load report alone.
+fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
+    if let Some(exception) = &report.raises {
+        return (LoadVerdict::Raises, Some(exception.clone()));
+    }
+    if let Some(first) = report.mismatched.first() {
+        // transformers 5 lists the shapes in its report, before it raises.
+        let why = if report.loader.starts_with("5.") {
+            "You set `ignore_mismatched_sizes` to `False`, thus raising an error. For details look at the above report!"
+                .to_owned()
+        } else {
+            let Mismatch { name, stored, expected } = first;
+            format!(
+                "Error(s) in loading state_dict: size mismatch for {name}: copying a param with shape \
+                 torch.Size({stored:?}) from checkpoint, the shape in current model is torch.Size({expected:?})."
+            )
+        };
+        return (LoadVerdict::Raises, Some(format!("RuntimeError: {why}")));
+    }
+    // Whether a tied tensor and the one that overwrites it differ shows in their bytes, which a rule compares.
+    let silent = report.silent.iter().filter(|silent| silent.reason != SilentReason::TiedOver).count();
+    match (report.missing.len(), silent) {
+        (0, 0) => (LoadVerdict::Loads, None),
+        (missing, silent) => {
+            let n = missing.saturating_add(silent);
+            let tensors = if n == 1 { "1 tensor gets".to_owned() } else { format!("{n} tensors get") };
+            (LoadVerdict::LoadsWrong, Some(format!("{tensors} values that are not those of the checkpoint")))
+        }
+    }
+}
+
+/// The objects that a user of this directory can open.
+fn offered(checkpoint: &Checkpoint) -> Vec<Object> {
+    let has = |object: Object| checkpoint.entries.keys().any(|name| Object::reading(name) == Some(object));
+    let found: Vec<Object> = Object::ALL.into_iter().filter(|object| has(*object)).collect();
+    // A directory with nothing to open was meant to be a model.
+    if found.is_empty() { vec![Object::Model] } else { found }
+}
