@@ -85,18 +85,23 @@ pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault
         // A known class is better evidence than a comparison of the layers with one another.
         faults.extend(layers::faults(inputs.stored.names()));
     }
-    // A version that nobody named and that cannot build the class is passed over.
-    for one in built.iter().filter(|one| one.target.leads) {
-        let reason = match &one.class {
-            Err(Refusal::Impossible(reasons)) => reasons.first().cloned().unwrap_or_default(),
-            Err(refusal @ Refusal::Raises(_)) => refusal.to_string(),
+    for one in built {
+        let fault = || {
+            Fault::new(FaultKind::ConfigIncomputable)
+                .at(Place::file("config.json"))
+                .with("architecture", one.architecture.name())
+        };
+        let fault = match &one.class {
+            // A version that nobody named and that cannot build the class is passed over.
+            Err(Refusal::Impossible(reasons)) if one.target.leads => {
+                fault().with("reason", reasons.first().cloned().unwrap_or_default())
+            }
+            Err(Refusal::Raises(exception)) => {
+                fault().with("raises", exception.as_str()).with("loader", one.target.version())
+            }
             _ => continue,
         };
-        let fault = Fault::new(FaultKind::ConfigIncomputable)
-            .at(Place::file("config.json"))
-            .with("architecture", one.architecture.name())
-            .under(one.target.loader.version());
-        faults.push(fault.with("reason", reason));
+        faults.push(fault.under(one.target.loader.version()));
     }
     faults
 }
