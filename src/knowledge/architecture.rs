@@ -17,7 +17,7 @@ use serde_json::Value;
 pub(crate) use blueprint::{Blueprint, Class};
 pub use conversions::Conversion;
 pub use doubt::Doubt;
-pub use refusal::{Refusal, UnknownPart};
+pub use refusal::Refusal;
 
 use super::{Evidence, Library, Loader};
 

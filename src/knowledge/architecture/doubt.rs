@@ -51,8 +51,8 @@ pub(super) fn unread_keys(
     found
 }
 
-/// The keys of a config, and of those in it, that are null where the class has a value of its own, except keys that a
-/// loader with typed configs does not let be null.
+/// The keys of a config, and of those in it, that are null where the class has a value of its own, except keys that the
+/// loader does not let be null.
 ///
 /// Called for a config that the description failed on: a class may well take the null, as one that does not read it.
 pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config: &Map<String, Value>) -> Vec<Doubt> {
@@ -61,7 +61,7 @@ pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config:
         let class = file.config(loader);
         let own = |key: &str| class.defaults.get(key).is_some_and(|value| !value.is_null());
         let keys = config.iter().filter(|(key, value)| value.is_null() && own(key)).map(|(key, _)| key);
-        let keys = keys.filter(|key| !Loader::ALL.into_iter().any(|loader| file.config(loader).forbids_null(key)));
+        let keys = keys.filter(|key| !class.forbids_null(key));
         found.extend(keys.map(|key| Doubt::Null(pointer(path, key))));
     });
     found
