@@ -75,7 +75,7 @@ impl Library {
     /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
     /// The class in `architectures` decides; where it is absent, or custom code may stand behind an unknown
-    /// name (`auto_map`), `model_type` does. Where several entries describe one class, the config (`when` of the file)
+    /// name (`auto_map`), `model_type` does, if its class has a head where the named one has. Where several entries describe one class, the config (`when` of the file)
     /// and the tensors (`chosen_by` of the class) choose.
     #[must_use]
     pub fn find<'n>(
@@ -95,7 +95,9 @@ impl Library {
             None if class.is_some() && config.get("auto_map").is_none() => return None,
             None => {
                 let files = self.all_of_model_type(model_type?).filter(|file| file.speaks_for(config));
-                choose(files.filter_map(|file| Some((file, main_class(file, loader)?))).collect(), &mut names)?
+                let mut mains: Vec<_> = files.filter_map(|file| Some((file, main_class(file, loader)?))).collect();
+                mains.retain(|(_, main)| class.is_none_or(|class| has_head(class) == has_head(&main.name)));
+                choose(mains, &mut names)?
             }
         };
         Some(Architecture::new(self, file, class, loader))
@@ -171,6 +173,11 @@ impl Library {
         };
         added.iter().chain(stems.filter_map(of_stem)).map(File::blueprint)
     }
+}
+
+/// Whether a class has more than the base model, by its name.
+fn has_head(class: &str) -> bool {
+    class.contains("For") || class.contains("LMHead")
 }
 
 /// The class that a config of this file means when it names none.

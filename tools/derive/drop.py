@@ -37,7 +37,7 @@ def with_corner(text, version, name, when):
     """The text of a file whose class is not predicted under this condition, in all versions of the entry."""
     corner = f"{{ when: {json.dumps(when)}, why: {json.dumps('what ' + when.replace('c.', '') + ' does is not described')} }}"
     for entry, cls, versions in list(entries(text)):
-        if cls == name and version in versions:
+        if cls == name and version in versions and corner not in entry:
             left = entry.replace("not_predicted_when: [", f"not_predicted_when: [{corner}, ", 1)
             if left == entry:
                 left = re.sub(r"^      tensors:", lambda m: f"      not_predicted_when: [{corner}],\n{m[0]}", entry, count=1, flags=re.M)

@@ -8,6 +8,10 @@ use super::blueprint::{Blueprint, ConfigClass};
 use super::resolve::DEPTH_CAP;
 use crate::knowledge::{Library, Loader};
 
+/// Keys that a class of any version calculates with, so that a version without types of fields raises on null as well.
+const REQUIRED: [&str; 5] =
+    ["hidden_size", "intermediate_size", "num_attention_heads", "num_hidden_layers", "vocab_size"];
+
 /// Why nothing can be predicted of a class with a config, though both are known.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Doubt {
@@ -51,8 +55,8 @@ pub(super) fn unread_keys(
     found
 }
 
-/// The keys of a config, and of those in it, that are null where the class has a value of its own, except keys that the
-/// loader does not let be null.
+/// The keys of a config, and of those in it, that are null where the class has a value of its own, except those that
+/// cannot be null.
 ///
 /// Called for a config that the description failed on: a class may well take the null, as one that does not read it.
 pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config: &Map<String, Value>) -> Vec<Doubt> {
@@ -61,7 +65,11 @@ pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config:
         let class = file.config(loader);
         let own = |key: &str| class.defaults.get(key).is_some_and(|value| !value.is_null());
         let keys = config.iter().filter(|(key, value)| value.is_null() && own(key)).map(|(key, _)| key);
-        let keys = keys.filter(|key| !class.forbids_null(key));
+        let required = |key: &str| {
+            let typed = |loader| file.config(loader).forbids_null(key);
+            class.forbids_null(key) || (REQUIRED.contains(&key) && Loader::ALL.into_iter().any(typed))
+        };
+        let keys = keys.filter(|key| !required(key));
         found.extend(keys.map(|key| Doubt::Null(pointer(path, key))));
     });
     found
