@@ -18,7 +18,7 @@ pub mod selection;
 pub mod settings;
 pub mod source;
 
-pub use architecture::{Architecture, Conversion, Expected, ExpectedTensor, Refusal, UnknownPart};
+pub use architecture::{Architecture, Conversion, Doubt, Expected, ExpectedTensor, Refusal};
 pub use evidence::Evidence;
 pub use expression::{EvalError, Expression, Scope, Template};
 pub use library::Library;

@@ -28,8 +28,15 @@ def add_fit(commands):
     p.add_argument("--only", help="regular expression on class name or model_type")
     p.add_argument("--version", help="transformers version whose samples to fit (default: the one at hand)")
     p.add_argument("--again", action="store_true", help="fit again what has been fitted")
-    p.add_argument("--check", action="store_true", help="evaluate each result on the fresh configs and say what differs")
     p.set_defaults(run="derive.fit")
+
+
+def add_draw(commands):
+    p = commands.add_parser("draw", help="configs no fit has seen, and what the classes have under them")
+    p.add_argument("--only", help="regular expression on class name")
+    p.add_argument("--seed", default="a", help="another seed draws others")
+    p.add_argument("--others", action="store_true", help="files as the other versions' draws saved them, under this one")
+    p.set_defaults(run="derive.draw")
 
 
 def add_conversions(commands):
@@ -47,8 +54,18 @@ def add_write(commands):
 def add_verify(commands):
     p = commands.add_parser("verify", help="ask ckpt-doctor about unseen configs; write what is right to rules/architectures")
     p.add_argument("--binary", help="ckpt-doctor (default: the environment variable CKPT_DOCTOR, else the one on the path)")
+    p.add_argument("--seeds", default="a", help="seeds of the draws to verify on, between commas")
     p.add_argument("--out", type=Path, help="another folder to write to")
+    p.add_argument("--versions", help="only these versions of transformers, between commas; with --out, to try something")
     p.set_defaults(run="derive.verify")
+
+
+def add_drop(commands):
+    p = commands.add_parser("drop", help="take classes that were found wrong out of rules/architectures, until the next verify")
+    p.add_argument("classes", nargs="+", metavar="VERSION:CLASS")
+    p.add_argument("--reason", default="not exact: found wrong on a config drawn later")
+    p.add_argument("--when", help="name this condition as a corner of theirs instead: c.add_adapter == true")
+    p.set_defaults(run="derive.drop")
 
 
 def add_table(commands):
@@ -66,12 +83,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
     commands = parser.add_subparsers(required=True)
-    for add in (add_sample, add_fit, add_conversions, add_write, add_verify, add_table, add_accepts):
+    for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_drop, add_table, add_accepts):
         add(commands)
     for sub in set(commands.choices.values()):                # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.cache is None and args.run != "derive.table":
+    if args.cache is None and args.run not in ("derive.table", "derive.drop"):
         parser.error("say where samples and results are kept: --cache DIR, or the environment variable DERIVE_CACHE")
     args.cache = Path(args.cache) if args.cache else None
     __import__(args.run)

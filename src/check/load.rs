@@ -11,6 +11,7 @@ mod report;
 mod stored;
 mod target;
 mod v4;
+mod v4_57;
 mod v5;
 
 use std::collections::BTreeSet;
@@ -33,6 +34,7 @@ pub(super) use target::{of_run, wanted};
 pub fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     let report = match expected.loader {
         Loader::V4_47_0 => v4::predict(expected, stored),
+        Loader::V4_57_6 => v4_57::predict(expected, stored),
         Loader::V5_23_0 => v5::predict(expected, stored),
     };
     LoadReport { loader: expected.loader.version().to_owned(), ..report }
@@ -44,6 +46,7 @@ pub fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
 pub fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
     match expected.loader {
         Loader::V4_47_0 => v4::in_model(expected, stored),
+        Loader::V4_57_6 => v4_57::in_model(expected, stored),
         Loader::V5_23_0 => v5::in_model(expected, stored),
     }
 }

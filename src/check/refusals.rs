@@ -193,8 +193,8 @@ fn json_type(value: &Value) -> &'static str {
     }
 }
 
-/// A quantisation block without `quant_method`, or with one that transformers 4 does not know; transformers 5 loads the
-/// latter as plain weights. Schemes of other programs are reported by the rules of quantised weights.
+/// A quantisation block without `quant_method`, or with one that the version does not know. The latter raises in 4.47.0, and
+/// 4.57.6 and 5.23.0 load the weights as plain ones. Schemes of other programs are reported by the rules of quantised weights.
 fn quantisation(knowledge: &Knowledge, config: &Value, targets: &[Target]) -> Option<Fault> {
     let (pointer, block) = block(config).filter(|(pointer, _)| *pointer == "/quantization_config")?;
     let is_set = |key| block.get(key).and_then(Value::as_bool) == Some(true);
@@ -206,7 +206,7 @@ fn quantisation(knowledge: &Knowledge, config: &Value, targets: &[Target]) -> Op
     let method = block.get("quant_method").and_then(Value::as_str);
     let raises = |target: &&Target| {
         let lacks = |method| knowledge.names.lacks(target.version(), NameKind::QuantMethod, method);
-        method.is_none_or(|method| target.loader.major() < 5 && lacks(method))
+        method.is_none_or(|method| version_numbers(target.version()) < vec![4, 48] && lacks(method))
     };
     let raising: Vec<&Target> = targets.iter().filter(raises).collect();
     let fault = match method {

@@ -6,7 +6,6 @@ use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
 
 use crate::check::Severity;
-use crate::knowledge::Loader;
 use crate::knowledge::loader::parse_requirement;
 use crate::report::Format;
 
@@ -84,10 +83,10 @@ pub struct ExpectArgs {
     /// and, to override the config's own class, a class name under "class"
     #[arg(value_name = "CONFIG|DIR|@FILE", required = true)]
     pub configs: Vec<String>,
-    /// Version of transformers that builds the class, as transformers==4.47.0; the nearest known version is used [default:
-    /// the version that the config names]
-    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_loader)]
-    pub loader: Option<Loader>,
+    /// Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3; the nearest known version that
+    /// has the class is used [default: the version that the config names]
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_requirement)]
+    pub target: Option<String>,
     /// Output format; in jsonl, a config that fails has an "error" and the others are still printed
     #[arg(long, alias = "format", value_name = "FMT", default_value = "text")]
     pub output_format: ExpectFormat,
@@ -335,11 +334,6 @@ pub enum Color {
     Always,
     /// Never
     Never,
-}
-
-/// The known loader nearest to the given version.
-fn parse_loader(text: &str) -> Result<Loader, String> {
-    parse_requirement(text).map(|version| Loader::nearest(&version))
 }
 
 /// Accepts the names of report formats, and lists them in the help.

@@ -33,7 +33,8 @@ struct Input {
 /// The expected tensors of a config, or the reason for the failure.
 struct Answer {
     source: String,
-    loader: Loader,
+    /// The loader that builds the class, or the version for which no loader has it.
+    loader: String,
     expected: Result<Expected, String>,
 }
 
@@ -43,7 +44,7 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let mut failed = false;
     let mut list = Vec::new();
     let mut answer = |input: Input| -> anyhow::Result<()> {
-        let answer = build(&library, input, args.loader);
+        let answer = build(&library, input, args.target.as_deref());
         failed |= answer.expected.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),
@@ -108,14 +109,16 @@ fn parse(bytes: &[u8]) -> Result<Value, String> {
     })
 }
 
-fn build(library: &Library, input: Input, loader: Option<Loader>) -> Answer {
+/// `version`: the value of `--for`; without it, the version that wrote the config, or the newest.
+fn build(library: &Library, input: Input, version: Option<&str>) -> Answer {
     let Input { source, record } = input;
-    let config = record.as_ref().map_or(&Value::Null, |r| &r.config);
-    let loader = loader.unwrap_or_else(|| Loader::of_config(config));
-    let expected = record.and_then(|Record { config, class }| {
+    let wrote = record.as_ref().ok().and_then(|r| r.config.get("transformers_version")).and_then(Value::as_str);
+    let version = version.or(wrote).unwrap_or_else(|| Loader::NEWEST.version()).to_owned();
+    let mut answer = Answer { source, loader: version.clone(), expected: Err(String::new()) };
+    answer.expected = record.and_then(|Record { config, class }| {
         let found = match &class {
-            Some(class) => library.class(class, loader),
-            None => library.find(&config, [], loader),
+            Some(class) => library.class_under(&version, class),
+            None => library.stands_for(&version, &config, &[]),
         };
         let unknown = || {
             let known = |other: &Loader| match &class {
@@ -127,15 +130,16 @@ fn build(library: &Library, input: Input, loader: Option<Loader>) -> Answer {
             let class = class.as_deref().or_else(|| config.pointer("/architectures/0")?.as_str());
             let model_type = config.get("model_type").and_then(Value::as_str);
             format!(
-                "no architecture is known for class {} and model_type {} under transformers {loader}{hint}",
+                "no architecture is known for class {} and model_type {} under transformers {version}{hint}",
                 class.unwrap_or("(missing)"),
                 model_type.unwrap_or("(missing)")
             )
         };
-        let architecture = found.ok_or_else(unknown)?;
+        let (loader, architecture) = found.ok_or_else(unknown)?;
+        loader.version().clone_into(&mut answer.loader);
         architecture.expect(&config).map_err(|refusal| format!("{}: {refusal}", architecture.class()))
     });
-    Answer { source, loader, expected }
+    answer
 }
 
 /// Maximum length of a text from a checkpoint in a line of output, in characters.
@@ -171,10 +175,10 @@ fn text(answer: &Answer) -> String {
 
 fn object(answer: &Answer) -> Value {
     match &answer.expected {
-        Err(reason) => json!({ "source": answer.source, "loader": answer.loader.version(), "error": reason }),
+        Err(reason) => json!({ "source": answer.source, "loader": answer.loader, "error": reason }),
         Ok(e) => json!({
             "source": answer.source,
-            "loader": answer.loader.version(),
+            "loader": answer.loader,
             "architecture": e.architecture,
             "class": e.class,
             "model_type": e.model_type,
@@ -186,6 +190,7 @@ fn object(answer: &Answer) -> Value {
             "ignore_missing": e.ignore_missing,
             "ignore_unexpected": e.ignore_unexpected,
             "conversions": e.conversions,
+            "not_predicted": e.doubts.iter().map(ToString::to_string).collect::<Vec<_>>(),
         }),
     }
 }

@@ -3,6 +3,8 @@
 mod blueprint;
 mod build;
 mod conversions;
+mod doubt;
+mod field_type;
 pub(crate) mod member;
 mod refusal;
 mod resolve;
@@ -14,7 +16,8 @@ use serde_json::Value;
 
 pub(crate) use blueprint::{Blueprint, Class};
 pub use conversions::Conversion;
-pub use refusal::{Refusal, UnknownPart};
+pub use doubt::Doubt;
+pub use refusal::Refusal;
 
 use super::{Evidence, Library, Loader};
 
@@ -120,8 +123,11 @@ pub struct Expected {
     pub ignore_missing: Vec<String>,
     /// As `ignore_missing`, of names whose presence is not reported.
     pub ignore_unexpected: Vec<String>,
-    /// What transformers 5 renames and converts, in the order of application; empty for transformers 4.
+    /// What transformers 5 renames and converts, in the order of application; of transformers 4.57, what the class
+    /// renames; empty for 4.47.
     pub conversions: Vec<Conversion>,
+    /// Why nothing follows from all this: what the description does not cover of this config. Empty where it covers it.
+    pub doubts: Vec<Doubt>,
 }
 
 impl Default for Expected {
@@ -139,6 +145,7 @@ impl Default for Expected {
             ignore_missing: Vec::new(),
             ignore_unexpected: Vec::new(),
             conversions: Vec::new(),
+            doubts: Vec::new(),
         }
     }
 }

@@ -1,6 +1,8 @@
 //! The architectures that ship with the program, and those a user adds.
 
 mod index;
+#[cfg(test)]
+mod scan;
 
 use std::borrow::Cow;
 use std::sync::OnceLock;
@@ -10,7 +12,6 @@ use serde_json::Value;
 use super::Loader;
 use super::architecture::{Architecture, Blueprint, Class};
 use super::source::{self, DataError};
-use index::Index;
 
 /// What `AutoModel…` mappings are asked for when a config names a model type and no class, in this order.
 const AUTO: [&str; 5] = ["causal_lm", "image_text_to_text", "vision_2_seq", "seq_to_seq_causal_lm", "model"];
@@ -18,13 +19,15 @@ const AUTO: [&str; 5] = ["causal_lm", "image_text_to_text", "vision_2_seq", "seq
 /// All known architectures. A file is parsed when it is first needed.
 #[derive(Default)]
 pub struct Library {
+    /// Those that a user adds, then the embedded ones by their stems.
     files: Vec<File>,
-    index: OnceLock<Index>,
+    /// Number of added files.
+    added: usize,
 }
 
 struct File {
     stem: String,
-    text: Cow<'static, str>,
+    text: Cow<'static, [u8]>,
     parsed: OnceLock<Blueprint>,
 }
 
@@ -32,14 +35,14 @@ impl Library {
     /// The architectures in the program, by name.
     #[must_use]
     pub fn embedded() -> Self {
-        let file = |(path, text): (String, &'static str)| {
-            let name = path.rsplit('/').next().unwrap_or_default();
-            let stem = name.strip_suffix(".json5").unwrap_or(name).to_owned();
+        // A page of a text is read from disk when it is first used.
+        let file = |(stem, text): (&str, &'static [u8])| {
+            let stem = stem.to_owned();
             File { stem, text: Cow::Borrowed(text), parsed: OnceLock::new() }
         };
-        let mut files: Vec<File> = source::embedded("architectures").into_iter().map(file).collect();
+        let mut files: Vec<File> = source::embedded_bytes("architectures").map(file).collect();
         files.sort_by(|a, b| a.stem.cmp(&b.stem));
-        Self { files, index: OnceLock::new() }
+        Self { files, added: 0 }
     }
 
     /// Adds an architecture file, or replaces the one of the same name.
@@ -49,9 +52,12 @@ impl Library {
     pub fn add(&mut self, path: &str, text: &str) -> Result<(), DataError> {
         let blueprint: Blueprint = source::parse(path, text)?;
         let stem = blueprint.architecture.clone();
-        self.files.retain(|file| file.stem != stem);
-        self.files.insert(0, File { stem, text: Cow::Owned(text.to_owned()), parsed: OnceLock::from(blueprint) });
-        self.index = OnceLock::new();
+        if let Some(at) = self.files.iter().position(|file| file.stem == stem) {
+            self.files.remove(at);
+            self.added = self.added.saturating_sub(usize::from(at < self.added));
+        }
+        self.files.insert(0, File { stem, text: Cow::Owned(text.into()), parsed: OnceLock::from(blueprint) });
+        self.added = self.added.saturating_add(1);
         Ok(())
     }
 
@@ -69,7 +75,7 @@ impl Library {
     /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
     /// The class in `architectures` decides; where it is absent, or custom code may stand behind an unknown
-    /// name (`auto_map`), `model_type` does. Where several entries describe one class, the config (`when` of the file)
+    /// name (`auto_map`), `model_type` does, if its class has a head where the named one has. Where several entries describe one class, the config (`when` of the file)
     /// and the tensors (`chosen_by` of the class) choose.
     #[must_use]
     pub fn find<'n>(
@@ -89,7 +95,9 @@ impl Library {
             None if class.is_some() && config.get("auto_map").is_none() => return None,
             None => {
                 let files = self.all_of_model_type(model_type?).filter(|file| file.speaks_for(config));
-                choose(files.filter_map(|file| Some((file, main_class(file, loader)?))).collect(), &mut names)?
+                let mut mains: Vec<_> = files.filter_map(|file| Some((file, main_class(file, loader)?))).collect();
+                mains.retain(|(_, main)| class.is_none_or(|class| has_head(class) == has_head(&main.name)));
+                choose(mains, &mut names)?
             }
         };
         Some(Architecture::new(self, file, class, loader))
@@ -104,19 +112,36 @@ impl Library {
     /// The model type of the class of this name; `None` for an unknown class, or when several have it.
     #[must_use]
     pub fn model_type_of(&self, class: &str) -> Option<&str> {
-        let files = self.files_at(self.index().with_class(class));
+        let files = self.candidates(index::with_class(class));
         let mut types = files.filter(|f| f.classes.iter().any(|c| c.name == class)).flat_map(|file| &file.model_types);
         types.next().filter(|first| types.all(|other| other == *first)).map(String::as_str)
     }
 
+    /// The known loader that stands for a version of transformers for one checkpoint, with the class it builds.
+    ///
+    /// A known version stands for itself alone. For any other it is the nearest one that has the class: `check` and
+    /// `expect` both ask here. `None` where none has it.
+    #[must_use]
+    pub fn stands_for(&self, version: &str, config: &Value, names: &[&str]) -> Option<(Loader, Architecture<'_>)> {
+        let built = |loader: Loader| Some((loader, self.find(config, names.iter().copied(), loader)?));
+        Loader::of_version(version).into_iter().find_map(built)
+    }
+
+    /// As [`Self::stands_for`], for a class by its name.
+    #[must_use]
+    pub fn class_under(&self, version: &str, name: &str) -> Option<(Loader, Architecture<'_>)> {
+        let built = |loader: Loader| Some((loader, self.class(name, loader)?));
+        Loader::of_version(version).into_iter().find_map(built)
+    }
+
     /// Stem and text of every file, unparsed.
     pub(super) fn texts(&self) -> impl Iterator<Item = (&str, &[u8])> {
-        self.files.iter().map(|file| (file.stem.as_str(), file.text.as_bytes()))
+        self.files.iter().map(|file| (file.stem.as_str(), file.text.as_ref()))
     }
 
     /// Text of the file of this stem.
     pub(super) fn text(&self, stem: &str) -> Option<&str> {
-        self.files.iter().find(|file| file.stem == stem).map(|file| file.text.as_ref())
+        self.files.iter().find(|file| file.stem == stem).map(File::text)
     }
 
     /// The file of this stem.
@@ -131,7 +156,7 @@ impl Library {
 
     fn entries(&self, class: &str, loader: Loader) -> Vec<(&Blueprint, &Class)> {
         let of_file = |file| Blueprint::classes(file, loader).filter(|c| c.name == class).map(move |c| (file, c));
-        self.files_at(self.index().with_class(class)).flat_map(of_file).collect()
+        self.candidates(index::with_class(class)).flat_map(of_file).collect()
     }
 
     /// The file of the config class of this model type: one that the loader knows, if any.
@@ -141,27 +166,32 @@ impl Library {
     }
 
     fn all_of_model_type(&self, model_type: &str) -> impl Iterator<Item = &Blueprint> {
-        let files = self.files_at(self.index().with_model_type(model_type));
+        let files = self.candidates(index::with_model_type(model_type));
         files.filter(move |f| f.model_types.iter().any(|t| t == model_type))
     }
 
     /// The file with the conversions of this class or model type: where it is described, or any other.
     pub(super) fn with_conversions(&self, identifier: &str) -> Option<&Blueprint> {
-        let index = self.index();
-        let described = index.with_class(identifier).iter().chain(index.with_model_type(identifier));
+        let described = self.candidates(index::with_class(identifier).chain(index::with_model_type(identifier)));
         let word = memchr::memmem::Finder::new(identifier);
-        let mentioned = self.files.iter().filter(|f| word.find(f.text.as_bytes()).is_some()).map(File::blueprint);
-        let files = described.filter_map(|at| self.files.get(*at)).map(File::blueprint).chain(mentioned);
-        files.into_iter().find(|f| f.conversions.contains_key(identifier))
+        let mentioned = self.files.iter().filter(|f| word.find(&f.text).is_some()).map(File::blueprint);
+        described.chain(mentioned).find(|f| f.conversions.contains_key(identifier))
     }
 
-    fn index(&self) -> &Index {
-        self.index.get_or_init(|| Index::of(self.files.iter().map(|f| (f.text.as_ref(), f.parsed.get()))))
+    /// The added files, and the embedded ones of these stems that no added file replaces.
+    fn candidates<'l>(&'l self, stems: impl Iterator<Item = &'static str> + 'l) -> impl Iterator<Item = &'l Blueprint> {
+        let (added, embedded) = self.files.split_at_checked(self.added).unwrap_or_default();
+        let of_stem = |stem: &str| {
+            let at = embedded.binary_search_by(|file| file.stem.as_str().cmp(stem)).ok()?;
+            embedded.get(at)
+        };
+        added.iter().chain(stems.filter_map(of_stem)).map(File::blueprint)
     }
+}
 
-    fn files_at<'l>(&'l self, places: &'l [usize]) -> impl Iterator<Item = &'l Blueprint> {
-        places.iter().filter_map(|at| self.files.get(*at)).map(File::blueprint)
-    }
+/// Whether a class has more than the base model, by its name.
+fn has_head(class: &str) -> bool {
+    class.contains("For") || class.contains("LMHead")
 }
 
 /// The class that a config of this file means when it names none.
@@ -190,12 +220,16 @@ impl std::fmt::Debug for Library {
 }
 
 impl File {
+    fn text(&self) -> &str {
+        std::str::from_utf8(&self.text).unwrap_or_default()
+    }
+
     /// # Panics
     /// When a file in the program does not parse; a test reads them all.
     fn blueprint(&self) -> &Blueprint {
         self.parsed.get_or_init(|| {
             let path = format!("rules/architectures/{}.json5", self.stem);
-            source::parse_embedded(&path, &self.text).unwrap_or_else(|e| panic!("{e}"))
+            source::parse_embedded(&path, self.text()).unwrap_or_else(|e| panic!("{e}"))
         })
     }
 }

@@ -8,15 +8,17 @@ use serde_json::Value;
 /// A version of transformers for which loads are predicted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Loader {
-    /// transformers 4.47.0, for all of 4.x.
+    /// transformers 4.47.0.
     V4_47_0,
+    /// transformers 4.57.6, the last of 4.x.
+    V4_57_6,
     /// transformers 5.23.0, for all of 5.x.
     V5_23_0,
 }
 
 impl Loader {
     /// All loaders, oldest first.
-    pub const ALL: [Self; 2] = [Self::V4_47_0, Self::V5_23_0];
+    pub const ALL: [Self; 3] = [Self::V4_47_0, Self::V4_57_6, Self::V5_23_0];
 
     /// The newest loader.
     pub const NEWEST: Self = Self::V5_23_0;
@@ -26,6 +28,7 @@ impl Loader {
     pub const fn version(self) -> &'static str {
         match self {
             Self::V4_47_0 => "4.47.0",
+            Self::V4_57_6 => "4.57.6",
             Self::V5_23_0 => "5.23.0",
         }
     }
@@ -34,19 +37,51 @@ impl Loader {
     #[must_use]
     pub const fn major(self) -> u64 {
         match self {
-            Self::V4_47_0 => 4,
+            Self::V4_47_0 | Self::V4_57_6 => 4,
             Self::V5_23_0 => 5,
         }
     }
 
-    /// The known loader nearest to a version: of the same major version; the oldest or newest for versions outside the
-    /// range. The newest if the text does not start with a number.
+    /// The version as one number that expressions of architecture files compare: `release >= 457`.
+    #[must_use]
+    pub const fn release(self) -> u64 {
+        match self {
+            Self::V4_47_0 => 447,
+            Self::V4_57_6 => 457,
+            Self::V5_23_0 => 523,
+        }
+    }
+
+    /// The known loader nearest to a version; the newest if the text does not start with a number.
+    /// [`Library::stands_for`](super::Library::stands_for) chooses among those that have a class.
     #[must_use]
     pub fn nearest(version: &str) -> Self {
-        let digits = version.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default();
-        match digits.parse::<u64>() {
-            Ok(major) if major <= 4 => Self::V4_47_0,
-            _ => Self::V5_23_0,
+        let [nearest, ..] = Self::by_distance(version);
+        nearest
+    }
+
+    /// All known loaders, the nearest to a version first: those of the same major version before others, then by the
+    /// second number; of two as near as each other the newer one.
+    #[must_use]
+    pub fn by_distance(version: &str) -> [Self; Self::ALL.len()] {
+        let mut loaders = Self::ALL;
+        let mut numbers = version.split(|c: char| !c.is_ascii_digit()).map(str::parse::<u64>);
+        let Some(Ok(major)) = numbers.next() else {
+            loaders.reverse();
+            return loaders;
+        };
+        let minor = numbers.next().and_then(Result::ok).unwrap_or(0);
+        let release = major.saturating_mul(100).saturating_add(minor.min(99));
+        loaders.reverse();
+        loaders.sort_by_key(|l| (l.major().abs_diff(major), l.release().abs_diff(release)));
+        loaders
+    }
+
+    /// The loaders that may stand for a version, the best first: a known version stands for itself alone.
+    pub(super) fn of_version(version: &str) -> Vec<Self> {
+        match Self::ALL.into_iter().find(|loader| loader.version() == version) {
+            Some(own) => vec![own],
+            None => Self::by_distance(version).to_vec(),
         }
     }
 
@@ -82,19 +117,20 @@ impl<'de> Deserialize<'de> for Loader {
     }
 }
 
-/// Parses `transformers==4.51.3` and returns the version; [`Loader::nearest`] maps it to a loader.
+/// Parses `transformers==4.51.3`, `4.51.3` or `4.51`, and returns the version;
+/// [`Library::stands_for`](super::Library::stands_for) maps it to a loader.
 ///
 /// # Errors
 /// The expected form, with the known versions.
 pub fn parse_requirement(text: &str) -> Result<String, String> {
-    let version = text.strip_prefix("transformers==").unwrap_or_default();
+    let version = text.strip_prefix("transformers==").unwrap_or(text);
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
     if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
         return Ok(version.to_owned());
     }
     let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
     Err(format!(
-        "expected transformers==VERSION; known versions are {}, others are predicted as the nearest one",
+        "expected VERSION or transformers==VERSION; known versions are {}, others are predicted as the nearest one",
         known.join(", ")
     ))
 }
@@ -109,6 +145,10 @@ mod tests {
     fn the_nearest_loader_has_the_same_major_version() {
         for (version, nearest) in [
             ("4.51.3", Loader::V4_47_0),
+            ("4.52.0", Loader::V4_57_6),
+            ("4.53", Loader::V4_57_6),
+            ("4.57.3", Loader::V4_57_6),
+            ("4.99.0", Loader::V4_57_6),
             ("3.0", Loader::V4_47_0),
             ("4.48.0.dev0", Loader::V4_47_0),
             ("5.0.0rc1", Loader::V5_23_0),
@@ -117,9 +157,25 @@ mod tests {
         ] {
             assert_eq!(Loader::nearest(version), nearest, "{version}");
         }
+        assert_eq!(Loader::by_distance("4.50"), [Loader::V4_47_0, Loader::V4_57_6, Loader::V5_23_0]);
+        assert_eq!(Loader::by_distance("5.1"), [Loader::V5_23_0, Loader::V4_57_6, Loader::V4_47_0]);
         assert_eq!(Loader::of_config(&json!({ "transformers_version": "4.40.1" })), Loader::V4_47_0);
         assert_eq!(Loader::of_config(&json!({})), Loader::NEWEST);
         assert_eq!(Loader::V4_47_0.to_string(), "4.47.0");
         assert_eq!(Loader::ALL.last(), Some(&Loader::NEWEST));
+        for loader in Loader::ALL {
+            assert_eq!(Loader::nearest(loader.version()), loader);
+        }
+    }
+
+    #[test]
+    fn a_version_is_asked_for_with_and_without_the_package() {
+        for text in ["transformers==4.57.3", "4.57.3"] {
+            assert_eq!(parse_requirement(text), Ok("4.57.3".to_owned()));
+        }
+        assert_eq!(parse_requirement("4.57"), Ok("4.57".to_owned()));
+        for text in ["", "transformers==", "transformers", "torch==2.1", "4 57", "v4.57"] {
+            assert!(parse_requirement(text).is_err(), "{text}");
+        }
     }
 }

@@ -156,6 +156,12 @@ pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {
     out
 }
 
+/// Stem and bytes of each `.json5` file in `rules/<folder>`, not in its subfolders.
+pub(super) fn embedded_bytes(folder: &str) -> impl Iterator<Item = (&'static str, &'static [u8])> {
+    let files = RULES.get_dir(folder).into_iter().flat_map(Dir::files);
+    files.filter_map(|file| Some((file.path().to_str()?.rsplit('/').next()?.strip_suffix(".json5")?, file.contents())))
+}
+
 /// The text of one embedded file, such as a template of a recipe.
 #[must_use]
 pub fn text(path: &str) -> Option<&'static str> {

@@ -380,9 +380,18 @@ def open_model(path):
             stored[name] = (dtype, shape, data)
     state = {name: tensor for name, tensor in model.state_dict().items()}
     for name, (_, _, data) in stored.items():
-        if name in state and state[name].contiguous().numpy().tobytes() != data:
+        if name in state and not is_equal(state[name], dtype, data):
             return f"{name} has other values"
     return Ignored if info["unexpected_keys"] else None
+
+
+def is_equal(tensor, dtype, data):
+    """Whether a loaded tensor has the stored values, in the dtype that it was loaded with."""
+    import torch
+
+    kinds = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64}
+    stored = torch.frombuffer(bytearray(data), dtype=kinds[dtype]).to(tensor.dtype) if data else torch.empty(0)
+    return torch.equal(tensor.flatten(), stored)
 
 
 # Both, compared.

@@ -4,7 +4,7 @@ import signal
 
 import torch
 import transformers
-from transformers import PreTrainedModel
+from transformers import PreTrainedModel, modeling_utils
 
 from .configs import flatten, subconfigs
 
@@ -50,7 +50,7 @@ def without_initialisation():
 
 class Built:
     """What one instantiation consists of."""
-    __slots__ = ("flat", "tensors", "tied", "buffers", "persistent", "models", "modules", "facts", "instance")
+    __slots__ = ("flat", "tensors", "tied", "buffers", "persistent", "models", "modules", "facts", "instance", "config")
 
 
 def build(cls, config, device="meta"):
@@ -86,7 +86,6 @@ def read(model, config):
         stack.extend((f"{prefix}{n}.", m) for n, m in reversed(module._modules.items()) if m is not None)
     b.tied = [names for names in shares.values() if len(names) > 1]
     b.modules = count
-    b.flat = flatten(config)
     b.instance = model
     return b
 
@@ -127,7 +126,8 @@ def essence(config):
 
 
 def alone(m, device):
-    """The tensors of a model inside a model when it is built by itself from the same config, or None."""
+    """The tensors of a model inside a model, and those that share their storage, when it is built by itself from the same
+    config; or None."""
     try:
         with time_limit(ALARM), torch.device(device):
             other = type(m)(m.config)
@@ -135,7 +135,8 @@ def alone(m, device):
         raise
     except Exception:                                         # it wants more than a config
         return None
-    return read(other, m.config).tensors
+    b = read(other, m.config)
+    return b.tensors, [frozenset(g) for g in b.tied]
 
 
 def patterns(x):
@@ -153,9 +154,18 @@ def facts(b, cls):
         "ignore_missing": patterns(getattr(cls, "_keys_to_ignore_on_load_missing", None)),
         "ignore_unexpected": patterns(getattr(cls, "_keys_to_ignore_on_load_unexpected", None)),
         "tied_weights_keys": plain_ties(getattr(cls, "_tied_weights_keys", None)),
+        "key_mapping": key_mapping(cls),
         "module": cls.__module__,
         "transformers": transformers.__version__,
     }
+
+
+def key_mapping(cls):
+    """What transformers 4.57 renames at load for this class: only where its name, or that of a base, is one of these."""
+    wanted = getattr(modeling_utils, "VLMS", ())
+    if any(word in base.__name__.lower() for base in cls.__mro__[:-1] for word in wanted):
+        return [list(row) for row in (getattr(cls, "_checkpoint_conversion_mapping", None) or {}).items()]
+    return []
 
 
 def plain_ties(x):

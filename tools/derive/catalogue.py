@@ -1,5 +1,6 @@
-"""Which classes there are: those of transformers' auto mappings, grouped by the config class they are built from."""
+"""Which classes there are: those of transformers' auto mappings, and those it exports besides, by their config class."""
 import collections
+import re
 
 import transformers
 from transformers.models.auto import modeling_auto
@@ -43,12 +44,14 @@ def config_class(model_type):
 def families():
     """[(config class, model_type, [class names])]: important ones first, the class without a head first in each.
 
-    Only names: a class is imported when its turn comes."""
+    Classes of the mappings are only named here: each is imported when its turn comes."""
     by_type = collections.defaultdict(dict)
     for short, table in sorted(mappings().items(), key=lambda kv: (kv[0] not in ("model", "backbone"), kv[0] == "backbone", kv[0])):
         for mt, names in table.items():
             for n in names:
                 by_type[mt].setdefault(n, short)
+    for mt, name in exported({n for names in by_type.values() for n in names}):
+        by_type[mt].setdefault(name, "exported")
     rank = {mt: i for i, mt in enumerate(IMPORTANT)}
     out, seen = [], set()
     for mt in sorted(by_type, key=lambda m: (rank.get(m, len(rank)), m)):
@@ -57,6 +60,24 @@ def families():
         if names and mt in CONFIG_MAPPING_NAMES:
             out.append((mt, names))
     return out
+
+
+MODEL = re.compile(r"(Model|Backbone|WithProjection)$|For[A-Z]|LMHead|DoubleHeads")
+NO_MODEL = re.compile(r"^(TF|Flax|Auto)|Pre[tT]rained|Config$|Processor|Collator|DataFormat|Dataset|Extractor|Output$|Criteria")
+
+
+def exported(mapped):
+    """(model_type, class) of the model classes that transformers exports and no mapping names: parts, and other heads."""
+    for name in sorted(dir(transformers)):
+        if name in mapped or not MODEL.search(name) or NO_MODEL.search(name):
+            continue
+        try:
+            cls = getattr(transformers, name)
+            mt = cls.config_class.model_type
+        except Exception:                                     # it wants a library that is not there, or is no model
+            continue
+        if mt in CONFIG_MAPPING_NAMES and issubclass(cls, transformers.PreTrainedModel):
+            yield mt, name
 
 
 def find_class(name):

@@ -65,11 +65,6 @@ def bracketed(text, *operators):
     return f"({text})" if top_level(text, operators) else text
 
 
-def either(old, new):
-    """An expression for both major versions."""
-    return old if old == new else f"major == 5 ? {bracketed(new, '?')} : {old}"
-
-
 def also(*conditions):
     """All conditions at once; None for none. `true` says nothing."""
     said = list(dict.fromkeys(c for c in conditions if c is not None and c != "true"))

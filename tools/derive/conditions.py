@@ -27,7 +27,7 @@ def literals(columns):
     """What can be asked of columns: null, flag, word, sign, a few values, comparison of two, membership."""
     out = []
     for c in columns:
-        out.extend(of_column(c))
+        out.extend(of_column(c) if c.there is None else guarded_by(c, of_column(c)))
     ints = [c for c in columns if c.kind() == "int"][:12]
     for a, b in itertools.combinations(ints, 2):
         va, vb = np.array(a.values), np.array(b.values)
@@ -44,6 +44,14 @@ def literals(columns):
     return keep
 
 
+def guarded_by(c, literals):
+    """The same of a key in a config that is not always there."""
+    config, there = c.there
+    there = np.array(there, dtype=bool)
+    for x in literals:
+        yield Literal(x.cost + .2, f"{config} != null && {x.text}", f"({config} == null || {x.opposite})", x.truth & there)
+
+
 def of_column(c):
     values = c.values
     nulls = np.array([v is None for v in values])
@@ -57,6 +65,8 @@ def of_column(c):
     if nulls.any():
         yield Literal(c.cost, f"{c.text} == null", f"{c.text} != null", nulls)
     some = [v for v in values if v is not None]
+    if any(isinstance(v, dict) for v in some):
+        return
     if any(isinstance(v, bool) for v in some):
         yield Literal(c.cost, f"{c.text} == true", f"{c.text} != true", np.array([v is True for v in values]))
         yield Literal(c.cost + .3, f"{c.text} == false", f"{c.text} != false", np.array([v is False for v in values]))
@@ -75,7 +85,7 @@ def of_column(c):
         for n in sorted({len(v) for v in some} - {0})[-6:]:
             yield when(.6, f"size({c.text}) >= {n}", f"size({c.text}) < {n}", [v is not None and len(v) >= n for v in values])
         for w in sorted({x for v in some for x in v if isinstance(x, str)})[:12]:
-            yield when(.6, f"{quoted(w)} in {c.text}", f"!({quoted(w)} in {c.text})", [v is not None and w in v for v in values])
+            yield when(.4, f"{quoted(w)} in {c.text}", f"!({quoted(w)} in {c.text})", [v is not None and w in v for v in values])
 
 
 def condition(truth, columns, extra=()):

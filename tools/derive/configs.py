@@ -20,8 +20,14 @@ TEXTS = {"llava": ["llama", "mistral", "qwen2", "gemma", "phi3"], "llava_next": 
          "instructblip": ["opt", "t5"], "video_llava": ["llama", "mistral"], "llava_next_video": ["llama", "mistral"], "instructblipvideo": ["opt", "t5"]}
 VISIONS = {"llava": ["clip_vision_model", "siglip_vision_model", "pixtral"], "llava_next": ["clip_vision_model", "siglip_vision_model"], "vipllava": ["clip_vision_model", "siglip_vision_model"],
            "llava_onevision": ["siglip_vision_model", "clip_vision_model"], "mistral3": ["pixtral"], "paligemma": ["siglip_vision_model"]}
-PAIRS = {"encoder-decoder": (("encoder", "bert"), ("decoder", "bert")), "speech-encoder-decoder": (("encoder", "wav2vec2"), ("decoder", "bert")),
-         "vision-encoder-decoder": (("encoder", "vit"), ("decoder", "gpt2")), "vision-text-dual-encoder": (("vision_config", "vit"), ("text_config", "bert"))}
+PAIRS = {"encoder-decoder": (("encoder", ["bert", "roberta", "bert-generation"]), ("decoder", ["bert", "gpt2", "roberta", "bert-generation"])),
+         "speech-encoder-decoder": (("encoder", ["wav2vec2", "hubert"]), ("decoder", ["bert", "mbart", "gpt2"])),
+         "vision-encoder-decoder": (("encoder", ["vit", "deit", "donut-swin", "swin", "beit"]), ("decoder", ["gpt2", "bert", "trocr", "mbart", "roberta"])),
+         "vision-text-dual-encoder": (("vision_config", ["vit", "clip_vision_model", "deit"]), ("text_config", ["bert", "roberta"]))}
+# What finds objects and depths is tried with, as its backbone.
+BACKBONES = {"dpt": ["dinov2", "beit", None], "depth_anything": ["dinov2"], "zoedepth": ["beit"], "upernet": ["swin", "convnext", "resnet"], "vitpose": ["vitpose_backbone"],
+             "mask2former": ["swin", "resnet"], "maskformer": ["swin", "resnet"], "oneformer": ["swin", "dinat"], "grounding-dino": ["swin"], "mm-grounding-dino": ["swin"],
+             "omdet-turbo": ["swin"], "vitmatte": ["vitdet"], "prompt_depth_anything": ["dinov2"]}
 
 
 def subconfigs(config):
@@ -37,18 +43,39 @@ def flatten(config, prefix="", out=None):
         if k in ("id2label", "label2id"):
             if k == "id2label" and isinstance(v, dict):
                 out[prefix + "num_labels"] = len(v)
-        elif k.startswith("_") or not isinstance(k, str):
+        elif not isinstance(k, str) or k.startswith("_") or not k.isidentifier():
             continue
         elif isinstance(v, dict):
             if (len(v) < 80 or "model_type" in v) and not k.startswith("task_specific"):
+                out[prefix + k] = {}                            # that it is there
                 flatten(v, f"{prefix}{k}.", out)
         elif v is None or isinstance(v, (bool, int, float, str)):
             out[prefix + k] = v
         elif isinstance(v, (list, tuple)) and len(v) < 300:
             out[prefix + k] = plain(v)
+    if not isinstance(config, dict):                            # a key can be read under its other names too
+        mirror(config, prefix, out)
     if not isinstance(config, dict) and not prefix and "num_labels" not in out and isinstance(getattr(config, "num_labels", None), int):
         out["num_labels"] = config.num_labels
     return out
+
+
+def mirror(config, prefix, out):
+    for alias, key in (getattr(config, "attribute_map", None) or {}).items():
+        if prefix + key in out:
+            out.setdefault(prefix + alias, out[prefix + key])
+    for sub, inner in subconfigs(config).items():
+        mirror(inner, f"{prefix}{sub}.", out)
+
+
+def other_names(config, prefix, out):
+    """{dotted key: [its other names]} of the configs inside a config."""
+    for sub, inner in subconfigs(config).items():
+        for alias, key in (getattr(inner, "attribute_map", None) or {}).items():
+            names = out.setdefault(f"{prefix}{sub}.{key}", [])
+            if alias not in names and alias not in vars(inner):
+                names.append(alias)
+        other_names(inner, f"{prefix}{sub}.", out)
 
 
 def plain(v):
@@ -87,7 +114,8 @@ def skeleton(model_type, config_class, rng):
     """What must be given before a class can be built at all, with the parts chosen at random where there is a choice."""
     if model_type in PAIRS:
         out = {}
-        for key, mt in PAIRS[model_type]:
+        for key, kinds in PAIRS[model_type]:
+            mt = rng.choice([k for k in kinds if k in CONFIG_MAPPING])
             extra = {"is_decoder": True, "add_cross_attention": True} if key == "decoder" else {}
             out[key] = {"model_type": mt, **extra}
         return out
@@ -96,13 +124,28 @@ def skeleton(model_type, config_class, rng):
         known = [t for t in table.get(model_type, []) if t in CONFIG_MAPPING]
         if known and rng.random() < .65:
             raw[key] = {"model_type": rng.choice(known)}
+    kinds = [k for k in BACKBONES.get(model_type, ()) if k in CONFIG_MAPPING or k is None]
+    if kinds and rng.random() < .6:
+        kind = rng.choice(kinds)
+        raw.update(backbone(kind) if kind else {"is_hybrid": False, "backbone_config": None})
     d = config_class(**copied(raw)).to_dict()
-    backbone = d.get("backbone_config")
-    if d.get("use_timm_backbone") or isinstance(backbone, dict) and backbone.get("model_type") == "timm_backbone":
+    if raw.get("backbone_config"):
+        if "use_timm_backbone" in d:
+            raw.update(use_timm_backbone=False, use_pretrained_backbone=False, backbone=None)
+        return raw
+    if d.get("use_timm_backbone") or isinstance(d.get("backbone_config"), dict) and d["backbone_config"].get("model_type") == "timm_backbone":
         raw["backbone_config"] = {"model_type": "resnet", "out_features": ["stage2", "stage3", "stage4"]}    # timm needs its own library
         if "use_timm_backbone" in d:
             raw.update(use_timm_backbone=False, use_pretrained_backbone=False, backbone=None)
     return raw
+
+
+def backbone(kind):
+    """A small backbone of this kind that gives out several maps."""
+    stages = {"dinov2": {"num_hidden_layers": 4, "out_features": ["stage1", "stage2", "stage3", "stage4"], "reshape_hidden_states": False},
+              "beit": {"num_hidden_layers": 4, "out_features": ["stage1", "stage2", "stage3", "stage4"], "reshape_hidden_states": False},
+              "vitdet": {"num_hidden_layers": 3, "out_features": ["stage3"]}, "vitpose_backbone": {"num_hidden_layers": 2, "out_indices": [2]}}
+    return {"backbone_config": {"model_type": kind, **stages.get(kind, {"out_features": ["stage1", "stage2", "stage3", "stage4"]})}}
 
 
 def random_raw(model_type, config_class, rng, keep=1.0):
@@ -232,6 +275,8 @@ def settle(model_type, over, base, rng):
     elif model_type == "hubert" or model_type.startswith(("wav2vec2", "wavlm", "unispeech", "data2vec-audio", "sew")):
         over.pop("conv_dim", None)
     settle_stages(model_type, over, base, rng)
+    if model_type in ("deberta", "deberta-v2") and rng.random() < .6:     # words of a list, which do nothing without the flag
+        over.update(relative_attention=True, pos_att_type=rng.choice([["c2p"], ["p2c"], ["p2c", "c2p"], "p2c|c2p"]))
     text = over.get("text_config")
     width = text.get("hidden_size") if isinstance(text, dict) else None
     if width:
@@ -242,6 +287,22 @@ def settle(model_type, over, base, rng):
                         over[name][k] = width
         if model_type == "paligemma":
             over.update(projection_dim=width, hidden_size=width)
+
+
+def with_lists_of_layers(raw, base, rng):
+    """The same with lists that have an entry for each layer cut to the number of layers there is now."""
+    out = copied(raw)
+    for key, sub in subconfigs(base).items():
+        if isinstance(out.get(key), dict):
+            out[key] = with_lists_of_layers(out[key], sub, rng)
+    was, now = getattr(base, "num_hidden_layers", None), out.get("num_hidden_layers")
+    if not is_int(was) or not is_int(now):
+        return out
+    for key, value in base.to_dict().items():
+        if isinstance(value, list) and len(value) == was > 1 and key not in ("out_features", "stage_names"):
+            at = sorted(rng.sample(range(was), min(now, was)))
+            out[key] = [value[n] for n in at]
+    return out
 
 
 def settle_mllama(text, rng):
@@ -288,7 +349,9 @@ def alternatives(key, v, words):
     if v is None:
         if said:
             return said[:4]
-        return [8, 16, 1, 2, 24, True] if OPTIONAL.search(leaf) else [True, 8] if FLAG.search(leaf) else []
+        if re.search("_idxs$|_indexes$|_indices$|layers_to|_layers_list$|_layer_ids$", leaf):
+            return [[0], [1], [0, 2], []]
+        return [8, 16, 1, 2, 24, True] if OPTIONAL.search(leaf) else [True, 8]
     if isinstance(v, list):
         return list_alternatives(leaf, v, said)
     return []
@@ -308,12 +371,70 @@ def list_alternatives(leaf, v, said):
             for shift in range(len(values)):
                 out.append([values[(j + shift) % len(values)] for j in range(len(v))])
             out += [[x] * len(v) for x in values[:3]]
+        if re.search("features", leaf):
+            out += [v[-1:], v[:1], v[::2]]
         return [x for x in out if x != v] + ([v[1:], v[:-1]] if len(v) > 1 else [])
     if all(isinstance(x, (list, tuple)) for x in v) and all(is_int(y) for x in v for y in x):
         return [[[y * 2 for y in x] for x in v], [[y + 1 for y in x] for x in v], v[:-1]] + [[[y * (2 if j == q else 1) for y in x] for j, x in enumerate(v)] for q in range(min(3, len(v)))]
     if all(isinstance(x, bool) for x in v):
         return [[not x for x in v], [not v[0], *v[1:]], [*v[:-1], not v[-1]], [j % 2 == 0 for j in range(len(v))]]
     return [v[:-1]] if len(v) > 1 else []
+
+
+COMPARED = re.compile(r"c\.([\w.]+?)(?:\[(\d+)\])? (==|!=|<=|>=|<|>) (.+)")
+
+
+def flipped(text, flat):
+    """(key, value) that may make a comparison come out otherwise."""
+    # A place from the end as the number it is in this config.
+    text = re.sub(r"\[size\(c\.([\w.]+)\) - (\d+)\]", lambda m: f"[{max(len(flat.get(m[1]) or ()) - int(m[2]), 0)}]", text)
+    m = re.fullmatch(r'c\.([\w.]+)\.(startsWith|endsWith|contains)\("(.*)"\)', text)
+    if m and isinstance(flat.get(m[1]), str):
+        tail = flat[m[1]].split("-")[-1]
+        yield m[1], {"startsWith": m[3] + tail, "endsWith": tail + m[3], "contains": m[3] + tail}[m[2]]
+        return
+    m = re.fullmatch(r"(.+) in c\.([\w.]+)", text)
+    if m and isinstance(flat.get(m[2]), list):
+        x = m[1].strip('"') if m[1].startswith('"') else int(m[1]) if m[1].isdigit() else None
+        yield m[2], [v for v in flat[m[2]] if v != x] if x in flat[m[2]] else [*flat[m[2]], x]
+        return
+    for left, right in sides(text):
+        key, at, value = left
+        now = flat.get(key)
+        if at is not None:
+            if not isinstance(now, list) or at >= len(now):
+                continue
+            now = now[at]
+        other = valued(right, flat)
+        if isinstance(other, str) and isinstance(now, (str, type(None))):
+            options = [other]
+        elif is_int(other) and (is_int(now) or now is None):
+            options = [other, other + 1, max(other - 1, 0), 2 * other + 8]
+        else:
+            continue
+        for x in options:
+            if x != now:
+                yield key, x if at is None else [x if n == at else y for n, y in enumerate(flat[key])]
+
+
+def sides(text):
+    """((key, index, None), other side) of a comparison, for each side that is a key."""
+    m = COMPARED.fullmatch(text)
+    if m:
+        yield (m[1], m[2] and int(m[2]), None), m[4]
+    m = re.fullmatch(r"(.+) (?:==|!=|<=|>=|<|>) c\.([\w.]+?)(?:\[(\d+)\])?", text)
+    if m:
+        yield (m[2], m[3] and int(m[3]), None), m[1]
+
+
+def valued(text, flat):
+    if text.startswith('"'):
+        return text.strip('"')
+    from . import evaluate
+    try:
+        return evaluate.value(text, flat)
+    except Exception:                                         # it asks for what this config does not have
+        return None
 
 
 def same_length_lists(flat):
@@ -332,6 +453,8 @@ def compared_words(*sources):
     for source in sources:
         for m in re.finditer(r"(\w+)(?:\[[^\]\n]*\])?\s*(?:==|!=|not in|in)\s*" + strings, source):
             add_words(out, m[1], m[2])
+        for m in re.finditer(r"([\"'][\w.\-]+[\"'])\s+(?:not )?in\s+(?:self\.)?(?:config\.)?(\w+)", source):
+            add_words(out, m[2], m[1])
         for m in re.finditer(r"(\w+)\s*:\s*(?:list\[)?Literal\[((?:\s*[\"'][\w.\-]+[\"']\s*,?)+)", source):
             add_words(out, m[1], m[2])
     for k in list(out):                                         # a list of layer types, compared one by one

@@ -2,6 +2,8 @@
 import inspect
 import json
 
+from . import store
+
 
 def row(transform):
     """One transform in the form of the project's knowledge files."""
@@ -36,13 +38,15 @@ def instances(args, version, identifiers, patterns):
         fit = json.loads(path.read_text())
         target = folder / "instances" / path.name
         names = {x for _, name, model_type in fit["models"] for x in (name, model_type)} | {fit["class"], fit["model_type"]}
-        if target.exists() or not names & (identifiers.keys() | patterns.keys()):
+        unseen = folder / "unseen" / "a" / f"{fit['class']}.json.gz"
+        if target.exists() or not names & (identifiers.keys() | patterns.keys()) or not unseen.exists():
+            continue
+        config = next((r["config"] for r in store.read(unseen) if r["kind"] == "full" and "error" not in r), None)
+        if config is None:
             continue
         try:
             cls = getattr(transformers, fit["class"])
-            with (folder / "fresh" / f"{fit['class']}.jsonl").open() as lines:
-                config = cls.config_class.from_dict(json.loads(next(lines))["config"])
-            model = build(cls, config).instance
+            model = build(cls, cls.config_class.from_dict(dict(config))).instance
             rows = []
             for transform in get_model_conversion_mapping(model, add_legacy=False):
                 told = row(transform)
@@ -53,7 +57,7 @@ def instances(args, version, identifiers, patterns):
                     "ignore_unexpected": listed(model, "_keys_to_ignore_on_load_unexpected")}
         except Exception as e:                                # whatever a model raises
             told = {"error": f"{type(e).__name__}: {e}"[:200]}
-        target.write_text(json.dumps(told, sort_keys=True) + "\n")
+        target.write_text(json.dumps({"config": config, **told}, sort_keys=True) + "\n")
 
 
 def main(args):

@@ -10,12 +10,36 @@ def divide(a, b):
     return a // b if isinstance(a, int) and isinstance(b, int) else a / b
 
 
+def split(x, separator):
+    """A list as it is; the words of a text."""
+    return [w.strip() for w in x.lower().split(separator)] if isinstance(x, str) else x
+
+
+def absent(e, key):
+    """As in CEL: a key that nobody gave is null, and one of a config that is not there is an error."""
+    parent = key.rpartition(".")[0]
+    if parent and e.get(parent) is None:
+        raise KeyError(key)
+    return None
+
+
 def item(xs, n):
-    return xs[n] if xs is not None and 0 <= n < len(xs) else None
+    """As in CEL: beyond a list's end there is nothing, and asking is an error."""
+    if n < 0:
+        raise IndexError(n)
+    return xs[n]
+
+
+def within(text):
+    """An element beyond a list's end is null to the fitter and an error to CEL: the same said by the index."""
+    text = re.sub(r"(c(?:\.\w+)+)\[([ijkl])( \+ 1)?\] == null", r"\2\3 >= size(\1)", text)
+    text = re.sub(r"(c(?:\.\w+)+)\[([ijkl])( \+ 1)?\] != null", r"\2\3 < size(\1)", text)
+    return re.sub(r"c(?:\.\w+)+\[([ijkl]) - 1\] ([!=])= null", lambda m: f"{m[1]} == 0" if m[2] == "=" else f"{m[1]} > 0", text)
 
 
 FUNCTIONS = {"size": lambda x: len(x) if x is not None else 0, "sum": sum, "pow": pow, "isqrt": math.isqrt, "floor": lambda x: math.floor(x + 1e-12),
-             "double": float, "min": min, "max": max, "range": lambda n: list(range(n))}
+             "double": float, "min": min, "max": max, "range": lambda n: list(range(n)), "split": split, "ceil": lambda x: math.ceil(x - 1e-12)}
+METHODS = {"startsWith": str.startswith, "endsWith": str.endswith, "contains": lambda s, part: part in s}
 OPERATORS = {"==": lambda a, b: a == b and isinstance(a, bool) == isinstance(b, bool), "!=": lambda a, b: not (a == b and isinstance(a, bool) == isinstance(b, bool)),
              "<": lambda a, b: a < b, ">": lambda a, b: a > b, "<=": lambda a, b: a <= b, ">=": lambda a, b: a >= b, "in": lambda a, b: a in b,
              "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "/": divide, "%": lambda a, b: a % b}
@@ -101,8 +125,13 @@ class Parser:
             return self.mapped(token)
         if token in FUNCTIONS and self.take("("):
             return self.call(FUNCTIONS[token])
+        key, _, method = token.removeprefix("c.").rpartition(".")
+        if method in METHODS and self.take("("):
+            argument = self.ternary()
+            self.need(")")
+            return lambda e: METHODS[method](e[key], argument(e))
         key = token.removeprefix("c.")
-        return lambda e: e.get(key)
+        return lambda e: e[key] if key in e else absent(e, key)
 
     def call(self, f):
         args = []
@@ -133,11 +162,12 @@ class Parser:
 
     def mapped(self, token):
         key = token.removesuffix(".map").removeprefix("c.")
-        return self.mapping(lambda e: e.get(key))
+        return self.mapping(lambda e: e[key] if key in e else absent(e, key))
 
 
 @functools.lru_cache(maxsize=100000)
 def compiled(text):
+    text = within(text)
     p = Parser(text.replace(").map(", ") .map(").replace("] .map", "].map"))
     f = p.ternary()
     if p.peek() is not None:

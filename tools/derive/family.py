@@ -4,18 +4,24 @@ import gzip
 import json
 import re
 from collections import defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from .cel import also, paths, tidy, top_level
+from .cel import paths, tidy, top_level
+from .evaluate import within
+from .keys import NOISE
 from .tree import Item
+
+
+# What no sample tells apart: null and unknown words are as `absolute` to every class that compares this key.
+RELATIVE = re.compile(r"(c(?:\.\w+)*\.position_embedding_type) != 'absolute'")
 
 
 def tidied(value):
     """The same with tidy expressions, 'words' in single quotes so that they need no escapes inside a string."""
     if isinstance(value, str):
-        return tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value)))
+        return RELATIVE.sub(r"(\1 == 'relative_key' || \1 == 'relative_key_query')", tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value))))
     if isinstance(value, list):
         return [tidied(v) for v in value]
     if isinstance(value, dict):
@@ -23,51 +29,12 @@ def tidied(value):
     return value
 
 
-def within(text):
-    """An element beyond a list's end is null to the fitter and an error to CEL: the same said by the index."""
-    text = re.sub(r"(c(?:\.\w+)+)\[i( \+ 1)?\] == null", r"i\2 >= size(\1)", text)
-    text = re.sub(r"(c(?:\.\w+)+)\[i( \+ 1)?\] != null", r"i\2 < size(\1)", text)
-    return re.sub(r"c(?:\.\w+)+\[i - 1\] ([!=])= null", lambda m: "i == 0" if m[1] == "=" else "i > 0", text)
-
-
 def load(path, otherwise=None):
     return json.loads(Path(path).read_text()) if Path(path).exists() else otherwise
 
 
-# Keys that a model class reads though its config class does not declare them, so that sampling cannot know of them:
-# {model_type: (key, its default, which tensors it decides on, the condition)}.
-UNDECLARED = {
-    # modeling_siglip.py: `True if not hasattr(config, "vision_use_head") else config.vision_use_head`
-    "siglip_vision_model": ("vision_use_head", True, re.compile(r"(vision_model\.)?head\."), "c.vision_use_head == true"),
-}
-
-# Tensors that are not there when two values are equal, which random values hardly ever are: {model_type: (names, condition)}.
-UNEQUAL = {
-    # modeling_sew.py: `self.project_features = config.conv_dim[-1] != config.hidden_size`
-    "sew": (re.compile(r"(sew\.)?feature_projection\."), "c.conv_dim[size(c.conv_dim) - 1] != c.hidden_size"),
-}
-
-# What a config class computes whatever is given, from a list's length that no sample varies: {model_type: {key: how}}.
-SWIN = {"hidden_size": "c.embed_dim * pow(2, size(c.depths) - 1)"}  # configuration_swin.py: `int(embed_dim * 2 ** (len(depths) - 1))`
-COMPUTED = {"swin": SWIN, "swinv2": SWIN, "maskformer-swin": SWIN, "donut-swin": SWIN}
-
 # Sub-configs that take the outer config's own values when there is none: `Qwen2VLConfig.__post_init__` of transformers 5.
 FLAT = {"qwen2_vl": "text_config", "qwen2_5_vl": "text_config"}
-
-
-def hand_conditions(model_type):
-    if model_type in UNDECLARED:
-        yield UNDECLARED[model_type][2:]
-    if model_type in UNEQUAL:
-        yield UNEQUAL[model_type]
-
-
-def always(model_type, value):
-    """The same with the keys that a config class computes by itself written out."""
-    text = json.dumps(value)
-    for key, how in COMPUTED.get(model_type, {}).items():
-        text = re.sub(rf"\bc\.{key}\b", f"({how})", text)
-    return json.loads(text)
 
 
 @dataclass
@@ -121,8 +88,6 @@ class Fit:
                 continue
             item = Item(name, repeats(e), e.get("when"), buffer=True)
             out.insert(neighbour(name, out), item)
-        for names, condition in hand_conditions(self.raw["model_type"]):
-            out = [replace(i, when=also(condition, i.when)) if names.match(i.name) else i for i in out]
         return out
 
     kept_buffers = frozenset()
@@ -138,6 +103,26 @@ class Fit:
             if head(item.name) in before or any(n.startswith(item.name.split("{")[0]) for n in self.order[:starts[0]]):
                 at = index + 1
         return at
+
+
+LAYERS = re.compile(r"^c\.(\w+\.)*(num_hidden_layers|n_layers?|num_layers|encoder_layers|decoder_layers|depth)$")
+
+
+def clamped(tensors):
+    """No tensor lies in a layer that there is none of: `first_k_dense_replace` may be more than `num_hidden_layers`."""
+    whole = {}                                               # what all layers of a list have, by what their names start with
+    for name, entry in tensors:
+        repeat = entry.get("repeat", [])
+        if len(repeat) == 1 and not entry.get("when") and LAYERS.match(repeat[0][1]):
+            whole.setdefault(name.split("{")[0], repeat[0][1])
+    out = []
+    for name, entry in tensors:
+        repeat, count = entry.get("repeat", []), whole.get(name.split("{")[0])
+        if count and repeat and name.split("{")[1].startswith(f"{repeat[0][0]}}}") and repeat[0][1].startswith("c.") and repeat[0][1] != count \
+                and re.fullmatch(r"c\.[\w.]+", repeat[0][1]):
+            entry = {**entry, "repeat": [[repeat[0][0], f"min({repeat[0][1]}, {count})"], *repeat[1:]]}
+        out.append([name, entry])
+    return out
 
 
 def repeats(entry):
@@ -188,23 +173,25 @@ class Version:
             out.configs[path.stem] = load(path)
         for path in sorted((folder / "fit").glob("*.json")):
             raw = load(path)
-            for key in ("tensors", "buffers", "parts", "computed"):
-                raw[key] = always(raw["model_type"], tidied(raw.get(key) or []))
-            fresh = folder / "fresh" / f"{raw['class']}.jsonl"
-            if not fresh.exists():
-                out.reasons[raw["class"]] = "no unseen configs to verify on"
-                continue
-            with fresh.open() as lines:
-                line = next(lines, None)
-            if line is None:
-                out.reasons[raw["class"]] = "no unseen configs to verify on"
-            elif raw.get("unexplained"):
+            for key in ("tensors", "buffers", "parts", "refuses"):
+                raw[key] = tidied(raw.get(key) or [])
+            raw["tensors"] = clamped(raw["tensors"])
+            if raw.get("unexplained"):
                 what = raw["unexplained"][0]
                 out.reasons[raw["class"]] = "not explained: " + " ".join(str(w) for w in (what if isinstance(what, list) else [what]))[:100]
             else:
-                out.fits[raw["class"]] = Fit(raw, list(json.loads(line)["state_dict"]), out.auto)
+                out.fits[raw["class"]] = Fit(raw, raw["order"], out.auto)
                 out.reasons.pop(raw["class"], None)
+        for config in out.configs.values():
+            config["computed"] = [[k, tidied(text), mode] for k, text, mode in config["computed"]]
+            config["refuses"] = tidied(config.get("refuses") or [])
         return out
+
+    @property
+    def release(self):
+        """The version as one number, as expressions compare it."""
+        major, minor, *_ = self.version.split(".")
+        return 100 * int(major) + int(minor)
 
     def model_type(self, name):
         return self.fits[name].raw["model_type"]
@@ -213,7 +200,7 @@ class Version:
         """Model types a sub-config may have, as far as known. One that bears its owner's name goes by both."""
         if self.sub_config(model_type, key).get("type") == model_type:
             return {f"{model_type}.{key}"}
-        told = {self.sub_config(model_type, key).get("type")}
+        told = {self.sub_config(model_type, key).get("type"), *self.sub_config(model_type, key).get("kinds", ())}
         for fit in self.family(model_type):
             for p in fit.raw["parts"]:
                 if p.get("config") == key:
@@ -254,22 +241,57 @@ class Version:
             return json.load(file)["sub"].get(key, {}).get("own") or {}
 
     def static(self, model_type):
-        """Values of the config class's keys, its own first."""
-        out = dict(self.configs.get(model_type, {}).get("defaults") or {})
-        for fit in self.family(model_type):
-            for key, value in fit.raw["defaults"].items():
-                out.setdefault(key, value)
-        if model_type in UNDECLARED:
-            out.setdefault(*UNDECLARED[model_type][:2])
-        return {k: v for k, v in out.items() if "." not in k}
+        """Values of the config class's keys."""
+        return {k: v for k, v in (self.configs.get(model_type, {}).get("defaults") or {}).items() if "." not in k}
 
     def computed(self, model_type):
-        out = dict(self.configs.get(model_type, {}).get("computed") or ())
-        for fit in self.family(model_type):
-            for key, text in fit.raw["computed"]:
-                out.setdefault(key, text)
-        out.update(COMPUTED.get(model_type, {}))
-        return {k: v for k, v in out.items() if "." not in k}
+        """{key: (expression, mode)} in the order they are computed in."""
+        return {k: (text, mode) for k, text, mode in self.configs.get(model_type, {}).get("computed") or () if "." not in k}
+
+    def aliases(self, model_type):
+        return self.configs.get(model_type, {}).get("aliases") or {}
+
+    @cached_property
+    def varied_inside(self):
+        """{model type: keys that were varied while its config lay in another}."""
+        out = defaultdict(set)
+        for fit in self.fits.values():
+            for key in fit.raw["varied"]:
+                path, _, leaf = key.rpartition(".")
+                if path and "." not in path:
+                    for t in self.types(fit.raw["model_type"], path):
+                        out[t].add(leaf)
+        return out
+
+    def of_others(self, model_type):
+        """Keys that only other config classes of the same modeling module declare: its source reads them of those."""
+        modules = {f.raw["module"] for f in self.family(model_type)}
+        near = {f.raw["model_type"] for f in self.fits.values() if f.raw["module"] in modules} - {model_type}
+        declared = set().union(*(self.configs.get(t, {}).get("declared", ()) for t in near))
+        return declared - set(self.configs.get(model_type, {}).get("declared", ()))
+
+    def unvaried(self, model_type, used):
+        """{key: its default} of keys that the source reads, that no expression uses, and that no sample had another value of."""
+        config = self.configs.get(model_type)
+        if config is None:
+            return {}
+        family = self.family(model_type)
+        reads = set(config["reads"]).union(*(f.raw["source_reads"] for f in family), *(f.raw["absent"] for f in family))
+        varied = set(config["varied"]).union(*(f.raw["varied"] for f in family)) | self.varied_inside[model_type]
+        left = reads - varied - used - set(self.aliases(model_type)) - set(config["configs"]) - self.of_others(model_type)
+        static = config["defaults"]
+        return {k: static.get(k) for k in sorted(left) if "." not in k and not NOISE.search(k) and not NO_KEY.search(k) and simple(static.get(k))}
+
+
+# What is read of a config that is no key of it, or that every config has and no class builds by.
+NO_KEY = re.compile(r"^(_|to_|get_|from_|update|save|is_composition|name_or_path|num_labels|architectures|quantization_config|sub_configs|layer_types_|use_return_dict|attribute_map"
+                    r"|keys_to|auto_map|output_attentions|use_bfloat16|tie_encoder_decoder$|is_encoder_decoder$|base_config|per_layer_config|is_heterogeneous|text_config|vision_config"
+                    r"|(\w+_)?act(ivation)?(_fn|_func|_function)?$|forced_|max_length$|min_length$|num_beam|length_penalty|no_repeat|do_sample|num_return|decoder_start|max_new"
+                    r"|generation|head_mask|items|keys|values|copy|pop|get)")
+
+
+def simple(v):
+    return v is None or isinstance(v, (bool, int, float, str, list))
 
 
 def expressions(items):
@@ -277,8 +299,9 @@ def expressions(items):
         yield from (text for text in (item.when, item.tied_when, *(item.shape or ()), *(count for _, count in item.repeat)) if text)
 
 
-def used_keys(version, classes):
-    """{model_type: keys} that the templates of the classes read, with what those keys are computed from."""
+def used_keys(version, classes, corners=None, kept=()):
+    """{model_type: keys} that the templates and the corners of the classes read, and those of classes kept from the files, with what those
+    keys are computed from."""
     used = defaultdict(set)
 
     def read(model_type, path):
@@ -291,7 +314,9 @@ def used_keys(version, classes):
         if first in used[model_type]:
             return
         used[model_type].add(first)
-        for inner in paths(version.computed(model_type).get(first, "")):
+        if first in version.aliases(model_type):
+            read(model_type, version.aliases(model_type)[first][0])
+        for inner in paths(version.computed(model_type).get(first, ("", ""))[0]):
             read(model_type, inner)
 
     def read_values(model_type, value):
@@ -308,6 +333,9 @@ def used_keys(version, classes):
         for text in expressions(fit.items):
             for path in paths(text):
                 read(model_type, path)
+        for corner in (corners or {}).get(name, ()):
+            for path in paths(corner["when"]):
+                read(model_type, path)
         for item in fit.parts:
             if item.part.get("config"):
                 read(model_type, item.part["config"])
@@ -320,7 +348,11 @@ def used_keys(version, classes):
                         for text in expressions(version.fits[other].items):
                             for path in paths(text):
                                 read(model_type, path)
-    for model_type in {version.model_type(n) for n in classes}:
+    for each in kept:
+        for path in [*each.configs(), *(path for text in each.texts() for path in paths(text))]:
+            read(each.model_type, path)
+            used[each.model_type].add(path.split(".")[0])
+    for model_type in {version.model_type(n) for n in classes} | {each.model_type for each in kept}:
         for spec in version.sub_configs(model_type).values():
             read_values(model_type, spec.get("absent"))
             read_values(model_type, spec.get("set"))

@@ -1,19 +1,35 @@
-"""One list of tensors for two transformers versions: what is equal is said once, what differs says so in place."""
+"""One list of tensors for two transformers versions, or more: what is equal is said once, what differs says so in place."""
 import difflib
 from dataclasses import replace
 
-from .cel import also, either
+from .cel import also, bracketed
 from .tree import Item
-
-MAJORS = ("4", "5")
-
 
 class Apart(Exception):
     """The versions differ in a way that one entry cannot say."""
 
 
-def merged(old, new, prefer=None):
-    """Items for both majors. `prefer`: "4" or "5" to take that one's expressions wherever both have the tensor."""
+class Border:
+    """Where the newer of two versions begins."""
+
+    def __init__(self, release):
+        self.release = release
+
+    @property
+    def newer(self):
+        return f"major == {self.release // 100}" if self.release >= 500 else f"release >= {self.release}"
+
+    @property
+    def older(self):
+        return f"major < {self.release // 100}" if self.release >= 500 else f"release < {self.release}"
+
+    def either(self, old, new):
+        """An expression for both."""
+        return old if old == new else f"{self.newer} ? {bracketed(new, '?')} : {bracketed(old, '?')}"
+
+
+def merged(old, new, border, prefer=None):
+    """Items for both. `prefer`: "old" or "new" to take that one's expressions wherever both have the tensor."""
     ours, theirs = {i.name: i for i in old}, {i.name: i for i in new}
     if len(ours) < len(old) or len(theirs) < len(new):
         raise Apart("a name twice")
@@ -27,15 +43,15 @@ def merged(old, new, prefer=None):
                 continue
             done.add(name)
             if name in ours and name in theirs:
-                out.append(one(ours[name], theirs[name], prefer))
+                out.append(one(ours[name], theirs[name], border, prefer))
             elif name in ours:
-                out.append(replace(ours[name], when=also("major == 4", ours[name].when)))
+                out.append(replace(ours[name], when=also(border.older, ours[name].when)))
             else:
-                out.append(replace(theirs[name], when=also("major == 5", theirs[name].when)))
+                out.append(replace(theirs[name], when=also(border.newer, theirs[name].when)))
     return out
 
 
-def one(a: Item, b: Item, prefer):
+def one(a: Item, b: Item, border, prefer):
     if a == b:
         return a
     if a.kind != b.kind:
@@ -44,29 +60,29 @@ def one(a: Item, b: Item, prefer):
         raise Apart(a.name)
     if a.tied_to and b.tied_to and a.tied_to != b.tied_to:
         raise Apart(f"{a.name}: tied to different tensors")
-    choose = {"4": lambda x, y: x, "5": lambda x, y: y, None: either}[prefer]
+    choose = {"old": lambda x, y: x, "new": lambda x, y: y, None: border.either}[prefer]
     joined = replace(
         b,
         repeat=[(i, choose(x, y)) for (i, x), (_, y) in zip(a.repeat, b.repeat)],
-        when=condition(a.when, b.when, choose),
+        when=condition(a.when, b.when, border, choose),
         part=part(a.part, b.part) if a.part else None,
         shape=None if a.shape is None else [choose(x, y) for x, y in zip(a.shape, b.shape)],
     )
     if a.tied_to or b.tied_to:
         joined.tied_to = a.tied_to or b.tied_to
         sides = [i.tied_when or "true" if i.tied_to else "false" for i in (a, b)]
-        joined.tied_when = condition(*sides, choose if a.tied_to and b.tied_to else either)
+        joined.tied_when = condition(*sides, border, choose if a.tied_to and b.tied_to else border.either)
     return joined
 
 
-def condition(a, b, choose):
+def condition(a, b, border, choose):
     a, b = a or "true", b or "true"
-    if choose is either and a != b:
+    if choose == border.either and a != b:
         if "true" in (a, b):
-            major, other = ("4", b) if a == "true" else ("5", a)
-            return f"major == {major} || {also(other)}" if "?" not in other else f"major == {major} || ({other})"
+            side, other = (border.older, b) if a == "true" else (border.newer, a)
+            return f"{side} || {also(other)}" if "?" not in other else f"{side} || ({other})"
         if "false" in (a, b):
-            return also("major == 5", b) if a == "false" else also("major == 4", a)
+            return also(border.newer, b) if a == "false" else also(border.older, a)
     text = choose(a, b)
     return None if text == "true" else text
 

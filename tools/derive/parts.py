@@ -74,6 +74,9 @@ def find(samples, name, known, root):
 def left_out(prefix, rows):
     """The shortest prefixes of what the composition leaves out, or None where they would take along something it has."""
     inside = {n[len(prefix):] for *_, s in rows for n in s.tensors if n.startswith(prefix)}
+    ends = {"*." + n.split(".")[-1] for _, lacks, _, _ in rows for n in lacks}
+    if len(ends) == 1 and not any(n.endswith(end[1:]) for n in inside for end in ends):
+        return sorted(ends)
     out = set()
     for _, lacks, _, _ in rows:
         for n in lacks:
@@ -137,7 +140,7 @@ def fit_ties(fitter, samples, done, inside, about):
                     tied[n, ix] = to
         if not tied:
             continue
-        to = common_target(tied)
+        to = common_target(tied) or chosen_target(fitter, tied)
         if to is None:
             bad.append([pattern, "tie", str(sorted(set(tied.values()))[:3])])
             continue
@@ -158,6 +161,20 @@ def fit_ties(fitter, samples, done, inside, about):
         except Exception as e:
             bad.append([pattern, "tie", str(e)])
     return bad
+
+
+def chosen_target(fitter, tied):
+    """A target that depends on the config: `{CONDITION ? 'this.weight' : 'that.weight'}`."""
+    targets = sorted(set(tied.values()))
+    if len(targets) != 2 or any(indices for _, indices in tied):
+        return None
+    rows = sorted(tied)
+    truth = tuple(tied[r] == targets[0] for r in rows)
+    try:
+        when = fitter.truth("tie", rows, truth, {n: tied[n, ()] for n, _ in rows})
+    except Exception:                                         # no condition tells which
+        return None
+    return "{" + when.replace('"', "'") + f" ? '{targets[0]}' : '{targets[1]}'" + "}"
 
 
 def spelled(pattern, indices):

@@ -1,12 +1,12 @@
 """Samples: each class built on many configs, a key changed at a time, written to `samples/<Class>.json.gz`.
 
 For every class: some random bases; one base with every key changed once (the scan); more values, on more bases, for
-keys that had an effect; bases on which every optional tensor exists; mixtures of everything that had an effect, and
-keys made equal on purpose. And configs no fit ever sees, in `fresh/<Class>.jsonl`.
+keys that had an effect; bases on which every optional tensor exists; mixtures of everything that had an effect, keys
+made equal on purpose, and what the class compared made to come out otherwise. All of it is followed (`trace.py`).
 """
+import copy
 import gc
 import gzip
-import inspect
 import json
 import os
 import random
@@ -19,66 +19,149 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TRANSFORMERS_VERBOSITY", "critical")
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
-from . import catalogue, configs  # noqa: E402
-from .build import TooSlow, alone, build, essence, facts, nested_models, without_initialisation  # noqa: E402
+from . import catalogue, config_sample, configs, evaluate, sources, trace  # noqa: E402
+from .build import TooSlow, alone, build, facts, nested_models, without_initialisation  # noqa: E402
 from .catalogue import VERSION  # noqa: E402
 from .configs import alternatives, candidates, changed, copied, flatten, is_int, random_raw  # noqa: E402
+from .keys import FLAG, NOISE, OPTIONAL  # noqa: E402
+from .names import skeleton  # noqa: E402
+from .output import failed, write_json  # noqa: E402
 
 MEMORY = 5 << 30
-HEAD_KEY = "label|tie|classif|pool|proj|head|summary|vocab|decoder|bias|^num_|use_"
-BASES, FRESH, OMITTED, MIXED, EQUAL = 6, 8, 4, 12, 6
-# A budget in modules built, not in seconds, so that the same version gives the same samples. A module costs about 60 µs.
-FIRST_BUDGET, OTHER_BUDGET, LEAST = 7000, 1800, 30
-CLASS_SECONDS = 45                                            # a stop for what the budget does not see
+BASES, MIXED, EQUAL, FLIPS = 6, 24, 6, 40
+# A budget in modules built, not in seconds, so that the same version gives the same samples. A module costs about 100 µs.
+FIRST_BUDGET, OTHER_BUDGET, LEAST = 9000, 5000, 40
+CLASS_SECONDS = 60                                            # a stop for what the budget does not see
+
+
+class Traced:
+    """What the instantiations of a class told, together."""
+
+    def __init__(self):
+        self.dims, self.literals, self.counts, self.reads, self.absent, self.opaque = {}, {}, {}, set(), {}, False
+        self.sites = {}                                       # place in the source -> values its loop index had
+        self.names = {}                                       # path of a config inside -> {key: its other names}
+
+    def add(self, record, model):
+        self.reads |= record.reads.keys()
+        self.absent.update({k: v for k, v in record.absent.items() if k not in self.absent})
+        self.opaque |= record.opaque
+        self.compared(record)
+        self.counts.update(dict.fromkeys(SITE.sub(r"@\2", t) for t in record.counts))
+        for name, texts in trace.dimensions(model).items():
+            self.dimensions(name, texts)
+
+    def compared(self, record):
+        for text in [*record.literals, *record.counts]:
+            for value, place in SITE.findall(text):
+                values = self.sites.setdefault(place, [])
+                if int(value) not in values and len(values) < 8:
+                    values.append(int(value))
+        for text in record.literals:
+            if len(self.literals) < 600:
+                self.literals.setdefault(SITE.sub(r"@\2", text), True)
+
+    def dimensions(self, name, texts):
+        pattern, indices = skeleton(name)
+        per = self.dims.setdefault(pattern, {})
+        for k, text in enumerate(texts):
+            if text is not None:
+                rows = per.setdefault(k, {}).setdefault(NUMBER.sub("#", text), [])
+                if len(rows) < 3 and [list(indices), text] not in rows:
+                    rows.append([list(indices), text])
+
+    def packed(self):
+        dims = {p: {k: [r for rows in list(kinds.values())[:12] for r in rows] for k, kinds in per.items()} for p, per in self.dims.items()}
+        return {"dims": dims, "literals": list(self.literals), "counts": list(self.counts), "reads": sorted(self.reads), "absent": self.absent,
+                "names": self.names, "sites": self.sites}
+
+
+SITE = re.compile(r"@(\d+)_(\d+)")
+NUMBER = re.compile(r"@\d+_\d+|\d+")
 
 
 class Sampler:
     """All samples of one class."""
 
-    def __init__(self, cls, config_class, model_type, raws, words, known, budget, hints):
-        # `hints`: for classes around one already sampled, the keys that had an effect there; others only if named by this class.
-        self.hints, self.text = hints, class_source(cls)
+    def __init__(self, cls, config_class, model_type, raws, words, known, budget):
         self.cls, self.config_class, self.model_type, self.words = cls, config_class, model_type, words
         self.budget, self.spent, self.count, self.started = budget, 0, 0, time.time()
         self.samples, self.seen, self.errors, self.device = [], {}, {}, "meta"
         self.rng = random.Random(f"sample/{cls.__name__}")
         self.raws, self.known, self.facts = raws, known, None
         self.effective, self.values, self.parts = {}, {}, {}
+        self.traced, self.varied, self.first, self.raised = Traced(), set(), {}, []
 
     # -- one instantiation
 
     def make(self, raw, parent=None, key=None):
-        """Build `raw` and remember it. None where it cannot be built or was built before."""
+        """Build `raw` and remember it. None where it cannot be built, was built before, or reads nothing that differs."""
         mark = json.dumps(raw, sort_keys=True, default=str)
         if mark in self.seen:
             return None
-        self.seen[mark] = None
+        self.seen[mark] = flat = None
         try:
             config = self.config_class(**copied(raw))
-            b = build(self.cls, config, self.device)
+            flat = flatten(config)
+            if parent is not None and self.reads_the_same(flat, self.samples[parent]):
+                self.varied.add(key)
+                return None
+            b, reads = self.built(config)
+            b.flat = flat
         except MemoryError:
             raise
         except Exception as e:
             note = f"{type(e).__name__}: {e}"[:120]
             self.errors[note] = self.errors.get(note, 0) + 1
+            if flat is not None and len(self.raised) < 80 and not isinstance(e, TooSlow):
+                self.raised.append([flat, f"{type(e).__name__}: {e}"[:200]])
             return None
+        self.varied.add(key)
         self.spent += b.modules
         self.count += 1
         s = {"raw": raw, "parent": parent, "key": key, "flat": b.flat, "tensors": b.tensors, "tied": b.tied, "buffers": b.buffers,
-             "persistent": b.persistent, "models": self.models(b, config)}
+             "persistent": b.persistent, "models": self.models(b, config), "reads": reads}
         if self.facts is None:
             self.facts = facts(b, self.cls)
         if parent is None or {(m[0], m[1]) for m in s["models"]} - set(self.parts):
             self.note_parts(b, s)
         self.seen[mark] = len(self.samples)
         self.samples.append(s)
+        for k in [*(reads or ()), *self.traced.absent]:       # where it was read first
+            self.first.setdefault(k, len(self.samples) - 1)
         return len(self.samples) - 1
+
+    def built(self, config):
+        """The model, followed where the class can be built from followed values; with the keys it read, None for all."""
+        try:
+            with trace.following() as record:
+                followed = copy.deepcopy(config)
+                trace.mark(followed)
+                b = build(self.cls, followed, self.device)
+        except (MemoryError, TooSlow):
+            raise
+        except Exception:
+            self.traced.compared(record)
+            return build(self.cls, config, self.device), None
+        self.traced.add(record, b.instance)
+        configs.other_names(followed, "", self.traced.names)
+        b.config = followed
+        return b, None if record.opaque else frozenset(record.reads)
+
+    @staticmethod
+    def reads_the_same(flat, s):
+        """Whether building from this config would go the same way, key by key, as for the sample."""
+        reads = s["reads"]
+        if reads is None:
+            return False
+        changed_keys = [k for k in flat.keys() | s["flat"].keys() if repr(flat.get(k)) != repr(s["flat"].get(k))]
+        return not any(k in reads or any(k.startswith(r + ".") for r in reads) or k not in s["flat"] or k not in flat for k in changed_keys)
 
     def models(self, b, config):
         """`nested_models`, worked out again only for models not seen before: comparing configs is slow."""
         key = tuple((prefix, type(m).__name__, id(type(m.config))) for prefix, m in b.models)
         if key not in self.values:
-            self.values[key] = nested_models(b, config)
+            self.values[key] = nested_models(b, getattr(b, "config", config))
         return self.values[key]
 
     def note_parts(self, b, s):
@@ -91,11 +174,15 @@ class Sampler:
             by_itself = alone(m, self.device)
             if by_itself is None:
                 continue
+            tensors, tied = by_itself
             inside = {n[len(prefix):]: shape for n, shape in b.tensors.items() if n.startswith(prefix)}
-            lacks = sorted(set(by_itself) - set(inside))
-            differs = sorted(n for n in inside if by_itself.get(n) != inside[n])
+            lacks = sorted(set(tensors) - set(inside))
+            differs = sorted(n for n in inside if tensors.get(n) != inside[n])
+            # Tensors that it shares by itself and not here: then it is no part either.
+            here = {frozenset(n[len(prefix):] for n in g if n.startswith(prefix)) for g in b.tied}
+            differs += [n for g in tied for n in g if not any(g <= h for h in here) and g <= set(inside)]
             s["parts"][prefix] = [name, path, lacks, differs]
-            if not differs and by_itself:
+            if not differs and tensors:
                 done.append(prefix)
 
     def left(self):
@@ -113,6 +200,19 @@ class Sampler:
         def outside(t):
             return {n: v for n, v in t["tensors"].items() if not n.startswith(known)}
         return 2 if outside(s) != outside(p) else 1
+
+    def alike(self, k, flat, keys):
+        """Values that other keys have: some tensors are there only where two are the same."""
+        v, beside = flat.get(k), k.rpartition(".")[0]
+        others = [flat.get(o) for o in keys if o != k and o.rpartition(".")[0] == beside and not re.search("vocab|layers|heads", o + k)]
+        pool = [x for o in others for x in (o if isinstance(o, list) else [o]) if is_int(x) and x > 1]
+        if not pool:
+            return []
+        if is_int(v) and v > 1:
+            return pool
+        if isinstance(v, list) and v and all(is_int(x) and x > 7 for x in v):
+            return [[self.rng.choice(pool + v) for _ in v] for _ in range(3)]
+        return []
 
     # -- the plan
 
@@ -139,23 +239,38 @@ class Sampler:
             if {"is_decoder", "add_cross_attention"} <= set(self.samples[base]["flat"]):
                 self.make(changed(changed(raw, "is_decoder", True), "add_cross_attention", True), base, "add_cross_attention")
         self.equalise(order[:2], strong)
+        self.flip(order)
+        self.late()
         self.mix(bases + ([rich] * 3 if rich is not None else []), strong)
 
     def scan(self, base, skip=()):
         """Every key once."""
         flat, raw = self.samples[base]["flat"], self.samples[base]["raw"]
-        for k in candidates(flat, self.words):
-            if k in skip or self.hints is not None and k not in self.hints and not re.search(HEAD_KEY, k) and k.split(".")[-1] not in self.text:
+        for k in self.candidates(flat):
+            if k in skip:
                 continue
             if not self.left():
                 break
-            for v in alternatives(k, flat[k], self.words)[:2]:
+            for v in self.alternatives(k, flat.get(k))[:3 if flat.get(k) is None else 2]:
                 i = self.change(base, raw, k, v)
                 if i is not None:
                     e = self.effect(i)
                     self.effective[k] = max(self.effective.get(k, 0), e)
-                    if e or not isinstance(flat[k], (str, list)) and flat[k] is not None:
+                    if e or not isinstance(flat.get(k), (str, list)) and flat.get(k) is not None:
                         break
+
+    def candidates(self, flat):
+        """Keys worth changing: those of the config, and those that the source asks for though the config has none."""
+        return candidates(flat, self.words) + [k for k in sorted(self.traced.absent) if k not in flat and not NOISE.search(k.split(".")[-1])]
+
+    def alternatives(self, k, v):
+        if v is None and k in self.traced.absent:
+            default, _ = self.traced.absent[k]
+            if default is not None:
+                return alternatives(k, default, self.words)
+            if FLAG.search(k.split(".")[-1]) and not OPTIONAL.search(k.split(".")[-1]) or re.search(r"(^|\.)(use|is|has|tie|add|with)_|_use_", k):
+                return [False, True]
+        return alternatives(k, v, self.words)
 
     def change(self, base, raw, k, v):
         try:
@@ -188,11 +303,11 @@ class Sampler:
         for k in keys:
             if not self.left():
                 return
-            if k not in flat:
+            if k not in flat and k not in self.traced.absent:
                 continue
             done = 0
-            many = 8 if isinstance(flat[k], list) and values > 1 else values
-            for v in alternatives(k, flat[k], self.words):
+            many = 8 if isinstance(flat.get(k), list) and values > 1 else values
+            for v in self.alternatives(k, flat.get(k)):
                 done += self.change(base, raw, k, v) is not None
                 if done >= many:
                     break
@@ -221,6 +336,60 @@ class Sampler:
                 if done < EQUAL and self.left():
                     done += self.change(base, self.samples[base]["raw"], a, self.samples[base]["flat"][b]) is not None
 
+    def flip(self, bases):
+        """Comparisons that came out the same in every sample, made to come out the other way."""
+        done = 0
+        for text in list(self.traced.literals):
+            if done >= FLIPS or not self.left():
+                return
+            seen = {t for s in self.samples if (t := truth(text, s["flat"])) is not None}
+            if "@" in text:
+                done += self.flip_rounds(bases[0], text)
+                continue
+            # Widths that are equal are rare: what is there only then is looked at from the first base too.
+            if len(seen) != 1 and not re.fullmatch(r"c\.[\w.\[\]]+ [!=]= c\.[\w.\[\]]+", text):
+                continue
+            for base in bases[:1]:
+                flat, raw = self.samples[base]["flat"], self.samples[base]["raw"]
+                for k, v in configs.flipped(text, flat):
+                    i = self.change(base, raw, k, v)
+                    if i is not None:
+                        done += 1
+                        if self.effect(i):
+                            self.beside(i)
+                        break
+
+    def late(self):
+        """Keys that are read only where something else has another value: changed there."""
+        for k, at in sorted(self.first.items()):
+            if k in self.varied or NOISE.search(k.split(".")[-1]) or configs.FIXED_FLAG.search(k.split(".")[-1]) or not self.left():
+                continue
+            s = self.samples[at]
+            for v in self.alternatives(k, s["flat"].get(k))[:2]:
+                i = self.change(at, s["raw"], k, v)
+                if i is not None:
+                    self.effective[k] = max(self.effective.get(k, 0), self.effect(i))
+
+    def flip_rounds(self, base, text):
+        """Small values for the keys that a loop compares its index with: with few layers a large one is never reached."""
+        flat, raw, done = self.samples[base]["flat"], self.samples[base]["raw"], 0
+        for key in dict.fromkeys(re.findall(r"c\.([\w.]+)", text)):
+            if (key, "rounds") in self.seen or key not in flat:
+                continue
+            self.seen[key, "rounds"] = None
+            for v in (1, 2, 0) if is_int(flat[key]) else ():
+                done += self.change(base, raw, key, v) is not None
+        return done
+
+    def beside(self, i):
+        """Flags without an effect so far, where a comparison came out otherwise: they may have one there."""
+        s = self.samples[i]
+        quiet = [k for k in sorted(self.traced.reads) if isinstance(s["flat"].get(k), bool) and not self.effective.get(k)]
+        for k in quiet[:8]:
+            n = self.change(i, s["raw"], k, not s["flat"][k])
+            if n is not None and self.effect(n):
+                self.effective[k] = 2
+
     def mix(self, bases, keys):
         """Several keys changed at once."""
         if not keys:
@@ -232,10 +401,13 @@ class Sampler:
             base = self.rng.choice(bases)
             raw = self.samples[base]["raw"]
             flat = self.samples[base]["flat"]
-            flags = [k for k in keys if k in flat and not is_int(flat[k])]
-            chosen = [k for k in flags if self.rng.random() < .5] + self.rng.sample(keys, min(len(keys), self.rng.randint(1, 3)))
+            flags = [k for k in keys if not is_int(flat.get(k))]
+            quiet = [k for k in sorted(self.traced.reads) if isinstance(flat.get(k), bool) and k not in keys]
+            chosen = [k for k in flags if self.rng.random() < .5] + [k for k in quiet if self.rng.random() < .2] + self.rng.sample(keys, min(len(keys), self.rng.randint(1, 3)))
             for k in dict.fromkeys(chosen):
-                options = alternatives(k, flat[k], self.words)[:5] if k in flat else []
+                options = self.alternatives(k, flat.get(k))[:5] if k in flat or k in self.traced.absent else []
+                if done % 2:
+                    options = self.alike(k, flat, keys) or options
                 if options:
                     try:
                         raw = changed(raw, k, self.rng.choice(options))
@@ -243,47 +415,12 @@ class Sampler:
                         pass
             done += self.make(raw, base, "mixed") is not None
 
-    # -- what no fit sees
 
-    def fresh(self, raws):
-        """Records for verification: configs as they are saved, the last ones with keys left out."""
-        out, full, omitted = [], 0, 0
-        rng = random.Random(f"fresh/{self.cls.__name__}")
-        for raw in raws:
-            leave_out = full >= FRESH
-            if omitted >= OMITTED or time.time() - self.started > CLASS_SECONDS * 1.5:
-                break
-            try:
-                config = self.config_class(**copied(raw))
-                if leave_out:
-                    saved = thinned(json.loads(config.to_json_string()), rng)
-                    config = self.config_class.from_dict(copied(saved))
-                else:
-                    saved = json.loads(config.to_json_string())
-                b = build(self.cls, config, self.device)
-            except MemoryError:
-                raise
-            except Exception:
-                continue
-            full, omitted = full + (not leave_out), omitted + leave_out
-            out.append({"config": {**saved, "architectures": [self.cls.__name__]}, "omitted": leave_out, "state_dict": b.tensors,
-                        "tied": b.tied, "buffers": b.buffers, "base_model_prefix": b.instance.base_model_prefix})
-        return out
-
-
-def thinned(config, rng):
-    """A config with some of its keys left out, as older files and files written by hand are."""
-    share = rng.uniform(.15, .5)
-    out = {}
-    for k, v in sorted(config.items()):
-        if k in ("model_type", "use_timm_backbone", "backbone", "use_pretrained_backbone", "out_features", "vocabulary_map"):
-            out[k] = v
-        elif isinstance(v, dict) and "model_type" in v:
-            if rng.random() > .1:
-                out[k] = thinned(v, rng)
-        elif rng.random() > share:
-            out[k] = v
-    return out
+def truth(text, flat):
+    try:
+        return bool(evaluate.value(text, flat))
+    except Exception:                                         # it asks for what this config does not have
+        return None
 
 
 def leaf(raw, key):
@@ -327,129 +464,21 @@ def packed(sampler, extra):
             row["parts"] = s["parts"]
         rows.append(row)
     largest = max(sampler.samples, key=lambda s: len(s["tensors"]))
+    extra = {**extra, "traced": sampler.traced.packed(), "varied": sorted(k for k in sampler.varied if k),
+             "source_reads": sources.model_reads(sampler.cls), "raised": sampler.raised}
     return {"class": sampler.cls.__name__, **extra, **sampler.facts, "device": sampler.device, "samples": rows, "names": names,
             "order": [at(n) for n in largest["tensors"]], "errors": dict(sorted(sampler.errors.items(), key=lambda kv: -kv[1])[:8])}
 
 
-def write_json(path, value):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tmp = path.with_name(path.name + ".part")
-    text = json.dumps(value, separators=(",", ":"), default=str)
-    if path.name.endswith(".gz"):
-        with gzip.GzipFile(tmp, "wb", compresslevel=4, mtime=0) as f:
-            f.write(text.encode())
-    else:
-        tmp.write_text(text + "\n")
-    tmp.replace(path)
-
-
-# ---- config classes ------------------------------------------------------------------------------------------
-
-def config_record(model_type, config_class, raws):
-    """What a config class makes of nothing, and of configs with keys left out."""
-    rng = random.Random(f"config/{model_type}")
-    static = config_class()
-    out = {"model_type": model_type, "config_class": config_class.__name__, "static": flatten(static), "sub": {}, "samples": [], "attribute_map": dict(getattr(config_class, "attribute_map", None) or {})}
-    for k, v in sorted(configs.subconfigs(static).items()):
-        own = None
-        try:
-            own = flatten(type(v)())
-        except Exception:                                     # a config class that cannot be built from nothing
-            pass
-        out["sub"][k] = {"model_type": getattr(v, "model_type", ""), "config_class": type(v).__name__, "own": own}
-    for n in range(3 * len(raws) + 30):
-        try:
-            if n < len(raws):
-                raw = copied(raws[n])
-            else:
-                raw = thinned_raw(copied(raws[n % len(raws)]), rng, .35 if n % 2 else .7) if raws else {}
-            config = config_class(**copied(raw))
-            out["samples"].append({"raw": raw, "flat": flatten(config), "types": {k: getattr(v, "model_type", "") for k, v in configs.subconfigs(config).items()}})
-        except Exception:
-            continue
-    return out
-
-
-def write_config(root, model_type, config_class, raws=None):
-    """The record of a config class, and of those inside it that have none yet."""
-    if raws is None:
-        raws = base_raws(model_type, config_class, lambda raw: config_class(**copied(raw)), BASES + FRESH, "config")
-    write_json(root / "config-samples" / f"{model_type}.json.gz", config_record(model_type, config_class, raws))
-    for sub in configs.subconfigs(config_class()).values():
-        mt = sub.model_type
-        if mt and type(sub) is not config_class and not (root / "config-samples" / f"{mt}.json.gz").exists():
-            write_config(root, mt, type(sub))
-
-
-def remaining_configs(root):
-    """Records of config classes no model was sampled for."""
-    for mt in sorted(catalogue.CONFIG_MAPPING_NAMES):
-        if not (root / "config-samples" / f"{mt}.json.gz").exists():
-            try:
-                write_config(root, mt, catalogue.config_class(mt))
-            except Exception as e:
-                failed(root, mt, f"config: {type(e).__name__}: {e}")
-
-
-def thinned_raw(raw, rng, share):
-    out = {}
-    for k, v in sorted(raw.items()):
-        if isinstance(v, dict) and "model_type" in v:
-            r = rng.random()
-            if r < .6:
-                out[k] = thinned_raw(v, rng, share)
-            elif r < .75:
-                out[k] = {"model_type": v["model_type"]}
-            elif r < .85:
-                out[k] = {x: y for x, y in thinned_raw(v, rng, share).items() if x != "model_type"}
-        elif k in ("model_type", "use_timm_backbone", "backbone", "use_pretrained_backbone", "vocabulary_map") or rng.random() > share:
-            out[k] = v
-    return out
-
-
 # ---- the run -------------------------------------------------------------------------------------------------
-
-def base_raws(model_type, config_class, works, wanted, seed):
-    """`wanted` random raw configs that `works` accepts, less and less random where it is hard to please."""
-    out, failed = [], 0
-    for n in range(wanted * 6):
-        if len(out) >= wanted or failed > 40 and not out:
-            break
-        rng = random.Random(f"{seed}/{model_type}/{n}")
-        keep = 1.0 if failed < 6 else (1.0, .7, .4, 0)[n % 4]
-        try:
-            raw = random_raw(model_type, config_class, rng, keep)
-            works(raw)
-            out.append(raw)
-        except (MemoryError, TooSlow):
-            raise
-        except Exception:
-            failed += 1
-    return out
-
-
-def class_source(cls):
-    try:
-        return inspect.getsource(cls)
-    except (OSError, TypeError):
-        return ""
-
-
-def sources(cls, config_class):
-    for c in (cls, config_class):
-        try:
-            yield inspect.getsource(sys.modules[c.__module__])
-        except (OSError, TypeError, KeyError):
-            pass
-
 
 def sample_family(root, model_type, names, again, log):
     """All classes of one model type: they share their bases."""
     config_class = catalogue.config_class(model_type)
     if config_class is None:
         raise RuntimeError("its config class cannot be imported")
-    shared, known, hints = {}, set(), {}
-    for order, name in enumerate(names):
+    shared, known = {}, set()
+    for name in names:
         target = root / "samples" / f"{name}.json.gz"
         (root / "current").write_text(name)
         if target.exists() and not again:
@@ -460,30 +489,25 @@ def sample_family(root, model_type, names, again, log):
             cls = catalogue.find_class(name)
             own = getattr(cls, "config_class", None) or config_class
             cc = config_class if issubclass(config_class, own) else own
-            model_type = cc.model_type
+            mt = cc.model_type
             if cc not in shared:
-                shared[cc] = family_raws(model_type, cc, cls)
-                write_config(root, model_type, cc, shared[cc][0] + shared[cc][1])
-            raws, fresh = shared[cc]
-            raws, fresh = labelled(name, raws), labelled(name, fresh)
-            words = configs.compared_words(*sources(cls, cc))
-            s = Sampler(cls, cc, model_type, raws, words, known, OTHER_BUDGET if known else FIRST_BUDGET, hints.get(cc))
+                shared[cc] = family_raws(mt, cc, cls, BASES, "base")
+                config_sample.write(root, mt, cc, shared[cc])
+            raws = labelled(name, shared[cc])
+            words = configs.compared_words(*sources.texts(cls, cc))
+            s = Sampler(cls, cc, mt, raws, words, known, OTHER_BUDGET if known else FIRST_BUDGET)
             s.run()
-            hints.setdefault(cc, {k for k, e in s.effective.items() if e})
-            write_json(root / "samples" / f"{name}.json.gz", packed(s, {"model_type": model_type, "config_class": cc.__name__, "version": VERSION}))
-            rows = s.fresh(fresh)
-            (root / "fresh").mkdir(exist_ok=True)
-            (root / "fresh" / f"{name}.jsonl").write_text("".join(json.dumps(r, separators=(",", ":"), default=str) + "\n" for r in rows))
+            write_json(root / "samples" / f"{name}.json.gz", packed(s, {"model_type": mt, "config_class": cc.__name__, "version": VERSION}))
             known.add(name)
-            print(f"{name}: {len(s.samples)} samples, {s.spent} modules, {len(rows)} fresh, {time.time() - started:.1f} s", file=log, flush=True)
+            print(f"{name}: {len(s.samples)} samples, {s.spent} modules, {time.time() - started:.1f} s", file=log, flush=True)
         except MemoryError:
             raise
         except Exception as e:
             failed(root, name, f"{type(e).__name__}: {e}")
 
 
-def family_raws(model_type, config_class, cls):
-    """(bases, fresh ones) that this class can be built from."""
+def family_raws(model_type, config_class, cls, count, seed):
+    """Configs that this class can be built from."""
     def works(raw):
         try:
             build(cls, config_class(**copied(raw)))
@@ -492,7 +516,7 @@ def family_raws(model_type, config_class, cls):
         except Exception as e:
             if "meta" not in str(e):                          # "cannot copy out of meta tensor": tried again on the CPU
                 raise
-    return base_raws(model_type, config_class, works, BASES, "base"), base_raws(model_type, config_class, works, (FRESH + OMITTED) * 5 // 4, "fresh")
+    return config_sample.base_raws(model_type, config_class, works, count, seed)
 
 
 def labelled(name, raws):
@@ -501,11 +525,6 @@ def labelled(name, raws):
         return raws
     rng = random.Random(f"labels/{name}")
     return [{**copied(r), "num_labels": rng.randint(1, 7)} if rng.random() < .8 else r for r in raws]
-
-
-def failed(root, name, reason):
-    with open(root / "failed.jsonl", "a") as f:
-        f.write(json.dumps({"class": name, "stage": "sample", "reason": reason[:500]}) + "\n")
 
 
 def has_failed(root):
@@ -519,6 +538,7 @@ def work(root, todo, args):
     """The worker: families until the list ends or it is time for a new process."""
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     without_initialisation()
+    trace.install()
     with open(root / "sample.log", "a") as log:
         for model_type, names in todo[:args.restart_every]:
             try:
@@ -545,7 +565,8 @@ def main(args):
         done = {p.name.removesuffix(".json.gz") for p in (root / "samples").glob("*.gz")} | bad if not args.again else set()
         todo = [(mt, [n for n in names if n not in bad or args.again]) for mt, names in families if set(names) - done]
         if not todo:
-            remaining_configs(root)
+            if not args.only:
+                config_sample.remaining(root)
             return 0
         pid = os.fork()
         if pid == 0:

@@ -3,6 +3,7 @@ import json
 import re
 from pathlib import Path
 
+from .graft import KEPT
 from .write import mended_classes, put
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,12 +38,16 @@ def write(writer, out=None):
         for stem in by_hand:
             for name in [n for n in ships if v.model_type(n) == stem]:
                 v.reasons[name] = "by hand"
+        for kept in writer.kept_classes(v):
+            v.reasons.pop(kept.name, None)
         for name, reason in sorted(v.reasons.items()):
             if name in mended.get(v.version, ()):
                 continue                                      # what the tool made of it was not right; the file is
             if name not in ships or reason == "by hand":
                 groups.setdefault(kind(reason), {})[name] = short(reason)
         rows[v.version] = groups
+    kept = {v.version: [k.name for k in writer.kept_classes(v)] for v in writer.versions}
+    (folder / KEPT.name if out else KEPT).write_text(json.dumps({v: names for v, names in kept.items() if names}, indent=1) + "\n")
     target = (folder / NOT_SHIPPED.name) if out else NOT_SHIPPED
     target.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
     sizes = [p.stat().st_size for p in folder.glob("*.json5")]

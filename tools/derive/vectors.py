@@ -16,15 +16,17 @@ LIMIT = 1 << 40
 
 class Column:
     """A value per row, with the expression that names it and what it costs to read."""
-    __slots__ = ("text", "values", "cost", "known")
+    __slots__ = ("text", "values", "cost", "known", "there")
 
-    def __init__(self, text, values, cost=1.0, known=None):
-        self.text, self.values, self.cost, self.known = text, values, cost, known
+    def __init__(self, text, values, cost=1.0, known=None, there=None):
+        # `there`: the config that the key is in, and in which rows it is there; None where it always is.
+        self.text, self.values, self.cost, self.known, self.there = text, values, cost, known, there
 
     def at(self, rows):
         """The same column in some of the rows."""
         kind = self.kind()
-        return Column(self.text, [self.values[i] for i in rows], self.cost, None if kind in ("mixed", "number") else kind)
+        there = self.there and (self.there[0], [self.there[1][i] for i in rows])
+        return Column(self.text, [self.values[i] for i in rows], self.cost, None if kind in ("mixed", "number") else kind, there and (None if all(there[1]) else there))
 
     def kind(self):
         if self.known is None:
@@ -32,7 +34,7 @@ class Column:
         return self.known
 
     def find_kind(self):
-        kinds = {"null" if v is None else "bool" if isinstance(v, bool) else "int" if isinstance(v, int) else "float" if isinstance(v, float)
+        kinds = {"object" if isinstance(v, dict) else "null" if v is None else "bool" if isinstance(v, bool) else "int" if isinstance(v, int) else "float" if isinstance(v, float)
                  else "str" if isinstance(v, str) else "list" for v in self.values}
         return next(iter(kinds)) if len(kinds) == 1 else "number" if kinds == {"int", "float"} else "mixed"
 

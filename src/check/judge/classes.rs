@@ -4,9 +4,9 @@ use serde_json::Value;
 
 use super::Inputs;
 use crate::check::layers;
-use crate::check::load::{self, Target};
+use crate::check::load::{self, LoadReport, Stored, Target};
 use crate::checkpoint::{Fault, FaultKind, Place};
-use crate::knowledge::{Architecture, Expected, Loader, Refusal, UnknownPart};
+use crate::knowledge::{Architecture, Doubt, Expected, Refusal};
 
 /// A target, and the architecture of the class that its loader would build.
 pub(super) struct TargetClass<'a> {
@@ -33,7 +33,7 @@ pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a
     // The layout in which another version packs quantised weights is unknown.
     let comparable = targets.into_iter().filter(|one| one.target.leads || inputs.is_plain());
     let built = comparable.map(|TargetClass { target, architecture }| BuiltClass {
-        class: load::build(architecture, inputs.config, inputs.stored),
+        class: load::build(architecture, inputs.config, inputs.stored).and_then(|class| covered(class, inputs.stored)),
         target,
         architecture,
     });
@@ -51,10 +51,21 @@ fn leading<'a>(inputs: &Inputs<'a>, mut built: Vec<BuiltClass<'a>>) -> Vec<Built
     built
 }
 
-/// Whether no leading loader knows the class and all of its parts. A class that is known and cannot be built counts as
-/// known.
+/// Whether no leading loader knows the class and all of its parts, and covers this config. A class that is known and cannot
+/// be built counts as known.
 fn is_unknown(built: &[BuiltClass<'_>]) -> bool {
-    built.iter().all(|one| !one.target.leads || matches!(one.class, Err(Refusal::UnknownPart(_))))
+    let is_gap = |refusal: &Refusal| matches!(refusal, Refusal::UnknownPart(_) | Refusal::NotCovered(_));
+    built.iter().all(|one| !one.target.leads || one.class.as_ref().is_err_and(is_gap))
+}
+
+/// The class, unless the checkpoint differs from it and the description does not cover this config: then the difference may
+/// be an error of the description.
+fn covered(class: Expected, stored: &Stored) -> Result<Expected, Refusal> {
+    let is_clean = |report: LoadReport| report.is_whole() && report.unexpected.is_empty();
+    if class.doubts.is_empty() || is_clean(load::predict(&class, stored)) {
+        return Ok(class);
+    }
+    Err(Refusal::NotCovered(class.doubts))
 }
 
 /// For each loader that has the class, why no report of it is made; used where there is none.
@@ -74,32 +85,38 @@ pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault
         // A known class is better evidence than a comparison of the layers with one another.
         faults.extend(layers::faults(inputs.stored.names()));
     }
-    // A version that nobody named and that cannot build the class is passed over.
-    for one in built.iter().filter(|one| one.target.leads) {
-        if let Err(Refusal::Impossible(reasons)) = &one.class {
-            let fault = Fault::new(FaultKind::ConfigIncomputable)
+    for one in built {
+        let fault = || {
+            Fault::new(FaultKind::ConfigIncomputable)
                 .at(Place::file("config.json"))
                 .with("architecture", one.architecture.name())
-                .under(one.target.loader.version());
-            faults.push(fault.with("reason", reasons.first().map_or("", String::as_str)));
-        }
+        };
+        let fault = match &one.class {
+            // A version that nobody named and that cannot build the class is passed over.
+            Err(Refusal::Impossible(reasons)) if one.target.leads => {
+                fault().with("reason", reasons.first().cloned().unwrap_or_default())
+            }
+            Err(Refusal::Raises(exception)) => {
+                fault().with("raises", exception.as_str()).with("loader", one.target.version())
+            }
+            _ => continue,
+        };
+        faults.push(fault.under(one.target.loader.version()));
     }
     faults
 }
 
 /// Faults of a class, or of a part of one, that no loader is known to build, or none of those that the user named.
 fn unknown(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
-    let unknown_part = |one: &BuiltClass<'_>| match &one.class {
-        Err(Refusal::UnknownPart(part)) => Some(part.clone()),
-        _ => None,
-    };
     if inputs.versions.is_empty() {
-        let part = built.iter().find_map(unknown_part);
-        return is_unknown(built).then(|| unknown_class(inputs.config, part.as_ref())).into_iter().collect();
+        return is_unknown(built)
+            .then(|| unknown_class(inputs.config, built.iter().find_map(gap)))
+            .into_iter()
+            .collect();
     }
     let for_version = |version: &String| {
-        let fault = match built.iter().find(|one| one.target.loader == Loader::nearest(version)) {
-            Some(found) => unknown_class(inputs.config, Some(&unknown_part(found)?)),
+        let fault = match built.iter().find(|one| one.target.versions.contains(version)) {
+            Some(found) => unknown_class(inputs.config, Some(gap(found)?)),
             None => unknown_class(inputs.config, None),
         };
         Some(fault.with("under", format!("transformers {version}")))
@@ -107,15 +124,23 @@ fn unknown(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
     inputs.versions.iter().filter_map(for_version).collect()
 }
 
-fn unknown_class(config: &Value, part: Option<&UnknownPart>) -> Fault {
-    let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).unwrap_or("none");
-    let pointer = match part {
-        Some(part) if !part.config.is_empty() => format!("/{}/model_type", part.config.replace('.', "/")),
-        _ => "/model_type".to_owned(),
+/// The pointer into config.json of what is unknown of a class, and its description.
+fn gap(one: &BuiltClass<'_>) -> Option<(String, String)> {
+    let pointer = match one.class.as_ref().err()? {
+        Refusal::UnknownPart(part) if part.config.is_empty() => "/model_type".to_owned(),
+        Refusal::UnknownPart(part) => format!("/{}/model_type", part.config.replace('.', "/")),
+        Refusal::NotCovered(doubts) => doubts.iter().find_map(Doubt::pointer).unwrap_or("/model_type").to_owned(),
+        _ => return None,
     };
+    Some((pointer, one.class.as_ref().err()?.to_string()))
+}
+
+fn unknown_class(config: &Value, gap: Option<(String, String)>) -> Fault {
+    let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).unwrap_or("none");
+    let (pointer, part) = gap.map_or(("/model_type".to_owned(), None), |(pointer, part)| (pointer, Some(part)));
     let fault = Fault::new(FaultKind::UnknownArchitecture)
         .at(Place::file("config.json").pointer(pointer))
         .with("model_type", text("/model_type"))
         .with("class", text("/architectures/0"));
-    part.into_iter().fold(fault, |fault, part| fault.with("part", part.to_string()))
+    part.into_iter().fold(fault, |fault, part| fault.with("part", part))
 }

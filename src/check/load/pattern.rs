@@ -26,6 +26,25 @@ impl Pattern {
         self.0.captures(name).ok().flatten()
     }
 
+    /// As Python's `re.sub`: every match replaced, `\1` standing for a group; `None` where nothing matches.
+    pub(super) fn replace_all(&self, name: &str, to: &str) -> Option<String> {
+        let mut out = String::new();
+        let mut end = 0;
+        for captures in self.0.captures_iter(name) {
+            let Ok(captures) = captures else { break };
+            let whole = captures.get(0)?;
+            out.push_str(name.get(end..whole.start())?);
+            let group = |n: usize| captures.get(n).map_or("", |m| m.as_str());
+            out.push_str(&(1..10).fold(to.to_owned(), |text, n| text.replace(&format!(r"\{n}"), group(n))));
+            end = whole.end();
+        }
+        if end == 0 && out.is_empty() && !self.found_in(name) {
+            return None;
+        }
+        out.push_str(name.get(end..)?);
+        Some(out)
+    }
+
     /// Number of the group of this name.
     pub(super) fn group(&self, name: &str) -> Option<usize> {
         self.0.capture_names().position(|group| group == Some(name))

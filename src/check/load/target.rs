@@ -11,6 +11,8 @@ pub struct Target {
     pub loader: Loader,
     /// The version, where it is not the loader's own.
     pub stands_for: Option<String>,
+    /// All versions that it is judged for.
+    pub versions: Vec<String>,
     /// Whether the checkpoint must load there. For another target, only the fact that it does not load is reported.
     pub leads: bool,
 }
@@ -22,9 +24,9 @@ impl Target {
         self.stands_for.as_deref().unwrap_or(self.loader.version())
     }
 
-    fn new(version: &str, leads: bool) -> Self {
-        let loader = Loader::nearest(version);
-        Self { loader, stands_for: (version != loader.version()).then(|| version.to_owned()), leads }
+    fn new(loader: Loader, version: &str, leads: bool) -> Self {
+        let stands_for = (version != loader.version()).then(|| version.to_owned());
+        Self { loader, stands_for, versions: vec![version.to_owned()], leads }
     }
 
     /// Lets it lead in place of the loader of `version`, which does not know the class.
@@ -34,20 +36,25 @@ impl Target {
     }
 }
 
-/// The targets of a checkpoint: the versions that the user named; without any, the version that wrote config.json, which
-/// leads, and the newest known one.
-pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<Target> {
+/// The versions to judge, each with whether it leads: those that the user named; without any, the version that wrote
+/// config.json, which leads, and the newest known one.
+fn versions<'v>(config: Option<&'v Value>, named: &'v [String]) -> Vec<(&'v str, bool)> {
     let wrote = config.and_then(|config| config.get("transformers_version")).and_then(Value::as_str);
-    let versions: Vec<(&str, bool)> = match (named, wrote) {
+    match (named, wrote) {
         ([], Some(version)) => vec![(version, true), (Loader::NEWEST.version(), false)],
         ([], None) => vec![(Loader::NEWEST.version(), true)],
         (named, _) => named.iter().map(|version| (version.as_str(), true)).collect(),
-    };
+    }
+}
+
+/// The targets of a checkpoint of any class: the nearest loader of each version.
+pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<Target> {
     let mut targets: Vec<Target> = Vec::new();
-    for (version, leads) in versions {
-        let target = Target::new(version, leads);
-        if !targets.iter().any(|t| t.loader == target.loader) {
-            targets.push(target);
+    for (version, leads) in versions(config, named) {
+        let loader = Loader::nearest(version);
+        match targets.iter_mut().find(|target| target.loader == loader) {
+            Some(target) => target.versions.push(version.to_owned()),
+            None => targets.push(Target::new(loader, version, leads)),
         }
     }
     targets
@@ -55,16 +62,20 @@ pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<
 
 /// The targets of a run: the [`wanted`] ones, as the prediction of loads changed them.
 ///
-/// A loader that does not have the class still reads the documents, so it stays.
+/// A loader that does not have the class still reads the documents, so it stays, unless another one was chosen for its
+/// version.
 pub(in crate::check) fn of_run(config: Option<&Value>, named: &[String], predicted: Vec<Target>) -> Vec<Target> {
+    let is_same = |one: &Target, other: &Target| {
+        one.loader == other.loader || one.versions.iter().any(|version| other.versions.contains(version))
+    };
     let mut targets = wanted(config, named);
-    for target in predicted {
-        match targets.iter_mut().find(|t| t.loader == target.loader) {
-            Some(same) => *same = target,
-            None => targets.push(target),
-        }
-    }
-    targets.sort_by_key(|target| !target.leads);
+    targets.retain(|target| !predicted.iter().any(|other| is_same(target, other)));
+    targets.extend(predicted);
+    let order = versions(config, named);
+    targets.sort_by_key(|target| {
+        let position = order.iter().position(|(version, _)| target.versions.iter().any(|v| v == version));
+        (!target.leads, position.unwrap_or(order.len()))
+    });
     targets
 }
 
@@ -80,12 +91,19 @@ pub fn targets<'l>(
     named: &[String],
 ) -> Vec<(Target, Architecture<'l>)> {
     let version = config.get("transformers_version").and_then(Value::as_str);
-    let built = |target: Target| Some((target.clone(), library.find(config, names.iter().copied(), target.loader)?));
-    let mut known: Vec<_> = wanted(Some(config), named).into_iter().filter_map(built).collect();
+    let mut known: Vec<(Target, Architecture<'l>)> = Vec::new();
+    for (version, leads) in versions(Some(config), named) {
+        let Some((loader, architecture)) = library.stands_for(version, config, names) else { continue };
+        match known.iter_mut().find(|(target, _)| target.loader == loader) {
+            Some((target, _)) => target.versions.push(version.to_owned()),
+            None => known.push((Target::new(loader, version, leads), architecture)),
+        }
+    }
     if named.is_empty() && !known.iter().any(|(target, _)| target.leads) {
         if known.is_empty() {
-            let mut others = Loader::ALL.into_iter().map(|loader| Target { loader, stands_for: None, leads: true });
-            known.extend(others.find_map(built));
+            let built = |loader| Some((loader, library.find(config, names.iter().copied(), loader)?));
+            let other = Loader::ALL.into_iter().find_map(built);
+            known.extend(other.map(|(loader, class)| (Target::new(loader, loader.version(), true), class)));
         }
         if let Some((target, _)) = known.first_mut() {
             target.lead(version);

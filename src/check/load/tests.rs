@@ -181,3 +181,59 @@ fn a_fault_names_every_tensor() {
         (FaultKind::MissingTensors, &json!(7), 7)
     );
 }
+
+/// Llama as 4.57 builds it; its loader reads the same class from the same data.
+fn llama_of_4_57(key_mapping: &[[&str; 2]]) -> Expected {
+    let conversions = key_mapping.iter().map(|[from, to]| crate::knowledge::Conversion {
+        kind: "KeyMapping".to_owned(),
+        from: vec![(*from).to_owned()],
+        to: vec![(*to).to_owned()],
+        ops: Vec::new(),
+        scope: None,
+        extra: serde_json::Map::new(),
+    });
+    Expected { loader: Loader::V4_57_6, conversions: conversions.collect(), ..llama(false) }
+}
+
+fn renamed_by(expected: &Expected, stored: &Shapes, with: impl Fn(&str) -> String) -> LoadReport {
+    let renamed: Shapes = stored.iter().map(|(name, shape)| (with(name), shape.clone())).collect();
+    predict(expected, &Stored::from_shapes(renamed))
+}
+
+#[test]
+fn transformers_4_57_renames_each_key_once_and_reports_names_of_the_model() {
+    let expected = llama_of_4_57(&[]);
+    let whole = all(&expected);
+    assert_eq!(
+        predict(&expected, &Stored::from_shapes(whole.clone())),
+        LoadReport { loader: "4.57.6".to_owned(), ..clean() }
+    );
+    // A base model's file, without prefix: names gain it.
+    let mut base = whole.clone();
+    base.remove("lm_head.weight");
+    let report = renamed_by(&expected, &base, |name| name.trim_start_matches("model.").to_owned());
+    assert_eq!(
+        (report.missing.as_slice(), report.unexpected.as_slice()),
+        (["lm_head.weight".to_owned()].as_slice(), [].as_slice())
+    );
+    // With the head beside it, it raises.
+    let corrupted = renamed_by(&expected, &whole, |name| name.trim_start_matches("model.").to_owned());
+    assert!(corrupted.raises.is_some_and(|r| r.starts_with("ValueError")));
+    // `gamma` is renamed only after LayerNorm, and an unexpected name loses the prefix that was put on.
+    let mut odd = base;
+    odd.insert("model.norm.gamma".to_owned(), vec![4]);
+    odd.insert("model.LayerNorm.gamma".to_owned(), vec![4]);
+    let report = renamed_by(&expected, &odd, |name| name.trim_start_matches("model.").to_owned());
+    assert_eq!(report.unexpected, ["LayerNorm.weight", "norm.gamma"]);
+}
+
+#[test]
+fn transformers_4_57_applies_the_first_pattern_of_a_class_that_matches() {
+    // As compositions have it: no base model that a prefix could be put before.
+    let mapped = llama_of_4_57(&[[r"^language_model\.(model|lm)", r"\1"], ["^language_model", "unused"]]);
+    let expected = Expected { base_model_prefix: String::new(), ..mapped };
+    let report = renamed_by(&expected, &all(&expected), |name| {
+        if name.starts_with("model.") { format!("language_model.{name}") } else { name.to_owned() }
+    });
+    assert_eq!(report, LoadReport { loader: "4.57.6".to_owned(), ..clean() });
+}

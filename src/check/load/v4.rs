@@ -10,7 +10,7 @@ use super::{LoadReport, Mismatch, Silent, SilentReason, Stored, absent_groups, p
 use crate::knowledge::{Evidence, Expected};
 
 /// What it says when a class with a head is given base-model keys without prefix, and the head.
-const CORRUPTED: &str = "ValueError: The state dictionary of the model you are trying to load is corrupted. Are you sure it was properly saved?";
+pub(super) const CORRUPTED: &str = "ValueError: The state dictionary of the model you are trying to load is corrupted. Are you sure it was properly saved?";
 
 pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     // File keys after the textual renames; the loader knows no others.
@@ -76,7 +76,7 @@ pub(super) fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
 }
 
 /// Names that share one storage, the one they are tied to first.
-fn tied_groups(expected: &Expected) -> Vec<Vec<&str>> {
+pub(super) fn tied_groups(expected: &Expected) -> Vec<Vec<&str>> {
     let mut groups: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (name, tensor) in &expected.tensors {
         if let Some(to) = &tensor.tied_to {

@@ -8,14 +8,15 @@ use serde::de::IgnoredAny;
 use serde_json::{Map, Value};
 
 use super::conversions::Rows;
+use super::field_type::FieldType;
 use super::member::Member;
 use crate::knowledge::ordered::ordered;
 use crate::knowledge::{Expression, Loader, Scope, Template};
 
 /// One architecture file.
 ///
-/// Expressions see the config, defaults filled in, as `c`, the loader's major version as `major`, the names of
-/// `let`, and the indices of the repeats around them.
+/// Expressions see the config, defaults filled in, as `c`, the loader's major version as `major`, its version as one
+/// number as `release` (457 for 4.57.6), the names of `let`, and the indices of the repeats around them.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -47,15 +48,31 @@ pub(crate) struct Blueprint {
     /// Values of config keys that are absent.
     #[serde(default)]
     defaults: Map<String, Value>,
-    /// Values of config keys that are absent or null, computed from the others, in order.
+    /// Values of config keys, computed from the others, in order: of those that are absent or null, where nothing else
+    /// is said.
     #[serde(default, deserialize_with = "ordered")]
-    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
-    computed: Vec<(String, Expression)>,
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Computed>"))]
+    computed: Vec<(String, Computed)>,
+    /// Other names of keys (`attribute_map`): what stands under one is written over the key it is a name of.
+    #[serde(default)]
+    aliases: BTreeMap<String, Alias>,
+    /// The key of a larger model's config under which this one lies (`base_config_key`).
+    #[serde(default)]
+    inside: Option<String>,
+    /// Keys that the classes' source reads and no sample varied, with the value that all samples had.
+    #[serde(default)]
+    unvaried: Map<String, Value>,
+    /// What the config class lets its keys be, with the names of the keys: `"int|null": "head_dim pad_token_id"`.
+    #[serde(default)]
+    types: BTreeMap<FieldType, String>,
+    /// Configs with which the loader raises while it reads them.
+    #[serde(default)]
+    refuses: Vec<Refuses>,
     /// Sub-configs: how each is resolved.
     #[serde(default, deserialize_with = "ordered")]
     #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, SubConfig>"))]
     configs: Vec<(String, SubConfig)>,
-    /// By version, what that loader has different of the four above: merged over them key by key.
+    /// By version, what that loader has different of those above: merged over them key by key; `refuses` stands beside.
     #[serde(default)]
     by_loader: BTreeMap<Loader, ConfigClass>,
     /// What a search for a config begins with when there is none: values without which nothing can be built, or that no
@@ -97,12 +114,35 @@ pub(crate) struct ConfigClass {
     pub defaults: Map<String, Value>,
     /// As in the file.
     #[serde(default, deserialize_with = "ordered")]
-    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
-    pub computed: Vec<(String, Expression)>,
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Computed>"))]
+    pub computed: Vec<(String, Computed)>,
+    /// As in the file.
+    #[serde(default)]
+    pub aliases: BTreeMap<String, Alias>,
+    /// As in the file.
+    #[serde(default)]
+    pub inside: Option<String>,
+    /// As in the file.
+    #[serde(default)]
+    pub unvaried: Map<String, Value>,
+    /// As in the file.
+    #[serde(default)]
+    pub types: BTreeMap<FieldType, String>,
+    /// As in the file.
+    #[serde(default)]
+    pub refuses: Vec<Refuses>,
     /// As in the file; each field that an entry gives replaces that field.
     #[serde(default, deserialize_with = "ordered")]
     #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, SubConfig>"))]
     pub configs: Vec<(String, SubConfig)>,
+}
+
+impl ConfigClass {
+    /// Whether the type of a key excludes null; `false` for a key without a type.
+    pub fn forbids_null(&self, key: &str) -> bool {
+        let of_key = |(_, keys): &(&FieldType, &String)| keys.split(' ').any(|k| k == key);
+        self.types.iter().find(of_key).is_some_and(|(kind, _)| !kind.takes(&Value::Null))
+    }
 }
 
 /// How the config inside a config gets its values. In `absent` and `set` a string that starts with `=` is an
@@ -114,6 +154,9 @@ pub(crate) struct SubConfig {
     /// The `model_type` of one that names none; the file of that model type fills in the rest.
     #[serde(default, rename = "type")]
     pub model_type: Option<String>,
+    /// Another key whose object is taken in its place where there is one: `text_config_dict`.
+    #[serde(default)]
+    pub instead: Option<String>,
     /// The sub-config when there is none, before that; without it, none is none.
     #[serde(default)]
     pub absent: Option<Map<String, Value>>,
@@ -129,8 +172,93 @@ pub(crate) struct SubConfig {
     pub defaults: Map<String, Value>,
     /// As in the file, over the sub-config.
     #[serde(default, deserialize_with = "ordered")]
-    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
-    pub computed: Vec<(String, Expression)>,
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Computed>"))]
+    pub computed: Vec<(String, Computed)>,
+}
+
+impl SubConfig {
+    /// The model type of a config under this key: its own, or the one that the class gives it.
+    ///
+    /// Called with the file of the config around it. A config that bears the model type of the whole is of the class that
+    /// the whole gives it: `vision_config` of Qwen2-VL and Qwen3-VL on the hub.
+    pub fn model_type_of<'s>(&'s self, owner: &Blueprint, config: &'s Map<String, Value>) -> Option<&'s str> {
+        let own = config.get("model_type").and_then(Value::as_str);
+        own.filter(|own| !owner.model_types.iter().any(|t| t == own)).or(self.model_type.as_deref()).or(own)
+    }
+}
+
+/// How a config class computes a key: an expression, for when the key is absent or null, or `{ unless_given: … }`,
+/// for when it is absent, or `{ always: … }`, over whatever is given.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub(crate) enum Computed {
+    /// When the key is absent or null.
+    Filled(Expression),
+    /// In other cases.
+    Other(ComputedOtherwise),
+}
+
+/// The cases of [`Computed`] that are said by their name.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields, rename_all = "snake_case")]
+pub(crate) enum ComputedOtherwise {
+    /// When the key is absent.
+    UnlessGiven(Expression),
+    /// Over whatever is given.
+    Always(Expression),
+}
+
+/// The key that an alias is a name of: `"d_model"`; `{ early: "d_model" }` where what is computed sees it already.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub(crate) enum Alias {
+    /// Written after the config class has computed its keys.
+    Late(String),
+    /// Written before.
+    Early(EarlyAlias),
+}
+
+/// The key behind an alias that is written before others are computed.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub(crate) struct EarlyAlias {
+    /// The key.
+    pub early: String,
+}
+
+impl Alias {
+    /// The key it is a name of.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Late(key) | Self::Early(EarlyAlias { early: key }) => key,
+        }
+    }
+}
+
+/// A condition on the config with which a loader raises.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Refuses {
+    /// The condition, on the config as it was resolved.
+    pub when: Expression,
+    /// The exception, as the loader says it: its class and the beginning of its message.
+    pub error: Template,
+}
+
+/// A condition on the config under which a class is not described.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub(crate) struct NotPredicted {
+    /// The condition, on the config as it was resolved.
+    pub when: Expression,
+    /// What is not described then.
+    pub why: String,
 }
 
 /// A condition on the config, and what to say when it does not hold.
@@ -167,6 +295,16 @@ pub(crate) struct Class {
     /// Regular expressions of names whose presence the loader does not report; the class's own.
     #[serde(default)]
     pub ignore_unexpected: Vec<String>,
+    /// What transformers 4.57 renames at load for this class, in order (`_checkpoint_conversion_mapping`): a regular
+    /// expression, and what the text that it matches becomes.
+    #[serde(default)]
+    pub key_mapping: Vec<[String; 2]>,
+    /// Configs that its description does not cover: nothing is predicted for them.
+    #[serde(default)]
+    pub not_predicted_when: Vec<NotPredicted>,
+    /// Configs with which the class cannot be built: the loader raises.
+    #[serde(default)]
+    pub refuses: Vec<Refuses>,
     /// Tensor-name prefixes that speak for this entry over another one of the same name.
     #[serde(default)]
     pub chosen_by: Vec<String>,
@@ -207,11 +345,23 @@ impl Blueprint {
             auto: self.auto.clone(),
             defaults: self.defaults.clone(),
             computed: self.computed.clone(),
+            aliases: self.aliases.clone(),
+            inside: self.inside.clone(),
+            unvaried: self.unvaried.clone(),
+            types: self.types.clone(),
+            refuses: self.refuses.clone(),
             configs: self.configs.clone(),
         };
         if let Some(other) = self.by_loader.get(&loader) {
             config.auto.extend(other.auto.clone());
             config.defaults.extend(other.defaults.clone());
+            config.aliases.extend(other.aliases.clone());
+            config.unvaried.extend(other.unvaried.clone());
+            config.types.extend(other.types.clone());
+            config.refuses.extend(other.refuses.iter().cloned());
+            if other.inside.is_some() {
+                config.inside.clone_from(&other.inside);
+            }
             overlay(&mut config.computed, &other.computed, |old, new| *old = new.clone());
             overlay(&mut config.configs, &other.configs, SubConfig::overlay);
         }
@@ -245,6 +395,9 @@ impl SubConfig {
     fn overlay(&mut self, other: &Self) {
         if other.model_type.is_some() {
             self.model_type.clone_from(&other.model_type);
+        }
+        if other.instead.is_some() {
+            self.instead.clone_from(&other.instead);
         }
         if other.absent.is_some() {
             self.absent.clone_from(&other.absent);

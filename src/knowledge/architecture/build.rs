@@ -6,11 +6,12 @@ use serde_json::{Map, Value};
 
 use super::blueprint::{Blueprint, Class};
 use super::conversions::{self, Module};
+use super::doubt::{Doubt, nulls, unread_keys};
 use super::member::{Kind, Member, Part, Tied};
 use super::refusal::{Refusal, UnknownPart};
-use super::resolve::{DEPTH_CAP, Resolver, at_path, evaluated, model_type};
+use super::resolve::{DEPTH_CAP, Resolver, at_path, evaluated, model_type, refused};
 use super::{Architecture, Evidence, Expected, ExpectedTensor, TENSOR_CAP};
-use crate::knowledge::{Expression, Scope, Template};
+use crate::knowledge::{Expression, Loader, Scope, Template};
 
 /// Entries visited before a config is refused: repeats whose conditions are all false cost time too.
 const STEP_CAP: usize = 2_000_000;
@@ -25,9 +26,10 @@ pub(super) type Outcome<T> = Result<T, Refusal>;
 pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &Evidence) -> Outcome<Expected> {
     let Value::Object(config) = config else { return Err(Refusal::impossible("the config is not an object")) };
     let Architecture { library, file, class, loader } = architecture;
+    let written = own_config(file, loader, config);
     let resolver = Resolver { library, loader, evidence };
     let mut builder = Builder { resolver, expected: Expected::default(), modules: Vec::new(), steps: 0 };
-    let mut read = config.clone();
+    let mut read = written.clone();
     // No template reads which modules a loader would fetch, and hostile ones are many.
     read.shift_remove("auto_map");
     let outcome = resolver.resolve(file, read, 0).and_then(|config| {
@@ -38,9 +40,16 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
     match outcome {
         Ok(config) => {
             let mut expected = builder.expected;
-            if loader.major() >= 5 {
-                expected.conversions = conversions::collect(library, &builder.modules, &class.base_model_prefix);
+            match loader {
+                Loader::V4_47_0 => {}
+                Loader::V4_57_6 => {
+                    expected.conversions = class.key_mapping.iter().map(conversions::key_mapping).collect();
+                }
+                Loader::V5_23_0 => {
+                    expected.conversions = conversions::collect(library, &builder.modules, &class.base_model_prefix);
+                }
             }
+            expected.doubts.extend(unread_keys(library, file, loader, written));
             Ok(Expected {
                 architecture: file.architecture.clone(),
                 loader,
@@ -53,11 +62,36 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
             })
         }
         // A default that looks into a sub-config nobody knows fails before the part is reached.
-        Err(Refusal::Impossible(reasons)) => Err(match resolver.unknown_sub_config(file, config) {
-            Some(part) => Refusal::UnknownPart(part),
-            None => Refusal::Impossible(reasons),
-        }),
+        Err(Refusal::Impossible(reasons)) => {
+            if let Some(part) = resolver.unknown_sub_config(file, written) {
+                return Err(Refusal::UnknownPart(part));
+            }
+            // What is not covered may be what it failed on.
+            let mut doubts = builder.expected.doubts;
+            doubts.extend(unread_keys(library, file, loader, written));
+            doubts.extend(nulls(library, file, loader, written));
+            Err(if doubts.is_empty() { Refusal::Impossible(reasons) } else { Refusal::NotCovered(doubts) })
+        }
         Err(unknown) => Err(unknown),
+    }
+}
+
+/// The part of a config.json that the config class of `file` reads: all of it, or, for a part of a larger model, the
+/// config inside it that is of this class (`PretrainedConfig.from_pretrained`).
+fn own_config<'c>(file: &Blueprint, loader: Loader, config: &'c Map<String, Value>) -> &'c Map<String, Value> {
+    let inside = file.config(loader).inside.as_ref().and_then(|key| config.get(key)).and_then(Value::as_object);
+    if let Some(inside) = inside {
+        return inside;
+    }
+    let model_type = |config: &'c Map<String, Value>| config.get("model_type").and_then(Value::as_str);
+    let is_mine = |named: &str| file.model_types.iter().any(|t| t == named);
+    match model_type(config) {
+        Some(named) if !is_mine(named) => {
+            let mut inner =
+                config.values().filter_map(Value::as_object).filter(|sub| model_type(sub).is_some_and(is_mine));
+            inner.next_back().unwrap_or(config)
+        }
+        _ => config,
     }
 }
 
@@ -93,16 +127,21 @@ struct Place<'a> {
 
 struct Without<'a> {
     root: &'a str,
-    starts: &'a [String],
+    names: &'a [String],
     outer: Option<&'a Without<'a>>,
 }
 
 impl Without<'_> {
     fn covers(&self, name: &str) -> bool {
         let inner = name.strip_prefix(self.root);
-        inner.is_some_and(|n| self.starts.iter().any(|s| n.starts_with(s.as_str())))
+        inner.is_some_and(|n| self.names.iter().any(|s| is_of(n, s)))
             || self.outer.is_some_and(|outer| outer.covers(name))
     }
+}
+
+/// Whether a name starts with a text, or, for one that starts with `*`, ends with the rest of it.
+fn is_of(name: &str, text: &str) -> bool {
+    text.strip_prefix('*').map_or_else(|| name.starts_with(text), |end| name.ends_with(end))
 }
 
 impl Place<'_> {
@@ -136,6 +175,13 @@ impl<'l> Builder<'l> {
         for (name, expression) in &file.lets {
             if let Err(e) = expression.bind(name, &mut scope) {
                 failed.push((format!("'{name}'"), e));
+            }
+        }
+        refused(&class.refuses, &scope)?;
+        for corner in &class.not_predicted_when {
+            // A condition that cannot be asked may well hold.
+            if corner.when.eval_bool(&scope).unwrap_or(true) {
+                self.expected.doubts.push(Doubt::Corner(corner.why.clone()));
             }
         }
         let outcome = bind_all(&class.lets, &mut scope)
@@ -197,7 +243,14 @@ impl<'l> Builder<'l> {
     ) -> Outcome<()> {
         self.steps = self.steps.saturating_add(1);
         if self.steps > STEP_CAP || self.expected.tensors.len() > TENSOR_CAP {
-            return Err(Refusal::impossible(format!("the config asks for more than {TENSOR_CAP} tensors")));
+            let reason = format!("the config implies more than {TENSOR_CAP} tensors");
+            // A loader builds such a class, so the config may be right unless the checkpoint has far fewer tensors.
+            let is_contradicted = (1..TENSOR_CAP / 2).contains(&self.resolver.evidence.iter().count());
+            return Err(if is_contradicted {
+                Refusal::impossible(reason)
+            } else {
+                Refusal::NotCovered(vec![Doubt::Corner(reason)])
+            });
         }
         if !holds(member.when.as_ref(), scope)? {
             return Ok(());
@@ -256,7 +309,7 @@ impl<'l> Builder<'l> {
             return Err(Refusal::impossible(format!("parts are nested more than {DEPTH_CAP} deep")));
         }
         let outer = place.without;
-        let without = Without { root: name, starts: &part.without, outer };
+        let without = Without { root: name, names: &part.without, outer };
         let place = Place { prefix: name, root: name, depth, without: Some(&without), ..place };
         let given = match &part.config {
             Some(path) => at_path(around.config.map, path)?,

@@ -63,6 +63,18 @@ static LEGACY: LazyLock<Vec<Conversion>> = LazyLock::new(|| {
     ]
 });
 
+/// A renaming of transformers 4.57 as a conversion: all places where the pattern matches, and no other renaming after it.
+pub(super) fn key_mapping([from, to]: &[String; 2]) -> Conversion {
+    Conversion {
+        kind: "KeyMapping".to_owned(),
+        from: vec![from.clone()],
+        to: vec![to.clone()],
+        ops: Vec::new(),
+        scope: None,
+        extra: Map::new(),
+    }
+}
+
 /// A `PreTrainedModel` inside the model, or the model itself.
 pub(super) struct Module<'l> {
     /// Where it is; empty for the model itself.

@@ -67,7 +67,7 @@ pub(crate) struct Part {
     /// Values that override the config's. A string that starts with `=` is an expression.
     #[serde(default)]
     pub set: Map<String, Value>,
-    /// Starts of names, within the part, that are not built.
+    /// Starts of names, within the part, that are not built; ends of names after `*`.
     #[serde(default)]
     pub without: Vec<String>,
 }

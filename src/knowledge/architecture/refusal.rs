@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use super::doubt::Doubt;
 use crate::knowledge::EvalError;
 
 /// Why a class cannot be built from a config: the config is at fault, or too little is known.
@@ -9,8 +10,12 @@ use crate::knowledge::EvalError;
 pub enum Refusal {
     /// No loader could build it: a sentence for each fault of the config.
     Impossible(Vec<String>),
+    /// This loader raises: the exception as it says it.
+    Raises(String),
     /// A part of the model is not known here. The config may be right.
     UnknownPart(UnknownPart),
+    /// The description does not cover this config, and fails on it. The config may be right.
+    NotCovered(Vec<Doubt>),
 }
 
 /// A part of a model that is not known here.
@@ -36,6 +41,7 @@ impl Refusal {
             Self::Impossible(reasons) => {
                 Self::Impossible(reasons.into_iter().map(|reason| format!("{path}: {reason}")).collect())
             }
+            Self::Raises(_) | Self::NotCovered(_) => self,
             Self::UnknownPart(part) if part.config.is_empty() => {
                 Self::UnknownPart(UnknownPart { config: path.to_owned(), ..part })
             }
@@ -61,7 +67,12 @@ impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Impossible(reasons) => f.write_str(&reasons.join("; ")),
+            Self::Raises(error) => write!(f, "the loader raises {error}"),
             Self::UnknownPart(part) => write!(f, "{part}"),
+            Self::NotCovered(doubts) => {
+                let words: Vec<String> = doubts.iter().map(ToString::to_string).collect();
+                write!(f, "it is not known here: {}", words.join("; "))
+            }
         }
     }
 }

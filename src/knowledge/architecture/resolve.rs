@@ -1,8 +1,10 @@
 //! From a config as it is written to one with every value its config class fills in.
 
+use std::collections::BTreeSet;
+
 use serde_json::{Map, Value};
 
-use super::blueprint::{Blueprint, SubConfig};
+use super::blueprint::{Alias, Blueprint, Computed, ComputedOtherwise, EarlyAlias, Refuses, SubConfig};
 use super::build::Outcome;
 use super::refusal::{Refusal, UnknownPart};
 use super::{Evidence, Expected};
@@ -10,6 +12,9 @@ use crate::knowledge::{Expression, Library, Loader, Scope};
 
 /// Depth of configs within configs, and of parts within parts.
 pub(super) const DEPTH_CAP: usize = 8;
+
+/// What transformers 5 says of a value of another type than the field's.
+const FIELD: &str = "StrictDataclassFieldValidationError: Validation error";
 
 /// What configs are resolved with.
 #[derive(Clone, Copy)]
@@ -20,7 +25,10 @@ pub(super) struct Resolver<'a> {
 }
 
 impl Resolver<'_> {
-    /// Fills in defaults: static ones, then sub-configs, then computed ones.
+    /// The config as the class makes it: aliases that come first, static defaults, sub-configs, computed values, other
+    /// aliases.
+    ///
+    /// Called for the config at hand and, through [`Self::sub_config`], for those in it. Refuses what the loader refuses.
     pub fn resolve(
         &self,
         file: &Blueprint,
@@ -31,6 +39,27 @@ impl Resolver<'_> {
             return Err(Refusal::impossible(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
         let class = file.config(self.loader);
+        for (told, keys) in &class.types {
+            for key in keys.split(' ') {
+                let names = class.aliases.iter().filter(|(_, k)| k.name() == key).map(|(alias, _)| alias.as_str());
+                let wrong = names.chain([key]).filter_map(|name| config.get(name)).find(|value| !told.takes(value));
+                if wrong.is_some() {
+                    return Err(Refusal::Raises(format!("{FIELD} for field '{key}'")));
+                }
+            }
+        }
+        // What stands under another name: written over the key before others are computed, or when they are.
+        let mut late: Vec<(&str, Value)> = Vec::new();
+        for (alias, key) in &class.aliases {
+            let Some(value) = config.shift_remove(alias) else { continue };
+            match key {
+                Alias::Early(EarlyAlias { early }) => {
+                    config.insert(early.clone(), value);
+                }
+                Alias::Late(key) => late.push((key, value)),
+            }
+        }
+        let given: BTreeSet<String> = config.keys().cloned().collect();
         for (key, _) in class.configs.iter().filter(|(_, spec)| spec.flat) {
             if config.get(key).is_none_or(Value::is_null) {
                 config.insert(key.clone(), Value::Object(values_of(&config)));
@@ -38,12 +67,17 @@ impl Resolver<'_> {
         }
         fill(&mut config, &class.defaults);
         let mut scope = self.scope(&config);
-        for (key, spec) in &class.configs {
-            if let Some(sub) = self.sub_config(file, spec, config.get(key), &scope, key, depth)? {
-                config.insert(key.clone(), Value::Object(sub));
+        // Those that take values of others are resolved after them.
+        let takes = |spec: &SubConfig| spec.set.values().any(|v| v.as_str().is_some_and(|s| s.starts_with('=')));
+        let (later, first): (Vec<_>, Vec<_>) = class.configs.iter().partition(|(_, spec)| takes(spec));
+        for group in [first, later].into_iter().filter(|group| !group.is_empty()) {
+            for (key, spec) in group {
+                let instead = spec.instead.as_ref().and_then(|other| config.get(other)).filter(|v| v.is_object());
+                let given = instead.or_else(|| config.get(key));
+                if let Some(sub) = self.sub_config(file, spec, given, &scope, key, depth)? {
+                    config.insert(key.clone(), Value::Object(sub));
+                }
             }
-        }
-        if !class.configs.is_empty() {
             bind(&mut scope, &config);
         }
         let unmet: Vec<String> = file
@@ -58,7 +92,18 @@ impl Resolver<'_> {
         if !unmet.is_empty() {
             return Err(Refusal::Impossible(unmet));
         }
-        compute(&mut config, &class.computed, &mut scope)?;
+        compute(&mut config, &class.computed, &given, &mut scope)?;
+        config.extend(late.into_iter().map(|(key, value)| (key.to_owned(), value)));
+        // A key can be read under its other names too.
+        for (alias, key) in &class.aliases {
+            if let Some(value) = config.get(key.name()).cloned() {
+                config.insert(alias.clone(), value);
+            }
+        }
+        if !class.refuses.is_empty() {
+            bind(&mut scope, &config);
+            refused(&class.refuses, &scope)?;
+        }
         Ok(config)
     }
 
@@ -78,10 +123,8 @@ impl Resolver<'_> {
             (None | Some(Value::Null), None) => return Ok(None),
             (Some(_), _) => return Err(Refusal::impossible(format!("`{key}` is not an object"))),
         };
-        if let Some(model_type) = &spec.model_type
-            && sub.get("model_type").is_none_or(Value::is_null)
-        {
-            sub.insert("model_type".to_owned(), model_type.clone().into());
+        if let Some(model_type) = spec.model_type_of(owner, &sub).map(str::to_owned) {
+            sub.insert("model_type".to_owned(), model_type.into());
         }
         sub.extend(evaluated(&spec.set, scope)?);
         fill(&mut sub, &spec.defaults);
@@ -96,7 +139,8 @@ impl Resolver<'_> {
         }
         if !spec.computed.is_empty() {
             let mut scope = self.scope(&sub);
-            compute(&mut sub, &spec.computed, &mut scope).map_err(inside)?;
+            let given = sub.keys().cloned().collect();
+            compute(&mut sub, &spec.computed, &given, &mut scope).map_err(inside)?;
         }
         Ok(Some(sub))
     }
@@ -105,7 +149,7 @@ impl Resolver<'_> {
     pub fn unknown_sub_config(&self, file: &Blueprint, config: &Map<String, Value>) -> Option<UnknownPart> {
         file.config(self.loader).configs.iter().find_map(|(key, spec)| {
             let sub = config.get(key)?.as_object()?;
-            let model_type = sub.get("model_type").and_then(Value::as_str).or(spec.model_type.as_deref())?;
+            let model_type = spec.model_type_of(file, sub)?;
             let is_known = spec.model_type.as_deref() == Some(model_type)
                 || self.library.of_model_type(model_type, self.loader).is_some();
             let part = || UnknownPart { config: key.clone(), model_type: Some(model_type.to_owned()), class: None };
@@ -123,6 +167,7 @@ impl Resolver<'_> {
         let evidence = self.evidence.clone();
         scope.function1("stored_count", move |prefix| evidence.count(prefix).into());
         scope.bind_int("major", self.loader.major());
+        scope.bind_int("release", self.loader.release());
         bind(&mut scope, config);
         scope
     }
@@ -136,11 +181,31 @@ fn fill(config: &mut Map<String, Value>, defaults: &Map<String, Value>) {
     }
 }
 
-fn compute(config: &mut Map<String, Value>, computed: &[(String, Expression)], scope: &mut Scope<'_>) -> Outcome<()> {
+/// Refuses a config with which the loader raises.
+pub(super) fn refused(refuses: &[Refuses], scope: &Scope<'_>) -> Outcome<()> {
+    // A condition that cannot be asked of this config is none that it fulfils.
+    match refuses.iter().find(|r| r.when.eval_bool(scope).unwrap_or(false)) {
+        Some(r) => Err(Refusal::Raises(r.error.render(scope))),
+        None => Ok(()),
+    }
+}
+
+/// `given`: the keys that the config had before anything was filled in.
+fn compute(
+    config: &mut Map<String, Value>,
+    computed: &[(String, Computed)],
+    given: &BTreeSet<String>,
+    scope: &mut Scope<'_>,
+) -> Outcome<()> {
     // Binding a large config is dear: only what is evaluated next has to see what was computed last.
     let mut stale = false;
-    for (key, expression) in computed {
-        if config.get(key).is_none_or(Value::is_null) {
+    for (key, how) in computed {
+        let (expression, wanted) = match how {
+            Computed::Filled(expression) => (expression, config.get(key).is_none_or(Value::is_null)),
+            Computed::Other(ComputedOtherwise::UnlessGiven(expression)) => (expression, !given.contains(key)),
+            Computed::Other(ComputedOtherwise::Always(expression)) => (expression, true),
+        };
+        if wanted {
             if std::mem::take(&mut stale) {
                 bind(scope, config);
             }

@@ -42,6 +42,7 @@ fn register(scope: &mut Scope<'static>) {
     scope.function("ceil", |a| round(a, f64::ceil));
     scope.function("range", range);
     scope.function("keys", keys);
+    scope.function("split", split);
     scope.function("zpad", zpad);
     scope.function("join", join);
     scope.function("plural", plural);
@@ -57,6 +58,17 @@ fn register(scope: &mut Scope<'static>) {
     scope.add("max", cel::functions::max);
     scope.add("get", get);
     steps::register(scope);
+}
+
+/// The words of a text, in lower case, between separators; a list is its words already. As `pos_att_type: "p2c|c2p"`.
+fn split(arguments: &[Value]) -> FunctionResult {
+    match arguments {
+        [Value::String(text), Value::String(separator)] => {
+            Ok(text.to_lowercase().split(separator.as_str()).map(|word| Value::from(word.trim())).collect())
+        }
+        [list @ (Value::Array(_) | Value::Null), Value::String(_)] => Ok(list.clone()),
+        _ => Err("split(text, separator) takes a text, or a list, and a text".to_owned()),
+    }
 }
 
 fn pow(arguments: &[Value]) -> FunctionResult {

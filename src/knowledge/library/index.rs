@@ -1,88 +1,64 @@
-//! Which file describes a class or a model type, read off the files' texts.
+//! Finds the files that describe a class or a model type without parsing them.
 
-use std::collections::HashMap;
+use std::cmp::Ordering;
 
-use memchr::memmem;
-
-use crate::knowledge::architecture::Blueprint;
-
-/// Numbers of files, by what stands in them.
+/// The index of the embedded files, as the build script writes it: sorted lines of a kind and a name, and the stems of
+/// files after tabs.
 ///
-/// Parsing half a thousand files to find one would take a hundred times as long as looking for the two words that
-/// introduce a class and a model type. A file that is listed under a name need not describe it; one that describes it
-/// is listed, which a test sees to.
-pub(super) struct Index {
-    classes: HashMap<Box<str>, Vec<usize>>,
-    model_types: HashMap<Box<str>, Vec<usize>>,
+/// A file that is listed under a name need not describe it; one that describes it is listed, which a test ensures.
+const EMBEDDED: &str = include_str!(concat!(env!("OUT_DIR"), "/architectures.index"));
+
+/// Stems of the embedded files that contain this class.
+pub(super) fn with_class(class: &str) -> impl Iterator<Item = &'static str> + use<> {
+    stems("c", class)
 }
 
-impl Index {
-    /// A file that is parsed already speaks for itself.
-    pub fn of<'f>(files: impl Iterator<Item = (&'f str, Option<&'f Blueprint>)>) -> Self {
-        let mut index = Self { classes: HashMap::new(), model_types: HashMap::new() };
-        for (at, (text, parsed)) in files.enumerate() {
-            if let Some(file) = parsed {
-                file.classes.iter().for_each(|c| add(&mut index.classes, &c.name, at));
-                file.model_types.iter().for_each(|t| add(&mut index.model_types, t, at));
-            } else {
-                classes(text).for_each(|c| add(&mut index.classes, c, at));
-                model_types(text).for_each(|t| add(&mut index.model_types, t, at));
-            }
-        }
-        index
-    }
-
-    pub fn with_class(&self, class: &str) -> &[usize] {
-        self.classes.get(class).map_or(&[], Vec::as_slice)
-    }
-
-    pub fn with_model_type(&self, model_type: &str) -> &[usize] {
-        self.model_types.get(model_type).map_or(&[], Vec::as_slice)
-    }
+/// Stems of the embedded files for this model type.
+pub(super) fn with_model_type(model_type: &str) -> impl Iterator<Item = &'static str> + use<> {
+    stems("m", model_type)
 }
 
-fn add(map: &mut HashMap<Box<str>, Vec<usize>>, key: &str, at: usize) {
-    match map.get_mut(key) {
-        Some(places) if places.last() == Some(&at) => {}
-        Some(places) => places.push(at),
-        None => {
-            map.insert(key.into(), vec![at]);
+fn stems(kind: &str, name: &str) -> impl Iterator<Item = &'static str> + use<> {
+    find(EMBEDDED, kind, name).unwrap_or_default().split('\t').filter(|stem| !stem.is_empty())
+}
+
+/// The rest of the line that starts with this kind and name, by bisection.
+fn find<'t>(mut text: &'t str, kind: &str, name: &str) -> Option<&'t str> {
+    loop {
+        let middle = text.as_bytes().get(..text.len() / 2)?;
+        let start = memchr::memrchr(b'\n', middle).map_or(0, |at| at.saturating_add(1));
+        let (before, rest) = text.split_at_checked(start)?;
+        let (line, after) = rest.split_once('\n')?;
+        let (key, found) = line.split_once('\t')?;
+        match key.split_once(' ')?.cmp(&(kind, name)) {
+            Ordering::Equal => return Some(found),
+            Ordering::Less => text = after,
+            Ordering::Greater => text = before,
         }
     }
-}
-
-/// What stands after `class:` in quotes, but for the parts: `part: { class: "LlamaModel" }`.
-fn classes(text: &str) -> impl Iterator<Item = &str> {
-    const KEY: &str = "class:";
-    memmem::find_iter(text.as_bytes(), KEY).filter_map(move |at| {
-        let (before, after) = (text.get(..at)?, text.get(at.checked_add(KEY.len())?..)?);
-        let object = before.get(..memchr::memrchr(b'{', before.as_bytes())?)?;
-        if object.trim_end().ends_with("part:") {
-            return None;
-        }
-        after.trim_start().strip_prefix('"')?.split('"').next()
-    })
-}
-
-/// What stands in `model_types: [...]`.
-fn model_types(text: &str) -> impl Iterator<Item = &str> {
-    let list = memmem::find(text.as_bytes(), b"model_types:").and_then(|at| text.get(at..)?.split(['[', ']']).nth(1));
-    list.unwrap_or_default().split('"').skip(1).step_by(2)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::scan;
     use super::*;
+    use crate::knowledge::architecture::Blueprint;
     use crate::knowledge::source;
 
     #[test]
-    fn every_class_and_model_type_of_every_file_is_found_in_its_text() {
+    fn every_class_and_model_type_of_every_file_is_found() {
         for (path, text) in source::embedded("architectures") {
             let file: Blueprint = source::parse_embedded(&path, text).unwrap_or_else(|e| panic!("{e}"));
-            let found: Vec<&str> = classes(text).collect();
-            let lost = file.classes.iter().find(|c| !found.contains(&c.name.as_str()));
-            assert_eq!(lost.map(|c| &c.name), None, "{path}: write it as class: \"…\"");
-            assert_eq!(model_types(text).collect::<Vec<_>>(), file.model_types, "{path}");
+            for class in &file.classes {
+                let found = with_class(&class.name).any(|stem| stem == file.architecture);
+                assert!(found, "{path}: {} is written as class: \"…\"", class.name);
+            }
+            for model_type in &file.model_types {
+                assert!(with_model_type(model_type).any(|stem| stem == file.architecture), "{path}: {model_type}");
+            }
+        }
+        for unknown in ["", "Nobody", "Zzz", "\t", "\n", "A", "a b"] {
+            assert_eq!(with_class(unknown).chain(with_model_type(unknown)).count(), 0, "{unknown:?}");
         }
     }
 
@@ -92,7 +68,7 @@ mod tests {
             { part: { config: "c", class: "C" } } } }, {
             class:
             "D" }]"#;
-        assert_eq!(classes(text).collect::<Vec<_>>(), ["A", "D"]);
-        assert_eq!(model_types(text).collect::<Vec<_>>(), ["a", "b"]);
+        assert_eq!(scan::classes(text).collect::<Vec<_>>(), ["A", "D"]);
+        assert_eq!(scan::model_types(text).collect::<Vec<_>>(), ["a", "b"]);
     }
 }

@@ -361,11 +361,11 @@ fn the_load_is_predicted_for_the_given_versions() {
     let shown = String::from_utf8(shown.stdout).unwrap();
     assert!(shown.contains(": raises with transformers 5.1.0 (predicted as 5.23.0) and 4.47.0"), "{shown}");
 
-    for wrong in ["5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
+    for wrong in ["v5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
         let output = doctor(&["check", dir.to_str().unwrap(), "--for", wrong]);
         assert_eq!(output.status.code(), Some(2), "{wrong}");
         let errors = String::from_utf8(output.stderr).unwrap();
-        assert!(errors.contains("known versions are 4.47.0, 5.23.0"), "{errors}");
+        assert!(errors.contains("known versions are 4.47.0, 4.57.6, 5.23.0"), "{errors}");
     }
     // A class of custom code, known for one version only.
     let spatialvla = donor("spatialvla-tiny");

@@ -154,7 +154,7 @@ fn errors_in_settings_have_a_position() {
         "{ severity: { JSN999: 'error' } }",
         "{ 'per-path': { 'a/[': { ignore: ['JSN001'] } } }",
         "{ 'per-path': { 'a': { ignore: ['nonfinite-number'] } } }",
-        "{ for: ['4.47.0'] }",
+        "{ for: ['torch==2.0'] }",
         "{ 'fail-on': 'eror' }",
         "{ rules: 'no-such-folder' }",
         "{ baseline: 'none.json' }",

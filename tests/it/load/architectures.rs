@@ -1,6 +1,6 @@
 //! Architectures against the tensor maps of real and tiny checkpoints, name for name and shape for shape.
 
-use ckpt_doctor::knowledge::{Evidence, Expected, Library, Loader};
+use ckpt_doctor::knowledge::{Doubt, Evidence, Expected, Library, Loader, Refusal};
 use serde_json::{Value, json};
 
 use super::total_bytes;
@@ -262,8 +262,9 @@ fn a_composition_takes_its_parts_as_each_loader_builds_them() {
     let library = small_library();
     let config = json!({ "architectures": ["HouseForSale"], "n": 3, "tower_config": { "depth": null } });
     let built = |config: &Value, loader| library.find(config, [], loader).expect("known").expect(config);
-    let refused = built(&config, Loader::V5_23_0).expect_err("depth is null, and null is no number");
-    assert!(refused.to_string().contains("c.depth"), "{refused:?}");
+    let refused =
+        built(&config, Loader::V5_23_0).expect_err("depth is null, and what the class makes of that is not known");
+    assert!(matches!(refused, Refusal::NotCovered(_)), "{refused:?}");
     let config = json!({ "architectures": ["HouseForSale"], "n": 3 });
 
     let old = built(&config, Loader::V4_47_0).expect("built");
@@ -307,4 +308,116 @@ fn a_composition_takes_its_parts_as_each_loader_builds_them() {
     );
     assert_eq!((steps.len(), steps[4]), (9, ("LayerNorm.gamma", None)));
     assert_eq!(new.conversions[0].extra["prefix_to_remove"], "a");
+}
+
+/// A class whose config class does to its keys all that one can say of it.
+const RESHAPED: &str = r#"{
+  architecture: "reshaped", summary: "for tests", model_types: ["reshaped"], sources: ["nobody"], loaders: ["4.47.0", "4.57.6", "5.23.0"],
+  inside: "whole",
+  defaults: { width: 8, heads: 2, kind: "plain", legacy: null, tied: null },
+  aliases: { hidden: "width", n_head: { early: "heads" } },
+  computed: {
+    width: { always: "c.legacy != null ? c.legacy : c.width" },
+    head_width: "c.width / c.heads",
+    gated: { unless_given: "c.kind.startsWith('gated-')" },
+    words: { always: "split(c.words, '|')" },
+  },
+  unvaried: { odd: 1 },
+  refuses: [{ when: "c.width % c.heads != 0", error: "ValueError: {c.width} is no multiple of {c.heads}" }],
+  by_loader: { "5.23.0": { aliases: { breadth: "width" } } },
+  classes: [{
+    class: "Reshaped",
+    key_mapping: [["^old\\.(\\w+)", "new.\\1"]],
+    not_predicted_when: [{ when: "c.adapter == true", why: "adapters are not described" }],
+    tensors: {
+      a: { shape: ["c.width", "c.head_width"] },
+      b: { when: "c.gated == true", shape: ["1"] },
+      c: { when: "'x' in c.words", shape: ["1"] },
+      d: { when: "release >= 457", shape: ["1"] },
+    },
+  }],
+}"#;
+
+fn reshaped(config: &Value, loader: Loader) -> Result<Expected, Refusal> {
+    let mut library = Library::default();
+    library.add("reshaped.json5", RESHAPED).expect("a file");
+    library.class("Reshaped", loader).expect("known").expect(config)
+}
+
+#[track_caller]
+fn assert_reshaped(mut config: Value, a: [u64; 2], others: &[&str]) {
+    config["words"] = config.get("words").cloned().unwrap_or_else(|| json!([]));
+    config["adapter"] = config.get("adapter").cloned().unwrap_or_else(|| json!(false));
+    let built = reshaped(&config, Loader::V4_47_0).expect("built");
+    assert_eq!(built.tensors["a"].shape, a, "{config}");
+    assert_eq!(built.tensors.keys().skip(1).collect::<Vec<_>>(), others, "{config}");
+}
+
+#[test]
+fn what_stands_under_another_name_is_written_over_the_key() {
+    assert_reshaped(json!({ "width": 12 }), [12, 6], &[]);
+    // A late one comes after what is computed from the key, and wins over it; an early one before.
+    assert_reshaped(json!({ "width": 12, "hidden": 24 }), [24, 6], &[]);
+    assert_reshaped(json!({ "width": 12, "heads": 3, "n_head": 4 }), [12, 3], &[]);
+    let five = reshaped(&json!({ "breadth": 16, "words": [], "adapter": false }), Loader::V5_23_0).expect("built");
+    assert_eq!(five.tensors["a"].shape, [16, 4]);
+    assert_reshaped(json!({ "breadth": 16 }), [8, 4], &[]);
+    // And it can be read under either name.
+    assert_eq!(five.config["breadth"], json!(16));
+}
+
+#[test]
+fn computed_keys_say_when_they_are() {
+    assert_reshaped(json!({ "width": 12, "legacy": 4 }), [4, 2], &[]);
+    assert_reshaped(json!({ "head_width": null }), [8, 4], &[]);
+    assert_reshaped(json!({ "head_width": 7 }), [8, 7], &[]);
+    assert_reshaped(json!({ "kind": "gated-relu" }), [8, 4], &["b"]);
+    assert_reshaped(json!({ "kind": "gated-relu", "gated": false }), [8, 4], &[]);
+    assert_reshaped(json!({ "kind": "gated-relu", "gated": null }), [8, 4], &[]);
+    assert_reshaped(json!({ "words": "y|X" }), [8, 4], &["c"]);
+    assert_reshaped(json!({ "words": ["x"] }), [8, 4], &["c"]);
+}
+
+#[test]
+fn a_part_of_a_larger_model_reads_its_own_config() {
+    let inner = json!({ "width": 20, "words": [], "adapter": false });
+    assert_reshaped(json!({ "model_type": "other", "width": 2, "whole": inner }), [20, 10], &[]);
+    let typed = json!({ "model_type": "reshaped", "width": 22, "words": [], "adapter": false });
+    assert_reshaped(json!({ "model_type": "other", "width": 2, "somewhere": typed }), [22, 11], &[]);
+    assert_reshaped(json!({ "model_type": "reshaped", "width": 2, "somewhere": typed }), [2, 1], &[]);
+}
+
+#[test]
+fn what_a_description_does_not_cover_is_said() {
+    let built = |config: &Value| reshaped(config, Loader::V4_57_6);
+    let plain = built(&json!({ "words": [], "adapter": false, "odd": 1 })).expect("built");
+    assert_eq!(plain.doubts, []);
+    assert!(plain.tensors.contains_key("d"));
+    assert_eq!(plain.conversions[0].from, [r"^old\.(\w+)"]);
+    let odd = built(&json!({ "words": [], "adapter": true, "odd": 2 })).expect("built");
+    let doubts: Vec<String> = odd.doubts.iter().map(ToString::to_string).collect();
+    assert_eq!(doubts, ["adapters are not described", "/odd is read by the class, and what it does is not known here"]);
+    // Where the description fails, a null in place of a value that the class has may be why.
+    let null = built(&json!({ "words": [], "adapter": false, "width": null })).expect_err("no width");
+    assert_eq!(null, Refusal::NotCovered(vec![Doubt::Null("/width".to_owned())]));
+    let refused = built(&json!({ "words": [], "adapter": false, "width": 9 })).expect_err("odd width");
+    assert_eq!(refused, Refusal::Raises("ValueError: 9 is no multiple of 2".to_owned()));
+}
+
+#[test]
+fn the_nearest_loader_that_has_a_class_stands_for_a_version() {
+    let library = Library::embedded();
+    let stands = |version: &str, class: &str| {
+        let config = json!({ "architectures": [class] });
+        library.stands_for(version, &config, &[]).map(|(loader, _)| loader)
+    };
+    assert_eq!(stands("4.50.0", "LlamaForCausalLM"), Some(Loader::V4_47_0));
+    assert_eq!(stands("4.56", "LlamaForCausalLM"), Some(Loader::V4_57_6));
+    assert_eq!(stands("4.57.3", "LlamaForCausalLM"), Some(Loader::V4_57_6));
+    // Known to 4.57 and not to 4.47, to which 4.50 is nearer; a known version stands for itself alone.
+    assert_eq!(stands("4.50.0", "Qwen3ForCausalLM"), Some(Loader::V4_57_6));
+    assert_eq!(stands("4.47.0", "Qwen3ForCausalLM"), None);
+    assert_eq!(stands("4.50.0", "Nobody"), None);
+    let by_name = library.class_under("4.50.0", "Qwen3ForCausalLM").map(|(loader, _)| loader);
+    assert_eq!(by_name, Some(Loader::V4_57_6));
 }

@@ -88,7 +88,7 @@ impl Record {
         let prefix = format!("{}.", self.base_model_prefix);
         let tied_to = |name: &String| match loader {
             // For names with the same storage, the first one is saved.
-            Loader::V4_47_0 => {
+            Loader::V4_47_0 | Loader::V4_57_6 => {
                 let first = self.tied.iter().find(|group| group.contains(name))?.first()?;
                 (first != name).then(|| first.clone())
             }
