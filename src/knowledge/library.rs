@@ -96,7 +96,7 @@ impl Library {
             None => {
                 let files = self.all_of_model_type(model_type?).filter(|file| file.speaks_for(config));
                 let mut mains: Vec<_> = files.filter_map(|file| Some((file, main_class(file, loader)?))).collect();
-                mains.retain(|(_, main)| class.is_none_or(|class| has_head(class) == has_head(&main.name)));
+                mains.retain(|(_, main)| class.is_none_or(|class| !has_head(class) || has_head(&main.name)));
                 choose(mains, &mut names)?
             }
         };

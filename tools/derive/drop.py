@@ -62,6 +62,8 @@ def main(args):
             texts[path] = without(text, version, name)
         if args.when:
             continue
+        for names in told[version].values():
+            names.pop(name, None)
         told[version].setdefault(why, {})[name] = args.reason if why == WRONG else "a part is not shipped"
         print(f"{version}: {name}: {why}")
     for path, text in texts.items():

@@ -65,11 +65,7 @@ pub(super) fn nulls(library: &Library, file: &Blueprint, loader: Loader, config:
         let class = file.config(loader);
         let own = |key: &str| class.defaults.get(key).is_some_and(|value| !value.is_null());
         let keys = config.iter().filter(|(key, value)| value.is_null() && own(key)).map(|(key, _)| key);
-        let required = |key: &str| {
-            let typed = |loader| file.config(loader).forbids_null(key);
-            class.forbids_null(key) || (REQUIRED.contains(&key) && Loader::ALL.into_iter().any(typed))
-        };
-        let keys = keys.filter(|key| !required(key));
+        let keys = keys.filter(|key| !class.forbids_null(key) && !REQUIRED.contains(&key.as_str()));
         found.extend(keys.map(|key| Doubt::Null(pointer(path, key))));
     });
     found
