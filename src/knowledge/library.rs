@@ -91,7 +91,10 @@ impl Library {
         candidates.retain(|(file, _)| file.speaks_for(config));
         candidates.sort_by_key(|(file, _)| !model_type.is_some_and(|t| file.model_types.iter().any(|m| m == t)));
         let (file, class) = match choose(candidates, &mut names) {
-            Some(found) => found,
+            Some((file, class)) => match self.by_type_instead(config, file, class, loader) {
+                Some(other) => other?,
+                None => (file, class),
+            },
             None if class.is_some() && config.get("auto_map").is_none() => return None,
             None => {
                 let files = self.all_of_model_type(model_type?).filter(|file| file.speaks_for(config));
@@ -101,6 +104,31 @@ impl Library {
             }
         };
         Some(Architecture::new(self, file, class, loader))
+    }
+
+    /// The class that the Auto classes build where `model_type` is not a type of the named class: that of the type for the
+    /// same task. `None` where the named class is built; an empty choice where the other class is not described.
+    fn by_type_instead(
+        &self,
+        config: &Value,
+        file: &Blueprint,
+        class: &Class,
+        loader: Loader,
+    ) -> Option<Option<(&Blueprint, &Class)>> {
+        let model_type = config.get("model_type").and_then(Value::as_str)?;
+        let is_of_type = file.model_types.iter().any(|t| t == model_type);
+        // Classes of other packages than transformers have no Auto class.
+        if is_of_type || !file.has_auto() || config.get("auto_map").is_some() {
+            return None;
+        }
+        let others = self.all_of_model_type(model_type).filter(|other| other.has_auto() && other.speaks_for(config));
+        let mut others = others.peekable();
+        others.peek()?;
+        let same_task = |other| {
+            let classes = Blueprint::classes(other, loader).filter(|c| task(&c.name) == task(&class.name));
+            classes.map(move |class| (other, class)).next()
+        };
+        Some(others.find_map(same_task))
     }
 
     /// Whether a file describes this model type, under any loader.
@@ -186,6 +214,14 @@ impl Library {
             embedded.get(at)
         };
         added.iter().chain(stems.filter_map(of_stem)).map(File::blueprint)
+    }
+}
+
+/// The part of a class name that Auto classes share: `ForCausalLM`; empty for a base model.
+fn task(class: &str) -> &str {
+    match class.find("LMHeadModel") {
+        Some(_) => "ForCausalLM",
+        None => class.find("For").and_then(|at| class.get(at..)).unwrap_or_default(),
     }
 }
 

@@ -374,6 +374,11 @@ impl Blueprint {
         own.or_else(|| self.auto.get(mapping)).map(String::as_str)
     }
 
+    /// Whether Auto classes of transformers build a class of this file.
+    pub fn has_auto(&self) -> bool {
+        !self.auto.is_empty() || self.by_loader.values().any(|other| !other.auto.is_empty())
+    }
+
     /// The `model_type` of a sub-config that names none, under one loader.
     pub fn sub_config_type(&self, key: &str, loader: Loader) -> Option<String> {
         let of = |configs: &[(String, SubConfig)]| {
