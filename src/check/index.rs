@@ -308,7 +308,7 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     unread_weights(checkpoint, &names).into_iter().collect()
 }
 
-/// Whether config.json is one of transformers: that of timm, diffusers or LeRobot names no model type and no class.
+/// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class.
 pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {
     let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
     (has("model_type") || has("architectures")) && !has("_class_name")
@@ -323,7 +323,7 @@ fn is_model(checkpoint: &Checkpoint) -> bool {
 /// has an index, a numbered one.
 ///
 /// Source: `_get_resolved_checkpoint_files` of transformers 4.57.6. Other names belong to other programs:
-/// `consolidated.safetensors` to mistral-inference, `open_clip_model.safetensors` to open_clip.
+/// `consolidated.safetensors` to mistral-inference, `open_clip_model.safetensors` to `open_clip`.
 pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
     match &checkpoint.index {
         _ if checkpoint.has_file(SINGLE) => name == SINGLE,
@@ -395,10 +395,14 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
         let names = || f.places.iter().filter_map(|p| p.file.as_deref());
         f.kind == FaultKind::LfsPointer && names().any(|n| n.ends_with(".bin"))
     };
+    // Beside weights that were not downloaded, other pickles are no weights: `colbert_linear.pt`.
+    let has_pointer = checkpoint.faults.iter().any(is_reported);
     match pickle {
-        Some(name) => Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name))),
-        None if checkpoint.faults.iter().any(is_reported) => None,
-        None => {
+        Some(name) if !has_pointer || name.starts_with("pytorch_model") => {
+            Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name)))
+        }
+        _ if has_pointer => None,
+        _ => {
             let is_foreign = |name: &&String| FOREIGN.iter().any(|ending| name.ends_with(ending));
             let foreign: Vec<&str> = checkpoint.entries.keys().filter(is_foreign).map(String::as_str).collect();
             let fault = Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint) && foreign.is_empty());

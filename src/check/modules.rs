@@ -164,6 +164,14 @@ fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
     direct.into_iter().flatten().chain([root.to_owned()]).collect()
 }
 
+/// Whether loading imports the file: an entry of `auto_map` leads to it.
+pub(super) fn is_imported(checkpoint: &Checkpoint, file: &str) -> bool {
+    let entries = entries(checkpoint);
+    let roots: BTreeSet<&str> = entries.iter().filter(|e| !e.nested).filter_map(|e| Some(e.parts()?.0)).collect();
+    let Some(module) = file.strip_suffix(".py") else { return false };
+    roots.into_iter().any(|root| closure(checkpoint, root).iter().any(|(name, _)| name == module))
+}
+
 /// Faults of every `auto_map` entry.
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
@@ -212,6 +220,7 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
             imports(checkpoint, &entries, entry, module, &mut faults);
         }
     }
+    faults.extend(packages(checkpoint, &roots));
     faults.extend(unimportable(checkpoint, &entries));
     faults
 }
@@ -239,21 +248,11 @@ fn imports(
             missing.insert(name);
         }
     }
-    let others = needed(checkpoint, root).map(|(_, import)| import.package.as_str());
-    let packages: BTreeSet<&str> = others.filter(|package| !is_own(checkpoint, package)).collect();
     for fault in own_as_packages(checkpoint, root) {
         // Several entries may lead to the same module.
         if !faults.contains(&fault) {
             faults.push(fault);
         }
-    }
-    if !packages.is_empty() {
-        faults.push(
-            Fault::new(FaultKind::ModuleNeedsPackage)
-                .at(Place::file(format!("{root}.py")))
-                .with("module", format!("{root}.py"))
-                .with("packages", packages.into_iter().collect::<Vec<_>>()),
-        );
     }
     for name in absent {
         faults.push(
@@ -283,6 +282,21 @@ fn needed<'c>(checkpoint: &'c Checkpoint, root: &str) -> impl Iterator<Item = (&
     let modules = closure(checkpoint, root).into_iter().filter_map(|(_, module)| module);
     let imports = modules.flat_map(|module| module.imports.iter().map(move |import| (module, import)));
     imports.filter(|(_, import)| !import.guarded && !is_at_hand(&import.package))
+}
+
+/// The packages that the modules of `roots` need, as one fault.
+fn packages(checkpoint: &Checkpoint, roots: &BTreeSet<&str>) -> Option<Fault> {
+    let needs = |root: &&str| {
+        let names = needed(checkpoint, root).map(|(_, import)| import.package.as_str());
+        let packages: BTreeSet<&str> = names.filter(|package| !is_own(checkpoint, package)).collect();
+        (format!("{root}.py"), packages)
+    };
+    let needs: Vec<_> = roots.iter().map(needs).filter(|(_, packages)| !packages.is_empty()).collect();
+    let packages: BTreeSet<&str> = needs.iter().flat_map(|(_, packages)| packages).copied().collect();
+    let modules: Vec<&str> = needs.iter().map(|(module, _)| module.as_str()).collect();
+    let fault = modules.iter().fold(Fault::new(FaultKind::ModuleNeedsPackage), |f, module| f.at(Place::file(*module)));
+    let fault = fault.with("packages", packages.into_iter().collect::<Vec<_>>());
+    (!modules.is_empty()).then(|| fault.with("modules", modules))
 }
 
 /// Modules of the checkpoint that those of a root import as if they were installed, one fault for each importing module.
@@ -326,7 +340,7 @@ fn unimportable(checkpoint: &Checkpoint, entries: &[AutoMapEntry]) -> Option<Fau
     Some(fault.with("module", format!("{module}.py")).with("imported", sibling))
 }
 
-/// Names of the modules of Python: `sys.stdlib_module_names` of CPython 3.10 to 3.13, and what 3.9 had besides.
+/// Names of the modules of Python: `sys.stdlib_module_names` of Python 3.10 to 3.13, and what 3.9 had besides.
 const STANDARD_LIBRARY: &str = include_str!("modules/standard_library.txt");
 
 /// Packages that come with transformers and torch.
@@ -354,7 +368,7 @@ fn is_at_hand(package: &str) -> bool {
 
 /// Whether a package of this name is a module or a folder of the checkpoint.
 ///
-/// Exports to ONNX and OpenVINO lie in folders that have the names of packages.
+/// Exports to ONNX and `OpenVINO` lie in folders that have the names of packages.
 fn is_own(checkpoint: &Checkpoint, package: &str) -> bool {
     let is_folder = checkpoint.entries.get(package).is_some_and(|entry| entry.kind == EntryKind::Directory);
     checkpoint.modules.contains_key(&format!("{package}.py")) || is_folder && !["onnx", "openvino"].contains(&package)

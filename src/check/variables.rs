@@ -82,6 +82,8 @@ pub fn scope(
     let here = Arc::clone(checkpoint);
     scope.function1("is_opened", move |name| json!(index::is_opened(&here, name)));
     let here = Arc::clone(checkpoint);
+    scope.function1("is_imported", move |file| json!(modules::is_imported(&here, file)));
+    let here = Arc::clone(checkpoint);
     scope.function1("has_file", move |name| json!(here.has_file(name)));
     let here = Arc::clone(checkpoint);
     scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));

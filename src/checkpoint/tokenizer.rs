@@ -12,7 +12,7 @@ mod vocabulary;
 
 pub use vocabulary::Vocabulary;
 
-/// Vocabulary files that are read, in the order in which a tokenizer takes its ids from them: M2M100 and Speech2Text take
+/// Vocabulary files that are read, in the order in which a tokenizer takes its ids from them: M2M100 and `Speech2Text` take
 /// those of `vocab.json`, and use `sentencepiece.bpe.model` to split text.
 pub const VOCABULARY_FILES: [&str; 8] = [
     "tokenizer.json",

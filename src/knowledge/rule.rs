@@ -167,7 +167,7 @@ pub struct FaultCheck {
 /// - `metadata_only`: weights may be missing.
 ///
 /// Functions are `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a
-/// shard of this name), `id_of(token)`, and `stays_random(tensor)`: whether a loader leaves the tensor randomly initialised,
+/// shard of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and `stays_random(tensor)`: whether a loader leaves the tensor randomly initialised,
 /// null when the class is unknown. For messages there are `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
 ///
 /// A condition that cannot be evaluated because a value is missing is not a finding.
