@@ -72,6 +72,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let targets = load::wanted(config, versions);
     let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
     scope.bind("loaders", &leading.collect());
+    scope.bind("named", &(!versions.is_empty()).into());
     scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
@@ -104,8 +105,10 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     // An effect without an object is on the one that reads the file of the fault, which may be any.
     let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects);
     let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
+    let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
     let basis = Basis {
         checkpoint,
+        program: program.and_then(|fault| fault.detail.get("program")?.as_str()),
         findings: &outcome.findings,
         loads: &outcome.loads,
         unpredicted: &judged.unpredicted,

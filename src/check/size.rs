@@ -289,11 +289,12 @@ mod tests {
     }
 
     #[test]
-    fn one_kind_or_module_in_the_other_type_is_legitimate_and_some_other_difference_is_not() {
+    fn one_or_two_kinds_in_the_other_type_are_legitimate_and_some_other_difference_is_not() {
         let llama = llama(false);
         let weighed = Weighed::new(&llama, &names(&llama)).expect("sizes");
         let plain = *weighed.sizes(2).expect("sizes").first().expect("a size");
-        for more in [8000, 8, 4 * 8 * 8] {
+        // An embedding, a norm, the attention of a layer; two kinds: a norm and the query, a norm and the head.
+        for more in [8000, 8, 4 * 8 * 8, 8 + 8 * 8, 8 + 8000] {
             assert!(weighed.mixed(plain + 2 * more, 2), "{more}");
         }
         assert!(weighed.mixed(2 * plain, 2), "all in float32");

@@ -163,7 +163,7 @@ pub struct FaultCheck {
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
 ///   `of_transformers`: config.json is one of transformers;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
-/// - `loaders`: versions of transformers to check for;
+/// - `loaders`: versions of transformers to check for; `named`: whether the user named them;
 /// - `metadata_only`: weights may be missing.
 ///
 /// Functions are `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a
