@@ -390,19 +390,21 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
         (n.ends_with(".bin") && n.starts_with("pytorch_model"))
             || ((n.ends_with(".pth") || n.ends_with(".pt")) && !is_training_state(n))
     };
-    let pickle = checkpoint.entries.keys().find(|n| is_pickle(n) && !is_pointer(checkpoint, n));
+    let pickles = checkpoint.entries.keys().filter(|n| is_pickle(n) && !is_pointer(checkpoint, n));
+    let pickle = pickles.min_by_key(|n| !n.starts_with("pytorch_model"));
     let is_reported = |f: &Fault| {
         let names = || f.places.iter().filter_map(|p| p.file.as_deref());
         f.kind == FaultKind::LfsPointer && names().any(|n| n.ends_with(".bin"))
     };
-    // Beside weights that were not downloaded, other pickles are no weights: `colbert_linear.pt`.
     let has_pointer = checkpoint.faults.iter().any(is_reported);
     match pickle {
-        Some(name) if !has_pointer || name.starts_with("pytorch_model") => {
+        // transformers reads no other name; beside weights that were not downloaded, `colbert_linear.pt` stands for none.
+        Some(name) if name.starts_with("pytorch_model") || !has_pointer && !is_model(checkpoint) => {
             Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name)))
         }
         _ if has_pointer => None,
-        _ => {
+        Some(name) => unread_weights(checkpoint, &[name]),
+        None => {
             let is_foreign = |name: &&String| FOREIGN.iter().any(|ending| name.ends_with(ending));
             let foreign: Vec<&str> = checkpoint.entries.keys().filter(is_foreign).map(String::as_str).collect();
             let fault = Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint) && foreign.is_empty());
