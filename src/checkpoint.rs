@@ -69,6 +69,8 @@ pub struct Checkpoint {
     pub tokenizer: Tokenizer,
     /// Text of files that are neither documents nor modules, by name: `chat_template.jinja`.
     pub texts: BTreeMap<String, Arc<str>>,
+    /// Whether the base model that `adapter_config.json` names by a relative path exists there.
+    pub has_base: bool,
     /// Digests of the tensors' bytes; `None` unless [`Checkpoint::read_contents`] ran.
     pub contents: Option<Contents>,
     /// Faults of the directory itself; [`Checkpoint::all_faults`] adds those of the files.

@@ -24,10 +24,9 @@ type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return Vec::new() };
     let mut faults = Vec::new();
-    // AdapterHub's library gives its own, other files the same name.
-    if adapter.config().is_some_and(|config| config.get("peft_type").is_none() && config.get("model_class").is_some()) {
-        let at = Place::file(CONFIG).pointer("/model_class");
-        return vec![Fault::new(FaultKind::AdapterTypeUnchecked).at(at).with("peft_type", "AdapterHub")];
+    if let Some((key, library)) = adapter.config().and_then(other_library) {
+        let at = Place::file(CONFIG).pointer(format!("/{key}"));
+        return vec![Fault::new(FaultKind::AdapterTypeUnchecked).at(at).with("peft_type", library)];
     }
     match adapter.file() {
         None => faults.push(Fault::new(FaultKind::AdapterWeightsMissing).at(Place::file(CONFIG))),
@@ -40,7 +39,7 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let Some(config) = adapter.config() else { return faults };
     let text = |key: &str| config.get(key).and_then(Value::as_str);
     let base = text("base_model_name_or_path").unwrap_or_default();
-    if is_path(base) {
+    if is_path(base) && !checkpoint.has_base {
         let at = Place::file(CONFIG).pointer("/base_model_name_or_path");
         faults.push(Fault::new(FaultKind::AdapterBaseIsAPath).at(at).with("base", base));
     }
@@ -66,6 +65,15 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     faults
 }
 
+/// The library other than PEFT that wrote an adapter config, and the key that shows it. Both have other weights files:
+/// `pytorch_adapter.bin`, `adapters.safetensors`.
+fn other_library(config: &Value) -> Option<(&'static str, &'static str)> {
+    const LIBRARIES: [(&str, &str); 3] =
+        [("model_class", "AdapterHub"), ("fine_tune_type", "MLX"), ("lora_parameters", "MLX")];
+    let is_peft = config.get("peft_type").is_some();
+    LIBRARIES.into_iter().find(|(key, _)| !is_peft && config.get(*key).is_some())
+}
+
 /// Whether a base model is named by a path of the machine that trained: a Hub id has at most one slash, inside.
 fn is_path(base: &str) -> bool {
     let drive = base.get(1..3).is_some_and(|s| s == ":\\" || s == ":/");
@@ -73,6 +81,13 @@ fn is_path(base: &str) -> bool {
 }
 
 fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
+    let empty: Vec<&str> = tensors.iter().filter(|t| t.shape.contains(&0)).map(|t| t.name.as_str()).collect();
+    if let Some(first) = empty.first() {
+        let fault = Fault::new(FaultKind::AdapterTensorsEmpty).at(Place::tensor(*first)).with("count", empty.len());
+        faults.push(fault.with("all", empty.len() == tensors.len()));
+        // Ranks and pairs of what was not gathered imply nothing.
+        return;
+    }
     let mut modules: BTreeMap<&str, AdapterModule<'_>> = BTreeMap::new();
     let mut whole: BTreeSet<&str> = BTreeSet::new();
     for tensor in tensors {

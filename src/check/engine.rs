@@ -10,9 +10,9 @@ use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, Stored, Target};
 use super::outcome::Outcome;
 use super::verdict::Basis;
-use super::{adapter, index, judge, model_type, modules, policy, refusals, tokens, variables};
+use super::{adapter, index, inspect, judge, model_type, modules, policy, refusals, tokens, variables};
 use crate::checkpoint::document::Locator;
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Object, Rule};
@@ -47,8 +47,9 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     faults.extend(index::faults(checkpoint));
     faults.extend(modules::faults(checkpoint));
     faults.extend(adapter::faults(checkpoint));
-    let judged = judge::judge(checkpoint, knowledge, versions, &Stored::of(checkpoint));
-    faults.extend(judged.faults);
+    let stored = Stored::of(checkpoint);
+    let judged = judge::judge(checkpoint, knowledge, versions, &stored);
+    faults.extend(judged.faults.into_iter().map(|fault| with_likely_class(fault, knowledge, &stored)));
     let config = checkpoint.config();
     let mut outcome = Outcome {
         architecture: judged.architecture,
@@ -71,6 +72,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let targets = load::wanted(config, versions);
     let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
     scope.bind("loaders", &leading.collect());
+    scope.bind("named", &(!versions.is_empty()).into());
     scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
@@ -106,8 +108,10 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     // An effect without an object is on the one that reads the file of the fault, which may be any.
     let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects);
     let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
+    let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
     let basis = Basis {
         checkpoint,
+        program: program.and_then(|fault| fault.detail.get("program")?.as_str()),
         findings: &outcome.findings,
         loads: &outcome.loads,
         unpredicted: &judged.unpredicted,
@@ -116,6 +120,15 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.verdicts = basis.verdicts(&context.targets);
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
+}
+
+/// Adds to the fault of an unknown class the known one that has its tensor names.
+fn with_likely_class(fault: Fault, knowledge: &Knowledge, stored: &Stored) -> Fault {
+    let declared = fault.detail.get("class").and_then(Value::as_str).unwrap_or_default();
+    let is_whole = fault.kind == FaultKind::UnknownArchitecture && !fault.detail.contains_key("part");
+    let likely = if is_whole { inspect::likely_class(&knowledge.library, stored, declared) } else { None };
+    let Some(likely) = likely.filter(|likely| likely.class() != declared) else { return fault };
+    fault.with("likely", likely.class()).with("likely_type", likely.model_type())
 }
 
 /// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.

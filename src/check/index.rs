@@ -85,12 +85,18 @@ fn pointers_below_total<'n>(checkpoint: &Checkpoint, shards: impl Iterator<Item 
     }
     let size = |name| entry(name).map(|e| e.lfs.as_ref().map_or(e.size, |pointer| pointer.size));
     let sum = shards.clone().try_fold(0_u64, |sum, name| Some(sum.saturating_add(size(name)?)))?;
+    // transformers up to 4.x kept the size in float32 of weights that it saved in half of that. A header has some 100 to
+    // 300 bytes for each tensor, and lies in the file besides the tensors.
+    let twice = sum.saturating_mul(2);
+    let headers =
+        u64::try_from(index.weight_map.len()).unwrap_or(u64::MAX).saturating_mul(2 * 300).saturating_add(4096);
+    let is_of_float32 = (stated..=stated.saturating_add(headers)).contains(&twice);
     let fault = Fault::new(FaultKind::LfsSizesBelowTotal)
         .at(Place::file(&index.document).pointer("/metadata/total_size"))
         .with("stated", stated)
         .with("sum", sum)
         .with("count", shards.count());
-    (sum < stated).then_some(fault)
+    (sum < stated && !is_of_float32).then_some(fault)
 }
 
 /// Whether a file is a shard of the base model by its name; those of adapters are not.
@@ -303,6 +309,19 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     unread_weights(checkpoint, &names).into_iter().collect()
 }
 
+/// Whether transformers opens a shard of this name: the single file, else the shards that the index names, else, once it
+/// has an index, a numbered one.
+///
+/// Source: `_get_resolved_checkpoint_files` of transformers 4.57.6. Other names belong to other programs:
+/// `consolidated.safetensors` to mistral-inference, `open_clip_model.safetensors` to `open_clip`.
+pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
+    match &checkpoint.index {
+        _ if checkpoint.has_file(SINGLE) => name == SINGLE,
+        Some(index) => index.weight_map.values().any(|file| file == name),
+        None => numbered(name).is_some(),
+    }
+}
+
 /// For a model whose shards all have names that no loader reads: no weights, with these names.
 fn unread_weights(checkpoint: &Checkpoint, names: &[&str]) -> Option<Fault> {
     let is_read = |name: &&str| matches!(*name, "pytorch_model.bin" | "pytorch_model.bin.index.json");
@@ -330,19 +349,57 @@ fn missing_index(prefix: &str, count: u32, shards: usize, present: &BTreeSet<u32
     std::iter::once(index).chain(missing).collect()
 }
 
-/// For a config without shards: pickled weights, or none at all.
+/// Endings of weights that programs other than transformers load, or transformers for another framework; and the folders
+/// in which they lie.
+const FOREIGN: [&str; 15] = [
+    ".onnx",
+    ".gguf",
+    ".ggml",
+    ".tflite",
+    ".mlmodel",
+    ".mlpackage",
+    ".rkllm",
+    ".rknn",
+    ".engine",
+    ".nemo",
+    ".h5",
+    ".msgpack",
+    "openvino_model.xml",
+    "onnx",
+    "openvino",
+];
+
+/// Whether a pickle file contains the state of a training run besides the weights, by the names of `Trainer`.
+fn is_training_state(name: &str) -> bool {
+    ["optimizer", "scheduler", "scaler", "rng_state", "training_args"].iter().any(|start| name.starts_with(start))
+}
+
+/// For a config without shards: pickled weights, those of another program, or none at all.
 fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
-    let is_pickle =
-        |n: &str| (n.ends_with(".bin") && n.starts_with("pytorch_model")) || n.ends_with(".pth") || n.ends_with(".pt");
-    let pickle = checkpoint.entries.keys().find(|n| is_pickle(n) && !is_pointer(checkpoint, n));
+    let is_pickle = |n: &str| {
+        (n.ends_with(".bin") && n.starts_with("pytorch_model"))
+            || ((n.ends_with(".pth") || n.ends_with(".pt")) && !is_training_state(n))
+    };
+    let pickles = checkpoint.entries.keys().filter(|n| is_pickle(n) && !is_pointer(checkpoint, n));
+    let pickle = pickles.min_by_key(|n| !n.starts_with("pytorch_model"));
     let is_reported = |f: &Fault| {
         let names = || f.places.iter().filter_map(|p| p.file.as_deref());
         f.kind == FaultKind::LfsPointer && names().any(|n| n.ends_with(".bin"))
     };
+    let has_pointer = checkpoint.faults.iter().any(is_reported);
     match pickle {
-        Some(name) => Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name))),
-        None if checkpoint.faults.iter().any(is_reported) => None,
-        None => Some(Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint))),
+        // transformers reads no other name; beside weights that were not downloaded, `colbert_linear.pt` stands for none.
+        Some(name) if name.starts_with("pytorch_model") || !has_pointer && !is_model(checkpoint) => {
+            Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name)))
+        }
+        _ if has_pointer => None,
+        Some(name) => unread_weights(checkpoint, &[name]),
+        None => {
+            let is_foreign = |name: &&String| FOREIGN.iter().any(|ending| name.ends_with(ending));
+            let foreign: Vec<&str> = checkpoint.entries.keys().filter(is_foreign).map(String::as_str).collect();
+            let fault = Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint) && foreign.is_empty());
+            Some(if foreign.is_empty() { fault } else { fault.with("foreign", foreign) })
+        }
     }
 }
 

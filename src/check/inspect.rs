@@ -15,6 +15,8 @@ use crate::knowledge::{Architecture, Library, Loader};
 const CANDIDATES: usize = 8;
 /// Classes with equally good names that are built, to compare their defaults with the tensors.
 const BUILT: usize = 40;
+/// Share of the names that a likely class has.
+const LIKELY: f64 = 0.95;
 /// Model types that are tried for a part.
 const PARTS: usize = 6;
 /// Share of the parameters beyond which a module is shown by its parts.
@@ -204,6 +206,19 @@ fn by_config<'l>(library: &'l Library, config: &Value, stored: &Stored) -> Optio
     let mut loaders = Loader::ALL;
     loaders.sort_by_key(|l| *l != Loader::of_config(config));
     loaders.into_iter().find_map(|loader| library.find(config, stored.names(), loader))
+}
+
+/// The known class whose tensor names are the stored ones, for a checkpoint whose class is unknown; `None` unless nearly
+/// all names are the same. Of several such classes, the one whose name starts most like `declared`, for a misspelt class.
+pub(super) fn likely_class<'l>(library: &'l Library, stored: &Stored, declared: &str) -> Option<Architecture<'l>> {
+    let mut alike = library.resembling(stored.names());
+    let best = alike.first().map(Resemblance::score).filter(|score| *score >= LIKELY)?;
+    nearest_first(&mut alike, stored);
+    let shared =
+        |class: &str| class.chars().zip(declared.chars()).take_while(|(a, b)| a.eq_ignore_ascii_case(b)).count();
+    let tied = alike.iter().take_while(|r| r.score() >= best).map(|r| r.architecture);
+    // Of classes whose names are equally close, the first: its defaults are the closest to the tensors.
+    tied.reduce(|one, other| if shared(other.class()) > shared(one.class()) { other } else { one })
 }
 
 /// Orders classes whose names fit equally well by how close their defaults are to the tensors.

@@ -11,10 +11,15 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Knowledge;
 use crate::knowledge::names::NameKind;
 
+/// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class.
+pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {
+    let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
+    (has("model_type") || has("architectures")) && !has("_class_name")
+}
+
 /// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
 pub(super) fn is_model(checkpoint: &Checkpoint) -> bool {
-    let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
-    (has("model_type") || has("architectures")) && !has("_class_name") && !checkpoint.has_file(adapter::CONFIG)
+    is_of_transformers(checkpoint) && !checkpoint.has_file(adapter::CONFIG)
 }
 
 /// The place of the `model_type` that a class selects a part by, of the fault that the part is unknown.

@@ -1,10 +1,11 @@
 //! `auto_map`: whether the module of each entry exists, has the class, and can import what it needs.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, PythonModule, is_plain_file_name, pointer};
+use crate::checkpoint::module::Import;
+use crate::checkpoint::{Checkpoint, EntryKind, Fault, FaultKind, Place, PythonModule, is_plain_file_name, pointer};
 
 /// An `auto_map` entry: its place and its value.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -163,6 +164,14 @@ fn copied(checkpoint: &Checkpoint, root: &str) -> BTreeSet<String> {
     direct.into_iter().flatten().chain([root.to_owned()]).collect()
 }
 
+/// Whether loading imports the file: an entry of `auto_map` leads to it.
+pub(super) fn is_imported(checkpoint: &Checkpoint, file: &str) -> bool {
+    let entries = entries(checkpoint);
+    let roots: BTreeSet<&str> = entries.iter().filter(|e| !e.nested).filter_map(|e| Some(e.parts()?.0)).collect();
+    let Some(module) = file.strip_suffix(".py") else { return false };
+    roots.into_iter().any(|root| closure(checkpoint, root).iter().any(|(name, _)| name == module))
+}
+
 /// Faults of every `auto_map` entry.
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
@@ -211,6 +220,8 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
             imports(checkpoint, &entries, entry, module, &mut faults);
         }
     }
+    faults.extend(packages(checkpoint, &roots));
+    faults.extend(unimportable(checkpoint, &entries));
     once_per_module(faults)
 }
 
@@ -260,14 +271,11 @@ fn imports(
             missing.insert(name);
         }
     }
-    let packages = needed_packages(checkpoint, root);
-    if !packages.is_empty() {
-        faults.push(
-            Fault::new(FaultKind::ModuleNeedsPackage)
-                .at(Place::file(format!("{root}.py")))
-                .with("module", format!("{root}.py"))
-                .with("packages", packages.into_iter().collect::<Vec<_>>()),
-        );
+    for fault in own_as_packages(checkpoint, root) {
+        // Several entries may lead to the same module.
+        if !faults.contains(&fault) {
+            faults.push(fault);
+        }
     }
     for name in absent {
         faults.push(
@@ -290,89 +298,104 @@ fn imports(
     }
 }
 
-/// Packages that the modules of a root import, other than those of Python and transformers.
+/// Imports of the modules of a root that neither Python nor transformers provides.
 ///
 /// transformers looks for every import outside a `try`, in functions too. Source: `get_imports` of 4.47.0.
-fn needed_packages<'a>(checkpoint: &'a Checkpoint, root: &str) -> BTreeSet<&'a str> {
+fn needed<'c>(checkpoint: &'c Checkpoint, root: &str) -> impl Iterator<Item = (&'c PythonModule, &'c Import)> {
     let modules = closure(checkpoint, root).into_iter().filter_map(|(_, module)| module);
-    let imports = modules.flat_map(|m| m.imports.iter().filter(|i| !i.guarded));
-    imports.map(|i| i.package.as_str()).filter(|p| !AT_HAND.contains(p)).collect()
+    let imports = modules.flat_map(|module| module.imports.iter().map(move |import| (module, import)));
+    imports.filter(|(_, import)| !import.guarded && !is_at_hand(&import.package))
 }
 
-/// Packages that come with Python, transformers and torch.
-const AT_HAND: [&str; 71] = [
+/// The packages that the modules of `roots` need, as one fault.
+fn packages(checkpoint: &Checkpoint, roots: &BTreeSet<&str>) -> Option<Fault> {
+    let needs = |root: &&str| {
+        let names = needed(checkpoint, root).map(|(_, import)| import.package.as_str());
+        let packages: BTreeSet<&str> = names.filter(|package| !is_own(checkpoint, package)).collect();
+        (format!("{root}.py"), packages)
+    };
+    let needs: Vec<_> = roots.iter().map(needs).filter(|(_, packages)| !packages.is_empty()).collect();
+    let packages: BTreeSet<&str> = needs.iter().flat_map(|(_, packages)| packages).copied().collect();
+    let modules: Vec<&str> = needs.iter().map(|(module, _)| module.as_str()).collect();
+    let fault = modules.iter().fold(Fault::new(FaultKind::ModuleNeedsPackage), |f, module| f.at(Place::file(*module)));
+    let fault = fault.with("packages", packages.into_iter().collect::<Vec<_>>());
+    (!modules.is_empty()).then(|| fault.with("modules", modules))
+}
+
+/// Modules of the checkpoint that those of a root import as if they were installed, one fault for each importing module.
+fn own_as_packages(checkpoint: &Checkpoint, root: &str) -> Vec<Fault> {
+    let mut found: BTreeMap<&str, Vec<&Import>> = BTreeMap::new();
+    for (module, import) in needed(checkpoint, root).filter(|(_, import)| is_own(checkpoint, &import.package)) {
+        found.entry(&module.name).or_default().push(import);
+    }
+    let fault = |(module, imports): (&str, Vec<&Import>)| {
+        let packages: BTreeSet<&str> = imports.iter().map(|import| import.package.as_str()).collect();
+        let fault = Fault::new(FaultKind::OwnModuleAsPackage)
+            .with("module", module)
+            .with("packages", packages.into_iter().collect::<Vec<_>>());
+        let places = imports.iter().map(|import| Place::file(module).span(import.span.clone()));
+        places.fold(fault, Fault::at)
+    };
+    found.into_iter().map(fault).collect()
+}
+
+/// For a directory with a dot in its name: the first module that imports a sibling which no earlier entry has loaded.
+///
+/// The name becomes a path of Python packages, which do not exist; only modules that are loaded already are found. Source:
+/// `get_class_in_module` of transformers 4.47.0; run.
+fn unimportable(checkpoint: &Checkpoint, entries: &[AutoMapEntry]) -> Option<Fault> {
+    let directory = checkpoint.root.file_name()?.to_string_lossy().into_owned();
+    let roots = |is_config: bool| {
+        let entries = entries.iter().filter(move |e| !e.nested && (e.key == "AutoConfig") == is_config);
+        entries.filter_map(|entry| Some((entry, entry.parts()?.0)))
+    };
+    let loaded: BTreeSet<&str> = roots(true).map(|(_, module)| module).collect();
+    let late = |module: &str| {
+        let modules = relative_modules(checkpoint.modules.get(&format!("{module}.py"))?);
+        modules.into_iter().find(|sibling| !loaded.contains(sibling.as_str()))
+    };
+    let mut found = roots(true).chain(roots(false)).filter_map(|(entry, module)| Some((entry, module, late(module)?)));
+    let (entry, module, sibling) = found.next().filter(|_| directory.contains('.'))?;
+    let fault = Fault::new(FaultKind::DirectoryNameWithDot).at(Place::file(format!("{module}.py")));
+    let fault = fault.at(Place::file(&entry.file).pointer(&entry.pointer));
+    let package = directory.split('.').next().unwrap_or_default();
+    let fault = fault.with("package", package).with("directory", directory.as_str());
+    Some(fault.with("module", format!("{module}.py")).with("imported", sibling))
+}
+
+/// Names of the modules of Python: `sys.stdlib_module_names` of Python 3.10 to 3.13, and what 3.9 had besides.
+const STANDARD_LIBRARY: &str = include_str!("modules/standard_library.txt");
+
+/// Packages that come with transformers and torch.
+const AT_HAND: [&str; 14] = [
     "PIL",
-    "__future__",
-    "abc",
-    "argparse",
-    "ast",
-    "asyncio",
-    "base64",
-    "bisect",
-    "builtins",
-    "collections",
-    "contextlib",
-    "copy",
-    "csv",
-    "ctypes",
-    "dataclasses",
-    "datetime",
-    "decimal",
-    "enum",
     "filelock",
-    "fractions",
-    "functools",
-    "gc",
-    "glob",
-    "hashlib",
-    "heapq",
-    "html",
     "huggingface_hub",
-    "importlib",
-    "inspect",
-    "io",
-    "itertools",
-    "json",
-    "logging",
-    "math",
-    "mimetypes",
-    "multiprocessing",
-    "numbers",
     "numpy",
-    "operator",
-    "os",
     "packaging",
-    "pathlib",
-    "pickle",
-    "platform",
-    "queue",
-    "random",
-    "re",
     "regex",
     "requests",
     "safetensors",
-    "shutil",
-    "string",
-    "struct",
-    "subprocess",
-    "sys",
-    "tempfile",
-    "textwrap",
-    "threading",
-    "time",
     "tokenizers",
     "torch",
     "torchvision",
     "tqdm",
-    "traceback",
     "transformers",
-    "types",
-    "typing",
     "typing_extensions",
-    "urllib",
-    "uuid",
-    "warnings",
 ];
+
+/// Whether every environment that loads a checkpoint has the package.
+fn is_at_hand(package: &str) -> bool {
+    AT_HAND.contains(&package) || STANDARD_LIBRARY.lines().any(|name| name == package)
+}
+
+/// Whether a package of this name is a module or a folder of the checkpoint.
+///
+/// Exports to ONNX and `OpenVINO` lie in folders that have the names of packages.
+fn is_own(checkpoint: &Checkpoint, package: &str) -> bool {
+    let is_folder = checkpoint.entries.get(package).is_some_and(|entry| entry.kind == EntryKind::Directory);
+    checkpoint.modules.contains_key(&format!("{package}.py")) || is_folder && !["onnx", "openvino"].contains(&package)
+}
 
 /// Tokenizer classes that the processor of `AutoProcessor` accepts, if its module names them literally.
 ///

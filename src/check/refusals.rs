@@ -150,6 +150,9 @@ fn of_fields(knowledge: &Knowledge, config: &Value, version: &str, at: &str) -> 
     for (kinds, keys) in knowledge.refusals.of_fields(version, model_type) {
         for key in keys {
             let Some(value) = map.get(&key) else { continue };
+            if kinds == "undivided" {
+                found.extend(undivided(map, pointer::join(at, &key)));
+            }
             if kinds.split(' ').any(|kind| kind == json_type(value)) {
                 found.push(Refusal {
                     pointer: pointer::join(at, &key),
@@ -164,6 +167,20 @@ fn of_fields(knowledge: &Knowledge, config: &Value, version: &str, at: &str) -> 
     let parts = map.iter().filter(|(key, value)| key.ends_with("_config") && value.is_object());
     found.extend(parts.flat_map(|(key, part)| of_fields(knowledge, part, version, &pointer::join(at, key))));
     found
+}
+
+/// Attention heads that do not divide the hidden size, for a config class that validates it.
+fn undivided(map: &Map<String, Value>, pointer: String) -> Option<Refusal> {
+    let count = |key| map.get(key).and_then(Value::as_u64);
+    let (heads, hidden) = (count("num_attention_heads")?, count("hidden_size")?);
+    (hidden.checked_rem(heads)? != 0).then(|| Refusal {
+        pointer,
+        value: heads.into(),
+        because: format!("which does not divide hidden_size {hidden}"),
+        raises: "StrictDataclassClassValidationError: Class validation error for validator 'validate_architecture'"
+            .to_owned(),
+        similar: None,
+    })
 }
 
 /// A dtype that torch does not have. Versions since 4.56 prefer `dtype` to `torch_dtype`.

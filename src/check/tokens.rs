@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, Vocabulary, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, pointer};
 use crate::knowledge::processor::Processor;
 use crate::knowledge::{EvalError, Scope};
 
@@ -97,9 +97,6 @@ pub fn open_tokenizer(
     Ok(Some(out))
 }
 
-/// The file whose `added_tokens_decoder` states ids.
-const DECODER: &str = "tokenizer_config.json";
-
 /// Faults of the tokenizer files among themselves and against the embedding.
 ///
 /// `rows` are the stored rows of the token embedding, where they are known.
@@ -107,14 +104,14 @@ const DECODER: &str = "tokenizer_config.json";
 pub fn faults(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     let tokenizer = &checkpoint.tokenizer;
     let stated = tokenizer.stated();
-    let mut faults: Vec<Fault> = rows.and_then(|rows| tokens_above(&stated, rows)).into_iter().collect();
+    let mut faults: Vec<Fault> = rows.and_then(|rows| tokens_above(tokenizer, &stated, rows)).into_iter().collect();
     // A slow tokenizer numbers added tokens one after another: a hole shifts all that follow.
-    let base = tokenizer.base().map(Vocabulary::len).filter(|_| !checkpoint.has_file("tokenizer.json"));
-    faults.extend(base.and_then(|base| first_hole(&stated, base)));
+    let base = tokenizer.first_added().filter(|_| !checkpoint.has_file("tokenizer.json"));
+    faults.extend(base.and_then(|base| first_hole(tokenizer, &stated, base)));
     let mut by_content: BTreeMap<&str, u64> = BTreeMap::new();
     for (id, token) in &stated {
         if let Some(first) = by_content.insert(token, *id) {
-            let fault = Fault::new(FaultKind::TokenIdTwice).at(decoder_entry(*id));
+            let fault = Fault::new(FaultKind::TokenIdTwice).at(tokenizer.place_of(*id));
             faults.push(fault.with("token", *token).with("first", first).with("second", *id));
         }
     }
@@ -132,16 +129,12 @@ pub fn faults(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     faults
 }
 
-fn decoder_entry(id: u64) -> Place {
-    Place::file(DECODER).pointer(format!("/added_tokens_decoder/{id}"))
-}
-
 /// Tokens whose ids are out of range for the embedding.
-fn tokens_above(stated: &BTreeMap<u64, &str>, rows: u64) -> Option<Fault> {
+fn tokens_above(tokenizer: &Tokenizer, stated: &BTreeMap<u64, &str>, rows: u64) -> Option<Fault> {
     let above: Vec<(&u64, &&str)> = stated.range(rows..).collect();
     let ((first, token), (last, _)) = (above.first()?, above.last()?);
     let fault = Fault::new(FaultKind::TokenAboveRows)
-        .at(decoder_entry(**first))
+        .at(tokenizer.place_of(**first))
         .with("count", above.len())
         .with("first", **first)
         .with("last", **last)
@@ -151,9 +144,9 @@ fn tokens_above(stated: &BTreeMap<u64, &str>, rows: u64) -> Option<Fault> {
 }
 
 /// The first id from `base` on that no token has although a later one does.
-fn first_hole(stated: &BTreeMap<u64, &str>, base: u64) -> Option<Fault> {
+fn first_hole(tokenizer: &Tokenizer, stated: &BTreeMap<u64, &str>, base: u64) -> Option<Fault> {
     let mut ids = (base..).zip(stated.range(base..));
     let (expected, (id, token)) = ids.find(|(expected, (id, _))| expected != *id)?;
-    let fault = Fault::new(FaultKind::TokenHole).at(decoder_entry(*id));
+    let fault = Fault::new(FaultKind::TokenHole).at(tokenizer.place_of(*id));
     Some(fault.with("missing", expected).with("next", *id).with("token", *token))
 }

@@ -6,7 +6,8 @@ use serde_json::{Map, Value, json};
 
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
-use super::{exceptions, index, modules};
+use super::{exceptions, index, model_type, modules};
+use crate::checkpoint::tokenizer::is_vocabulary;
 use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
 use crate::knowledge::{Expression, Scope};
 
@@ -77,6 +78,11 @@ pub fn scope(
     scope.function1("shape", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.shape)));
     let here = Arc::clone(checkpoint);
     scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
+    scope.bind("of_transformers", &json!(model_type::is_of_transformers(checkpoint)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("is_opened", move |name| json!(index::is_opened(&here, name)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("is_imported", move |file| json!(modules::is_imported(&here, file)));
     let here = Arc::clone(checkpoint);
     scope.function1("has_file", move |name| json!(here.has_file(name)));
     scope.function2("json_error", |file, reason| json!(exceptions::unparsed(file, reason)));
@@ -128,6 +134,10 @@ fn tokenizer(checkpoint: &Checkpoint) -> Value {
         t.id_of(content)
     };
     let entries = |file: &str| t.vocabularies.get(file).map(|v| v.len());
+    let stated = t.stated();
+    // Of two tokens with the highest id, the added one is the cause.
+    let highest = stated.iter().next_back().map(|(id, token)| (*id, Some(*token)));
+    let highest = highest.max(t.base().and_then(Vocabulary::max_id).map(|id| (id, None)));
     json!({
         "length": t.length(),
         "base": t.base().map(Vocabulary::len),
@@ -138,6 +148,8 @@ fn tokenizer(checkpoint: &Checkpoint) -> Value {
         "bos": special("bos_token"),
         "eos": special("eos_token"),
         "pad": special("pad_token"),
-        "highest": t.stated().keys().last().copied().max(t.base().and_then(Vocabulary::max_id)),
+        "highest": highest.map(|(id, _)| id),
+        "highest_token": highest.and_then(|(_, token)| token),
+        "has_vocabulary": checkpoint.entries.keys().any(|name| is_vocabulary(name) && checkpoint.has_file(name)),
     })
 }

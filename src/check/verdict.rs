@@ -111,6 +111,8 @@ impl PredictedLoad {
 /// What verdicts are made from.
 pub(super) struct Basis<'a> {
     pub(super) checkpoint: &'a Checkpoint,
+    /// The program other than transformers that loads the weights, by their quantisation.
+    pub(super) program: Option<&'a str>,
     /// Findings before suppressions.
     pub(super) findings: &'a [Finding],
     /// The predicted load reports.
@@ -193,6 +195,9 @@ impl Basis<'_> {
         }
         if self.checkpoint.config().is_none() {
             return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));
+        }
+        if let Some(program) = self.program {
+            return (LoadVerdict::NotPredicted, Some(format!("the weights are quantised for {program}")));
         }
         match self.report(loader) {
             Some(_) if !self.was_read() => {

@@ -5,11 +5,13 @@ use std::fs;
 use std::path::{Component, Path};
 use std::sync::Arc;
 
+use super::adapter;
 use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_capped};
+use super::tokenizer::is_vocabulary;
 use super::{
     Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, OpenError, Place, PythonModule,
     REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Vocabulary,
@@ -37,6 +39,12 @@ const TEXTS: [&str; 1] = ["chat_template.jinja"];
 /// Whether the name is one of pickled weights.
 fn is_pickle(name: &str) -> bool {
     has_ending(name, "bin") && ["pytorch_model", "adapter_model", "model"].iter().any(|start| name.starts_with(start))
+}
+
+/// Whether a loader reads the file, and this program does not.
+fn is_unread(name: &str) -> bool {
+    let is_read = VOCABULARIES.contains(&name) || is_document(name);
+    is_pickle(name) || TEXTS.contains(&name) || is_vocabulary(name) && !is_read
 }
 
 /// Whether the name has this extension; case-sensitive, like the loaders.
@@ -87,9 +95,23 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
         checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(place));
     }
     checkpoint.derive(vocabularies);
+    checkpoint.has_base = has_base(&checkpoint);
     checkpoint.tokenizer.faults.extend(vocabulary_faults);
     git::mark_pointers(&mut checkpoint);
     Ok(checkpoint)
+}
+
+/// Whether the base model of an adapter lies in a directory beside it or in it. Nothing in there is opened, and no path
+/// from the root is tried.
+fn has_base(checkpoint: &Checkpoint) -> bool {
+    let base = checkpoint.document(adapter::CONFIG).and_then(|document| document.get("/base_model_name_or_path"));
+    let Some(base) = base.and_then(serde_json::Value::as_str).map(Path::new) else { return false };
+    let is_near = |c: Component<'_>| matches!(c, Component::ParentDir | Component::CurDir | Component::Normal(_));
+    let is_relative = base.starts_with("..") || base.starts_with(".");
+    is_relative
+        && base.components().all(is_near)
+        && base.components().count() <= 4
+        && fs::symlink_metadata(checkpoint.root.join(base).join("config.json")).is_ok()
 }
 
 /// State of reading a directory.
@@ -144,7 +166,7 @@ impl DirectoryReader {
     /// Adds the faults that show without reading the content.
     fn check_entry(&mut self, name: &str, entry: &Entry) {
         let faults = &mut self.checkpoint.faults;
-        if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_pickle(name) || TEXTS.contains(&name)) {
+        if let Some(pointer) = entry.lfs.as_ref().filter(|_| is_unread(name)) {
             let fault = Fault::new(FaultKind::LfsPointer).at(Place::file(name));
             faults.push(fault.with("oid", pointer.oid.as_str()).with("size", pointer.size));
         }

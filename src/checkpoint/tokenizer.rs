@@ -5,24 +5,51 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::{Document, Fault, FaultKind, Place};
+use super::{Document, Fault, FaultKind, Place, pointer};
 
 mod sentencepiece;
 mod vocabulary;
 
 pub use vocabulary::Vocabulary;
 
-/// Vocabulary files of the tokenizers in transformers; a tokenizer needs one of them.
+/// Vocabulary files that are read, in the order in which a tokenizer takes its ids from them: M2M100 and `Speech2Text` take
+/// those of `vocab.json`, and use `sentencepiece.bpe.model` to split text.
 pub const VOCABULARY_FILES: [&str; 8] = [
     "tokenizer.json",
     "tokenizer.model",
     "spiece.model",
-    "sentencepiece.bpe.model",
     "vocab.json",
+    "sentencepiece.bpe.model",
     "vocab.txt",
     "tekken.json",
     "tiktoken.model",
 ];
+
+/// Other vocabulary files of tokenizers in transformers. Source: every `VOCAB_FILES_NAMES` of 4.47.0, 4.57.6 and 5.23.0.
+const OTHER_VOCABULARY_FILES: [&str; 11] = [
+    "bpe.codes",
+    "byte_maps.json",
+    "dict.txt",
+    "entity_vocab.json",
+    "merges.txt",
+    "prophetnet.tokenizer",
+    "target_vocab.json",
+    "vocab-src.json",
+    "vocab-tgt.json",
+    "artists.json",
+    "lyrics.json",
+];
+
+/// Endings of vocabulary files: `spm_char.model`, `source.spm`, `qwen.tiktoken`.
+const VOCABULARY_ENDINGS: [&str; 3] = [".model", ".spm", ".tiktoken"];
+
+/// Whether a file of this name is the vocabulary of a tokenizer, or a part of it.
+#[must_use]
+pub fn is_vocabulary(name: &str) -> bool {
+    VOCABULARY_FILES.contains(&name)
+        || OTHER_VOCABULARY_FILES.contains(&name)
+        || VOCABULARY_ENDINGS.iter().any(|ending| name.ends_with(ending))
+}
 
 /// Special-token attributes in the order transformers adds them. Source: `SPECIAL_TOKENS_ATTRIBUTES` in 4.47.0.
 const SPECIAL: [&str; 8] = [
@@ -149,13 +176,44 @@ impl Tokenizer {
         self.vocabularies.get(self.source.as_deref()?).map(AsRef::as_ref)
     }
 
+    /// The id that a slow tokenizer gives to the first token outside its vocabulary; `None` when it is not known: the
+    /// classes of XLM-R, mBART and NLLB, which have `sentencepiece.bpe.model`, and Pegasus shift the ids of the file.
+    #[must_use]
+    pub fn first_added(&self) -> Option<u64> {
+        let is_shifted = self.source.as_deref() == Some("sentencepiece.bpe.model")
+            || self.tokenizer_class.as_deref().is_some_and(|class| class.contains("Pegasus"));
+        self.base().filter(|_| !is_shifted).map(Vocabulary::len)
+    }
+
+    /// The first list of added tokens, and its file.
+    fn stating(&self) -> Option<(&'static str, &[AddedToken])> {
+        let lists = [
+            ("tokenizer_config.json", &self.added_tokens_decoder),
+            ("added_tokens.json", &self.added_tokens_json),
+            ("tokenizer.json", &self.tokenizer_json_added),
+        ];
+        lists.into_iter().find_map(|(file, list)| Some((file, list.as_deref()?)))
+    }
+
     /// Added tokens by id, from the first file that states them: `added_tokens_decoder`, `added_tokens.json`,
     /// `tokenizer.json`.
     #[must_use]
     pub fn stated(&self) -> BTreeMap<u64, &str> {
-        let lists = [&self.added_tokens_decoder, &self.added_tokens_json, &self.tokenizer_json_added];
-        let list = lists.into_iter().flatten().next();
-        list.into_iter().flatten().map(|t| (t.id, t.content.as_str())).collect()
+        let list = self.stating().map(|(_, list)| list).unwrap_or_default();
+        list.iter().map(|t| (t.id, t.content.as_str())).collect()
+    }
+
+    /// The place that states the id of an added token.
+    #[must_use]
+    pub fn place_of(&self, id: u64) -> Place {
+        let Some((file, list)) = self.stating() else { return Place::default() };
+        let found = list.iter().enumerate().find(|(_, token)| token.id == id);
+        let pointer = match (file, found) {
+            ("added_tokens.json", Some((_, token))) => pointer::join("", &token.content),
+            ("tokenizer.json", Some((at, _))) => format!("/added_tokens/{at}"),
+            _ => format!("/added_tokens_decoder/{id}"),
+        };
+        Place::file(file).pointer(pointer)
     }
 
     /// Tokens outside the base vocabulary, with their ids after loading.

@@ -74,7 +74,7 @@ impl Library {
 
     /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
-    /// The class in `architectures` decides; where it is absent, or custom code may stand behind an unknown
+    /// The class in `architectures` decides, unless `model_type` is that of another class; where it is absent, or custom code may stand behind an unknown
     /// name (`auto_map`), `model_type` does, if its class has a head where the named one has. Where several entries describe one class, the config (`when` of the file)
     /// and the tensors (`chosen_by` of the class) choose.
     #[must_use]
@@ -91,10 +91,16 @@ impl Library {
         candidates.retain(|(file, _)| file.speaks_for(config));
         candidates.sort_by_key(|(file, _)| !model_type.is_some_and(|t| file.model_types.iter().any(|m| m == t)));
         let (file, class) = match choose(candidates, &mut names) {
-            Some((file, class)) => match self.by_type_instead(config, file, class, loader) {
-                Some(other) => other?,
-                None => (file, class),
-            },
+            Some((file, class)) if self.is_of_type(config, file) => (file, class),
+            Some((_, named)) => {
+                let mut files =
+                    self.all_of_model_type(model_type?).filter(|file| file.has_auto() && file.speaks_for(config));
+                let same_task = |file| {
+                    let mut classes = Blueprint::classes(file, loader).filter(|c| task(&c.name) == task(&named.name));
+                    Some((file, classes.next()?))
+                };
+                files.find_map(same_task)?
+            }
             None if class.is_some() && config.get("auto_map").is_none() => return None,
             None => {
                 let files = self.all_of_model_type(model_type?).filter(|file| file.speaks_for(config));
@@ -106,29 +112,15 @@ impl Library {
         Some(Architecture::new(self, file, class, loader))
     }
 
-    /// The class that the Auto classes build where `model_type` is not a type of the named class: that of the type for the
-    /// same task. `None` where the named class is built; an empty choice where the other class is not described.
-    fn by_type_instead(
-        &self,
-        config: &Value,
-        file: &Blueprint,
-        class: &Class,
-        loader: Loader,
-    ) -> Option<Option<(&Blueprint, &Class)>> {
-        let model_type = config.get("model_type").and_then(Value::as_str)?;
-        let is_of_type = file.model_types.iter().any(|t| t == model_type);
-        // Classes of other packages than transformers have no Auto class.
-        if is_of_type || !file.has_auto() || config.get("auto_map").is_some() {
-            return None;
-        }
-        let others = self.all_of_model_type(model_type).filter(|other| other.has_auto() && other.speaks_for(config));
-        let mut others = others.peekable();
-        others.peek()?;
-        let same_task = |other| {
-            let classes = Blueprint::classes(other, loader).filter(|c| task(&c.name) == task(&class.name));
-            classes.map(move |class| (other, class)).next()
-        };
-        Some(others.find_map(same_task))
+    /// Whether the class of this file is the one that Auto classes build for the `model_type` of the config. Otherwise they
+    /// build the class of the type for the same task. Classes of other packages than transformers have no Auto class.
+    fn is_of_type(&self, config: &Value, file: &Blueprint) -> bool {
+        let Some(model_type) = config.get("model_type").and_then(Value::as_str) else { return true };
+        let is_other = |other: &Blueprint| other.has_auto() && other.speaks_for(config);
+        file.model_types.iter().any(|t| t == model_type)
+            || !file.has_auto()
+            || config.get("auto_map").is_some()
+            || !self.all_of_model_type(model_type).any(is_other)
     }
 
     /// Whether a file describes this model type, under any loader.

@@ -159,17 +159,20 @@ pub struct FaultCheck {
 /// - `model`: `config` with the defaults of the class filled in; `text`: its language-model part; `arch`: the name of the
 ///   architecture, empty when unknown;
 /// - `rows`: rows of the token embedding;
-/// - `tokenizer`: `length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`, `highest`;
+/// - `tokenizer`: `length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`, `highest`,
+///   `highest_token` (null for one of the vocabulary), `has_vocabulary`;
 /// - `tokens`: ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and
 ///   `scattered`; `processor_tokenizers`: tokenizer classes that the processor's module names;
 /// - `chat_templates`: templates by file;
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
+///   `of_transformers`: config.json is one of transformers;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
-/// - `loaders`: versions of transformers to check for;
+/// - `loaders`: versions of transformers to check for; `named`: whether the user named them;
 /// - `metadata_only`: weights may be missing.
 ///
 /// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
-/// loaders; `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `id_of(token)`, and `stays_random(tensor)`:
+/// loaders; `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard
+/// of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and `stays_random(tensor)`:
 /// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
 /// `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
 ///

@@ -2,7 +2,7 @@
 
 Every model class is built from a config that is known to build, with one value replaced; `classes` has the keys whose
 replacement then raises the exception that is known for it. `fields` has, for each config class, the JSON types that it
-refuses with the keys that refuse them (transformers 5 validates fields; transformers 4 does not). Each entry is one line: the program reads only
+refuses with the keys that refuse them, and `undivided` where hidden_size has to be a multiple of num_attention_heads (transformers 5 validates fields; transformers 4 does not). Each entry is one line: the program reads only
 the lines that it needs.
 """
 import collections
@@ -104,6 +104,13 @@ def fields(model_type):
         refused = [kind for kind, values in VALUES.items() if all(is_refused(cls, default, key, value) for value in values)]
         if refused:
             found.setdefault(" ".join(refused), []).append(key)
+    heads = default.get("num_attention_heads")
+    if isinstance(heads, int) and isinstance(default.get("hidden_size"), int):
+        try:
+            cls.from_dict({**copy.deepcopy(default), "hidden_size": heads * 8 + 1})
+        except Exception as error:
+            if type(error).__name__ == "StrictDataclassClassValidationError" and "not a multiple" in str(error):
+                found["undivided"] = ["num_attention_heads"]
     return found
 
 

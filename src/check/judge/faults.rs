@@ -23,7 +23,17 @@ pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[
         let has_vote = |load: &&ExplainedLoad<'_>| {
             load.votes().is_some_and(|votes| votes.iter().any(|v| v.pointer == vote.pointer))
         };
-        loads.iter().filter(has_vote).map(ExplainedLoad::loader).fold(votes::fault(vote), Fault::under)
+        let fault = loads.iter().filter(has_vote).map(ExplainedLoad::loader).fold(votes::fault(vote), Fault::under);
+        // With the value of the config the load raises where a tensor has another shape, and is wrong otherwise.
+        let mismatch = |load: &ExplainedLoad<'_>| {
+            Some((load.loader(), load.prediction.report.as_ref()?.mismatched.first()?.name.clone()))
+        };
+        let (raising, names): (Vec<&str>, Vec<String>) = loads.iter().filter(has_vote).filter_map(mismatch).unzip();
+        names
+            .into_iter()
+            .next()
+            .into_iter()
+            .fold(fault.with("raising", raising), |fault, name| fault.with("mismatched", name))
     }));
     faults
 }

@@ -4,6 +4,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::super::expression::{Expression, Template};
 use super::super::loader::version_numbers;
+use crate::checkpoint::tokenizer::is_vocabulary;
 
 /// What a loader opens from a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -50,21 +51,7 @@ impl Object {
     /// The object that reads a file of a checkpoint; `None` for a file that no loader needs.
     #[must_use]
     pub fn reading(file: &str) -> Option<Self> {
-        const TOKENIZER: [&str; 13] = [
-            "tokenizer.json",
-            "tokenizer.model",
-            "tokenizer_config.json",
-            "special_tokens_map.json",
-            "added_tokens.json",
-            "vocab.json",
-            "vocab.txt",
-            "merges.txt",
-            "spiece.model",
-            "sentencepiece.bpe.model",
-            "tekken.json",
-            "qwen.tiktoken",
-            "tiktoken.model",
-        ];
+        const TOKENIZER: [&str; 3] = ["tokenizer_config.json", "special_tokens_map.json", "added_tokens.json"];
         const PROCESSOR: [&str; 4] = [
             "processor_config.json",
             "preprocessor_config.json",
@@ -77,7 +64,7 @@ impl Object {
             "generation_config.json" => Some(Self::Generation),
             "adapter_config.json" => Some(Self::Adapter),
             _ if file.starts_with("adapter_model.") => Some(Self::Adapter),
-            _ if TOKENIZER.contains(&file) => Some(Self::Tokenizer),
+            _ if TOKENIZER.contains(&file) || is_vocabulary(file) => Some(Self::Tokenizer),
             _ if PROCESSOR.contains(&file) => Some(Self::Processor),
             _ if file.ends_with(".py") => Some(Self::importing(file)),
             _ => is_weights.then_some(Self::Model),

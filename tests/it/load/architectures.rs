@@ -167,11 +167,13 @@ fn compositions_name_the_part_that_cannot_be_built() {
 }
 
 #[test]
-fn the_class_decides_before_the_model_type() {
+fn the_class_decides_unless_the_model_type_is_of_another() {
     let library = Library::embedded();
     let found = |config: Value| library.find(&config, [], Loader::V4_47_0).map(|a| a.name().to_owned());
     let some = |name: &str| Some(name.to_owned());
-    assert_eq!(found(json!({ "architectures": ["Gemma2ForCausalLM"], "model_type": "llama" })), some("gemma2"));
+    // The Auto classes build LlamaForCausalLM for it.
+    assert_eq!(found(json!({ "architectures": ["Gemma2ForCausalLM"], "model_type": "llama" })), some("llama"));
+    assert_eq!(found(json!({ "architectures": ["Gemma2ForCausalLM"], "model_type": "not_described" })), some("gemma2"));
     assert_eq!(found(json!({ "model_type": "clip_vision_model" })), some("clip_vision_model"));
     assert_eq!(found(json!({ "architectures": ["LlamaForNothing"], "model_type": "llama" })), None);
     assert_eq!(

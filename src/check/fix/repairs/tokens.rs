@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 
 use crate::check::fix::Edit;
-use crate::checkpoint::{Checkpoint, Vocabulary};
+use crate::checkpoint::Checkpoint;
 
 /// Adds to `added_tokens_decoder` the entries that it lacks and another file has, so that every id keeps its token.
 pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
@@ -15,7 +15,7 @@ pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
     let used: BTreeSet<&str> = known.values().copied().collect();
     let others = tokenizer.added_tokens_json.iter().chain(&tokenizer.tokenizer_json_added).flatten();
     let proven: BTreeMap<u64, &str> = others.map(|t| (t.id, t.content.as_str())).collect();
-    let first = tokenizer.base().map(Vocabulary::len)?;
+    let first = tokenizer.first_added()?;
     let last = *known.keys().next_back()?;
     // More holes than this are no slip, and the ids of a file are its own word.
     let holes: Vec<u64> = (first..last).filter(|id| !known.contains_key(id)).take(10_001).collect();
