@@ -85,23 +85,32 @@ pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault
         // A known class is better evidence than a comparison of the layers with one another.
         faults.extend(layers::faults(inputs.stored.names()));
     }
-    for one in built {
-        let fault = || {
-            Fault::new(FaultKind::ConfigIncomputable)
-                .at(Place::file("config.json"))
-                .with("architecture", one.architecture.name())
-        };
-        let fault = match &one.class {
+    faults.extend(unbuildable(built));
+    faults
+}
+
+/// Faults of classes that cannot be built: one for each leading loader, which stands for the others that raise as well.
+fn unbuildable(built: &[BuiltClass<'_>]) -> Vec<Fault> {
+    let mut faults: Vec<Fault> = Vec::new();
+    let (leading, others): (Vec<_>, Vec<_>) = built.iter().partition(|one| one.target.leads);
+    for one in leading.into_iter().chain(others) {
+        let fault = Fault::new(FaultKind::ConfigIncomputable)
+            .at(Place::file("config.json"))
+            .with("architecture", one.architecture.name())
+            .under(one.target.loader.version());
+        match (&one.class, faults.first_mut()) {
+            (Err(Refusal::Raises(_)), Some(first)) if !one.target.leads => {
+                first.loaders.push(one.target.loader.version());
+            }
+            (Err(Refusal::Raises(exception)), _) => {
+                faults.push(fault.with("raises", exception.as_str()).with("loader", one.target.version()));
+            }
             // A version that nobody named and that cannot build the class is passed over.
-            Err(Refusal::Impossible(reasons)) if one.target.leads => {
-                fault().with("reason", reasons.first().cloned().unwrap_or_default())
+            (Err(Refusal::Impossible(reasons)), _) if one.target.leads => {
+                faults.push(fault.with("reason", reasons.first().cloned().unwrap_or_default()));
             }
-            Err(Refusal::Raises(exception)) => {
-                fault().with("raises", exception.as_str()).with("loader", one.target.version())
-            }
-            _ => continue,
-        };
-        faults.push(fault.under(one.target.loader.version()));
+            _ => {}
+        }
     }
     faults
 }
