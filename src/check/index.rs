@@ -6,7 +6,7 @@ use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
 use super::model_type::is_model;
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, Place, Shard, pointer};
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
@@ -70,9 +70,19 @@ pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     match &checkpoint.index {
-        Some(index) => IndexComparison::new(checkpoint, index).map_or_else(Vec::new, |comparison| comparison.faults()),
+        Some(index) => {
+            let found = IndexComparison::new(checkpoint, index).map_or_else(Vec::new, |comparison| comparison.faults());
+            found.into_iter().chain(empty_map(checkpoint)).collect()
+        }
         None => without_index(checkpoint),
     }
+}
+
+/// The fault of an index that lists no tensor.
+fn empty_map(checkpoint: &Checkpoint) -> Option<Fault> {
+    let map = checkpoint.document(INDEX_NAME)?.get("/weight_map")?.as_object()?;
+    let place = Place::file(INDEX_NAME).pointer("/weight_map");
+    map.is_empty().then(|| Fault::new(FaultKind::WeightMapMalformed).at(place).with("found", "an empty object"))
 }
 
 /// An index that states more bytes than its shards have, when Git LFS pointers state their sizes.

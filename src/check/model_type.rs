@@ -6,8 +6,9 @@
 use serde_json::Value;
 
 use super::load::Target;
+use super::refusals::short;
 use crate::checkpoint::adapter;
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::names::NameKind;
 
@@ -53,7 +54,7 @@ pub(super) fn faults(
         None => missing(checkpoint, knowledge, of_class, targets),
     };
     let with_class = |fault: Fault| match (class, of_class) {
-        (Some(class), Some(model_type)) => fault.with("class", class).with("of_class", model_type),
+        (Some(class), Some(model_type)) => fault.with("class", escape(class, 80)).with("of_class", model_type),
         _ => fault,
     };
     let of_part = |place: &Place| {
@@ -82,8 +83,13 @@ fn unknown(knowledge: &Knowledge, value: &Value, place: Place, targets: &[Target
         return None;
     }
     let versions: Vec<&str> = lacking.iter().map(|target| target.version()).collect();
-    let fault =
-        Fault::new(FaultKind::ModelTypeUnknown).at(place).with("model_type", value.clone()).with("versions", versions);
+    // The rule tells lists and dicts, which are not hashable, from other values.
+    let shown = match value {
+        Value::Array(_) => Value::Array(Vec::new()),
+        Value::Object(_) => Value::Object(serde_json::Map::new()),
+        other => short(other),
+    };
+    let fault = Fault::new(FaultKind::ModelTypeUnknown).at(place).with("model_type", shown).with("versions", versions);
     let fault = names
         .similar(NameKind::ModelType, name)
         .into_iter()

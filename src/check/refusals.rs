@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 
 use super::load::Target;
 use super::model_type::{has_code, is_model};
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape, pointer};
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
@@ -13,6 +13,19 @@ use crate::knowledge::refusals::ClassRefusals;
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
+
+/// Characters of a value that a message shows.
+const CAP: usize = 80;
+
+/// A value for a message: the start of a string, and the kind of an array or object.
+pub(super) fn short(value: &Value) -> Value {
+    match value {
+        Value::String(text) => escape(text, CAP).into(),
+        Value::Array(_) => "an array".into(),
+        Value::Object(_) => "an object".into(),
+        other => other.clone(),
+    }
+}
 
 /// A value that a loader refuses.
 struct Refusal {
@@ -59,7 +72,7 @@ impl Refusal {
         let fault = Fault::new(FaultKind::ValueRefused)
             .at(Place::file("config.json").pointer(self.pointer))
             .with("key", key)
-            .with("value", self.value)
+            .with("value", short(&self.value))
             .with("because", self.because)
             .with("raises", self.raises);
         self.similar.into_iter().fold(fault, |fault, similar| fault.with("similar", similar))
@@ -78,7 +91,7 @@ fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal
         if knowledge.names.lacks(version, NameKind::Activation, name) {
             let similar = knowledge.names.similar(NameKind::Activation, name).map(str::to_owned);
             let because = "which is no activation function".to_owned();
-            let raises = format!("KeyError: '{name}'");
+            let raises = format!("KeyError: '{}'", escape(name, CAP));
             found.push(Refusal { pointer, value: name.into(), because, raises, similar });
         }
     }
@@ -125,7 +138,7 @@ fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<
         pointer: format!("{pointer}/{key}"),
         value: name.into(),
         because: "which is no type of rope".to_owned(),
-        raises: format!("KeyError: '{name}'"),
+        raises: format!("KeyError: '{}'", escape(name, CAP)),
         similar: knowledge.names.similar(NameKind::RopeType, name).map(str::to_owned),
     })
 }
@@ -134,8 +147,8 @@ fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Ref
     let (_, name) = rope_type(rope)?;
     let is_refused = ROPE_WITH_FACTOR.contains(&name) && !rope.contains_key("factor");
     is_refused.then(|| Refusal {
-        value: Value::Object(rope.clone()),
-        because: format!("and rope type {name} needs a factor"),
+        value: format!("of type {name}").into(),
+        because: "which needs a factor".to_owned(),
         raises: format!("KeyError: Missing required keys for 'rope_type'='{name}': {{'factor'}}"),
         similar: None,
         pointer,
@@ -157,7 +170,7 @@ fn of_fields(knowledge: &Knowledge, config: &Value, version: &str, at: &str) -> 
                 found.push(Refusal {
                     pointer: pointer::join(at, &key),
                     value: value.clone(),
-                    because: format!("and {model_type} takes no {} there", json_type(value)),
+                    because: format!("and {} takes no {} there", escape(model_type, CAP), json_type(value)),
                     raises: format!("StrictDataclassFieldValidationError: Validation error for field '{key}'"),
                     similar: None,
                 });
@@ -192,7 +205,7 @@ fn dtype(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Refusal
         pointer: format!("/{key}"),
         value: name.into(),
         because: "which is no dtype of torch".to_owned(),
-        raises: format!("AttributeError: module 'torch' has no attribute '{name}'"),
+        raises: format!("AttributeError: module 'torch' has no attribute '{}'", escape(name, CAP)),
         similar: knowledge.names.similar(NameKind::Dtype, name.trim_start_matches("torch.")).map(str::to_owned),
     })
 }
@@ -227,7 +240,7 @@ fn quantisation(knowledge: &Knowledge, config: &Value, targets: &[Target]) -> Op
     };
     let raising: Vec<&Target> = targets.iter().filter(raises).collect();
     let fault = match method {
-        Some(method) => Fault::new(FaultKind::QuantMethodUnknown).at(place).with("method", method),
+        Some(method) => Fault::new(FaultKind::QuantMethodUnknown).at(place).with("method", escape(method, CAP)),
         None => Fault::new(FaultKind::QuantMethodMissing).at(place),
     };
     let versions: Vec<&str> = raising.iter().map(|target| target.version()).collect();

@@ -163,7 +163,8 @@ impl Basis<'_> {
         let (mut verdict, mut why) = self.alone(object, loader);
         // The exception that ends the predicted load is exact; of anything else, a finding tells more.
         let is_exact = object == Object::Model && self.report(loader).is_some_and(|report| report.raises.is_some());
-        if let Some((_, worst)) = effects().rev().max_by_key(|(_, effect)| LoadVerdict::from(effect.outcome))
+        if let Some((_, worst)) =
+            effects().rev().max_by_key(|(_, effect)| (LoadVerdict::from(effect.outcome), !ends_the_load(&effect.text)))
             && !is_exact
             && LoadVerdict::from(worst.outcome) >= verdict
         {
@@ -215,6 +216,11 @@ impl Basis<'_> {
         let known = self.unpredicted.iter().find(|(of, _)| *of == loader).map(|(_, why)| why.clone());
         (LoadVerdict::NotPredicted, Some(known.unwrap_or_else(|| "its class is unknown".to_owned())))
     }
+}
+
+/// Whether this is the error for shapes that differ, which follows all others.
+fn ends_the_load(text: &str) -> bool {
+    text.starts_with("RuntimeError: ")
 }
 
 /// The verdict of a load report alone.

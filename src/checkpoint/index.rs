@@ -90,10 +90,6 @@ impl Index {
             Some(other) => return faults.push(malformed(self.place("/weight_map"), other)),
             None => return faults.push(Fault::new(FaultKind::WeightMapMissing).at(self.place(""))),
         };
-        if map.is_empty() {
-            let fault = Fault::new(FaultKind::WeightMapMalformed).at(self.place("/weight_map"));
-            return faults.push(fault.with("found", "an empty object"));
-        }
         for (tensor, file) in map {
             let place = || self.place(&pointer::join("/weight_map", tensor)).in_tensor(tensor.clone());
             match file.as_str() {

@@ -91,6 +91,10 @@ impl LoaderNames {
     /// The known name that `name` is a misspelling of: another separator or case, or a letter.
     #[must_use]
     pub fn similar(&self, kind: NameKind, name: &str) -> Option<&str> {
+        // No name is this long, and the comparison takes as much memory.
+        if name.len() > 64 {
+            return None;
+        }
         let plain = |name: &str| name.to_ascii_lowercase().replace(['-', '.', ' '], "_");
         let all: BTreeSet<&str> = self.versions.values().flat_map(|lists| lists.of(kind)).map(String::as_str).collect();
         let likeness = |other: &str| strsim::damerau_levenshtein(&plain(other), &plain(name));

@@ -6,6 +6,7 @@ use memchr::memmem;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
+use super::loader::version_numbers;
 use super::source;
 
 /// What one model class refuses, by pointers without the first slash; an unused list is empty.
@@ -20,6 +21,22 @@ pub struct ClassRefusals {
     pub rope_type: Vec<String>,
     /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
     pub rope_factor: Vec<String>,
+}
+
+impl ClassRefusals {
+    /// What both refuse; the key of rope parameters has another name since transformers 5.
+    fn and(self, other: &Self) -> Self {
+        let old = |key: &String| key.replace("rope_parameters", "rope_scaling");
+        let both = |mine: Vec<String>, other: &[String]| -> Vec<String> {
+            mine.into_iter().filter(|key| other.iter().any(|o| old(o) == old(key))).collect()
+        };
+        Self {
+            activation: both(self.activation, &other.activation),
+            padding: both(self.padding, &other.padding),
+            rope_type: both(self.rope_type, &other.rope_type),
+            rope_factor: both(self.rope_factor, &other.rope_factor),
+        }
+    }
 }
 
 /// `rules/refused/<version>.json`, which `tools/derive_architectures.py accepts` writes by trying every class. An entry is
@@ -37,10 +54,19 @@ impl Refusals {
         Self { versions: files.filter_map(|(name, text)| Some((name.strip_suffix(".json")?, text))).collect() }
     }
 
-    /// What the model class refuses under this version; `None` for other versions and unknown classes.
+    /// What the model class refuses under this version. Where it was not tried there, what both the next older and the
+    /// next newer version refuse.
     #[must_use]
     pub fn of_class(&self, version: &str, class: &str) -> Option<ClassRefusals> {
-        self.entry(version, "classes", class)
+        let own = || self.entry(version, "classes", class);
+        let numbers = version_numbers(version);
+        let entry = |version: &&'static str| self.entry::<ClassRefusals>(version, "classes", class);
+        let between = || {
+            let older = self.versions.keys().filter(|v| version_numbers(v) < numbers).rev().find_map(entry)?;
+            let newer = self.versions.keys().filter(|v| version_numbers(v) > numbers).find_map(entry)?;
+            Some(older.and(&newer))
+        };
+        own().or_else(between)
     }
 
     /// The JSON types that keys of a config class refuse under this version, as `string integer`, with the keys.
@@ -84,5 +110,11 @@ mod tests {
             }
         }
         assert_eq!(refusals.of_class("4.47.0", "llama"), None);
+        // A version between two known ones.
+        let llama = refusals.of_class("4.51.3", "LlamaForCausalLM").unwrap();
+        assert_eq!(
+            (llama.activation, llama.rope_type),
+            (vec!["hidden_act".to_owned()], vec!["rope_scaling".to_owned()])
+        );
     }
 }

@@ -25,7 +25,7 @@ VALUES = {
     "integer": [3, 0, 1, -1, 64],
     "fraction": [1.5, 0.5, 0.02, -1.5],
     "boolean": [True],
-    "array": [[], [1], [1.5], ["x"], [[1]], [{}]],
+    "array": [[], [1], [1.5], ["x"], [[1]], [{}], [1, 2], [0.0, 1.0], [1, 2, 3], ["x", "y"]],
     "object": [{}, {"a": 1}, {"a": "x"}, {"a": {}}],
     "null": [None],
 }
@@ -101,7 +101,8 @@ def fields(model_type):
         # One value of a kind does not stand for the others.
         if "Literal" in str(typed(cls, key)):
             continue
-        refused = [kind for kind, values in VALUES.items() if all(is_refused(cls, default, key, value) for value in values)]
+        kinds = {kind: values for kind, values in VALUES.items() if kind != json_type(default[key])}
+        refused = [kind for kind, values in kinds.items() if all(is_refused(cls, default, key, value) for value in values)]
         if refused:
             found.setdefault(" ".join(refused), []).append(key)
     heads = default.get("num_attention_heads")
@@ -116,6 +117,11 @@ def fields(model_type):
 
 def typed(cls, key):
     return next((base.__annotations__[key] for base in cls.__mro__ if key in getattr(base, "__annotations__", {})), "")
+
+
+def json_type(value):
+    types = {bool: "boolean", int: "integer", float: "fraction", str: "string", dict: "object", type(None): "null"}
+    return next((name for kind, name in types.items() if isinstance(value, kind)), "array")
 
 
 def is_refused(cls, default, key, value):
@@ -149,8 +155,7 @@ def main(args):
         by = collections.defaultdict(list)
         for replacement, pointer in sorted(found):
             by[replacement].append(pointer)
-        if by:
-            classes[name] = by
+        classes[name] = by
     types = {}
     if not version.startswith("4"):
         for model_type in sorted(transformers.models.auto.configuration_auto.CONFIG_MAPPING_NAMES):
@@ -159,5 +164,5 @@ def main(args):
     OUT.mkdir(exist_ok=True)
     lines = [f"{json.dumps(part)}: {{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()) + "\n}" for part, entries in (("classes", classes), ("fields", types))]
     (OUT / f"{version}.json").write_text("{\n" + ",\n".join(lines) + "\n}\n")
-    print(f"{version}: {probed} classes probed, {len(classes)} refuse a value; {len(types)} config classes validate fields")
+    print(f"{version}: {probed} classes probed, {sum(map(bool, classes.values()))} refuse a value; {len(types)} config classes validate fields")
     return 0

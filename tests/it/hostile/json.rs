@@ -49,7 +49,7 @@ fn depth() -> Vec<Case> {
         }),
         clean("J1", "127 levels", |d| {
             d.config(format!(
-                r#"{{"model_type": "unheard", "architectures": ["Unheard"], "a": {}}}"#,
+                r#"{{"model_type": "llama", "architectures": ["Unheard"], "a": {}}}"#,
                 nested("[", "]", 126)
             ));
         }),
@@ -82,7 +82,7 @@ fn numbers() -> Vec<Case> {
             name,
             codes,
             CONFIG,
-            format!(r#"{{"architectures": ["Unheard"], "model_type": "unheard", "x": {literal}}}"#),
+            format!(r#"{{"architectures": ["Unheard"], "model_type": "llama", "x": {literal}}}"#),
         )
     };
     vec![
@@ -101,18 +101,16 @@ fn numbers() -> Vec<Case> {
         of("J6", "an exponent of a million digits", "JSN010", &format!("1e{}", "9".repeat(1_000_000))),
         of("J6", "leading zero", "JSN016", "007"),
         of("J6", "hexadecimal", "JSN016", "0xff"),
-        clean("J6", "1e-400", |d| d.config(r#"{"architectures": ["Unheard"], "model_type": "unheard", "x": 1e-400}"#)),
+        clean("J6", "1e-400", |d| d.config(r#"{"architectures": ["Unheard"], "model_type": "llama", "x": 1e-400}"#)),
         clean("J6", "31 digits", |d| {
-            d.config(
-                r#"{"architectures": ["Unheard"], "model_type": "unheard", "x": 1000000000000000019884624838656}"#,
-            );
+            d.config(r#"{"architectures": ["Unheard"], "model_type": "llama", "x": 1000000000000000019884624838656}"#);
         }),
     ]
 }
 
 /// J4: encodings.
 fn encodings() -> Vec<Case> {
-    let text = r#"{"architectures": ["Unheard"], "model_type": "unheard"}"#;
+    let text = r#"{"architectures": ["Unheard"], "model_type": "llama"}"#;
     let utf16 = |little: bool| -> Vec<u8> {
         text.encode_utf16().flat_map(|u| if little { u.to_le_bytes() } else { u.to_be_bytes() }).collect()
     };

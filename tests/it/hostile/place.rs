@@ -43,7 +43,7 @@ impl Dir {
 
     /// A checkpoint of an unknown class with one tensor, so that all findings are about the case.
     pub fn small(&self) {
-        self.put("config.json", r#"{"architectures": ["Unheard"], "model_type": "unheard"}"#);
+        self.put("config.json", r#"{"architectures": ["Unheard"], "model_type": "llama"}"#);
         self.entries(&entry("a", "U8", "[1]", 0, 1), 1);
     }
 
