@@ -56,7 +56,7 @@ pub struct Finding {
     /// Further findings of the rule that are counted and not listed, because one file or one checkpoint has too many.
     #[serde(skip_serializing_if = "is_zero")]
     pub hidden: u64,
-    /// Whether the rule is a note, see [`Self::is_note`].
+    /// Whether the rule is a note, which the header shows.
     #[serde(skip)]
     pub note: bool,
 }
