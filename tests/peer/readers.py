@@ -25,6 +25,8 @@ STRICTER_ON_DOCUMENTS = {
     "JSN009": "deeper than 127: serde_json and the tokenizers library stop there, Python some levels later",
     "JSN010": "1e400 is infinite to Python and an error to others",
     "JSN012": "any value is JSON; a config must be an object",
+    "CFG024": "any text is JSON; transformers does not know the model type",
+    "CFG025": "any object is JSON; a config must have a model type",
 }
 
 PIECES = [
