@@ -16,7 +16,6 @@ from peer import Tally, check, workplace
 # Errors about shards that safetensors accepts, each with the reason.
 STRICTER_ON_SHARDS = {
     "SAF006": "the format forbids equal names; the crate behind Python's package silently keeps one of them",
-    "SAF009": "transformers requires `format`, the container does not",
     "SAF011": "serde also reads an entry from an array",
 }
 
