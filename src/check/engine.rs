@@ -8,6 +8,7 @@ use serde_json::{Map, Value, json};
 use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, Stored, Target};
+use super::model_type::Asked;
 use super::outcome::Outcome;
 use super::verdict::Basis;
 use super::{adapter, index, inspect, judge, model_type, modules, policy, refusals, tokens, variables};
@@ -77,9 +78,10 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
     let architecture = outcome.architecture.as_deref();
     let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
+    let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
     let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
-    faults.extend(model_type::faults(checkpoint, knowledge, &context.targets, &unknown));
-    faults.extend(refusals::faults(checkpoint, knowledge, &context.targets));
+    faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
+    faults.extend(refusals::faults(checkpoint, knowledge, &asked));
     for rule in &knowledge.rules.rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {

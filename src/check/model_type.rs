@@ -10,7 +10,7 @@ use super::refusals::short;
 use crate::checkpoint::adapter;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
-use crate::knowledge::names::NameKind;
+use crate::knowledge::names::{LoaderNames, NameKind};
 
 /// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class.
 pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {
@@ -23,20 +23,36 @@ pub(super) fn is_model(checkpoint: &Checkpoint) -> bool {
     is_of_transformers(checkpoint) && !checkpoint.has_file(adapter::CONFIG)
 }
 
+/// The targets of a run.
+#[derive(Clone, Copy)]
+pub(super) struct Asked<'t> {
+    pub(super) targets: &'t [Target],
+    /// Whether the user named them.
+    pub(super) named: bool,
+}
+
+impl<'t> Asked<'t> {
+    /// The targets that do not know a name. The version that config.json states is no evidence against a name that it
+    /// uses and a known version has: models are published with the version of a development build.
+    pub(super) fn lacking(self, names: &LoaderNames, kind: NameKind, name: &str) -> Vec<&'t Target> {
+        let is_stated = |target: &Target| target.leads && !self.named;
+        let lacks = |target: &&Target| {
+            names.lacks(target.version(), kind, name) && !(is_stated(target) && names.contains(kind, name))
+        };
+        self.targets.iter().filter(lacks).collect()
+    }
+}
+
 /// The place of the `model_type` that a class selects a part by, of the fault that the part is unknown.
 pub(super) fn place_of_part(fault: &Fault) -> Option<Place> {
     let is_part = fault.kind == FaultKind::UnknownArchitecture && fault.detail.contains_key("part");
-    fault.places.first().filter(|_| is_part).cloned()
+    let is_type = |place: &&Place| place.pointer.as_ref().is_some_and(|pointer| pointer.ends_with("/model_type"));
+    fault.places.first().filter(|_| is_part).filter(is_type).cloned()
 }
 
 /// Faults of `model_type`, each under the loaders that raise. Called by the engine with the targets of the run, and the
 /// places of the types of parts that no description has.
-pub(super) fn faults(
-    checkpoint: &Checkpoint,
-    knowledge: &Knowledge,
-    targets: &[Target],
-    parts: &[Place],
-) -> Vec<Fault> {
+pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>, parts: &[Place]) -> Vec<Fault> {
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
         return Vec::new();
     };
@@ -50,8 +66,8 @@ pub(super) fn faults(
     let of_class = class.and_then(|class| knowledge.library.model_type_of(class));
     let place = Place::file("config.json").pointer("/model_type");
     let fault = match config.get("model_type") {
-        Some(value) => unknown(knowledge, value, place, targets),
-        None => missing(checkpoint, knowledge, of_class, targets),
+        Some(value) => unknown(knowledge, value, place, asked),
+        None => missing(checkpoint, knowledge, of_class, asked.targets),
     };
     let with_class = |fault: Fault| match (class, of_class) {
         (Some(class), Some(model_type)) => fault.with("class", escape(class, 80)).with("of_class", model_type),
@@ -59,7 +75,7 @@ pub(super) fn faults(
     };
     let of_part = |place: &Place| {
         let value = config.pointer(place.pointer.as_deref()?)?;
-        Some(unknown(knowledge, value, place.clone(), targets)?.with("part", true))
+        Some(unknown(knowledge, value, place.clone(), asked)?.with("part", true))
     };
     fault.into_iter().map(with_class).chain(parts.iter().filter_map(of_part)).collect()
 }
@@ -71,14 +87,13 @@ pub(super) fn has_code(config: &Value) -> bool {
 
 /// The fault of a `model_type` that loaders lack. Types that only an architecture file describes belong to packages that
 /// register them, such as that of LLaVA-3D.
-fn unknown(knowledge: &Knowledge, value: &Value, place: Place, targets: &[Target]) -> Option<Fault> {
+fn unknown(knowledge: &Knowledge, value: &Value, place: Place, asked: &Asked<'_>) -> Option<Fault> {
     let names = &knowledge.names;
     let name = value.as_str().unwrap_or_default();
     if !names.contains(NameKind::ModelType, name) && knowledge.library.describes(name) {
         return None;
     }
-    let lacking: Vec<&Target> =
-        targets.iter().filter(|target| names.lacks(target.version(), NameKind::ModelType, name)).collect();
+    let lacking = asked.lacking(names, NameKind::ModelType, name);
     if lacking.is_empty() {
         return None;
     }

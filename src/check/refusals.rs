@@ -3,7 +3,7 @@
 use serde_json::{Map, Value};
 
 use super::load::Target;
-use super::model_type::{has_code, is_model};
+use super::model_type::{Asked, has_code, is_model};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape, pointer};
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
@@ -40,12 +40,12 @@ struct Refusal {
 }
 
 /// Faults of refused values, each under the loaders that raise. Called by the engine with the targets of the run.
-pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[Target]) -> Vec<Fault> {
+pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>) -> Vec<Fault> {
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
         return Vec::new();
     };
     let mut faults: Vec<Fault> = Vec::new();
-    for target in targets {
+    for target in asked.targets {
         let mut found = of_class(knowledge, config, target.version());
         found.extend(of_fields(knowledge, config, target.version(), ""));
         found.extend(dtype(knowledge, config, target.version()));
@@ -62,7 +62,7 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[
             }
         }
     }
-    faults.extend(quantisation(knowledge, config, targets));
+    faults.extend(quantisation(knowledge, config, asked));
     faults
 }
 
@@ -225,7 +225,7 @@ fn json_type(value: &Value) -> &'static str {
 
 /// A quantisation block without `quant_method`, or with one that the version does not know. The latter raises in 4.47.0, and
 /// 4.57.6 and 5.23.0 load the weights as plain ones. Schemes of other programs are reported by the rules of quantised weights.
-fn quantisation(knowledge: &Knowledge, config: &Value, targets: &[Target]) -> Option<Fault> {
+fn quantisation(knowledge: &Knowledge, config: &Value, asked: &Asked<'_>) -> Option<Fault> {
     let (pointer, block) = block(config).filter(|(pointer, _)| *pointer == "/quantization_config")?;
     let is_set = |key| block.get(key).and_then(Value::as_bool) == Some(true);
     let is_other = matches!(declared_scheme(config, &knowledge.schemes), DeclaredScheme::Known(scheme) if scheme.scheme().loaded_by.is_some());
@@ -234,11 +234,11 @@ fn quantisation(knowledge: &Knowledge, config: &Value, targets: &[Target]) -> Op
     }
     let place = Place::file("config.json").pointer(pointer);
     let method = block.get("quant_method").and_then(Value::as_str);
-    let raises = |target: &&Target| {
-        let lacks = |method| knowledge.names.lacks(target.version(), NameKind::QuantMethod, method);
-        method.is_none_or(|method| version_numbers(target.version()) < vec![4, 48] && lacks(method))
-    };
-    let raising: Vec<&Target> = targets.iter().filter(raises).collect();
+    let mut raising: Vec<&Target> = asked.targets.iter().collect();
+    if let Some(method) = method {
+        raising = asked.lacking(&knowledge.names, NameKind::QuantMethod, method);
+        raising.retain(|target| version_numbers(target.version()) < vec![4, 48]);
+    }
     let fault = match method {
         Some(method) => Fault::new(FaultKind::QuantMethodUnknown).at(place).with("method", escape(method, CAP)),
         None => Fault::new(FaultKind::QuantMethodMissing).at(place),
