@@ -75,7 +75,7 @@ def add_table(commands):
 
 
 def add_accepts(commands):
-    p = commands.add_parser("accepts", help="try what classes and config classes refuse; write rules/refused")
+    p = commands.add_parser("accepts", help="try what classes refuse; write rules/refused")
     p.set_defaults(run="derive.accepts")
 
 

@@ -76,33 +76,12 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     scope.bind("named", &(!versions.is_empty()).into());
     scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
-    let architecture = outcome.architecture.as_deref();
     let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
     let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
     let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
     faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
     faults.extend(refusals::faults(checkpoint, knowledge, &asked));
-    for rule in &knowledge.rules.rules {
-        // Built-in rules are known to end; a user's rule gets a limit.
-        let (found, stopped) = match rule.origin {
-            Some(_) => within(STEPS, || evaluate(rule, &context, &faults, &scope, architecture)),
-            None => (evaluate(rule, &context, &faults, &scope, architecture), false),
-        };
-        if stopped {
-            let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
-            outcome.unusable.push(Skipped { code: rule.code.clone(), why });
-        }
-        match found {
-            Ok(findings) => outcome.findings.extend(findings),
-            Err(why) => {
-                let skipped = Skipped { code: rule.code.clone(), why };
-                if rule.origin.is_some() && skipped.why.contains("Undeclared reference") {
-                    outcome.unusable.push(skipped.clone());
-                }
-                outcome.skipped.push(skipped);
-            }
-        }
-    }
+    run_rules(knowledge, &context, &faults, &scope, &mut outcome);
     let unselected = knowledge.rules.unselected.iter();
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
@@ -122,6 +101,32 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.verdicts = basis.verdicts(&context.targets);
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
+}
+
+/// Runs the selected rules, and adds their findings and the skipped rules to the outcome.
+fn run_rules(knowledge: &Knowledge, context: &Context<'_>, faults: &[Fault], scope: &Scope<'_>, outcome: &mut Outcome) {
+    let architecture = outcome.architecture.clone();
+    for rule in &knowledge.rules.rules {
+        // Built-in rules are known to end; a user's rule gets a limit.
+        let (found, stopped) = match rule.origin {
+            Some(_) => within(STEPS, || evaluate(rule, context, faults, scope, architecture.as_deref())),
+            None => (evaluate(rule, context, faults, scope, architecture.as_deref()), false),
+        };
+        if stopped {
+            let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
+            outcome.unusable.push(Skipped { code: rule.code.clone(), why });
+        }
+        match found {
+            Ok(findings) => outcome.findings.extend(findings),
+            Err(why) => {
+                let skipped = Skipped { code: rule.code.clone(), why };
+                if rule.origin.is_some() && skipped.why.contains("Undeclared reference") {
+                    outcome.unusable.push(skipped.clone());
+                }
+                outcome.skipped.push(skipped);
+            }
+        }
+    }
 }
 
 /// Adds to the fault of an unknown class the known one that has its tensor names.

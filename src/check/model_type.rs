@@ -6,11 +6,23 @@
 use serde_json::Value;
 
 use super::load::Target;
-use super::refusals::short;
 use crate::checkpoint::adapter;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::names::{LoaderNames, NameKind};
+
+/// Characters of a value that a message shows.
+pub(super) const CAP: usize = 80;
+
+/// A value for a message: the start of a string, and the kind of an array or object.
+pub(super) fn short(value: &Value) -> Value {
+    match value {
+        Value::String(text) => escape(text, CAP).into(),
+        Value::Array(_) => "an array".into(),
+        Value::Object(_) => "an object".into(),
+        other => other.clone(),
+    }
+}
 
 /// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class.
 pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {
@@ -70,7 +82,7 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
         None => missing(checkpoint, knowledge, of_class, asked.targets),
     };
     let with_class = |fault: Fault| match (class, of_class) {
-        (Some(class), Some(model_type)) => fault.with("class", escape(class, 80)).with("of_class", model_type),
+        (Some(class), Some(model_type)) => fault.with("class", escape(class, CAP)).with("of_class", model_type),
         _ => fault,
     };
     let of_part = |place: &Place| {

@@ -3,8 +3,8 @@
 use serde_json::{Map, Value};
 
 use super::load::Target;
-use super::model_type::{Asked, has_code, is_model};
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape, pointer};
+use super::model_type::{Asked, CAP, has_code, is_model, short};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
@@ -13,19 +13,6 @@ use crate::knowledge::refusals::ClassRefusals;
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
-
-/// Characters of a value that a message shows.
-const CAP: usize = 80;
-
-/// A value for a message: the start of a string, and the kind of an array or object.
-pub(super) fn short(value: &Value) -> Value {
-    match value {
-        Value::String(text) => escape(text, CAP).into(),
-        Value::Array(_) => "an array".into(),
-        Value::Object(_) => "an object".into(),
-        other => other.clone(),
-    }
-}
 
 /// A value that a loader refuses.
 struct Refusal {
@@ -47,7 +34,6 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
     let mut faults: Vec<Fault> = Vec::new();
     for target in asked.targets {
         let mut found = of_class(knowledge, config, target.version());
-        found.extend(of_fields(knowledge, config, target.version(), ""));
         found.extend(dtype(knowledge, config, target.version()));
         for refusal in found {
             let loader = target.loader.version();
@@ -83,7 +69,7 @@ impl Refusal {
 fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal> {
     let class = config.pointer("/architectures/0").and_then(Value::as_str);
     let Some(refused) = class.and_then(|class| knowledge.refusals.of_class(version, class)) else { return Vec::new() };
-    let ClassRefusals { activation, padding, rope_type, rope_factor } = &refused;
+    let ClassRefusals { activation, heads, padding, rope_type, rope_factor } = &refused;
     let mut found = Vec::new();
     for key in activation {
         let pointer = format!("/{key}");
@@ -95,6 +81,7 @@ fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal
             found.push(Refusal { pointer, value: name.into(), because, raises, similar });
         }
     }
+    found.extend(heads.iter().filter_map(|key| undivided(config, format!("/{key}"))));
     for key in padding {
         let pointer = format!("/{key}");
         let rows = config.pointer(&format!("{}/vocab_size", parent(&pointer))).and_then(Value::as_u64);
@@ -155,37 +142,10 @@ fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Ref
     })
 }
 
-/// Values whose JSON type the config class refuses, in the config at `at` and in its parts that name their model type.
-fn of_fields(knowledge: &Knowledge, config: &Value, version: &str, at: &str) -> Vec<Refusal> {
-    let Some(map) = config.as_object() else { return Vec::new() };
-    let Some(model_type) = map.get("model_type").and_then(Value::as_str) else { return Vec::new() };
-    let mut found = Vec::new();
-    for (kinds, keys) in knowledge.refusals.of_fields(version, model_type) {
-        for key in keys {
-            let Some(value) = map.get(&key) else { continue };
-            if kinds == "undivided" {
-                found.extend(undivided(map, pointer::join(at, &key)));
-            }
-            if kinds.split(' ').any(|kind| kind == json_type(value)) {
-                found.push(Refusal {
-                    pointer: pointer::join(at, &key),
-                    value: value.clone(),
-                    because: format!("and {} takes no {} there", escape(model_type, CAP), json_type(value)),
-                    raises: format!("StrictDataclassFieldValidationError: Validation error for field '{key}'"),
-                    similar: None,
-                });
-            }
-        }
-    }
-    let parts = map.iter().filter(|(key, value)| key.ends_with("_config") && value.is_object());
-    found.extend(parts.flat_map(|(key, part)| of_fields(knowledge, part, version, &pointer::join(at, key))));
-    found
-}
-
-/// Attention heads that do not divide the hidden size, for a config class that validates it.
-fn undivided(map: &Map<String, Value>, pointer: String) -> Option<Refusal> {
-    let count = |key| map.get(key).and_then(Value::as_u64);
-    let (heads, hidden) = (count("num_attention_heads")?, count("hidden_size")?);
+/// Attention heads that do not divide the hidden size.
+fn undivided(config: &Value, pointer: String) -> Option<Refusal> {
+    let heads = config.pointer(&pointer)?.as_u64()?;
+    let hidden = config.pointer(&format!("{}/hidden_size", parent(&pointer)))?.as_u64()?;
     (hidden.checked_rem(heads)? != 0).then(|| Refusal {
         pointer,
         value: heads.into(),
@@ -208,19 +168,6 @@ fn dtype(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Refusal
         raises: format!("AttributeError: module 'torch' has no attribute '{}'", escape(name, CAP)),
         similar: knowledge.names.similar(NameKind::Dtype, name.trim_start_matches("torch.")).map(str::to_owned),
     })
-}
-
-/// The JSON type of a value, with the two kinds of numbers that Python tells apart.
-fn json_type(value: &Value) -> &'static str {
-    match value {
-        Value::Null => "null",
-        Value::Bool(_) => "boolean",
-        Value::Number(number) if number.is_f64() => "fraction",
-        Value::Number(_) => "integer",
-        Value::String(_) => "string",
-        Value::Array(_) => "array",
-        Value::Object(_) => "object",
-    }
 }
 
 /// A quantisation block without `quant_method`, or with one that the version does not know. The latter raises in 4.47.0, and

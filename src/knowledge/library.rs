@@ -74,9 +74,10 @@ impl Library {
 
     /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
-    /// The class in `architectures` decides, unless `model_type` is that of another class; where it is absent, or custom code may stand behind an unknown
-    /// name (`auto_map`), `model_type` does, if its class has a head where the named one has. Where several entries describe one class, the config (`when` of the file)
-    /// and the tensors (`chosen_by` of the class) choose.
+    /// The class in `architectures` decides, unless `model_type` is that of another class. Where it is absent, or custom
+    /// code may stand behind an unknown name (`auto_map`), `model_type` decides, if its class has a head where the named one
+    /// has. Where several entries describe one class, the config (`when` of the file) and the tensors (`chosen_by` of the
+    /// class) choose.
     #[must_use]
     pub fn find<'n>(
         &self,

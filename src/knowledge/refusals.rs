@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use memchr::memmem;
 use serde::Deserialize;
-use serde::de::DeserializeOwned;
 
 use super::loader::version_numbers;
 use super::source;
@@ -15,6 +14,9 @@ use super::source;
 pub struct ClassRefusals {
     /// Keys of activation functions: an unknown name raises `KeyError`.
     pub activation: Vec<String>,
+    /// Keys of attention heads: a count that does not divide `hidden_size` beside it raises
+    /// `StrictDataclassClassValidationError`.
+    pub heads: Vec<String>,
     /// Keys of padding ids: an id beyond `vocab_size` beside it raises `AssertionError`.
     pub padding: Vec<String>,
     /// Keys of rope parameters: an unknown type raises `KeyError`.
@@ -32,6 +34,7 @@ impl ClassRefusals {
         };
         Self {
             activation: both(self.activation, &other.activation),
+            heads: both(self.heads, &other.heads),
             padding: both(self.padding, &other.padding),
             rope_type: both(self.rope_type, &other.rope_type),
             rope_factor: both(self.rope_factor, &other.rope_factor),
@@ -58,31 +61,21 @@ impl Refusals {
     /// next newer version refuse.
     #[must_use]
     pub fn of_class(&self, version: &str, class: &str) -> Option<ClassRefusals> {
-        let own = || self.entry(version, "classes", class);
         let numbers = version_numbers(version);
-        let entry = |version: &&'static str| self.entry::<ClassRefusals>(version, "classes", class);
+        let entry = |version: &&'static str| self.entry(version, class);
         let between = || {
             let older = self.versions.keys().filter(|v| version_numbers(v) < numbers).rev().find_map(entry)?;
             let newer = self.versions.keys().filter(|v| version_numbers(v) > numbers).find_map(entry)?;
             Some(older.and(&newer))
         };
-        own().or_else(between)
+        self.entry(version, class).or_else(between)
     }
 
-    /// The JSON types that keys of a config class refuse under this version, as `string integer`, with the keys.
-    #[must_use]
-    pub fn of_fields(&self, version: &str, model_type: &str) -> BTreeMap<String, Vec<String>> {
-        self.entry(version, "fields", model_type).unwrap_or_default()
-    }
-
-    fn entry<T: DeserializeOwned>(&self, version: &str, part: &str, name: &str) -> Option<T> {
+    fn entry(&self, version: &str, class: &str) -> Option<ClassRefusals> {
         let text = self.versions.get(version)?;
-        let from = |text: &'static str, needle: &str| {
-            let at = memmem::find(text.as_bytes(), needle.as_bytes())?;
-            text.get(at.checked_add(needle.len())?..)
-        };
-        let part = from(text, &format!("\n\"{part}\": {{"))?;
-        let line = from(part, &format!("\n{}: ", serde_json::Value::from(name)))?.lines().next()?;
+        let start = format!("\n{}: ", serde_json::Value::from(class));
+        let at = memmem::find(text.as_bytes(), start.as_bytes())?.checked_add(start.len())?;
+        let line = text.get(at..)?.lines().next()?;
         serde_json::from_str(line.strip_suffix(',').unwrap_or(line)).ok()
     }
 }
@@ -97,16 +90,9 @@ mod tests {
         assert!(refusals.versions.len() >= 3);
         for (version, text) in &refusals.versions {
             let document: serde_json::Value = serde_json::from_str(text).unwrap();
-            for (class, entry) in document["classes"].as_object().unwrap() {
+            for (class, entry) in document.as_object().unwrap() {
                 let expected: ClassRefusals = serde_json::from_value(entry.clone()).unwrap();
                 assert_eq!(refusals.of_class(version, class), Some(expected), "{version} {class}");
-            }
-            for (model_type, entry) in document["fields"].as_object().unwrap() {
-                assert_eq!(
-                    serde_json::json!(refusals.of_fields(version, model_type)),
-                    *entry,
-                    "{version} {model_type}"
-                );
             }
         }
         assert_eq!(refusals.of_class("4.47.0", "llama"), None);

@@ -219,6 +219,8 @@ fn the_page_of_data_files_is_fresh() {
          | `quantization/` | quantisation schemes: the tensors that replace a plain weight |\n\
          | `processors/` | tokens that a processor adds to a tokenizer |\n\
          | `recipes/` | merges, with the Python modules that they write |\n\
+         | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
+         | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\n\
          All files are JSON5. The keys below come from the JSON Schemas in [`schemas/`](../schemas). *Expression* means an \

@@ -5,13 +5,12 @@
 
 Each FOLDER has one version of transformers, for the Python that runs this. For N config classes drawn at random, a value of a
 random JSON type replaces that of a random key; for N model classes, an activation function or a padding id is replaced. The
-config is read, and the class built on the meta device: CFG026 is reported where, and only where, this raises what CFG026 is
-about. The seed is that of the day unless it is given.
+config is read, and the class built on the meta device: ARC002 or CFG026 is reported only where this raises, and for at least
+three quarters of the refused values of known classes.
 """
 
 import argparse
 import copy
-import datetime
 import json
 import os
 import random
@@ -21,6 +20,7 @@ from pathlib import Path
 
 from peer import ROOT, Tally, doctor, workplace
 
+REFUSED = ("StrictDataclassFieldValidationError", "KeyError: 'swoosh'", "AssertionError: Padding_idx")
 VALUES = ["x", "", 3, 0, 1.5, 0.25, True, None, [], [1, 2], ["a"], {}, {"a": 1}]
 
 
@@ -94,7 +94,7 @@ def main():
     parser.add_argument("folders", nargs="+")
     parser.add_argument("--configs", type=int, default=300)
     parser.add_argument("--classes", type=int, default=40)
-    parser.add_argument("--seed", default=datetime.date.today().isoformat())
+    parser.add_argument("--seed", default="1")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
@@ -119,14 +119,17 @@ def compare(tally, version, rows):
     raised = silent = 0
     for path, said in rows:
         name = Path(path).name
-        ours = [f["effects"][0]["text"] for f in found[name]["findings"] if f["code"] == "CFG026"]
-        about = (said or "").startswith(("StrictDataclassFieldValidationError", "KeyError: 'swoosh'", "AssertionError: Padding_idx"))
+        codes = {f["code"] for f in found[name]["findings"]}
+        texts = [f["effects"][0]["text"] for f in found[name]["findings"] if f["code"] in ("ARC002", "CFG026")]
+        # That a class cannot be built shows only when it is built, which the first configs are not.
+        ours = [text for text in texts if text.startswith(REFUSED)]
+        about = "ARC001" not in codes and (said or "").startswith(REFUSED)
         raised += about
         silent += about and not ours
         if about and not ours:
             print(f"  not reported: {what_of(version, path)}: {said}")
         # Silence is allowed: a key with a nested type is only known by some of its values. A false alarm is not.
-        tally.expect(bool(ours) <= bool(said), f"{what_of(version, path)}: the loader says {said}; CFG026: {ours}")
+        tally.expect(bool(ours) <= bool(said), f"{what_of(version, path)}: the loader says {said}; reported: {ours}")
     print(f"{version}: {len(rows)} configs, {raised} refused, {silent} of them not reported")
     tally.expect(silent <= 0.25 * raised + 1, f"{version}: {silent} refused configs are not reported")
 
