@@ -76,6 +76,8 @@ def add_table(commands):
 
 def add_accepts(commands):
     p = commands.add_parser("accepts", help="try what classes refuse; write rules/refused")
+    p.add_argument("--jobs", type=int, default=2)
+    p.add_argument("--only", help="a regular expression on model types; entries of other classes are kept")
     p.set_defaults(run="derive.accepts")
 
 

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
-use super::load::{self, Stored, Target};
+use super::load::{self, LoadReport, Stored, Target};
 use super::model_type::Asked;
 use super::outcome::Outcome;
 use super::verdict::Basis;
@@ -33,6 +33,16 @@ struct Context<'a> {
     bench: Bench<'a>,
     /// The versions of transformers of the run.
     targets: Vec<Target>,
+    /// Whether the load fails under a version that its own loader predicts.
+    fails_for_certain: bool,
+}
+
+impl<'a> Context<'a> {
+    fn new(checkpoint: &'a Checkpoint, targets: Vec<Target>, loads: &[LoadReport]) -> Self {
+        let is_certain = |version: &str| targets.iter().any(|t| t.loader.version() == version && t.is_certain());
+        let fails_for_certain = loads.iter().any(|load| !load.is_whole() && is_certain(&load.loader));
+        Self { bench: Bench::new(checkpoint), targets, fails_for_certain }
+    }
 }
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
@@ -70,17 +80,14 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
     });
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
-    let targets = load::wanted(config, versions);
-    let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
-    scope.bind("loaders", &leading.collect());
-    scope.bind("named", &(!versions.is_empty()).into());
-    scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
+    bind_run(&mut scope, knowledge, config, versions, outcome.architecture.as_deref());
     variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
-    let context = Context { bench: Bench::new(checkpoint), targets: load::of_run(config, versions, judged.targets) };
+    let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &outcome.loads);
     let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
     let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
     faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
-    faults.extend(refusals::faults(checkpoint, knowledge, &asked));
+    let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
+    faults.extend(refused);
     run_rules(knowledge, &context, &faults, &scope, &mut outcome);
     let unselected = knowledge.rules.unselected.iter();
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
@@ -101,6 +108,23 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.verdicts = basis.verdicts(&context.targets);
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
+}
+
+/// Binds what the run asks for, and what is known of the class.
+fn bind_run(
+    scope: &mut Scope<'_>,
+    knowledge: &Knowledge,
+    config: Option<&Value>,
+    versions: &[String],
+    architecture: Option<&str>,
+) {
+    let targets = load::wanted(config, versions);
+    let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
+    scope.bind("loaders", &leading.collect());
+    scope.bind("named", &(!versions.is_empty()).into());
+    let groups_heads = |name: &str| knowledge.library.speaks_of(name, "num_key_value_heads");
+    scope.bind("groups_heads", &architecture.is_none_or(groups_heads).into());
+    scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
 }
 
 /// Runs the selected rules, and adds their findings and the skipped rules to the outcome.
@@ -143,7 +167,7 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
     let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(named);
     // Without a loader: these faults concern no load.
-    let context = Context { bench: Bench::new(checkpoint), targets: Vec::new() };
+    let context = Context { bench: Bench::new(checkpoint), targets: Vec::new(), fails_for_certain: false };
     let mut findings: Vec<Finding> =
         rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);
@@ -243,7 +267,7 @@ fn from_faults(
         inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
         let mut caused = Caused::default();
         for fault in all.iter().take(PLACES) {
-            caused.add(rule, &context.targets, &fault.loaders, &fault_scope(scope, fault, count));
+            caused.add(rule, context, &fault.loaders, &fault_scope(scope, fault, count));
         }
         return vec![finding(rule, &inner, caused, places, evidence, fix)];
     }
@@ -255,7 +279,7 @@ fn from_faults(
         let inner = fault_scope(scope, fault, 1);
         let fix = hint(rule, context, fault, &inner);
         let mut caused = Caused::default();
-        caused.add(rule, &context.targets, &fault.loaders, &inner);
+        caused.add(rule, context, &fault.loaders, &inner);
         out.push(finding(rule, &inner, caused, locate(&places), fault.detail.clone(), fix));
     }
     // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
@@ -335,7 +359,7 @@ fn one_assert(
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
     let fix = fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: None, scope });
     let mut caused = Caused::default();
-    caused.add(rule, &context.targets, &[], scope);
+    caused.add(rule, context, &[], scope);
     Ok(Some(finding(rule, scope, caused, locate(&places), Map::new(), fix)))
 }
 
@@ -371,7 +395,7 @@ fn finding(
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity: rule.severity_given(caused.leading, !caused.effects.is_empty()),
+        severity: rule.severity_given(caused.leads(), !caused.effects.is_empty()),
         message: rule.message.render(scope),
         details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
         effects: caused.effects,
@@ -390,11 +414,20 @@ struct Caused {
     effects: Vec<FindingEffect>,
     /// Whether a leading loader has one.
     leading: bool,
+    /// Whether one is predicted for a leading version by a loader that only stands for it.
+    standing: bool,
+    /// Whether one is predicted for a version by its own loader.
+    certain: bool,
 }
 
 impl Caused {
+    /// Whether it fails for a leading version: what is predicted by another version alone is not certain.
+    const fn leads(&self) -> bool {
+        self.leading || (self.standing && self.certain)
+    }
+
     /// Adds the effects of `rule` under the loaders of a fault; all of the run if `loaders` is empty.
-    fn add(&mut self, rule: &Rule, targets: &[Target], loaders: &[&str], scope: &Scope<'_>) {
+    fn add(&mut self, rule: &Rule, context: &Context<'_>, loaders: &[&str], scope: &Scope<'_>) {
         for effect in &rule.effects {
             let holds = |when: &Expression| when.eval_bool(scope).unwrap_or(false);
             if !effect.when.as_ref().is_none_or(holds) {
@@ -403,7 +436,7 @@ impl Caused {
             let file = scope.get("file");
             let reader = || Object::reading(file.as_ref()?.as_str()?);
             let Some(object) = effect.object.or_else(reader) else { continue };
-            for target in targets {
+            for target in &context.targets {
                 let loader = target.loader.version();
                 let is_meant = loaders.is_empty() || loaders.contains(&loader);
                 let same = |e: &FindingEffect| {
@@ -412,7 +445,10 @@ impl Caused {
                 if !is_meant || !effect.loaders.contains(target.version()) || self.effects.iter().any(same) {
                     continue;
                 }
-                self.leading |= target.leads;
+                let is_stated = loaders.is_empty();
+                self.leading |= target.leads && (is_stated || target.is_certain());
+                self.standing |= target.leads;
+                self.certain |= target.is_certain() || context.fails_for_certain;
                 self.effects.push(FindingEffect {
                     object,
                     loader: loader.to_owned(),

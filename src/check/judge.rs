@@ -11,6 +11,7 @@
 mod classes;
 mod explain;
 mod faults;
+mod integers;
 mod predict;
 #[cfg(test)]
 mod tests;

@@ -1,5 +1,7 @@
 //! Values of config.json that a loader refuses: it raises while it builds the config or the class.
 
+use std::collections::BTreeMap;
+
 use serde_json::{Map, Value};
 
 use super::load::Target;
@@ -9,13 +11,16 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
-use crate::knowledge::refusals::ClassRefusals;
+use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, Heads, RefusedValues};
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
 
+/// Keys that the config class of a part refuses as that of the whole does.
+const LABELS: [&str; 2] = ["/id2label", "/label2id"];
+
 /// A value that a loader refuses.
-struct Refusal {
+struct Rejection {
     pointer: String,
     value: Value,
     /// Why, after the key and the value.
@@ -26,17 +31,33 @@ struct Refusal {
     similar: Option<String>,
 }
 
-/// Faults of refused values, each under the loaders that raise. Called by the engine with the targets of the run.
-pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>) -> Vec<Fault> {
+/// Faults of refused values, each under the loaders that raise. Called by the engine with the targets of the run, and the
+/// faults of the loads: where a class cannot be built, the value is reported there, for all loaders. `filled` is the config with the defaults
+/// of the class; null when no class was built.
+pub(super) fn faults(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    asked: &Asked<'_>,
+    of_loads: &mut [Fault],
+    filled: &Value,
+) -> Vec<Fault> {
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
         return Vec::new();
     };
     let mut faults: Vec<Fault> = Vec::new();
     for target in asked.targets {
-        let mut found = of_class(knowledge, config, target.version());
+        let loader = target.loader.version();
+        let configs = Configs { written: config, filled };
+        let mut found = of_class(knowledge, &configs, target.version());
         found.extend(dtype(knowledge, config, target.version()));
+        let mut own = of_kinds(knowledge, &configs, target.version());
+        own.retain(|rejection| !is_non_finite(checkpoint, &rejection.pointer));
+        match of_loads.iter_mut().find(|fault| fault.kind == FaultKind::ConfigIncomputable) {
+            Some(unbuilt) if !own.is_empty() && !unbuilt.loaders.contains(&loader) => unbuilt.loaders.push(loader),
+            Some(_) => {}
+            None => found = own.into_iter().fold(found, with_other_pointer),
+        }
         for refusal in found {
-            let loader = target.loader.version();
             let same = faults.iter_mut().find(|fault| {
                 let place = fault.places.first().and_then(|place| place.pointer.as_deref());
                 place == Some(&refusal.pointer)
@@ -52,7 +73,7 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
     faults
 }
 
-impl Refusal {
+impl Rejection {
     fn fault(self) -> Fault {
         let key = self.pointer.trim_start_matches('/').replace('/', ".");
         let fault = Fault::new(FaultKind::ValueRefused)
@@ -65,11 +86,31 @@ impl Refusal {
     }
 }
 
-/// Values that the model class refuses.
-fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal> {
+/// A config as it is written, and with the defaults of its class.
+struct Configs<'c> {
+    written: &'c Value,
+    filled: &'c Value,
+}
+
+impl<'c> Configs<'c> {
+    /// The value that the class reads.
+    fn read(&self, pointer: &str) -> Option<&'c Value> {
+        self.filled.pointer(pointer).or_else(|| self.written.pointer(pointer))
+    }
+
+    /// The same, or the default.
+    fn read_or(&self, pointer: &str, defaults: &BTreeMap<String, u64>) -> Option<Value> {
+        let default = || defaults.get(pointer.trim_start_matches('/')).copied().map(Value::from);
+        self.read(pointer).cloned().or_else(default)
+    }
+}
+
+/// Values that the model class refuses, by rules of their own.
+fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, version: &str) -> Vec<Rejection> {
+    let config = configs.written;
     let class = config.pointer("/architectures/0").and_then(Value::as_str);
     let Some(refused) = class.and_then(|class| knowledge.refusals.of_class(version, class)) else { return Vec::new() };
-    let ClassRefusals { activation, heads, padding, rope_type, rope_factor } = &refused;
+    let ClassRefusals { activation, padding, rope_type, rope_factor, .. } = &refused;
     let mut found = Vec::new();
     for key in activation {
         let pointer = format!("/{key}");
@@ -78,18 +119,18 @@ fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal
             let similar = knowledge.names.similar(NameKind::Activation, name).map(str::to_owned);
             let because = "which is no activation function".to_owned();
             let raises = format!("KeyError: '{}'", escape(name, CAP));
-            found.push(Refusal { pointer, value: name.into(), because, raises, similar });
+            found.push(Rejection { pointer, value: name.into(), because, raises, similar });
         }
     }
-    found.extend(heads.iter().filter_map(|key| undivided(config, format!("/{key}"))));
     for key in padding {
         let pointer = format!("/{key}");
-        let rows = config.pointer(&format!("{}/vocab_size", parent(&pointer))).and_then(Value::as_u64);
-        let Some((id, rows)) = config.pointer(&pointer).and_then(Value::as_u64).zip(rows) else { continue };
+        let rows = configs.read(&format!("{}/vocab_size", parent(&pointer))).and_then(Value::as_u64);
+        let id = configs.read_or(&pointer, &refused.defaults).and_then(|id| id.as_u64());
+        let Some((id, rows)) = id.zip(rows) else { continue };
         if id >= rows {
             let because = format!("but the embedding has vocab_size {rows} rows");
             let raises = "AssertionError: Padding_idx must be within num_embeddings".to_owned();
-            found.push(Refusal { pointer, value: id.into(), because, raises, similar: None });
+            found.push(Rejection { pointer, value: id.into(), because, raises, similar: None });
         }
     }
     for key in rope_type {
@@ -100,6 +141,65 @@ fn of_class(knowledge: &Knowledge, config: &Value, version: &str) -> Vec<Refusal
         found.extend(ropes(config, key).into_iter().filter_map(|(pointer, rope)| rope_without_factor(pointer, rope)));
     }
     found
+}
+
+/// Values that do not fit a width, and values of kinds that the model class refuses, or every class.
+fn of_kinds(knowledge: &Knowledge, configs: &Configs<'_>, version: &str) -> Vec<Rejection> {
+    let config = configs.written;
+    let class = config.pointer("/architectures/0").and_then(Value::as_str);
+    let of_class = class.and_then(|class| knowledge.refusals.of_class(version, class)).unwrap_or_default();
+    let of_every = knowledge.refusals.of_class(version, EVERY_CLASS).unwrap_or_default();
+    let heads = of_class.heads.iter().filter_map(|heads| undivided(configs, heads, &of_class.defaults));
+    let mut found: Vec<Rejection> = heads.collect();
+    found.extend(of_class.values().iter().flat_map(|values| of_kind(config, "", values)));
+    found.extend(of_every.values().iter().flat_map(|values| of_kind(config, "", values)));
+    for at in sub_configs(config) {
+        let labels = of_every.values().iter().flat_map(|values| of_kind(config, &at, values));
+        found.extend(labels.filter(|rejection| LABELS.iter().any(|key| rejection.pointer.ends_with(key))));
+    }
+    found
+}
+
+/// Pointers of the configs of the parts.
+fn sub_configs(config: &Value) -> impl Iterator<Item = String> {
+    let parts =
+        config.as_object().into_iter().flatten().filter(|(key, value)| key.ends_with("_config") && value.is_object());
+    parts.map(|(key, _)| format!("/{key}")).filter(|pointer| pointer != "/quantization_config")
+}
+
+/// Whether config.json has NaN or an infinity at a pointer, which Python reads and strict JSON has no value for.
+fn is_non_finite(checkpoint: &Checkpoint, pointer: &str) -> bool {
+    let faults = checkpoint.document("config.json").into_iter().flat_map(|document| &document.faults);
+    let mut places = faults.filter(|fault| fault.kind == FaultKind::NonFiniteNumber).flat_map(|fault| &fault.places);
+    places.any(|place| place.pointer.as_deref() == Some(pointer))
+}
+
+/// Adds a refusal unless the value, or a part of it, is refused already.
+fn with_other_pointer(mut found: Vec<Rejection>, refusal: Rejection) -> Vec<Rejection> {
+    if !found.iter().any(|other| other.pointer.starts_with(&refusal.pointer)) {
+        found.push(refusal);
+    }
+    found
+}
+
+/// Values of a kind that raises, in the config at a pointer.
+fn of_kind(config: &Value, at: &str, values: &RefusedValues) -> Vec<Rejection> {
+    let value = |key: &String| Some((format!("{at}/{key}"), config.pointer(&format!("{at}/{key}"))?));
+    let refused = values.keys.iter().filter_map(value);
+    // Parameters of rope are refused without a type, and judged by themselves with one.
+    let is_typed = |value: &Value| value.as_object().is_some_and(|object| rope_type(object).is_some());
+    let refused = refused.filter(move |(pointer, value)| {
+        let is_rope = pointer.ends_with("rope_scaling") || pointer.ends_with("rope_parameters");
+        values.kinds.iter().any(|kind| kind.has(value)) && !(is_rope && is_typed(value))
+    });
+    let rejections = refused.map(|(pointer, value)| Rejection {
+        pointer,
+        value: value.clone(),
+        because: "which the class refuses".to_owned(),
+        raises: values.raises.clone(),
+        similar: None,
+    });
+    rejections.collect()
 }
 
 /// The rope parameters under the key of the version, or under the other one, which transformers 5 reads as well.
@@ -119,9 +219,9 @@ fn rope_type(rope: &Map<String, Value>) -> Option<(&'static str, &str)> {
     named("rope_type").or_else(|| named("type"))
 }
 
-fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<String, Value>) -> Option<Refusal> {
+fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<String, Value>) -> Option<Rejection> {
     let (key, name) = rope_type(rope)?;
-    knowledge.names.lacks(version, NameKind::RopeType, name).then(|| Refusal {
+    knowledge.names.lacks(version, NameKind::RopeType, name).then(|| Rejection {
         pointer: format!("{pointer}/{key}"),
         value: name.into(),
         because: "which is no type of rope".to_owned(),
@@ -130,10 +230,10 @@ fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<
     })
 }
 
-fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Refusal> {
+fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rejection> {
     let (_, name) = rope_type(rope)?;
     let is_refused = ROPE_WITH_FACTOR.contains(&name) && !rope.contains_key("factor");
-    is_refused.then(|| Refusal {
+    is_refused.then(|| Rejection {
         value: format!("of type {name}").into(),
         because: "which needs a factor".to_owned(),
         raises: format!("KeyError: Missing required keys for 'rope_type'='{name}': {{'factor'}}"),
@@ -142,26 +242,32 @@ fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Ref
     })
 }
 
-/// Attention heads that do not divide the hidden size.
-fn undivided(config: &Value, pointer: String) -> Option<Refusal> {
-    let heads = config.pointer(&pointer)?.as_u64()?;
-    let hidden = config.pointer(&format!("{}/hidden_size", parent(&pointer)))?.as_u64()?;
-    (hidden.checked_rem(heads)? != 0).then(|| Refusal {
+/// Attention heads that do not divide the width beside them.
+fn undivided(
+    configs: &Configs<'_>,
+    Heads(key, width, raises): &Heads,
+    defaults: &BTreeMap<String, u64>,
+) -> Option<Rejection> {
+    let pointer = format!("/{key}");
+    let value = configs.read_or(&pointer, defaults)?;
+    let columns = configs.read(&format!("{}/{width}", parent(&pointer)))?.as_f64()?;
+    // As Python has it: 1.5 divides 24.
+    let rest = value.as_f64().filter(|heads| *heads != 0.0).map(|heads| columns % heads)?;
+    (rest != 0.0).then(|| Rejection {
         pointer,
-        value: heads.into(),
-        because: format!("which does not divide hidden_size {hidden}"),
-        raises: "StrictDataclassClassValidationError: Class validation error for validator 'validate_architecture'"
-            .to_owned(),
+        value,
+        because: format!("which does not divide {width} {columns}"),
+        raises: raises.clone(),
         similar: None,
     })
 }
 
 /// A dtype that torch does not have. Versions since 4.56 prefer `dtype` to `torch_dtype`.
-fn dtype(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Refusal> {
+fn dtype(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Rejection> {
     let named = |key: &'static str| Some((key, config.get(key)?.as_str()?));
     let newer = if version_numbers(version) >= vec![4, 56] { named("dtype") } else { None };
     let (key, name) = newer.or_else(|| named("torch_dtype"))?;
-    knowledge.names.lacks(version, NameKind::Dtype, name).then(|| Refusal {
+    knowledge.names.lacks(version, NameKind::Dtype, name).then(|| Rejection {
         pointer: format!("/{key}"),
         value: name.into(),
         because: "which is no dtype of torch".to_owned(),

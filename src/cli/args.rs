@@ -6,7 +6,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
 
 use crate::check::Severity;
-use crate::knowledge::loader::parse_requirement;
+use crate::knowledge::loader::{parse_requirement, parse_requirement_or_all};
 use crate::report::Format;
 
 /// Validates, repairs and merges model checkpoint directories by reading their files; nothing of a model is run.
@@ -181,8 +181,9 @@ pub struct CheckArgs {
     /// Checkpoint directories, directories that contain checkpoints, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
-    /// Predict the load for this version; may be repeated [default: the version that wrote config.json, and the newest known]
-    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_requirement)]
+    /// Predict the load for these versions: 4.57, transformers==4.57.3, or all; may be repeated [default: the version that
+    /// wrote config.json, and the newest known of each major version]
+    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_requirement_or_all)]
     pub versions: Vec<String>,
     /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub
     /// checksums

@@ -8,6 +8,7 @@ use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
 use crate::check::Severity;
 use crate::knowledge::Knowledge;
+use crate::knowledge::loader::expanded;
 use crate::knowledge::selection::Choice;
 use crate::knowledge::settings::{Chain, nearest};
 
@@ -121,7 +122,7 @@ impl SettingsResolver {
         let mut policy = chain.govern(&mut rules, typed.choice.clone())?;
         policy.metadata_only |= typed.metadata_only;
         let library = library::with(folder.as_deref())?;
-        let versions = if typed.versions.is_empty() { chain.versions()? } else { typed.versions.clone() };
+        let versions = if typed.versions.is_empty() { chain.versions()? } else { expanded(typed.versions.clone()) };
         Ok(Resolved {
             knowledge: Knowledge { policy, ..Knowledge::with(rules, library)? },
             versions,

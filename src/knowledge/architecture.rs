@@ -56,10 +56,28 @@ impl<'l> Architecture<'l> {
         self.file.model_types.first().map(String::as_str)
     }
 
+    /// The other classes of the same config class.
+    pub fn siblings(self) -> impl Iterator<Item = Self> {
+        let others = self.file.classes(self.loader).filter(move |class| class.name != self.class.name);
+        others.map(move |class| Self { class, ..self })
+    }
+
+    /// Whether Auto classes of transformers build it.
+    #[must_use]
+    pub fn has_auto(&self) -> bool {
+        self.file.has_auto()
+    }
+
+    /// Whether Auto classes build it for other model types than this one.
+    #[must_use]
+    pub fn is_of_other_type(&self, model_type: &str) -> bool {
+        self.has_auto() && !self.file.model_types.iter().any(|own| own == model_type)
+    }
+
     /// Whether a key of a config is a word of its file.
     #[must_use]
     pub fn speaks_of(&self, key: &str) -> bool {
-        self.library.text(self.name()).is_some_and(|text| text.contains(key))
+        self.library.speaks_of(self.name(), key)
     }
 
     /// Whether its file reads sizes from stored tensors, as classes do whose config does not name them.

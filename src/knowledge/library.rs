@@ -96,9 +96,11 @@ impl Library {
             Some((_, named)) => {
                 let mut files =
                     self.all_of_model_type(model_type?).filter(|file| file.has_auto() && file.speaks_for(config));
+                let base = task(&named.name).is_empty();
                 let same_task = |file| {
-                    let mut classes = Blueprint::classes(file, loader).filter(|c| task(&c.name) == task(&named.name));
-                    Some((file, classes.next()?))
+                    let of_auto = Blueprint::auto(file, "model", loader).filter(|_| base);
+                    let is_built = |class: &str| of_auto.map_or(task(class) == task(&named.name), |auto| class == auto);
+                    Some((file, Blueprint::classes(file, loader).find(|c| is_built(&c.name))?))
                 };
                 files.find_map(same_task)?
             }
@@ -122,6 +124,12 @@ impl Library {
             || !file.has_auto()
             || config.get("auto_map").is_some()
             || !self.all_of_model_type(model_type).any(is_other)
+    }
+
+    /// Whether a key of a config is a word of the file of this stem.
+    #[must_use]
+    pub fn speaks_of(&self, stem: &str, key: &str) -> bool {
+        self.text(stem).is_some_and(|text| text.contains(key))
     }
 
     /// Whether a file describes this model type, under any loader.

@@ -135,6 +135,29 @@ pub fn parse_requirement(text: &str) -> Result<String, String> {
     ))
 }
 
+/// The word for all known versions, where several can be named.
+const ALL: &str = "all";
+
+/// As [`parse_requirement`], for a place that takes several versions: `all` stays, for [`expanded`].
+///
+/// # Errors
+/// As for one.
+pub fn parse_requirement_or_all(text: &str) -> Result<String, String> {
+    if text == ALL { Ok(text.to_owned()) } else { parse_requirement(text) }
+}
+
+/// The versions of a list that [`parse_requirement_or_all`] read; the start of a known version, `4.57`, is that one.
+#[must_use]
+pub fn expanded(versions: Vec<String>) -> Vec<String> {
+    let known = || Loader::ALL.iter().map(|loader| loader.version().to_owned()).collect();
+    let whole = |version: String| {
+        let starts =
+            |loader: &Loader| loader.version().strip_prefix(&version).is_some_and(|rest| rest.starts_with('.'));
+        Loader::ALL.into_iter().rfind(starts).map_or(version.clone(), |loader| loader.version().to_owned())
+    };
+    versions.into_iter().flat_map(|version| if version == ALL { known() } else { vec![whole(version)] }).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use serde_json::json;
@@ -175,7 +198,10 @@ mod tests {
         }
         assert_eq!(parse_requirement("4.57"), Ok("4.57".to_owned()));
         for text in ["", "transformers==", "transformers", "torch==2.1", "4 57", "v4.57"] {
-            assert!(parse_requirement(text).is_err(), "{text}");
+            assert!(parse_requirement_or_all(text).is_err(), "{text}");
         }
+        let asked = |texts: &[&str]| expanded(texts.iter().map(|t| parse_requirement_or_all(t).unwrap()).collect());
+        assert_eq!(asked(&["all"]), ["4.47.0", "4.57.6", "5.23.0"]);
+        assert_eq!(asked(&["4.57", "5", "4.5", "4.51.3"]), ["4.57.6", "5.23.0", "4.5", "4.51.3"]);
     }
 }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use memchr::memmem;
 use serde::Deserialize;
+use serde_json::Value;
 
 use super::loader::version_numbers;
 use super::source;
@@ -14,33 +15,133 @@ use super::source;
 pub struct ClassRefusals {
     /// Keys of activation functions: an unknown name raises `KeyError`.
     pub activation: Vec<String>,
-    /// Keys of attention heads: a count that does not divide `hidden_size` beside it raises
-    /// `StrictDataclassClassValidationError`.
-    pub heads: Vec<String>,
+    /// Counts of attention heads that have to divide a width.
+    pub heads: Vec<Heads>,
     /// Keys of padding ids: an id beyond `vocab_size` beside it raises `AssertionError`.
     pub padding: Vec<String>,
     /// Keys of rope parameters: an unknown type raises `KeyError`.
     pub rope_type: Vec<String>,
     /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
     pub rope_factor: Vec<String>,
+    /// Defaults of keys of heads and padding ids, by pointer.
+    pub defaults: BTreeMap<String, u64>,
+    /// The exception that a parameter raises that is stored as integers.
+    pub integers: Option<String>,
+    /// Kinds of values that raise whatever else the config has.
+    values: Option<Values>,
+}
+
+/// A count of attention heads, the key beside it that it has to divide, and the exception otherwise.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Heads(pub String, pub String, pub String);
+
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(untagged)]
+enum Values {
+    /// Those of this class.
+    Of(String),
+    Own(Vec<RefusedValues>),
+}
+
+/// An exception, the kinds of values that raise it, and the keys.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct RefusedValues {
+    /// Name of the class of the exception.
+    pub raises: String,
+    /// Kinds of values.
+    pub kinds: Vec<ValueKind>,
+    /// Pointers without the first slash.
+    pub keys: Vec<String>,
+}
+
+/// A kind of JSON value, as `tools/derive/accepts.py` tries them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ValueKind {
+    /// `null`.
+    Null,
+    /// Any string.
+    Text,
+    /// `true`.
+    True,
+    /// `false`.
+    False,
+    /// The whole number 0: a field of transformers 5 may take 0.0.
+    Zero,
+    /// A whole number below 0.
+    Negative,
+    /// A number that is not whole.
+    Fraction,
+    /// A number above 1.
+    AboveOne,
+    /// Any list.
+    List,
+    /// Any object.
+    Object,
+}
+
+impl ValueKind {
+    /// Whether a value is of this kind.
+    #[must_use]
+    pub fn has(self, value: &Value) -> bool {
+        let (whole, number) = (value.as_i64(), value.as_f64());
+        match self {
+            Self::Null => value.is_null(),
+            Self::Text => value.is_string(),
+            Self::True => value == &Value::Bool(true),
+            Self::False => value == &Value::Bool(false),
+            Self::Zero => whole == Some(0),
+            Self::Negative => whole.is_some_and(|n| n < 0),
+            Self::Fraction => number.is_some_and(|n| n.fract() != 0.0),
+            Self::AboveOne => number.is_some_and(|n| n > 1.0),
+            Self::List => value.is_array(),
+            Self::Object => value.is_object(),
+        }
+    }
 }
 
 impl ClassRefusals {
+    /// Kinds of values that raise whatever else the config has.
+    #[must_use]
+    pub fn values(&self) -> &[RefusedValues] {
+        match &self.values {
+            Some(Values::Own(values)) => values,
+            _ => &[],
+        }
+    }
+
     /// What both refuse; the key of rope parameters has another name since transformers 5.
     fn and(self, other: &Self) -> Self {
         let old = |key: &String| key.replace("rope_parameters", "rope_scaling");
         let both = |mine: Vec<String>, other: &[String]| -> Vec<String> {
             mine.into_iter().filter(|key| other.iter().any(|o| old(o) == old(key))).collect()
         };
+        let refused = |key: &str, kind: ValueKind| {
+            other.values().iter().any(|v| v.kinds.contains(&kind) && v.keys.iter().any(|k| k == key))
+        };
+        let of_key = |raises: &str, kinds: &[ValueKind], key: String| RefusedValues {
+            raises: raises.to_owned(),
+            kinds: kinds.iter().copied().filter(|kind| refused(&key, *kind)).collect(),
+            keys: vec![key],
+        };
+        let values =
+            self.values().iter().flat_map(|v| v.keys.iter().map(|key| of_key(&v.raises, &v.kinds, key.clone())));
+        let values = Some(Values::Own(values.filter(|v| !v.kinds.is_empty()).collect()));
         Self {
             activation: both(self.activation, &other.activation),
-            heads: both(self.heads, &other.heads),
+            heads: self.heads.into_iter().filter(|Heads(key, ..)| other.heads.iter().any(|o| o.0 == *key)).collect(),
             padding: both(self.padding, &other.padding),
             rope_type: both(self.rope_type, &other.rope_type),
             rope_factor: both(self.rope_factor, &other.rope_factor),
+            defaults: self.defaults,
+            integers: self.integers.filter(|_| other.integers.is_some()),
+            values,
         }
     }
 }
+
+/// The entry with what every class refuses.
+pub const EVERY_CLASS: &str = "*";
 
 /// `rules/refused/<version>.json`, which `tools/derive_architectures.py accepts` writes by trying every class. An entry is
 /// one line, and only the lines that a check needs are parsed.
@@ -72,8 +173,16 @@ impl Refusals {
     }
 
     fn entry(&self, version: &str, class: &str) -> Option<ClassRefusals> {
+        let mut entry = self.line(version, class)?;
+        if let Some(Values::Of(other)) = &entry.values {
+            entry.values = self.line(version, other)?.values;
+        }
+        Some(entry)
+    }
+
+    fn line(&self, version: &str, class: &str) -> Option<ClassRefusals> {
         let text = self.versions.get(version)?;
-        let start = format!("\n{}: ", serde_json::Value::from(class));
+        let start = format!("\n{}: ", Value::from(class));
         let at = memmem::find(text.as_bytes(), start.as_bytes())?.checked_add(start.len())?;
         let line = text.get(at..)?.lines().next()?;
         serde_json::from_str(line.strip_suffix(',').unwrap_or(line)).ok()
@@ -82,17 +191,44 @@ impl Refusals {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
+
+    #[test]
+    fn kinds_of_values() {
+        use ValueKind::*;
+        let all = [Null, Text, True, False, Zero, Negative, Fraction, AboveOne, List, Object];
+        for (value, kinds) in [
+            (json!(null), vec![Null]),
+            (json!("x"), vec![Text]),
+            (json!(true), vec![True]),
+            (json!(false), vec![False]),
+            (json!(0), vec![Zero]),
+            (json!(0.0), vec![]),
+            (json!(-1), vec![Negative]),
+            (json!(0.5), vec![Fraction]),
+            (json!(1.5), vec![Fraction, AboveOne]),
+            (json!(7), vec![AboveOne]),
+            (json!([]), vec![List]),
+            (json!({}), vec![Object]),
+        ] {
+            let found: Vec<ValueKind> = all.into_iter().filter(|kind| kind.has(&value)).collect();
+            assert_eq!(found, kinds, "{value}");
+        }
+    }
 
     #[test]
     fn every_line_is_read_as_the_document_has_it() {
         let refusals = Refusals::embedded();
         assert!(refusals.versions.len() >= 3);
         for (version, text) in &refusals.versions {
-            let document: serde_json::Value = serde_json::from_str(text).unwrap();
+            let document: Value = serde_json::from_str(text).unwrap();
             for (class, entry) in document.as_object().unwrap() {
                 let expected: ClassRefusals = serde_json::from_value(entry.clone()).unwrap();
-                assert_eq!(refusals.of_class(version, class), Some(expected), "{version} {class}");
+                assert_eq!(refusals.line(version, class), Some(expected), "{version} {class}");
+                let whole = refusals.of_class(version, class).unwrap();
+                assert!(!matches!(whole.values, Some(Values::Of(_))), "{version} {class}");
             }
         }
         assert_eq!(refusals.of_class("4.47.0", "llama"), None);

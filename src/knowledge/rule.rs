@@ -169,6 +169,7 @@ pub struct FaultCheck {
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
 /// - `loaders`: versions of transformers to check for; `named`: whether the user named them;
 /// - `metadata_only`: weights may be missing.
+/// - `groups_heads`: the class reads `num_key_value_heads`, or is unknown.
 ///
 /// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
 /// loaders; `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard

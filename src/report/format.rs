@@ -261,7 +261,17 @@ pub fn agreeing(loads: &[PredictedLoad]) -> Vec<(&LoadReport, Vec<&PredictedLoad
 /// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
 pub fn versions(loaders: &[&PredictedLoad]) -> String {
     let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
-    format!("transformers {}", versions.join(" and "))
+    format!("transformers {}", and(&versions))
+}
+
+/// `a`, `a and b`, `a, b and c`.
+pub fn and<T: AsRef<str>>(items: &[T]) -> String {
+    let items: Vec<&str> = items.iter().map(AsRef::as_ref).collect();
+    match items.split_last() {
+        Some((last, [])) => (*last).to_owned(),
+        Some((last, others)) => format!("{} and {last}", others.join(", ")),
+        None => String::new(),
+    }
 }
 
 /// The verdicts in one line, the worst first and those that are not predicted last: `raises with transformers 5.23.0; loads
@@ -274,7 +284,7 @@ pub fn headline(loads: &[PredictedLoad]) -> String {
         let versions: Vec<String> = loaders.map(|load| name(&load.version())).collect();
         if !versions.is_empty() {
             let transformers = if parts.is_empty() { "transformers " } else { "" };
-            parts.push(format!("{} with {transformers}{}", verdict.name(), versions.join(" and ")));
+            parts.push(format!("{} with {transformers}{}", verdict.name(), and(&versions)));
         }
     }
     parts.join("; ")

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::Style;
-use super::format::{bytes, more, name, plural, scaled, sentence};
+use super::format::{and, bytes, more, name, plural, scaled, sentence};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
@@ -121,7 +121,7 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
         name(&best.architecture),
         percent(best.names),
         fit.unwrap_or_default(),
-        best.loaders.join(" and ")
+        and(&best.loaders)
     );
     let others: Vec<&ClassCandidate> = inspection.classes.iter().skip(1).collect();
     if !others.is_empty() {

@@ -212,6 +212,46 @@ fn weights_of_another_program_are_an_error_when_transformers_is_named() {
     }
 }
 
+/// What only a nearby version predicts is no error, unless a version that was asked for fails as well.
+#[test]
+fn a_finding_that_rests_on_a_nearby_version_is_a_warning() {
+    let room = tempfile::tempdir().expect("a directory");
+    let old = r#"{ set: { file: "config.json", at: "/transformers_version", to: "4.40.0" } }"#;
+    let dir = crate::support::made("llama", &format!(r#"[{old}, {{ drop_tensors: "model.norm." }}]"#), room.path());
+    for (versions, severity) in [
+        (&["4.40.0"] as &[&str], Severity::Warning),
+        (&["4.47.0"], Severity::Error),
+        (&["4.40.0", "5.23.0"], Severity::Error),
+        (&[], Severity::Error),
+    ] {
+        let versions: Vec<String> = versions.iter().map(|v| (*v).to_owned()).collect();
+        let checkpoint = Checkpoint::open(&dir).expect("a checkpoint").into();
+        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &versions);
+        let missing = outcome.findings.iter().find(|f| f.code == "ARC003").expect("ARC003");
+        assert_eq!(missing.severity, severity, "{versions:?}");
+        assert!(outcome.verdicts.iter().all(|load| load.verdict == LoadVerdict::LoadsWrong), "{:?}", outcome.verdicts);
+    }
+}
+
+/// Code in the directory may build another class than transformers has: where the tensors differ, nothing is predicted.
+#[test]
+fn differences_from_a_class_with_code_in_the_directory_are_not_predicted() {
+    let room = tempfile::tempdir().expect("a directory");
+    let auto_map = r#"{ set: { file: "config.json", at: "/auto_map", to: { AutoModelForCausalLM: "modeling_own.LlamaForCausalLM" } } }"#;
+    let code = r#"{ write: { file: "modeling_own.py", bytes: "class LlamaForCausalLM: pass" } }"#;
+    let drop = r#"{ drop_tensors: "model.norm." }"#;
+    for (name, changes, verdict) in [
+        ("whole", format!("[{auto_map}, {code}]"), LoadVerdict::Loads),
+        ("norm-dropped", format!("[{auto_map}, {code}, {drop}]"), LoadVerdict::NotPredicted),
+        ("without-code", format!("[{drop}]"), LoadVerdict::LoadsWrong),
+    ] {
+        let dir = crate::support::made("llama", &changes, &room.path().join(name));
+        let outcome = check(&Checkpoint::open(&dir).expect("a checkpoint").into(), &crate::support::knowledge());
+        let verdicts: Vec<_> = outcome.verdicts.iter().map(|load| load.verdict).collect();
+        assert!(verdicts.iter().all(|one| *one == verdict), "{name}: {:?}", outcome.verdicts);
+    }
+}
+
 /// The donor has the same faults as the published checkpoints: three `Infinity`.
 #[test]
 fn the_donor_has_three_infinities() {

@@ -126,8 +126,8 @@ def shrunk(config, scale):
             out[key] = 2
         elif whole and POSITIONS.match(key) and value > 128 and "image" not in key:
             out[key] = value if value in (514, 130) else 128
-        elif whole and (HEADS.match(key) or KV_HEADS.match(key)) and value >= scale and value % scale == 0:
-            out[key] = value // scale
+        elif whole and (HEADS.match(key) or KV_HEADS.match(key)) and value > 0:
+            out[key] = max(value // scale, 1)
         elif whole and (WIDTH.search(key) or INNER.match(key) or SMALL.match(key)) and "head_dim" not in key and value >= 64 and value % scale == 0:
             out[key] = value // scale
         elif isinstance(value, list) and layers and len(value) == layers > 2:

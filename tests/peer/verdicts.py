@@ -389,9 +389,9 @@ def is_equal(tensor, dtype, data):
     """Whether a loaded tensor has the stored values, in the dtype that it was loaded with."""
     import torch
 
-    kinds = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64}
+    kinds = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64, "U8": torch.uint8, "BOOL": torch.bool}
     stored = torch.frombuffer(bytearray(data), dtype=kinds[dtype]).to(tensor.dtype) if data else torch.empty(0)
-    return torch.equal(tensor.flatten(), stored)
+    return not tensor.is_meta and torch.equal(tensor.flatten(), stored)
 
 
 # Both, compared.

@@ -1,25 +1,124 @@
 """What the classes of one version refuse in a config, found by trying: rules/refused/<version>.json.
 
-Every model class is built from a config that is known to build, with one value replaced; an entry has the keys whose
-replacement then raises the exception that is known for it. Each entry is one line: the program reads only the lines that it
-needs. The types that fields take are in the architecture files.
+A small model of every class is saved, and loaded again with one value of its config.json replaced. An entry has the keys
+whose replacement raises, and the exception. Each entry is one line: the program reads only the lines that it needs. Field types
+that the architecture files know are left out.
+
+The first class of a config class is tried with every key. The others are tried with one replacement of each key, and with all of
+them where that one shows a difference.
 """
 import collections
+import contextlib
 import copy
 import gzip
 import json
+import multiprocessing
+import re
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
+import torch
 import transformers
 from transformers.activations import ACT2FN
 
 from . import catalogue
-from .build import build, without_initialisation
+from .build import TooSlow, time_limit
+from .keys import HEADS
 
-OUT = Path(__file__).resolve().parents[2] / "rules" / "refused"
-ROPE = "rope_parameters" if transformers.__version__.startswith("5") else "rope_scaling"
+ROOT = Path(__file__).resolve().parents[2]
+OUT = ROOT / "rules" / "refused"
+NEW = transformers.__version__.startswith("5")
+ROPE = "rope_parameters" if NEW else "rope_scaling"
+PARAMETERS = 12_000_000
+SECONDS = 12
+WIDTHS = ("hidden_size", "d_model", "n_embd", "embed_dim", "dim", "encoder_embed_dim")
+NEVER = {"architectures", "model_type", "transformers_version", "_name_or_path", "quantization_config", "auto_map", "_attn_implementation_autoset"}
+# The values that stand for each kind: a kind is refused when all of them are.
+KINDS = {
+    "null": [None],
+    "text": ["swoosh"],
+    "true": [True],
+    "false": [False],
+    "zero": [0],
+    "negative": [-1, -2],
+    "fraction": [0.37, 1.5, 1.63, 2.5],
+    "above-one": [1.63, 7],
+    "list": [[], ["x"]],
+    "object": [{}, {"x": 1}],
+}
+FIRST = ("null", "text", "negative", "zero", "object")
+# Keys of every config whose values matter to some classes only.
+TRIED = {"pad_token_id", "is_decoder", "add_cross_attention", "tie_word_embeddings", "is_encoder_decoder", "use_cache"}
+SAMPLE = 10  # every so many families are tried with all keys of every config
+# Classes of other packages, by the classes of transformers that they build: {version: {class: {sub-config: class}}}
+CUSTOM = {
+    "4.47.0": {
+        "LlavaLlamaForCausalLM": {"": "LlamaForCausalLM"},
+        "SpatialVLAForConditionalGeneration": {"text_config": "Gemma2ForCausalLM", "vision_config": "SiglipVisionModel"},
+    },
+}
+MISMATCH = re.compile(r"size mismatch|ignore_mismatched_sizes")
+
+
+class Small:
+    """A small saved model, to be loaded with other configs."""
+
+    def __init__(self, cls, config, folder):
+        self.cls, self.folder = cls, Path(folder)
+        with contextlib.suppress(Exception):                      # some classes cannot be built on `meta`
+            with time_limit(SECONDS), torch.device("meta"):
+                count = sum(p.numel() for p in cls(cls.config_class.from_dict(copy.deepcopy(config))).parameters())
+            if count > PARAMETERS:
+                raise MemoryError(f"{count} parameters")
+        with time_limit(SECONDS * 4):
+            cls(cls.config_class.from_dict(copy.deepcopy(config))).save_pretrained(folder)
+        self.file = self.folder / "config.json"
+        written = json.loads(self.file.read_text())
+        # Every key that the config has, with its value; keys that the hub has and the class writes otherwise as well.
+        whole = json.loads(json.dumps(cls.config_class.from_dict(copy.deepcopy(config)).to_dict(), default=str))
+        self.config = {**whole, **written}
+        if self.outcome(self.config) is not None:
+            self.config = written
+            if said := self.outcome(written):
+                raise ValueError(said)
+
+    def outcome(self, config):
+        """The exception that loading with this config.json raises, or None; None as well where only shapes differ."""
+        self.file.write_text(json.dumps(config))
+        try:
+            with time_limit(SECONDS):
+                self.cls.from_pretrained(self.folder)
+        except (MemoryError, TooSlow):
+            return None
+        except Exception as error:
+            said = f"{type(error).__name__}: {error}"
+            return None if MISMATCH.search(said) else said
+        return None
+
+    def raises(self, pointer, value):
+        return self.outcome(changed(self.config, pointer, value))
+
+    def refuses(self, pointer, kind):
+        """The exception of a kind of value under a key, if all values of the kind raise it."""
+        said = [self.raises(pointer, value) for value in KINDS[kind]]
+        names = {each and each.split(":", 1)[0] for each in said}
+        if None in names:
+            return None
+        # A value of the same type that does not fit does not tell of others.
+        value = at(self.config, pointer)
+        if isinstance(value, {"list": list, "object": dict, "true": bool, "false": bool}.get(kind, ())) and pointer[-1] != ROPE:
+            return None
+        if kind == "text" and (isinstance(value, str) or value is None and not names <= {"TypeError", "AttributeError", "StrictDataclassFieldValidationError"}):
+            return None
+        return said[0].split(":", 1)[0]
+
+
+def at(config, pointer):
+    for key in pointer:
+        config = config.get(key) if isinstance(config, dict) else None
+    return config
 
 
 def nested(config, path=()):
@@ -30,20 +129,17 @@ def nested(config, path=()):
             yield from nested(value, (*path, key))
 
 
-def replacements(config):
-    """(name of the replacement, pointer of the key, changed copy of the config, start of the expected exception)."""
+def pointers(config, every):
+    """The keys to try: those that not every config has, and the others of the root where `every` is set."""
+    general = set(transformers.PretrainedConfig().to_dict()) - TRIED
     for path, part in nested(config):
-        for key, value in part.items():
-            if isinstance(value, str) and value in ACT2FN:
-                yield "activation", (*path, key), "swoosh", "KeyError: 'swoosh'"
-        vocabulary = part.get("vocab_size")
-        if isinstance(vocabulary, int):
-            yield "padding", (*path, "pad_token_id"), vocabulary, "AssertionError: Padding_idx must be within num_embeddings"
-        heads = part.get("num_attention_heads")
-        if isinstance(heads, int) and isinstance(part.get("hidden_size"), int):
-            yield "heads", (*path, "num_attention_heads"), heads * 8 + 1, "StrictDataclassClassValidationError"
-        yield "rope-type", (*path, ROPE), {"rope_type": "spiral", "factor": 2.0, "rope_theta": 10000.0}, "KeyError: 'spiral'"
-        yield "rope-factor", (*path, ROPE), {"rope_type": "linear", "rope_theta": 10000.0}, "KeyError: \"Missing required keys in `"
+        for key in part:
+            if key not in NEVER and (key not in general or every and not path):
+                yield (*path, key)
+        if NEW and ROPE in part:
+            yield from ((*path, "rope_theta"), (*path, "rope_scaling"), (*path, "partial_rotary_factor"))
+    if every:
+        yield from ((key,) for key in ("dtype", "torch_dtype", "id2label", "label2id", "pad_token_id") if key not in config)
 
 
 def changed(config, pointer, value):
@@ -52,59 +148,229 @@ def changed(config, pointer, value):
     for key in pointer[:-1]:
         place = place[key]
     place[pointer[-1]] = value
+    # The newer form of what stands under an older key would win.
+    place.pop({"torch_dtype": "dtype", "rope_theta": ROPE, "partial_rotary_factor": ROPE, "rope_scaling": ROPE}.get(pointer[-1]) if pointer[-1] != ROPE else None, None)
     return copied
 
 
-def outcome(cls, config):
-    """The exception that loading this config.json raises, or None."""
-    try:
-        build(cls, cls.config_class.from_dict(copy.deepcopy(config)))
-    except MemoryError:
-        raise
-    except BaseException as error:
-        return f"{type(error).__name__}: {error}"
-    return None
+def integers(small):
+    """The exception that a weight raises that is stored as integers, if it is not converted."""
+    from safetensors.torch import load_file, save_file
 
-
-def probe(cls, configs):
-    """{(replacement, pointer)} that raise as expected, by the first of the configs that builds."""
-    for config in configs:
-        if outcome(cls, config) is None:
-            break
-    else:
+    small.file.write_text(json.dumps(small.config))
+    weights = small.folder / "model.safetensors"
+    if not weights.exists():
         return None
+    stored, tensors = weights.read_bytes(), load_file(weights)
+    # 4.47 copies the values where the first tensor of the class, an embedding, has another dtype than the model.
+    names = [name for name, tensor in tensors.items() if name.endswith("weight") and tensor.is_floating_point() and "embed" not in name]
+    if not names:
+        return None
+    save_file({**tensors, names[-1]: tensors[names[-1]].to(torch.int64)}, weights, {"format": "pt"})
+    said = small.outcome(small.config)
+    weights.write_bytes(stored)
+    return said and said.split(":", 1)[0]
+
+
+def special(small):
+    """{(name, pointer)} of replacements with a rule of their own: unknown names, and values that have to fit others."""
     found = set()
-    for name, pointer, value, expected in replacements(config):
-        said = outcome(cls, changed(config, pointer, value))
+
+    def put(name, pointer, value, expected):
+        said = small.raises(pointer, value)
         if said and expected in said.split("\n")[0]:
             found.add((name, "/".join(pointer)))
+
+    for path, part in nested(small.config):
+        for key, value in part.items():
+            if isinstance(value, str) and value in ACT2FN:
+                put("activation", (*path, key), "swoosh", "KeyError: 'swoosh'" if not NEW else "swoosh")
+        vocabulary = part.get("vocab_size")
+        if isinstance(vocabulary, int):
+            put("padding", (*path, "pad_token_id"), vocabulary, "AssertionError: Padding_idx must be within num_embeddings")
+        put("rope-type", (*path, ROPE), {"rope_type": "spiral", "factor": 2.0, "rope_theta": 10000.0}, "KeyError: 'spiral'")
+        put("rope-factor", (*path, ROPE), {"rope_type": "linear", "rope_theta": 10000.0}, "KeyError: \"Missing required keys in `")
     return found
 
 
-def main(args):
+def heads(small):
+    """[(pointer of a count of heads, name of the width that it has to divide, exception)]."""
+    for path, part in nested(small.config):
+        widths = [key for key in WIDTHS if isinstance(part.get(key), int)]
+        for key, count in part.items():
+            if not HEADS.match(key) or not isinstance(count, int) or isinstance(count, bool) or not widths:
+                continue
+            width = part[widths[0]]
+            divisors = [n for n in range(2, width) if width % n == 0 and n != count and (width // n) % 2 == 0]
+            others = [n for n in (3, 5, 7, 9, 11, 13) if width % n]
+            said = [small.raises((*path, key), n) for n in others[:2]]
+            passes = any(small.raises((*path, key), n) is None for n in divisors[:3])
+            if len(said) == 2 and all(said) and passes:
+                yield "/".join((*path, key)), widths[0], said[0].split(":", 1)[0]
+
+
+def values(small, every, known=None):
+    """{(pointer, kind): exception}. `known` is what a class of the same config class refuses."""
+    found = {}
+    for pointer in dict.fromkeys(pointers(small.config, every)):
+        if known is not None:
+            of_key = {kind: raised for (p, kind), raised in known.items() if p == pointer}
+            tried = next(iter(of_key), "object")
+            if small.refuses(pointer, tried) == of_key.get(tried):
+                found.update({(pointer, kind): raised for kind, raised in of_key.items()})
+                continue
+        first = {kind: raised for kind in FIRST if (raised := small.refuses(pointer, kind))}
+        if first:
+            # A whole number may be too small for others of the config.
+            kinds = [kind for kind in KINDS if kind not in FIRST and not (kind == "above-one" and isinstance(at(small.config, pointer), int))]
+            rest = {kind: raised for kind in kinds if (raised := small.refuses(pointer, kind))}
+            every = {**first, **rest}
+            if at(small.config, pointer) is None and {"zero", "negative", "fraction"} <= every.keys():
+                every.pop("text", None)                           # one of a few words may pass
+            found.update({(pointer, kind): raised for kind, raised in every.items()})
+        elif isinstance(at(small.config, pointer), float) and (raised := small.refuses(pointer, "above-one")):
+            found[pointer, "above-one"] = raised
+    return found
+
+
+def typed(model_type):
+    """The keys whose types the architecture file of a model type has."""
+    found = set()
+    for path in (ROOT / "rules" / "architectures").glob(f"{model_type.replace('-', '?')}.json5"):
+        for block in re.findall(r"\btypes: \{(.*?)\}", path.read_text(), re.DOTALL):
+            found.update(re.findall(r"(\w+):", block))
+    return found
+
+
+def family(args):
+    """{class: entry} of the classes of one config class."""
+    model_type, names, draws, every = args
     warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
     transformers.utils.logging.set_verbosity(50)
-    without_initialisation()
+    transformers.utils.logging.disable_progress_bar()
+    out, known, first = {}, None, None
+    keys = typed(model_type) if NEW else set()
+    for name in names:
+        path = draws / f"{name}.json.gz"
+        if not path.exists():
+            continue
+        rows = [row["config"] for row in json.loads(gzip.decompress(path.read_bytes())) if "error" not in row and row.get("kind") == "full"]
+        models = []
+        with contextlib.ExitStack() as stack:
+            for row in rows:
+                folder = stack.enter_context(tempfile.TemporaryDirectory())
+                with contextlib.suppress(Exception, TooSlow):     # it may only be too large
+                    models.append(Small(catalogue.find_class(name), row, folder))
+                if len(models) == 4 or known is not None and models:
+                    break
+            if not models:
+                print(f"{name}: no config loads", file=sys.stderr)
+                continue
+            found = values(models[0], every, known)
+            if known is None:
+                for other in models[1:]:
+                    found = {(pointer, kind): raised for (pointer, kind), raised in found.items() if at(other.config, pointer[:-1]) is None or other.refuses(pointer, kind) == raised}
+            entry = collections.defaultdict(list)
+            for kind, pointer in sorted(special(models[0])):
+                entry[kind].append(pointer)
+            for pointer, width, raised in heads(models[0]):
+                entry["heads"].append([pointer, width, raised])
+            if raised := integers(models[0]):
+                entry["integers"] = raised
+            kept = {(pointer, kind): raised for (pointer, kind), raised in found.items() if not (raised == "StrictDataclassFieldValidationError" and pointer[-1] in keys)}
+            entry["values"] = table(kept)
+            if known is None:
+                known, first = found, name
+            elif entry["values"] == out[first]["values"]:
+                entry["values"] = first
+            out[name] = finished(entry, catalogue.find_class(name).config_class)
+    return out
+
+
+def finished(entry, config_class):
+    """Adds to an entry the other names of its keys, and the defaults of those that are compared with others."""
+    aliases = collections.defaultdict(list)
+    for alias, key in getattr(config_class, "attribute_map", {}).items():
+        aliases[key].append(alias)
+    entry["heads"] += [[alias, *rest] for key, *rest in entry["heads"] for alias in aliases[key]]
+    for row in entry["values"] if isinstance(entry["values"], list) else []:
+        row["keys"] = sorted({*row["keys"], *(alias for key in row["keys"] for alias in aliases[key])})
+    with contextlib.suppress(Exception):
+        defaults = config_class().to_dict()
+        compared = [*entry["padding"], *(row[0] for row in entry["heads"])]
+        entry["defaults"] = {key: defaults[key] for key in compared if isinstance(defaults.get(key), int)}
+    return entry
+
+
+def table(found):
+    """[{"raises": exception, "kinds": [kind], "keys": [pointer]}], as short as it gets."""
+    by_key = collections.defaultdict(list)
+    for (pointer, kind), raised in found.items():
+        by_key["/".join(pointer), raised].append(kind)
+    rows = collections.defaultdict(list)
+    for (pointer, raised), kinds in by_key.items():
+        rows[raised, tuple(k for k in KINDS if k in kinds)].append(pointer)
+    return [{"raises": raised, "kinds": list(kinds), "keys": sorted(pointers)} for (raised, kinds), pointers in sorted(rows.items())]
+
+
+def general(classes, sampled):
+    """Takes the values out of all entries that nearly every class refuses; returns them."""
+    def flat(entry):
+        return {(row["raises"], kind, pointer) for row in entry["values"] for kind in row["kinds"] for pointer in row["keys"]}
+
+    own = {name: flat(entry) for name, entry in classes.items() if not isinstance(entry["values"], str)}
+    tried = [name for name in own if name in sampled]
+    counts = collections.Counter(each for name in tried for each in own[name])
+    shared = {each for each, n in counts.items() if n >= 0.9 * len(tried) and "/" not in each[2]}
+    every = set(transformers.PretrainedConfig().to_dict()) - TRIED | {"dtype", "torch_dtype"}
+    shared = {each for each in shared if each[2] in every}
+    for name, found in own.items():
+        # What only the sampled classes were tried with, no other class would have.
+        kept = {(raised, kind, pointer) for raised, kind, pointer in found if pointer not in every}
+        classes[name]["values"] = table({((pointer,), kind): raised for raised, kind, pointer in kept})
+    return table({((pointer,), kind): raised for raised, kind, pointer in shared})
+
+
+def composed(entries, parts):
+    """The entry of a class that builds other classes from sub-configs."""
+    out = collections.defaultdict(list)
+    for part, name in parts.items():
+        entry, under = entries.get(name, {}), f"{part}/" if part else ""
+        for kind, found in entry.items():
+            if kind == "values":
+                rows = entries[found]["values"] if isinstance(found, str) else found
+                out[kind] += [{**row, "keys": [under + key for key in row["keys"]]} for row in rows]
+            elif kind == "heads":
+                out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
+            elif kind == "integers":
+                out[kind] = found
+            elif kind == "defaults":
+                out[kind] = {**(out[kind] or {}), **{under + key: value for key, value in found.items()}}
+            else:
+                out[kind] += [under + key for key in found]
+    return out
+
+
+def main(args):
     version = transformers.__version__
     draws = args.cache / version / "unseen" / "a"
+    only = re.compile(args.only or "")
+    wanted = [(model_type, names) for model_type, names in catalogue.families() if only.search(model_type)]
+    jobs = [(model_type, names, draws, at % SAMPLE == 0) for at, (model_type, names) in enumerate(wanted)]
+    sampled = {name for _, names, _, every in jobs if every for name in names}
     classes = {}
-    for path in sorted(draws.glob("*.json.gz")):
-        name = path.name.removesuffix(".json.gz")
-        rows = [row["config"] for row in json.loads(gzip.decompress(path.read_bytes())) if "error" not in row and row.get("kind") == "full"]
-        try:
-            found = probe(catalogue.find_class(name), rows[:4])
-        except Exception as error:
-            print(f"{name}: {type(error).__name__}: {error}"[:150], file=sys.stderr)
-            continue
-        if found is None:
-            print(f"{name}: no config builds", file=sys.stderr)
-            continue
-        by = collections.defaultdict(list)
-        for replacement, pointer in sorted(found):
-            by[replacement].append(pointer)
-        classes[name] = by
-    OUT.mkdir(exist_ok=True)
-    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in classes.items())
-    (OUT / f"{version}.json").write_text(f"{{\n{lines}\n}}\n")
+    with multiprocessing.get_context("fork").Pool(args.jobs, maxtasksperchild=4) as pool:
+        for at_, found in enumerate(pool.imap_unordered(family, jobs)):
+            classes.update(found)
+            if at_ % 20 == 0:
+                print(f"{version}: {at_} of {len(jobs)} families, {len(classes)} classes", file=sys.stderr, flush=True)
+    file = OUT / f"{version}.json"
+    kept = json.loads(file.read_text()) if args.only and file.exists() else {}
+    shared = general(classes, sampled)
+    entries = kept | {"*": {"values": shared}} | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
+    entries |= {name: composed(entries, parts) for name, parts in CUSTOM.get(version, {}).items()}
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in sorted(entries.items()))
+    file.write_text(f"{{\n{lines}\n}}\n")
     print(f"{version}: {len(classes)} classes tried, {sum(map(bool, classes.values()))} refuse a value")
     return 0

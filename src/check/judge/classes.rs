@@ -6,6 +6,7 @@ use super::Inputs;
 use crate::check::layers;
 use crate::check::load::{self, LoadReport, Stored, Target};
 use crate::checkpoint::{Fault, FaultKind, Place};
+use crate::knowledge::names::NameKind;
 use crate::knowledge::{Architecture, Doubt, Expected, Refusal};
 
 /// A target, and the architecture of the class that its loader would build.
@@ -21,23 +22,50 @@ pub(super) struct BuiltClass<'a> {
     pub(super) class: Result<Expected, Refusal>,
 }
 
-/// The versions to predict for whose loader has the class.
+/// The versions to predict for whose loader has the class. None where `model_type` is known and described by no file: then
+/// another class is built than `architectures` names.
 pub(super) fn resolve_targets<'a>(inputs: &Inputs<'a>) -> Vec<TargetClass<'a>> {
     let names: Vec<&str> = inputs.stored.names().collect();
+    let model_type = inputs.config.get("model_type").and_then(Value::as_str).unwrap_or_default();
+    let is_of_another = |architecture: &Architecture<'_>| {
+        architecture.is_of_other_type(model_type)
+            && inputs.knowledge.names.contains(NameKind::ModelType, model_type)
+            && inputs.config.get("auto_map").is_none()
+    };
     let targets = load::targets(&inputs.knowledge.library, inputs.config, &names, inputs.versions);
-    targets.into_iter().map(|(target, architecture)| TargetClass { target, architecture }).collect()
+    let own = targets.into_iter().filter(|(_, architecture)| !is_of_another(architecture));
+    own.map(|(target, architecture)| TargetClass { target, architecture }).collect()
 }
 
 /// Builds the class of each target.
 pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a>>) -> Vec<BuiltClass<'a>> {
     // The layout in which another version packs quantised weights is unknown.
     let comparable = targets.into_iter().filter(|one| one.target.leads || inputs.is_plain());
-    let built = comparable.map(|TargetClass { target, architecture }| BuiltClass {
-        class: load::build(architecture, inputs.config, inputs.stored).and_then(|class| covered(class, inputs.stored)),
+    let is_unnamed = inputs.config.pointer("/architectures/0").is_none() && inputs.is_plain();
+    let fitting = comparable.map(|one| if is_unnamed { with_fitting_class(inputs, one) } else { one });
+    let built = fitting.map(|TargetClass { target, architecture }| BuiltClass {
+        class: load::build(architecture, inputs.config, inputs.stored).and_then(|mut class| {
+            class.doubts.extend(own_code(inputs, &architecture));
+            covered(class, inputs.stored)
+        }),
         target,
         architecture,
     });
     leading(inputs, built.collect())
+}
+
+/// The class of this config class whose tensors are stored, where config.json names none: an encoder of T5, for one. Without
+/// such a class, the one that `model_type` stands for.
+fn with_fitting_class<'a>(inputs: &Inputs<'_>, one: TargetClass<'a>) -> TargetClass<'a> {
+    let fits = |architecture: &Architecture<'_>| {
+        let class = load::build(*architecture, inputs.config, inputs.stored);
+        class.is_ok_and(|class| load::predict(&class, inputs.stored).is_whole())
+    };
+    if fits(&one.architecture) {
+        return one;
+    }
+    let architecture = one.architecture.siblings().find(fits).unwrap_or(one.architecture);
+    TargetClass { architecture, ..one }
 }
 
 /// Lets another loader lead where the one that should does not know a part, unless the user named versions.
@@ -56,6 +84,16 @@ fn leading<'a>(inputs: &Inputs<'a>, mut built: Vec<BuiltClass<'a>>) -> Vec<Built
 fn is_unknown(built: &[BuiltClass<'_>]) -> bool {
     let is_gap = |refusal: &Refusal| matches!(refusal, Refusal::UnknownPart(_) | Refusal::NotCovered(_));
     built.iter().all(|one| !one.target.leads || one.class.as_ref().is_err_and(is_gap))
+}
+
+/// The doubt about a class of transformers where the directory has code for it: with `trust_remote_code` that code is used,
+/// and it may differ.
+fn own_code(inputs: &Inputs<'_>, architecture: &Architecture<'_>) -> Option<Doubt> {
+    let entries = inputs.config.get("auto_map")?.as_object().filter(|_| architecture.has_auto())?;
+    let models = entries.iter().filter(|(key, _)| key.starts_with("AutoModel")).filter_map(|(_, value)| value.as_str());
+    let mut modules = models.filter_map(|class| Some(format!("{}.py", class.rsplit_once('.')?.0)));
+    let present = modules.find(|module| inputs.checkpoint.modules.contains_key(module))?;
+    Some(Doubt::Corner(format!("{present} may differ from the class of transformers")))
 }
 
 /// The class, unless the checkpoint differs from it and the description does not cover this config: then the difference may

@@ -4,6 +4,7 @@ use serde_json::Value;
 
 use super::Inputs;
 use super::explain::ExplainedLoad;
+use super::integers;
 use super::predict::{quantised, same_bytes};
 use crate::check::load::{self, Judged, LoadReport, Stored};
 use crate::check::votes::{self, Vote};
@@ -18,6 +19,7 @@ pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[
     let modules = loads.first().and_then(|load| load.prediction.quantised.as_ref()).or(without_class.as_ref());
     faults.extend(quantization::faults(inputs.checkpoint, &inputs.scheme, modules));
     faults.extend(total_size(inputs, loads));
+    faults.extend(integers::fault(inputs, loads));
     faults.extend(tensors(loads, inputs.stored).into_iter().map(|fault| compare_tied(inputs.checkpoint, fault)));
     faults.extend(votes.iter().map(|vote| {
         let has_vote = |load: &&ExplainedLoad<'_>| {
@@ -75,7 +77,25 @@ fn tensors(loads: &[ExplainedLoad<'_>], stored: &Stored) -> Vec<Fault> {
         predictions.filter_map(|one| Some(Judged { report: one.report.as_ref()?, expected: &one.expected }))
     };
     if let Some(leading) = judged(true).next() {
-        faults.extend(judged(false).filter_map(|other| load::difference(leading, other, stored)));
+        let differences = judged(false).filter_map(|other| load::difference(leading, other, stored));
+        faults.extend(differences.fold(Vec::new(), with_difference));
+    }
+    faults
+}
+
+/// Adds a difference between two loaders; versions that differ in the same way are one fault.
+fn with_difference(mut faults: Vec<Fault>, fault: Fault) -> Vec<Fault> {
+    let apart = |fault: &Fault| {
+        fault.detail.iter().filter(|(key, _)| *key != "loader").map(|(k, v)| (k.clone(), v.clone())).collect::<Vec<_>>()
+    };
+    match faults.iter_mut().find(|other| apart(other) == apart(&fault)) {
+        Some(other) => {
+            let versions = [&*other, &fault]
+                .map(|f| f.detail.get("loader").and_then(Value::as_str).unwrap_or_default().to_owned());
+            other.detail.insert("loader".to_owned(), versions.join(" and ").into());
+            other.loaders.extend(fault.loaders);
+        }
+        None => faults.push(fault),
     }
     faults
 }

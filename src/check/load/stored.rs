@@ -116,7 +116,7 @@ impl Stored {
     }
 
     /// Shape of a tensor, when its file was read.
-    pub(super) fn shape(&self, name: &str) -> Option<&[u64]> {
+    pub(in crate::check) fn shape(&self, name: &str) -> Option<&[u64]> {
         self.shapes.get(name).map(Vec::as_slice)
     }
 

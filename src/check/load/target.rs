@@ -15,6 +15,8 @@ pub struct Target {
     pub versions: Vec<String>,
     /// Whether the checkpoint must load there. For another target, only the fact that it does not load is reported.
     pub leads: bool,
+    /// Whether transformers itself has the class; otherwise the version says little about it.
+    of_transformers: bool,
 }
 
 impl Target {
@@ -26,7 +28,14 @@ impl Target {
 
     fn new(loader: Loader, version: &str, leads: bool) -> Self {
         let stands_for = (version != loader.version()).then(|| version.to_owned());
-        Self { loader, stands_for, versions: vec![version.to_owned()], leads }
+        Self { loader, stands_for, versions: vec![version.to_owned()], leads, of_transformers: true }
+    }
+
+    /// Whether a prediction holds for a version that was asked for, and is not only near to one.
+    pub(in crate::check) fn is_certain(&self) -> bool {
+        self.stands_for.is_none()
+            || !self.of_transformers
+            || self.versions.iter().any(|version| version == self.loader.version())
     }
 
     /// Lets it lead in place of the loader of `version`, which does not know the class.
@@ -37,14 +46,22 @@ impl Target {
 }
 
 /// The versions to judge, each with whether it leads: those that the user named; without any, the version that wrote
-/// config.json, which leads, and the newest known one.
+/// config.json, which leads, and the newest known one of each major version.
 fn versions<'v>(config: Option<&'v Value>, named: &'v [String]) -> Vec<(&'v str, bool)> {
     let wrote = config.and_then(|config| config.get("transformers_version")).and_then(Value::as_str);
     match (named, wrote) {
-        ([], Some(version)) => vec![(version, true), (Loader::NEWEST.version(), false)],
-        ([], None) => vec![(Loader::NEWEST.version(), true)],
+        ([], Some(version)) => {
+            std::iter::once((version, true)).chain(newest_of_each_major().map(|version| (version, false))).collect()
+        }
+        ([], None) => newest_of_each_major().map(|version| (version, version == Loader::NEWEST.version())).collect(),
         (named, _) => named.iter().map(|version| (version.as_str(), true)).collect(),
     }
+}
+
+/// The newest known version of each major one, the oldest first.
+fn newest_of_each_major() -> impl Iterator<Item = &'static str> {
+    let is_last = |loader: &Loader| Loader::ALL.iter().all(|other| other.major() != loader.major() || other <= loader);
+    Loader::ALL.into_iter().filter(is_last).map(Loader::version)
 }
 
 /// The targets of a checkpoint of any class: the nearest loader of each version.
@@ -98,6 +115,9 @@ pub fn targets<'l>(
             Some((target, _)) => target.versions.push(version.to_owned()),
             None => known.push((Target::new(loader, version, leads), architecture)),
         }
+    }
+    for (target, architecture) in &mut known {
+        target.of_transformers = architecture.has_auto();
     }
     if named.is_empty() && !known.iter().any(|(target, _)| target.leads) {
         if known.is_empty() {

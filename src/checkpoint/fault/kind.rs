@@ -154,6 +154,7 @@ fault_kinds! {
         IndexKeyNowhere = "index-key-nowhere",
         IndexMissing = "index-missing",
         IndexNamesOtherShard = "index-names-other-shard",
+        IntegerWeights = "integer-weights",
         LayerLacksTensor = "layer-lacks-tensor",
         LfsSizesBelowTotal = "lfs-sizes-below-total",
         LoadRaises = "load-raises",

@@ -35,6 +35,15 @@ pub enum Dtype {
 }
 
 impl Dtype {
+    /// Whether a parameter of it can have no gradient: integers and truth values.
+    #[must_use]
+    pub const fn is_integer(self) -> bool {
+        matches!(
+            self,
+            Self::BOOL | Self::U8 | Self::I8 | Self::I16 | Self::U16 | Self::I32 | Self::U32 | Self::I64 | Self::U64
+        )
+    }
+
     /// All element types, in the alignment order of the format (narrowest first).
     pub const ALL: [Self; 22] = [
         Self::BOOL,

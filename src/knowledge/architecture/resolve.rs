@@ -4,7 +4,9 @@ use std::collections::BTreeSet;
 
 use serde_json::{Map, Value};
 
-use super::blueprint::{Alias, Blueprint, Computed, ComputedOtherwise, EarlyAlias, Refuses, SubConfig};
+use super::blueprint::{
+    Alias, Blueprint, Computed, ComputedOtherwise, ConfigClass, EarlyAlias, Refuses, Requirement, SubConfig,
+};
 use super::build::Outcome;
 use super::refusal::{Refusal, UnknownPart};
 use super::{Evidence, Expected};
@@ -15,6 +17,18 @@ pub(super) const DEPTH_CAP: usize = 8;
 
 /// What transformers 5 says of a value of another type than the field's.
 const FIELD: &str = "StrictDataclassFieldValidationError: Validation error";
+
+/// Old names of kinds of layers, and those that every config class of transformers 5 gives them: `remap_legacy_layer_types`
+/// of 5.23.0.
+const OLD_LAYER_TYPES: [(&str, &str); 4] = [
+    ("mamba", "linear_attention"),
+    ("attention", "full_attention"),
+    ("deepseek_sparse_attention", "indexed_attention"),
+    ("qwen_sparse_attention", "indexed_attention"),
+];
+
+/// The keys of lists of kinds of layers.
+const LAYER_TYPES: [&str; 4] = ["layer_types", "layers_block_type", "mtp_layer_types", "mtp_layers_block_type"];
 
 /// What configs are resolved with.
 #[derive(Clone, Copy)]
@@ -39,14 +53,12 @@ impl Resolver<'_> {
             return Err(Refusal::impossible(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
         let class = file.config(self.loader);
-        for (told, keys) in &class.types {
-            for key in keys.split(' ') {
-                let names = class.aliases.iter().filter(|(_, k)| k.name() == key).map(|(alias, _)| alias.as_str());
-                let wrong = names.chain([key]).filter_map(|name| config.get(name)).find(|value| !told.takes(value));
-                if wrong.is_some() {
-                    return Err(Refusal::Raises(format!("{FIELD} for field '{key}'")));
-                }
-            }
+        typed(class, &config)?;
+        if self.loader.major() >= 5 {
+            config
+                .iter_mut()
+                .filter(|(key, _)| LAYER_TYPES.contains(&key.as_str()))
+                .for_each(|(_, v)| rename_layer_types(v));
         }
         // What stands under another name: written over the key before others are computed, or when they are.
         let mut late: Vec<(&str, Value)> = Vec::new();
@@ -66,6 +78,7 @@ impl Resolver<'_> {
             }
         }
         fill(&mut config, &class.defaults);
+        as_python(&mut config, &class.defaults);
         let mut scope = self.scope(&config);
         // Those that take values of others are resolved after them.
         let takes = |spec: &SubConfig| spec.set.values().any(|v| v.as_str().is_some_and(|s| s.starts_with('=')));
@@ -80,18 +93,7 @@ impl Resolver<'_> {
             }
             bind(&mut scope, &config);
         }
-        let unmet: Vec<String> = file
-            .require
-            .iter()
-            .filter_map(|r| match r.that.eval_bool(&scope) {
-                Ok(true) => None,
-                Ok(false) => Some(r.message.render(&scope)),
-                Err(e) => Some(e.to_string()),
-            })
-            .collect();
-        if !unmet.is_empty() {
-            return Err(Refusal::Impossible(unmet));
-        }
+        required(file, &scope)?;
         compute(&mut config, &class.computed, &given, &mut scope)?;
         config.extend(late.into_iter().map(|(key, value)| (key.to_owned(), value)));
         // A key can be read under its other names too.
@@ -173,11 +175,70 @@ impl Resolver<'_> {
     }
 }
 
+/// Refuses a config that does not meet what the file requires.
+fn required(file: &Blueprint, scope: &Scope<'_>) -> Outcome<()> {
+    let unmet = |requirement: &Requirement| match requirement.that.eval_bool(scope) {
+        Ok(true) => None,
+        Ok(false) => Some(requirement.message.render(scope)),
+        Err(error) => Some(error.to_string()),
+    };
+    let unmet: Vec<String> = file.require.iter().filter_map(unmet).collect();
+    if unmet.is_empty() { Ok(()) } else { Err(Refusal::Impossible(unmet)) }
+}
+
+/// Refuses a value of another type than its field has.
+fn typed(class: &ConfigClass, config: &Map<String, Value>) -> Outcome<()> {
+    for (told, keys) in &class.types {
+        for key in keys.split(' ') {
+            let names = class.aliases.iter().filter(|(_, k)| k.name() == key).map(|(alias, _)| alias.as_str());
+            let wrong = names.chain([key]).filter_map(|name| config.get(name)).find(|value| !told.takes(value));
+            if wrong.is_some() {
+                return Err(Refusal::Raises(format!("{FIELD} for field '{key}'")));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Gives the kinds of layers in a list the names of transformers 5.
+fn rename_layer_types(kinds: &mut Value) {
+    for kind in kinds.as_array_mut().into_iter().flatten() {
+        if let Some((_, new)) = OLD_LAYER_TYPES.iter().find(|(old, _)| kind == old) {
+            *kind = (*new).into();
+        }
+    }
+}
+
 fn fill(config: &mut Map<String, Value>, defaults: &Map<String, Value>) {
     for (key, value) in defaults {
         if !config.contains_key(key) {
             config.insert(key.clone(), value.clone());
         }
+    }
+}
+
+/// Takes values of another type than the default's as Python does: what stands where the default is a truth value has one in
+/// a condition, and a truth value is a number. `null` stays: a class may ask whether a key is set.
+fn as_python(config: &mut Map<String, Value>, defaults: &Map<String, Value>) {
+    for (key, default) in defaults {
+        let Some(value) = config.get_mut(key) else { continue };
+        *value = match (default, &*value) {
+            (Value::Bool(_), given) if !given.is_null() => is_true(given).into(),
+            (Value::Number(_), Value::Bool(truth)) => u8::from(*truth).into(),
+            _ => continue,
+        };
+    }
+}
+
+/// Whether Python takes a value as true.
+fn is_true(value: &Value) -> bool {
+    match value {
+        Value::Null => false,
+        Value::Bool(truth) => *truth,
+        Value::Number(number) => number.as_f64() != Some(0.0),
+        Value::String(text) => !text.is_empty(),
+        Value::Array(list) => !list.is_empty(),
+        Value::Object(map) => !map.is_empty(),
     }
 }
 
@@ -210,6 +271,11 @@ fn compute(
                 bind(scope, config);
             }
             config.insert(key.clone(), expression.eval(scope)?);
+            stale = true;
+        } else if let Some(value) = config.get_mut(key).filter(|value| !value.is_boolean() && !value.is_null())
+            && matches!(expression.eval(scope), Ok(Value::Bool(_)))
+        {
+            *value = is_true(value).into();
             stale = true;
         }
     }

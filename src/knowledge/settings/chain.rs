@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::SettingsSource;
 use super::policy::Policy;
-use crate::knowledge::loader::parse_requirement;
+use crate::knowledge::loader::{expanded, parse_requirement_or_all};
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::selection::{Choice, UnknownRule};
 use crate::knowledge::source::DataError;
@@ -69,13 +69,14 @@ impl Chain {
     /// Versions to predict the load for.
     ///
     /// # Errors
-    /// A text that is not a requirement such as `transformers==4.47.0`.
+    /// A text that is neither a requirement such as `transformers==4.47.0` nor `all`.
     pub fn versions(&self) -> Result<Vec<String>, DataError> {
         let Some((source, versions)) = self.last(|s| Some((s, s.settings.versions.as_ref()?))) else {
             return Ok(Vec::new());
         };
-        let read = |text: &String| parse_requirement(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
-        versions.iter().map(read).collect()
+        let read =
+            |text: &String| parse_requirement_or_all(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
+        Ok(expanded(versions.iter().map(read).collect::<Result<_, _>>()?))
     }
 
     /// Selects rules and sets their severities; the command line, `typed`, takes precedence over the files. Returns the

@@ -351,7 +351,9 @@ fn the_load_is_predicted_for_the_given_versions() {
         loads.iter().map(|l| json!([l["loader"], l["stands_for"]])).collect::<Vec<_>>()
     };
     // fixtures/bases/llama was written by 4.47.0.
-    assert_eq!(loaders(&[]), [json!(["4.47.0", null]), json!(["5.23.0", null])]);
+    let known = ["4.47.0", "4.57.6", "5.23.0"].map(|version| json!([version, null]));
+    assert_eq!(loaders(&[]), known);
+    assert_eq!(loaders(&["--for", "all"]), known);
     assert_eq!(loaders(&["--for", "transformers==5.23.0"]), [json!(["5.23.0", null])]);
     assert_eq!(loaders(&["--for", "transformers==4.51.3"]), [json!(["4.47.0", "4.51.3"])]);
     let both = ["--for", "transformers==5.1.0", "--for", "transformers==4.47.0"];
