@@ -395,7 +395,7 @@ fn finding(
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity: rule.severity_given(caused.leads(), !caused.effects.is_empty()),
+        severity: rule.severity_given(caused.leads(), caused.ahead),
         message: rule.message.render(scope),
         details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
         effects: caused.effects,
@@ -407,23 +407,33 @@ fn finding(
     }
 }
 
+/// Whether a leading version has an effect.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+enum Leading {
+    #[default]
+    No,
+    /// It is predicted by a loader that only stands for the version.
+    Perhaps,
+    Yes,
+}
+
 /// The effects of one finding.
 #[derive(Default)]
 struct Caused {
     /// One effect for each object, loader and consequence.
     effects: Vec<FindingEffect>,
-    /// Whether a leading loader has one.
-    leading: bool,
-    /// Whether one is predicted for a leading version by a loader that only stands for it.
-    standing: bool,
+    /// Whether a leading version has one.
+    leading: Leading,
     /// Whether one is predicted for a version by its own loader.
     certain: bool,
+    /// Whether one is of a version that is not older than those that the checkpoint must load with.
+    ahead: bool,
 }
 
 impl Caused {
     /// Whether it fails for a leading version: what is predicted by another version alone is not certain.
     const fn leads(&self) -> bool {
-        self.leading || (self.standing && self.certain)
+        matches!((self.leading, self.certain), (Leading::Yes, _) | (Leading::Perhaps, true))
     }
 
     /// Adds the effects of `rule` under the loaders of a fault; all of the run if `loaders` is empty.
@@ -446,8 +456,10 @@ impl Caused {
                     continue;
                 }
                 let is_stated = loaders.is_empty();
-                self.leading |= target.leads && (is_stated || target.is_certain());
-                self.standing |= target.leads;
+                let leading = if is_stated || target.is_certain() { Leading::Yes } else { Leading::Perhaps };
+                self.leading = self.leading.max(if target.leads { leading } else { Leading::No });
+                self.ahead |=
+                    target.leads || context.targets.iter().all(|other| !other.leads || other.loader <= target.loader);
                 self.certain |= target.is_certain() || context.fails_for_certain;
                 self.effects.push(FindingEffect {
                     object,

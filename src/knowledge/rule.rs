@@ -102,11 +102,11 @@ pub struct Rule {
 }
 
 impl Rule {
-    /// Severity of a finding, by whether a leading loader and whether any loader of the run has an effect.
+    /// Severity of a finding, by whether a leading loader has an effect, and one of the run that is not older.
     #[must_use]
-    pub fn severity_given(&self, leading: bool, any: bool) -> Severity {
+    pub fn severity_given(&self, leading: bool, ahead: bool) -> Severity {
         let stated = self.severity.unwrap_or(Severity::Info);
-        self.regraded.unwrap_or(match (self.harm, leading, any) {
+        self.regraded.unwrap_or(match (self.harm, leading, ahead) {
             (Some(_), ..) | (None, true, _) => stated.max(Severity::Error),
             (None, false, true) => stated.max(Severity::Warning),
             (None, false, false) => stated,
