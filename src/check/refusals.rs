@@ -32,8 +32,8 @@ struct Rejection {
 }
 
 /// Faults of refused values, each under the loaders that raise. Called by the engine with the targets of the run, and the
-/// faults of the loads: where a class cannot be built, the value is reported there, for all loaders. `filled` is the config with the defaults
-/// of the class; null when no class was built.
+/// faults of the loads: where a class cannot be built, the value is reported there, for all loaders. `filled` is the config
+/// with the defaults of the class; null when no class was built.
 pub(super) fn faults(
     checkpoint: &Checkpoint,
     knowledge: &Knowledge,
