@@ -122,7 +122,7 @@ fn bind_run(
     let leading = targets.iter().filter(|target| target.leads).map(|target| target.loader.version());
     scope.bind("loaders", &leading.collect());
     scope.bind("named", &(!versions.is_empty()).into());
-    let groups_heads = |name: &str| knowledge.library.speaks_of(name, "num_key_value_heads");
+    let groups_heads = |name: &str| knowledge.library.speaks_of(name, "c.num_key_value_heads");
     scope.bind("groups_heads", &architecture.is_none_or(groups_heads).into());
     scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
 }

@@ -51,7 +51,9 @@ pub(super) fn faults(
         let mut found = of_class(knowledge, &configs, target.version());
         found.extend(dtype(knowledge, config, target.version()));
         let mut own = of_kinds(knowledge, &configs, target.version());
-        own.retain(|rejection| !is_non_finite(checkpoint, &rejection.pointer));
+        own.retain(|rejection| {
+            !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)
+        });
         match of_loads.iter_mut().find(|fault| fault.kind == FaultKind::ConfigIncomputable) {
             Some(unbuilt) if !own.is_empty() && !unbuilt.loaders.contains(&loader) => unbuilt.loaders.push(loader),
             Some(_) => {}
@@ -172,6 +174,13 @@ fn is_non_finite(checkpoint: &Checkpoint, pointer: &str) -> bool {
     let faults = checkpoint.document("config.json").into_iter().flat_map(|document| &document.faults);
     let mut places = faults.filter(|fault| fault.kind == FaultKind::NonFiniteNumber).flat_map(|fault| &fault.places);
     places.any(|place| place.pointer.as_deref() == Some(pointer))
+}
+
+/// Whether a value stands in the config of a part that old files of CLIP have twice: `text_config_dict` wins over
+/// `text_config`.
+fn is_overridden(config: &Value, pointer: &str) -> bool {
+    let part = pointer.split('/').nth(1).filter(|part| part.ends_with("_config"));
+    part.is_some_and(|part| config.get(format!("{part}_dict")).is_some_and(Value::is_object))
 }
 
 /// Adds a refusal unless the value, or a part of it, is refused already.

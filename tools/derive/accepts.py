@@ -222,7 +222,7 @@ def values(small, every, known=None):
         first = {kind: raised for kind in FIRST if (raised := small.refuses(pointer, kind))}
         if first:
             # A whole number may be too small for others of the config.
-            kinds = [kind for kind in KINDS if kind not in FIRST and not (kind == "above-one" and isinstance(at(small.config, pointer), int))]
+            kinds = [kind for kind in KINDS if kind not in FIRST and not (kind == "above-one" and isinstance(at(small.config, pointer), int) and "drop" not in pointer[-1])]
             rest = {kind: raised for kind in kinds if (raised := small.refuses(pointer, kind))}
             every = {**first, **rest}
             if at(small.config, pointer) is None and {"zero", "negative", "fraction"} <= every.keys():

@@ -221,6 +221,9 @@ impl<'l> Builder<'l> {
         let Some(((index, count), inner)) = repeats.split_first() else {
             return self.member(name, member, around, scope, place);
         };
+        if let Some(negative) = count.eval(scope)?.as_i64().filter(|n| *n < 0) {
+            return Err(Refusal::impossible(format!("`{count}` is {negative}: no layer is built")));
+        }
         let count_of = count.eval_u64(scope)?;
         if count_of > TENSOR_CAP as u64 {
             return Err(Refusal::impossible(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
