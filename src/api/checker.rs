@@ -17,8 +17,8 @@ pub struct Checker {
 }
 
 impl Checker {
-    /// A checker that predicts the load for the version of transformers that wrote the checkpoint and for the newest known
-    /// one, and that reads no tensor data.
+    /// A checker that predicts the load for the version of transformers that wrote the checkpoint and the newest known
+    /// one of each major version, and that reads no tensor data.
     #[must_use]
     pub fn new() -> Self {
         Self::default()

@@ -45,7 +45,7 @@ impl<'a> Context<'a> {
     }
 }
 
-/// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest one.
+/// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest of each major version.
 #[must_use]
 pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     check_for(checkpoint, knowledge, &[])

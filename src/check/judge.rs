@@ -63,7 +63,8 @@ impl Inputs<'_> {
 }
 
 /// Predicts the loads of a checkpoint. Called by the rule engine, with the versions that the user named; without any, the
-/// version that wrote config.json and the newest known one apply. Empty when config.json is missing or invalid.
+/// version that wrote config.json and the newest known one of each major version apply. Empty when config.json is missing or
+/// invalid.
 #[must_use]
 pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String], stored: &Stored) -> Judgement {
     let Some(config) = checkpoint.config() else { return Judgement::default() };

@@ -48,9 +48,11 @@ pub(super) fn faults(
     for target in asked.targets {
         let loader = target.loader.version();
         let configs = Configs { written: config, filled };
-        let mut found = of_class(knowledge, &configs, target.version());
+        let class = config.pointer("/architectures/0").and_then(Value::as_str);
+        let refused = class.and_then(|class| knowledge.refusals.of_class(target.version(), class)).unwrap_or_default();
+        let mut found = of_class(knowledge, &configs, &refused, target.version());
         found.extend(dtype(knowledge, config, target.version()));
-        let mut own = of_kinds(knowledge, &configs, target.version());
+        let mut own = of_kinds(knowledge, &configs, &refused, target.version());
         own.retain(|rejection| {
             !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)
         });
@@ -59,15 +61,15 @@ pub(super) fn faults(
             Some(_) => {}
             None => found = own.into_iter().fold(found, with_other_pointer),
         }
-        for refusal in found {
+        for rejection in found {
             let same = faults.iter_mut().find(|fault| {
                 let place = fault.places.first().and_then(|place| place.pointer.as_deref());
-                place == Some(&refusal.pointer)
-                    && fault.detail.get("raises") == Some(&Value::from(refusal.raises.as_str()))
+                place == Some(&rejection.pointer)
+                    && fault.detail.get("raises") == Some(&Value::from(rejection.raises.as_str()))
             });
             match same {
                 Some(fault) => fault.loaders.push(loader),
-                None => faults.push(refusal.fault().under(loader)),
+                None => faults.push(rejection.fault().under(loader)),
             }
         }
     }
@@ -108,11 +110,9 @@ impl<'c> Configs<'c> {
 }
 
 /// Values that the model class refuses, by rules of their own.
-fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, version: &str) -> Vec<Rejection> {
+fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusals, version: &str) -> Vec<Rejection> {
     let config = configs.written;
-    let class = config.pointer("/architectures/0").and_then(Value::as_str);
-    let Some(refused) = class.and_then(|class| knowledge.refusals.of_class(version, class)) else { return Vec::new() };
-    let ClassRefusals { activation, padding, rope_type, rope_factor, .. } = &refused;
+    let ClassRefusals { activation, padding, rope_type, rope_factor, .. } = refused;
     let mut found = Vec::new();
     for key in activation {
         let pointer = format!("/{key}");
@@ -146,14 +146,12 @@ fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, version: &str) -> Vec<
 }
 
 /// Values that do not fit a width, and values of kinds that the model class refuses, or every class.
-fn of_kinds(knowledge: &Knowledge, configs: &Configs<'_>, version: &str) -> Vec<Rejection> {
+fn of_kinds(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusals, version: &str) -> Vec<Rejection> {
     let config = configs.written;
-    let class = config.pointer("/architectures/0").and_then(Value::as_str);
-    let of_class = class.and_then(|class| knowledge.refusals.of_class(version, class)).unwrap_or_default();
     let of_every = knowledge.refusals.of_class(version, EVERY_CLASS).unwrap_or_default();
-    let heads = of_class.heads.iter().filter_map(|heads| undivided(configs, heads, &of_class.defaults));
+    let heads = refused.heads.iter().filter_map(|heads| undivided(configs, heads, &refused.defaults));
     let mut found: Vec<Rejection> = heads.collect();
-    found.extend(of_class.values().iter().flat_map(|values| of_kind(config, "", values)));
+    found.extend(refused.values().iter().flat_map(|values| of_kind(config, "", values)));
     found.extend(of_every.values().iter().flat_map(|values| of_kind(config, "", values)));
     for at in sub_configs(config) {
         let labels = of_every.values().iter().flat_map(|values| of_kind(config, &at, values));
@@ -183,10 +181,13 @@ fn is_overridden(config: &Value, pointer: &str) -> bool {
     part.is_some_and(|part| config.get(format!("{part}_dict")).is_some_and(Value::is_object))
 }
 
-/// Adds a refusal unless the value, or a part of it, is refused already.
-fn with_other_pointer(mut found: Vec<Rejection>, refusal: Rejection) -> Vec<Rejection> {
-    if !found.iter().any(|other| other.pointer.starts_with(&refusal.pointer)) {
-        found.push(refusal);
+/// Adds a rejection unless the value, or a part of it, is rejected already.
+fn with_other_pointer(mut found: Vec<Rejection>, rejection: Rejection) -> Vec<Rejection> {
+    let is_within = |pointer: &str| {
+        pointer.strip_prefix(&rejection.pointer).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+    };
+    if !found.iter().any(|other| is_within(&other.pointer)) {
+        found.push(rejection);
     }
     found
 }

@@ -126,10 +126,10 @@ impl Library {
             || !self.all_of_model_type(model_type).any(is_other)
     }
 
-    /// Whether a key of a config is a word of the file of this stem.
+    /// Whether the file of this stem contains these words: a key of a config, or a part of an expression that reads it.
     #[must_use]
-    pub fn speaks_of(&self, stem: &str, key: &str) -> bool {
-        self.text(stem).is_some_and(|text| text.contains(key))
+    pub fn speaks_of(&self, stem: &str, words: &str) -> bool {
+        self.text(stem).is_some_and(|text| text.contains(words))
     }
 
     /// Whether a file describes this model type, under any loader.

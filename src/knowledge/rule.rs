@@ -168,7 +168,7 @@ pub struct FaultCheck {
 ///   `of_transformers`: config.json is one of transformers;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
 /// - `loaders`: versions of transformers to check for; `named`: whether the user named them;
-/// - `metadata_only`: weights may be missing.
+/// - `metadata_only`: weights may be missing;
 /// - `groups_heads`: the class reads `num_key_value_heads`, or is unknown.
 ///
 /// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of

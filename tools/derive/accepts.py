@@ -31,6 +31,8 @@ ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "rules" / "refused"
 NEW = transformers.__version__.startswith("5")
 ROPE = "rope_parameters" if NEW else "rope_scaling"
+# The keys of transformers 5 that stand for older ones.
+NEWER = {"torch_dtype": "dtype", **({"rope_theta": ROPE, "partial_rotary_factor": ROPE, "rope_scaling": ROPE} if NEW else {})}
 PARAMETERS = 12_000_000
 SECONDS = 12
 WIDTHS = ("hidden_size", "d_model", "n_embd", "embed_dim", "dim", "encoder_embed_dim")
@@ -149,7 +151,7 @@ def changed(config, pointer, value):
         place = place[key]
     place[pointer[-1]] = value
     # The newer form of what stands under an older key would win.
-    place.pop({"torch_dtype": "dtype", "rope_theta": ROPE, "partial_rotary_factor": ROPE, "rope_scaling": ROPE}.get(pointer[-1]) if pointer[-1] != ROPE else None, None)
+    place.pop(NEWER.get(pointer[-1]), None)
     return copied
 
 
@@ -368,7 +370,8 @@ def main(args):
     file = OUT / f"{version}.json"
     kept = json.loads(file.read_text()) if args.only and file.exists() else {}
     shared = general(classes, sampled)
-    entries = kept | {"*": {"values": shared}} | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
+    # A few families do not tell what every class refuses.
+    entries = {"*": {"values": shared}} | kept | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
     entries |= {name: composed(entries, parts) for name, parts in CUSTOM.get(version, {}).items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in sorted(entries.items()))
     file.write_text(f"{{\n{lines}\n}}\n")
