@@ -72,10 +72,19 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     match &checkpoint.index {
         Some(index) => {
             let found = IndexComparison::new(checkpoint, index).map_or_else(Vec::new, |comparison| comparison.faults());
-            found.into_iter().chain(empty_map(checkpoint)).collect()
+            found.into_iter().chain(empty_map(checkpoint)).chain(no_tensors(checkpoint)).collect()
         }
-        None => without_index(checkpoint),
+        None => without_index(checkpoint).into_iter().chain(no_tensors(checkpoint)).collect(),
     }
+}
+
+/// The fault of shards that were read and hold no tensor between them.
+fn no_tensors(checkpoint: &Checkpoint) -> Option<Fault> {
+    let mut shards = checkpoint.shards.values();
+    let first = shards.clone().next()?;
+    let is_empty = shards.all(|shard| shard.is_sound() && shard.tensors.is_empty());
+    let fault = Fault::new(FaultKind::NoTensors).at(Place::file(&*first.name));
+    is_empty.then(|| fault.with("shards", checkpoint.shards.len()))
 }
 
 /// The fault of an index that lists no tensor.
@@ -161,6 +170,7 @@ impl<'c> IndexComparison<'c> {
             pointers_below_total(self.checkpoint, self.referenced.keys().copied()).into_iter().collect();
         faults.extend(self.absent_shards());
         faults.extend(self.pickles());
+        faults.extend(self.entries_without_shard());
         faults.extend(self.misplaced_entries());
         faults.extend(self.tensors_without_entry());
         faults.extend(self.stray_shards());
@@ -202,6 +212,20 @@ impl<'c> IndexComparison<'c> {
         let is_pickle = |name: &&&str| checkpoint.has_file(name) && !is_pointer(checkpoint, name);
         let name = self.referenced.keys().find(is_pickle).filter(|_| self.index.is_of_pickles())?;
         Some(Fault::new(FaultKind::PickleWeights).at(Place::file(*name)))
+    }
+
+    /// Files that an index of safetensors names, and that are no safetensors file by their name.
+    fn entries_without_shard(&self) -> Vec<Fault> {
+        let Self { checkpoint, index, referenced, .. } = self;
+        let is_other = |name: &str| !checkpoint.shards.contains_key(name) && checkpoint.has_file(name);
+        let others = referenced.iter().filter(|(name, _)| !index.is_of_pickles() && is_other(name));
+        let fault = |(name, (tensors, first)): (&&str, &(usize, &str))| {
+            let fault = Fault::new(FaultKind::IndexEntryNotAShard);
+            let fault = fault.at(Place::file(&index.document).pointer(pointer_to(first)).in_tensor(*first));
+            let pickle = [".bin", ".pt", ".pth"].iter().any(|ending| name.ends_with(ending));
+            fault.with("named", *name).with("tensors", *tensors).with("pickle", pickle)
+        };
+        others.map(fault).collect()
     }
 
     /// Entries whose tensor is in another shard than the one mapped, or in none.

@@ -146,9 +146,9 @@ impl Basis<'_> {
         targets.iter().map(verdict).collect()
     }
 
-    /// Whether any tensor was read; the names of an index alone tell nothing of a load.
+    /// Whether any shard was read; the names of an index alone tell nothing of a load.
     fn was_read(&self) -> bool {
-        self.checkpoint.tensors().next().is_some()
+        self.checkpoint.shards.values().any(|shard| shard.is_sound() || !shard.tensors.is_empty())
     }
 
     fn report(&self, loader: &str) -> Option<&LoadReport> {

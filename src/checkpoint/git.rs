@@ -26,13 +26,16 @@ struct AttributeLine {
 }
 
 /// Adds the detail `tracked` to faults of pointers that the work tree contains on purpose.
-pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
+///
+/// `trusts` is called with the top of the work tree. The checkpoint itself has no say: a `.git` and a `.gitattributes` in
+/// it are ignored.
+pub(super) fn mark_pointers(checkpoint: &mut Checkpoint, trusts: &dyn Fn(&Path) -> bool) {
     let pointers: BTreeSet<String> =
         checkpoint.entries.iter().filter(|(_, e)| e.lfs.is_some()).map(|(name, _)| name.clone()).collect();
     if pointers.is_empty() {
         return;
     }
-    let kept = kept(&checkpoint.root, pointers);
+    let kept = kept(&checkpoint.root, pointers, trusts);
     let mark = |fault: &mut Fault| {
         let file = fault.places.first().and_then(|place| place.file.as_deref());
         if fault.kind == FaultKind::LfsPointer && file.is_some_and(|file| kept.contains(file)) {
@@ -47,16 +50,16 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint) {
 }
 
 /// The given files that git-lfs handles according to the `.gitattributes` of the work tree around `root`.
-fn kept(root: &Path, mut files: BTreeSet<String>) -> BTreeSet<String> {
+fn kept(root: &Path, mut files: BTreeSet<String>, trusts: &dyn Fn(&Path) -> bool) -> BTreeSet<String> {
     let Ok(root) = root.canonicalize() else { return BTreeSet::new() };
-    let Some(top) = root.ancestors().find(|dir| dir.join(".git").symlink_metadata().is_ok()) else {
+    let Some(top) = root.ancestors().skip(1).find(|dir| dir.join(".git").symlink_metadata().is_ok()) else {
         return BTreeSet::new();
     };
-    if !has_git_lfs(top) {
+    if !trusts(top) || !has_git_lfs(top) {
         return BTreeSet::new();
     }
     // From the top of the work tree down: the last matching line decides.
-    let mut folders: Vec<&Path> = root.ancestors().take_while(|dir| dir.starts_with(top)).collect();
+    let mut folders: Vec<&Path> = root.ancestors().skip(1).take_while(|dir| dir.starts_with(top)).collect();
     folders.reverse();
     let lines: Vec<(&Path, Vec<AttributeLine>)> = folders.into_iter().map(|dir| (dir, lines(dir))).collect();
     files.retain(|file| {
@@ -123,20 +126,25 @@ mod tests {
         let root = dir.path().join("models/a");
         fs::create_dir_all(&root).unwrap();
         let all = ["a.bin", "a.safetensors", "model.safetensors", "t.json", "x{y}.npy"];
-        let kept = || {
-            let kept = kept(&root, all.map(str::to_owned).into());
+        let kept = |trusted: bool| {
+            let kept = kept(&root, all.map(str::to_owned).into(), &|_| trusted);
             kept.into_iter().collect::<Vec<_>>().join(" ")
         };
         let attributes = "# *.json filter=lfs\n*.safetensors filter=lfs diff=lfs -text\nmodels/**/*.bin filter=lfs\n\
                           a/t.json filter=lfs\n\"x{y}.npy\" filter=lfs\n*.json text\n";
         fs::write(dir.path().join(".gitattributes"), attributes).unwrap();
-        assert_eq!(kept(), "", "no work tree");
+        assert_eq!(kept(true), "", "no work tree");
         fs::create_dir_all(dir.path().join(".git/hooks")).unwrap();
-        assert_eq!(kept(), "", "a clone without git-lfs");
+        assert_eq!(kept(true), "", "a clone without git-lfs");
         fs::create_dir(dir.path().join(".git/lfs")).unwrap();
-        assert_eq!(kept(), "a.bin a.safetensors model.safetensors x{y}.npy");
-        fs::write(root.join(".gitattributes"), "/model.safetensors !filter\na.bin filter=other\nt.json filter=lfs")
-            .unwrap();
-        assert_eq!(kept(), "a.safetensors t.json x{y}.npy");
+        assert_eq!(kept(true), "a.bin a.safetensors model.safetensors x{y}.npy");
+        assert_eq!(kept(false), "", "a work tree that is not trusted");
+        let nearer = "model.safetensors !filter\na.bin filter=other\nt.json filter=lfs";
+        fs::write(root.join(".gitattributes"), nearer).unwrap();
+        assert_eq!(kept(true), "a.bin a.safetensors model.safetensors x{y}.npy", "the checkpoint has no say");
+        fs::write(root.parent().unwrap().join(".gitattributes"), nearer).unwrap();
+        assert_eq!(kept(true), "a.safetensors t.json x{y}.npy");
+        fs::create_dir_all(root.join(".git/lfs")).unwrap();
+        assert_eq!(kept(true), "a.safetensors t.json x{y}.npy", "nor a work tree in it");
     }
 }

@@ -103,6 +103,14 @@ pub enum OpenError {
         /// The given path.
         path: PathBuf,
     },
+    /// A symbolic link that leads out of the checkpoint.
+    #[error("{} is a symbolic link to {}, outside the directory; copy the file into the directory", path.display(), target.display())]
+    Outside {
+        /// The given path.
+        path: PathBuf,
+        /// Target of the link.
+        target: PathBuf,
+    },
     /// Any other error of the system.
     #[error("cannot read {}: {source}", path.display())]
     Io {
@@ -125,6 +133,9 @@ impl OpenError {
                 fault(FaultKind::DanglingSymlink).with("target", target.to_string_lossy().into_owned())
             }
             Self::SymlinkLoop { .. } => fault(FaultKind::SymlinkLoop),
+            Self::Outside { target, .. } => {
+                fault(FaultKind::LinkNotFollowed).with("target", target.to_string_lossy().into_owned())
+            }
             Self::Io { source, .. } => fault(FaultKind::UnreadableFile).with("reason", source.to_string()),
             Self::NotFound { .. } | Self::NotADirectory { .. } => {
                 fault(FaultKind::UnreadableFile).with("reason", "it does not exist")
@@ -156,20 +167,78 @@ impl OpenError {
 /// # Errors
 /// When the file is missing, is not regular, or has more than `cap` bytes.
 pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
+    open_at(path, path, cap, OFlags::empty())
+}
+
+/// Opens a file of the checkpoint in `root`, as [`open_regular`] does. A symbolic link is followed if its target lies in
+/// the checkpoint or is a blob of the hub cache.
+///
+/// Everything that is copied, linked or quoted is opened here: a link in a download can name any file of the user.
+///
+/// # Errors
+/// As [`open_regular`], and [`OpenError::Outside`].
+pub fn open_own(root: &Path, name: &str, cap: u64) -> Result<Opened, OpenError> {
+    let path = root.join(name);
+    let real = real_target(root, &path)?;
+    // A link that somebody puts there now is not followed.
+    open_at(real.as_deref().unwrap_or(&path), &path, cap, OFlags::NOFOLLOW)
+}
+
+/// Reads a whole file of the checkpoint in `root`, see [`open_own`].
+///
+/// # Errors
+/// As [`open_own`], and when reading fails.
+pub fn read_own(root: &Path, name: &str, cap: u64) -> Result<Vec<u8>, OpenError> {
+    open_own(root, name, cap)?.read_all(&root.join(name))
+}
+
+/// The file that a symbolic link of the checkpoint in `root` leads to; `None` when `path` is no link.
+///
+/// # Errors
+/// [`OpenError::Outside`], and those of a link without a target.
+pub fn real_target(root: &Path, path: &Path) -> Result<Option<PathBuf>, OpenError> {
     let io = |source| OpenError::from_io(path, source);
+    if !std::fs::symlink_metadata(path).map_err(io)?.is_symlink() {
+        return Ok(None);
+    }
+    let root = root.canonicalize().map_err(io)?;
+    let real = path.canonicalize().map_err(io)?;
+    // Devices and pipes have a clearer error of their own.
+    let is_file = std::fs::metadata(&real).is_ok_and(|metadata| metadata.is_file());
+    if real.starts_with(&root) || is_blob(&root, &real) || !is_file {
+        return Ok(Some(real));
+    }
+    let target = std::fs::read_link(path).map_err(io)?;
+    Err(OpenError::Outside { path: path.to_owned(), target })
+}
+
+/// Whether a path is a blob of the hub cache of this checkpoint, or of any repository in a hub cache. A blob is named by
+/// the hash of its content: <https://huggingface.co/docs/huggingface_hub/guides/manage-cache>.
+fn is_blob(root: &Path, real: &Path) -> bool {
+    let Some(blobs) = real.parent().filter(|dir| dir.file_name() == Some("blobs".as_ref())) else { return false };
+    let Some(repository) = blobs.parent() else { return false };
+    let name = real.file_name().map(|name| name.to_string_lossy()).unwrap_or_default();
+    let is_hash = matches!(name.len(), 40 | 64) && name.bytes().all(|b| b.is_ascii_hexdigit());
+    let folder = repository.file_name().map(|name| name.to_string_lossy()).unwrap_or_default();
+    is_hash && (root.starts_with(repository) || folder.starts_with("models--"))
+}
+
+/// Opens `path`, which errors call `shown`.
+fn open_at(path: &Path, shown: &Path, cap: u64, more: OFlags) -> Result<Opened, OpenError> {
+    let io = |source| OpenError::from_io(shown, source);
     let regular = |metadata: &Metadata| match EntryKind::from_metadata(metadata) {
         EntryKind::Regular => Ok(()),
-        kind => Err(OpenError::NotRegular { path: path.to_owned(), kind }),
+        kind => Err(OpenError::NotRegular { path: shown.to_owned(), kind }),
     };
     regular(&std::fs::metadata(path).map_err(io)?)?;
-    let flags = OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY;
+    let flags = OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY | more;
     let flags = i32::try_from(flags.bits()).unwrap_or(0);
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path).map_err(io)?;
     let metadata = file.metadata().map_err(io)?;
     regular(&metadata)?;
     let identity = Identity::from_metadata(&metadata);
     if identity.size > cap {
-        return Err(OpenError::TooLarge { path: path.to_owned(), size: identity.size, cap });
+        return Err(OpenError::TooLarge { path: shown.to_owned(), size: identity.size, cap });
     }
     Ok(Opened { file, identity, cap })
 }

@@ -10,7 +10,7 @@ use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
-use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_capped};
+use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_own, real_target};
 use super::tokenizer::is_vocabulary;
 use super::{
     Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, OpenError, Place, PythonModule,
@@ -57,6 +57,11 @@ pub(super) fn is_document(name: &str) -> bool {
     DOCUMENTS.contains(&name) || name.ends_with("config.json") || name.ends_with(".index.json")
 }
 
+/// Whether the content of the file is read, and may be quoted. Of a shard, names and shapes are read.
+fn is_content(name: &str) -> bool {
+    is_document(name) || has_ending(name, "py") || TEXTS.contains(&name) || VOCABULARIES.contains(&name)
+}
+
 impl Checkpoint {
     /// Reads a checkpoint directory.
     ///
@@ -64,6 +69,12 @@ impl Checkpoint {
     /// When the directory itself cannot be read. The content of its files cannot make this fail.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
         open(path.as_ref())
+    }
+
+    /// Expects Git LFS pointers where a git work tree above the checkpoint contains them on purpose, if `trusts` is true of
+    /// its top.
+    pub fn expect_lfs_pointers(&mut self, trusts: &dyn Fn(&Path) -> bool) {
+        git::mark_pointers(self, trusts);
     }
 
     /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
@@ -97,7 +108,6 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
     checkpoint.derive(vocabularies);
     checkpoint.has_base = has_base(&checkpoint);
     checkpoint.tokenizer.faults.extend(vocabulary_faults);
-    git::mark_pointers(&mut checkpoint);
     Ok(checkpoint)
 }
 
@@ -124,7 +134,7 @@ struct DirectoryReader {
 impl DirectoryReader {
     /// Reads the content of this file, if a loader would.
     fn read_content(&mut self, name: &str, entry: &Entry) {
-        let path = self.checkpoint.root.join(name);
+        let root = &self.checkpoint.root.clone();
         let is_shard = name.ends_with(".safetensors");
         if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
             // A folder is a checkpoint of its own, or unrelated.
@@ -133,33 +143,33 @@ impl DirectoryReader {
             self.checkpoint.shards.insert(name.to_owned(), shard);
         } else if is_document(name) {
             let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
-            let document = match read_capped(&path, cap) {
+            let document = match read_own(root, name, cap) {
                 Ok(bytes) => Document::parse(name, &bytes),
                 Err(error) => Document::unread(name, error.fault(name)),
             };
             self.checkpoint.documents.insert(name.to_owned(), document);
         } else if has_ending(name, "py") {
-            let module = match read_capped(&path, MODULE_CAP) {
+            let module = match read_own(root, name, MODULE_CAP) {
                 Ok(bytes) => PythonModule::parse(name, &bytes),
                 Err(error) => PythonModule::unread(name, error.fault(name)),
             };
             self.checkpoint.modules.insert(name.to_owned(), module);
         } else if TEXTS.contains(&name) && entry.lfs.is_none() {
-            match read_capped(&path, MODULE_CAP) {
+            match read_own(root, name, MODULE_CAP) {
                 Ok(bytes) => {
                     self.checkpoint.texts.insert(name.to_owned(), String::from_utf8_lossy(&bytes).into());
                 }
                 Err(error) => self.checkpoint.faults.push(error.fault(name)),
             }
         } else if VOCABULARIES.contains(&name) {
-            match vocabulary(&path, name) {
+            match vocabulary(root, name) {
                 Ok(vocabulary) => drop(self.vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
                 Err(fault) => self.vocabulary_faults.push(*fault),
             }
         } else if entry.kind == EntryKind::Broken
-            && let Err(error) = fs::metadata(&path)
+            && let Err(error) = fs::metadata(root.join(name))
         {
-            self.checkpoint.faults.push(OpenError::from_io(&path, error).fault(name));
+            self.checkpoint.faults.push(OpenError::from_io(&root.join(name), error).fault(name));
         }
     }
 
@@ -201,9 +211,8 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
         let link = link.map(|l| l.to_string_lossy().into_owned());
         return Entry { kind: EntryKind::Broken, link, ..Entry::default() };
     };
-    if let Some(target) = &link
-        && metadata.is_file()
-        && is_outside(root, &path, target)
+    if !is_content(name)
+        && let Err(OpenError::Outside { target, .. }) = real_target(root, &path)
     {
         let fault = Fault::new(FaultKind::SymlinkOutside).at(Place::file(name));
         faults.push(fault.with("target", target.to_string_lossy().into_owned()));
@@ -212,28 +221,15 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
     let size = if kind == EntryKind::Regular { metadata.len() } else { 0 };
     let small = u64::try_from(MAX_POINTER).is_ok_and(|cap| size <= cap);
     let lfs = if kind == EntryKind::Regular && size > 0 && small {
-        read_capped(&path, size).ok().and_then(|bytes| LfsPointer::parse(&bytes))
+        read_own(root, name, size).ok().and_then(|bytes| LfsPointer::parse(&bytes))
     } else {
         None
     };
     Entry { kind, size, link: link.map(|l| l.to_string_lossy().into_owned()), lfs }
 }
 
-/// Whether a link leads outside the directory. Links into the `blobs` folder of the hub cache are allowed: its
-/// snapshots consist of links to `../../blobs/…`.
-fn is_outside(root: &Path, path: &Path, target: &Path) -> bool {
-    let mut steps = target.components().skip_while(|c| *c == Component::ParentDir);
-    if target.starts_with("..") && steps.next() == Some(Component::Normal("blobs".as_ref())) {
-        return false;
-    }
-    match (fs::canonicalize(root), fs::canonicalize(path)) {
-        (Ok(root), Ok(path)) => !path.starts_with(root),
-        _ => false,
-    }
-}
-
-fn vocabulary(path: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {
-    let bytes = read_capped(path, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
+fn vocabulary(root: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {
+    let bytes = read_own(root, name, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
     let fault = |kind| Fault::new(kind).at(Place::file(name));
     if let Some(pointer) = LfsPointer::parse(&bytes) {
         return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());

@@ -73,6 +73,12 @@ pub struct Shard {
 }
 
 impl Shard {
+    /// Whether the header was read and has no fault.
+    #[must_use]
+    pub(crate) fn is_sound(&self) -> bool {
+        !self.unread && self.faults.is_empty()
+    }
+
     /// A shard that could not be read at all.
     #[must_use]
     pub(crate) fn unread(name: impl Into<String>, fault: Fault) -> Self {

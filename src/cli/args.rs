@@ -48,7 +48,7 @@ pub enum Command {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Settings")]
 pub struct SettingsArgs {
-    /// Use this settings file instead of the nearest ckpt-doctor.json5 in the directories above each checkpoint
+    /// Use this settings file instead of the nearest ckpt-doctor.json5 from the working directory upward
     #[arg(long, value_name = "FILE", conflicts_with = "isolated")]
     pub config: Option<PathBuf>,
     /// Use no settings file

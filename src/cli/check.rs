@@ -1,7 +1,6 @@
 //! `check`.
 
 use std::path::{Path, PathBuf};
-use std::rc::Rc;
 use std::sync::Arc;
 
 use anyhow::bail;
@@ -9,39 +8,40 @@ use anyhow::bail;
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::paths::{self, Targets};
-use super::settings::{Resolved, SettingsResolver, Typed};
+use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::Checkpoint;
-use crate::report::model::{CheckpointReport, Fixed, Fixing, UncheckedPath, Withdrawn};
+use crate::knowledge::settings::Surroundings;
+use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
 
-/// A checkpoint, the result of checking it and the settings it was checked under.
+/// A checkpoint, and the result of checking it.
 struct Checked {
     dir: PathBuf,
     checkpoint: Arc<Checkpoint>,
     outcome: Outcome,
-    by: Rc<Resolved>,
     /// Applied fixes, and fixes that were rolled back.
     repaired: (Vec<Fixed>, Vec<Withdrawn>),
 }
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let mut settings = SettingsResolver::new(Typed::check(args, rules));
     let Targets { dirs, mut unchecked } = paths::targets(&args.paths, args.quiet);
+    let surroundings = Surroundings::new(args.paths.iter().chain(&dirs).map(PathBuf::as_path));
+    let by = &resolve(&Typed::check(args, rules), &surroundings)?;
+    let run = CheckRun { args, by, surroundings: &surroundings };
     args.fix.refuse(dirs.len())?;
     if args.fix.writes() {
         signals::install()?;
     }
     let mut looked = Vec::new();
     for dir in dirs {
-        let by = settings.resolve(&dir)?;
         let path = dir.display().to_string();
-        let checked = match look(dir, args, by) {
+        let checked = match run.look(dir) {
             Ok(checked) => {
-                refuse_unusable(&checked)?;
-                repaired(checked, args)
+                run.refuse_unusable(&checked)?;
+                run.repaired(checked)
             }
             failed => failed,
         };
@@ -61,17 +61,18 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         (true, false) => CLEAN,
     };
     if args.fix.diff {
-        let changes = looked.iter().map(|l| fix::show(&args.fix, &l.dir, &l.checkpoint, &l.outcome, &check_by(&l.by)));
+        let changes = looked.iter().map(|l| fix::show(&args.fix, &l.dir, &l.checkpoint, &l.outcome, &check_by(by)));
         let changes = changes.sum::<anyhow::Result<usize>>()?;
         return Ok(exit(changes > 0));
     }
     // A suppression in a path that was not checked may still suppress something.
     let is_checked = |path: &&PathBuf| !unchecked.iter().any(|u| Path::new(&u.path).starts_with(path));
     let searched: Vec<PathBuf> = args.paths.iter().filter(is_checked).cloned().collect();
-    report_unused_suppressions(&mut looked, &settings, &searched);
+    report_unused_suppressions(&mut looked, by, &searched);
     let reports = looked.iter().map(|l| {
         let mut report = CheckpointReport::new(l.dir.display().to_string(), None, &l.checkpoint, &l.outcome);
-        report.settings = l.by.file.as_ref().map(|file| file.display().to_string());
+        report.settings = by.file.as_ref().map(|file| file.display().to_string());
+        report.overrides = Overrides::of(&by.knowledge);
         (report.fixed, report.withdrawn) = l.repaired.clone();
         report.fixing = Some(Fixing { unsafe_fixes: args.fix.unsafe_fixes, made: args.fix.writes() });
         report
@@ -82,18 +83,15 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         output::print(&fixes::made(&reports))?;
         return Ok(exit(fixed));
     }
-    let by: Vec<Rc<Resolved>> = looked.iter().map(|l| Rc::clone(&l.by)).collect();
-    baseline::apply_baselines(&mut reports, &by, args.baseline.write_baseline)?;
-    let fails =
-        |(report, by): (&CheckpointReport, &Rc<Resolved>)| report.counts.worst().is_some_and(|w| w >= by.fail_on);
-    let failed = reports.iter().zip(&by).any(fails);
+    baseline::apply_baseline(&mut reports, by, args.baseline.write_baseline)?;
+    let failed = reports.iter().any(|report| report.counts.worst().is_some_and(|w| w >= by.fail_on));
     let code = exit(fixed || failed && !args.report.exit_zero);
-    let hidden = reports.iter_mut().zip(&by).map(|(report, by)| report.hide_below(by.min_severity)).sum();
+    let hidden = reports.iter_mut().map(|report| report.hide_below(by.min_severity)).sum();
     let report = Report::new(reports, None).with_unchecked(unchecked).with_hidden(hidden);
     output::finish(&report, &args.report, args.statistics, args.quiet)?;
     if args.verbose {
         for l in &looked {
-            skipped::print(&l.dir, &l.outcome, &l.by.knowledge.rules);
+            skipped::print(&l.dir, &l.outcome, &by.knowledge.rules);
         }
     }
     Ok(code)
@@ -104,52 +102,56 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
     |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
 }
 
-fn open(dir: &Path, args: &CheckArgs) -> anyhow::Result<Arc<Checkpoint>> {
-    let mut checkpoint = Checkpoint::open(dir)?;
-    if args.deep {
-        checkpoint.read_contents();
+/// Options of a run, and what surrounds the directories that it checks.
+struct CheckRun<'a> {
+    args: &'a CheckArgs,
+    by: &'a Resolved,
+    surroundings: &'a Surroundings,
+}
+
+impl CheckRun<'_> {
+    fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
+        let mut checkpoint = Checkpoint::open(dir)?;
+        checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
+        if self.args.deep {
+            checkpoint.read_contents();
+        }
+        Ok(Arc::new(checkpoint))
     }
-    Ok(Arc::new(checkpoint))
-}
 
-/// Reads and checks a checkpoint.
-fn look(dir: PathBuf, args: &CheckArgs, by: Rc<Resolved>) -> anyhow::Result<Checked> {
-    fix::recover(&args.fix, &dir)?;
-    let checkpoint = open(&dir, args)?;
-    let outcome = check_by(&by)(&checkpoint);
-    Ok(Checked { dir, checkpoint, outcome, by, repaired: Default::default() })
-}
-
-/// Fails when a rule of the user cannot be used.
-fn refuse_unusable(checked: &Checked) -> anyhow::Result<()> {
-    let Some(rule) = checked.outcome.unusable.first() else { return Ok(()) };
-    let origin = checked.by.knowledge.rules.find(&rule.code)?.origin.as_deref().unwrap_or_default();
-    bail!("{origin}: {} on {}: {}", rule.code, checked.dir.display(), rule.why);
-}
-
-/// Applies the fixes, if the arguments ask for it.
-fn repaired(checked: Checked, args: &CheckArgs) -> anyhow::Result<Checked> {
-    if !args.fix.writes() {
-        return Ok(checked);
+    /// Reads and checks a checkpoint.
+    fn look(&self, dir: PathBuf) -> anyhow::Result<Checked> {
+        fix::recover(&self.args.fix, &dir)?;
+        let checkpoint = self.open(&dir)?;
+        let outcome = check_by(self.by)(&checkpoint);
+        Ok(Checked { dir, checkpoint, outcome, repaired: Default::default() })
     }
-    let Checked { dir, checkpoint, outcome, by, .. } = checked;
-    let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } =
-        fix::repair(&args.fix, dir, &checkpoint, outcome, &|dir| open(dir, args), &check_by(&by))?;
-    Ok(Checked { dir, checkpoint, outcome, by, repaired: (fixed, withdrawn) })
+
+    /// Fails when a rule of the user cannot be used.
+    fn refuse_unusable(&self, checked: &Checked) -> anyhow::Result<()> {
+        let Some(rule) = checked.outcome.unusable.first() else { return Ok(()) };
+        let origin = self.by.knowledge.rules.find(&rule.code)?.origin.as_deref().unwrap_or_default();
+        bail!("{origin}: {} on {}: {}", rule.code, checked.dir.display(), rule.why);
+    }
+
+    /// Applies the fixes, if the arguments ask for it.
+    fn repaired(&self, checked: Checked) -> anyhow::Result<Checked> {
+        if !self.args.fix.writes() {
+            return Ok(checked);
+        }
+        let Checked { dir, checkpoint, outcome, .. } = checked;
+        let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } =
+            fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &check_by(self.by))?;
+        Ok(Checked { dir, checkpoint, outcome, repaired: (fixed, withdrawn) })
+    }
 }
 
 /// Adds a finding for each suppression that suppressed nothing.
-fn report_unused_suppressions(looked: &mut [Checked], settings: &SettingsResolver, searched: &[PathBuf]) {
-    for resolved in settings.all() {
-        let here: Vec<usize> =
-            looked.iter().enumerate().filter(|(_, l)| Rc::ptr_eq(&l.by, resolved)).map(|(at, _)| at).collect();
-        let outcomes: Vec<_> =
-            here.iter().filter_map(|at| looked.get(*at)).map(|l| (Arc::clone(&l.checkpoint), &l.outcome)).collect();
-        let unused = unused_suppressions(&resolved.knowledge, &outcomes, searched);
-        for (at, finding) in unused {
-            if let Some(looked) = here.get(at).and_then(|at| looked.get_mut(*at)) {
-                looked.outcome.findings.push(finding);
-            }
+fn report_unused_suppressions(looked: &mut [Checked], by: &Resolved, searched: &[PathBuf]) {
+    let outcomes: Vec<_> = looked.iter().map(|l| (Arc::clone(&l.checkpoint), &l.outcome)).collect();
+    for (at, finding) in unused_suppressions(&by.knowledge, &outcomes, searched) {
+        if let Some(looked) = looked.get_mut(at) {
+            looked.outcome.findings.push(finding);
         }
     }
 }

@@ -12,7 +12,7 @@ use serde_json::{Map, Value, json};
 use super::args::{ExpectArgs, ExpectFormat};
 use super::exit::{CLEAN, FINDINGS};
 use super::{library, output};
-use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped};
+use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped, read_own};
 use crate::checkpoint::{Document, escape};
 use crate::knowledge::{Expected, Library, Loader};
 
@@ -69,8 +69,8 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 
 /// Reads a config.json, or the one in a directory.
 fn one(path: &Path) -> anyhow::Result<Input> {
-    let file = if path.is_dir() { path.join("config.json") } else { path.to_owned() };
-    let record = parse(&read_capped(&file, JSON_CAP)?).map(|config| Record { config, class: None });
+    let text = if path.is_dir() { read_own(path, "config.json", JSON_CAP) } else { read_capped(path, JSON_CAP) };
+    let record = parse(&text?).map(|config| Record { config, class: None });
     Ok(Input { source: path.display().to_string(), record })
 }
 

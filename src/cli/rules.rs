@@ -8,13 +8,14 @@ use comfy_table::{Table, presets};
 use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
-use super::settings::{SettingsResolver, Typed};
+use super::settings::{Typed, resolve};
 use crate::knowledge::rule::{Fix, Object, Rule, RuleSet, Safety, example};
+use crate::knowledge::settings::Surroundings;
 use crate::knowledge::{Loader, Template};
 
 /// Runs `rules`: lists the selected rules.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let here = SettingsResolver::new(Typed::new(args, rules)).resolve(Path::new("."))?;
+    let here = resolve(&Typed::new(args, rules), &Surroundings::new([]))?;
     let rows = here.knowledge.rules.rules.iter().map(|rule| [&rule.code, rule.highest_severity().name(), &rule.name]);
     output::print(&table(rows))?;
     Ok(CLEAN)
@@ -22,7 +23,7 @@ pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 
 /// Runs `explain`: prints the page of a rule, or the list of a family.
 pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let here = SettingsResolver::new(Typed::new(&args.settings, rules)).resolve(Path::new("."))?;
+    let here = resolve(&Typed::new(&args.settings, rules), &Surroundings::new([]))?;
     let rules = &here.knowledge.rules;
     let text = match family(rules, &args.rule) {
         Some(list) => list,

@@ -1,8 +1,6 @@
-//! Combines the command line and settings files into the options of each checkpoint.
+//! Combines the command line and the settings file into the options of a run.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::rc::Rc;
 
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
@@ -10,9 +8,9 @@ use crate::check::Severity;
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::expanded;
 use crate::knowledge::selection::Choice;
-use crate::knowledge::settings::{Chain, nearest};
+use crate::knowledge::settings::{Chain, Surroundings};
 
-/// Resolved options for the checkpoints under one settings file.
+/// Resolved options of a run.
 pub struct Resolved {
     /// The settings file, if any.
     pub file: Option<PathBuf>,
@@ -28,7 +26,7 @@ pub struct Resolved {
     pub baseline: Option<PathBuf>,
 }
 
-/// Options of the command line. They override every settings file.
+/// Options of the command line. They override the settings file.
 #[derive(Default)]
 pub struct Typed {
     config: Option<PathBuf>,
@@ -71,64 +69,48 @@ impl Typed {
     }
 }
 
-/// Finds the settings of checkpoints, and reads each file once.
-pub struct SettingsResolver {
-    typed: Typed,
-    resolved: BTreeMap<Option<PathBuf>, Rc<Resolved>>,
-    reported: BTreeSet<PathBuf>,
+/// The options of a run on these directories, from the settings file that may decide and the command line.
+///
+/// # Errors
+/// A settings file, rule, architecture or recipe that cannot be read.
+pub fn resolve(typed: &Typed, surroundings: &Surroundings) -> anyhow::Result<Resolved> {
+    let file = if typed.isolated {
+        None
+    } else if let Some(config) = &typed.config {
+        Some(config.clone())
+    } else {
+        let found = surroundings.nearest();
+        for (ignored, why) in &found.ignored {
+            let file = output::safe(&shortened(ignored));
+            output::note(&format!("note: {file} {} and is ignored; pass --config {file} to use it", why.reason()));
+        }
+        found.file
+    };
+    typed.read(file)
 }
 
-impl SettingsResolver {
-    pub fn new(typed: Typed) -> Self {
-        Self { typed, resolved: BTreeMap::new(), reported: BTreeSet::new() }
-    }
+/// The path from the working directory, if it is below it.
+fn shortened(path: &Path) -> String {
+    let here = std::env::current_dir().ok();
+    let below = here.and_then(|here| path.strip_prefix(here).ok().map(Path::to_owned));
+    below.as_deref().unwrap_or(path).display().to_string()
+}
 
-    /// The options for the checkpoint in this directory.
-    pub fn resolve(&mut self, checkpoint: &Path) -> anyhow::Result<Rc<Resolved>> {
-        let file = if self.typed.isolated {
-            None
-        } else if let Some(config) = &self.typed.config {
-            Some(config.clone())
-        } else {
-            let found = nearest(checkpoint);
-            if let Some(ignored) = found.ignored
-                && self.reported.insert(ignored.clone())
-            {
-                let file = output::safe(&ignored.display().to_string());
-                output::note(&format!(
-                    "note: {file} is inside a checkpoint and is ignored; pass --config {file} to use it"
-                ));
-            }
-            found.file
-        };
-        if let Some(resolved) = self.resolved.get(&file) {
-            return Ok(Rc::clone(resolved));
-        }
-        let resolved = Rc::new(self.read(file.clone())?);
-        self.resolved.insert(file, Rc::clone(&resolved));
-        Ok(resolved)
-    }
-
-    /// The options of every settings file found so far.
-    pub fn all(&self) -> impl Iterator<Item = &Rc<Resolved>> {
-        self.resolved.values()
-    }
-
+impl Typed {
     fn read(&self, file: Option<PathBuf>) -> anyhow::Result<Resolved> {
-        let typed = &self.typed;
         let chain = file.as_deref().map(Chain::load).transpose()?.unwrap_or_default();
-        let folder = typed.rules.clone().or_else(|| chain.rules());
+        let folder = self.rules.clone().or_else(|| chain.rules());
         let mut rules = library::rules(folder.as_deref())?;
-        let mut policy = chain.govern(&mut rules, typed.choice.clone())?;
-        policy.metadata_only |= typed.metadata_only;
+        let mut policy = chain.govern(&mut rules, self.choice.clone())?;
+        policy.metadata_only |= self.metadata_only;
         let library = library::with(folder.as_deref())?;
-        let versions = if typed.versions.is_empty() { chain.versions()? } else { expanded(typed.versions.clone()) };
+        let versions = if self.versions.is_empty() { chain.versions()? } else { expanded(self.versions.clone()) };
         Ok(Resolved {
             knowledge: Knowledge { policy, ..Knowledge::with(rules, library)? },
             versions,
-            fail_on: typed.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
-            min_severity: typed.min_severity.or_else(|| chain.min_severity()).unwrap_or(Severity::Info),
-            baseline: typed.baseline.clone().or_else(|| chain.baseline()),
+            fail_on: self.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
+            min_severity: self.min_severity.or_else(|| chain.min_severity()).unwrap_or(Severity::Info),
+            baseline: self.baseline.clone().or_else(|| chain.baseline()),
             file,
         })
     }

@@ -13,7 +13,7 @@ use super::rule::Severity;
 use super::source::{self, DataError};
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
 pub use chain::Chain;
-pub use find::{FILE, absolute, nearest};
+pub use find::{FILE, Surroundings, absolute};
 pub use policy::{Policy, Suppression};
 
 /// A settings file. Paths in it are relative to its folder.

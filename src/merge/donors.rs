@@ -7,6 +7,7 @@ use super::error::{MergeError, PipelineError};
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
 use crate::checkpoint::Checkpoint;
+use crate::checkpoint::open::real_target;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{DonorSpec, Recipe};
 use crate::report::model::Role;
@@ -24,6 +25,9 @@ pub(super) fn open(
         let seen = DonorSnapshot::record(dir);
         let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
         snapshots.push(seen?);
+        for name in checkpoint.shards.keys() {
+            real_target(dir, &dir.join(name)).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
+        }
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);
         donors.push(Donor { role: role.clone(), checkpoint: Arc::clone(&checkpoint), config: outcome.config.clone() });

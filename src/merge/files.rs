@@ -11,7 +11,7 @@ use super::draft::MergeDraft;
 use super::error::MergeError;
 use crate::check::modules::relative_modules;
 use crate::checkpoint::Document;
-use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
+use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
 use crate::knowledge::source;
 use crate::report::model::MergedFile;
@@ -85,7 +85,7 @@ fn copy_of(context: &Context<'_>, role: &str, name: &str) -> Result<Option<Plann
     if !donor.checkpoint.has_file(name) {
         return Ok(None);
     }
-    let bytes = read_capped(&donor.checkpoint.root.join(name), TOKENIZER_CAP)
+    let bytes = read_own(&donor.checkpoint.root, name, TOKENIZER_CAP)
         .map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
     Ok(Some(PlannedFile { name: name.to_owned(), bytes: bytes.into(), origin: format!("{role} donor, unchanged") }))
 }

@@ -41,6 +41,7 @@ impl CheckpointReport {
             verdict: counts.verdict(),
             counts,
             settings: None,
+            overrides: None,
             findings: by_severity(&outcome.findings),
             suppressed: outcome.suppressed.clone(),
             loads: outcome.verdicts.clone(),
@@ -54,6 +55,11 @@ impl CheckpointReport {
     /// Whether nothing about it is printed with `--quiet`: it has no findings but notes, and nothing was fixed.
     pub(crate) fn is_quiet(&self) -> bool {
         self.findings.iter().all(Finding::is_note) && self.fixed.is_empty() && self.withdrawn.is_empty()
+    }
+
+    /// Whether settings, options or a baseline changed what is reported.
+    pub(crate) const fn is_governed(&self) -> bool {
+        self.overrides.is_some() || !self.suppressed.is_empty()
     }
 
     /// Removes findings below this severity; they stay in `counts`. Returns their number.

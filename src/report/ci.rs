@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 
-use super::format::{advice, headline, sentence};
+use super::format::{advice, governed, headline, sentence};
 use super::model::{CheckpointReport, MergeReport, Report, UncheckedPath};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
@@ -30,6 +30,8 @@ pub struct Group<'a> {
     pub path: String,
     /// The verdicts in one line; empty for a merge.
     pub headline: String,
+    /// The settings that changed the verdict, see [`governed`].
+    pub governed: Option<String>,
     /// Texts of the documents; `None` for a merge.
     pub sources: Option<&'a BTreeMap<String, Arc<str>>>,
     /// Items in report order.
@@ -89,7 +91,15 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
     };
     let items = checkpoint.findings.iter().map(&mut item).collect();
     let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
-    Group { title, path, headline: headline(&checkpoint.loads), sources: Some(&checkpoint.sources), items, suppressed }
+    Group {
+        title,
+        path,
+        headline: headline(&checkpoint.loads),
+        governed: governed(checkpoint).filter(|_| checkpoint.is_governed()),
+        sources: Some(&checkpoint.sources),
+        items,
+        suppressed,
+    }
 }
 
 /// Fingerprint of a finding of the checkpoint at `path`.
@@ -120,6 +130,7 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         title: format!("merge {}", merge.recipe),
         path,
         headline: String::new(),
+        governed: None,
         sources: None,
         items,
         suppressed: Vec::new(),
@@ -142,6 +153,7 @@ fn unchecked<'a>(unchecked: &UncheckedPath, seen: &mut BTreeMap<String, usize>) 
         title: path.clone(),
         path,
         headline: String::new(),
+        governed: None,
         sources: None,
         items: vec![item],
         suppressed: Vec::new(),

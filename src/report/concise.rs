@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::Style;
 use super::fixes::mark;
-use super::format::{capped, headline, more, name, place, sentence, worst_first};
+use super::format::{capped, governed, headline, more, name, place, sentence, worst_first};
 use super::model::{CheckpointReport, Report};
 
 pub fn render(report: &Report, style: Style) -> String {
@@ -33,6 +33,9 @@ pub fn render(report: &Report, style: Style) -> String {
 fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     if !checkpoint.loads.is_empty() {
         let _ok = writeln!(out, "{}: {}", name(&checkpoint.path), headline(&checkpoint.loads));
+    }
+    if let Some(governed) = governed(checkpoint) {
+        let _ok = writeln!(out, "{}: {governed}", name(&checkpoint.path));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
     let (notes, findings): (Vec<_>, Vec<_>) = shown.into_iter().partition(|finding| finding.is_note());

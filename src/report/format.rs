@@ -274,6 +274,35 @@ pub fn and<T: AsRef<str>>(items: &[T]) -> String {
     }
 }
 
+/// Under which settings the verdict was made: `settings: ckpt-doctor.json5 (175 rules off), 2 suppressed`; `None` when the
+/// rules apply as they are.
+pub fn governed(checkpoint: &CheckpointReport) -> Option<String> {
+    let mut changes = Vec::new();
+    if let Some(overrides) = checkpoint.overrides {
+        let mut change = |n: usize, one: &str, rest: &str| {
+            if n > 0 {
+                changes.push(format!("{}{rest}", plural(n, one)));
+            }
+        };
+        change(overrides.rules_off, "rule", " off");
+        change(overrides.regraded, "rule", " regraded");
+        change(overrides.paths, "path", " with settings of its own");
+        if overrides.metadata_only {
+            changes.push("weights not required".to_owned());
+        }
+    }
+    let changes = changes.join(", ");
+    let by = match (&checkpoint.settings, changes.is_empty()) {
+        (Some(file), true) => Some(format!("settings: {}", name(file))),
+        (Some(file), false) => Some(format!("settings: {} ({changes})", name(file))),
+        (None, true) => None,
+        (None, false) => Some(format!("options: {changes}")),
+    };
+    let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
+    let parts: Vec<String> = by.into_iter().chain(suppressed).collect();
+    (!parts.is_empty()).then(|| parts.join(", "))
+}
+
 /// The verdicts in one line, the worst first and those that are not predicted last: `raises with transformers 5.23.0; loads
 /// with 4.47.0`.
 pub fn headline(loads: &[PredictedLoad]) -> String {

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::Report;
 use super::format::hostile;
-use super::model::{Role, Summary, ToolInfo, UncheckedPath};
+use super::model::{Overrides, Role, Summary, ToolInfo, UncheckedPath};
 
 pub fn render(report: &Report) -> String {
     pretty(report)
@@ -19,14 +19,19 @@ pub fn pretty<T: Serialize>(value: &T) -> String {
 
 /// One predicted load or finding per line, with the summary last.
 ///
-/// Every line is an object whose `type` is `load`, `finding`, `seam`, `unchecked` or `summary`. The other keys are those of the JSON
-/// contract.
+/// Every line is an object whose `type` is `settings`, `load`, `finding`, `seam`, `unchecked` or `summary`. The other keys are
+/// those of the JSON contract.
 pub fn lines(report: &Report) -> String {
     let mut lines = Vec::new();
     for checkpoint in &report.checkpoints {
         let (path, role) = (&checkpoint.path, checkpoint.role.as_ref());
         let line = |finding| JsonLine { r#type: LineKind::Finding, path, role, content: finding };
         let load = |load| JsonLine { r#type: LineKind::Load, path, role, content: load };
+        let settings = SettingsContent { settings: checkpoint.settings.as_deref(), overrides: checkpoint.overrides };
+        if checkpoint.is_governed() {
+            let line = JsonLine { r#type: LineKind::Settings, path, role, content: &settings };
+            lines.push(written(serde_json::to_string(&line)));
+        }
         lines.extend(checkpoint.loads.iter().map(|l| written(serde_json::to_string(&load(l)))));
         lines.extend(checkpoint.findings.iter().map(|f| written(serde_json::to_string(&line(f)))));
     }
@@ -48,6 +53,7 @@ pub fn lines(report: &Report) -> String {
 #[derive(Serialize)]
 #[serde(rename_all = "lowercase")]
 enum LineKind {
+    Settings,
     Load,
     Finding,
     Seam,
@@ -64,6 +70,15 @@ struct JsonLine<'a, T> {
     role: Option<&'a Role>,
     #[serde(flatten)]
     content: &'a T,
+}
+
+/// What changed the verdict on a checkpoint; its suppressed findings are counted in the summary.
+#[derive(Serialize)]
+struct SettingsContent<'a> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    settings: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    overrides: Option<Overrides>,
 }
 
 #[derive(Serialize)]

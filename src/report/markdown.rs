@@ -78,8 +78,8 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     for line in objects {
         let _ok = writeln!(out, "- {}", text(&line));
     }
-    if !checkpoint.suppressed.is_empty() {
-        let _ok = writeln!(out, "\nSuppressed: {}", plural(checkpoint.suppressed.len(), "finding"));
+    if let Some(governed) = format::governed(checkpoint) {
+        let _ok = writeln!(out, "\n{}", text(&governed));
     }
     let (shown, hidden) = capped(&checkpoint.findings, cap);
     for finding in format::alike(shown.into_iter().filter(|finding| !finding.is_note()).collect()) {

@@ -11,6 +11,7 @@ pub use super::merge::{
 use crate::check::finding::Suppressed;
 use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
+use crate::knowledge::Knowledge;
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
 /// The report of one run. Serialised, it is the JSON contract (`schema` 3).
@@ -128,6 +129,9 @@ pub struct CheckpointReport {
     /// The settings file that applied.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub settings: Option<String>,
+    /// What settings and options changed about the rules; missing when nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub overrides: Option<Overrides>,
     /// Findings, sorted by severity (errors first), file, place and code.
     pub findings: Vec<Finding>,
     /// Findings that settings or a baseline accept; `counts` does not include them.
@@ -187,6 +191,35 @@ impl From<Severity> for Verdict {
             Severity::Warning => Self::Warning,
             Severity::Error => Self::Error,
         }
+    }
+}
+
+/// Changes to the rules by a settings file and by options; a verdict under them differs from the one without.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct Overrides {
+    /// Rules that did not run.
+    pub rules_off: usize,
+    /// Rules with another severity.
+    pub regraded: usize,
+    /// Paths with ignored rules or severities of their own.
+    pub paths: usize,
+    /// Whether weights may be missing.
+    pub metadata_only: bool,
+}
+
+impl Overrides {
+    /// The changes; `None` when nothing is changed.
+    #[must_use]
+    pub fn of(knowledge: &Knowledge) -> Option<Self> {
+        let overrides = Self {
+            rules_off: knowledge.rules.unselected.len(),
+            regraded: knowledge.rules.rules.iter().filter(|rule| rule.regraded.is_some()).count(),
+            paths: knowledge.policy.paths(),
+            metadata_only: knowledge.policy.metadata_only,
+        };
+        (overrides != Self::default()).then_some(overrides)
     }
 }
 

@@ -10,7 +10,8 @@ use std::fmt::Write as _;
 
 use self::paint::Paint;
 use super::format::{
-    agreeing, alike, bytes, capped, counts, headline, name, notes, objects, plural, summary, worst_first, wrap,
+    agreeing, alike, bytes, capped, counts, governed, headline, name, notes, objects, plural, summary, worst_first,
+    wrap,
 };
 use super::model::{CheckpointReport, Report};
 use super::overview::Overview;
@@ -77,11 +78,8 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));
-    let settings = checkpoint.settings.as_deref().map(|file| format!("settings: {}", name(file)));
-    let suppressed = (!checkpoint.suppressed.is_empty()).then(|| format!("{} suppressed", checkpoint.suppressed.len()));
-    let policy: Vec<String> = settings.into_iter().chain(suppressed).collect();
-    if !policy.is_empty() {
-        let _ok = writeln!(out, "  {}", paint.quiet(&policy.join(", ")));
+    if let Some(governed) = governed(checkpoint) {
+        let _ok = writeln!(out, "  {}", paint.quiet(&governed));
     }
     for line in objects(&checkpoint.loads).into_iter().chain(notes(checkpoint)) {
         let width = style.width.map(|width| width.saturating_sub(4).max(40));

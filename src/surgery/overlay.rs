@@ -13,6 +13,7 @@ use super::staging::Staging;
 use super::stop::interrupted;
 use super::system::{check_space, retry};
 use super::target::check_target;
+use crate::checkpoint::open::real_target;
 
 /// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's or, on
 /// another file system, symbolic links. Hidden files are not copied.
@@ -49,16 +50,18 @@ fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<()
     }
     let original = &repair.original;
     for name in original.entries.keys().filter(|name| repair.changes.iter().all(|change| change.name != **name)) {
-        link(&original.root.join(name), &dir.join(name))?;
+        link(&original.root, name, &dir.join(name))?;
     }
     Ok(())
 }
 
-/// Links the target of `from` under a second name; a broken link is skipped.
-fn link(from: &Path, to: &Path) -> Result<(), ApplyError> {
+/// Links the target of a file of the original under a second name; a broken link is skipped. A file outside of the
+/// original gets no second name: a symbolic link leads to it, as in the original.
+fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
+    let from = &root.join(name);
     let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
     let is_file = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?.is_file();
-    if is_file {
+    if is_file && real_target(root, from).is_ok() {
         match retry(|| fs::hard_link(&real, to)) {
             Ok(()) => return Ok(()),
             // Another file system, no hard links, or a file of another user: use a symbolic link.

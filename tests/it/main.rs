@@ -22,6 +22,7 @@ mod docs;
 mod fix;
 mod hostile;
 mod house;
+mod laws;
 mod library;
 mod load;
 mod merge;

@@ -3,7 +3,7 @@
 //! The inputs follow from a seed. `cargo test` runs some thousands; `CKPT_DOCTOR_MUTATIONS=200000`, as in CI, sets the
 //! number.
 
-mod mutate;
+pub mod mutate;
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,7 +16,7 @@ use ckpt_doctor::checkpoint::{Checkpoint, Document, Parts, PythonModule, Shard, 
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{Format, Report, Style, render};
-use mutate::Mutator;
+pub use mutate::Mutator;
 
 /// Number of inputs in a plain `cargo test`.
 const FEW: usize = 2_000;

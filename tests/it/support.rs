@@ -164,6 +164,13 @@ pub fn knowledge() -> Knowledge {
     Knowledge::with(rules(), Library::embedded()).unwrap_or_else(|e| panic!("{e}"))
 }
 
+/// Reads a directory; a git work tree around it is trusted.
+fn read(dir: &Path) -> Checkpoint {
+    let mut checkpoint = Checkpoint::open(dir).expect("a directory");
+    checkpoint.expect_lfs_pointers(&|top| Some(top) == dir.parent());
+    checkpoint
+}
+
 /// Checks a directory under settings in the folder above it.
 fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let above = dir.parent().expect("a folder above");
@@ -171,7 +178,7 @@ fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> 
         SettingsSource::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
     knowledge.policy =
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
-    let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
+    let checkpoint = Arc::new(read(dir));
     let mut outcome = check(&checkpoint, &knowledge);
     let unused = unused_suppressions(&knowledge, &[(Arc::clone(&checkpoint), &outcome)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
@@ -229,7 +236,7 @@ pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
 }
 
 fn open(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
-    let mut checkpoint = Checkpoint::open(dir).expect("a directory");
+    let mut checkpoint = read(dir);
     if deep {
         checkpoint.read_contents();
     }

@@ -17,6 +17,8 @@ pub struct Stored {
     keys: BTreeSet<String>,
     shapes: BTreeMap<String, Vec<u64>>,
     absent: BTreeSet<String>,
+    /// Whether a file that the loader opens was read without a fault: without a tensor in it, everything is missing.
+    was_read: bool,
 }
 
 impl Stored {
@@ -43,24 +45,27 @@ impl Stored {
                 // A shard that is not there or could not be read may hold anything.
                 let all_read =
                     opened.len() == files.len() && opened.iter().all(|s| !s.tensors.is_empty() || s.faults.is_empty());
-                let Self { shapes, .. } = Self::together(opened);
+                let Self { shapes, was_read, .. } = Self::together(opened);
                 let keys: BTreeSet<String> = index.keys().cloned().collect();
                 let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();
-                Self { keys, shapes, absent }
+                Self { keys, shapes, absent, was_read }
             }
         }
     }
 
     fn together<'s>(shards: impl IntoIterator<Item = &'s Shard>) -> Self {
-        let tensors = shards.into_iter().flat_map(|s| &s.tensors);
-        let shapes: BTreeMap<String, Vec<u64>> = tensors.map(|t| (t.name.clone(), t.shape.clone())).collect();
-        Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new() }
+        let (mut shapes, mut was_read) = (BTreeMap::new(), false);
+        for shard in shards {
+            was_read |= shard.is_sound();
+            shapes.extend(shard.tensors.iter().map(|t| (t.name.clone(), t.shape.clone())));
+        }
+        Self { was_read, ..Self::from_shapes(shapes) }
     }
 
     /// Names and shapes of one file.
     #[must_use]
     pub fn from_shapes(shapes: BTreeMap<String, Vec<u64>>) -> Self {
-        Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new() }
+        Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new(), was_read: false }
     }
 
     /// The same with some tensors taken out and others put in; of those the shape may be unknown.
@@ -89,6 +94,7 @@ impl Stored {
             keys: self.keys.iter().map(renamed).collect(),
             shapes: self.shapes.iter().map(|(name, shape)| (renamed(name), shape.clone())).collect(),
             absent: self.absent.iter().map(renamed).collect(),
+            was_read: self.was_read,
         }
     }
 
@@ -97,10 +103,10 @@ impl Stored {
         self.keys.iter().map(String::as_str)
     }
 
-    /// Whether there is nothing to load.
+    /// Whether nothing is known of what a loader finds: no tensor was read, and no file that is known to be empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.keys.is_empty() && self.shapes.is_empty()
+        self.keys.is_empty() && self.shapes.is_empty() && !self.was_read
     }
 
     /// The stored tensors, for what an architecture reads off them.

@@ -97,6 +97,12 @@ impl Policy {
         Ok(policy)
     }
 
+    /// Number of paths with settings of their own.
+    #[must_use]
+    pub const fn paths(&self) -> usize {
+        self.places.len()
+    }
+
     /// Whether the policy leaves every finding unchanged.
     #[must_use]
     pub fn is_empty(&self) -> bool {

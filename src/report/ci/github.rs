@@ -18,6 +18,10 @@ pub fn render(report: &Report) -> String {
             let verdict = format!("{}: {}", escape(&group.title, PATH), group.headline);
             let _infallible = writeln!(out, "::notice title=verdict::{}", data(&verdict));
         }
+        if let Some(governed) = &group.governed {
+            let settings = format!("{}: {governed}", escape(&group.title, PATH));
+            let _infallible = writeln!(out, "::notice title=settings::{}", data(&settings));
+        }
         for item in &group.items {
             command(&mut out, &group, item);
         }

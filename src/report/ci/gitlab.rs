@@ -3,9 +3,11 @@
 //! <https://docs.gitlab.com/ci/testing/code_quality/#code-quality-report-format>
 
 use serde::Serialize;
+use sha2::{Digest as _, Sha256};
 
 use super::{file, groups};
 use crate::check::Severity;
+use crate::checkpoint::hex;
 use crate::report::Report;
 use crate::report::format::name;
 use crate::report::json;
@@ -33,6 +35,16 @@ struct Lines {
 pub fn render(report: &Report) -> String {
     let mut entries = Vec::new();
     for group in groups(report) {
+        if let Some(governed) = &group.governed {
+            // The format has no other place for it.
+            entries.push(QualityEntry {
+                description: format!("Checked under changed rules: {governed}"),
+                check_name: "settings".to_owned(),
+                fingerprint: hex(&Sha256::digest(format!("settings {} {governed}", group.path))),
+                severity: "info",
+                location: QualityLocation { path: group.path.clone(), lines: Lines { begin: 1 } },
+            });
+        }
         for item in group.items {
             let first = item.locations.first();
             let path = first.and_then(|l| file(&group.path, l)).unwrap_or_else(|| group.path.clone());

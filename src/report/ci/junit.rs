@@ -23,6 +23,9 @@ pub fn render(report: &Report) -> String {
         if !group.headline.is_empty() {
             suite.add_property(Property::new("verdict", legal(&group.headline)));
         }
+        if let Some(governed) = &group.governed {
+            suite.add_property(Property::new("settings", legal(governed)));
+        }
         if group.items.is_empty() {
             let mut case = TestCase::new("clean", TestCaseStatus::success());
             case.set_classname(words(&group.path));

@@ -35,7 +35,7 @@ struct SarifRun {
     original_uri_base_ids: BTreeMap<&'static str, SarifBase>,
     column_kind: &'static str,
     results: Vec<SarifResult>,
-    /// A property bag (3.8): the verdicts, by checkpoint.
+    /// A property bag (3.8): the verdicts, and the settings that changed them, by checkpoint.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     properties: BTreeMap<&'static str, BTreeMap<String, String>>,
 }
@@ -124,11 +124,12 @@ pub fn render(report: &Report) -> String {
     let mut rules: Vec<SarifRule> = Vec::new();
     let mut known: BTreeMap<String, usize> = BTreeMap::new();
     let mut results = Vec::new();
-    let mut verdicts = BTreeMap::new();
+    let (mut verdicts, mut settings) = (BTreeMap::new(), BTreeMap::new());
     for group in groups(report) {
         if !group.headline.is_empty() {
             verdicts.insert(name(&group.title), group.headline.clone());
         }
+        settings.extend(group.governed.iter().map(|governed| (name(&group.title), governed.clone())));
         let accepted = group.suppressed.iter().map(|(item, accepted)| (item, Some(*accepted)));
         for (item, accepted) in group.items.iter().map(|item| (item, None)).chain(accepted) {
             let id = name(item.code);
@@ -156,7 +157,8 @@ pub fn render(report: &Report) -> String {
     }
     let tool = SarifTool { driver: SarifDriver { name: report.tool.name, version: report.tool.version, rules } };
     // Columns count characters (3.14.17).
-    let properties = Some(("verdicts", verdicts)).filter(|(_, verdicts)| !verdicts.is_empty()).into_iter().collect();
+    let bags = [("verdicts", verdicts), ("settings", settings)];
+    let properties = bags.into_iter().filter(|(_, bag)| !bag.is_empty()).collect();
     let run = SarifRun { tool, original_uri_base_ids, column_kind: "unicodeCodePoints", results, properties };
     json::pretty(&SarifLog { schema: SCHEMA, version: "2.1.0", runs: [run] })
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value, json};
 
 use crate::check::{Edit, renamed};
-use crate::checkpoint::open::{TOKENIZER_CAP, read_capped};
+use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::checkpoint::{Checkpoint, Document, Parts, PythonModule, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
@@ -230,7 +230,7 @@ impl RepairDraft {
     }
 
     fn reencode(&mut self, file: &str) -> Option<()> {
-        let bytes = read_capped(&self.original.root.join(file), TOKENIZER_CAP).ok()?;
+        let bytes = read_own(&self.original.root, file, TOKENIZER_CAP).ok()?;
         let text = Document::decoded(&bytes)?;
         self.write(file, &text)
     }

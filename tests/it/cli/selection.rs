@@ -75,18 +75,18 @@ fn the_nearest_settings_file_applies_and_the_command_line_overrides_it() {
     assert_eq!(found(root, &["--select", "JSN"]).0, INFINITY);
     assert_eq!(found(root, &["--isolated", "--ignore", "JSN"]).0, ["VLA024 info"]);
     // A nearer file replaces the one above, unless it extends it.
-    settings(&root.join("models"), r#"{ severity: { "non-finite-number": "error" } }"#);
-    assert_eq!(found(root, &[]).0, [&["JSN001 error"; 3][..], &["VLA024 info"]].concat());
-    settings(
-        &root.join("models"),
-        r#"{ extend: "../ckpt-doctor.json5", "extend-select": ["JSN001"], severity: { JSN: "error" } }"#,
-    );
-    assert_eq!(found(root, &[]).0.len(), 4);
-    assert_eq!(doctor(root, &["check", "models"]).status.code(), Some(1));
-    // The working directory does not matter.
-    let here = doctor(&root.join("models/vla"), &["check", "--output-format", "concise"]);
-    // The verdict, and four findings.
-    assert_eq!(String::from_utf8(here.stdout).unwrap().lines().count(), 5);
+    let models = &root.join("models");
+    let lines = |args: &[&str]| {
+        let shown = doctor(models, &[&["check", "--output-format", "concise"], args].concat()).stdout;
+        String::from_utf8(shown).unwrap().lines().filter(|line| line.contains('[')).count()
+    };
+    settings(models, r#"{ severity: { "non-finite-number": "error" }, ignore: ["VLA"] }"#);
+    assert_eq!(lines(&["vla"]), 3);
+    settings(models, r#"{ extend: "../ckpt-doctor.json5", "extend-select": ["JSN001"], severity: { JSN: "error" } }"#);
+    assert_eq!(lines(&["vla"]), 4);
+    assert_eq!(doctor(models, &["check", "vla"]).status.code(), Some(1));
+    // It is in the directory that is checked, so the one above applies.
+    assert_eq!((lines(&["."]), found(root, &[]).0.len()), (1, 1));
     // Another file given by name; its paths start at its folder.
     fs::create_dir(root.join("ci")).unwrap();
     fs::write(
@@ -226,15 +226,18 @@ fn a_suppression_is_unused_only_if_all_its_paths_were_checked() {
     // Used in one checkpoint, unused in the other.
     assert_eq!(unused("rule: 'JSN001'", &["models"]), 0);
     assert_eq!(unused("rule: 'LFS001'", &["models"]), 0, "below models is not all that lies below the file");
-    assert_eq!(unused("rule: 'LFS001'", &["."]), 1);
+    // The settings file is in the directory that is checked, and must be named.
+    let named = ["--config", "ckpt-doctor.json5"];
+    let whole = |args: &[&str]| unused("rule: 'LFS001'", &[&["."], &named[..], args].concat());
+    assert_eq!(whole(&[]), 1);
     assert_eq!(unused("rule: 'LFS001', path: 'models/**'", &["models"]), 1);
     assert_eq!(unused("rule: 'LFS001', path: 'models/*'", &["models/vla"]), 0);
     assert_eq!(unused("rule: 'LFS001', path: 'models/vla'", &["models/vla/config.json"]), 1);
     assert_eq!(unused("rule: 'LFS001', path: 'models/vla/*.json'", &["models/vla"]), 1);
     assert_eq!(unused("rule: 'LFS001', path: 'models/gone'", &["models/vla"]), 0);
     assert_eq!(unused("rule: 'LFS001', path: 'models/gone'", &["models"]), 1);
-    assert_eq!(unused("rule: 'LFS001'", &[".", "--ignore", "LFS"]), 0);
-    assert_eq!(unused("rule: 'LFS001'", &[".", "--ignore", "SUP"]), 0);
+    assert_eq!(whole(&["--ignore", "LFS"]), 0);
+    assert_eq!(whole(&["--ignore", "SUP"]), 0);
 }
 
 #[test]

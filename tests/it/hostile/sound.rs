@@ -42,7 +42,6 @@ pub fn cases() -> Vec<Case> {
         raw("white space everywhere", file(one.replace(',', " ,\r\n ").replace(':', " : "), 1)),
         raw("unaligned header", file(format!("{one} "), 1)),
         raw("twenty megabytes of padding", file(format!("{one}{}", " ".repeat(20_000_000)), 1)),
-        raw("metadata without tensors", file(r#"{"__metadata__":{"format":"pt"}}"#, 0)),
         raw(
             "much metadata",
             file(

@@ -50,8 +50,8 @@ fn cases() -> Vec<Case> {
     let blob = |root: &Path| {
         let blobs = root.join("../../blobs");
         fs::create_dir_all(&blobs).unwrap();
-        fs::write(blobs.join("0123abcd"), "{}").unwrap();
-        symlink("../../blobs/0123abcd", root.join("config.json")).unwrap();
+        fs::write(blobs.join("0123456789abcdef0123456789abcdef01234567"), "{}").unwrap();
+        symlink("../../blobs/0123456789abcdef0123456789abcdef01234567", root.join("config.json")).unwrap();
     };
     vec![
         case("empty directory", &[], &|_| {}),
@@ -64,9 +64,13 @@ fn cases() -> Vec<Case> {
             fs::write(root.join("a.json"), "{}").unwrap();
             symlink("a.json", root.join("config.json")).unwrap();
         }),
-        case("link out", &[FaultKind::SymlinkOutside], &|root| {
+        case("link out", &[FaultKind::LinkNotFollowed], &|root| {
             fs::write(root.join("../other.json"), "{}").unwrap();
             symlink("../other.json", root.join("config.json")).unwrap();
+        }),
+        case("shard linked out", &[FaultKind::SymlinkOutside], &|root| {
+            fs::write(root.join("../other.safetensors"), file(br#"{"__metadata__":{"format":"pt"}}"#, 0)).unwrap();
+            symlink("../other.safetensors", root.join("model.safetensors")).unwrap();
         }),
         case("neighbours", &[], &|root| {
             for name in ["model.onnx", "weights.sha256", ".hidden.json", "README.md", "train.json"] {

@@ -28,6 +28,7 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
         verdict: counts.verdict(),
         counts,
         settings: None,
+        overrides: None,
         findings,
         suppressed: vec![],
         loads: vec![],

@@ -1,0 +1,47 @@
+//! What an untrusted directory may do, as laws: each test generates its cases from a seed.
+//!
+//! `SECURITY.md` names the test of each promise. `CKPT_DOCTOR_LAWS=500` sets the number of cases of each test.
+
+mod completeness;
+mod judgement;
+mod leaks;
+
+use std::path::Path;
+use std::sync::LazyLock;
+
+use tempfile::TempDir;
+
+/// Number of cases of a test: `few` in a plain `cargo test`.
+fn cases(few: u64) -> u64 {
+    std::env::var("CKPT_DOCTOR_LAWS").map_or(few, |n| n.parse().expect("a number"))
+}
+
+/// Choices that follow from a seed.
+struct Draw(crate::mutation::Mutator);
+
+impl Draw {
+    fn new(seed: u64) -> Self {
+        Self(crate::mutation::Mutator::new(seed))
+    }
+
+    /// One of the items.
+    fn one<'i, T>(&mut self, items: &'i [T]) -> &'i T {
+        &items[self.0.below(items.len())]
+    }
+
+    /// True once in `times`.
+    fn once_in(&mut self, times: usize) -> bool {
+        self.0.below(times) == 0
+    }
+}
+
+/// Writes a sound tiny Llama.
+fn base(dir: &Path) {
+    static LLAMA: LazyLock<TempDir> = LazyLock::new(|| {
+        let dir = TempDir::new().unwrap();
+        crate::support::make_base("llama", dir.path());
+        dir
+    });
+    std::fs::create_dir_all(dir).unwrap();
+    crate::support::copy(LLAMA.path(), dir);
+}
