@@ -20,6 +20,8 @@ mod skipped;
 
 mod undo;
 
+use std::ffi::OsString;
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -39,9 +41,21 @@ fn causes(error: &anyhow::Error) -> String {
     causes.join(": ")
 }
 
+/// The first option that is also the name of an existing file. A repository may have a file `--baseline=known.json`, and a
+/// hook or a shell glob passes its name like any other.
+fn file_as_option(args: impl Iterator<Item = OsString>, exists: impl Fn(&Path) -> bool) -> Option<OsString> {
+    let mut options = args.take_while(|arg| arg != "--").filter(|arg| arg.as_encoded_bytes().starts_with(b"-"));
+    options.find(|arg| exists(Path::new(arg)))
+}
+
 /// Runs the program.
 #[must_use]
 pub fn main() -> ExitCode {
+    if let Some(name) = file_as_option(std::env::args_os().skip(1), Path::exists) {
+        let name = output::safe(&name.to_string_lossy());
+        output::note(&format!("error: {name} is also the name of a file; write -- before file names"));
+        return ExitCode::from(exit::FAILED);
+    }
     let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
     let result = match &command {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
@@ -65,5 +79,25 @@ pub fn main() -> ExitCode {
                 ExitCode::from(exit::FAILED)
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ffi::OsString;
+    use std::path::Path;
+
+    use super::file_as_option;
+
+    #[test]
+    fn names_of_files_are_no_options() {
+        let found = |args: &[&str]| {
+            let args = args.iter().map(OsString::from);
+            let there = |path: &Path| ["--fix", "--report=json=x.json", "a"].iter().any(|name| path == Path::new(name));
+            file_as_option(args, there).map(|arg| arg.to_string_lossy().into_owned())
+        };
+        assert_eq!(found(&["check", "a", "--report=json=x.json"]).as_deref(), Some("--report=json=x.json"));
+        assert_eq!(found(&["check", "--fix"]).as_deref(), Some("--fix"));
+        assert_eq!(found(&["check", "--diff", "a", "--", "--fix"]), None);
     }
 }

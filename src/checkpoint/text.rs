@@ -28,12 +28,17 @@ pub fn escape(text: &str, cap: usize) -> String {
     out
 }
 
-/// Characters that reorder or hide text: bidirectional controls, zero-width characters, line
-/// separators, byte-order marks and tags.
+/// Characters that reorder or hide text: those with the Unicode property `Default_Ignorable_Code_Point`, all of the
+/// category Cf, line and paragraph separators, and the Braille pattern without dots. The tests compare it with the tables
+/// of the `regex` crate.
 const fn is_invisible(c: char) -> bool {
     matches!(c,
-        '\u{ad}' | '\u{61c}' | '\u{180e}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}'
-        | '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{fff0}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
+        '\u{ad}' | '\u{34f}' | '\u{600}'..='\u{605}' | '\u{61c}' | '\u{6dd}' | '\u{70f}' | '\u{890}'..='\u{891}'
+        | '\u{8e2}' | '\u{115f}'..='\u{1160}' | '\u{17b4}'..='\u{17b5}' | '\u{180b}'..='\u{180f}'
+        | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{2800}' | '\u{3164}'
+        | '\u{fe00}'..='\u{fe0f}' | '\u{feff}' | '\u{ffa0}' | '\u{fff0}'..='\u{fffb}' | '\u{110bd}' | '\u{110cd}'
+        | '\u{13430}'..='\u{1343f}' | '\u{1bca0}'..='\u{1bca3}' | '\u{1d173}'..='\u{1d17a}'
+        | '\u{e0000}'..='\u{e0fff}')
 }
 
 /// A size in decimal units, three digits: `8.06 GB`.
@@ -85,4 +90,22 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
         let _ = write!(out, "{byte:02x}");
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use regex::Regex;
+
+    use super::escape;
+
+    /// The tables of another program decide which characters are invisible.
+    #[test]
+    fn every_invisible_character_is_escaped() {
+        let invisible = Regex::new(r"^[\p{Default_Ignorable_Code_Point}\p{Cc}\p{Cf}\p{Zl}\p{Zp}\u{2800}]$").unwrap();
+        let mut text = [0; 4];
+        for c in (0..=u32::from(char::MAX)).filter_map(char::from_u32) {
+            let text = &*c.encode_utf8(&mut text);
+            assert_eq!(escape(text, 1) != text, invisible.is_match(text), "U+{:04X}", u32::from(c));
+        }
+    }
 }

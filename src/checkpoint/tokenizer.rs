@@ -139,6 +139,12 @@ impl Tokenizer {
         let own = get("tokenizer.json", "/added_tokens")
             .and_then(Value::as_array)
             .map(|list| list.iter().filter_map(|token| added(token.get("id")?.as_u64()?, token)).collect());
+        let listed = get("tokenizer.json", "/added_tokens").and_then(Value::as_array);
+        if let Some(at) = listed.and_then(|list| list.iter().position(|token| !has_valid_id(token))) {
+            let place = Place::file("tokenizer.json").pointer(format!("/added_tokens/{at}"));
+            let reason = "the id of an added token is not a whole number from 0 to 4294967295";
+            faults.push(Fault::new(FaultKind::VocabularyMalformed).at(place).with("reason", reason));
+        }
         let special_from = if decoder.is_some() { vec![config] } else { vec!["special_tokens_map.json", config] };
         let mut tokenizer = Self {
             files,
@@ -277,6 +283,11 @@ impl Tokenizer {
         self.length = base.filter(|_| known).map(|_| base_len.saturating_add(more));
         self.added = ids;
     }
+}
+
+/// Whether `tokenizers` accepts the id of this entry of `added_tokens`, which it reads as a `u32`.
+fn has_valid_id(token: &Value) -> bool {
+    token.get("id").and_then(Value::as_u64).is_some_and(|id| u32::try_from(id).is_ok())
 }
 
 fn added(id: u64, token: &Value) -> Option<AddedToken> {

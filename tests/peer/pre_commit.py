@@ -41,10 +41,9 @@ def repository(at):
     git("init", "-q", cwd=at)
 
 
-def configure(repo, source, rev, hook, args=()):
-    repo.joinpath(".pre-commit-config.yaml").write_text(
-        f"repos:\n- repo: {source}\n  rev: {rev}\n  hooks:\n  - id: {hook}\n    args: {json.dumps(list(args))}\n"
-    )
+def configure(repo, source, rev, hook, args=None):
+    text = f"repos:\n- repo: {source}\n  rev: {rev}\n  hooks:\n  - id: {hook}\n"
+    repo.joinpath(".pre-commit-config.yaml").write_text(text + (f"    args: {json.dumps(args)}\n" if args else ""))
     run(sys.executable, "-m", "pre_commit", "install", cwd=repo)
 
 
@@ -83,13 +82,29 @@ def main(files, room):
     shards = sorted(set(wrong["weight_map"].values()))
     wrong["weight_map"][name] = next(shard for shard in shards if shard != wrong["weight_map"][name])
     index.write_text(json.dumps(wrong, indent=2))
-    configure(repo, source, rev, "ckpt-doctor-system", ["--fix"])
+    configure(repo, source, rev, "ckpt-doctor-system", ["--fix", "--"])
     expect(commit(repo, "wrong", ok=False), "files were modified by this hook", "fixed IDX008")
     commit(repo, "repaired by the hook")
     configure(repo, source, rev, "ckpt-doctor-system")
     print("a wrong index is repaired by --fix in the hook")
     run("git", "checkout", "-q", "HEAD", "--", ".", cwd=repo)
     print("a commit with a broken model is refused")
+
+    # A file name is never an option, not even if somebody sets `args` without `--`.
+    planted = [repo / "--report=json=written.json", repo / "--baseline=models" / "known.json"]
+    for file in planted:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("{}")
+    commit(repo, "names like options")
+    configure(repo, source, rev, "ckpt-doctor-system", ["--fail-on=error"])
+    for file in planted:
+        file.write_text("{ }")
+    expect(commit(repo, "names like options", ok=False), "is also the name of a file")
+    if any(path.name == "written.json" for path in repo.iterdir()):
+        sys.exit("a file name was taken for an option")
+    configure(repo, source, rev, "ckpt-doctor-system")
+    commit(repo, "names like options after --")
+    print("file names are never options")
 
     # A commit that deletes a shard: pre-commit passes no deleted file, but it passes the changed index.
     shard = sorted(model.glob("*.safetensors"))[0]
@@ -102,7 +117,7 @@ def main(files, room):
     # Pointers, as left by GIT_LFS_SKIP_SMUDGE=1, are intended where git-lfs is installed.
     other = repo / "models" / "b"
     shutil.copytree(model, other)
-    other.joinpath(".gitattributes").write_text("*.safetensors filter=lfs diff=lfs merge=lfs -text\n")
+    repo.joinpath(".gitattributes").write_text("models/b/*.safetensors filter=lfs diff=lfs merge=lfs -text\n")
     for n, shard in enumerate(sorted(other.glob("*.safetensors"))):
         shard.write_text(POINTER.format(f"{n:064x}"))
     for key in ("clean", "smudge"):
