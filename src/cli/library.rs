@@ -11,6 +11,10 @@ use crate::knowledge::rule::RuleSet;
 
 /// Maximum depth of folders in a directory of rules.
 const MAX_DEPTH: usize = 8;
+/// Maximum number of files in a directory of rules; some 200 are built in.
+const MAX_FILES: usize = 4_000;
+/// Maximum number of bytes of the files in a directory of rules.
+const MAX_BYTES: usize = 32 << 20;
 
 /// The built-in library with the files of `rules/architectures`, which override built-in ones.
 pub fn with(rules: Option<&Path>) -> anyhow::Result<Library> {
@@ -42,8 +46,16 @@ fn texts(rules: Option<&Path>, folder: &str) -> anyhow::Result<Vec<(String, Stri
     }
     files.retain(|file| file.starts_with(rules.join(folder)));
     files.sort();
+    if files.len() > MAX_FILES {
+        bail!("{} contains {} files; at most {MAX_FILES} are read", rules.display(), files.len());
+    }
+    let mut bytes = 0_usize;
     let read = |file: PathBuf| {
         let text = String::from_utf8(read_capped(&file, MODULE_CAP)?);
+        bytes = bytes.saturating_add(text.as_ref().map_or(0, String::len));
+        if bytes > MAX_BYTES {
+            bail!("the files in {} have more than {MAX_BYTES} bytes", rules.display());
+        }
         let name = file.display().to_string();
         Ok((name.clone(), text.with_context(|| format!("{name}: not UTF-8"))?))
     };

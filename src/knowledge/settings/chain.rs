@@ -10,6 +10,9 @@ use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::selection::{Choice, UnknownRule};
 use crate::knowledge::source::DataError;
 
+/// Most files that extend one another; more are a mistake, or an attempt to keep the program busy.
+const MAX_FILES: usize = 16;
+
 /// A settings file and the files that it extends, in order of increasing precedence.
 #[derive(Debug, Clone, Default)]
 pub struct Chain(pub Vec<SettingsSource>);
@@ -29,6 +32,9 @@ impl Chain {
                 let circle: Vec<&str> = chain.iter().map(|s| s.name.as_str()).collect();
                 let circle = format!("extends itself: {} → {}", circle.join(" → "), source.name);
                 return Err(DataError::new(&source.name, circle));
+            }
+            if chain.len() >= MAX_FILES {
+                return Err(DataError::new(&source.name, format!("is extended by {MAX_FILES} files, one after another")));
             }
             next = source.settings.extend.as_ref().map(|extended| source.dir.join(extended));
             chain.push(source);
