@@ -74,6 +74,19 @@ pub struct Import {
     pub nested: bool,
 }
 
+/// The keywords of Python 3.13 (`keyword.kwlist`), which are no names anywhere; soft keywords such as `match` are.
+const KEYWORDS: [&str; 35] = [
+    "False", "None", "True", "and", "as", "assert", "async", "await", "break", "class", "continue", "def", "del",
+    "elif", "else", "except", "finally", "for", "from", "global", "if", "import", "in", "is", "lambda", "nonlocal",
+    "not", "or", "pass", "raise", "return", "try", "while", "with", "yield",
+];
+
+/// Whether a word is a keyword of Python.
+#[must_use]
+pub fn is_keyword(word: &str) -> bool {
+    KEYWORDS.contains(&word)
+}
+
 impl PythonModule {
     /// A module that could not be read at all.
     #[must_use]

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 
 use tree_sitter::{Node, ParseOptions, Parser, Tree, TreeCursor};
 
-use super::{Import, PythonClass, PythonModule, RelativeImport};
+use super::{Import, PythonClass, PythonModule, RelativeImport, is_keyword};
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::{Fault, FaultKind, Place};
@@ -121,7 +121,9 @@ impl<'a> ModuleReader<'a> {
 
     /// Records the facts of one node; returns the context for its children, or `None` to skip them.
     fn visit(&mut self, node: Node<'_>, scope: StatementContext) -> Option<StatementContext> {
-        if node.is_error() || node.is_missing() {
+        // The grammar takes a keyword for a name where no keyword can stand: `import a.class`.
+        let keyword = node.kind() == "identifier" && is_keyword(self.str(node));
+        if node.is_error() || node.is_missing() || keyword {
             let start = node.start_byte();
             // An error node can span the rest of the file; the mistake is near its beginning.
             let rest = self.text.get(node.byte_range()).unwrap_or_default();
@@ -143,7 +145,7 @@ impl<'a> ModuleReader<'a> {
                 }
                 Some(StatementContext { function: true, ..scope })
             }
-            "lambda" | "call" | "string" | "comment" => None,
+            "string" | "comment" => None,
             "try_statement" => Some(StatementContext { guarded: true, ..scope }),
             "if_statement" => {
                 let test = node.child_by_field_name("condition").map_or("", |c| self.str(c));
@@ -152,11 +154,11 @@ impl<'a> ModuleReader<'a> {
             }
             "import_statement" => {
                 self.import(node, scope, top);
-                None
+                Some(scope)
             }
             "import_from_statement" | "future_import_statement" => {
                 self.import_from(node, scope, top);
-                None
+                Some(scope)
             }
             "assignment" => {
                 if let Some(left) = node.child_by_field_name("left").filter(|_| top) {
