@@ -15,6 +15,7 @@ mod discover;
 pub mod document;
 mod entry;
 pub mod fault;
+mod file_name;
 mod git;
 pub mod index;
 mod lfs;
@@ -36,6 +37,7 @@ pub use entry::{Entry, EntryKind};
 #[cfg(feature = "internals")]
 pub use fault::FaultSource;
 pub use fault::{Fault, FaultKind, Place};
+pub use file_name::FileName;
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::PythonModule;

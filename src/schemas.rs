@@ -11,6 +11,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
+use crate::checkpoint::FileName;
 use crate::knowledge::architecture::Blueprint;
 use crate::knowledge::expression::{Expression, Template};
 use crate::knowledge::loader::Loader;
@@ -41,6 +42,7 @@ macro_rules! text {
 
 text!(Expression, "Expression", "An expression in CEL, the Common Expression Language: https://cel.dev");
 text!(Template, "Template", "Text with expressions in braces; a literal brace is doubled.");
+text!(FileName, "FileName", "The name of a file in the result: no folder, no `:`, no control character, not hidden.");
 text!(Loader, "Loader", "A version of transformers; it is mapped to the nearest known one.");
 
 fn project() -> &'static Path {

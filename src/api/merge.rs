@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::{Error, knowledge};
-use crate::merge::{MergeRequest, ResolvedMergeFile, find_recipe, run};
+use crate::merge::{MergeRequest, ResolvedMergeFile, run};
 use crate::report::Report;
 
 /// A merge of several checkpoints, the donors, into a new one.
@@ -28,7 +28,7 @@ impl Merge {
     /// A merge into this directory, which must not exist yet or be empty.
     #[must_use]
     pub fn new(out: impl Into<PathBuf>) -> Self {
-        Self { parts: ResolvedMergeFile { out: out.into(), ..ResolvedMergeFile::default() }, hash: false }
+        Self { parts: ResolvedMergeFile::new(out.into()), hash: false }
     }
 
     /// The merge that a merge file describes; paths in it are relative to its folder.
@@ -101,8 +101,8 @@ impl Merge {
 
     fn start(&self, dry_run: bool) -> Result<Report, Error> {
         let knowledge = knowledge()?;
-        let ResolvedMergeFile { recipe, base, donors, options, out } = self.parts.clone();
-        let recipe = recipe.map(|name| find_recipe(&knowledge.recipes, &name, &base)).transpose()?;
+        let recipe = self.parts.find_recipe(knowledge)?;
+        let ResolvedMergeFile { donors, options, out, .. } = self.parts.clone();
         let request = MergeRequest { recipe, donors, options, out, dry_run, hash: self.hash };
         Ok(run(&request, knowledge, &mut |_, _| {})?.report())
     }

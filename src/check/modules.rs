@@ -26,10 +26,16 @@ impl AutoMapEntry {
     /// Module and class of a well-formed local entry.
     #[must_use]
     pub fn parts(&self) -> Option<(&str, &str)> {
-        let (module, class) = self.target.split_once('.')?;
-        (!class.contains('.') && !self.target.contains("--") && !module.is_empty() && !class.is_empty())
-            .then_some((module, class))
+        local_class(&self.target)
     }
+}
+
+/// Module and class of `module.Class`; `None` for a class of another repository, and for anything else.
+#[must_use]
+pub fn local_class(target: &str) -> Option<(&str, &str)> {
+    let (module, class) = target.split_once('.')?;
+    (!class.contains('.') && !target.contains("--") && !module.is_empty() && !class.is_empty())
+        .then_some((module, class))
 }
 
 /// Documents whose `auto_map` a loader reads.

@@ -87,6 +87,16 @@ pub fn is_keyword(word: &str) -> bool {
     KEYWORDS.contains(&word)
 }
 
+/// Whether a text is a dotted module name in ASCII, such as `package.module`, so that `import` accepts it.
+#[must_use]
+pub fn is_dotted_name(text: &str) -> bool {
+    text.split('.').all(|part| {
+        part.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+            && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+            && !is_keyword(part)
+    })
+}
+
 impl PythonModule {
     /// A module that could not be read at all.
     #[must_use]

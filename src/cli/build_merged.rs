@@ -11,15 +11,14 @@ use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::{library, output, signals};
 use crate::check::Severity;
 use crate::knowledge::Knowledge;
-use crate::knowledge::recipe::Recipe;
 use crate::knowledge::rule::RuleSet;
-use crate::merge::{self, MergeRequest, MergeRun, ResolvedMergeFile, find_recipe};
+use crate::merge::{self, MergeRequest, MergeRun, ResolvedMergeFile};
 use crate::report::model::{MergeStage, Role};
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let knowledge = Knowledge::with(RuleSet::embedded()?, library::with(rules)?)?;
-    let request = request(args, &knowledge.recipes)?;
+    let request = request(args, &knowledge)?;
     signals::install()?;
     let terminal = std::io::stderr().is_terminal();
     let mut last = 0;
@@ -50,11 +49,13 @@ fn result_fails(run: &MergeRun, args: &BuildMergedArgs) -> bool {
     result.is_some_and(|c| c.outcome.findings.iter().any(|f| f.severity >= least))
 }
 
-fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRequest> {
+fn request(args: &BuildMergedArgs, knowledge: &Knowledge) -> anyhow::Result<MergeRequest> {
     let file = args.file.as_deref().map(ResolvedMergeFile::read).transpose()?;
     let out = args.out.clone().or_else(|| file.as_ref().map(|f| f.out.clone()));
-    let ResolvedMergeFile { recipe, base, mut donors, mut options, .. } = file.unwrap_or_default();
-    let recipe = args.recipe.clone().or(recipe);
+    let mut file = file.unwrap_or_default();
+    file.recipe = args.recipe.clone().or(file.recipe);
+    let recipe = file.find_recipe(knowledge)?;
+    let ResolvedMergeFile { mut donors, mut options, .. } = file;
     let short = [("vision", &args.vision), ("language", &args.language)];
     let typed = args.donor.iter().map(|(role, dir)| (role.clone(), PathBuf::from(dir)));
     for (role, dir) in typed.chain(short.into_iter().filter_map(|(r, d)| Some((r.to_owned(), d.clone()?)))) {
@@ -73,7 +74,6 @@ fn request(args: &BuildMergedArgs, recipes: &[Recipe]) -> anyhow::Result<MergeRe
         }
     }
     options.extend(typed);
-    let recipe = recipe.map(|name| find_recipe(recipes, &name, &base)).transpose()?;
     let out = out.context("no output directory given; pass --out DIR")?;
     Ok(MergeRequest { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
 }

@@ -6,13 +6,15 @@
 mod compiled;
 mod functions;
 mod program;
+mod references;
 mod scope;
 mod steps;
 mod template;
 
 pub use compiled::{EvalError, Expression};
 pub(crate) use compiled::{compile_eagerly, compile_lazily};
-pub(crate) use functions::glob;
+pub(crate) use functions::{glob, is_function};
+pub use references::{FunctionCall, References};
 pub use scope::Scope;
 pub(crate) use steps::within;
 pub use template::Template;

@@ -8,6 +8,7 @@ use serde_json::{Map, Value};
 use super::expression::{Expression, Template};
 use super::processor::Let;
 use super::source::{self, DataError};
+use crate::checkpoint::FileName;
 
 /// A recipe, as read from its file in `rules/recipes/`.
 ///
@@ -139,8 +140,8 @@ pub struct SeamTensor {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct DocumentSpec {
-    /// File name.
-    pub name: String,
+    /// File name; it ends in `.json`.
+    pub name: FileName,
     /// Condition for writing the document.
     #[serde(default)]
     pub when: Option<Expression>,
@@ -203,9 +204,9 @@ pub enum TokensForm {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SetEdit {
-    /// JSON pointer.
+    /// JSON pointer. Of the keys that make a loader run code, only `/auto_map` can be set.
     pub at: String,
-    /// The value.
+    /// The value, without the keys that make a loader run code; `auto_map` may name modules of the result only.
     pub to: Expression,
     /// Condition for this entry.
     #[serde(default)]
@@ -219,7 +220,7 @@ pub struct SetEdit {
 pub struct GraftEdit {
     /// JSON pointer.
     pub at: String,
-    /// Role of the donor.
+    /// Role of the donor. Keys that make a loader run code are left out.
     pub from: String,
     /// Keys to leave out: exact names, or prefixes that end in `*`.
     #[serde(default)]
@@ -280,7 +281,7 @@ pub enum FileSpec {
     Template(TemplateSpec),
 }
 
-/// Copies files.
+/// Copies files; a JSON file loses the keys that make a loader run code.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -288,7 +289,7 @@ pub struct CopySpec {
     /// Role of the donor.
     pub from: String,
     /// File names.
-    pub names: Vec<String>,
+    pub names: Vec<FileName>,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
@@ -314,7 +315,7 @@ pub struct ModulesSpec {
 #[serde(deny_unknown_fields)]
 pub struct TemplateSpec {
     /// File name in the result.
-    pub name: String,
+    pub name: FileName,
     /// Path below `rules/recipes/`.
     pub text: String,
     /// Values of placeholders: `{{key}}` becomes the value of the expression.
@@ -336,12 +337,15 @@ pub struct Note {
     pub say: Template,
 }
 
-/// Config keys that make a loader download or run code; no merge copies them from a donor.
+/// The key that names the classes of a checkpoint's own modules.
+pub const AUTO_MAP: &str = "auto_map";
+
+/// Config keys that make a loader download or run code; no document of a merge contains them, except an [`AUTO_MAP`]
+/// that a recipe writes and that names modules of the result.
 ///
-/// `trust_remote_code`: CVE-2026-5241. `_attn_implementation_internal` and related keys: CVE-2026-4372. A recipe that
-/// needs an `auto_map` writes its own.
+/// `trust_remote_code`: CVE-2026-5241. `_attn_implementation_internal` and related keys: CVE-2026-4372.
 pub const CODE_SWITCHES: &[&str] = &[
-    "auto_map",
+    AUTO_MAP,
     "custom_pipelines",
     "trust_remote_code",
     "_attn_implementation",

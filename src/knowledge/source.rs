@@ -33,6 +33,21 @@ impl DataError {
         let place = found.map(|at| line_column(text, at));
         Self { place, ..Self::new(file, reason) }
     }
+
+    /// An error in `file` at the first member `key` of `text` whose value is the string `word`, or else as [`Self::about`].
+    #[must_use]
+    pub fn about_value(file: &str, text: &str, key: &str, word: &str, reason: impl Into<String>) -> Self {
+        let quoted = serde_json::to_string(word).unwrap_or_default();
+        let spelled = quoted.get(1..quoted.len().saturating_sub(1)).unwrap_or_default();
+        let member = |word: &str| {
+            let pattern = format!(r#"\b{}["']?\s*:\s*["']({})["']"#, regex::escape(key), regex::escape(word));
+            let found = regex::Regex::new(&pattern).ok()?.captures(text)?.get(1)?;
+            Some(line_column(text, found.start()))
+        };
+        let other = || Self::about(file, text, if text.contains(word) { word } else { spelled }, "").place;
+        let place = member(word).or_else(|| member(spelled)).or_else(other);
+        Self { place, ..Self::new(file, reason) }
+    }
 }
 
 /// Maximum nesting of a data file. The json5 crate recurses without a limit, so deeper nesting could overflow the
@@ -102,18 +117,25 @@ fn depth(text: &str) -> usize {
 fn readable_cause(cause: &str) -> String {
     let quoted: Vec<&str> = cause.split('`').skip(1).step_by(2).collect();
     match (cause.starts_with("unknown field "), cause.starts_with("unknown variant "), quoted.split_first()) {
-        (true, _, Some((key, known))) => format!("unknown key `{key}`; {}", suggestion(key, known)),
-        (_, true, Some((word, known))) => format!("unknown value `{word}`; {}", suggestion(word, known)),
+        (true, _, Some((key, known))) => format!("unknown key `{key}`; {}", hint(key, known)),
+        (_, true, Some((word, known))) => format!("unknown value `{word}`; {}", hint(word, known)),
         _ => cause.strip_prefix("missing field").map_or_else(|| cause.to_owned(), |key| format!("missing key{key}")),
     }
 }
 
-fn suggestion(word: &str, known: &[&str]) -> String {
-    match nearest(word, known.iter().copied()) {
-        Some(near) => format!("did you mean `{near}`?"),
-        None => format!("expected one of {}", known.join(", ")),
+/// `did you mean `near`?`, or the known words if none is similar.
+#[must_use]
+pub fn hint(word: &str, known: &[&str]) -> String {
+    match (nearest(word, known.iter().copied()), known) {
+        (Some(near), _) => format!("did you mean `{near}`?"),
+        (None, []) => "there is none".to_owned(),
+        (None, known) if known.len() > MANY => format!("none of the {} known names is similar", known.len()),
+        (None, known) => format!("expected one of {}", known.join(", ")),
     }
 }
+
+/// Most words that a hint lists.
+const MANY: usize = 40;
 
 /// Lowest similarity, from 0 to 1, of a suggestion.
 const NEAR: f64 = 0.75;
@@ -160,6 +182,20 @@ pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {
 pub(super) fn embedded_bytes(folder: &str) -> impl Iterator<Item = (&'static str, &'static [u8])> {
     let files = RULES.get_dir(folder).into_iter().flat_map(Dir::files);
     files.filter_map(|file| Some((file.path().to_str()?.rsplit('/').next()?.strip_suffix(".json5")?, file.contents())))
+}
+
+/// Paths below `rules/<folder>` of all embedded files in it and in its subfolders.
+#[must_use]
+pub fn paths(folder: &str) -> Vec<&'static str> {
+    let mut pending: Vec<&Dir<'static>> = RULES.get_dir(folder).into_iter().collect();
+    let mut out = Vec::new();
+    while let Some(dir) = pending.pop() {
+        let paths = dir.files().filter_map(|file| file.path().to_str());
+        out.extend(paths.filter_map(|path| path.strip_prefix(folder)?.strip_prefix('/')));
+        pending.extend(dir.dirs());
+    }
+    out.sort_unstable();
+    out
 }
 
 /// The text of one embedded file, such as a template of a recipe.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value, json};
 
 use super::error::MergeError;
+use super::explain;
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
@@ -43,7 +44,7 @@ impl Context<'_> {
 
     pub(super) fn at(&self, place: impl Into<String>) -> impl FnOnce(EvalError) -> MergeError {
         let (recipe, place) = (self.recipe.recipe.clone(), place.into());
-        move |error| MergeError::Expression { recipe, place, error }
+        move |error| MergeError::Expression { recipe, place, cause: explain::cause(self, &error) }
     }
 
     pub(super) fn holds(&self, when: Option<&Expression>, place: &str) -> Result<bool, MergeError> {

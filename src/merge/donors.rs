@@ -10,6 +10,7 @@ use crate::checkpoint::Checkpoint;
 use crate::checkpoint::open::real_target;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{DonorSpec, Recipe};
+use crate::knowledge::source::hint;
 use crate::report::model::Role;
 use crate::surgery::donor::DonorSnapshot;
 
@@ -69,11 +70,8 @@ pub(super) fn check_roles(recipe: &Recipe, request: &MergeRequest) -> Result<(),
     for role in request.donors.keys() {
         if !recipe.donors.iter().any(|d| d.role == *role) {
             let known: Vec<&str> = recipe.donors.iter().map(|d| d.role.as_str()).collect();
-            return Err(MergeError::Option(format!(
-                "recipe {} has no donor {role}; it has {}",
-                recipe.recipe,
-                known.join(", ")
-            )));
+            let hint = hint(role, &known);
+            return Err(MergeError::Option(format!("recipe {} has no donor {role}; {hint}", recipe.recipe)));
         }
     }
     for spec in recipe.donors.iter().filter(|d| !d.optional) {

@@ -36,16 +36,18 @@ impl MergeDraft {
         parts.shards = self.plan.shards.iter().map(PlannedShard::preview).collect();
         for file in &self.plan.files {
             if file.name.ends_with(".py") {
-                parts.modules.push(PythonModule::parse(file.name.as_str(), &file.bytes));
-            } else if !self.documents.iter().any(|d| d.name == file.name) {
+                parts.modules.push(PythonModule::parse(&*file.name, &file.bytes));
+            } else if !self.documents.iter().any(|d| d.name == *file.name) {
                 if file.name.ends_with(".json") {
-                    parts.documents.push(Document::parse(file.name.as_str(), &file.bytes));
-                } else if VOCABULARY_FILES.contains(&file.name.as_str())
+                    parts.documents.push(Document::parse(&*file.name, &file.bytes));
+                } else if VOCABULARY_FILES.contains(&&*file.name)
                     && let Ok(vocabulary) = Vocabulary::parse(&file.name, &file.bytes)
                 {
-                    parts.vocabularies.insert(file.name.clone(), Arc::new(vocabulary));
+                    parts.vocabularies.insert(file.name.to_string(), Arc::new(vocabulary));
                 }
-                parts.entries.insert(file.name.clone(), Entry { size: file.bytes.len() as u64, ..Entry::default() });
+                parts
+                    .entries
+                    .insert(file.name.to_string(), Entry { size: file.bytes.len() as u64, ..Entry::default() });
             }
         }
         Checkpoint::planned(out, parts)

@@ -3,7 +3,6 @@
 use std::path::PathBuf;
 
 use crate::checkpoint::OpenError;
-use crate::knowledge::EvalError;
 use crate::surgery::ApplyError;
 
 /// Why a recipe could not be turned into a draft. A seam mismatch is not an error.
@@ -16,14 +15,14 @@ pub enum MergeError {
     #[error("{0}")]
     Donor(String),
     /// An expression of the recipe cannot be evaluated with these donors.
-    #[error("recipe {recipe}, {place}: {error}")]
+    #[error("recipe {recipe}, {place}: {cause}")]
     Expression {
         /// Recipe name.
         recipe: String,
         /// Position in the recipe.
         place: String,
-        /// The evaluation error.
-        error: EvalError,
+        /// The cause in words, and the expression with its error.
+        cause: String,
     },
     /// The recipe is faulty.
     #[error("recipe {0}")]

@@ -9,13 +9,17 @@ use super::context::Context;
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::error::MergeError;
+use super::switches;
 use crate::check::modules::relative_modules;
-use crate::checkpoint::Document;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
+use crate::checkpoint::{Document, FileName, INDEX_NAME};
 use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
 use crate::knowledge::source;
 use crate::report::model::MergedFile;
 use crate::surgery::plan::PlannedFile;
+
+/// Name of the index.
+const INDEX: FileName = FileName::constant(INDEX_NAME);
 
 pub(super) fn plan(
     context: &Context<'_>,
@@ -28,13 +32,13 @@ pub(super) fn plan(
             FileSpec::Copy(copy) => {
                 if context.holds(copy.when.as_ref(), "files")? {
                     for name in &copy.names {
-                        files.extend(copy_of(context, &copy.from, name)?);
+                        files.extend(copy_of(context, &copy.from, name, draft)?);
                     }
                 }
             }
             FileSpec::Modules(spec) => {
                 if context.holds(spec.when.as_ref(), "files")? {
-                    files.extend(modules(context, spec)?);
+                    files.extend(modules(context, spec, draft)?);
                 }
             }
             FileSpec::Template(template) => {
@@ -46,7 +50,7 @@ pub(super) fn plan(
     }
     if let Some(index) = index(draft) {
         files.push(PlannedFile {
-            name: index.name.clone(),
+            name: INDEX,
             bytes: bytes_of(&index),
             origin: "generated from the shards".to_owned(),
         });
@@ -54,13 +58,9 @@ pub(super) fn plan(
     }
     // A loader starts at config.json. It is written last, so that an incomplete copy is not mistaken for a checkpoint.
     let (config, others): (Vec<MergedDocument>, Vec<MergedDocument>) =
-        documents.into_iter().partition(|b| b.document.name == "config.json");
+        documents.into_iter().partition(|b| &*b.name == "config.json");
     for merged in others.into_iter().chain(config) {
-        files.push(PlannedFile {
-            name: merged.document.name.clone(),
-            bytes: bytes_of(&merged.document),
-            origin: merged.origin,
-        });
+        files.push(PlannedFile { name: merged.name, bytes: bytes_of(&merged.document), origin: merged.origin });
         draft.documents.push(merged.document);
     }
     let mut seen = BTreeSet::new();
@@ -70,7 +70,7 @@ pub(super) fn plan(
             return Err(MergeError::Recipe(format!("{}: {} would be written twice", context.recipe.recipe, file.name)));
         }
     }
-    draft.files = files.iter().map(|f| MergedFile { name: f.name.clone(), origin: f.origin.clone() }).collect();
+    draft.files = files.iter().map(|f| MergedFile { name: f.name.to_string(), origin: f.origin.clone() }).collect();
     draft.plan.files = files;
     Ok(())
 }
@@ -79,29 +79,37 @@ fn bytes_of(document: &Document) -> Arc<[u8]> {
     document.text.as_deref().unwrap_or_default().as_bytes().into()
 }
 
-/// A donor's file; `None` when the donor lacks it.
-fn copy_of(context: &Context<'_>, role: &str, name: &str) -> Result<Option<PlannedFile>, MergeError> {
+/// A donor's file; `None` when the donor lacks it. A JSON file is copied without the keys that make a loader run code.
+fn copy_of(
+    context: &Context<'_>,
+    role: &str,
+    name: &FileName,
+    draft: &mut MergeDraft,
+) -> Result<Option<PlannedFile>, MergeError> {
     let Some(donor) = context.donor(role) else { return Ok(None) };
     if !donor.checkpoint.has_file(name) {
         return Ok(None);
     }
     let bytes = read_own(&donor.checkpoint.root, name, TOKENIZER_CAP)
         .map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
-    Ok(Some(PlannedFile { name: name.to_owned(), bytes: bytes.into(), origin: format!("{role} donor, unchanged") }))
+    let (bytes, how) = switches::stripped_copy(role, name, &bytes, draft)?
+        .map_or_else(|| (bytes.into(), "unchanged"), |stripped| (stripped, "edited"));
+    Ok(Some(PlannedFile { name: name.clone(), bytes, origin: format!("{role} donor, {how}") }))
 }
 
 /// The root modules and every module that they import, each from the first donor that has it.
-fn modules(context: &Context<'_>, spec: &ModulesSpec) -> Result<Vec<PlannedFile>, MergeError> {
-    let mut found: BTreeMap<String, PlannedFile> = BTreeMap::new();
+fn modules(context: &Context<'_>, spec: &ModulesSpec, draft: &mut MergeDraft) -> Result<Vec<PlannedFile>, MergeError> {
+    let mut found: BTreeMap<FileName, PlannedFile> = BTreeMap::new();
     let mut pending = spec.roots.clone();
     while let Some(module) = pending.pop() {
-        let name = format!("{module}.py");
+        // An import of something that no file name can spell leads to no module of a donor.
+        let Ok(name) = FileName::parse(&format!("{module}.py")) else { continue };
         if found.contains_key(&name) {
             continue;
         }
         for role in &spec.from {
-            let Some(parsed) = context.donor(role).and_then(|d| d.checkpoint.modules.get(&name)) else { continue };
-            if let Some(file) = copy_of(context, role, &name)? {
+            let Some(parsed) = context.donor(role).and_then(|d| d.checkpoint.modules.get(&*name)) else { continue };
+            if let Some(file) = copy_of(context, role, &name, draft)? {
                 pending.extend(relative_modules(parsed));
                 found.insert(name, file);
                 break;
@@ -133,8 +141,8 @@ fn index(draft: &MergeDraft) -> Option<Document> {
     if draft.plan.shards.len() < 2 {
         return None;
     }
-    let map: BTreeMap<&str, &str> = draft.plan.tensors().map(|(s, t)| (t.name.as_str(), s.name.as_str())).collect();
+    let map: BTreeMap<&str, &str> = draft.plan.tensors().map(|(s, t)| (t.name.as_str(), &*s.name)).collect();
     let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k.to_owned(), json!(v))).collect();
     let value = json!({ "metadata": { "total_size": draft.plan.tensor_bytes() }, "weight_map": map });
-    Some(Document::from_value("model.safetensors.index.json", value))
+    Some(Document::from_value(&*INDEX, value))
 }

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::context::{Donor, Options};
 use super::draft::MergeDraft;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, FileName};
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::ToolInfo;
 use crate::surgery::ApplyError;
@@ -14,7 +14,7 @@ use crate::surgery::donor::sha256;
 use crate::surgery::plan::TensorTransform;
 
 /// File name in the merged directory.
-pub(super) const NAME: &str = "merge-manifest.json";
+pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 
 /// `merge-manifest.json`: how a merged checkpoint was made.
 ///
@@ -90,8 +90,8 @@ pub(crate) struct DonorTensor {
     pub shape: Vec<u64>,
 }
 
-/// The manifest of a planned merge. With `all_bytes` whole shards are hashed, otherwise only their headers.
 /// The manifest of a planned merge. With `all_bytes`, whole shards are hashed, otherwise only their headers.
+///
 /// # Errors
 /// When a donor's file cannot be read, or a signal arrived.
 pub(super) fn manifest(
@@ -106,7 +106,7 @@ pub(super) fn manifest(
         let from = t.source.donor();
         TensorOrigin {
             name: t.name.clone(),
-            shard: shard.name.clone(),
+            shard: shard.name.to_string(),
             dtype: t.dtype.name().to_owned(),
             shape: t.shape.clone(),
             transform: t.source.transform(),

@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use super::context::Options;
 use super::error::MergeError;
+use crate::checkpoint::module::is_dotted_name;
 use crate::knowledge::recipe::{OptionSpec, Recipe};
+use crate::knowledge::source::hint;
 
 /// Shard size of a recipe without this option: the default of `save_pretrained`.
 pub(super) const DEFAULT_SHARD: u64 = 5_000_000_000;
@@ -17,8 +19,8 @@ pub(super) fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Resu
     for name in given.keys() {
         if !recipe.options.iter().any(|o| o.name == *name) {
             let known: Vec<&str> = recipe.options.iter().map(|o| o.name.as_str()).collect();
-            let reason = format!("recipe {} has no option {name}; it has {}", recipe.recipe, known.join(", "));
-            return Err(MergeError::Option(reason));
+            let hint = hint(name, &known);
+            return Err(MergeError::Option(format!("recipe {} has no option {name}; {hint}", recipe.recipe)));
         }
     }
     recipe
@@ -32,13 +34,17 @@ pub(super) fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Resu
         .collect()
 }
 
-fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
+/// Checks a value of an option.
+///
+/// # Errors
+/// [`MergeError::Option`] with the allowed values.
+pub(super) fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
     if spec.values.is_empty() {
         return parse_size(value).map(drop);
     }
     let takes = |v: &String| match v.strip_suffix(':') {
         // The argument after the colon becomes part of a Python import, so it must be a dotted module path.
-        Some(head) => value.strip_prefix(head).and_then(|t| t.strip_prefix(':')).is_some_and(is_module_path),
+        Some(head) => value.strip_prefix(head).and_then(|t| t.strip_prefix(':')).is_some_and(is_dotted_name),
         None => v == value,
     };
     if spec.values.iter().any(takes) {
@@ -47,13 +53,6 @@ fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
     let forms: Vec<String> =
         spec.values.iter().map(|v| if v.ends_with(':') { format!("{v}PACKAGE") } else { v.clone() }).collect();
     Err(MergeError::Option(format!("{}={value} is not one of {}", spec.name, forms.join(", "))))
-}
-
-fn is_module_path(text: &str) -> bool {
-    text.split('.').all(|part| {
-        part.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
-            && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-    })
 }
 
 /// Bytes of a size such as `5GB` (5·10⁹), `300MiB` (300·2²⁰) or `1000`; at least one.
@@ -96,9 +95,9 @@ mod tests {
 
     #[test]
     fn packages_are_module_paths() {
-        assert!(is_module_path("pkg.sub_mod"));
-        for bad in ["", ".x", "a..b", "a;import os", "a b", "1a", "a\n"] {
-            assert!(!is_module_path(bad), "{bad}");
+        assert!(is_dotted_name("pkg.sub_mod.match"));
+        for bad in ["", ".x", "a..b", "a;import os", "a b", "1a", "a\n", "a.import.b", "None", "a.True"] {
+            assert!(!is_dotted_name(bad), "{bad}");
         }
     }
 }

@@ -112,24 +112,19 @@ impl MergeRun {
     /// The report of the run.
     #[must_use]
     pub fn report(&self) -> Report {
-        self.report_with(|path| path.display().to_string())
+        self.report_with(self.record.clone(), |checked| checked.path.display().to_string())
     }
 
-    /// The report with only the last component of each directory, for the file inside the result.
+    /// The report without the names of directories, for the file inside the result: the same merge of donors that lie
+    /// elsewhere has the same bytes. The manifest identifies the donors by hashes.
     pub(super) fn portable_report(&self) -> Report {
-        self.report_with(|path| match path.file_name() {
-            Some(name) => name.to_string_lossy().into_owned(),
-            None => path.display().to_string(),
-        })
+        let record = MergeReport { out: String::new(), donors: BTreeMap::new(), ..self.record.clone() };
+        self.report_with(record, |checked| checked.role.to_string())
     }
 
-    fn report_with(&self, name: impl Fn(&Path) -> String) -> Report {
-        let checkpoint = |c: &CheckedCheckpoint| {
-            CheckpointReport::new(name(&c.path), Some(c.role.clone()), &c.checkpoint, &c.outcome)
-        };
-        let mut record = self.record.clone();
-        record.out = name(Path::new(&record.out));
-        record.donors = record.donors.iter().map(|(role, dir)| (role.clone(), name(Path::new(dir)))).collect();
+    fn report_with(&self, record: MergeReport, name: impl Fn(&CheckedCheckpoint) -> String) -> Report {
+        let checkpoint =
+            |c: &CheckedCheckpoint| CheckpointReport::new(name(c), Some(c.role.clone()), &c.checkpoint, &c.outcome);
         Report::new(self.checked.iter().map(checkpoint).collect(), Some(record))
     }
 }

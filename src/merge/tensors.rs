@@ -9,6 +9,8 @@ use super::context::{Context, Donor};
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::error::MergeError;
+use super::explain;
+use super::run::count;
 use crate::checkpoint::{Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Library, Loader};
@@ -43,6 +45,9 @@ pub(super) fn plan(
 ) -> Result<(), MergeError> {
     let rules = rules(context)?;
     let (taken, dropped) = take(context.donors, &rules);
+    if taken.is_empty() {
+        return Err(nothing_taken(context, &rules));
+    }
     draft.dropped = dropped;
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.tensor.shape.clone()))).collect();
     let names = taken.iter().map(|t| t.name.as_str());
@@ -70,6 +75,27 @@ pub(super) fn plan(
     tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
     draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
     Ok(())
+}
+
+/// The reason why the result would have no tensor.
+fn nothing_taken(context: &Context<'_>, rules: &[TensorRule<'_>]) -> MergeError {
+    let kept = || rules.iter().filter(|rule| rule.spec.drop.is_none());
+    let donor = |donor: &&Donor| kept().any(|rule| rule.spec.from == donor.role);
+    let reason = |donor: &Donor| {
+        let role = &donor.role;
+        explain::without_tensors(donor).map_or_else(
+            || {
+                let patterns: Vec<&str> =
+                    kept().filter(|rule| rule.spec.from == *role).map(|rule| rule.spec.names.as_str()).collect();
+                let count = count(donor.checkpoint.tensors().count(), "tensor", "tensors");
+                format!("none of the {role} donor's {count} is taken by {}", patterns.join(", "))
+            },
+            |reason| format!("the {role} donor has no tensors: {reason}"),
+        )
+    };
+    let reasons: Vec<String> = context.donors.iter().filter(donor).map(reason).collect();
+    let reasons = if reasons.is_empty() { "no entry of `tensors` applies".to_owned() } else { reasons.join("; ") };
+    MergeError::Donor(format!("recipe {}: the result would have no tensors: {reasons}", context.recipe.recipe))
 }
 
 /// The tensors that the recipe selects, and the others.

@@ -1,5 +1,5 @@
-//! Renders reports as Markdown. The output contains no times and, for a merge, no directories, so that
-//! `merge-report.md` inside a merged checkpoint is reproducible.
+//! Renders reports as Markdown. The output contains no times, so that `merge-report.md` inside a merged checkpoint is
+//! reproducible; the merge omits the names of directories from it.
 
 use std::fmt::Write as _;
 
@@ -185,8 +185,10 @@ fn groups(out: &mut String, title: &str, groups: &[NameGroup], cap: usize) {
 
 fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
     let _ok = writeln!(out, "# Merge report: {}", text_name(&merge.recipe));
-    let donors: Vec<_> = merge.donors.iter().map(|(role, path)| [text_name(role), code(&name(last(path)))]).collect();
-    table(out, ["donor", "directory"], &donors, cap);
+    if !merge.donors.is_empty() {
+        let donors = merge.donors.iter().map(|(role, path)| [text_name(role), code(&name(last(path)))]);
+        table(out, ["donor", "directory"], &donors.collect::<Vec<_>>(), cap);
+    }
     if !merge.options.is_empty() {
         let options: Vec<_> = merge.options.iter().map(|(k, v)| [text_name(k), code(&name(v))]).collect();
         table(out, ["option", "value"], &options, cap);

@@ -18,7 +18,7 @@ pub struct MergeReport {
     pub stage: Option<MergeStage>,
     /// The output directory.
     pub out: String,
-    /// Directories of the donors, by role.
+    /// Directories of the donors, by role; empty in the report that is written into the result.
     pub donors: BTreeMap<String, String>,
     /// Options in effect, defaults included.
     pub options: BTreeMap<String, String>,

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::checkpoint::{Dtype, Shard, Tensor, byte_len};
+use crate::checkpoint::{Dtype, FileName, Shard, Tensor, byte_len};
 
 /// A checkpoint to be written.
 #[derive(Debug, Clone, Default)]
@@ -24,7 +24,7 @@ pub struct Plan {
 #[derive(Debug, Clone)]
 pub struct PlannedFile {
     /// Name in the target directory.
-    pub name: String,
+    pub name: FileName,
     /// Its bytes.
     pub bytes: Arc<[u8]>,
     /// Origin, for the report.
@@ -35,7 +35,7 @@ pub struct PlannedFile {
 #[derive(Debug, Clone)]
 pub struct PlannedShard {
     /// Name in the target directory.
-    pub name: String,
+    pub name: FileName,
     /// Tensors in the order of their bytes.
     pub tensors: Vec<PlannedTensor>,
     /// `__metadata__`; transformers refuses a shard without `format` in it.
@@ -111,6 +111,9 @@ pub enum TensorTransform {
 }
 
 impl TensorTransform {
+    /// All transforms.
+    pub const ALL: [Self; 4] = [Self::Copy, Self::GrowRows, Self::Pad, Self::Reinit];
+
     /// The name in recipes, options and reports.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -218,7 +221,7 @@ impl PlannedShard {
             })
             .collect();
         Shard {
-            name: self.name.clone(),
+            name: self.name.to_string(),
             file_len: data_start.saturating_add(at),
             data_start,
             tensors,
@@ -276,12 +279,7 @@ pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard>
         .enumerate()
         .map(|(i, mut tensors)| {
             tensors.sort_by(|a, b| b.dtype.cmp(&a.dtype).then_with(|| a.name.cmp(&b.name)));
-            let name = if count == 1 {
-                "model.safetensors".to_owned()
-            } else {
-                format!("model-{:05}-of-{count:05}.safetensors", i.saturating_add(1))
-            };
-            PlannedShard { name, tensors, metadata: format_pt() }
+            PlannedShard { name: FileName::shard(i.saturating_add(1), count), tensors, metadata: format_pt() }
         })
         .collect()
 }

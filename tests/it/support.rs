@@ -8,7 +8,7 @@ mod base;
 mod change;
 pub mod data;
 pub mod invariants;
-mod weights;
+pub mod weights;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;

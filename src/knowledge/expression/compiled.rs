@@ -115,7 +115,7 @@ impl Expression {
         Ok(expression)
     }
 
-    fn program(&self) -> Result<&Program, &str> {
+    pub(super) fn program(&self) -> Result<&Program, &str> {
         let program = self.0.program.get_or_init(|| Program::compile(&self.0.source, self.0.counted));
         program.as_ref().map_err(String::as_str)
     }

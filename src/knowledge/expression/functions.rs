@@ -5,6 +5,7 @@ use cel::common::value::Val;
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 use serde_json::Value;
 
+use super::compiled::{EvalError, Expression};
 use super::scope::{Scope, plain};
 use super::steps;
 use crate::checkpoint::file_size;
@@ -31,6 +32,17 @@ impl Default for Scope<'static> {
     fn default() -> Self {
         Self::new()
     }
+}
+
+/// Whether expressions of data files have a function of this name, of CEL or of this module.
+///
+/// The crate does not list its functions, so one is called: an unknown one is an undeclared reference.
+pub(crate) fn is_function(name: &str) -> bool {
+    let scope = Scope::new();
+    let undeclared = |error: EvalError| error.cause.starts_with("Undeclared reference");
+    let unknown = |call: String| Expression::parse(&call).is_ok_and(|call| call.eval(&scope).is_err_and(undeclared));
+    // Some are functions of a string only: `text.startsWith(other)`.
+    !unknown(format!("{name}()")) || !unknown(format!("''.{name}('')"))
 }
 
 /// Adds all functions to a root scope.
@@ -221,4 +233,21 @@ pub(crate) fn glob(name: &str, pattern: &str) -> bool {
         }
     }
     pattern.get(p..).is_some_and(|rest| rest.iter().all(|c| *c == '*'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_function;
+
+    #[test]
+    fn functions_are_told_from_unknown_names() {
+        for name in
+            ["size", "startsWith", "contains", "matches", "int", "string", "double", "type", "get", "min", "pow"]
+        {
+            assert!(is_function(name), "{name}");
+        }
+        for name in ["shap", "len", "exec"] {
+            assert!(!is_function(name), "{name}");
+        }
+    }
 }

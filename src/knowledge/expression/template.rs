@@ -90,7 +90,6 @@ impl Template {
     }
 
     /// The expressions of its placeholders, in order.
-    #[cfg(any(test, feature = "internals"))]
     pub fn expressions(&self) -> impl Iterator<Item = &Expression> {
         self.pieces.iter().filter_map(|piece| match piece {
             Piece::Value(expression) => Some(expression),

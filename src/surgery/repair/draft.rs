@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
-use crate::checkpoint::{Checkpoint, Document, Parts, PythonModule, Splice, spliced};
+use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
 /// Result of applying the edits of one fix.
@@ -300,7 +300,7 @@ impl RepairDraft {
             }),
         });
         let metadata = shard.metadata.clone().unwrap_or_default();
-        Some(PlannedShard { name: file.to_owned(), tensors: tensors.collect(), metadata })
+        Some(PlannedShard { name: FileName::parse(file).ok()?, tensors: tensors.collect(), metadata })
     }
 
     fn header(&mut self, file: &str) -> Option<()> {

@@ -1,0 +1,93 @@
+//! Explains in words why an expression of a recipe cannot be evaluated with these donors.
+
+use serde_json::Value;
+
+use super::context::{Context, Donor};
+use crate::knowledge::expression::FunctionCall;
+use crate::knowledge::source::hint;
+use crate::knowledge::{EvalError, Expression};
+
+/// The cause of an error as one sentence, then the expression with the error of the expression language, which is written
+/// for authors of expressions.
+pub(super) fn cause(context: &Context<'_>, error: &EvalError) -> String {
+    let references = Expression::parse(&error.source_text).map(|e| e.references()).unwrap_or_default();
+    let missing_value = || references.paths.iter().find_map(|path| missing_value(context, path));
+    let missing_tensor = || references.calls.iter().find_map(|call| missing_tensor(context, call));
+    let words = missing_value().or_else(missing_tensor).or_else(|| in_words(&error.cause).map(str::to_owned));
+    words.map_or_else(|| error.to_string(), |words| format!("{words} ({error})"))
+}
+
+/// The first key of a path that a donor's config lacks.
+fn missing_value(context: &Context<'_>, path: &[String]) -> Option<String> {
+    let (role, keys) = path.split_first()?;
+    let spec = context.recipe.donors.iter().find(|spec| spec.role == *role)?;
+    let Some(donor) = context.donor(role) else {
+        return Some(format!("no {role} donor is given, {}; pass --donor {role}=DIR", spec.what));
+    };
+    let mut here = &donor.config;
+    if here.is_null() && !keys.is_empty() {
+        return Some(format!("the {role} donor has no readable config.json"));
+    }
+    let mut place = String::new();
+    for key in keys {
+        let Value::Object(map) = here else {
+            let null = || format!("{} of the {role} donor's config.json is null", place.trim_end_matches('.'));
+            return here.is_null().then(null);
+        };
+        let Some(value) = map.get(key) else {
+            let known: Vec<&str> = map.keys().map(String::as_str).collect();
+            let hint = hint(key, &known);
+            return Some(format!("the {role} donor's config.json has no {place}{key}; {hint}"));
+        };
+        here = value;
+        place.push_str(key);
+        place.push('.');
+    }
+    here.is_null().then(|| format!("{} of the {role} donor's config.json is null", place.trim_end_matches('.')))
+}
+
+/// The tensor that a call of `shape` names and the donor lacks.
+fn missing_tensor(context: &Context<'_>, call: &FunctionCall) -> Option<String> {
+    let (true, [Some(role), Some(name)]) = (call.function == "shape", call.arguments.as_slice()) else { return None };
+    let Some(donor) = context.donor(role) else { return Some(format!("no {role} donor is given")) };
+    if donor.checkpoint.tensor(name).is_some() {
+        return None;
+    }
+    let reason = without_tensors(donor).map(|reason| format!(": {reason}")).unwrap_or_default();
+    Some(format!("the {role} donor has no tensor {name}{reason}"))
+}
+
+/// File name extensions of weights that are read by running them.
+const PICKLES: [&str; 5] = [".bin", ".pt", ".pth", ".ckpt", ".pkl"];
+
+/// The reason why no tensor of the donor was read; `None` when it has tensors.
+pub(super) fn without_tensors(donor: &Donor) -> Option<String> {
+    if donor.checkpoint.tensors().next().is_some() {
+        return None;
+    }
+    let pickle = donor.checkpoint.entries.keys().find(|name| PICKLES.iter().any(|end| name.ends_with(end)));
+    Some(pickle.map_or_else(
+        || "it has no safetensors file with a tensor in it".to_owned(),
+        |pickle| {
+            format!(
+                "its weights are in {pickle}, which is not read because that runs code; convert it where running its code is safe: from_pretrained(DIR).save_pretrained(NEW_DIR, safe_serialization=True)"
+            )
+        },
+    ))
+}
+
+/// An error of the crate `cel` as a sentence; `None` for the errors of this program, which are sentences.
+fn in_words(cause: &str) -> Option<&'static str> {
+    const WORDS: [(&str, &str); 9] = [
+        ("No such key", "a value has no such key"),
+        ("found no matching overload", "a value is missing, or of another type than the expression needs"),
+        ("Unexpected type", "a value is missing, or of another type than the expression needs"),
+        ("Unable to use value", "a value cannot be used as a key"),
+        ("Undeclared reference", "a name is not defined"),
+        ("Index out of bounds", "a list is shorter than the expression needs"),
+        ("Division by zero", "a divisor is zero"),
+        ("Remainder by zero", "a divisor is zero"),
+        ("Overflow", "a number exceeds 64 bits"),
+    ];
+    WORDS.iter().find(|(start, _)| cause.starts_with(start)).map(|(_, words)| *words)
+}

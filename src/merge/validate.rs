@@ -1,0 +1,165 @@
+//! Validates a user's recipe as a whole, before a donor is opened: every name in it must lead somewhere.
+//!
+//! What depends on donors, such as the keys of their configs, is checked while the merge is planned.
+
+mod expressions;
+mod files;
+mod places;
+
+use std::collections::BTreeSet;
+
+use regex::Regex;
+
+use super::options;
+use crate::knowledge::Knowledge;
+use crate::knowledge::recipe::{OptionSpec, Recipe, SeamTensor};
+use crate::knowledge::source::{DataError, hint};
+
+/// Names of the scope of expressions that no role and no `let` may take.
+const RESERVED: [&str; 9] = ["opt", "arg", "tokens", "processor", "preprocessor", "true", "false", "null", "in"];
+
+/// A recipe with its text, for the places of errors.
+struct Validator<'a> {
+    path: &'a str,
+    text: &'a str,
+    recipe: &'a Recipe,
+    knowledge: &'a Knowledge,
+}
+
+/// Validates a recipe that was parsed from `text`, the content of the file `path`.
+///
+/// # Errors
+/// [`DataError`] with the file, the place, the unknown or misused word, and the nearest known one.
+pub fn validate(recipe: &Recipe, path: &str, text: &str, knowledge: &Knowledge) -> Result<(), DataError> {
+    let validator = Validator { path, text, recipe, knowledge };
+    validator.roles()?;
+    validator.options()?;
+    validator.tokens()?;
+    validator.tensors()?;
+    validator.files()?;
+    validator.expressions()
+}
+
+impl Validator<'_> {
+    /// An error at the first member `key` with the value `word`.
+    fn wrong(&self, key: &str, word: &str, reason: impl Into<String>) -> DataError {
+        DataError::about_value(self.path, self.text, key, word, reason)
+    }
+
+    /// Fails unless `word`, the value of `key`, is among the known words of a kind.
+    fn known(&self, key: &str, what: &str, word: &str, known: &[&str]) -> Result<(), DataError> {
+        if known.contains(&word) {
+            return Ok(());
+        }
+        Err(self.wrong(key, word, format!("unknown {what} `{word}`; {}", hint(word, known))))
+    }
+
+    fn role_names(&self) -> Vec<&str> {
+        self.recipe.donors.iter().map(|donor| donor.role.as_str()).collect()
+    }
+
+    fn role(&self, key: &str, role: &str) -> Result<(), DataError> {
+        self.known(key, "role", role, &self.role_names())
+    }
+
+    /// Roles are names of variables and of the command line; architectures and tolerated rules exist.
+    fn roles(&self) -> Result<(), DataError> {
+        let architectures: Vec<&str> = self.knowledge.library.names().collect();
+        let rules: Vec<&str> = self.knowledge.rules.all().map(|rule| rule.code.as_str()).collect();
+        let mut seen = BTreeSet::new();
+        for donor in &self.recipe.donors {
+            self.name("role", &donor.role)?;
+            if !seen.insert(donor.role.as_str()) {
+                return Err(self.wrong("role", &donor.role, format!("the role `{}` is defined twice", donor.role)));
+            }
+            for architecture in &donor.architectures {
+                self.known("architectures", "architecture", architecture, &architectures)?;
+            }
+            for code in &donor.tolerates {
+                if let Some(current) = self.knowledge.rules.catalogue.current(code) {
+                    let reason = format!("the rule {code} is retired; write {current}");
+                    return Err(self.wrong("tolerates", code, reason));
+                }
+                self.known("tolerates", "rule", code, &rules)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// A role or a name of `let`: a variable of expressions that no other variable hides.
+    fn name(&self, key: &str, name: &str) -> Result<(), DataError> {
+        let word = |name: &str| {
+            name.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+                && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+        };
+        if !word(name) {
+            let reason = format!("`{name}` cannot be used in expressions; write letters, digits and `_`");
+            return Err(self.wrong(key, name, reason));
+        }
+        if RESERVED.contains(&name) {
+            return Err(self.wrong(key, name, format!("`{name}` has a meaning in expressions; choose another name")));
+        }
+        Ok(())
+    }
+
+    fn options(&self) -> Result<(), DataError> {
+        let mut seen = BTreeSet::new();
+        for option in &self.recipe.options {
+            if !seen.insert(option.name.as_str()) {
+                return Err(self.wrong("name", &option.name, format!("the option `{}` is defined twice", option.name)));
+            }
+            options::check(option, &option.default)
+                .map_err(|error| self.wrong("default", &option.default, format!("the default: {error}")))?;
+        }
+        let seams = self.recipe.seams.iter().flat_map(|seam| &seam.options);
+        for advice in seams.chain(self.recipe.tensors.iter().flat_map(|tensor| &tensor.options)) {
+            self.advice(advice)?;
+        }
+        Ok(())
+    }
+
+    /// An `OPTION=VALUE` that a seam suggests.
+    fn advice(&self, advice: &str) -> Result<(), DataError> {
+        let (name, value) = advice.split_once('=').unwrap_or((advice, ""));
+        let names: Vec<&str> = self.recipe.options.iter().map(|option| option.name.as_str()).collect();
+        let of_name = |option: &&OptionSpec| option.name == name;
+        let Some(option) = self.recipe.options.iter().find(of_name) else {
+            let reason = format!("unknown option `{name}` in `{advice}`; {}", hint(name, &names));
+            return Err(self.wrong("options", advice, reason));
+        };
+        options::check(option, value).map_err(|error| self.wrong("options", advice, error.to_string()))
+    }
+
+    fn tokens(&self) -> Result<(), DataError> {
+        let Some(tokens) = &self.recipe.tokens else { return Ok(()) };
+        self.role("base", &tokens.base)?;
+        let known: Vec<&str> = self.knowledge.processors.iter().map(|p| p.processor.as_str()).collect();
+        self.known("processor", "processor", &tokens.processor, &known)
+    }
+
+    fn tensors(&self) -> Result<(), DataError> {
+        for tensor in &self.recipe.tensors {
+            self.role("from", &tensor.from)?;
+            self.seam_tensor(tensor.meets.as_ref())?;
+            if let Err(error) = Regex::new(&tensor.names) {
+                let error = error.to_string();
+                let cause = error.lines().last().unwrap_or_default().trim_start_matches("error: ");
+                let reason = format!("`{}` is not a regular expression: {cause}", tensor.names);
+                return Err(self.wrong("names", &tensor.names, reason));
+            }
+        }
+        for seam in &self.recipe.seams {
+            self.seam_tensor(seam.tensor.as_ref())?;
+            self.seam_tensor(seam.meets.as_ref())?;
+        }
+        if self.recipe.tensors.iter().all(|tensor| tensor.drop.is_some()) {
+            let reason = "`tensors` takes no tensor from any donor; add an entry without `drop`";
+            return Err(DataError::about(self.path, self.text, "tensors", reason));
+        }
+        Ok(())
+    }
+
+    fn seam_tensor(&self, tensor: Option<&SeamTensor>) -> Result<(), DataError> {
+        tensor.map_or(Ok(()), |tensor| self.role("from", &tensor.from))
+    }
+}

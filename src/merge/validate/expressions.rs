@@ -1,0 +1,147 @@
+//! Validates the expressions of a recipe: variables, options, roles and functions that they use.
+
+use std::collections::BTreeSet;
+
+use super::Validator;
+use crate::knowledge::expression::{FunctionCall, References, is_function};
+use crate::knowledge::recipe::{DocumentEdit, FileSpec};
+use crate::knowledge::source::{DataError, hint, nearest};
+use crate::knowledge::{Expression, Template};
+use crate::surgery::plan::TensorTransform;
+
+/// Names of CEL's types, which expressions may compare with `type(…)`.
+const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
+
+/// Functions of a merge's scope, with a role as the first argument.
+const ROLE_FUNCTIONS: [&str; 2] = ["shape", "has"];
+
+impl Validator<'_> {
+    pub(super) fn expressions(&self) -> Result<(), DataError> {
+        let mut variables: BTreeSet<&str> = self.role_names().into_iter().collect();
+        variables.extend(["opt", "arg", "processor", "preprocessor"]);
+        variables.extend(self.recipe.tokens.iter().map(|_| "tokens"));
+        for item in &self.recipe.lets {
+            self.name("name", &item.name)?;
+            self.expression("is", &item.is, &variables)?;
+            if !variables.insert(&item.name) {
+                return Err(self.wrong("name", &item.name, format!("the name `{}` is defined twice", item.name)));
+            }
+        }
+        self.all(|key, expression| self.expression(key, expression, &variables))?;
+        for fit in self.recipe.tensors.iter().filter_map(|tensor| tensor.fit.as_ref()) {
+            self.fit(fit)?;
+        }
+        Ok(())
+    }
+
+    /// Calls `check` with each expression outside of `let`, and the key that it is the value of.
+    fn all<'e>(
+        &'e self,
+        check: impl Fn(&'static str, &'e Expression) -> Result<(), DataError>,
+    ) -> Result<(), DataError> {
+        let some = |key, expression: Option<&'e Expression>| expression.map_or(Ok(()), |e| check(key, e));
+        let template = |key, text: &'e Template| text.expressions().try_for_each(|e| check(key, e));
+        for seam in &self.recipe.seams {
+            check("that", &seam.that)?;
+            template("message", &seam.message)?;
+            some("needed", seam.needed.as_ref())?;
+        }
+        for document in &self.recipe.documents {
+            some("when", document.when.as_ref())?;
+            for edit in &document.edits {
+                match edit {
+                    DocumentEdit::Set(set) => {
+                        check("to", &set.to)?;
+                        some("when", set.when.as_ref())?;
+                    }
+                    DocumentEdit::Remove(remove) => some("when", remove.when.as_ref())?,
+                    DocumentEdit::Tokens(tokens) => some("when", tokens.when.as_ref())?,
+                    DocumentEdit::Graft(_) => {}
+                }
+            }
+        }
+        for tensor in &self.recipe.tensors {
+            some("when", tensor.when.as_ref())?;
+            some("fit", tensor.fit.as_ref())?;
+            tensor.rename.as_ref().map_or(Ok(()), |rename| template("as", rename))?;
+        }
+        for file in &self.recipe.files {
+            match file {
+                FileSpec::Copy(copy) => some("when", copy.when.as_ref())?,
+                FileSpec::Modules(modules) => some("when", modules.when.as_ref())?,
+                FileSpec::Template(text) => {
+                    some("when", text.when.as_ref())?;
+                    text.fill.values().try_for_each(|expression| check("fill", expression))?;
+                }
+            }
+        }
+        self.recipe.notes.iter().try_for_each(|note| {
+            check("when", &note.when)?;
+            template("say", &note.say)
+        })
+    }
+
+    fn expression(&self, key: &str, expression: &Expression, variables: &BTreeSet<&str>) -> Result<(), DataError> {
+        let wrong = |reason: String| Err(self.wrong(key, expression.source(), reason));
+        let References { paths, calls, .. } = expression.references();
+        for path in &paths {
+            if let Some(reason) = self.unknown_name(path, variables) {
+                return wrong(reason);
+            }
+        }
+        for FunctionCall { function, arguments } in &calls {
+            if !ROLE_FUNCTIONS.contains(&function.as_str()) && !is_function(function) {
+                let near = nearest(function, ROLE_FUNCTIONS).map(|near| format!("; did you mean `{near}`?"));
+                return wrong(format!("unknown function `{function}`{}", near.unwrap_or_default()));
+            }
+            let role = arguments.first().and_then(Option::as_deref).filter(|_| arguments.len() == 2);
+            if let Some(role) = role.filter(|_| ROLE_FUNCTIONS.contains(&function.as_str()))
+                && !self.role_names().contains(&role)
+            {
+                return wrong(format!("unknown role `{role}` in {function}(…); {}", hint(role, &self.role_names())));
+            }
+        }
+        Ok(())
+    }
+
+    /// The error about a path whose variable, or whose key of `opt`, `arg` or `tokens`, is unknown.
+    fn unknown_name(&self, path: &[String], variables: &BTreeSet<&str>) -> Option<String> {
+        let (variable, keys) = path.split_first()?;
+        let unknown =
+            |what: &str, word: &str, known: &[&str]| Some(format!("unknown {what} `{word}`; {}", hint(word, known)));
+        if !variables.contains(variable.as_str()) && !TYPES.contains(&variable.as_str()) {
+            if variable == "tokens" {
+                return Some("`tokens` is defined only in a recipe with the key `tokens`; add it".to_owned());
+            }
+            return unknown("name", variable, &variables.iter().copied().collect::<Vec<_>>());
+        }
+        let key = keys.first()?;
+        let (what, known) = match variable.as_str() {
+            "opt" | "arg" => ("option", self.recipe.options.iter().map(|option| option.name.as_str()).collect()),
+            "tokens" => ("key of `tokens`", self.token_keys()),
+            _ => return None,
+        };
+        if known.contains(&key.as_str()) { None } else { unknown(what, key, &known) }
+    }
+
+    /// The keys of `tokens`: see `OpenedTokenizer::summary`.
+    fn token_keys(&self) -> Vec<&str> {
+        let name = self.recipe.tokens.as_ref().map(|tokens| tokens.processor.as_str());
+        let processor = self.knowledge.processors.iter().find(|processor| Some(processor.processor.as_str()) == name);
+        let lets = processor.iter().flat_map(|p| &p.lets).map(|item| item.name.as_str());
+        let runs = processor.iter().flat_map(|p| &p.add).filter_map(|run| run.name.as_deref());
+        ["length", "scattered"].into_iter().chain(lets).chain(runs).collect()
+    }
+
+    /// The strings in `fit` that may be its value.
+    fn fit(&self, fit: &Expression) -> Result<(), DataError> {
+        let known = TensorTransform::ALL.map(TensorTransform::name);
+        match fit.references().results.iter().find(|result| !known.contains(&result.as_str())) {
+            Some(word) => {
+                let reason = format!("unknown treatment `{word}` in `fit`; {}", hint(word, &known));
+                Err(self.wrong("fit", fit.source(), reason))
+            }
+            None => Ok(()),
+        }
+    }
+}
