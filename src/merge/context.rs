@@ -37,8 +37,8 @@ pub(super) struct Context<'a> {
     processors: &'a [Processor],
 }
 
-impl Context<'_> {
-    pub(super) fn donor(&self, role: &str) -> Option<&Donor> {
+impl<'a> Context<'a> {
+    pub(super) fn donor(&self, role: &str) -> Option<&'a Donor> {
         self.donors.iter().find(|d| d.role == role)
     }
 

@@ -121,7 +121,7 @@ impl<'a> ModuleReader<'a> {
 
     /// Records the facts of one node; returns the context for its children, or `None` to skip them.
     fn visit(&mut self, node: Node<'_>, scope: StatementContext) -> Option<StatementContext> {
-        // The grammar takes a keyword for a name where no keyword can stand: `import a.class`.
+        // The grammar takes `async` and `await` for names, as Python before 3.7 did.
         let keyword = node.kind() == "identifier" && is_keyword(self.str(node));
         if node.is_error() || node.is_missing() || keyword {
             let start = node.start_byte();

@@ -67,6 +67,7 @@ fn cases() -> Vec<Case> {
         case("empty", &[], b""),
         case("broken", &[FaultKind::PythonSyntax], b"class A(:\n    pass\n"),
         case("keyword in a dotted name", &[FaultKind::PythonSyntax], b"from a.import.b import x\n"),
+        case("keyword of newer versions", &[FaultKind::PythonSyntax], b"async = 1\n"),
         case("keyword as an attribute", &[FaultKind::PythonSyntax], b"x = a.None\n"),
         case("broken import", &[FaultKind::PythonSyntax], b"from a import (b c)\n"),
         case("broken call", &[FaultKind::PythonSyntax], b"f(a b)\n"),

@@ -30,7 +30,7 @@ fn sound() -> Value {
         "let": [{ "name": "hidden", "is": "a.hidden_size" }, { "name": "own", "is": "opt.alias == 'own'" }],
         "documents": [
             { "name": "config.json", "from": "a", "edits": [{ "set": { "at": "/hidden_size", "to": "hidden" } }] },
-            { "name": "generation_config.json", "from": "b", "optional": true },
+            { "name": "generation_config.json", "from": "b", "optional": true, "edits": [] },
         ],
         "tensors": [{ "from": "a", "names": "." }],
         "files": [
