@@ -80,7 +80,11 @@ impl Validator<'_> {
 
     fn template(&self, template: &TemplateSpec) -> Result<(), DataError> {
         self.free("name", &template.name)?;
-        let templates = source::paths("recipes").into_iter().filter(|path| !path.ends_with(".json5"));
+        if !template.name.ends_with(".py") {
+            let reason = format!("{} is a Python module, so its name must end in .py", template.name);
+            return Err(self.wrong("name", &template.name, reason));
+        }
+        let templates = source::paths("recipes").into_iter().filter(|path| path.ends_with(".py"));
         self.known("text", "template", &template.text, &templates.collect::<Vec<_>>())
     }
 }

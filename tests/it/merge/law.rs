@@ -111,8 +111,9 @@ fn published(out: &Path, report: &Report) {
     for name in others {
         assert!(!name.starts_with('.'), "{name}");
         if name.ends_with(".py") {
-            // These two do not compile, whatever the parser says.
-            assert!(!["broken.py", "keyword.py"].contains(&name), "{name}");
+            // These two of the donors do not compile, whatever the parser says.
+            let text = String::from_utf8_lossy(bytes(name));
+            assert!(!text.contains("def serve(") && !text.contains("a.import.b"), "{name}: {text}");
             assert_eq!(PythonModule::parse(name, bytes(name)).faults, [], "{name}");
         } else if name.to_lowercase().ends_with(".json") {
             let value: Value = serde_json::from_slice(bytes(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
