@@ -1,7 +1,7 @@
 //! The law of merges, for generated recipes and options: a merge writes inside its target or nothing, and what it
 //! publishes runs no code of a donor's choice.
 //!
-//! The recipes follow from a seed. `cargo test` runs some hundreds; `CKPT_DOCTOR_MUTATIONS=100000` sets the number.
+//! The recipes follow from a seed. `cargo test` runs some hundreds; `CKPT_DOCTOR_LAWS=100000` sets the number.
 
 mod donors;
 mod recipes;
@@ -148,7 +148,7 @@ fn no_switches(name: &str, document: &Value, published: &BTreeSet<&str>) {
 
 #[test]
 fn a_merge_writes_inside_its_target_or_nothing() {
-    let wanted = std::env::var("CKPT_DOCTOR_MUTATIONS").map_or(FEW, |n| n.parse().expect("a number"));
+    let wanted = std::env::var("CKPT_DOCTOR_LAWS").map_or(FEW, |n| n.parse().expect("a number"));
     let next = AtomicUsize::new(0);
     let work = || {
         let (mut outcomes, mut broken) = (BTreeMap::new(), Vec::new());
