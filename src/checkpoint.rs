@@ -19,6 +19,7 @@ mod file_name;
 mod git;
 pub mod index;
 mod lfs;
+pub mod list;
 pub mod module;
 pub mod open;
 pub(crate) mod pointer;

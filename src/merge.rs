@@ -39,7 +39,7 @@ use crate::knowledge::recipe::Recipe;
 use crate::report::markdown;
 use crate::report::model::{MergeStage, MergedFile, Role};
 use crate::surgery::plan::PlannedFile;
-use crate::surgery::{apply, check_target};
+use crate::surgery::{Target, apply, check_target, claim_target};
 
 /// File name of the report in the merged directory.
 pub(crate) const REPORT: FileName = FileName::constant("merge-report.md");
@@ -58,7 +58,8 @@ pub fn run(
 ) -> Result<MergeRun, PipelineError> {
     let mut run = MergeRun::new(request);
     let dirs: Vec<&Path> = request.donors.values().map(AsRef::as_ref).collect();
-    let out = check_target(&request.out, &dirs)?;
+    let target = if request.dry_run { check_target } else { claim_target };
+    let Target { path: out, cleared } = target(&request.out, &dirs)?;
     if let Some(recipe) = &request.recipe {
         // A request that does not fit is refused before a donor is read.
         donors::check_roles(recipe, request)?;
@@ -102,11 +103,12 @@ pub fn run(
     add_manifest(&mut draft, &mut run, recipe, &options, &donors, request.hash)?;
     let total = draft.plan.len();
     let mut done = 0_u64;
-    apply(&draft.plan, &snapshots, &out, &mut |bytes| {
+    let leftover = apply(&draft.plan, &snapshots, &out, &mut |bytes| {
         done = done.saturating_add(bytes);
         progress(done, total);
     })?;
     run.note("write", &format!("{total} bytes, published by one rename"));
+    run.note_files(cleared.as_deref(), leftover.as_ref());
 
     let reopen = |error| PipelineError::Reopen { out: request.out.clone(), error };
     let written = Checkpoint::open(&out).map_err(reopen)?;

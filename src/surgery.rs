@@ -5,6 +5,7 @@ mod changes;
 pub mod donor;
 mod error;
 pub mod journal;
+mod leftover;
 mod lock;
 mod overlay;
 pub mod plan;
@@ -18,6 +19,7 @@ pub mod verify;
 
 pub use apply::apply;
 pub use error::{ApplyError, RepairError};
+pub use leftover::Leftover;
 pub use overlay::overlay;
 pub use stop::stop_on;
-pub use target::check_target;
+pub use target::{Target, check_target, claim_target};

@@ -1,8 +1,10 @@
 //! Finds the checkpoints for a path given by the user, and names the weights beside them that are not read.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
-use std::{fs, io};
+
+use super::list::{ListedEntry, list};
 
 /// Depth of folders to which checkpoints are searched for.
 const MAX_DEPTH: usize = 6;
@@ -51,23 +53,23 @@ pub fn find_checkpoints(path: &Path) -> Found {
 
 impl Found {
     fn search(&mut self, dir: &Path, depth: usize) {
-        let entries = match fs::read_dir(dir) {
+        let entries = match list(dir) {
             Ok(entries) => entries,
             Err(error) => return self.unlisted.push((dir.to_owned(), error)),
         };
         let mut folders = Vec::new();
         let mut foreign = Vec::new();
         for entry in entries.flatten() {
-            let name = entry.file_name();
-            let name = name.to_string_lossy();
-            let is_folder = entry.file_type().is_ok_and(|t| t.is_dir());
+            let name = entry.name.to_string_lossy();
+            let path = dir.join(&entry.name);
+            let is_folder = entry.is_folder;
             if !is_folder && marks_checkpoint(&name) {
                 return self.checkpoints.push(dir.to_owned());
             }
             if let Some(format) = foreign_format(&name, is_folder) {
-                foreign.push((format, entry.path()));
+                foreign.push((format, path));
             } else if is_folder && !name.starts_with('.') {
-                folders.push(entry.path());
+                folders.push(path);
             }
         }
         for (format, path) in foreign {
@@ -136,9 +138,8 @@ fn owner(file: &Path) -> Option<PathBuf> {
 /// Whether a directory is a checkpoint itself.
 #[must_use]
 pub fn is_checkpoint(dir: &Path) -> bool {
-    let is_file = |entry: &fs::DirEntry| !entry.file_type().is_ok_and(|t| t.is_dir());
-    let marks = |entry: fs::DirEntry| is_file(&entry) && marks_checkpoint(&entry.file_name().to_string_lossy());
-    fs::read_dir(dir).is_ok_and(|entries| entries.flatten().any(marks))
+    let marks = |entry: ListedEntry| !entry.is_folder && marks_checkpoint(&entry.name.to_string_lossy());
+    list(dir).is_ok_and(|entries| entries.flatten().any(marks))
 }
 
 /// Whether a file of this name makes its directory a checkpoint.

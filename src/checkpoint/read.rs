@@ -10,6 +10,7 @@ use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
+use super::list::list;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_own, real_target};
 use super::tokenizer::is_vocabulary;
 use super::{
@@ -191,8 +192,8 @@ impl DirectoryReader {
 fn names(root: &Path) -> Result<Vec<String>, OpenError> {
     let io = |source| OpenError::from_io(root, source);
     let mut names = Vec::new();
-    for entry in fs::read_dir(root).map_err(io)? {
-        if let Ok(name) = entry.map_err(io)?.file_name().into_string()
+    for entry in list(root).map_err(io)? {
+        if let Ok(name) = entry.map_err(io)?.name.into_string()
             && !name.starts_with('.')
             && is_plain_file_name(&name)
         {

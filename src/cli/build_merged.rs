@@ -30,6 +30,7 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         }
     };
     let run = merge::run(&request, &knowledge, &mut progress)?;
+    run.notices.iter().for_each(|notice| output::note(&output::safe(notice)));
     let stage = run.record.stage;
     output::finish(&run.report(), &args.report, false, false).with_context(|| match stage {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),

@@ -12,9 +12,9 @@ use crate::check::Outcome;
 use crate::checkpoint::{Checkpoint, escape};
 use crate::report::model::{Fixed, Withdrawn};
 use crate::report::{diff, fixes};
-use crate::surgery::journal::{self, Recovered};
+use crate::surgery::journal::{self, Recovered, Recovery};
 use crate::surgery::repair::{Repair, plan};
-use crate::surgery::{ApplyError, RepairError, overlay};
+use crate::surgery::{ApplyError, Leftover, RepairError, overlay};
 
 /// Checks a checkpoint with the selected rules.
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
@@ -40,15 +40,26 @@ impl FixArgs {
 /// Finishes or rolls back a repair that was interrupted, before the checkpoint is checked.
 pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
     if args.writes() && args.output.is_none() {
-        let done = match journal::recover(dir)? {
-            None => return Ok(()),
-            Some(Recovered::Finished) => "finished",
-            Some(Recovered::RolledBack) => "rolled back",
+        let Recovery { outcome, leftover } = journal::recover(dir)?;
+        let done = match outcome {
+            None => None,
+            Some(Recovered::Finished) => Some("finished"),
+            Some(Recovered::RolledBack) => Some("rolled back"),
         };
-        let dir = escape(&dir.display().to_string(), 300);
-        output::note(&format!("{dir}: {done} an interrupted repair"));
+        if let Some(done) = done {
+            let dir = escape(&dir.display().to_string(), 300);
+            output::note(&format!("{dir}: {done} an interrupted repair"));
+        }
+        warn(leftover.as_ref());
     }
     Ok(())
+}
+
+/// Warns about temporary files that could not be removed.
+fn warn(leftover: Option<&Leftover>) {
+    if let Some(leftover) = leftover {
+        output::note(&output::safe(&leftover.to_string()));
+    }
 }
 
 /// A checkpoint after its fixes were applied.
@@ -100,10 +111,15 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         }
     };
     if let Some(out) = &args.output {
-        overlay(repair, out, &mut progress).map_err(|error| name_interrupted(error, out))?;
+        let copy = overlay(repair, out, &mut progress).map_err(|error| name_interrupted(error, out))?;
+        if let Some(cleared) = &copy.cleared {
+            let cleared = output::safe(&cleared.display().to_string());
+            output::note(&format!("{cleared}, which an ended run had left, was removed"));
+        }
+        warn(copy.leftover.as_ref());
         return Ok(Some(out.clone()));
     }
-    journal::write(repair, &mut progress).map_err(|error| name_interrupted(error, dir))?;
+    warn(journal::write(repair, &mut progress).map_err(|error| name_interrupted(error, dir))?.as_ref());
     Ok(Some(dir.to_owned()))
 }
 

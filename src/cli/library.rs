@@ -1,10 +1,10 @@
 //! The built-in rules and architectures, and those of `--rules`.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
+use crate::checkpoint::list::list;
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
 use crate::knowledge::Library;
 use crate::knowledge::rule::RuleSet;
@@ -63,12 +63,12 @@ fn texts(rules: Option<&Path>, folder: &str) -> anyhow::Result<Vec<(String, Stri
 }
 
 fn find(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> anyhow::Result<()> {
-    let entries = fs::read_dir(folder).with_context(|| format!("{} cannot be listed", folder.display()))?;
+    let entries = list(folder).with_context(|| format!("{} cannot be listed", folder.display()))?;
     for entry in entries {
         let entry = entry?;
-        let path = entry.path();
+        let path = folder.join(&entry.name);
         // Links to folders are skipped: they may form a loop.
-        if entry.file_type()?.is_dir() {
+        if entry.is_folder {
             if let Some(depth) = depth.checked_sub(1) {
                 find(&path, depth, files)?;
             }

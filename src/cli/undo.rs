@@ -22,6 +22,9 @@ pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {
         let earlier = if undone.left == 1 { "repair" } else { "repairs" };
         writeln!(out, "{} earlier {earlier} can be undone too", undone.left)?;
     }
+    if let Some(leftover) = &undone.leftover {
+        output::note(&output::safe(&leftover.to_string()));
+    }
     output::print(&out)?;
     Ok(CLEAN)
 }

@@ -11,6 +11,7 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::Report;
 use crate::report::model::{CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
+use crate::surgery::Leftover;
 
 /// A request for a merge.
 #[derive(Debug, Clone)]
@@ -49,6 +50,8 @@ pub struct MergeRun {
     pub checked: Vec<CheckedCheckpoint>,
     /// The record for the reports.
     pub record: MergeReport,
+    /// Temporary files of an earlier run that were removed, and those of this run that were not; for standard error.
+    pub notices: Vec<String>,
 }
 
 impl MergeRun {
@@ -56,7 +59,7 @@ impl MergeRun {
     pub(super) fn new(request: &MergeRequest) -> Self {
         let donors = request.donors.iter().map(|(role, dir)| (role.clone(), dir.display().to_string())).collect();
         let record = MergeReport { out: request.out.display().to_string(), donors, ..MergeReport::default() };
-        Self { checked: Vec::new(), record }
+        Self { record, ..Self::default() }
     }
 
     /// The donor in a role of the recipe; `None` before it was checked.
@@ -67,6 +70,17 @@ impl MergeRun {
     /// Records the outcome of one stage.
     pub(super) fn note(&mut self, name: &str, outcome: &str) {
         self.record.stages.push(StageOutcome { name: name.to_owned(), outcome: outcome.to_owned() });
+    }
+
+    /// Records that the staging directory of an ended run was removed, and that the own one could not be.
+    ///
+    /// Called after writing: the report in the merged directory must not depend on what an earlier run left.
+    pub(super) fn note_files(&mut self, cleared: Option<&Path>, leftover: Option<&Leftover>) {
+        let cleared = cleared.map(|path| format!("{}, which an ended run had left, was removed", path.display()));
+        for line in cleared.into_iter().chain(leftover.map(Leftover::to_string)) {
+            self.note("clean up", &line);
+            self.notices.push(line);
+        }
     }
 
     /// Ends the run at `stage`.

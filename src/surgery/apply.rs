@@ -9,6 +9,7 @@ use std::path::Path;
 
 use super::donor::{DonorFile, DonorSnapshot};
 use super::error::{ApplyError, io_at};
+use super::leftover::Leftover;
 use super::plan::{Plan, PlannedShard, PlannedTensor, TensorRef, TensorSource};
 use super::staging::Staging;
 use super::stop::interrupted;
@@ -17,7 +18,8 @@ use super::transform;
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::open_regular;
 
-/// Writes `plan` as the directory `out` (a path from [`super::check_target`]); `progress` receives the bytes written.
+/// Writes `plan` as the directory `out` (a path from [`super::claim_target`]); `progress` receives the bytes written.
+/// Returns the staging directory if it could not be removed afterwards.
 ///
 /// Fails when a donor no longer matches its snapshot.
 ///
@@ -28,7 +30,7 @@ pub fn apply(
     donors: &[DonorSnapshot],
     out: &Path,
     progress: &mut dyn FnMut(u64),
-) -> Result<(), ApplyError> {
+) -> Result<Option<Leftover>, ApplyError> {
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let files = plan.files.iter().map(|f| f.bytes.len() as u64);
     let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
@@ -41,9 +43,9 @@ pub fn apply(
         .and_then(|()| interrupted())
         .and_then(|()| staging.publish(out));
     match (written, staging.discard()) {
-        (Ok(()), _) => Ok(()), // a remaining marker is removed by the next run
-        (Err(error), Ok(())) => Err(explained(error)),
-        (Err(error), Err((path, why))) => Err(ApplyError::Left { error: Box::new(explained(error)), path, why }),
+        (Ok(()), leftover) => Ok(leftover),
+        (Err(error), None) => Err(explained(error)),
+        (Err(error), Some(leftover)) => Err(ApplyError::Left { error: Box::new(explained(error)), leftover }),
     }
 }
 

@@ -3,6 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::leftover::Leftover;
+
 /// Why a plan was not written. The target then does not exist, except with [`ApplyError::Unsynced`].
 #[derive(Debug, thiserror::Error)]
 pub enum ApplyError {
@@ -88,14 +90,12 @@ pub enum ApplyError {
         error: io::Error,
     },
     /// Writing failed, and the incomplete files could not be removed.
-    #[error("{error}; {path} could not be removed ({why}); the next run with the same target tries again", path = path.display())]
+    #[error("{error}; {leftover}")]
     Left {
         /// The first error.
         error: Box<Self>,
         /// The staging directory.
-        path: PathBuf,
-        /// Error of the removal.
-        why: io::Error,
+        leftover: Leftover,
     },
     /// The target is complete, but its name could neither be synced nor removed.
     #[error("{path}: syncing the parent directory: {error}; the directory is complete, but may be lost on a power failure", path = path.display())]
@@ -162,6 +162,13 @@ pub enum RepairError {
         /// The file.
         path: PathBuf,
     },
+    /// A file changed between the staging of its replacement and the replacement.
+    #[error("{path} changed while it was repaired; it keeps its new content, and the repair was rolled back, \
+             retry once nothing else modifies it", path = path.display())]
+    ChangedWhileRepaired {
+        /// The file.
+        path: PathBuf,
+    },
     /// A file changed after the repair.
     #[error("{path} has changed since the repair, so it was not restored; its original is in {originals}",
         path = path.display(), originals = originals.display())]
@@ -191,9 +198,27 @@ pub enum RepairError {
         /// The error.
         error: Box<RepairError>,
     },
+    /// The repair was not written, and its files could not be removed.
+    #[error("{error}; {leftover}")]
+    Left {
+        /// The first error.
+        error: Box<RepairError>,
+        /// The directory.
+        leftover: Leftover,
+    },
     /// Any other error of writing files.
     #[error(transparent)]
     Apply(#[from] ApplyError),
+}
+
+impl RepairError {
+    /// The error of a run that also left files.
+    pub(super) fn with_leftover(self, leftover: Option<Leftover>) -> Self {
+        match leftover {
+            Some(leftover) => Self::Left { error: Box::new(self), leftover },
+            None => self,
+        }
+    }
 }
 
 /// Turns an error of the system into [`ApplyError::Io`]; `doing` names the operation on `path`.

@@ -1,10 +1,12 @@
 //! Repairs in place that change all files or none, and can be undone.
 //!
 //! The folder `.ckpt-doctor/` in the checkpoint contains the state of a repair. New files are staged in `new/`. Then
-//! `journal.json` lists the changes. Then the originals are linked into `undo/N/`, and the new files are renamed over
-//! them. Last, the journal becomes `undo/N.json`. A run killed before the journal exists has changed nothing; after
-//! that, the next run ([`recover`]) finishes the repair or rolls it back. The folder is locked meanwhile.
+//! `journal.json` lists the changes. Then the originals are linked into `undo/N/`, and the new files are exchanged for
+//! them. Last, the journal becomes `undo/N.json`. `undo` renames it back, which needs no space, and rolls the repair back.
+//! A run killed before the journal exists has changed nothing; after that, the next run ([`recover`]) finishes the repair
+//! or rolls it back. The folder is locked meanwhile.
 
+mod exchange;
 mod folder;
 mod record;
 mod recover;
@@ -12,6 +14,6 @@ mod replay;
 mod undo;
 mod write;
 
-pub use recover::{Recovered, recover};
+pub use recover::{Recovered, Recovery, recover};
 pub use undo::undo;
 pub use write::write;

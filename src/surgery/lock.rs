@@ -9,6 +9,7 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
 use rustix::fs::OFlags;
+use rustix::io::Errno;
 
 use super::error::{ApplyError, io_at};
 use super::system::{custom, retry};
@@ -22,7 +23,8 @@ pub(super) enum Lock {
     Theirs(String),
     /// The file or its directory was removed by the run that had it.
     Gone,
-    /// The file system does not support locks; Lustre, for one, may be mounted without.
+    /// The file system does not support locks (Lustre, for one, may be mounted without), or its lock service is not
+    /// reachable (`ENOLCK`; NFS, flock(2)).
     Unknown(LockFile),
 }
 
@@ -53,7 +55,7 @@ pub(super) fn take(path: &Path) -> Result<Lock, ApplyError> {
             Ok(()) => break,
             Err(TryLockError::WouldBlock) => return Ok(Lock::Theirs(holder(path))),
             Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Interrupted => {}
-            Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
+            Err(TryLockError::Error(e)) if has_no_locks(&e) => {
                 return Ok(Lock::Unknown(LockFile(file)));
             }
             Err(TryLockError::Error(e)) => return Err(io_at(path, "locking")(e)),
@@ -63,6 +65,11 @@ pub(super) fn take(path: &Path) -> Result<Lock, ApplyError> {
     // A run that ended between opening and locking has removed the file, so this lock is on a deleted file.
     let same = fs::symlink_metadata(path).is_ok_and(|m| (m.dev(), m.ino()) == (held.dev(), held.ino()));
     Ok(if same { Lock::Ours(LockFile(file)) } else { Lock::Gone })
+}
+
+/// Whether the error of a lock says that there are no locks.
+fn has_no_locks(error: &io::Error) -> bool {
+    error.kind() == io::ErrorKind::Unsupported || Errno::from_io_error(error) == Some(Errno::NOLCK)
 }
 
 /// Writes the process of this run into the locked file.

@@ -8,12 +8,22 @@ use std::path::{Path, PathBuf};
 use super::changes::{check_unchanged, explain_error, write_content};
 use super::donor::DonorSnapshot;
 use super::error::{ApplyError, RepairError, io_at};
+use super::leftover::Leftover;
 use super::repair::Repair;
 use super::staging::Staging;
 use super::stop::interrupted;
 use super::system::{check_space, retry};
-use super::target::check_target;
+use super::target::{Target, claim_target};
 use crate::checkpoint::open::real_target;
+
+/// A repaired copy that was written.
+#[derive(Debug)]
+pub struct RepairedCopy {
+    /// The staging directory of an ended run, if one was removed.
+    pub cleared: Option<PathBuf>,
+    /// The staging directory, if it could not be removed.
+    pub leftover: Option<Leftover>,
+}
 
 /// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's or, on
 /// another file system, symbolic links. Hidden files are not copied.
@@ -22,9 +32,9 @@ use crate::checkpoint::open::real_target;
 ///
 /// # Errors
 /// A [`RepairError`]; then the directory was not created.
-pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<PathBuf, RepairError> {
+pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<RepairedCopy, RepairError> {
     let original = &repair.original;
-    let out = check_target(out, &[&original.root])?;
+    let Target { path: out, cleared } = claim_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let donor = DonorSnapshot::record(&original.root)?;
     let explained = |error| explain_error(error, parent, repair);
@@ -37,8 +47,8 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
         .and_then(|()| Ok(staging.publish(&out)?))
         .map_err(explained);
     match (written, staging.discard()) {
-        (Ok(()), _) => Ok(out), // a remaining marker is removed by the next run
-        (Err(error), _) => Err(error),
+        (Ok(()), leftover) => Ok(RepairedCopy { cleared, leftover }),
+        (Err(error), leftover) => Err(error.with_leftover(leftover)),
     }
 }
 

@@ -12,9 +12,10 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::error::{ApplyError, io_at};
+use super::leftover::Leftover;
 use super::lock::{self, Lock, LockFile};
 pub(super) use super::system::sync_dir;
-use super::system::{names, remove_dir, remove_dir_all, remove_file, retry};
+use super::system::{names, remove_dir, remove_file, remove_folder, retry};
 
 const MARKER: &str = "ckpt-doctor-owner";
 const CONTENT: &str = "content";
@@ -37,27 +38,25 @@ pub(super) struct Staging {
 }
 
 impl Staging {
-    /// Creates and locks the staging directory of `out`.
+    /// Creates and locks the staging directory of `out`, after [`clear_remains`].
     ///
     /// # Errors
     /// [`ApplyError::Busy`] when another run has locked it, [`ApplyError::Target`] when it is not a staging directory.
     pub(super) fn new(out: &Path) -> Result<Self, ApplyError> {
         let path = staging_path(out);
-        // Three attempts: a run that ends between these steps may remove the directory or the marker.
+        // Three attempts: another run may create or remove the directory between these steps.
         for _ in 0..3 {
-            let made = match retry(|| fs::create_dir(&path)) {
-                Ok(()) => true,
-                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => false,
-                Err(e) => return Err(io_at(&path, "creating")(e)),
-            };
-            match Self::lock(out, &path, made) {
+            clear_remains(out)?;
+            match retry(|| fs::create_dir(&path)) {
+                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => continue,
+                other => other.map_err(io_at(&path, "creating"))?,
+            }
+            match Self::fill(out, &path) {
                 Ok(Some(staging)) => return Ok(staging),
                 Ok(None) => {}
                 Err(error) => {
-                    if made {
-                        // Fails when another run works in the directory: then it is not empty.
-                        let _ = remove_dir(&path);
-                    }
+                    // Fails when another run works in the directory: then it is not empty.
+                    let _ = remove_dir(&path);
                     return Err(error);
                 }
             }
@@ -65,34 +64,21 @@ impl Staging {
         Err(ApplyError::Busy { path: out.to_owned(), holder: "it has just ended".to_owned() })
     }
 
-    /// Locks the marker in `path`; `None` when the directory was removed meanwhile.
-    fn lock(out: &Path, path: &Path, made: bool) -> Result<Option<Self>, ApplyError> {
-        if !made && !is_ours(path)? {
-            return Ok(None);
-        }
+    /// Locks the new directory `path` and creates its content; `None` when another run has removed it meanwhile.
+    fn fill(out: &Path, path: &Path) -> Result<Option<Self>, ApplyError> {
         let marker = path.join(MARKER);
         let lock = match lock::take(&marker) {
-            Ok(Lock::Ours(lock)) => lock,
+            // Without lock support, the run that created the directory uses it.
+            Ok(Lock::Ours(lock) | Lock::Unknown(lock)) => lock,
             Ok(Lock::Theirs(holder)) => return Err(ApplyError::Busy { path: out.to_owned(), holder }),
             Ok(Lock::Gone) => return Ok(None),
-            // Without lock support, only the run that created the directory may use it.
-            Ok(Lock::Unknown(lock)) if made => lock,
-            Ok(Lock::Unknown(_)) => {
-                let reason = "exists, and this file system has no locks that would show whether a run is still writing; \
-                              remove it if no run is";
-                return Err(ApplyError::Target { path: path.to_owned(), reason: reason.to_owned() });
-            }
             Err(error) => {
-                if made {
-                    let _ = remove_file(&marker);
-                }
+                let _ = remove_file(&marker);
                 return Err(error);
             }
         };
-        let content = path.join(CONTENT);
         // From here on every error removes the directory.
-        let mut staging = Self { path: path.to_owned(), content, lock, over: false };
-        remove_dir_all(&staging.content).map_err(io_at(&staging.content, "removing"))?;
+        let mut staging = Self { path: path.to_owned(), content: path.join(CONTENT), lock, over: false };
         lock::sign(&mut staging.lock).map_err(io_at(&marker, "writing"))?;
         retry(|| fs::create_dir(&staging.content)).map_err(io_at(&staging.content, "creating"))?;
         Ok(Some(staging))
@@ -122,10 +108,9 @@ impl Staging {
 
     /// Removes the staging directory with its content.
     ///
-    /// # Errors
-    /// The path of the directory and the system's error.
-    pub(super) fn discard(mut self) -> Result<(), (PathBuf, io::Error)> {
-        self.remove().map_err(|why| (self.path.clone(), why))
+    /// Returns the directory if that fails.
+    pub(super) fn discard(mut self) -> Option<Leftover> {
+        self.remove().err().map(|why| Leftover { path: self.path.clone(), why })
     }
 
     /// The marker is removed last, so that an incomplete removal can be continued.
@@ -133,7 +118,7 @@ impl Staging {
         if self.over {
             return Ok(());
         }
-        remove_dir_all(&self.content)?;
+        remove_folder(&self.content)?;
         // Without the marker, another run may start in the directory before it is removed.
         self.over = true;
         remove_file(&self.path.join(MARKER))?;
@@ -148,6 +133,38 @@ impl Drop for Staging {
     fn drop(&mut self) {
         // After panics and early errors; does nothing after `discard`.
         let _ = self.remove();
+    }
+}
+
+/// Removes the staging directory that an ended run with the target `out` left; returns its path, `None` without one.
+///
+/// # Errors
+/// [`ApplyError::Busy`] when a run has locked it, [`ApplyError::Target`] when it is not a staging directory, or when the
+/// file system has no locks; [`ApplyError::Io`] when it cannot be removed.
+pub(super) fn clear_remains(out: &Path) -> Result<Option<PathBuf>, ApplyError> {
+    let path = staging_path(out);
+    if !is_ours(&path)? {
+        return Ok(None);
+    }
+    // A run killed before it wrote the marker, or after it removed it, leaves an empty directory.
+    if remove_dir(&path).is_ok() {
+        return Ok(Some(path));
+    }
+    match lock::take(&path.join(MARKER))? {
+        Lock::Ours(lock) => {
+            let staging = Staging { content: path.join(CONTENT), path: path.clone(), lock, over: false };
+            match staging.discard() {
+                Some(Leftover { why, .. }) => Err(io_at(&path, "removing the files of an ended run")(why)),
+                None => Ok(Some(path)),
+            }
+        }
+        Lock::Theirs(holder) => Err(ApplyError::Busy { path: out.to_owned(), holder }),
+        Lock::Gone => Ok(None),
+        Lock::Unknown(_) => {
+            let reason = "exists, and this file system has no locks that would show whether a run is still writing; \
+                          remove it if no run is";
+            Err(ApplyError::Target { path, reason: reason.to_owned() })
+        }
     }
 }
 

@@ -7,11 +7,12 @@ use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-use rustix::fs::OFlags;
-use rustix::io::Errno;
+use rustix::fs::{AtFlags, OFlags, unlinkat};
+use rustix::io::{Errno, retry_on_intr};
 use rustix::process::{Resource, getrlimit};
 
 use super::error::{ApplyError, io_at};
+use crate::checkpoint::list::{list, list_real};
 
 /// Repeats a call that a signal interrupted. The standard library repeats reads, writes, opens and syncs of files, but
 /// not other calls, which some network file systems interrupt as well.
@@ -41,9 +42,22 @@ pub(super) fn sync_dir(path: &Path) -> Result<(), ApplyError> {
     File::open(path).and_then(|d| retry(|| d.sync_all())).map_err(io_at(path, "syncing"))
 }
 
-/// Removes a directory and its content; a missing directory is not an error.
-pub(super) fn remove_dir_all(path: &Path) -> io::Result<()> {
-    ignore_missing(retry(|| fs::remove_dir_all(path)))
+/// Removes a directory and the files and links in it; a missing directory is not an error.
+///
+/// The directories that this program creates contain no others, so another one in them is an error.
+pub(super) fn remove_folder(path: &Path) -> io::Result<()> {
+    let mut listing = match list_real(path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+        other => other?,
+    };
+    // Listed before the first removal: a file system may skip entries when the directory changes meanwhile.
+    let names: Vec<OsString> = listing.by_ref().map(|entry| entry.map(|e| e.name)).collect::<io::Result<_>>()?;
+    let folder = listing.folder()?;
+    for name in names {
+        let removed = retry_on_intr(|| unlinkat(folder, &name, AtFlags::empty()));
+        ignore_missing(removed.map_err(io::Error::from))?;
+    }
+    remove_dir(path)
 }
 
 /// Removes a file; a missing file is not an error.
@@ -67,7 +81,7 @@ pub(super) fn look(path: &Path) -> Result<Option<Metadata>, ApplyError> {
 
 /// Names in a directory, unsorted.
 pub(super) fn names(path: &Path) -> io::Result<Vec<OsString>> {
-    retry(|| fs::read_dir(path))?.map(|entry| entry.map(|e| e.file_name())).collect()
+    list(path)?.map(|entry| entry.map(|e| e.name)).collect()
 }
 
 fn ignore_missing(removed: io::Result<()>) -> io::Result<()> {
@@ -89,8 +103,7 @@ struct Room {
 
 /// Free space on the file system of `dir`; `None` when it is not reported, as on some network file systems.
 fn room(dir: &Path) -> Result<Option<Room>, ApplyError> {
-    let stats = rustix::io::retry_on_intr(|| rustix::fs::statvfs(dir))
-        .map_err(|e| io_at(dir, "querying free space")(e.into()))?;
+    let stats = retry_on_intr(|| rustix::fs::statvfs(dir)).map_err(|e| io_at(dir, "querying free space")(e.into()))?;
     let block = stats.f_frsize.max(1);
     let room = Room {
         bytes: stats.f_bavail.saturating_mul(block),
@@ -158,7 +171,7 @@ pub(super) fn is_mount_point(_: &Path) -> bool {
 #[cfg(target_os = "linux")]
 pub(super) fn copy_in_kernel(from: &File, mut at: u64, to: &File, len: u64) -> io::Result<Option<u64>> {
     let len = usize::try_from(len).unwrap_or(usize::MAX);
-    match rustix::io::retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut at), to, None, len)) {
+    match retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut at), to, None, len)) {
         // Some file systems return 0 for unsupported; at the end of the file a plain read reports the end.
         Ok(0) | Err(Errno::NOSYS | Errno::XDEV | Errno::INVAL | Errno::OPNOTSUPP | Errno::PERM | Errno::BADF) => {
             Ok(None)

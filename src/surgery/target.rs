@@ -6,38 +6,67 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::error::{ApplyError, io_at};
-use super::staging::staging_path;
-use super::system::is_mount_point;
+use super::staging::{clear_remains, staging_path};
+use super::system::{is_mount_point, look};
+use crate::checkpoint::list::list;
+
+/// An output directory that is free.
+#[derive(Debug)]
+pub struct Target {
+    /// The path, with the links of its parent resolved.
+    pub path: PathBuf,
+    /// The staging directory of an ended run, if one was removed.
+    pub cleared: Option<PathBuf>,
+}
 
 /// Checks that `out` can become a new directory: missing or empty, and not overlapping a donor.
 ///
-/// Returns the resulting path with the links of its parent resolved.
-///
 /// # Errors
 /// [`ApplyError::Target`] and [`ApplyError::Donor`]; [`ApplyError::Io`] when the metadata of a path cannot be read.
-pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError> {
-    let target = |reason: &str| ApplyError::Target { path: out.to_owned(), reason: reason.to_owned() };
-    let real = match fs::symlink_metadata(out) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => resolve_absent(out)?,
-        Err(e) => return Err(io_at(out, "reading metadata")(e)),
-        Ok(m) if m.is_symlink() => {
-            // For a link to a donor, the error about the overlap is clearer.
-            if let Ok(real) = fs::canonicalize(out) {
-                apart(out, &real, donors)?;
-            }
-            return Err(target("is a symbolic link"));
+pub fn check_target(out: &Path, donors: &[&Path]) -> Result<Target, ApplyError> {
+    let path = resolve(out, donors)?;
+    match obstacle(out, &path)? {
+        Some(reason) => Err(ApplyError::Target { path: out.to_owned(), reason: reason.to_owned() }),
+        None => Ok(Target { path, cleared: None }),
+    }
+}
+
+/// Removes the staging directory that an ended run with this target left, then checks the target as [`check_target`].
+/// The directory is removed even if the target is refused: the run may have ended after it published the target.
+///
+/// # Errors
+/// As [`check_target`], and when the staging directory cannot be removed.
+pub fn claim_target(out: &Path, donors: &[&Path]) -> Result<Target, ApplyError> {
+    let path = resolve(out, donors)?;
+    let cleared = match clear_remains(&path) {
+        // Another run works there, or it is not ours: reported before the first file is written.
+        Err(ApplyError::Busy { .. } | ApplyError::Target { .. }) => None,
+        other => other?,
+    };
+    match (obstacle(out, &path)?, &cleared) {
+        (None, _) => Ok(Target { path, cleared }),
+        (Some(reason), None) => Err(ApplyError::Target { path: out.to_owned(), reason: reason.to_owned() }),
+        (Some(reason), Some(staging)) => {
+            let reason = format!("{reason} ({}, which an ended run had left, was removed)", staging.display());
+            Err(ApplyError::Target { path: out.to_owned(), reason })
         }
-        Ok(m) if !m.is_dir() => return Err(target("is a file")),
-        Ok(_) => {
-            let real = fs::canonicalize(out).map_err(io_at(out, "resolving"))?;
-            apart(out, &real, donors)?;
-            if fs::read_dir(out).map_err(io_at(out, "listing"))?.next().is_some() {
-                return Err(target("is a directory with files in it"));
+    }
+}
+
+/// Resolves the target, and checks that neither it nor its staging directory overlaps a donor.
+fn resolve(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError> {
+    let real = match look(out)? {
+        None => resolve_absent(out)?,
+        Some(metadata) => {
+            let real = fs::canonicalize(out).map_err(io_at(out, "resolving"));
+            if metadata.is_symlink() {
+                // For a link to a donor, the error about the overlap is clearer.
+                if let Ok(real) = real {
+                    apart(out, &real, donors)?;
+                }
+                return Err(ApplyError::Target { path: out.to_owned(), reason: "is a symbolic link".to_owned() });
             }
-            if is_mount_point(&real) {
-                return Err(target("is a mount point, which a rename cannot replace"));
-            }
-            real
+            real?
         }
     };
     apart(out, &real, donors)?;
@@ -47,6 +76,20 @@ pub fn check_target(out: &Path, donors: &[&Path]) -> Result<PathBuf, ApplyError>
         return Err(ApplyError::Donor { path: out.to_owned(), reason });
     }
     Ok(real)
+}
+
+/// Why no directory can be renamed to the target.
+fn obstacle(out: &Path, real: &Path) -> Result<Option<&'static str>, ApplyError> {
+    let Some(metadata) = look(real)? else { return Ok(None) };
+    Ok(if !metadata.is_dir() {
+        Some("is a file")
+    } else if list(real).map_err(io_at(out, "listing"))?.next().is_some() {
+        Some("is a directory with files in it")
+    } else if is_mount_point(real) {
+        Some("is a mount point, which a rename cannot replace")
+    } else {
+        None
+    })
 }
 
 /// Resolves a path that does not exist, in a directory that does.

@@ -75,7 +75,7 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
     match ckpt_doctor::surgery::journal::write(&repair, &mut |_| {}) {
         // FIFOs and links in a fixture are not repaired.
         Err(RepairError::Linked { .. }) => return Ok(Some(format!("{fixed} (linked)"))),
-        other => other.map_err(|e| format!("writing: {e}"))?,
+        other => assert!(other.map_err(|e| format!("writing: {e}"))?.is_none(), "every temporary file is removed"),
     }
     let (after, again) = planned(dir, deep, knowledge);
     if after.findings != repair.outcome.findings {

@@ -39,20 +39,23 @@ MESSAGES = {
     "ENOSYS": "Function not implemented",
 }
 # Errors that a run must survive: it repeats the call, or uses another one.
-HARMLESS = ("EINTR", "EXDEV", "EINVAL", "EOPNOTSUPP", "ENODEV", "ENOMEM")
+HARMLESS = ("EINTR", "EXDEV", "EINVAL", "EOPNOTSUPP", "ENODEV", "ENOMEM", "ENOLCK")
 ROOM = ("ENOSPC", "EDQUOT", "EIO")
 FAULTS = {
     **dict.fromkeys(("write", "pwrite64", "sendfile", "ftruncate", "fallocate"), (*ROOM, "EFBIG", "EINTR")),
     "copy_file_range": (*ROOM, "EFBIG", "EINTR", "EXDEV", "EINVAL", "EOPNOTSUPP"),
     **dict.fromkeys(("fsync", "fdatasync", "close", "mkdir", "link", "linkat", "symlink", "symlinkat"), (*ROOM, "EINTR")),
-    **dict.fromkeys(("rename", "renameat", "renameat2"), (*ROOM, "EROFS", "EINTR")),
+    **dict.fromkeys(("rename", "renameat"), (*ROOM, "EROFS", "EINTR")),
+    "renameat2": (*ROOM, "EROFS", "EINTR", "EINVAL"),
     "mapping": ("ENODEV", "ENOMEM"),
-    **dict.fromkeys(("unlink", "unlinkat", "rmdir", "flock", "statfs", "pread64", "read", "fchmod", "fchown"), ("EIO", "EINTR")),
+    **dict.fromkeys(("unlink", "unlinkat", "rmdir", "statfs", "pread64", "read", "fchmod", "fchown"), ("EIO", "EINTR")),
+    "flock": ("EIO", "EINTR", "ENOLCK", "EOPNOTSUPP"),
     "openat": ("EIO", "EMFILE", "EINTR"),
     "creating": (*ROOM, "EMFILE", "EINTR"),
 }  # fmt: skip
 WRITES = ("write", "pwrite64", "copy_file_range", "sendfile", "creating", "mkdir", "fsync", "fdatasync", "rename")
 REMOVES = ("unlink", "unlinkat", "rmdir")
+CLOSES = ("EDQUOT", "ENOMEM", "EROFS", "EIO")
 
 
 class Crash(Pressure):
@@ -97,9 +100,7 @@ class Crash(Pressure):
             calls, first, last = job.calls()
             cases = []
             for call in calls[first : last + 1]:
-                # The standard library assumes that closing a directory cannot fail.
-                errors = () if call.name == "close" and call.is_directory else FAULTS.get(call.kind, ())
-                for error in errors:
+                for error in FAULTS.get(call.kind, ()):
                     cases.append((call, f"error={error}"))
                 if call.name in ("write", "copy_file_range", "pread64"):
                     cases.append((call, "retval=0"))  # no bytes and no error: an end of file, a full device
@@ -122,6 +123,9 @@ class Crash(Pressure):
             # The report is printed after the target is complete.
             job.promises(outcome, before, done_is_fine=bool(call.printed), left_is_fine=removing)
             self.words(outcome, call, what, job.takes_room)
+            left = job.left_over()
+            if left and not ("could not be removed" in outcome.output or "is incomplete" in outcome.output):
+                raise Broken(f"left {left} without a word\n{outcome.output}")
             if removing or outcome.code != 0:
                 job.recovers()
         except Broken as broken:
@@ -154,6 +158,45 @@ class Crash(Pressure):
         if missing:
             raise Broken(f"the message lacks {missing}\n{output}")
 
+    # Calls that end a directory or a file.
+
+    def closes(self):
+        """Closing a directory fails: without effect. It is closed to list or to sync it, in every phase of a run."""
+        for job in self.jobs:
+            calls = job.calls()[0]
+            ours = [c for c in calls if c.name == "close" and any(p.startswith(str(job.place)) for p in c.paths) and c.is_directory]
+            cases = [(call, f"error={error}") for call in ours for error in CLOSES]
+            some = cases if self.full else self.sample(cases, 24)
+            ended = sum(self.each(job, some, self.fault))
+            if ended:
+                raise Broken(f"{job.name}: {ended} runs ended because closing a directory failed")
+            self.report(f"{job.name}: {len(some)} failures to close a directory, of {len(ours)} closes, without effect")
+
+    def removals(self):
+        """Removing fails once, or from some call on: the run states what it left, and the next one removes it."""
+        for job in self.jobs:
+            calls, first, last = job.calls()
+            removing = [c for c in calls[first : last + 1] if c.name in REMOVES]
+            cases = [(call, f"error={error}", on) for call in removing for error in ("EIO", "EROFS") for on in ("", "+")]
+            some = cases if self.full else self.sample(cases, 20)
+            left = sum(self.each(job, some, self.removal))
+            self.report(f"{job.name}: {len(some)} failures to remove, once or from then on ({left} left files, which the next run removed)")
+
+    @staticmethod
+    def removal(job, call, what, on):
+        job.reset()
+        before = job.inputs()
+        outcome = job.inject(call, what, on)
+        try:
+            job.promises(outcome, before, left_is_fine=True)
+            left = job.left_over()
+            if left and not ("could not be removed" in outcome.output or "is incomplete" in outcome.output):
+                raise Broken(f"left {left} without a word\n{outcome.output}")
+            job.recovers()
+        except Broken as broken:
+            raise Broken(f"{job.name} with {what}{on} at {call}: {broken}") from broken
+        return bool(left)
+
     # Kills.
 
     def kills(self):
@@ -163,8 +206,10 @@ class Crash(Pressure):
             phase = calls[first : min(last + 30, len(calls))]
             # The disk does not change between two changing calls, so one call after each is enough.
             after = [b for a, b in zip(phase, phase[1:], strict=False) if a.changes]
-            must = list({(c.name, c.nth): c for c in [*[c for c in phase if c.changes], *after]}.values())
-            rest = [c for c in phase if not c.changes]
+            # After the last name was given, the next run is refused or has nothing to do: every call counts.
+            named = max(i for i, call in enumerate(phase) if call.name.startswith("rename"))
+            must = list({(c.name, c.nth): c for c in [*[c for c in phase if c.changes], *after, *phase[named:]]}.values())
+            rest = [c for c in phase[:named] if not c.changes]
             most = {"build": 1000}.get(job.name, 300) if self.full else {"build": 80}.get(job.name, 40)
             chosen = self.sample(must, most)
             chosen += self.sample(rest, max(0, most - len(chosen)))
@@ -261,7 +306,7 @@ class Crash(Pressure):
             job.reset()
 
 
-PARTS = ["faults", "kills", "signals", "limits", "order", "changes", "rounds", "disks"]
+PARTS = ["faults", "closes", "removals", "kills", "signals", "limits", "order", "changes", "saves", "rounds", "disks"]
 
 
 def main():

@@ -106,6 +106,7 @@ class Job:
     name = ""
     takes_room = True
     husk = frozenset()  # may stay where removing failed: empty, and used by the next run
+    says_removed = False  # whether a run states that it removed the remains of another
     blocks_first = 1  # used before the check for free space: the marker
     blocks_more = 0  # needed in addition to the files
 
@@ -167,6 +168,10 @@ class Job:
         """The calls during which the run holds the signed lock."""
         raise NotImplementedError
 
+    def refused(self):
+        """The words and the exit code of a run on a complete target; `None` for exit 0."""
+        raise NotImplementedError
+
     def again(self):
         """Prepares for another run after a finished one."""
         self.reset()
@@ -196,9 +201,9 @@ class Job:
         log.unlink()
         return outcome
 
-    def inject(self, call, what):
-        """One run with `what` injected at `call`; fails if the injection did not happen."""
-        outcome = self.strace("-e", f"trace={call.name}", "-e", f"inject={call.name}:{what}:when={call.nth}")
+    def inject(self, call, what, on=""):
+        """One run with `what` injected at `call`, and with `on="+"` at all later ones; fails if that did not happen."""
+        outcome = self.strace("-e", f"trace={call.name}", "-e", f"inject={call.name}:{what}:when={call.nth}{on}")
         if "signal=" not in what and "(INJECTED)" not in outcome.log:
             raise Broken(f"strace injected nothing at {call}: the calls of two runs differ")
         return outcome
@@ -249,9 +254,23 @@ class Job:
             raise Broken(f"remains: {self.left_over()}\n{outcome.output}")
         return state
 
+    def cleans(self):
+        """Checks that a run after one that completed, with the same target, removes the remains of the latter."""
+        left, before = self.left_over(), self.inputs()
+        refused = self.refused()
+        outcome = self.run()
+        word, code = refused or ("", 0)
+        if outcome.code != code or word not in outcome.output or self.state() != "complete":
+            raise Broken(f"the next run on a complete target: exit {outcome.code}, {self.state()}\n{outcome.output}")
+        if self.left_over() or self.inputs() != before:
+            raise Broken(f"the next run on a complete target: left {self.left_over()} of {left}\n{outcome.output}")
+        if left and self.says_removed and "was removed" not in outcome.output:
+            raise Broken(f"the next run does not state that it removed {left}\n{outcome.output}")
+
     def recovers(self):
-        """Checks that the next run completes after any remains of the last one."""
+        """Checks that the next run completes after any remains of the last one, and removes them."""
         if self.state() == "complete":
+            self.cleans()
             self.again()
         before = self.inputs()
         outcome = self.run()

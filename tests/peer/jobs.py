@@ -40,6 +40,7 @@ class Build(Job):
     name = "build"
     old = None
     race_codes = ([0, 2],)
+    says_removed = True
 
     def lay(self):
         self.donors = self.place / "donors"
@@ -48,6 +49,9 @@ class Build(Job):
 
     def reset(self):
         shutil.rmtree(self.out, ignore_errors=True)
+
+    def refused(self):
+        return "is a directory with files in it", 2
 
     def argv(self):
         return [PROGRAM, "build-merged", "--vision", str(self.donors / "spatialvla-tiny"),
@@ -133,6 +137,9 @@ class Repair(Job):
     def again(self):
         """A second run needs no preparation: it finds nothing to do."""
 
+    def refused(self):
+        return None
+
     def recovers(self):
         if self.state() == "pending":
             seen = subprocess.run([PROGRAM, "check", str(self.model)], capture_output=True, text=True)
@@ -145,7 +152,7 @@ class Undo(Repair):
     """`undo` of that repair."""
 
     name = "undo"
-    takes_room = False  # except for its journal
+    takes_room = False
     husk = frozenset({".gitignore", "lock", "undo"})
     race_codes = ([0, 2],)
 
@@ -162,8 +169,10 @@ class Undo(Repair):
         return [PROGRAM, "undo", str(self.model)]
 
     def again(self):
-        if not self.pending():
-            self.reset()
+        self.reset()
+
+    def refused(self):
+        return None if self.pending() else ("has no repair to undo", 2)
 
 
 class Overlay(Build):

@@ -1,5 +1,6 @@
 """Parts of crash.py with external causes: limits and full disks, changing donors, a second run."""
 
+import contextlib
 import os
 import resource
 import shutil
@@ -57,6 +58,19 @@ HARMS = {
     "a directory in its place": become_directory,
     "a FIFO in its place": become_fifo,
 }
+
+
+def save_in_place(path):
+    path.write_bytes(b"saved by an editor")
+
+
+def save_by_rename(path):
+    other = path.with_name(path.name + "~")
+    other.write_bytes(b"saved by an editor")
+    other.rename(path)
+
+
+SAVES = {"in place": save_in_place, "by a rename": save_by_rename}
 
 
 class Pressure:
@@ -147,6 +161,38 @@ class Pressure:
             os.utime(victim, ns=(times.st_atime_ns, times.st_mtime_ns))
         job.recovers()
 
+    # Files that an editor saves during a repair.
+
+    def saves(self):
+        """A file that is saved while it is repaired, or while the repair is undone, is never lost."""
+        for job in (j for j in self.jobs if j.name in ("fix", "undo")):
+            calls, first, last = job.calls()
+            changes = [c for c in calls[first : last + 1] if c.changes]
+            victims = sorted(n for n in job.complete.keys() | job.old.keys() if job.complete.get(n) != job.old.get(n))
+            cases = [(call, name, save) for call in changes for name in victims for save in SAVES.items()]
+            cases = cases if self.full else self.sample(cases, 40)
+            ended = sum(self.each(job, [(call, name, *save) for call, name, save in cases], self.save))
+            self.report(f"{job.name}: {len(cases)} files saved during the run, none was lost ({ended} runs ended with an error)")
+
+    @staticmethod
+    def save(job, call, name, how, save):
+        job.reset()
+        process, pid = stopped_at(job, call)
+        victim = job.model / name
+        save(victim)
+        saved = victim.read_bytes()
+        job.command += f"; while it is stopped, {name} is saved, {how}"
+        outcome = go_on(process, pid)
+        if outcome.code not in (0, 1, 2):
+            raise Broken(f"{name} saved, {how}, at {call}: exit {outcome.code}\n{outcome.output}")
+        if not victim.exists() or victim.read_bytes() != saved:
+            raise Broken(f"{name} saved, {how}, at {call}: lost\n{outcome.output}")
+        if "changed while it was repaired" in outcome.output:
+            now = {n: what for n, what in job.target().items() if n != name}
+            if now != {n: what for n, what in job.old.items() if n != name}:
+                raise Broken(f"{name} saved, {how}, at {call}: other files are not as before\n{outcome.output}")
+        return outcome.code == 2
+
     # Two runs at once.
 
     def rounds(self):
@@ -210,6 +256,10 @@ class Pressure:
 
     def small_disks(self):
         page = 4096
+        for job in (j for j in self.jobs if j.name == "undo"):
+            with job.disk("size=64m"):
+                self.full_disk(job)
+            self.report(f"{job.name}: complete on a disk without a free byte")
         for job in (j for j in self.jobs if j.takes_room):
             with job.disk("size=64m"):
                 job.measure()  # on another disk than its input
@@ -249,6 +299,22 @@ class Pressure:
         if outcome.code != 0 and not all(word in outcome.output for word in words):
             raise Broken(f"size {size}: the message lacks one of {words}\n{outcome.output}")
         return outcome.code == 0
+
+    @staticmethod
+    def full_disk(job):
+        before = job.inputs()
+        ballast = job.work / "ballast"
+        with ballast.open("wb") as file, contextlib.suppress(OSError):
+            while True:
+                file.write(bytes(1 << 16))
+                file.flush()
+        if os.statvfs(job.work).f_bavail:
+            raise Broken("the disk is not full")
+        outcome = job.run()
+        ballast.unlink()
+        job.promises(outcome, before)
+        if outcome.code != 0:
+            raise Broken(f"undo on a full disk: exit {outcome.code}\n{outcome.output}")
 
     @staticmethod
     def filled_meanwhile(job, call, free):

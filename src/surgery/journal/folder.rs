@@ -9,6 +9,7 @@ use super::record::Journal;
 use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
+use crate::surgery::leftover::Leftover;
 use crate::surgery::lock::{self, Lock, LockFile};
 use crate::surgery::system::{self, create, look, retry, sync_dir, with_figures};
 
@@ -17,6 +18,9 @@ const IGNORE: (&str, &str) = (".gitignore", "# created by ckpt-doctor for undoin
 
 /// Folder of staged files.
 const NEW: &str = "new";
+
+/// Folder of the originals and journals of finished repairs.
+const UNDO: &str = "undo";
 
 /// The journal while it is being written.
 const DRAFT: &str = "journal.json.part";
@@ -27,6 +31,17 @@ const LOCK: &str = "lock";
 /// Version of the journal format.
 pub(super) const VERSION: u32 = 1;
 
+/// What an ended run left in the folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Remains {
+    /// Nothing: there is no folder, or it holds the originals of repairs.
+    None,
+    /// A folder without a repair that can be undone.
+    Empty,
+    /// A journal or staged files.
+    Interrupted,
+}
+
 /// The folder; the lock is held while this value exists.
 pub(super) struct Folder {
     pub(super) root: PathBuf,
@@ -35,10 +50,18 @@ pub(super) struct Folder {
 }
 
 impl Folder {
-    /// Whether an interrupted run left files.
-    pub(super) fn has_remains(root: &Path) -> bool {
+    /// What an ended run left; decided without the lock.
+    pub(super) fn remains(root: &Path) -> Result<Remains, RepairError> {
         let path = root.join(REPAIR_FOLDER);
-        [REPAIR_JOURNAL, DRAFT, NEW].iter().any(|name| fs::symlink_metadata(path.join(name)).is_ok())
+        if look(&path)?.is_none_or(|m| !m.is_dir()) {
+            return Ok(Remains::None);
+        }
+        if [REPAIR_JOURNAL, DRAFT, NEW].iter().any(|name| fs::symlink_metadata(path.join(name)).is_ok()) {
+            return Ok(Remains::Interrupted);
+        }
+        let ours = |name: &String| [IGNORE.0, LOCK, UNDO].contains(&name.as_str());
+        let is_empty = numbers(&path)?.is_empty() && names(&path)?.iter().all(ours);
+        Ok(if is_empty { Remains::Empty } else { Remains::None })
     }
 
     /// Locks the folder of a checkpoint; `None` when the folder does not exist.
@@ -49,7 +72,7 @@ impl Folder {
             // Without lock support, users must not run two repairs at once.
             Lock::Ours(mut lock) | Lock::Unknown(mut lock) => {
                 // The signature is only for the message of other runs. Writing it may fail on a full disk, where `undo`
-                // may still help.
+                // still works.
                 let _ = lock::sign(&mut lock);
                 Ok(Some(Self { root: root.to_owned(), path, _lock: lock }))
             }
@@ -101,8 +124,7 @@ impl Folder {
             Ok(()) => Ok(self),
             Err(error) => {
                 let _ = system::remove_file(&path);
-                self.tidy();
-                Err(error)
+                Err(error.with_leftover(self.tidy()))
             }
         }
     }
@@ -114,12 +136,12 @@ impl Folder {
 
     /// Folder of the originals of a repair.
     pub(super) fn originals(&self, number: u32) -> PathBuf {
-        self.path.join("undo").join(number.to_string())
+        self.path.join(UNDO).join(number.to_string())
     }
 
     /// Journal of a finished repair.
     pub(super) fn done(&self, number: u32) -> PathBuf {
-        self.path.join("undo").join(format!("{number}.json"))
+        self.path.join(UNDO).join(format!("{number}.json"))
     }
 
     /// Journal of the current repair or undo.
@@ -190,15 +212,26 @@ impl Folder {
         Ok(())
     }
 
+    /// Makes the journal of a finished repair the current one again, so that the repair can be undone; does nothing while
+    /// there is a current one. A rename needs no space, so this works on a full disk.
+    ///
+    /// A run killed afterwards leaves a repair that the next run finishes or rolls back, as after any other kill.
+    pub(super) fn reopen(&self, number: u32) -> Result<(), RepairError> {
+        let (journal, done) = (self.journal(), self.done(number));
+        if look(&journal)?.is_some() {
+            return Ok(());
+        }
+        retry(|| fs::rename(&done, &journal)).map_err(io_at(&journal, "publishing"))?;
+        sync_dir(&self.path).and_then(|()| done.parent().map_or(Ok(()), sync_dir)).map_err(|error| {
+            // Nothing has changed yet. If this fails, the next run finishes the repair, which changes nothing.
+            let _ = retry(|| fs::rename(&journal, &done));
+            error.into()
+        })
+    }
+
     /// Numbers of the repairs that can be undone, in ascending order.
     pub(super) fn numbers(&self) -> Result<Vec<u32>, RepairError> {
-        let undo = self.path.join("undo");
-        let mut numbers = Vec::new();
-        for name in names(&undo)? {
-            numbers.extend(name.strip_suffix(".json").and_then(|n| n.parse::<u32>().ok()));
-        }
-        numbers.sort_unstable();
-        Ok(numbers)
+        numbers(&self.path)
     }
 
     /// Removes files of a run that was killed before it wrote a journal.
@@ -206,32 +239,59 @@ impl Folder {
         remove_tree(&self.staged())?;
         remove_file(&self.path.join(DRAFT))?;
         let kept = self.numbers()?;
-        for name in names(&self.path.join("undo"))? {
+        for name in names(&self.path.join(UNDO))? {
             if name.parse::<u32>().is_ok_and(|n| !kept.contains(&n)) {
-                remove_tree(&self.path.join("undo").join(name))?;
+                remove_tree(&self.path.join(UNDO).join(name))?;
             }
         }
         Ok(())
     }
 
-    /// Removes the folder when no repair can be undone. Errors are ignored: an empty folder is harmless.
-    pub(super) fn tidy(&self) {
-        if self.numbers().is_ok_and(|numbers| numbers.is_empty()) && !self.journal().exists() && self.clear().is_ok() {
-            let _ = system::remove_dir(&self.path.join("undo"));
-            let others = names(&self.path).unwrap_or_default().into_iter().any(|name| name != IGNORE.0 && name != LOCK);
-            if !others {
-                let _ = system::remove_file(&self.path.join(IGNORE.0));
-                // The lock goes last: without it another run may begin, and then the folder stays.
-                let _ = system::remove_file(&self.path.join(LOCK));
-                let _ = system::remove_dir(&self.path);
-            }
+    /// Removes the folder when no repair can be undone, or else the files of a failed run. Returns the folder if it could
+    /// not be removed; [`super::recover`] tries again.
+    pub(super) fn tidy(&self) -> Option<Leftover> {
+        let leftover = |why| Leftover { path: self.path.clone(), why };
+        match look(&self.journal()) {
+            Ok(None) => self.remove_unused().err().map(leftover),
+            _ => None, // the next run needs it
+        }
+    }
+
+    fn remove_unused(&self) -> io::Result<()> {
+        self.clear().map_err(io::Error::other)?;
+        if !self.numbers().map_err(io::Error::other)?.is_empty() {
+            return Ok(());
+        }
+        match system::remove_dir(&self.path.join(UNDO)) {
+            Err(e) if e.kind() != io::ErrorKind::DirectoryNotEmpty => return Err(e),
+            _ => {}
+        }
+        if system::names(&self.path)?.into_iter().any(|name| name != IGNORE.0 && name != LOCK) {
+            return Ok(()); // files of somebody else
+        }
+        system::remove_file(&self.path.join(IGNORE.0))?;
+        // The lock goes last: without it another run may begin, and then the folder stays.
+        system::remove_file(&self.path.join(LOCK))?;
+        match system::remove_dir(&self.path) {
+            Err(e) if e.kind() == io::ErrorKind::DirectoryNotEmpty => Ok(()),
+            other => other,
         }
     }
 }
 
+/// Numbers of the repairs that can be undone in the folder `path`, in ascending order.
+fn numbers(path: &Path) -> Result<Vec<u32>, RepairError> {
+    let mut numbers = Vec::new();
+    for name in names(&path.join(UNDO))? {
+        numbers.extend(name.strip_suffix(".json").and_then(|n| n.parse::<u32>().ok()));
+    }
+    numbers.sort_unstable();
+    Ok(numbers)
+}
+
 /// Refuses symbolic links in place of folders: through them, a checkpoint from elsewhere could move files outside it.
 fn only_folders(path: &Path) -> Result<(), RepairError> {
-    let undo = path.join("undo");
+    let undo = path.join(UNDO);
     let mut folders = vec![path.to_owned(), path.join(NEW), undo.clone()];
     if look(&undo)?.is_some_and(|m| m.is_dir()) {
         folders.extend(names(&undo)?.iter().filter(|name| name.parse::<u32>().is_ok()).map(|name| undo.join(name)));
@@ -258,5 +318,5 @@ pub(super) fn remove_file(path: &Path) -> Result<(), RepairError> {
 }
 
 pub(super) fn remove_tree(path: &Path) -> Result<(), RepairError> {
-    Ok(system::remove_dir_all(path).map_err(io_at(path, "removing"))?)
+    Ok(system::remove_folder(path).map_err(io_at(path, "removing"))?)
 }

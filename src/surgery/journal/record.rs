@@ -2,20 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Kind of change that a journal describes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub(super) enum JournalKind {
-    Repair,
-    Undo,
-}
-
 /// The serialised journal of a repair.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Journal {
     pub(super) version: u32,
-    pub(super) kind: JournalKind,
     /// Number of the repair; the highest is undone first.
     pub(super) number: u32,
     pub(super) files: Vec<JournaledFile>,

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use super::folder::Folder;
-use super::record::JournalKind;
+use super::folder::{Folder, Remains};
 use super::replay::Replay;
 use crate::surgery::error::RepairError;
+use crate::surgery::leftover::Leftover;
 
 /// Outcome of the recovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,44 +16,47 @@ pub enum Recovered {
     RolledBack,
 }
 
-/// Finishes or rolls back an interrupted repair; `None` when there is none.
+/// Result of [`recover`].
+#[derive(Debug, Default)]
+pub struct Recovery {
+    /// What happened to an interrupted repair or undo; `None` when there was none.
+    pub outcome: Option<Recovered>,
+    /// Files that could not be removed.
+    pub leftover: Option<Leftover>,
+}
+
+/// Finishes or rolls back an interrupted repair, and removes what an ended run has left.
 ///
 /// # Errors
 /// A [`RepairError`]; the journal stays, so that the next run can continue.
-pub fn recover(root: &Path) -> Result<Option<Recovered>, RepairError> {
-    // A directory without remains needs no lock, so it may be read-only.
-    if !Folder::has_remains(root) {
-        return Ok(None);
-    }
-    match Folder::open(root)? {
-        None => Ok(None),
-        Some(folder) => {
-            let recovered = recover_in(&folder)?;
-            folder.tidy();
-            Ok(recovered)
+pub fn recover(root: &Path) -> Result<Recovery, RepairError> {
+    match Folder::remains(root)? {
+        Remains::None => Ok(Recovery::default()),
+        // Without a repair to finish, a directory may be read-only, and another run may have the lock.
+        Remains::Empty => {
+            let leftover = Folder::open(root).ok().flatten().and_then(|folder| folder.tidy());
+            Ok(Recovery { outcome: None, leftover })
         }
+        Remains::Interrupted => match Folder::open(root)? {
+            None => Ok(Recovery::default()),
+            Some(folder) => {
+                let (outcome, leftover) = recover_in(&folder)?;
+                Ok(Recovery { outcome, leftover: leftover.or(folder.tidy()) })
+            }
+        },
     }
 }
 
-pub(super) fn recover_in(folder: &Folder) -> Result<Option<Recovered>, RepairError> {
+/// The recovery in a locked folder.
+pub(super) fn recover_in(folder: &Folder) -> Result<(Option<Recovered>, Option<Leftover>), RepairError> {
     let Some(journal) = folder.pending()? else {
         folder.clear()?;
-        return Ok(None);
+        return Ok((None, None));
     };
     let replay = Replay::new(folder, &journal);
-    let recovered = match journal.kind {
-        JournalKind::Undo => {
-            replay.restore()?;
-            Recovered::Finished
-        }
-        JournalKind::Repair if replay.can_finish()? => {
-            replay.finish()?;
-            Recovered::Finished
-        }
-        JournalKind::Repair => {
-            replay.roll_back()?;
-            Recovered::RolledBack
-        }
-    };
-    Ok(Some(recovered))
+    if replay.can_finish()? {
+        return Ok((Some(Recovered::Finished), replay.finish()?));
+    }
+    replay.roll_back()?;
+    Ok((Some(Recovered::RolledBack), None))
 }

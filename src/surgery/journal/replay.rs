@@ -6,15 +6,41 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{CWD, RenameFlags, renameat_with};
 use sha2::{Digest, Sha256};
 
+use super::exchange::{Taken, exchange, keep, rename_new, take_away};
 use super::folder::{Folder, remove_file, remove_tree};
 use super::record::{Journal, JournaledFile, NewFile, OldFile};
 use crate::checkpoint::hex;
-use crate::checkpoint::open::open_regular;
+use crate::checkpoint::open::{Identity, open_regular};
 use crate::surgery::error::{RepairError, io_at};
-use crate::surgery::system::{look, retry, sync_dir};
+use crate::surgery::leftover::Leftover;
+use crate::surgery::system::{look, remove_folder, retry, sync_dir};
+
+/// What the staging folder holds under the name of a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Staged {
+    /// Nothing: the new file was moved into place.
+    Missing,
+    /// The new file.
+    New,
+    /// The original, exchanged for the new file.
+    Original,
+    /// A file that another program saved between the link to the original and the exchange.
+    Other,
+}
+
+/// A step that restores a file.
+enum StepBack {
+    /// Exchange the original for the new file, of this identity.
+    Exchange(Identity),
+    /// Take away the new file, of this identity, which the repair had added.
+    TakeAway(Identity),
+    /// Move the original back: links are not supported.
+    MoveBack,
+    /// Return a file of another program from the staging folder.
+    Displaced,
+}
 
 /// A journal and its folder.
 pub(super) struct Replay<'a> {
@@ -43,19 +69,29 @@ impl<'a> Replay<'a> {
         self.originals().join(&entry.name)
     }
 
+    /// What the staging folder holds under the name of this file.
+    fn staged_file(&self, entry: &JournaledFile) -> Result<Staged, RepairError> {
+        let staged = self.staged(entry);
+        Ok(match (look(&staged)?, look(&self.original(entry))?) {
+            (None, _) => Staged::Missing,
+            (Some(there), Some(kept)) if is_same(&there, &kept) => Staged::Original,
+            _ if entry.new.identity(&staged)?.is_some() => Staged::New,
+            _ => Staged::Other,
+        })
+    }
+
     /// Whether all files needed to finish the repair are present and unchanged.
     pub(super) fn can_finish(&self) -> Result<bool, RepairError> {
         for entry in &self.journal.files {
             let target = self.target(entry);
-            let ready = if look(&self.staged(entry))?.is_some() {
-                let untouched = match (look(&target)?, &entry.old) {
+            let ready = match self.staged_file(entry)? {
+                Staged::New => match (look(&target)?, &entry.old) {
                     (Some(is), Some(was)) => OldFile::from_metadata(&is) == *was,
                     (None, Some(_)) => look(&self.original(entry))?.is_some(),
                     (there, None) => there.is_none(),
-                };
-                untouched && entry.new.matches(&self.staged(entry))?
-            } else {
-                entry.new.matches(&target)?
+                },
+                Staged::Missing | Staged::Original => entry.new.identity(&target)?.is_some(),
+                Staged::Other => false,
             };
             if !ready {
                 return Ok(false);
@@ -64,75 +100,116 @@ impl<'a> Replay<'a> {
         Ok(true)
     }
 
-    /// Links the originals, moves the new files into place, and archives the journal.
-    pub(super) fn finish(&self) -> Result<(), RepairError> {
+    /// Links the originals, moves the new files into place, and archives the journal. Returns the staging folder if it
+    /// could not be removed.
+    pub(super) fn finish(&self) -> Result<Option<Leftover>, RepairError> {
         self.folder.folder(&self.originals())?;
-        for entry in &self.journal.files {
+        let staged: Vec<_> = self.journal.files.iter().filter(|entry| self.is_staged(entry)).collect();
+        for entry in &staged {
             let (target, original) = (self.target(entry), self.original(entry));
-            if entry.old.is_some() && look(&self.staged(entry))?.is_some() && look(&original)?.is_none() {
+            if entry.old.is_some() && look(&original)?.is_none() {
                 keep(&target, &original).map_err(io_at(&target, "linking the original"))?;
             }
         }
         // The originals must be durable before they are replaced.
         sync_dir(&self.originals())?;
         sync_dir(&self.folder.root)?;
-        for entry in &self.journal.files {
-            let (staged, target) = (self.staged(entry), self.target(entry));
-            if look(&staged)?.is_none() {
-                continue;
-            }
-            let put = match entry.old {
-                Some(_) => retry(|| fs::rename(&staged, &target)),
-                None => rename_new(&staged, &target),
-            };
-            put.map_err(io_at(&target, "replacing"))?;
+        for entry in staged {
+            self.publish(entry)?;
         }
         sync_dir(&self.folder.root)?;
         let (journal, done) = (self.folder.journal(), self.folder.done(self.journal.number));
         retry(|| fs::rename(&journal, &done)).map_err(io_at(&done, "publishing"))?;
         done.parent().map_or(Ok(()), sync_dir)?;
         journal.parent().map_or(Ok(()), sync_dir)?;
-        remove_tree(&self.folder.staged())
+        let staging = self.folder.staged();
+        Ok(remove_folder(&staging).err().map(|why| Leftover { path: staging, why }))
     }
 
-    /// Restores the originals that a repair has replaced, and removes its files.
+    /// Whether the new file is still in the staging folder, in a repair that can be finished.
+    fn is_staged(&self, entry: &JournaledFile) -> bool {
+        match (fs::symlink_metadata(self.staged(entry)), fs::symlink_metadata(self.original(entry))) {
+            (Ok(there), Ok(kept)) => !is_same(&there, &kept),
+            (there, _) => there.is_ok(),
+        }
+    }
+
+    /// Moves a new file into place. The original stays in the staging folder, if the file system can exchange names.
+    fn publish(&self, entry: &JournaledFile) -> Result<(), RepairError> {
+        let (staged, target) = (self.staged(entry), self.target(entry));
+        let taken = match (&entry.old, look(&self.original(entry))?) {
+            // A missing target was moved to its original.
+            (Some(old), Some(kept)) if look(&target)?.is_some() => exchange(
+                &staged,
+                &target,
+                &Identity { size: old.len, mtime: old.mtime, ..Identity::from_metadata(&kept) },
+            ),
+            _ => rename_new(&staged, &target).map(|()| Taken::Expected),
+        };
+        match taken.map_err(io_at(&target, "replacing"))? {
+            Taken::Expected => Ok(()),
+            Taken::Changed => Err(RepairError::ChangedWhileRepaired { path: target }),
+        }
+    }
+
+    /// Restores the originals that a repair has replaced, and removes its files. Files that another program has saved
+    /// before they were replaced stay.
+    ///
+    /// `undo` calls this for a finished repair.
     pub(super) fn roll_back(&self) -> Result<(), RepairError> {
         let mut back = Vec::new();
         for entry in &self.journal.files {
-            let (target, original) = (self.target(entry), self.original(entry));
-            match (look(&original)?, look(&target)?) {
-                (Some(kept), Some(there)) if (kept.dev(), kept.ino()) == (there.dev(), there.ino()) => {}
-                (Some(_), None) => back.push(entry),
-                (Some(_) | None, Some(_)) if self.is_new(entry)? => back.push(entry),
-                (Some(_), Some(_)) => {
-                    return Err(RepairError::ChangedSinceRepair { path: target, originals: self.originals() });
-                }
-                (None, _) => {}
-            }
+            back.extend(self.step_back(entry)?.map(|step| (entry, step)));
         }
-        for entry in back {
+        for (entry, step) in back {
             let (target, original) = (self.target(entry), self.original(entry));
-            if entry.old.is_some() {
-                retry(|| fs::rename(&original, &target)).map_err(io_at(&target, "restoring"))?;
-            } else {
-                remove_file(&target)?;
+            let taken = match step {
+                StepBack::Exchange(new) => exchange(&original, &target, &new),
+                StepBack::TakeAway(new) => take_away(&target, &original, &new),
+                StepBack::MoveBack => rename_new(&original, &target).map(|()| Taken::Expected),
+                StepBack::Displaced => retry(|| fs::rename(self.staged(entry), &target)).map(|()| Taken::Expected),
+            };
+            if taken.map_err(io_at(&target, "restoring"))? == Taken::Changed {
+                return Err(self.changed_since(target));
             }
         }
         sync_dir(&self.folder.root)?;
         self.forget()
     }
 
-    /// Whether the target is the repair's new file.
-    fn is_new(&self, entry: &JournaledFile) -> Result<bool, RepairError> {
-        let published = look(&self.staged(entry))?.is_none();
-        Ok(published && entry.new.matches(&self.target(entry))?)
+    /// The step that restores this file; `None` when it was never replaced, or is already restored.
+    fn step_back(&self, entry: &JournaledFile) -> Result<Option<StepBack>, RepairError> {
+        let (target, original) = (self.target(entry), self.original(entry));
+        let staged = self.staged_file(entry)?;
+        let new = entry.new.identity(&target)?;
+        Ok(match (staged, look(&original)?, look(&target)?) {
+            (Staged::Other, _, Some(_)) if new.is_some() => Some(StepBack::Displaced),
+            (_, Some(_), None) if entry.new.identity(&original)?.is_some() => None,
+            (_, Some(_), None) => Some(StepBack::MoveBack),
+            (Staged::New, ..) | (_, None, None) => None,
+            (_, Some(kept), Some(there)) if is_same(&kept, &there) => None,
+            (_, Some(_), Some(_)) => match new {
+                Some(new) => Some(StepBack::Exchange(new)),
+                None if entry.new.identity(&original)?.is_some() => None,
+                None => return Err(self.changed_since(target)),
+            },
+            (_, None, Some(_)) => match (new, &entry.old) {
+                (Some(new), None) => Some(StepBack::TakeAway(new)),
+                (Some(_), Some(_)) => return Err(self.changed_since(original)),
+                (None, _) => None,
+            },
+        })
+    }
+
+    fn changed_since(&self, path: PathBuf) -> RepairError {
+        RepairError::ChangedSinceRepair { path, originals: self.originals() }
     }
 
     /// The first file that changed after the repair, or whose original is missing.
     pub(super) fn changed(&self) -> Result<Option<PathBuf>, RepairError> {
         for entry in &self.journal.files {
             let kept = look(&self.original(entry))?.map(|m| m.len());
-            if !entry.new.matches(&self.target(entry))? {
+            if entry.new.identity(&self.target(entry))?.is_none() {
                 return Ok(Some(self.target(entry)));
             }
             if kept != entry.old.as_ref().map(|old| old.len) {
@@ -140,22 +217,6 @@ impl<'a> Replay<'a> {
             }
         }
         Ok(None)
-    }
-
-    /// Undoes a finished repair; files that are already restored are skipped.
-    pub(super) fn restore(&self) -> Result<(), RepairError> {
-        for entry in &self.journal.files {
-            let (target, original) = (self.target(entry), self.original(entry));
-            if entry.old.is_none() {
-                if entry.new.matches(&target)? {
-                    remove_file(&target)?;
-                }
-            } else if look(&original)?.is_some() {
-                retry(|| fs::rename(&original, &target)).map_err(io_at(&target, "restoring"))?;
-            }
-        }
-        sync_dir(&self.folder.root)?;
-        self.forget()
     }
 
     /// Removes all files of a repair, the journal last.
@@ -169,25 +230,9 @@ impl<'a> Replay<'a> {
     }
 }
 
-/// Links a file under a second name, so that the first always exists; moves it if links are not supported.
-fn keep(target: &Path, original: &Path) -> io::Result<()> {
-    retry(|| fs::hard_link(target, original)).or_else(|e| match e.kind() {
-        io::ErrorKind::PermissionDenied | io::ErrorKind::Unsupported | io::ErrorKind::TooManyLinks => {
-            retry(|| fs::rename(target, original))
-        }
-        _ => Err(e),
-    })
-}
-
-/// Renames a file; fails if the new name exists.
-fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
-    match rustix::io::retry_on_intr(|| renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE)) {
-        // Some file systems do not support the flag.
-        Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) if fs::symlink_metadata(to).is_err() => {
-            retry(|| fs::rename(from, to))
-        }
-        other => other.map_err(io::Error::from),
-    }
+/// Whether two names are those of one file.
+fn is_same(a: &Metadata, b: &Metadata) -> bool {
+    (a.dev(), a.ino()) == (b.dev(), b.ino())
 }
 
 impl OldFile {
@@ -199,16 +244,23 @@ impl OldFile {
 impl NewFile {
     /// Hashes a file.
     pub(super) fn hash(path: &Path) -> Result<Self, RepairError> {
+        Ok(Self::hash_opened(path)?.0)
+    }
+
+    fn hash_opened(path: &Path) -> Result<(Self, Identity), RepairError> {
         let opened = open_regular(path, u64::MAX).map_err(|e| io_at(path, "reading")(io::Error::other(e)))?;
         let mut hasher = Hasher(Sha256::new());
         let len = io::copy(&mut &opened.file, &mut hasher).map_err(io_at(path, "reading"))?;
-        Ok(Self { len, sha256: hex(&hasher.0.finalize()) })
+        Ok((Self { len, sha256: hex(&hasher.0.finalize()) }, opened.identity))
     }
 
-    /// Whether the file at `path` has this hash and size.
-    fn matches(&self, path: &Path) -> Result<bool, RepairError> {
-        let is_file = look(path)?.is_some_and(|m| m.is_file() && m.len() == self.len);
-        Ok(is_file && Self::hash(path)? == *self)
+    /// The identity of the file at `path`, if it has this hash and size.
+    fn identity(&self, path: &Path) -> Result<Option<Identity>, RepairError> {
+        if !look(path)?.is_some_and(|m| m.is_file() && m.len() == self.len) {
+            return Ok(None);
+        }
+        let (is, identity) = Self::hash_opened(path)?;
+        Ok((is == *self).then_some(identity))
     }
 }
 

@@ -3,14 +3,15 @@
 use std::path::Path;
 
 use super::folder::Folder;
-use super::record::{Journal, JournalKind, JournaledFile};
+use super::record::{Journal, JournaledFile};
 use super::recover::{Recovered, recover_in};
 use super::replay::Replay;
 use crate::surgery::error::RepairError;
+use crate::surgery::leftover::Leftover;
 use crate::surgery::stop::interrupted;
 
 /// Result of an undo.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug)]
 pub struct Undone {
     /// Files that were restored.
     pub restored: Vec<String>,
@@ -18,6 +19,8 @@ pub struct Undone {
     pub removed: Vec<String>,
     /// Number of earlier repairs that can still be undone.
     pub left: usize,
+    /// Files that could not be removed.
+    pub leftover: Option<Leftover>,
 }
 
 /// Undoes the latest repair of a checkpoint. An interrupted repair is finished or rolled back first.
@@ -28,34 +31,34 @@ pub struct Undone {
 pub fn undo(root: &Path) -> Result<Undone, RepairError> {
     let Some(folder) = Folder::open(root)? else { return Err(RepairError::NothingToUndo { path: root.to_owned() }) };
     let pending = folder.pending()?;
-    let recovered = recover_in(&folder)?;
+    let (recovered, _) = recover_in(&folder)?;
     if let Some(journal) = pending
-        && (journal.kind == JournalKind::Undo || recovered == Some(Recovered::RolledBack))
+        && recovered == Some(Recovered::RolledBack)
     {
-        // The recovery has finished an interrupted undo, which is the requested one.
+        // The recovery has undone an interrupted repair, or finished an interrupted undo: this is the requested one.
         return Ok(undone(&folder, &journal));
     }
     let numbers = folder.numbers()?;
     let read = numbers.last().map(|number| Folder::read_journal(&folder.done(*number))).transpose()?.flatten();
     let Some(journal) = read else {
-        folder.tidy();
-        return Err(RepairError::NothingToUndo { path: root.to_owned() });
+        let leftover = folder.tidy();
+        let error = RepairError::NothingToUndo { path: root.to_owned() };
+        return Err(error.with_leftover(leftover));
     };
-    let journal = Journal { kind: JournalKind::Undo, ..journal };
     let replay = Replay::new(&folder, &journal);
     if let Some(path) = replay.changed()? {
         return Err(RepairError::ChangedSinceRepair { path, originals: folder.originals(journal.number) });
     }
     interrupted()?;
-    folder.begin(&journal)?;
-    replay.restore().map_err(|error| RepairError::Unfinished { error: Box::new(error) })?;
+    folder.reopen(journal.number)?;
+    replay.roll_back().map_err(|error| RepairError::Unfinished { error: Box::new(error) })?;
     Ok(undone(&folder, &journal))
 }
 
 fn undone(folder: &Folder, journal: &Journal) -> Undone {
     let left = folder.numbers().map_or(0, |numbers| numbers.len());
-    folder.tidy();
+    let leftover = folder.tidy();
     let (restored, removed): (Vec<_>, Vec<_>) = journal.files.iter().partition(|f| f.old.is_some());
     let names = |entries: Vec<&JournaledFile>| entries.into_iter().map(|f| f.name.clone()).collect();
-    Undone { restored: names(restored), removed: names(removed), left }
+    Undone { restored: names(restored), removed: names(removed), left, leftover }
 }

@@ -5,22 +5,24 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
 use super::folder::{Folder, VERSION};
-use super::record::{Journal, JournalKind, JournaledFile, NewFile, OldFile};
+use super::record::{Journal, JournaledFile, NewFile, OldFile};
 use super::replay::Replay;
 use crate::surgery::changes::{check_unchanged, explain_error, write_content};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{RepairError, io_at};
+use crate::surgery::leftover::Leftover;
 use crate::surgery::repair::Repair;
 use crate::surgery::stop::interrupted;
 use crate::surgery::system::{check_space, look, retry, sync_dir};
 
 /// Replaces the changed files of a repair, all of them or none.
 ///
-/// `progress` receives the bytes written. Call [`super::recover`] before the checkpoint is opened.
+/// `progress` receives the bytes written. Call [`super::recover`] before the checkpoint is opened. Returns the files that
+/// could not be removed afterwards.
 ///
 /// # Errors
 /// A [`RepairError`]; then the checkpoint is unchanged, except with [`RepairError::Unfinished`].
-pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
+pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<Option<Leftover>, RepairError> {
     let root = &repair.original.root;
     for change in &repair.changes {
         let path = root.join(&change.name);
@@ -33,17 +35,16 @@ pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<(), Repai
     let written = stage(repair, &folder, progress).and_then(|journal| {
         folder.begin(&journal)?;
         let replay = Replay::new(&folder, &journal);
-        replay.finish().map_err(|error| match replay.roll_back() {
+        let undo = || folder.reopen(journal.number).and_then(|()| replay.roll_back());
+        replay.finish().map_err(|error| match undo() {
             Ok(()) => error,
             Err(_) => RepairError::Unfinished { error: Box::new(error) },
         })
     });
-    if written.is_err() && !folder.journal().exists() {
-        // The first error is reported; the next run would clear the folder as well.
-        let _ = folder.clear();
+    match written {
+        Ok(leftover) => Ok(leftover.or(folder.tidy())),
+        Err(error) => Err(explain_error(error, root, repair).with_leftover(folder.tidy())),
     }
-    folder.tidy();
-    written.map_err(|error| explain_error(error, root, repair))
 }
 
 /// Stages the new files.
@@ -79,7 +80,7 @@ fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Res
     sync_dir(&staging)?;
     donor.unchanged()?;
     interrupted()?;
-    Ok(Journal { version: VERSION, kind: JournalKind::Repair, number, files })
+    Ok(Journal { version: VERSION, number, files })
 }
 
 /// Gives a new file the owner and the mode of the original.

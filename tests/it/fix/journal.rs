@@ -95,7 +95,7 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
 
             let found = check(&Arc::new(Checkpoint::open(&dir).expect("open")), &support::knowledge()).findings;
             assert_eq!(found.iter().any(|f| f.code == "FIL010"), (1..5).contains(&step), "step {step}");
-            let recovered = journal::recover(&dir).expect("recovered");
+            let recovered = journal::recover(&dir).expect("recovered").outcome;
             let (outcome, files) = match step {
                 1..=3 if damaged => (Some(Recovered::RolledBack), &before),
                 1..=4 => (Some(Recovered::Finished), &after),
@@ -112,18 +112,91 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
     }
 }
 
+/// Every state that a killed undo can leave, with and without `RENAME_EXCHANGE`.
 #[test]
-fn an_undo_that_was_interrupted_is_finished() {
+fn an_interrupted_undo_is_finished() {
     let (_room, dir) = broken();
     let before = contents(&dir);
+    let folder = dir.join(".ckpt-doctor");
+    let (kept, config, index) = (folder.join("undo/1"), "config.json", "model.safetensors.index.json");
+    for step in 0..=4 {
+        for exchanged in [false, true] {
+            journal::write(&repair(&dir), &mut |_| {}).expect("written");
+            let after = contents(&dir);
+            // 0: the journal is current again. 1: the original restored. 2: the added file removed. 3: the originals
+            // removed. 4: the journal removed.
+            fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
+            if step >= 1 {
+                fs::rename(kept.join(config), dir.join(config)).expect("a rename");
+                if exchanged {
+                    fs::write(kept.join(config), &after[config]).expect("a file");
+                }
+            }
+            if step >= 2 {
+                fs::rename(dir.join(index), kept.join(index)).expect("a rename");
+                if !exchanged {
+                    fs::remove_file(kept.join(index)).expect("removed");
+                }
+            }
+            if step >= 3 {
+                fs::remove_dir_all(&kept).expect("removed");
+            }
+            if step >= 4 {
+                fs::remove_file(folder.join("journal.json")).expect("removed");
+            }
+            let recovered = journal::recover(&dir).expect("recovered").outcome;
+            let (outcome, files) = match step {
+                0 => (Some(Recovered::Finished), &after),
+                1..=3 => (Some(Recovered::RolledBack), &before),
+                _ => (None, &before),
+            };
+            assert_eq!((recovered, &contents(&dir)), (outcome, files), "step {step}, {exchanged}");
+            if step == 0 {
+                journal::undo(&dir).expect("undone");
+            }
+            assert_eq!(contents(&dir), before, "step {step}, {exchanged}");
+            assert!(!folder.exists(), "step {step}, {exchanged}: the folder is left behind");
+        }
+    }
+}
+
+/// Another program saved a file between the link to the original and the exchange, and the run was killed before it could
+/// exchange the files back.
+#[test]
+fn a_file_saved_during_an_interrupted_repair_is_returned() {
+    let (_room, dir) = broken();
     journal::write(&repair(&dir), &mut |_| {}).expect("written");
     let folder = dir.join(".ckpt-doctor");
-    let filed = fs::read_to_string(folder.join("undo/1.json")).expect("a journal");
-    fs::write(folder.join("journal.json"), filed.replace("\"repair\"", "\"undo\"")).expect("a journal");
-    fs::rename(folder.join("undo/1/config.json"), dir.join("config.json")).expect("a rename");
-    journal::undo(&dir).expect("finished");
-    assert_eq!(contents(&dir), before);
+    fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
+    fs::create_dir(folder.join("new")).expect("a folder");
+    fs::write(folder.join("new/config.json"), "saved").expect("a file");
+    assert_eq!(journal::recover(&dir).expect("recovered").outcome, Some(Recovered::RolledBack));
+    assert_eq!(fs::read_to_string(dir.join("config.json")).expect("a file"), "saved");
     assert!(!folder.exists());
+}
+
+/// What stays when the removal of the last temporary files failed.
+#[test]
+fn an_empty_folder_is_removed_by_the_next_run() {
+    let (_room, dir) = broken();
+    let folder = dir.join(".ckpt-doctor");
+    for names in
+        [&[][..], &["lock"], &[".gitignore", "lock"], &[".gitignore", "lock", "undo/"], &["new/"], &["undo/1/"]]
+    {
+        fs::create_dir(&folder).expect("a folder");
+        for name in names {
+            match name.strip_suffix('/') {
+                Some(name) => fs::create_dir_all(folder.join(name)).expect("a folder"),
+                None => fs::write(folder.join(name), "").expect("a file"),
+            }
+        }
+        assert_eq!(journal::recover(&dir).expect("recovered").outcome, None);
+        assert!(!folder.exists(), "{names:?}");
+    }
+    fs::create_dir(&folder).expect("a folder");
+    fs::write(folder.join("notes"), "mine").expect("a file");
+    journal::recover(&dir).expect("recovered");
+    assert_eq!(seen(&folder).into_keys().collect::<Vec<_>>(), ["notes"]);
 }
 
 #[test]
@@ -183,7 +256,8 @@ fn links_are_never_written_through() {
     let error = journal::write(&repair, &mut |_| {}).expect_err("refused");
     assert!(error.to_string().contains("--fix --output DIR"), "{error}");
     assert!(!dir.join(".ckpt-doctor").exists());
-    let out = overlay(&repair, &room.path().join("repaired"), &mut |_| {}).expect("a copy");
+    let out = room.path().join("repaired");
+    overlay(&repair, &out, &mut |_| {}).expect("a copy");
     assert_eq!(fs::read(&blob).expect("a file"), bytes);
     assert!(fs::symlink_metadata(out.join("config.json")).expect("a file").is_file());
 }
@@ -193,7 +267,8 @@ fn a_copy_leaves_the_original_alone() {
     let (room, dir) = broken();
     let before = seen(&dir);
     let repair = repair(&dir);
-    let out = overlay(&repair, &room.path().join("repaired"), &mut |_| {}).expect("a copy");
+    let out = room.path().join("repaired");
+    overlay(&repair, &out, &mut |_| {}).expect("a copy");
     assert_eq!(seen(&dir), before);
     let found = check(&Arc::new(Checkpoint::open(&out).expect("open")), &support::knowledge()).findings;
     assert_eq!(found, repair.outcome.findings);

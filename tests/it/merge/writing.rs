@@ -213,6 +213,45 @@ fn only_the_staging_directory_of_a_killed_run_is_cleared() {
     assert_eq!(names(&stale), ["thesis.txt"]);
 }
 
+/// Every state in which a run can leave its staging directory after the rename, and every reason to refuse the target.
+#[test]
+fn remains_are_removed_even_if_the_target_is_refused() {
+    let work = TempDir::new().unwrap();
+    let (stale, out) = (work.path().join(".out.partial"), work.path().join("out"));
+    for (marker, content) in [(true, true), (true, false), (false, false)] {
+        for kind in ["directory", "file"] {
+            fs::create_dir(&stale).unwrap();
+            if marker {
+                fs::write(stale.join("ckpt-doctor-owner"), "process 1").unwrap();
+            }
+            if content {
+                fs::create_dir(stale.join("content")).unwrap();
+                fs::write(stale.join("content/model.safetensors"), "half").unwrap();
+            }
+            if kind == "file" {
+                fs::write(&out, "mine").unwrap();
+            } else {
+                fs::create_dir(&out).unwrap();
+                fs::write(out.join("mine"), "mine").unwrap();
+            }
+            let dry = tiny(&out, &["--dry-run"]);
+            assert_eq!((dry.status.code(), names(work.path()).len()), (Some(2), 2), "{}", text(&dry));
+            let run = tiny(&out, &[]);
+            assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+            assert!(text(&run).contains(".out.partial, which an ended run had left, was removed"), "{}", text(&run));
+            assert_eq!(names(work.path()), ["out"]);
+            let _ = fs::remove_file(&out);
+            let _ = fs::remove_dir_all(&out);
+        }
+    }
+    fs::create_dir(&stale).unwrap();
+    fs::write(stale.join("ckpt-doctor-owner"), "process 1").unwrap();
+    let run = tiny(&out, &[]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    assert!(text(&run).contains(".out.partial, which an ended run had left, was removed"), "{}", text(&run));
+    assert_eq!(names(work.path()), ["out"]);
+}
+
 #[test]
 fn a_running_merge_is_not_disturbed() {
     let work = TempDir::new().unwrap();
@@ -224,5 +263,8 @@ fn a_running_merge_is_not_disturbed() {
     let run = tiny(&work.path().join("out"), &[]);
     assert_eq!(run.status.code(), Some(2));
     assert!(text(&run).contains("process 4711"), "{}", text(&run));
+    assert_eq!(names(&staging), ["ckpt-doctor-owner"]);
+    fs::write(work.path().join("out"), "a refused target").unwrap();
+    assert_eq!(tiny(&work.path().join("out"), &[]).status.code(), Some(2));
     assert_eq!(names(&staging), ["ckpt-doctor-owner"]);
 }
