@@ -32,6 +32,13 @@ pub(super) enum Lock {
 /// the descriptor until it runs its program, and would keep the lock for that time.
 pub(super) struct LockFile(File);
 
+impl LockFile {
+    /// Syncs the file with its signature.
+    pub(super) fn sync(&self) -> io::Result<()> {
+        retry(|| self.0.sync_all())
+    }
+}
+
 impl Drop for LockFile {
     fn drop(&mut self) {
         // An error would only mean that the file system has no locks.

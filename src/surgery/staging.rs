@@ -80,6 +80,9 @@ impl Staging {
         // From here on every error removes the directory.
         let mut staging = Self { path: path.to_owned(), content: path.join(CONTENT), lock, over: false };
         lock::sign(&mut staging.lock).map_err(io_at(&marker, "writing"))?;
+        // A power failure may keep the content without the marker otherwise: btrfs syncs a file without its siblings.
+        staging.lock.sync().map_err(io_at(&marker, "syncing"))?;
+        sync_dir(path)?;
         retry(|| fs::create_dir(&staging.content)).map_err(io_at(&staging.content, "creating"))?;
         Ok(Some(staging))
     }

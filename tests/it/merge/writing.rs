@@ -9,9 +9,10 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use serde_json::Value;
 use tempfile::TempDir;
 
-use super::{copy, donor, names, text, tiny};
+use super::{copy, donor, json, names, text, tiny};
 
 /// A merge of the donors in `work`; the fixtures replace missing ones.
 fn merge(work: &Path, out: &Path) -> Command {
@@ -244,12 +245,28 @@ fn remains_are_removed_even_if_the_target_is_refused() {
             let _ = fs::remove_dir_all(&out);
         }
     }
-    fs::create_dir(&stale).unwrap();
-    fs::write(stale.join("ckpt-doctor-owner"), "process 1").unwrap();
-    let run = tiny(&out, &[]);
-    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
-    assert!(text(&run).contains(".out.partial, which an ended run had left, was removed"), "{}", text(&run));
-    assert_eq!(names(work.path()), ["out"]);
+}
+
+#[test]
+fn a_merge_states_which_remains_it_removed() {
+    let work = TempDir::new().unwrap();
+    let (stale, out) = (work.path().join(".out.partial"), work.path().join("out"));
+    let place = fs::canonicalize(work.path()).unwrap().display().to_string();
+    let mut said = String::new();
+    for (target, expected) in [("free", 0), ("taken", 2)] {
+        fs::create_dir(&stale).unwrap();
+        fs::write(stale.join("ckpt-doctor-owner"), "process 1").unwrap();
+        let run = tiny(&out, &["--output-format", "json"]);
+        assert_eq!(run.status.code(), Some(expected), "{}", text(&run));
+        assert_eq!(names(work.path()), ["out"]);
+        let stage = |stage: &Value| format!("stage {}: {}\n", stage["name"], stage["outcome"]);
+        let stages = if expected == 0 { json(&run)["merge"]["stages"].clone() } else { Value::Array(Vec::new()) };
+        let stages: String = stages.as_array().unwrap().iter().filter(|s| s["name"] == "clean up").map(stage).collect();
+        said += &format!("{target}: {}{stages}", String::from_utf8_lossy(&run.stderr)).replace(&place, "/work");
+    }
+    // The report in the result does not depend on what an earlier run left.
+    assert!(!fs::read_to_string(out.join("merge-report.md")).unwrap().contains("ended run"));
+    snapshot!("merge-remains", said);
 }
 
 #[test]
