@@ -59,6 +59,7 @@ class Disk:
     def remove(self, path):
         self.bytes.discard(path)
         for names in self.given.values():
+            self.names_given -= path in names  # removed before it had to be durable
             names.discard(path)
         self.names.pop(path, None)
         if parent(path) in self.names:
@@ -93,7 +94,12 @@ def durable(log, place):
             disk.sync(files[0])
         elif name in ("rename", "renameat", "renameat2", "link", "linkat") and disk.inside(paths[-1]):
             disk.give(paths[0], paths[-1], name.startswith("rename"))
-        elif name in ("unlink", "unlinkat", "rmdir") and paths and disk.inside(paths[0]):
-            disk.remove(paths[0])
+            if "RENAME_EXCHANGE" in text:
+                disk.give(paths[-1], paths[0], False)
+        elif name in ("unlink", "unlinkat", "rmdir") and paths:
+            # A name relative to an open directory.
+            path = paths[0] if paths[0].startswith("/") or not files else f"{files[0]}/{paths[0]}"
+            if disk.inside(path):
+                disk.remove(path)
     disk.end()
     return {"files": disk.files, "names": disk.names_given, "synced": disk.synced}
