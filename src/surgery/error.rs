@@ -163,8 +163,7 @@ pub enum RepairError {
         path: PathBuf,
     },
     /// A file changed between the staging of its replacement and the replacement.
-    #[error("{path} changed while it was repaired; it keeps its new content, and the repair was rolled back, \
-             retry once nothing else modifies it", path = path.display())]
+    #[error("{path} changed while it was repaired, and keeps its new content; retry once nothing else modifies it", path = path.display())]
     ChangedWhileRepaired {
         /// The file.
         path: PathBuf,

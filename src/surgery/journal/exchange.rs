@@ -55,7 +55,9 @@ pub(super) fn take_away(place: &Path, other: &Path, was: &Identity) -> io::Resul
 pub(super) fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
     match retry_on_intr(|| renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE)) {
         // Some file systems do not support the flag.
-        Err(Errno::INVAL | Errno::NOSYS) if fs::symlink_metadata(to).is_err() => retry(|| fs::rename(from, to)),
+        Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if fs::symlink_metadata(to).is_err() => {
+            retry(|| fs::rename(from, to))
+        }
         other => other.map_err(io::Error::from),
     }
 }
