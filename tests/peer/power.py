@@ -64,7 +64,13 @@ class Recording:
                 chosen.append(blocks[: rng.randrange(len(blocks))])
             found += [(epoch, blocks) for blocks in chosen]
         numbered = [(i, *state) for i, state in enumerate(found)]
-        return numbered if full else sorted(rng.sample(numbered, min(SAMPLE, len(numbered))))
+        if full:
+            return numbered
+        # Half of the sample is around the last flush of the run, where the target gets its name.
+        late = [state for state in numbered if state[1] >= self.flushes - 2]
+        early = [state for state in numbered if state[1] < self.flushes - 2]
+        some = [state for half in (early, late) for state in rng.sample(half, min(SAMPLE // 2, len(half)))]
+        return sorted(some, key=lambda state: state[0])
 
 
 def run(*command):
