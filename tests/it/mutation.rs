@@ -8,15 +8,14 @@ pub mod mutate;
 use std::collections::BTreeMap;
 use std::fs;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ckpt_doctor::check::check;
-use ckpt_doctor::checkpoint::{Checkpoint, Document, Parts, PythonModule, Shard, Vocabulary};
 use ckpt_doctor::knowledge::Knowledge;
-use ckpt_doctor::report::model::CheckpointReport;
-use ckpt_doctor::report::{Format, Report, Style, render};
+use ckpt_doctor::report::Format;
 pub use mutate::Mutator;
+
+use crate::support::repairs::{File, planned, renders, repairs};
 
 /// Number of inputs in a plain `cargo test`.
 const FEW: usize = 2_000;
@@ -64,26 +63,15 @@ fn hold(name: &str, bytes: &[u8]) {
     }
 }
 
-/// Changes one file of the checkpoint, then checks it and renders a report.
+/// Changes one file of the checkpoint, then checks it, renders a report and repairs it.
 fn look(seeds: &[Seed], changed: usize, bytes: &[u8], knowledge: &Knowledge, format: Format) {
-    let mut parts = Parts::default();
-    for (at, seed) in seeds.iter().enumerate() {
-        let (name, bytes) = (seed.name.as_str(), if at == changed { bytes } else { &seed.bytes });
-        if name.ends_with(".safetensors") {
-            parts.shards.push(Shard::parse(name, bytes.len() as u64, bytes));
-        } else if name.ends_with(".json") {
-            parts.documents.push(Document::parse(name, bytes));
-        } else if name.ends_with(".py") {
-            parts.modules.push(PythonModule::parse(name, bytes));
-        } else if let Ok(vocabulary) = Vocabulary::parse(name, bytes) {
-            parts.vocabularies.insert(name.to_owned(), Arc::new(vocabulary));
-        }
-    }
-    let checkpoint = Arc::new(Checkpoint::planned("mutated", parts));
+    let mut files: Vec<File> =
+        seeds.iter().map(|seed| (seed.name.as_str(), seed.bytes.len() as u64, seed.bytes.as_slice())).collect();
+    files[changed] = (files[changed].0, bytes.len() as u64, bytes);
+    let checkpoint = planned(&files);
     let outcome = check(&checkpoint, knowledge);
-    let report = Report::new(vec![CheckpointReport::new("mutated", None, &checkpoint, &outcome)], None);
-    let text = render(&report, format, Style::default());
-    assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{format:?} lets a control character through");
+    renders(&checkpoint, &outcome, format);
+    repairs(&files, &checkpoint, &outcome, knowledge);
 }
 
 #[test]

@@ -8,6 +8,7 @@ mod base;
 mod change;
 pub mod data;
 pub mod invariants;
+pub mod repairs;
 pub mod weights;
 
 use std::collections::{BTreeMap, BTreeSet};
