@@ -15,6 +15,8 @@ import json
 import multiprocessing
 import os
 import random
+import re
+import signal
 import sys
 import tempfile
 from collections import Counter
@@ -31,6 +33,8 @@ SYSTEM = (
     "/etc/ld.so.cache", "/etc/ld.so.preload", "/lib/", "/lib64/", "/usr/lib/", "/usr/lib64/", "/usr/local/lib/", "/etc/localtime",
     "/usr/share/zoneinfo/", "/sys/fs/cgroup/", "/sys/devices/system/cpu/", "/dev/null",
 )  # fmt: skip
+# Blobs of any model in a hub cache: a name that is a hash says what the file contains.
+BLOB = re.compile(r"/models--[^/]+/blobs/([0-9a-f]{40}|[0-9a-f]{64})$")
 # Below /proc/PID of the process itself.
 OF_ITSELF = ("maps", "cgroup", "mountinfo", "status")
 FORMATS = ("full", "concise", "json", "jsonl", "markdown", "sarif", "github", "gitlab", "junit")
@@ -86,8 +90,9 @@ def writes_inside(job, outcome, _):
 
 
 def reads_inside(job, outcome, _):
-    """Nothing is read but the given paths, the blobs of a snapshot's own model in the hub cache, and the files that any
-    process opens. `.gitattributes` of the work tree and settings of the working directory are the only files above."""
+    """Nothing is read but the given paths, blobs of a hub cache, shards that a link leads to (their names and shapes, see
+    `keeps_secrets`), and the files that any process opens. `.gitattributes` of the work tree and settings of the working
+    directory are the only files above."""
     for event in outcome.events:
         linked = event.call in ("link", "linkat")
         if not linked and (event.call not in traced.OPENS or event.writes):
@@ -96,7 +101,9 @@ def reads_inside(job, outcome, _):
         case = next((case for case in job.reads if inside(path, [case])), None)
         allowed = job.reads[case] if case else []
         above = [str(job.cwd), *allowed, *job.writes]
-        if inside(real, allowed) or inside(real, job.writes) or of_the_system(real):
+        if inside(real, allowed) or inside(real, job.writes) or of_the_system(real) or BLOB.search(real):
+            continue
+        if (case or inside(path, job.writes)) and not linked and path.endswith(".safetensors") and os.path.islink(path):
             continue
         if event.listing and any(inside(place, [real.rstrip("/")]) for place in above):
             continue
@@ -151,13 +158,19 @@ def keeps_secrets(job, outcome, _):
             for name in names:
                 path = os.path.join(folder, name)
                 if os.path.islink(path):
-                    places = [place for case in job.reads.values() for place in case]
-                    if job.new and not inside(os.path.realpath(path), places):
+                    if job.new and not is_original(job, path):
                         yield f"{path!r} is a link to {os.path.realpath(path)!r}"
                 elif os.path.isfile(path):
                     with open(path, "rb") as file:
                         if SECRET.encode() in file.read():
                             yield f"in {path!r}"
+
+
+def is_original(job, link):
+    """Whether a link in a repaired copy leads where the entry of this name leads in the original; a merge makes no links."""
+    originals = [os.path.join(place, os.path.basename(link)) for place in job.checkpoints]
+    same = any(os.path.lexists(o) and os.path.realpath(o) == os.path.realpath(link) for o in originals)
+    return same and job.arguments[0] != "build-merged"
 
 
 def leaves_outside(job, outcome, changed):
@@ -210,7 +223,6 @@ class Case:
         around = {}
         if kind == "hub":
             plants.write(plants.into_hub_cache(site, tree), place)
-            self.reads.append(str(place / "models--own--m" / "blobs"))
         else:
             if kind == "collection":
                 given = place
@@ -327,6 +339,7 @@ ROOT = None  # the folder of this worker
 
 def start(place):
     global ROOT
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     ROOT = Path(tempfile.mkdtemp(prefix="laws-", dir=place))
     plants.outside(ROOT)
     mergers.FIXTURES.update(plants.fixtures(ROOT))
@@ -366,6 +379,7 @@ def main():
         mutants += groups[-1].size
     if given.only is not None:
         groups = [Group(given.seed, given.only)]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the place is removed
     place = tempfile.mkdtemp(prefix="laws-", dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
     try:
         failed = report(groups, place, most=8 if given.only is None else 1000)

@@ -60,7 +60,8 @@ def outside(root):
         "secret.jinja": f"{{{{ {SECRET} }}}}".encode(),
         "secret.py": f"class {SECRET}:\n    pass\n".encode(),
         "secret.model": sentencepiece(["<unk>", "<s>", "</s>", SECRET]),
-        "secret.safetensors": shard({SECRET: [4], "lm_head.weight": [32, 8]}, {"format": "pt", SECRET: SECRET}),
+        # Names and shapes may be read through a link, tensors may not.
+        "secret.safetensors": shard({"lm_head.weight": [32, 8], "extra.weight": [4]})[:-16] + SECRET.encode() + b"\0" * (16 - len(SECRET)),
         "secret.attributes": f"*.safetensors filter=lfs {SECRET}\n".encode(),
         SETTINGS: as_json({"ignore": ["ARC", "CFG", "IDX", "SAF", "SEC", "AUT"], "per-path": {SECRET: {}}}),
     }
@@ -410,9 +411,10 @@ def mutated(site, tree, most=3):
 
 
 def into_hub_cache(site, tree):
-    """The tree as a snapshot of the hub cache: files are links to blobs, some of them to those of another model."""
+    """The tree as a snapshot of the hub cache: files are links to blobs, some of them to those of another model, or to files
+    and links beside the blobs."""
     rng, blobs, snapshot = site.rng, {}, {}
-    other = {"e" * 64: Link(str(site.secrets / "secret.json")), "d" * 40: as_json({SECRET: SECRET, "bos_token_id": 1})}
+    other = {"e" * 64: Link(str(site.secrets / "secret.json")), "d" * 40: as_json({"bos_token_id": 1}), "secret.json": as_json({SECRET: 1})}
     for number, (name, entry) in enumerate(sorted(tree.items())):
         if not isinstance(entry, bytes):
             snapshot[name] = entry

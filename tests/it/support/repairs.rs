@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ckpt_doctor::check::{Outcome, check};
+use ckpt_doctor::check::{Finding, Outcome, check};
 use ckpt_doctor::checkpoint::{Checkpoint, Document, Parts, PythonModule, Shard, Vocabulary};
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::model::CheckpointReport;
@@ -79,7 +79,7 @@ fn written(files: &[File], repair: &Repair) -> Arc<Checkpoint> {
 }
 
 fn count(outcome: &Outcome, code: &str) -> usize {
-    outcome.findings.iter().filter(|f| f.code == code).map(|f| f.count()).sum()
+    outcome.findings.iter().filter(|f| f.code == code).map(Finding::count).sum()
 }
 
 fn codes(outcome: &Outcome) -> BTreeMap<&str, usize> {
