@@ -140,7 +140,7 @@ impl DirectoryReader {
         if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
             // A folder is a checkpoint of its own, or unrelated.
         } else if is_shard {
-            let shard = Shard::read(&self.checkpoint.root, name);
+            let shard = own_shard(root, name, Shard::read(root, name));
             self.checkpoint.shards.insert(name.to_owned(), shard);
         } else if is_document(name) {
             let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
@@ -227,6 +227,16 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
         None
     };
     Entry { kind, size, link: link.map(|l| l.to_string_lossy().into_owned()), lfs }
+}
+
+/// A shard as it was read, unless it is a link out of the directory to a file of another format: its faults would quote it.
+fn own_shard(root: &Path, name: &str, shard: Shard) -> Shard {
+    match real_target(root, &root.join(name)) {
+        Err(error @ OpenError::Outside { .. }) if shard.tensors.is_empty() && !shard.is_sound() => {
+            Shard::unread(name, error.fault(name))
+        }
+        _ => shard,
+    }
 }
 
 fn vocabulary(root: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {

@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use super::record::Journal;
-use crate::checkpoint::open::{JSON_CAP, OpenError, read_capped};
+use crate::checkpoint::open::{JSON_CAP, OpenError, read_own};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::leftover::Leftover;
@@ -157,7 +157,9 @@ impl Folder {
     /// Reads a journal; `None` when the file is missing.
     pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>, RepairError> {
         let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
-        let bytes = match read_capped(path, JSON_CAP) {
+        let (folder, name) = (path.parent().unwrap_or(path), path.file_name().unwrap_or_default());
+        // A download may have a journal that is a link.
+        let bytes = match read_own(folder, &name.to_string_lossy(), JSON_CAP) {
             Err(OpenError::NotFound { .. }) => return Ok(None),
             other => other.map_err(|e| unusable(e.to_string()))?,
         };

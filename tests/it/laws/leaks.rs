@@ -15,7 +15,7 @@ use crate::support;
 const SECRET: &str = "hf_5ecretOutside";
 
 /// Files that a loader, a merge or a repair reads, and some that nothing reads.
-const NAMES: [&str; 16] = [
+const NAMES: [&str; 18] = [
     "config.json",
     "generation_config.json",
     "tokenizer_config.json",
@@ -32,6 +32,8 @@ const NAMES: [&str; 16] = [
     "modeling_spatialvla.py",
     "action_tokenizer.py",
     "notes.md",
+    "model.safetensors",
+    "model-00001-of-00002.safetensors",
 ];
 
 /// The content of a file outside: as far as possible a sound file of this name, with the secret in it.
