@@ -248,7 +248,9 @@ fn mode_is_kept_and_the_last_repair_is_undone_first() {
 #[test]
 fn links_are_never_written_through() {
     let (room, dir) = broken();
-    let blob = room.path().join("blob");
+    let blobs = room.path().join("blobs");
+    fs::create_dir(&blobs).expect("a folder");
+    let blob = blobs.join("0123456789abcdef0123456789abcdef01234567");
     fs::rename(dir.join("config.json"), &blob).expect("a rename");
     symlink(&blob, dir.join("config.json")).expect("a link");
     let bytes = fs::read(&blob).expect("a file");
