@@ -1,13 +1,12 @@
 //! Digests and faults from the bytes of the tensors; read only for `check --deep`.
 //!
-//! Every byte of every shard passes once through one buffer, independent of the size of the weights. Reads are
-//! positioned instead of memory-mapped: a file that shrinks during the read gives a fault instead of a signal.
+//! Every byte of every shard passes once through one buffer, independent of the size of the weights; holes of sparse files,
+//! which are zeros, are not read. Reads are positioned instead of memory-mapped: a file that shrinks during the read gives a
+//! fault instead of a signal.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::FileExt as _;
 use std::path::Path;
-
-use sha2::{Digest as _, Sha256};
 
 use super::open::{Opened, open_regular};
 use super::shard::tail::zero_tail;
@@ -15,11 +14,17 @@ use super::text::hex;
 use super::{Entry, Fault, FaultKind, Shard, Tensor};
 
 mod numbers;
+mod pieces;
 
 use numbers::{NonFiniteCounter, as_u64};
+use pieces::{Hash, Piece, each_piece};
 
 /// Bytes read at a time: a multiple of every element width, so that no element is split between two reads.
 const CHUNK: usize = 1 << 20;
+
+/// Maximum number of zeros in holes that are hashed of one checkpoint: a few seconds of work. A tensor with more has no
+/// digest.
+const HASHED_ZEROS: u64 = 1 << 30;
 
 /// SHA-256 digests of the tensors, by shard and tensor name.
 #[derive(Debug, Clone, Default)]
@@ -31,8 +36,10 @@ impl Contents {
     /// Reads the bytes of every tensor of `shards`, and adds the faults that only the bytes reveal.
     pub(super) fn read(root: &Path, entries: &BTreeMap<String, Entry>, shards: &mut BTreeMap<String, Shard>) -> Self {
         let mut contents = Self::default();
+        let mut zeros_left = HASHED_ZEROS;
         for shard in shards.values_mut() {
-            let mut reader = ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new() };
+            let mut reader =
+                ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new(), zeros_left: &mut zeros_left };
             reader.run(root, entries.get(&shard.name));
             let ContentsReader { digests, faults, .. } = reader;
             contents.digests.insert(shard.name.clone(), digests);
@@ -79,6 +86,8 @@ struct ContentsReader<'s> {
     shard: &'s Shard,
     digests: BTreeMap<String, [u8; 32]>,
     faults: Vec<Fault>,
+    /// Zeros in holes that may still be hashed.
+    zeros_left: &'s mut u64,
 }
 
 impl ContentsReader<'_> {
@@ -112,45 +121,51 @@ impl ContentsReader<'_> {
         // The file is hashed in the order of its tensors, which must cover all of it.
         let stated =
             entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == FaultKind::ZeroTail));
-        let mut whole = stated.as_ref().map(|_| Sha256::new());
-        if let Some(whole) = &mut whole {
-            each_chunk(opened, 0, self.shard.data_start, &mut buffer, |bytes| whole.update(bytes))?;
-        }
+        let mut whole = stated.as_ref().map_or_else(Hash::none, |_| Hash::new());
+        each_piece(opened, 0, self.shard.data_start, &mut buffer, |piece| whole.add(&piece, self.zeros_left))?;
         // End of the last nonzero byte, counted from the start of the data.
         let mut last_value = 0_u64;
-        for tensor in &tensors {
-            // The other tensors of a truncated shard can still be read.
-            if tensor.end > region {
-                continue;
+        let mut read = 0_u64;
+        // The other tensors of a truncated shard can still be read.
+        for tensor in tensors.iter().filter(|tensor| tensor.end <= region) {
+            // Tensors that overlap could name the same bytes any number of times.
+            read = read.saturating_add(tensor.len());
+            if read > region.saturating_mul(2) {
+                self.unread("its tensors overlap");
+                return Ok(());
             }
-            let mut digest = Sha256::new();
+            let mut digest = Hash::new();
             let mut numbers = NonFiniteCounter::new(tensor.dtype);
             let mut at = tensor.begin;
             let start = self.shard.data_start.saturating_add(tensor.begin);
-            each_chunk(opened, start, tensor.len(), &mut buffer, |bytes| {
-                digest.update(bytes);
-                if let Some(whole) = &mut whole {
-                    whole.update(bytes);
+            each_piece(opened, start, tensor.len(), &mut buffer, |piece| {
+                digest.add(&piece, self.zeros_left);
+                whole.add(&piece, self.zeros_left);
+                match &piece {
+                    Piece::Data(bytes) => numbers.add(bytes),
+                    Piece::Hole(len) => numbers.skip(*len),
                 }
-                numbers.add(bytes);
-                if let Some(place) = bytes.iter().rposition(|byte| *byte != 0) {
+                if let Piece::Data(bytes) = &piece
+                    && let Some(place) = bytes.iter().rposition(|byte| *byte != 0)
+                {
                     last_value = at.saturating_add(as_u64(place)).saturating_add(1);
                 }
-                at = at.saturating_add(as_u64(bytes.len()));
+                at = at.saturating_add(piece.len());
             })?;
-            self.digests.insert(tensor.name.clone(), digest.finalize().into());
+            self.digests.extend(digest.finish().map(|digest| (tensor.name.clone(), digest)));
             self.faults.extend(numbers.fault(self.shard, tensor));
         }
         if last_value < region {
             let tail = zero_tail(self.shard, &tensors, last_value);
             self.faults.extend(tail);
         }
-        if let (Some(whole), Some(stated)) = (whole, stated) {
-            let found = hex(&whole.finalize());
-            if found != stated {
+        match (whole.finish(), stated) {
+            (Some(found), Some(stated)) if hex(&found) != stated => {
                 let fault = Fault::new(FaultKind::ContentHashDiffers).at(self.shard.place());
-                self.faults.push(fault.with("stated", stated).with("found", found));
+                self.faults.push(fault.with("stated", stated).with("found", hex(&found)));
             }
+            (None, Some(_)) => self.unread("its holes have more zeros than are hashed"),
+            _ => {}
         }
         Ok(())
     }
@@ -161,24 +176,4 @@ fn stated_digest(entry: &Entry) -> Option<String> {
     let name = entry.link.as_deref()?.rsplit('/').next()?;
     let is_digest = name.len() == 64 && name.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
     is_digest.then(|| name.to_owned())
-}
-
-/// Calls `each` with the `len` bytes from `start` on, one chunk at a time.
-fn each_chunk(
-    opened: &Opened,
-    start: u64,
-    len: u64,
-    buffer: &mut [u8],
-    mut each: impl FnMut(&[u8]),
-) -> std::io::Result<()> {
-    let (mut at, mut left) = (start, len);
-    while left > 0 {
-        let size = usize::try_from(left).unwrap_or(usize::MAX).min(buffer.len());
-        let Some(piece) = buffer.get_mut(..size) else { return Ok(()) };
-        opened.file.read_exact_at(piece, at)?;
-        each(piece);
-        at = at.saturating_add(as_u64(size));
-        left = left.saturating_sub(as_u64(size));
-    }
-    Ok(())
 }

@@ -34,6 +34,17 @@ impl NonFiniteCounter {
         }
     }
 
+    /// Counts the elements of `len` bytes that are zeros.
+    pub(super) fn skip(&mut self, len: u64) {
+        let width: u64 = match self.dtype {
+            Dtype::BF16 | Dtype::F16 => 2,
+            Dtype::F32 | Dtype::C64 => 4,
+            Dtype::F64 => 8,
+            _ => 1,
+        };
+        self.seen = self.seen.saturating_add(len.checked_div(width).unwrap_or(0));
+    }
+
     /// IEEE formats: all exponent bits are set; the fraction is zero for infinity and nonzero for NaN.
     fn wide<const N: usize>(&mut self, bytes: &[u8], exponent: u64, bits: impl Fn([u8; N]) -> u64) {
         let (elements, _) = bytes.as_chunks::<N>();
