@@ -17,6 +17,7 @@ mod entry;
 pub mod fault;
 mod file_name;
 mod git;
+pub(crate) mod glob;
 pub mod index;
 mod lfs;
 pub mod list;

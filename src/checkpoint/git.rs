@@ -7,8 +7,9 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use globset::{GlobBuilder, GlobMatcher};
+use globset::GlobSet;
 
+use super::glob::glob;
 use super::open::read_capped;
 use super::{Checkpoint, Fault, FaultKind};
 
@@ -19,7 +20,7 @@ const LINES: usize = 2_000;
 
 /// One line that sets the filter attribute: a pattern, and whether the filter is git-lfs.
 struct AttributeLine {
-    glob: GlobMatcher,
+    glob: GlobSet,
     /// Whether the glob matches the path below its folder; otherwise it matches the file name.
     whole: bool,
     lfs: bool,
@@ -109,8 +110,7 @@ fn line(line: &str) -> Option<AttributeLine> {
     let whole = pattern.contains('/');
     // Git patterns do not support braces.
     let pattern = pattern.trim_start_matches('/').replace('{', "[{]").replace('}', "[}]");
-    let glob = GlobBuilder::new(&pattern).literal_separator(true).build().ok()?;
-    Some(AttributeLine { glob: glob.compile_matcher(), whole, lfs })
+    Some(AttributeLine { glob: glob(&pattern).ok()?, whole, lfs })
 }
 
 #[cfg(test)]

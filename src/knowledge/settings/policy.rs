@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use globset::{GlobBuilder, GlobMatcher};
+use globset::GlobSet;
 
 use super::SettingsSource;
 use super::find::absolute;
+use crate::checkpoint::{escape, glob};
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::source::DataError;
 
@@ -50,7 +51,7 @@ struct Area {
     /// Folder at which the glob starts, absolute.
     dir: PathBuf,
     /// `None` for everything below `dir`.
-    glob: Option<GlobMatcher>,
+    glob: Option<GlobSet>,
     /// The folders before the first wildcard, absolute.
     base: PathBuf,
 }
@@ -165,9 +166,10 @@ impl Area {
         }
         let plain = |part: &&str| !part.contains(['*', '?', '[', '{', '\\']);
         let base = rest.split('/').take_while(plain).fold(dir.clone(), |base, part| base.join(part));
-        let glob = GlobBuilder::new(rest).literal_separator(true).build();
-        let glob = glob.map_err(|e| source.wrong(written, format!("`{written}` is not a valid glob: {}", e.kind())))?;
-        Ok(Self { dir, glob: Some(glob.compile_matcher()), base })
+        let glob = glob::glob(rest);
+        let glob =
+            glob.map_err(|e| source.wrong(written, format!("`{}` is not a valid glob: {e}", escape(written, 80))))?;
+        Ok(Self { dir, glob: Some(glob), base })
     }
 
     /// Whether the area contains the checkpoint at `root` or this file of it.
