@@ -2,6 +2,8 @@
 
 use serde_json::{Map, Value};
 
+use super::scan::MAX_DEPTH;
+
 /// Escapes a step: `~` becomes `~0`, `/` becomes `~1`.
 pub fn escape(step: &str) -> String {
     step.replace('~', "~0").replace('/', "~1")
@@ -18,10 +20,16 @@ pub fn join(parent: &str, step: &str) -> String {
     format!("{parent}/{}", escape(step))
 }
 
-/// The steps, unescaped; `None` when the pointer is neither empty nor begins with `/`.
+/// Maximum number of steps: a document that is nested more deeply is not read, so none leads to a value.
+pub const MAX_STEPS: usize = MAX_DEPTH;
+
+/// The steps, unescaped; `None` when the pointer is neither empty nor begins with `/`, or has more than [`MAX_STEPS`].
 pub fn steps(pointer: &str) -> Option<Vec<String>> {
     if pointer.is_empty() {
         return Some(Vec::new());
+    }
+    if memchr::memchr_iter(b'/', pointer.as_bytes()).nth(MAX_STEPS).is_some() {
+        return None;
     }
     Some(pointer.strip_prefix('/')?.split('/').map(unescape).collect())
 }
@@ -88,6 +96,8 @@ mod tests {
         assert_eq!(pointer, "/a~1b/~01");
         assert_eq!(steps(&pointer), Some(vec!["a/b".to_owned(), "~1".to_owned()]));
         assert_eq!((steps(""), steps("a")), (Some(Vec::new()), None));
+        assert!(steps(&"/a".repeat(MAX_STEPS)).is_some());
+        assert_eq!((steps(&"/a".repeat(MAX_STEPS + 1)), steps(&"/".repeat(1 << 24))), (None, None));
     }
 
     #[test]
