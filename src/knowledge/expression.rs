@@ -5,6 +5,7 @@
 
 mod compiled;
 mod functions;
+mod limits;
 mod program;
 mod references;
 mod scope;

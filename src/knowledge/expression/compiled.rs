@@ -95,7 +95,7 @@ impl Expression {
         let expression = Self(Arc::new(Inner { source: source.into(), counted: true, program: OnceLock::new() }));
         match expression.program() {
             Ok(_) => Ok(expression),
-            Err(cause) => Err(ParseError { source_text: source.to_owned(), cause: cause.to_owned() }),
+            Err(cause) => Err(ParseError { source_text: shortened(source), cause: cause.to_owned() }),
         }
     }
 
@@ -190,7 +190,15 @@ impl Expression {
             cause.truncate(at);
             cause.push('…');
         }
-        EvalError { source_text: self.0.source.to_string(), cause }
+        EvalError { source_text: shortened(&self.0.source), cause }
+    }
+}
+
+/// The text of an expression for an error.
+fn shortened(source: &str) -> String {
+    match source.char_indices().nth(MESSAGE_CAP) {
+        Some((at, _)) => format!("{}…", source.get(..at).unwrap_or_default()),
+        None => source.to_owned(),
     }
 }
 

@@ -5,6 +5,7 @@ use cel::common::types::CelString;
 use cel::common::value::Val;
 use cel::{Context, ExecutionError, Value as Cel};
 
+use super::limits;
 use super::scope::ENV;
 use super::steps;
 
@@ -38,6 +39,9 @@ impl Program {
                 Self::General(program)
             }
         };
+        if counted {
+            limits::check(source)?;
+        }
         ENV.compile(source).map(compiled).map_err(|errors| {
             let errors = errors.errors.iter().map(|e| format!("column {}: {}", e.pos.1, e.msg));
             errors.collect::<Vec<_>>().join("; ")
@@ -77,7 +81,14 @@ impl Program {
                 follow(root.as_ref(), keys)
             }
             Self::General(program) => program.execute(context),
-            Self::Counted(_, expression) => Cel::resolve(expression, context),
+            Self::Counted(_, expression) => {
+                let value = steps::bounded(|| Cel::resolve(expression, context))?;
+                if steps::size(&value) > limits::VALUE {
+                    let message = "the value is too large".to_owned();
+                    return Err(ExecutionError::FunctionError { function: "value".to_owned(), message });
+                }
+                Ok(value)
+            }
         }
     }
 

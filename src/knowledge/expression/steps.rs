@@ -1,8 +1,8 @@
-//! Limits for the evaluation of a user's rules.
+//! Counts the steps that the expressions of a user's files take.
 //!
 //! CEL always terminates, but nested loops over a document's lists can take very long, and the crate has no limit. The
-//! loops of a user's rule are therefore rewritten to count steps: the list of a loop and each collected value pass
-//! through a function that source text cannot name.
+//! loops of a user's expression are therefore rewritten to count steps: the list of a loop, each collected value and each sum
+//! pass through a function that source text cannot name.
 
 use std::cell::Cell;
 use std::time::{Duration, Instant};
@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use cel::common::ast::{CallExpr, EntryExpr, Expr, IdedExpr, operators};
 use cel::{ExecutionError, FunctionContext, Value as Cel};
 
+use super::limits;
 use super::scope::Scope;
 
 /// Name of the function; identifiers cannot contain `@`.
@@ -44,6 +45,11 @@ pub(crate) fn within<T>(steps: u64, work: impl FnOnce() -> T) -> (T, bool) {
     (result, LIMIT.get().is_some_and(|limit| limit.steps == 0))
 }
 
+/// Runs one evaluation, with a limit of its own unless one is set.
+pub(super) fn bounded<T>(work: impl FnOnce() -> T) -> T {
+    if LIMIT.get().is_some() { work() } else { within(limits::STEPS, work).0 }
+}
+
 /// Counts steps, if a limit is set.
 pub(super) fn spend(steps: u64) -> Result<(), String> {
     let Some(limit) = LIMIT.get() else { return Ok(()) };
@@ -63,7 +69,7 @@ pub(super) fn register(scope: &mut Scope<'static>) {
 }
 
 /// Number of nested values, including the value itself; a string counts as its number of eight-byte words.
-fn size(value: &Cel) -> u64 {
+pub(super) fn size(value: &Cel) -> u64 {
     let sum = |sizes: &mut dyn Iterator<Item = u64>| sizes.fold(1_u64, u64::saturating_add);
     match value {
         Cel::List(items) => sum(&mut items.iter().map(size)),
@@ -97,7 +103,12 @@ fn visit(expression: &mut IdedExpr) {
                 wrap(&mut l.loop_cond);
             }
         }
-        Expr::Call(call) => call.target.as_deref_mut().into_iter().chain(&mut call.args).for_each(visit),
+        Expr::Call(call) => {
+            call.target.as_deref_mut().into_iter().chain(&mut call.args).for_each(visit);
+            if call.func_name == operators::ADD && !is_gathering(call) {
+                wrap(expression);
+            }
+        }
         Expr::List(list) => list.elements.iter_mut().for_each(visit),
         Expr::Select(select) => visit(&mut select.operand),
         Expr::Map(map) => map.entries.iter_mut().for_each(|e| entry(&mut e.expr)),
@@ -114,6 +125,11 @@ fn entry(entry: &mut EntryExpr) {
             visit(&mut pair.value);
         }
     }
+}
+
+/// Whether a sum is the step of `map` or `filter`, which CEL runs fast only as it is.
+fn is_gathering(call: &CallExpr) -> bool {
+    matches!(call.args.first().map(|first| &first.expr), Some(Expr::Ident(name)) if name.starts_with('@'))
 }
 
 /// The values that `map` and `filter` append to their result, `@result + [value]`, with or without a filter.
@@ -151,6 +167,8 @@ mod tests {
         scope.bind("m", &json!({ "a": [1], "b": [] }));
         for (source, value) in [
             ("l.map(x, x * 2)", json!([2, 4, 6])),
+            ("l.map(x, x + 1 + x)", json!([3, 5, 7])),
+            ("'a' + 'b' + string(l.size() + 1)", json!("ab4")),
             ("l.map(x, x > 1, l.filter(y, y < x))", json!([[1], [1, 2]])),
             ("l.all(x, l.exists(y, y == x))", json!(true)),
             ("l.exists_one(x, x == 2) && [l, l].all(a, a.size() == 3)", json!(true)),
@@ -158,6 +176,58 @@ mod tests {
             ("m.exists(k, m[k].size() == 0)", json!(true)),
         ] {
             assert_eq!(Expression::parse(source).unwrap().eval(&scope).unwrap(), value, "{source}");
+        }
+    }
+
+    #[test]
+    fn values_grow_to_a_limit() {
+        // Each step makes the value four times as long, as the `let` of an architecture or a recipe may.
+        let mut scope = Scope::new();
+        scope.bind("x", &json!("aaaaaaaa"));
+        let grow = Expression::parse("x + x + x + x").unwrap();
+        let error = (0..40).find_map(|_| grow.bind("x", &mut scope).err()).unwrap();
+        assert!(error.cause.contains("too large") || error.cause.contains("limit"), "{error}");
+        let Some(serde_json::Value::String(held)) = scope.get("x") else { panic!("x is text") };
+        assert!(held.len() <= 8 * 250_000, "{}", held.len());
+        scope.bind("l", &json!([1]));
+        let grow = Expression::parse("[l, l, l, l, l, l, l, l]").unwrap();
+        let error = (0..40).find_map(|_| grow.bind("l", &mut scope).err()).unwrap();
+        assert!(error.cause.contains("too large"), "{error}");
+    }
+
+    #[test]
+    fn no_source_text_exhausts_the_stack() {
+        let pieces = [
+            ("1+", ""),
+            ("(", ")"),
+            ("[", "]"),
+            ("{1:", "}"),
+            ("!", ""),
+            ("-", ""),
+            ("", "-1"),
+            ("true?", ":2"),
+            ("true?1:", ""),
+            ("[1].map(x,", ")"),
+            ("size(", ")"),
+            ("", "[0]"),
+            ("", ".a"),
+            ("1<", ""),
+            ("true&&", ""),
+            ("[1]+", ""),
+            ("1 in ", ""),
+            ("'(' + ", ""),
+            ("x ", ""),
+        ];
+        let repeated = |open: &str, close: &str, n: usize| format!("{}1{}", open.repeat(n), close.repeat(n));
+        let sources = pieces.iter().flat_map(|(open, close)| {
+            let longest = limits::SOURCE.saturating_sub(1) / (open.len() + close.len());
+            [8, 20, 24, 60, 120, 240, longest, 300_000].map(|n| repeated(open, close, n))
+        });
+        for source in sources {
+            let scope = Scope::new();
+            let result = Expression::parse(&source).map(|expression| expression.eval(&scope).is_ok());
+            let message = result.map_or_else(|error| error.to_string(), |_| String::new());
+            assert!(message.len() < 2000, "{} bytes: {message}", message.len());
         }
     }
 

@@ -6,6 +6,7 @@ use std::fmt;
 use serde::{Deserialize, Deserializer};
 
 use super::compiled::{EvalError, Expression, ParseError};
+use super::limits;
 use super::scope::{Scope, plain};
 
 /// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
@@ -98,11 +99,11 @@ impl Template {
     }
 
     /// The text with evaluated placeholders: strings without quotes, lists as `[2304, 1152]`. A placeholder that fails
-    /// becomes `?`.
+    /// becomes `?`, and so does a text of more than a mebibyte.
     #[must_use]
     pub fn render(&self, scope: &Scope<'_>) -> String {
         self.fill(|expression| Ok(expression.eval(scope).map_or_else(|_| "?".to_owned(), |v| plain(&v))))
-            .unwrap_or_default()
+            .unwrap_or_else(|_| "?".to_owned())
     }
 
     /// As [`Self::render`], but fails when a placeholder fails.
@@ -119,6 +120,10 @@ impl Template {
             match piece {
                 Piece::Text(text) => out.push_str(text),
                 Piece::Value(expression) => out.push_str(&value(expression)?),
+            }
+            if out.len() > limits::TEXT {
+                let cause = format!("the text is longer than {} bytes", limits::TEXT);
+                return Err(EvalError { source_text: self.source.chars().take(80).collect(), cause });
             }
         }
         Ok(out)
