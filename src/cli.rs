@@ -17,7 +17,7 @@ mod rules;
 mod settings;
 mod signals;
 mod skipped;
-
+mod stack;
 mod undo;
 
 use std::ffi::OsString;
@@ -51,6 +51,10 @@ fn file_as_option(args: impl Iterator<Item = OsString>, exists: impl Fn(&Path) -
 /// Runs the program.
 #[must_use]
 pub fn main() -> ExitCode {
+    stack::with_room(run)
+}
+
+fn run() -> ExitCode {
     if let Some(name) = file_as_option(std::env::args_os().skip(1), Path::exists) {
         let name = output::safe(&name.to_string_lossy());
         output::note(&format!("error: {name} is also the name of a file; write -- before file names"));
