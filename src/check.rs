@@ -1,6 +1,7 @@
 //! Compares a checkpoint with the knowledge about its class; pure functions from a checkpoint to findings.
 
 pub mod adapter;
+mod bounded;
 pub mod engine;
 mod exceptions;
 pub mod finding;

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use serde_json::Value;
 
 pub mod adapter;
+mod budget;
 mod contents;
 mod discover;
 pub mod document;
@@ -192,6 +193,12 @@ impl Checkpoint {
     #[must_use]
     pub fn config(&self) -> Option<&Value> {
         self.documents.get("config.json")?.value.as_ref()
+    }
+
+    /// Whether files were left out because the checkpoint is too large: then nothing that is absent is missing.
+    #[must_use]
+    pub fn is_partial(&self) -> bool {
+        self.faults.iter().any(|fault| fault.kind == FaultKind::CheckpointTooLarge)
     }
 
     /// The document of this file name.

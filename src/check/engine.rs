@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
+use super::bounded::bounded;
 use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, LoadReport, Stored, Target};
@@ -13,7 +14,7 @@ use super::outcome::Outcome;
 use super::verdict::Basis;
 use super::{adapter, index, inspect, judge, model_type, modules, policy, refusals, tokens, variables};
 use crate::checkpoint::document::Locator;
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, pointer};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Object, Rule};
@@ -81,7 +82,8 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     });
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     bind_run(&mut scope, knowledge, config, versions, outcome.architecture.as_deref());
-    variables::bind_loads(&mut scope, checkpoint, outcome.loads.clone());
+    variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
+    outcome.loads.iter_mut().for_each(LoadReport::shorten);
     let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &outcome.loads);
     let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
     let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
@@ -106,6 +108,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         unjudged: &unjudged.collect(),
     };
     outcome.verdicts = basis.verdicts(&context.targets);
+    outcome.findings = bounded(std::mem::take(&mut outcome.findings));
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
 }
@@ -157,7 +160,11 @@ fn run_rules(knowledge: &Knowledge, context: &Context<'_>, faults: &[Fault], sco
 fn with_likely_class(fault: Fault, knowledge: &Knowledge, stored: &Stored) -> Fault {
     let declared = fault.detail.get("class").and_then(Value::as_str).unwrap_or_default();
     let is_whole = fault.kind == FaultKind::UnknownArchitecture && !fault.detail.contains_key("part");
-    let likely = if is_whole { inspect::likely_class(&knowledge.library, stored, declared) } else { None };
+    let likely = if is_whole && stored.is_searchable() {
+        inspect::likely_class(&knowledge.library, stored, declared)
+    } else {
+        None
+    };
     let Some(likely) = likely.filter(|likely| likely.class() != declared) else { return fault };
     fault.with("likely", likely.class()).with("likely_type", likely.model_type())
 }
@@ -510,6 +517,8 @@ fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
 }
 
 fn nearest(locator: &mut Locator<'_>, mut pointer: &str) -> Option<std::ops::Range<usize>> {
+    // No prefix of a pointer with too many steps is worth the time.
+    pointer::steps(pointer)?;
     loop {
         if let Some(span) = locator.value(pointer) {
             return Some(span);

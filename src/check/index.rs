@@ -6,6 +6,7 @@ use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
 use super::model_type::is_model;
+use crate::checkpoint::fault::Faults;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, Place, Shard, pointer};
 
 /// The file that a loader prefers to an index.
@@ -26,7 +27,7 @@ pub(super) fn readable(shard: &Shard) -> bool {
         FaultKind::UnreadableFile,
         FaultKind::NotARegularFile,
     ];
-    !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind))
+    !shard.unread && !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind))
 }
 
 /// Whether every shard exists and its header was read, so that a tensor that was not read is missing.
@@ -166,16 +167,16 @@ impl<'c> IndexComparison<'c> {
     }
 
     fn faults(&self) -> Vec<Fault> {
-        let mut faults: Vec<Fault> =
-            pointers_below_total(self.checkpoint, self.referenced.keys().copied()).into_iter().collect();
+        let mut faults = Faults::of_comparison();
+        faults.extend(pointers_below_total(self.checkpoint, self.referenced.keys().copied()));
         faults.extend(self.absent_shards());
         faults.extend(self.pickles());
         faults.extend(self.entries_without_shard());
-        faults.extend(self.misplaced_entries());
-        faults.extend(self.tensors_without_entry());
+        self.misplaced_entries(&mut faults);
+        self.tensors_without_entry(&mut faults);
         faults.extend(self.stray_shards());
         faults.extend(self.total_size());
-        faults
+        faults.into_vec()
     }
 
     /// Shards that the index names and that are missing.
@@ -229,10 +230,9 @@ impl<'c> IndexComparison<'c> {
     }
 
     /// Entries whose tensor is in another shard than the one mapped, or in none.
-    fn misplaced_entries(&self) -> Vec<Fault> {
+    fn misplaced_entries(&self, faults: &mut Faults) {
         let shards = &self.checkpoint.shards;
         let unreadable: BTreeSet<&str> = shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
-        let mut faults = Vec::new();
         for (tensor, said) in &self.index.weight_map {
             let Some(shard) = shards.get(said).filter(|s| readable(s)) else { continue };
             let held = self.holders.get(tensor.as_str());
@@ -249,15 +249,13 @@ impl<'c> IndexComparison<'c> {
                 faults.push(Fault::new(FaultKind::IndexKeyNowhere).at(place).with("said", said.as_str()));
             }
         }
-        faults
     }
 
     /// Tensors of the named shards that the index does not map, or that two of these shards hold.
-    fn tensors_without_entry(&self) -> Vec<Fault> {
+    fn tensors_without_entry(&self, faults: &mut Faults) {
         // Entries that name no file are the reader's fault to report.
         let places = self.index.faults.iter().flat_map(|f| &f.places);
         let unusable: BTreeSet<&str> = places.filter_map(|place| place.tensor.as_deref()).collect();
-        let mut faults = Vec::new();
         for (tensor, shards) in self.holders.iter().filter(|(tensor, _)| !unusable.contains(*tensor)) {
             let mut mapped = shards.iter().filter(|s| self.referenced.contains_key(**s));
             let Some(first) = mapped.next() else { continue };
@@ -274,7 +272,6 @@ impl<'c> IndexComparison<'c> {
                 (Some(_), None) => {}
             }
         }
-        faults
     }
 
     /// Safetensors files that the index does not name.

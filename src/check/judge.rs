@@ -64,10 +64,10 @@ impl Inputs<'_> {
 
 /// Predicts the loads of a checkpoint. Called by the rule engine, with the versions that the user named; without any, the
 /// version that wrote config.json and the newest known one of each major version apply. Empty when config.json is missing or
-/// invalid.
+/// invalid, or when tensors may exist that were not read.
 #[must_use]
 pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String], stored: &Stored) -> Judgement {
-    let Some(config) = checkpoint.config() else { return Judgement::default() };
+    let Some(config) = checkpoint.config().filter(|_| !checkpoint.is_partial()) else { return Judgement::default() };
     let scheme = declared_scheme(config, &knowledge.schemes);
     let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme };
     let targets = classes::resolve_targets(&inputs);

@@ -16,7 +16,7 @@ mod v5;
 
 use std::collections::BTreeSet;
 
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
@@ -85,6 +85,19 @@ fn absent_groups(expected: &Expected, there: impl Fn(&str) -> bool) -> BTreeSet<
     optional().map(|(_, group)| group).filter(|group| !present.contains(group)).collect()
 }
 
+/// The fault of a list of tensors, which counts all of them and names as many as a report has room for; `None` for none.
+fn of_names<'n>(kind: FaultKind, names: impl Iterator<Item = &'n str> + Clone) -> Option<Fault> {
+    let count = names.clone().count();
+    (count > 0).then(|| with_names(Fault::new(kind).with("count", count), "names", names))
+}
+
+/// Adds a list of tensors under `key`, and each of them as a place, as far as a report has room.
+fn with_names<'n>(fault: Fault, key: &str, names: impl Iterator<Item = &'n str> + Clone) -> Fault {
+    let names: Vec<&str> = names.clone().take(report::listed(names)).collect();
+    let fault = fault.with(key, names.clone());
+    names.into_iter().fold(fault, |fault, name| fault.at(Place::tensor(name)))
+}
+
 /// Faults of a load report, one for each cause.
 ///
 /// `indexed-but-absent` is not among them: the comparison of the index with the shards reports it without a class.
@@ -108,26 +121,21 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
         for (kind, names) in
             [(FaultKind::MissingTensors, &report.missing), (FaultKind::UnexpectedTensors, &report.unexpected)]
         {
-            if !names.is_empty() {
-                let mut fault = Fault::new(kind).with("count", names.len()).with("names", json!(names));
-                fault.places = names.iter().map(Place::tensor).collect();
-                faults.push(fault);
-            }
+            faults.extend(of_names(kind, names.iter().map(String::as_str)));
         }
         // A shape of no elements is no other shape: nothing was stored.
         let is_empty = |m: &&Mismatch| m.stored.contains(&0) && !m.expected.contains(&0);
         let (empty, others): (Vec<&Mismatch>, Vec<&Mismatch>) = report.mismatched.iter().partition(is_empty);
-        if !empty.is_empty() {
-            let names: Vec<String> = empty.iter().map(|m| m.name.clone()).collect();
-            let mut fault = Fault::new(FaultKind::EmptyTensors).with("count", names.len()).with("names", json!(names));
-            fault.places = names.iter().map(Place::tensor).collect();
-            faults.push(fault);
-        }
-        faults.extend(others.into_iter().map(|m| {
+        faults.extend(of_names(FaultKind::EmptyTensors, empty.iter().map(|m| m.name.as_str())));
+        let hidden = others.len().saturating_sub(report::LISTED);
+        faults.extend(others.into_iter().take(report::LISTED).map(|m| {
             let fault =
                 Fault::new(FaultKind::MismatchedTensor).at(Place::tensor(&*m.name)).with("tensor", m.name.as_str());
             fault.with("stored", m.stored.clone()).with("expected", m.expected.clone())
         }));
+        if let Some(last) = faults.last_mut().filter(|_| hidden > 0) {
+            last.hidden = u64::try_from(hidden).unwrap_or(u64::MAX);
+        }
     }
     let named = |fault: Fault| match under {
         Some(loader) => fault.with("under", loader),

@@ -1,5 +1,6 @@
 //! The variables and functions of a checkpoint for the expressions of rules.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
@@ -96,7 +97,7 @@ pub fn scope(
 }
 
 /// Binds `stays_random` and `complete`, which depend on the predicted loads.
-pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: Vec<LoadReport>) {
+pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: &[LoadReport]) {
     // Without a class no load is predicted, and a `total_size` that is too large is the only trace of a lost tensor.
     let stored = || checkpoint.tensors().fold(0_u64, |n, (_, tensor)| n.saturating_add(tensor.len()));
     let stated = checkpoint.index.as_ref().and_then(Index::total_bytes);
@@ -104,9 +105,10 @@ pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: Ve
     let whole = loads.iter().all(|load| load.missing.iter().all(held) && load.raises.is_none());
     let known = !loads.is_empty() || stated.is_none_or(|stated| stated <= stored());
     scope.bind("complete", &json!(whole && known && index::is_complete(checkpoint)));
-    scope.function1("stays_random", move |name| match loads.as_slice() {
-        [] => Value::Null,
-        loads => json!(loads.iter().any(|report| report.leaves_random(name))),
+    let random: Option<BTreeSet<String>> =
+        (!loads.is_empty()).then(|| loads.iter().flat_map(LoadReport::left_random).map(str::to_owned).collect());
+    scope.function1("stays_random", move |name| {
+        random.as_ref().map_or(Value::Null, |names| json!(names.contains(name)))
     });
 }
 

@@ -197,6 +197,9 @@ impl Basis<'_> {
         if self.checkpoint.config().is_none() {
             return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));
         }
+        if self.checkpoint.is_partial() {
+            return (LoadVerdict::NotPredicted, Some("the checkpoint is too large to be read whole".to_owned()));
+        }
         if let Some(program) = self.program {
             return (LoadVerdict::NotPredicted, Some(format!("the weights are quantised for {program}")));
         }
@@ -244,7 +247,8 @@ fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
     }
     // Whether a tied tensor and the one that overwrites it differ shows in their bytes, which a rule compares.
     let silent = report.silent.iter().filter(|silent| silent.reason != SilentReason::TiedOver).count();
-    match (report.missing.len(), silent) {
+    let [missing, ..] = report.lengths();
+    match (missing, silent) {
         (0, 0) => (LoadVerdict::Loads, None),
         (missing, silent) => {
             let n = missing.saturating_add(silent);

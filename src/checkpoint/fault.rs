@@ -127,12 +127,22 @@ pub(crate) struct Faults {
     list: Vec<Fault>,
     /// By kind: number of faults, and the position in `list` of the last one kept.
     seen: BTreeMap<FaultKind, (usize, usize)>,
+    /// Whether they are those of a comparison.
+    of_comparison: bool,
 }
 
+/// Maximum number of faults of one kind in a comparison of whole files; each one may be repaired by an edit of its own.
+const COMPARISON_CAP: usize = 10_000;
+
 impl Faults {
+    /// Collects the faults of a comparison, which finds one for each tensor of an index or a shard.
+    pub(crate) fn of_comparison() -> Self {
+        Self { of_comparison: true, ..Self::default() }
+    }
+
     /// Adds a fault, or only counts it above the limit of its kind.
     pub(crate) fn push(&mut self, fault: Fault) {
-        let cap = cap(fault.kind);
+        let cap = if self.of_comparison { COMPARISON_CAP } else { cap(fault.kind) };
         let (count, last) = self.seen.entry(fault.kind).or_insert((0, 0));
         *count = count.saturating_add(1);
         if *count <= cap {
@@ -149,7 +159,8 @@ impl Faults {
     /// The faults kept; the last of a kind that had too many counts the others as hidden.
     pub(crate) fn into_vec(mut self) -> Vec<Fault> {
         for (kind, (count, last)) in &self.seen {
-            let more = count.saturating_sub(cap(*kind));
+            let cap = if self.of_comparison { COMPARISON_CAP } else { cap(*kind) };
+            let more = count.saturating_sub(cap);
             if more > 0
                 && let Some(fault) = self.list.get_mut(*last)
             {

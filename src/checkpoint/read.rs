@@ -1,11 +1,12 @@
 //! Reads a directory into a [`Checkpoint`]: only its own files, never other paths that a file refers to.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Component, Path};
 use std::sync::Arc;
 
 use super::adapter;
+use super::budget::{Budget, text_cost};
 use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
@@ -94,14 +95,19 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
         checkpoint: Checkpoint { root: root.to_owned(), ..Checkpoint::default() },
         vocabularies: BTreeMap::new(),
         vocabulary_faults: Vec::new(),
+        budget: Budget::default(),
+        unread: Unread::default(),
     };
-    for name in names(root)? {
+    let (names, more) = names(root)?;
+    reader.unread.count = more;
+    for name in names {
         let entry = entry(root, &name, &mut reader.checkpoint.faults);
-        reader.read_content(&name, &entry);
+        reader.read_within_budget(&name, &entry);
         reader.check_entry(&name, &entry);
         reader.checkpoint.entries.insert(name, entry);
     }
-    let DirectoryReader { mut checkpoint, vocabularies, vocabulary_faults } = reader;
+    reader.report_unread();
+    let DirectoryReader { mut checkpoint, vocabularies, vocabulary_faults, .. } = reader;
     if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
         let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
         checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(place));
@@ -130,9 +136,72 @@ struct DirectoryReader {
     checkpoint: Checkpoint,
     vocabularies: BTreeMap<String, Arc<Vocabulary>>,
     vocabulary_faults: Vec<Fault>,
+    budget: Budget,
+    unread: Unread,
+}
+
+/// Files that were not read to their end because those before them took the budget.
+#[derive(Default)]
+struct Unread {
+    first: Option<String>,
+    count: u64,
 }
 
 impl DirectoryReader {
+    /// Reads the content of this file if a loader would, and if enough of the budget is left.
+    fn read_within_budget(&mut self, name: &str, entry: &Entry) {
+        let is_module = has_ending(name, "py");
+        let is_shard = name.ends_with(".safetensors");
+        let is_text = is_module || is_document(name) || TEXTS.contains(&name) || VOCABULARIES.contains(&name);
+        let cap = if is_module { MODULE_CAP } else { TOKENIZER_CAP };
+        if !is_text && !is_shard || entry.kind != EntryKind::Regular {
+            return self.read_content(name, entry);
+        }
+        // A file above its cap is not read, and has a fault of its own.
+        let cost = if is_text && entry.size <= cap { text_cost(entry.size, is_module) } else { 0 };
+        let is_left = !self.budget.is_spent() && self.budget.spend(cost);
+        if is_left {
+            self.read_content(name, entry);
+            self.spend_content(name);
+        }
+        if !is_left || is_shard && self.budget.is_spent() {
+            self.unread.first.get_or_insert_with(|| name.to_owned());
+            self.unread.count = self.unread.count.saturating_add(1);
+        }
+        if !is_left && is_shard {
+            self.checkpoint.shards.insert(name.to_owned(), Shard::skipped(name, entry.size));
+        } else if !is_left && is_module {
+            let module = PythonModule { name: name.to_owned(), unread: true, ..PythonModule::default() };
+            self.checkpoint.modules.insert(name.to_owned(), module);
+        } else if !is_left && is_document(name) {
+            let document = Document { name: name.to_owned(), ..Document::default() };
+            self.checkpoint.documents.insert(name.to_owned(), document);
+        }
+    }
+
+    /// Takes the cost of what was read of a file from the budget.
+    fn spend_content(&mut self, name: &str) {
+        if let Some(document) = self.checkpoint.documents.get(name) {
+            self.budget.spend_values(document);
+            self.budget.spend_faults(&document.faults);
+        }
+        let shard = self.checkpoint.shards.get(name).map(|shard| &shard.faults);
+        let module = self.checkpoint.modules.get(name).map(|module| &module.faults);
+        for faults in shard.into_iter().chain(module) {
+            self.budget.spend_faults(faults);
+        }
+    }
+
+    /// Adds the fault of a checkpoint that is larger than the budget.
+    fn report_unread(&mut self) {
+        let Unread { first, count } = std::mem::take(&mut self.unread);
+        if count > 0 {
+            let fault = Fault::new(FaultKind::CheckpointTooLarge).with("count", count);
+            let fault = first.into_iter().fold(fault, |fault, first| fault.at(Place::file(first)));
+            self.checkpoint.faults.push(fault);
+        }
+    }
+
     /// Reads the content of this file, if a loader would.
     fn read_content(&mut self, name: &str, entry: &Entry) {
         let root = &self.checkpoint.root.clone();
@@ -140,7 +209,7 @@ impl DirectoryReader {
         if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
             // A folder is a checkpoint of its own, or unrelated.
         } else if is_shard {
-            let shard = own_shard(root, name, Shard::read(root, name));
+            let shard = own_shard(root, name, Shard::read_within(root, name, &mut self.budget));
             self.checkpoint.shards.insert(name.to_owned(), shard);
         } else if is_document(name) {
             let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
@@ -187,21 +256,28 @@ impl DirectoryReader {
     }
 }
 
-/// Names of the entries, sorted. Hidden entries belong to other tools. Names that are not plain UTF-8 are skipped: no
-/// loader opens them.
-fn names(root: &Path) -> Result<Vec<String>, OpenError> {
+/// Maximum number of entries of a directory. Published checkpoints have some hundred.
+const MAX_NAMES: usize = 100_000;
+
+/// The first [`MAX_NAMES`] names of the entries, sorted, and the number of the others. Hidden entries belong to other tools.
+/// Names that are not plain UTF-8 are skipped: no loader opens them.
+fn names(root: &Path) -> Result<(BTreeSet<String>, u64), OpenError> {
     let io = |source| OpenError::from_io(root, source);
-    let mut names = Vec::new();
+    let mut names = BTreeSet::new();
+    let mut more = 0_u64;
     for entry in list(root).map_err(io)? {
         if let Ok(name) = entry.map_err(io)?.name.into_string()
             && !name.starts_with('.')
             && is_plain_file_name(&name)
         {
-            names.push(name);
+            names.insert(name);
+            if names.len() > MAX_NAMES {
+                names.pop_last();
+                more = more.saturating_add(1);
+            }
         }
     }
-    names.sort();
-    Ok(names)
+    Ok((names, more))
 }
 
 /// Reads one directory entry, and adds the faults that no reader of its content would report.

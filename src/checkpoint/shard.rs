@@ -85,6 +85,12 @@ impl Shard {
         Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
     }
 
+    /// A shard of `file_len` bytes that was not opened because the checkpoint is too large.
+    #[must_use]
+    pub(crate) fn skipped(name: impl Into<String>, file_len: u64) -> Self {
+        Self { name: name.into(), file_len, unread: true, ..Self::default() }
+    }
+
     /// The entry of this name.
     #[must_use]
     pub fn tensor(&self, name: &str) -> Option<&Tensor> {

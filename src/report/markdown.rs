@@ -141,9 +141,8 @@ fn place(location: &Location) -> Option<String> {
 
 fn render_load(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], cap: usize) {
     let versions = text(&format::versions(loaders));
-    let (missing, unexpected) = (load.missing.len(), load.unexpected.len());
-    let (mismatched, silent) = (load.mismatched.len(), load.silent.len());
-    if [missing, unexpected, mismatched, silent] == [0; 4] {
+    let [missing, unexpected, mismatched, silent] = load.lengths();
+    if load.lengths() == [0; 4] {
         return;
     }
     let _ok = writeln!(
@@ -155,7 +154,9 @@ fn render_load(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], 
     }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
     groups(out, "Missing: the loader initialises these with random values", &names(&load.missing), cap);
+    unlisted(out, load.unlisted.missing);
     groups(out, "Unexpected: the loader ignores these", &names(&load.unexpected), cap);
+    unlisted(out, load.unlisted.unexpected);
     if !load.mismatched.is_empty() {
         let rows: Vec<_> = format::mismatched(load)
             .into_iter()
@@ -163,9 +164,18 @@ fn render_load(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], 
             .collect();
         let _ok = writeln!(out, "\nMismatched: the loader raises an exception");
         table(out, ["tensor", "stored", "expected"], &rows, cap);
+        unlisted(out, load.unlisted.mismatched);
     }
     for (reason, names) in format::silent(load) {
         groups(out, &format!("Silent, loaded without a warning: {}", text(&reason)), &names, cap);
+    }
+    unlisted(out, load.unlisted.silent);
+}
+
+/// The number of names that the report does not have.
+fn unlisted(out: &mut String, count: usize) {
+    if count > 0 {
+        let _ok = writeln!(out, "\nAnd {count} tensors that are not listed.");
     }
 }
 

@@ -119,7 +119,7 @@ pub(super) fn unpredicted(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<
 /// Faults of classes that are unknown or cannot be built from this config.
 pub(super) fn faults(inputs: &Inputs<'_>, built: &[BuiltClass<'_>]) -> Vec<Fault> {
     let mut faults = unknown(inputs, built);
-    if is_unknown(built) {
+    if is_unknown(built) && inputs.stored.is_searchable() {
         // A known class is better evidence than a comparison of the layers with one another.
         faults.extend(layers::faults(inputs.stored.names()));
     }

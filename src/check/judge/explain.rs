@@ -41,7 +41,8 @@ pub(super) fn explain<'a>(inputs: &Inputs<'_>, predictions: Vec<Prediction<'a>>)
 fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> ExplainedLoad<'a> {
     let Prediction { target, architecture, expected, report, .. } = &prediction;
     // A quantised tensor has the shape that its scheme packs it into, which no config value explains.
-    let Some(report) = report.as_ref().filter(|_| target.leads && inputs.is_plain()) else {
+    let is_searched = target.leads && inputs.is_plain() && inputs.stored.is_searchable();
+    let Some(report) = report.as_ref().filter(|_| is_searched) else {
         return ExplainedLoad { prediction, prefixes: Vec::new(), explanation: None };
     };
     let moved = load::moved(*architecture, inputs.config, expected, inputs.stored, report);

@@ -1,8 +1,8 @@
 //! Checkpoints that load under one version of transformers but not under another.
 
 use super::LoadReport;
-use super::Stored;
-use crate::checkpoint::{Fault, FaultKind, Place};
+use super::{Stored, with_names};
+use crate::checkpoint::{Fault, FaultKind};
 use crate::knowledge::{Expected, Loader};
 
 /// A loader's prediction, and the class it was made for.
@@ -31,20 +31,16 @@ pub fn difference(loads: Judged<'_>, other: Judged<'_>, stored: &Stored) -> Opti
     let fault = fault.under(other.expected.loader.version());
     let mut fault = match &report.raises {
         Some(exception) => fault.with("raises", exception.as_str()),
-        None if missing.is_empty() => named(fault, "mismatched", report.mismatched.iter().map(|m| m.name.as_str())),
-        None => named(fault, "missing", missing.into_iter()),
+        None if missing.is_empty() => {
+            let names = report.mismatched.iter().map(|m| m.name.as_str());
+            with_names(fault.with("count", report.mismatched.len()), "mismatched", names)
+        }
+        None => with_names(fault.with("count", missing.len()), "missing", missing.iter().copied()),
     };
     if let Some(reason) = reason(loads.expected, other, stored) {
         fault = fault.with("reason", reason);
     }
     Some(fault)
-}
-
-/// Adds a list of tensors under `key`, and each of them as a place.
-fn named<'n>(fault: Fault, key: &str, names: impl Iterator<Item = &'n str>) -> Fault {
-    let names: Vec<&str> = names.collect();
-    let fault = fault.with(key, names.clone());
-    names.into_iter().fold(fault, |fault, name| fault.at(Place::tensor(name)))
 }
 
 /// The step in which the two versions differ, if it is known; the rule puts it into words.

@@ -88,9 +88,9 @@ pub(super) fn hijackers<'f>(expected: &Expected, file: &'f BTreeSet<String>) -> 
     if expected.base_model_prefix.is_empty() {
         return Vec::new();
     }
-    let (strays, others): (BTreeSet<String>, BTreeSet<String>) =
-        file.iter().cloned().partition(|key| key.starts_with(&expected.base_model_prefix));
-    if strays.is_empty() {
+    let is_stray = |key: &&String| key.starts_with(&expected.base_model_prefix);
+    let others: BTreeSet<String> = file.iter().filter(|key| !is_stray(key)).cloned().collect();
+    if others.is_empty() || others.len() == file.len() {
         return Vec::new();
     }
     let recognised = |file: &BTreeSet<String>| {
@@ -98,7 +98,7 @@ pub(super) fn hijackers<'f>(expected: &Expected, file: &'f BTreeSet<String>) -> 
         expected.tensors.keys().filter(|name| file.contains(&spelling.in_file(name))).count()
     };
     if recognised(&others) > recognised(file) {
-        file.iter().map(String::as_str).filter(|key| strays.contains(*key)).collect()
+        file.iter().filter(is_stray).map(String::as_str).collect()
     } else {
         Vec::new()
     }

@@ -10,8 +10,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 
 use super::LoadReport;
-use super::{Stored, build, predict};
-use crate::checkpoint::{Fault, FaultKind, Place};
+use super::{Stored, build, predict, with_names};
+use crate::checkpoint::{Fault, FaultKind};
 use crate::knowledge::{Architecture, Expected};
 
 /// Stored names from which prefixes are guessed.
@@ -93,14 +93,12 @@ struct Step {
 
 impl Step {
     fn fault(&self, stored: &Stored) -> Fault {
-        let mut fault = Fault::new(FaultKind::NamesMoved)
+        let fault = Fault::new(FaultKind::NamesMoved)
             .with("from", self.from.as_str())
             .with("to", self.to.as_str())
             .with("count", self.names.len())
-            .with("prefixes", json!(self.prefixes(stored)))
-            .with("names", json!(self.names));
-        fault.places = self.names.iter().map(Place::tensor).collect();
-        fault
+            .with("prefixes", json!(self.prefixes(stored)));
+        with_names(fault, "names", self.names.iter().map(String::as_str))
     }
 
     /// Pairs of prefixes that rename these tensors and no other: where others have the prefix too, longer ones. None

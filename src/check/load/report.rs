@@ -24,27 +24,98 @@ pub struct LoadReport {
     /// The exception the loader stops with before it reports any list.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub raises: Option<String>,
+    /// The names that a long list leaves out; missing where every list is whole.
+    #[serde(skip_serializing_if = "Unlisted::is_none")]
+    pub unlisted: Unlisted,
+}
+
+/// Names that are counted and not listed, by list.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct Unlisted {
+    /// Further names of `missing`.
+    pub missing: usize,
+    /// Further names of `unexpected`.
+    pub unexpected: usize,
+    /// Further entries of `mismatched`.
+    pub mismatched: usize,
+    /// Further entries of `silent`.
+    pub silent: usize,
+}
+
+impl Unlisted {
+    const fn is_none(&self) -> bool {
+        matches!(self, Self { missing: 0, unexpected: 0, mismatched: 0, silent: 0 })
+    }
+}
+
+/// Maximum number of names in a list of a report.
+pub(in crate::check) const LISTED: usize = 10_000;
+/// Maximum number of bytes of the names in a list of a report.
+const LISTED_BYTES: usize = 512 << 10;
+
+/// The number of names at the start of a list that a report has room for. Called for the lists of a report and of a fault.
+pub(in crate::check) fn listed<'n>(names: impl Iterator<Item = &'n str>) -> usize {
+    let mut bytes = 0_usize;
+    let fits = |name: &&str| {
+        bytes = bytes.saturating_add(name.len());
+        bytes <= LISTED_BYTES
+    };
+    names.take(LISTED).take_while(fits).count()
+}
+
+/// Shortens a list to what a report has room for, and returns the number of the others.
+fn shorten<T>(list: &mut Vec<T>, name: impl Fn(&T) -> &str) -> usize {
+    let kept = listed(list.iter().map(name));
+    let others = list.len().saturating_sub(kept);
+    list.truncate(kept);
+    list.shrink_to_fit();
+    others
 }
 
 impl LoadReport {
     /// Whether every tensor of the class comes from the checkpoint.
     #[must_use]
     pub fn is_whole(&self) -> bool {
-        self.missing.is_empty() && self.mismatched.is_empty() && self.raises.is_none()
+        let [missing, _, mismatched, _] = self.lengths();
+        missing == 0 && mismatched == 0 && self.raises.is_none()
     }
 
-    /// Whether a tensor of the class keeps its random start, reported or not.
-    #[must_use]
-    pub(crate) fn leaves_random(&self, name: &str) -> bool {
-        let absent = |silent: &Silent| silent.reason == SilentReason::IndexedButAbsent && silent.name == name;
-        self.missing.iter().any(|missing| missing == name) || self.silent.iter().any(absent)
+    /// The tensors of the class that keep their random start, reported or not.
+    pub(crate) fn left_random(&self) -> impl Iterator<Item = &str> {
+        let absent = self.silent.iter().filter(|silent| silent.reason == SilentReason::IndexedButAbsent);
+        self.missing.iter().chain(absent.map(|silent| &silent.name)).map(String::as_str)
     }
 
     /// Whether two loaders say the same.
     #[must_use]
     pub(crate) fn agrees(&self, other: &Self) -> bool {
-        let said = |r: &Self| Self { loader: String::new(), stands_for: None, ..r.clone() };
-        said(self) == said(other)
+        let Self { loader: _, stands_for: _, missing, unexpected, mismatched, silent, raises, unlisted } = self;
+        (missing, unexpected, mismatched) == (&other.missing, &other.unexpected, &other.mismatched)
+            && (silent, raises, unlisted) == (&other.silent, &other.raises, &other.unlisted)
+    }
+
+    /// Shortens the lists to what a report has room for. Called when the whole lists were compared
+    /// and bound for the rules.
+    pub(in crate::check) fn shorten(&mut self) {
+        self.unlisted = Unlisted {
+            missing: shorten(&mut self.missing, |name| name),
+            unexpected: shorten(&mut self.unexpected, |name| name),
+            mismatched: shorten(&mut self.mismatched, |one| &one.name),
+            silent: shorten(&mut self.silent, |one| &one.name),
+        };
+    }
+
+    /// The lengths of the whole lists: missing, unexpected, mismatched, silent.
+    #[must_use]
+    pub(crate) const fn lengths(&self) -> [usize; 4] {
+        [
+            self.missing.len().saturating_add(self.unlisted.missing),
+            self.unexpected.len().saturating_add(self.unlisted.unexpected),
+            self.mismatched.len().saturating_add(self.unlisted.mismatched),
+            self.silent.len().saturating_add(self.unlisted.silent),
+        ]
     }
 
     /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.

@@ -8,6 +8,11 @@ use crate::knowledge::Evidence;
 /// The file a loader takes before it looks for an index.
 const SINGLE: &str = "model.safetensors";
 
+/// Maximum number of stored tensors for which causes are searched; the largest published models have some 210 000.
+const SEARCHED: usize = 300_000;
+/// Maximum number of bytes of their names; those of the largest published models have some 15 MB.
+const SEARCHED_BYTES: usize = 24 << 20;
+
 /// Keys and tensors as the loader sees them.
 ///
 /// Keys come from the index alone, values from every shard the index names: a tensor in a shard and not in
@@ -43,8 +48,8 @@ impl Stored {
                 let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
                 let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
                 // A shard that is not there or could not be read may hold anything.
-                let all_read =
-                    opened.len() == files.len() && opened.iter().all(|s| !s.tensors.is_empty() || s.faults.is_empty());
+                let all_read = opened.len() == files.len()
+                    && opened.iter().all(|s| !s.unread && (!s.tensors.is_empty() || s.faults.is_empty()));
                 let Self { shapes, was_read, .. } = Self::together(opened);
                 let keys: BTreeSet<String> = index.keys().cloned().collect();
                 let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();
@@ -107,6 +112,13 @@ impl Stored {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.keys.is_empty() && self.shapes.is_empty() && !self.was_read
+    }
+
+    /// Whether causes and similar classes are searched for these tensors: a search keeps further copies of their names.
+    #[must_use]
+    pub(in crate::check) fn is_searchable(&self) -> bool {
+        let bytes = self.keys.iter().fold(0_usize, |sum, name| sum.saturating_add(name.len()));
+        self.keys.len().max(self.shapes.len()) <= SEARCHED && bytes <= SEARCHED_BYTES
     }
 
     /// The stored tensors, for what an architecture reads off them.

@@ -248,15 +248,14 @@ fn natural(a: &str, b: &str) -> Ordering {
             a_text.cmp(b_text).then_with(|| number(a_digits).cmp(&number(b_digits)))
         })
     };
-    let (a, b) = (parts(a), parts(b));
-    let differing = a.iter().zip(&b).map(|(a, b)| compare(a, b)).find(|o| o.is_ne());
-    differing.unwrap_or_else(|| a.len().cmp(&b.len()))
+    let differing = parts(a).zip(parts(b)).map(|(a, b)| compare(&a, &b)).find(|o| o.is_ne());
+    differing.unwrap_or_else(|| parts(a).count().cmp(&parts(b).count()))
 }
 
 /// The parts of a name, each with whether it is a word.
-fn parts(name: &str) -> Vec<(bool, &str)> {
+fn parts(name: &str) -> impl Iterator<Item = (bool, &str)> {
     let is_number = |part: &str| !part.is_empty() && part.bytes().all(|b| b.is_ascii_digit());
-    name.split('.').map(|part| (!is_number(part), part)).collect()
+    name.split('.').map(move |part| (!is_number(part), part))
 }
 
 fn trailing_digits(part: &str) -> (&str, &str) {

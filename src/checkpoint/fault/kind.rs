@@ -56,6 +56,7 @@ fault_kinds! {
     Reader {
         AppendedSection = "appended-section",
         ByteOrderMark = "byte-order-mark",
+        CheckpointTooLarge = "checkpoint-too-large",
         CommentInJson = "comment-in-json",
         ContentHashDiffers = "content-hash-differs",
         ContentsUnread = "contents-unread",

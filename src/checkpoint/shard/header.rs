@@ -6,6 +6,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::entry::HeaderEntry;
 use super::{MAX_HEADER, Shard, layout};
+use crate::checkpoint::budget::Budget;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
 use crate::checkpoint::scan::{ScanError, ScanErrorKind, Scanner, Token};
@@ -25,13 +26,18 @@ impl Shard {
     /// the first few hundred bytes are enough to recognise it.
     #[must_use]
     pub fn parse(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
+        Self::parse_within(name, file_len, head, &mut Budget::default())
+    }
+
+    /// As [`Self::parse`], with the budget of the checkpoint: a header that needs more than is left is abandoned.
+    pub(super) fn parse_within(name: impl Into<String>, file_len: u64, head: &[u8], budget: &mut Budget) -> Self {
         let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
-        parse(shard, head)
+        parse(shard, head, budget)
     }
 }
 
 /// Fills in `shard`, which already has its name and length, from the first bytes of the file.
-fn parse(mut shard: Shard, head: &[u8]) -> Shard {
+fn parse(mut shard: Shard, head: &[u8], budget: &mut Budget) -> Shard {
     let (header, data_start) = match frame(&shard, head) {
         Ok(frame) => frame,
         Err(fault) => {
@@ -49,7 +55,7 @@ fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     };
     let scanner = Scanner::strict(text, 0);
     let mut reader =
-        HeaderReader { shard: &shard, scanner, faults, entries: Vec::new(), metadata: HeaderMetadata::Absent };
+        HeaderReader { shard: &shard, scanner, faults, entries: Vec::new(), metadata: HeaderMetadata::Absent, budget };
     let error = reader.object().err();
     let HeaderReader { mut faults, entries, metadata, scanner, .. } = reader;
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
@@ -57,6 +63,7 @@ fn parse(mut shard: Shard, head: &[u8]) -> Shard {
     }
     // Text after the object is padding; any other error leaves entries unread.
     let unread = error.as_ref().is_some_and(|error| error.kind != ScanErrorKind::Trailing);
+    let error = error.filter(|error| error.kind != ScanErrorKind::Syntax(TOO_LARGE));
     faults.extend(error.map(|error| scan_fault(&shard, text, error)));
     if !unread {
         check_format(&shard, &metadata, &mut faults);
@@ -182,6 +189,9 @@ fn other_format(head: &[u8]) -> Option<String> {
 /// hundred thousand over all shards, and each entry takes more memory than its bytes.
 const MAX_ENTRIES: usize = 200_000;
 
+/// Maximum length of a tensor's name in bytes. Published ones have some 100; a name is part of every message about it.
+const MAX_NAME: usize = 16 << 10;
+
 /// Content of `__metadata__`.
 enum HeaderMetadata {
     Absent,
@@ -216,16 +226,26 @@ fn without_duplicates(shard: &Shard, entries: Vec<HeaderEntry>, faults: &mut Fau
     entries.into_iter().zip(drop).filter_map(|(e, d)| (!d).then_some(e)).collect()
 }
 
-struct HeaderReader<'s, 't> {
+struct HeaderReader<'s, 't, 'b> {
     shard: &'s Shard,
     scanner: Scanner<'t>,
     faults: Faults,
     entries: Vec<HeaderEntry>,
     metadata: HeaderMetadata,
+    /// What is left for the entries of this header and of further shards.
+    budget: &'b mut Budget,
 }
 
 /// Reason for abandoning a header with too many entries.
 const TOO_MANY: &str = "too many entries";
+
+/// Reason for abandoning a header that needs more than is left for the checkpoint. It is no fault of the shard: the reader
+/// of the directory reports it.
+const TOO_LARGE: &str = "the checkpoint is too large";
+
+fn too_large() -> ScanError {
+    ScanError { kind: ScanErrorKind::Syntax(TOO_LARGE), span: 0..0 }
+}
 
 fn too_many() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax(TOO_MANY), span: 0..0 }
@@ -236,7 +256,7 @@ fn ended() -> ScanError {
     ScanError { kind: ScanErrorKind::Syntax("the header ends too early"), span: 0..0 }
 }
 
-impl<'t> HeaderReader<'_, 't> {
+impl<'t> HeaderReader<'_, 't, '_> {
     fn token(&mut self) -> Result<Token<'t>, ScanError> {
         Ok(self.scanner.next()?.ok_or_else(ended)?.0)
     }
@@ -260,6 +280,8 @@ impl<'t> HeaderReader<'_, 't> {
                 }
                 metadata_seen = true;
                 self.read_metadata()?;
+            } else if name.len() > MAX_NAME {
+                self.skip_entry(&name)?;
             } else {
                 self.check_name(&name, lone);
                 self.read_entry(name.into_owned())?;
@@ -267,6 +289,20 @@ impl<'t> HeaderReader<'_, 't> {
         }
         // The scanner reports text after the object, other than space, as an error.
         self.scanner.next().map(|_| ())
+    }
+
+    /// Skips an entry with a name above [`MAX_NAME`], which stands among the unreadable ones with the start of its name.
+    fn skip_entry(&mut self, name: &str) -> Result<(), ScanError> {
+        if !self.budget.spend_entry(0) {
+            return Err(too_large());
+        }
+        let value = self.token()?;
+        self.scanner.skip_rest_of(&value)?;
+        let start = escape(name, 200);
+        let fault = Fault::new(FaultKind::EntryMalformed).at(self.shard.place().in_tensor(start.clone()));
+        self.faults.push(fault.with("reason", "its name is longer than 16 KiB"));
+        self.entries.push(HeaderEntry { name: start, dtype: None, shape: None, offsets: None });
+        Ok(())
     }
 
     fn read_metadata(&mut self) -> Result<(), ScanError> {
@@ -283,6 +319,9 @@ impl<'t> HeaderReader<'_, 't> {
                         return Err(too_many());
                     }
                     let key = key.decode().0.into_owned();
+                    if !self.budget.spend_entry(key.len()) {
+                        return Err(too_large());
+                    }
                     match self.token()? {
                         Token::String(value) if !value.decode().1 => {
                             if strings.contains_key(&key) {
@@ -290,7 +329,11 @@ impl<'t> HeaderReader<'_, 't> {
                                 let fault = Fault::new(FaultKind::DuplicateHeaderKey).at(self.shard.place());
                                 self.faults.push(fault.with("key", label));
                             }
-                            strings.insert(key, value.decode().0.into_owned());
+                            let value = value.decode().0.into_owned();
+                            if !self.budget.spend_entry(value.len()) {
+                                return Err(too_large());
+                            }
+                            strings.insert(key, value);
                         }
                         other => {
                             self.scanner.skip_rest_of(&other)?;

@@ -8,6 +8,7 @@ use rustix::io::Errno;
 
 use super::tail::zero_tail;
 use super::{MAX_HEADER, Shard, Tensor};
+use crate::checkpoint::budget::Budget;
 use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::{Fault, FaultKind, Place};
@@ -21,19 +22,24 @@ impl Shard {
     #[doc(hidden)]
     #[must_use]
     pub fn read(dir: &Path, name: &str) -> Self {
+        Self::read_within(dir, name, &mut Budget::default())
+    }
+
+    /// As [`Self::read`], with the budget of the checkpoint.
+    pub(crate) fn read_within(dir: &Path, name: &str, budget: &mut Budget) -> Self {
         match open_regular(&dir.join(name), u64::MAX) {
-            Ok(opened) => read(name, &opened),
+            Ok(opened) => read(name, &opened, budget),
             Err(error) => Self::unread(name, error.fault(name)),
         }
     }
 
     /// Reads the header of an open file. Never fails: what is wrong becomes a fault.
     pub(crate) fn read_opened(name: &str, opened: &Opened) -> Self {
-        read(name, opened)
+        read(name, opened, &mut Budget::default())
     }
 }
 
-fn read(name: &str, opened: &Opened) -> Shard {
+fn read(name: &str, opened: &Opened, budget: &mut Budget) -> Shard {
     let head = match read_head(opened) {
         Ok(head) => head,
         Err(error) => {
@@ -41,7 +47,8 @@ fn read(name: &str, opened: &Opened) -> Shard {
             return Shard { file_len: opened.identity.size, ..Shard::unread(name, fault) };
         }
     };
-    let mut shard = Shard::parse(name, opened.identity.size, &head);
+    budget.spend_header(head.len());
+    let mut shard = Shard::parse_within(name, opened.identity.size, &head, budget);
     name_trailing_bytes(&mut shard, opened);
     shard.faults.extend(unwritten_tail(&shard, opened));
     shard

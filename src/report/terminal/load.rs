@@ -15,14 +15,11 @@ use crate::check::verdict::PredictedLoad;
 /// Renders the load report of loaders with the same result.
 pub fn render(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], style: Style) {
     let paint = Paint(style.color);
-    let n = [load.missing.len(), load.unexpected.len(), load.mismatched.len(), load.silent.len()];
+    let n = load.lengths();
+    let [missing, unexpected, mismatches, silents] = n;
     let line = format!(
-        "predicted load by {}: {} missing, {} unexpected, {} mismatched, {} silent",
+        "predicted load by {}: {missing} missing, {unexpected} unexpected, {mismatches} mismatched, {silents} silent",
         versions(loaders),
-        n[0],
-        n[1],
-        n[2],
-        n[3]
     );
     // The verdict tells of a load without differences.
     if n == [0; 4] {
@@ -35,13 +32,24 @@ pub fn render(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad], s
     }
     let names = |list: &[String]| collapse(list.iter().map(String::as_str));
     list(out, "missing: the loader initialises these with random values", &names(&load.missing), style);
+    unlisted(out, load.unlisted.missing);
     list(out, "unexpected: the loader ignores these", &names(&load.unexpected), style);
+    unlisted(out, load.unlisted.unexpected);
     if !load.mismatched.is_empty() {
         let _ok = writeln!(out, "\n  mismatched: the loader raises an exception");
         table(out, ["tensor", "stored", "expected"], &mismatched(load), style);
+        unlisted(out, load.unlisted.mismatched);
     }
     for (reason, groups) in silent(load) {
         list(out, &format!("silent, loaded without a warning: {reason}"), &groups, style);
+    }
+    unlisted(out, load.unlisted.silent);
+}
+
+/// The number of names that the report does not have.
+fn unlisted(out: &mut String, count: usize) {
+    if count > 0 {
+        let _ok = writeln!(out, "    and {count} tensors that are not listed");
     }
 }
 

@@ -1,6 +1,6 @@
 //! Reads the fields of one header entry.
 
-use super::HeaderReader;
+use super::{HeaderReader, too_large};
 use crate::checkpoint::scan::{ScanError, Token};
 use crate::checkpoint::shard::Dtype;
 use crate::checkpoint::shard::entry::HeaderEntry;
@@ -9,6 +9,9 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Maximum rank of a tensor, above that of any library; a shape with millions of dimensions only takes memory.
 const MAX_RANK: usize = 1024;
+
+/// Rank of usual tensors.
+const USUAL_RANK: usize = 8;
 
 /// Result of reading one field.
 enum Field<T> {
@@ -23,12 +26,15 @@ impl<T> Field<T> {
     }
 }
 
-impl HeaderReader<'_, '_> {
+impl HeaderReader<'_, '_, '_> {
     /// Reads the value of the entry `name`.
     pub(super) fn read_entry(&mut self, name: String) -> Result<(), ScanError> {
         let shard = self.shard;
         let place = || shard.place().in_tensor(name.clone());
         let malformed = |reason: &str| Fault::new(FaultKind::EntryMalformed).at(place()).with("reason", reason);
+        if !self.budget.spend_entry(name.len()) {
+            return Err(too_large());
+        }
         let (mut dtype, mut shape, mut offsets) = (Field::Absent, Field::Absent, Field::Absent);
         let first = self.token()?;
         if first == Token::BeginObject {
@@ -115,6 +121,8 @@ impl HeaderReader<'_, '_> {
             match self.token()? {
                 Token::EndArray => break,
                 Token::Number(literal) if good && numbers.len() < cap => match literal.parse() {
+                    // A usual shape is part of the cost of a tensor.
+                    Ok(_) if numbers.len() >= USUAL_RANK && !self.budget.spend_dimension() => return Err(too_large()),
                     Ok(number) if !literal.starts_with('-') => numbers.push(number),
                     _ => good = false,
                 },
