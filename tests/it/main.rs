@@ -19,6 +19,7 @@ mod support;
 
 mod cli;
 mod docs;
+mod excess;
 mod fix;
 mod hostile;
 mod house;

@@ -299,8 +299,8 @@ impl<'t> HeaderReader<'_, 't, '_> {
         let value = self.token()?;
         self.scanner.skip_rest_of(&value)?;
         let start = escape(name, 200);
-        let fault = Fault::new(FaultKind::EntryMalformed).at(self.shard.place().in_tensor(start.clone()));
-        self.faults.push(fault.with("reason", "its name is longer than 16 KiB"));
+        let fault = Fault::new(FaultKind::OddTensorName).at(self.shard.place().in_tensor(start.clone()));
+        self.faults.push(fault.with("reason", "it is longer than 1 KiB").with("bytes", name.len()));
         self.entries.push(HeaderEntry { name: start, dtype: None, shape: None, offsets: None });
         Ok(())
     }

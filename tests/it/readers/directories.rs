@@ -99,6 +99,9 @@ fn cases() -> Vec<Case> {
         case("loop", &[FaultKind::SymlinkLoop], &|root| symlink("config.json", root.join("config.json")).unwrap()),
         case("6 GiB config", &[FaultKind::FileTooLarge], &|root| sparse(&root.join("config.json"), 6 << 30)),
         case("large module", &[FaultKind::FileTooLarge], &|root| sparse(&root.join("m.py"), MODULE_CAP + 1)),
+        case("four modules of 4 MiB", &[FaultKind::CheckpointTooLarge, FaultKind::PythonTooComplex], &|root| {
+            (0..4).for_each(|i| sparse(&root.join(format!("m{i}.py")), MODULE_CAP));
+        }),
         case("partial download", &[FaultKind::PartialDownload], &|root| {
             fs::write(root.join("model-00001-of-00002.safetensors.incomplete"), "x").unwrap();
         }),

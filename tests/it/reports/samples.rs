@@ -248,6 +248,7 @@ fn load() -> LoadReport {
             Silent { name: "language_model.lm_head.weight".to_owned(), reason: SilentReason::TiedOver, by: None },
         ],
         raises: Some("ValueError: The state dictionary is corrupted.".to_owned()),
+        ..LoadReport::default()
     }
 }
 
