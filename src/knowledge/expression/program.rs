@@ -28,6 +28,9 @@ const RESERVED: [&str; 4] = ["true", "false", "null", "in"];
 impl Program {
     /// Fails with CEL's message, including the column.
     pub fn compile(source: &str, counted: bool) -> Result<Self, String> {
+        if counted {
+            limits::check(source)?;
+        }
         if let Some(simple) = Self::constant(source).or_else(|| Self::path(source)) {
             return Ok(simple);
         }
@@ -39,9 +42,6 @@ impl Program {
                 Self::General(program)
             }
         };
-        if counted {
-            limits::check(source)?;
-        }
         ENV.compile(source).map(compiled).map_err(|errors| {
             let errors = errors.errors.iter().map(|e| format!("column {}: {}", e.pos.1, e.msg));
             errors.collect::<Vec<_>>().join("; ")
