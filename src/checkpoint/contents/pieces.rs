@@ -139,7 +139,7 @@ mod tests {
     /// Numbers from a seed.
     fn next(state: &mut u64, below: u64) -> u64 {
         *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (*state >> 33) % below
+        (*state >> 33).checked_rem(below).unwrap_or(0)
     }
 
     #[test]
