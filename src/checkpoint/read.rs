@@ -169,7 +169,7 @@ impl DirectoryReader {
             self.unread.count = self.unread.count.saturating_add(1);
         }
         if !is_left && is_shard {
-            self.checkpoint.shards.insert(name.to_owned(), Shard::skipped(name, entry.size));
+            self.checkpoint.shards.insert(name.to_owned(), Shard::counted(&self.checkpoint.root, name));
         } else if !is_left && is_module {
             let module = PythonModule { name: name.to_owned(), unread: true, ..PythonModule::default() };
             self.checkpoint.modules.insert(name.to_owned(), module);

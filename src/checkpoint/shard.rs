@@ -66,6 +66,8 @@ pub struct Shard {
     pub unread: bool,
     /// Names of entries in the header that are too malformed for `tensors`.
     pub unreadable: Vec<String>,
+    /// Number of tensors that were counted and not read, because the checkpoint is too large.
+    pub further: u64,
     /// SHA-256 of the first `data_start` bytes, in hexadecimal; empty for a planned shard.
     pub header_sha256: String,
     /// Faults of the container.
@@ -85,10 +87,10 @@ impl Shard {
         Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
     }
 
-    /// A shard of `file_len` bytes that was not opened because the checkpoint is too large.
+    /// Number of tensors that the header lists.
     #[must_use]
-    pub(crate) fn skipped(name: impl Into<String>, file_len: u64) -> Self {
-        Self { name: name.into(), file_len, unread: true, ..Self::default() }
+    pub(crate) fn count(&self) -> u64 {
+        u64::try_from(self.tensors.len()).unwrap_or(u64::MAX).saturating_add(self.further)
     }
 
     /// The entry of this name.

@@ -23,6 +23,7 @@ impl CheckpointReport {
                 sources.insert(file.clone(), text);
             }
         }
+        let listed = checkpoint.shards.values().fold(0_u64, |sum, shard| sum.saturating_add(shard.count()));
         let (mut parameters, mut bytes) = (0_u64, 0_u64);
         for (_, tensor) in checkpoint.tensors() {
             let elements = tensor.shape.iter().fold(1_u64, |n, dim| n.saturating_mul(*dim));
@@ -35,7 +36,7 @@ impl CheckpointReport {
             role,
             class: text("/architectures/0").or_else(|| text("/_class_name")),
             architecture: outcome.architecture.clone(),
-            tensors: checkpoint.tensors().count(),
+            tensors: usize::try_from(listed).unwrap_or(usize::MAX),
             parameters,
             bytes,
             verdict: counts.verdict(),

@@ -116,9 +116,9 @@ pub struct CheckpointReport {
     pub class: Option<String>,
     /// The architecture of the predicted loads; null if it is unknown.
     pub architecture: Option<String>,
-    /// Number of tensors in the shards.
+    /// Number of tensors in the shards, also of a checkpoint that is too large to be read whole.
     pub tensors: usize,
-    /// Their elements as stored; a quantised tensor may hold several parameters in one.
+    /// Elements as stored of the tensors that were read; a quantised tensor may hold several parameters in one.
     pub parameters: u64,
     /// Their bytes.
     pub bytes: u64,

@@ -33,12 +33,12 @@ fn complaints(run: &Run, Made { tensors, names }: Made) -> Vec<String> {
     let checkpoint = &run.report["checkpoints"][0];
     let findings = || checkpoint["findings"].as_array().into_iter().flatten();
     let loads = || checkpoint["loads"].as_array().into_iter().flatten();
+    hold(checkpoint["tensors"] == tensors, format!("{} tensors are counted of {tensors}", checkpoint["tensors"]));
     if findings().any(|finding| finding["code"] == "FIL011") {
         hold(checkpoint["verdict"] == "error", "what was not read is no error".to_owned());
         let is_predicted = |load: &Value| !load["tensors"].is_null() || load["verdict"] == "loads";
         hold(!loads().any(is_predicted), "a load is predicted from a part".to_owned());
     } else {
-        hold(checkpoint["tensors"] == tensors, format!("{} tensors are counted of {tensors}", checkpoint["tensors"]));
         for report in loads().map(|load| &load["tensors"]).filter(|report| !report.is_null()) {
             let listed = report["unexpected"].as_array().map_or(0, Vec::len) as u64;
             let count = listed + report["unlisted"]["unexpected"].as_u64().unwrap_or(0);

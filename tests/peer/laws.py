@@ -132,7 +132,7 @@ def settings_from_here(job, outcome, _):
     if "json" in job.arguments and outcome.output.startswith(b"{"):
         try:
             judged = json.JSONDecoder().raw_decode(outcome.output.decode())[0].get("checkpoints", [])
-        except ValueError:
+        except (ValueError, RecursionError):
             return
         for checkpoint in judged:
             named = checkpoint.get("settings")
@@ -272,6 +272,7 @@ class Group:
         elif self.kind == "output":
             out = batch / "out"
             job.arguments[1:1] = ["--output", str(out)]
+            job.checkpoints.append(str(out))
             job.writes, job.results, job.new = [str(out), str(batch / ".out.partial")], [str(out)], True
         return job
 

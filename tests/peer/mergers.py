@@ -131,6 +131,8 @@ def job(Job, site, batch):
     words, out = arguments(site, place, recipe_file, donors)
     staging = out and os.path.join(os.path.dirname(out), f".{os.path.basename(out)}.partial")
     made = Job(words, batch, {str(place): reads}, checkpoints=reads)
+    # The remains of an ended run are cleared even if the run is then refused.
+    made.writes = [str(place / ".out.partial")]
     if out:
         made.writes, made.new = [out, staging], True
         taken = os.path.lexists(out) and (os.path.islink(out) or not os.path.isdir(out) or os.listdir(out))

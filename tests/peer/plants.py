@@ -216,7 +216,7 @@ def document(tree, rng):
         name = names.pop(rng.randrange(len(names)))
         try:
             return name, json.loads(tree[name])
-        except ValueError:
+        except (ValueError, RecursionError):
             pass
     return None
 
@@ -334,7 +334,7 @@ def auto_map(site, tree):
     name = rng.choice(names)
     try:
         found = json.loads(tree[name])
-    except ValueError:
+    except (ValueError, RecursionError):
         return
     if not isinstance(found, dict):
         return

@@ -29,6 +29,13 @@ impl Shard {
         Self::parse_within(name, file_len, head, &mut Budget::default())
     }
 
+    /// Counts the entries of a header, for a shard of `file_len` bytes that is not read because the checkpoint is too large.
+    pub(super) fn count_entries(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
+        let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
+        let further = frame(&shard, head).map_or(0, |(header, _)| count(header));
+        Self { further, ..shard }
+    }
+
     /// As [`Self::parse`], with the budget of the checkpoint: a header that needs more than is left is abandoned.
     pub(super) fn parse_within(name: impl Into<String>, file_len: u64, head: &[u8], budget: &mut Budget) -> Self {
         let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
@@ -61,9 +68,10 @@ fn parse(mut shard: Shard, head: &[u8], budget: &mut Budget) -> Shard {
     if let Some(ScanError { kind: ScanErrorKind::Syntax(reason), span }) = scanner.refused {
         faults.push(not_json(&shard, reason, span.start));
     }
+    let is_too_large = error.as_ref().is_some_and(|error| error.kind == ScanErrorKind::Syntax(TOO_LARGE));
     // Text after the object is padding; any other error leaves entries unread.
     let unread = error.as_ref().is_some_and(|error| error.kind != ScanErrorKind::Trailing);
-    let error = error.filter(|error| error.kind != ScanErrorKind::Syntax(TOO_LARGE));
+    let error = error.filter(|_| !is_too_large);
     faults.extend(error.map(|error| scan_fault(&shard, text, error)));
     if !unread {
         check_format(&shard, &metadata, &mut faults);
@@ -81,8 +89,50 @@ fn parse(mut shard: Shard, head: &[u8], budget: &mut Budget) -> Shard {
             Err(name) => shard.unreadable.push(name),
         }
     }
+    if is_too_large {
+        let kept = shard.tensors.len().saturating_add(shard.unreadable.len());
+        shard.further = count(header).saturating_sub(u64::try_from(kept).unwrap_or(u64::MAX));
+    }
     shard.faults = faults.into_vec();
     shard
+}
+
+/// Number of tensors that a header lists. Nothing is kept of them, and the text may be malformed.
+fn count(header: &[u8]) -> u64 {
+    let (mut depth, mut count) = (0_u64, 0_u64);
+    let mut key: &[u8] = b"";
+    let mut at = 0_usize;
+    while let Some(byte) = header.get(at) {
+        match byte {
+            b'"' => {
+                let rest = header.get(at.saturating_add(1)..).unwrap_or_default();
+                let len = string_len(rest);
+                if depth == 1 {
+                    key = rest.get(..len).unwrap_or_default();
+                }
+                at = at.saturating_add(len).saturating_add(1);
+            }
+            b'{' | b'[' => {
+                depth = depth.saturating_add(1);
+                count = count.saturating_add(u64::from(depth == 2 && key != b"__metadata__"));
+            }
+            b'}' | b']' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        at = at.saturating_add(1);
+    }
+    count
+}
+
+/// Bytes before the quote that ends a string.
+fn string_len(text: &[u8]) -> usize {
+    let mut is_escaped = false;
+    let end = text.iter().position(|byte| {
+        let ends = *byte == b'"' && !is_escaped;
+        is_escaped = *byte == b'\\' && !is_escaped;
+        ends
+    });
+    end.unwrap_or(text.len())
 }
 
 /// The header as text, without a byte-order mark; `None` when it is not UTF-8.

@@ -34,7 +34,10 @@ impl Chain {
                 return Err(DataError::new(&source.name, circle));
             }
             if chain.len() >= MAX_FILES {
-                return Err(DataError::new(&source.name, format!("is extended by {MAX_FILES} files, one after another")));
+                return Err(DataError::new(
+                    &source.name,
+                    format!("is extended by {MAX_FILES} files, one after another"),
+                ));
             }
             next = source.settings.extend.as_ref().map(|extended| source.dir.join(extended));
             chain.push(source);
