@@ -7,7 +7,7 @@ use super::error::{MergeError, PipelineError};
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
 use crate::checkpoint::Checkpoint;
-use crate::checkpoint::open::real_target;
+use crate::checkpoint::open::{OpenError, real_target};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{DonorSpec, Recipe};
 use crate::knowledge::source::hint;
@@ -27,7 +27,10 @@ pub(super) fn open(
         let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
         snapshots.push(seen?);
         for name in checkpoint.shards.keys() {
-            real_target(dir, &dir.join(name)).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
+            // Other errors of a link are findings.
+            if let Err(error @ OpenError::Outside { .. }) = real_target(dir, &dir.join(name)) {
+                return Err(PipelineError::Donor { role: role.clone(), error });
+            }
         }
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);

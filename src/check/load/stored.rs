@@ -48,8 +48,7 @@ impl Stored {
                 let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
                 let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
                 // A shard that is not there or could not be read may hold anything.
-                let all_read = opened.len() == files.len()
-                    && opened.iter().all(|s| !s.unread && (!s.tensors.is_empty() || s.faults.is_empty()));
+                let all_read = opened.len() == files.len() && opened.iter().all(|shard| !shard.unread);
                 let Self { shapes, was_read, .. } = Self::together(opened);
                 let keys: BTreeSet<String> = index.keys().cloned().collect();
                 let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();

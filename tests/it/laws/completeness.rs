@@ -62,11 +62,16 @@ fn scatter(draw: &mut Draw, dir: &Path) -> BTreeSet<String> {
             _ => Some(json!(name(number))),
         };
         map.extend(mapped.map(|file| (tensor.clone(), file)));
+        if at == 0 && draw.once_in(6) {
+            // A name that is too long to be kept.
+            let long = json!({ "dtype": "U8", "shape": [1], "data_offsets": [0, 1] });
+            shards[number].push(("x".repeat(20_000), long, vec![1]));
+        }
         if at >= lost {
             shards[number].push((tensor, entry, data[offsets[0]..offsets[1]].to_vec()));
         }
     }
-    let found = shards.iter().flatten().map(|(tensor, ..)| tensor.clone()).collect();
+    let found = shards.iter().flatten().map(|(tensor, ..)| tensor.clone()).filter(|n| n.len() < 20_000).collect();
     let whole = count == 1 && draw.once_in(2);
     for (number, shard) in shards.iter().enumerate() {
         let file = if whole { "model.safetensors".to_owned() } else { name(number) };
