@@ -170,7 +170,7 @@ def arguments(site, place, recipe_file, donors):
 
 def accepted(place, into, donors):
     """The target that a merge file names, if a merge into it is not refused."""
-    if not isinstance(into, str) or not into.isprintable():
+    if not isinstance(into, str) or "\0" in into:
         return None
     path = os.path.normpath(os.path.join(place, into))
     inside = [str(place / role) for role in donors]
