@@ -6,7 +6,7 @@ mod merging;
 
 use std::fs;
 
-use ckpt_doctor::merge::{MergeRequest, ResolvedMergeFile, find_recipe};
+use ckpt_doctor::merge::{MergeRequest, ResolvedMergeFile};
 use libfuzzer_sys::fuzz_target;
 use merging::{KNOWLEDGE, PLACE, hold};
 
@@ -22,7 +22,8 @@ fuzz_target!(|data: &[u8]| {
     if !PLACE.join("recipe.json5").exists() {
         fs::write(PLACE.join("recipe.json5"), RECIPE).expect("written");
     }
-    let Ok(ResolvedMergeFile { recipe, base, donors, options, out }) = ResolvedMergeFile::read(&path) else { return };
-    let Ok(recipe) = recipe.map(|name| find_recipe(&KNOWLEDGE.recipes, &name, &base)).transpose() else { return };
+    let Ok(file) = ResolvedMergeFile::read(&path) else { return };
+    let Ok(recipe) = file.find_recipe(&KNOWLEDGE) else { return };
+    let ResolvedMergeFile { donors, options, out, .. } = file;
     hold(&MergeRequest { recipe, donors, options, out, dry_run: true, hash: false });
 });
