@@ -16,6 +16,7 @@ pub(crate) mod manifest;
 mod options;
 mod plan;
 mod publish;
+mod recipe_file;
 mod run;
 mod switches;
 mod tensors;
@@ -25,6 +26,8 @@ use std::path::Path;
 
 pub use error::PipelineError;
 pub use file::ResolvedMergeFile;
+#[cfg(feature = "cli")]
+pub(crate) use recipe_file::read as read_recipe;
 pub use run::{MergeRequest, MergeRun};
 #[cfg(feature = "internals")]
 pub use validate::validate;

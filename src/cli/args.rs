@@ -16,8 +16,8 @@ pub struct Cli {
     /// The subcommand.
     #[command(subcommand)]
     pub command: Command,
-    /// Directory with extra rules (checks/**/*.json5) and architectures (architectures/*.json5); an architecture replaces
-    /// the built-in one of the same name
+    /// Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors
+    /// (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name
     #[arg(long, value_name = "DIR", global = true)]
     pub rules: Option<PathBuf>,
 }

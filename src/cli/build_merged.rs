@@ -17,7 +17,7 @@ use crate::report::model::{MergeStage, Role};
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let knowledge = Knowledge::with(RuleSet::embedded()?, library::with(rules)?)?;
+    let knowledge = library::knowledge(RuleSet::embedded()?, rules)?;
     let request = request(args, &knowledge)?;
     signals::install()?;
     let terminal = std::io::stderr().is_terminal();

@@ -103,10 +103,9 @@ impl Typed {
         let mut rules = library::rules(folder.as_deref())?;
         let mut policy = chain.govern(&mut rules, self.choice.clone())?;
         policy.metadata_only |= self.metadata_only;
-        let library = library::with(folder.as_deref())?;
         let versions = if self.versions.is_empty() { chain.versions()? } else { expanded(self.versions.clone()) };
         Ok(Resolved {
-            knowledge: Knowledge { policy, ..Knowledge::with(rules, library)? },
+            knowledge: Knowledge { policy, ..library::knowledge(rules, folder.as_deref())? },
             versions,
             fail_on: self.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
             min_severity: self.min_severity.or_else(|| chain.min_severity()).unwrap_or(Severity::Info),

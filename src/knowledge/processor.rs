@@ -14,7 +14,8 @@ use super::source::{self, DataError};
 pub struct Processor {
     /// Name of the processor.
     pub processor: String,
-    /// Architectures that use the processor.
+    /// Architectures that use the processor: checks of their checkpoints add its tokens. Empty for one that only recipes name.
+    #[serde(default)]
     pub architectures: Vec<String>,
     /// Names for expressions, in order; each may use the names before it.
     #[serde(rename = "let", default)]
@@ -60,6 +61,14 @@ pub struct TokenRun {
 }
 
 impl Processor {
+    /// Parses a processor.
+    ///
+    /// # Errors
+    /// [`DataError`] with the position.
+    pub fn parse(path: &str, text: &str) -> Result<Self, DataError> {
+        source::parse(path, text)
+    }
+
     /// The built-in processors.
     ///
     /// # Errors

@@ -1,12 +1,13 @@
 //! Recipes: the parts that `build-merged` takes from each donor.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::expression::{Expression, Template};
-use super::processor::Let;
+use super::processor::{Let, Processor};
 use super::source::{self, DataError};
 use crate::checkpoint::FileName;
 
@@ -51,6 +52,22 @@ pub struct Recipe {
     #[serde(default, rename = "$schema")]
     #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
+    /// The file that the recipe was read from.
+    #[serde(skip)]
+    pub origin: Origin,
+}
+
+/// The file of a recipe, and the files in its folder that it names.
+#[derive(Debug, Clone, Default)]
+pub struct Origin {
+    /// Path of the file; `rules/recipes/…` for a built-in recipe.
+    pub path: String,
+    /// Text of the file.
+    pub text: Cow<'static, str>,
+    /// Templates in the folder of the file, by the paths that the recipe gives them.
+    pub templates: BTreeMap<String, String>,
+    /// The processor in the folder of the file that `tokens` names.
+    pub processor: Option<Processor>,
 }
 
 /// A donor role.
@@ -97,7 +114,7 @@ pub struct OptionSpec {
 pub struct TokenSpec {
     /// Role of the donor whose tokenizer is used.
     pub base: String,
-    /// Name of a processor in `rules/processors/`.
+    /// Name of a processor in `rules/processors/`, or the path of a `.json5` file below the folder of the recipe.
     pub processor: String,
 }
 
@@ -316,7 +333,7 @@ pub struct ModulesSpec {
 pub struct TemplateSpec {
     /// File name in the result.
     pub name: FileName,
-    /// Path below `rules/recipes/`.
+    /// Path below the folder of the recipe, or below `rules/recipes/`.
     pub text: String,
     /// Values of placeholders: `{{key}}` becomes the value of the expression.
     #[serde(default)]
@@ -364,7 +381,8 @@ impl Recipe {
     /// # Errors
     /// [`DataError`] with the position.
     pub fn parse(path: &str, text: &str) -> Result<Self, DataError> {
-        source::parse(path, text)
+        let origin = Origin { path: path.to_owned(), text: Cow::Owned(text.to_owned()), ..Origin::default() };
+        Ok(Self { origin, ..source::parse(path, text)? })
     }
 
     /// The built-in recipes, by name.
@@ -372,7 +390,25 @@ impl Recipe {
     /// # Errors
     /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
-        source::embedded("recipes").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
+        let parse = |(path, text): (String, &'static str)| {
+            let recipe: Self = source::parse_embedded(&path, text)?;
+            let origin = Origin { path, text: Cow::Borrowed(text), ..Origin::default() };
+            Ok(Self { origin, ..recipe })
+        };
+        source::embedded("recipes").into_iter().map(parse).collect()
+    }
+
+    /// Text of a template: the one in the folder of the recipe, or else the built-in one of this path.
+    #[must_use]
+    pub fn template(&self, path: &str) -> Option<&str> {
+        self.origin.templates.get(path).map(String::as_str).or_else(|| source::text(&format!("recipes/{path}")))
+    }
+
+    /// The processor of `tokens`: the one in the folder of the recipe, or else the known one of this name.
+    #[must_use]
+    pub fn processor<'p>(&'p self, known: &'p [Processor]) -> Option<&'p Processor> {
+        let name = &self.tokens.as_ref()?.processor;
+        self.origin.processor.as_ref().or_else(|| known.iter().find(|processor| processor.processor == *name))
     }
 }
 

@@ -109,7 +109,7 @@ impl Context<'_> {
     fn add_tokens(&mut self) -> Result<(), MergeError> {
         let Some(spec) = &self.recipe.tokens else { return Ok(()) };
         if self.tokens.is_none() {
-            let processor = self.processors.iter().find(|p| p.processor == spec.processor).ok_or_else(|| {
+            let processor = self.recipe.processor(self.processors).ok_or_else(|| {
                 MergeError::Recipe(format!("{}: no processor {}", self.recipe.recipe, spec.processor))
             })?;
             let donor = self

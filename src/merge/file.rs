@@ -4,8 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
 use super::options;
-use super::validate::validate;
-use crate::checkpoint::open::{JSON_CAP, read_capped};
+use super::recipe_file::{self, text};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{MergeFile, Recipe};
 use crate::knowledge::source::{self, DataError, hint};
@@ -125,18 +124,9 @@ fn find_recipe(knowledge: &Knowledge, name: &str, base: &Path) -> Result<Recipe,
     }
     let path = base.join(name);
     if path.extension().is_some_and(|e| e == "json5" || e == "json") {
-        let (name, text) = (path.display().to_string(), text(&path)?);
-        let recipe = Recipe::parse(&name, &text)?;
-        validate(&recipe, &name, &text, knowledge)?;
-        return Ok(recipe);
+        return recipe_file::read(&path, knowledge);
     }
     let names: Vec<&str> = knowledge.recipes.iter().map(|r| r.recipe.as_str()).collect();
     let names = names.join(", ");
     Err(DataError::new(name, format!("unknown recipe; pass one of {names}, or the path of a .json5 file")))
-}
-
-fn text(path: &Path) -> Result<String, DataError> {
-    let name = path.display().to_string();
-    let bytes = read_capped(path, JSON_CAP).map_err(|error| DataError::new(&name, error.to_string()))?;
-    String::from_utf8(bytes).map_err(|_| DataError::new(&name, "not UTF-8"))
 }

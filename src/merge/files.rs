@@ -14,7 +14,6 @@ use crate::check::modules::relative_modules;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::checkpoint::{Document, FileName, INDEX_NAME};
 use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
-use crate::knowledge::source;
 use crate::report::model::MergedFile;
 use crate::surgery::plan::PlannedFile;
 
@@ -121,9 +120,9 @@ fn modules(context: &Context<'_>, spec: &ModulesSpec, draft: &mut MergeDraft) ->
 
 fn fill_template(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFile, MergeError> {
     let recipe = &context.recipe.recipe;
-    let mut text = source::text(&format!("recipes/{}", spec.text))
-        .ok_or_else(|| MergeError::Recipe(format!("{recipe}: no template {}", spec.text)))?
-        .to_owned();
+    let template = context.recipe.template(&spec.text);
+    let mut text =
+        template.ok_or_else(|| MergeError::Recipe(format!("{recipe}: no template {}", spec.text)))?.to_owned();
     for (key, expression) in &spec.fill {
         let value = expression.eval(&context.scope).map_err(context.at(spec.text.as_str()))?;
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);

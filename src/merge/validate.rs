@@ -133,6 +133,9 @@ impl Validator<'_> {
     fn tokens(&self) -> Result<(), DataError> {
         let Some(tokens) = &self.recipe.tokens else { return Ok(()) };
         self.role("base", &tokens.base)?;
+        if self.recipe.origin.processor.is_some() {
+            return Ok(());
+        }
         let known: Vec<&str> = self.knowledge.processors.iter().map(|p| p.processor.as_str()).collect();
         self.known("processor", "processor", &tokens.processor, &known)
     }

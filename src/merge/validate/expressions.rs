@@ -126,8 +126,7 @@ impl Validator<'_> {
 
     /// The keys of `tokens`: see `OpenedTokenizer::summary`.
     fn token_keys(&self) -> Vec<&str> {
-        let name = self.recipe.tokens.as_ref().map(|tokens| tokens.processor.as_str());
-        let processor = self.knowledge.processors.iter().find(|processor| Some(processor.processor.as_str()) == name);
+        let processor = self.recipe.processor(&self.knowledge.processors);
         let lets = processor.iter().flat_map(|p| &p.lets).map(|item| item.name.as_str());
         let runs = processor.iter().flat_map(|p| &p.add).filter_map(|run| run.name.as_deref());
         ["length", "scattered"].into_iter().chain(lets).chain(runs).collect()

@@ -84,6 +84,9 @@ impl Validator<'_> {
             let reason = format!("{} is a Python module, so its name must end in .py", template.name);
             return Err(self.wrong("name", &template.name, reason));
         }
+        if self.recipe.origin.templates.contains_key(&template.text) {
+            return Ok(());
+        }
         let templates = source::paths("recipes").into_iter().filter(|path| path.ends_with(".py"));
         self.known("text", "template", &template.text, &templates.collect::<Vec<_>>())
     }

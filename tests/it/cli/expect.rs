@@ -78,7 +78,7 @@ fn architectures_of_a_rules_folder_are_used() {
     let (wrong, code) = expect(dir, &["config.json", "--rules", "mine"]);
     assert_eq!(
         (code, wrong.as_str()),
-        (Some(2), "error: mine contains neither architectures/*.json5 nor checks/**/*.json5\n")
+        (Some(2), "error: mine contains no .json5 file in architectures/, checks/, processors/, recipes/\n")
     );
     let file = |tensors: &str| {
         let text = format!(
