@@ -12,9 +12,10 @@ mod surroundings;
 
 use std::fmt::Write as _;
 
+use crate::support::Draw;
 use run::{Run, check};
 use serde_json::Value;
-use shape::{Excess, Made, Random};
+use shape::{Excess, Made};
 use tempfile::TempDir;
 
 /// Largest report of one checkpoint, in bytes.
@@ -55,11 +56,11 @@ fn complaints(run: &Run, Made { tensors, names }: Made) -> Vec<String> {
 
 #[test]
 fn every_excess_is_bounded_and_counted() {
-    let mut random = Random::new(20);
+    let mut draw = Draw::new(20);
     let mut wrong = String::new();
     for shape in Excess::ALL {
         let dir = TempDir::new().unwrap();
-        let made = shape.write(dir.path(), run::large(1_000), &mut random);
+        let made = shape.write(dir.path(), run::large(1_000), &mut draw);
         let run = check(dir.path(), &[]);
         for complaint in complaints(&run, made) {
             let _ = writeln!(wrong, "{shape:?}: {complaint}");
@@ -75,7 +76,7 @@ fn time_is_linear_in_the_bytes() {
     for shape in Excess::ALL {
         let cpu = [1, 4].map(|times| {
             let dir = TempDir::new().unwrap();
-            shape.write(dir.path(), times * run::large(100), &mut Random::new(7));
+            shape.write(dir.path(), times * run::large(100), &mut Draw::new(7));
             let run = check(dir.path(), &[]);
             assert!(matches!(run.code, Some(0 | 1)), "{shape:?} ×{times}: {:?} {}", run.code, run.errors);
             run.cpu

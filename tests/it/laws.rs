@@ -16,25 +16,6 @@ fn cases(few: u64) -> u64 {
     std::env::var("CKPT_DOCTOR_LAWS").map_or(few, |n| n.parse().expect("a number"))
 }
 
-/// Choices that follow from a seed.
-struct Draw(crate::mutation::Mutator);
-
-impl Draw {
-    fn new(seed: u64) -> Self {
-        Self(crate::mutation::Mutator::new(seed))
-    }
-
-    /// One of the items.
-    fn one<'i, T>(&mut self, items: &'i [T]) -> &'i T {
-        &items[self.0.below(items.len())]
-    }
-
-    /// True once in `times`.
-    fn once_in(&mut self, times: usize) -> bool {
-        self.0.below(times) == 0
-    }
-}
-
 /// Writes a sound tiny Llama.
 fn base(dir: &Path) {
     static LLAMA: LazyLock<TempDir> = LazyLock::new(|| {

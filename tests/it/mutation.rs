@@ -3,7 +3,7 @@
 //! The inputs follow from a seed. `cargo test` runs some thousands; `CKPT_DOCTOR_MUTATIONS=200000`, as in CI, sets the
 //! number.
 
-pub mod mutate;
+mod mutate;
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -13,8 +13,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use ckpt_doctor::check::check;
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::Format;
-pub use mutate::Mutator;
+use mutate::Mutator;
 
+use crate::support::Draw;
 use crate::support::repairs::{File, planned, renders, repairs};
 
 /// Number of inputs in a plain `cargo test`.
@@ -92,8 +93,8 @@ fn invariants_hold_for_mutated_files() {
             }
             let (base, file) = files[number % files.len()];
             let seed = &bases[base][file];
-            let mut mutator = Mutator::new(number as u64);
-            let other = &bases[base][mutator.below(bases[base].len())];
+            let mut mutator = Mutator(Draw::new(number as u64));
+            let other = &bases[base][mutator.0.below(bases[base].len())];
             let bytes = mutator.mutate(&seed.bytes, &other.bytes);
             let tried = catch_unwind(AssertUnwindSafe(|| {
                 hold(&seed.name, &bytes);

@@ -7,6 +7,7 @@
 mod base;
 mod change;
 pub mod data;
+mod draw;
 pub mod invariants;
 pub mod repairs;
 pub mod weights;
@@ -29,6 +30,7 @@ use serde::Deserialize;
 
 pub use base::{BASES, copy};
 use change::Change;
+pub use draw::Draw;
 
 /// Compares a text with `tests/snapshots/NAME.snap`.
 macro_rules! snapshot {

@@ -280,8 +280,8 @@ def too_long(*_):
     raise TooLong
 
 
-def worker(rows_file, work, seed, mutants, classes):
-    """Under one version: makes models and mutants, and writes what its loader does with each."""
+def prepared(rows_file, seed):
+    """At the start of a worker: limits its time and memory, and returns its generator and the configs in a drawn order."""
     import torch
     import transformers
 
@@ -292,6 +292,14 @@ def worker(rows_file, work, seed, mutants, classes):
     rng = random.Random(f"{seed} {transformers.__version__}")
     rows = [json.loads(line) for line in Path(rows_file).read_text().splitlines()]
     rng.shuffle(rows)
+    return rng, rows
+
+
+def worker(rows_file, work, seed, mutants, classes):
+    """Under one version: makes models and mutants, and writes what its loader does with each."""
+    import transformers
+
+    rng, rows = prepared(rows_file, seed)
     others = [shrunk(row["config"], 8) for row in rows]
     work = Path(work)
     made = list(bases(rng, rows * 3, work, classes))
@@ -331,6 +339,17 @@ def worker(rows_file, work, seed, mutants, classes):
 # All versions.
 
 
+def start_worker(script, folder, place, *arguments):
+    """Runs `script --worker ROWS PLACE ARGUMENT...` under the version in `folder`; returns what it printed."""
+    rows = place / "rows.jsonl"
+    rows.write_text("".join(json.dumps({**json.loads(line), "number": n}) + "\n" for n, line in enumerate(CONFIGS.read_text().splitlines())))
+    env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": "", "PYTHONHASHSEED": "0"}
+    done = subprocess.run([sys.executable, script, "--worker", rows, place, *arguments], capture_output=True, text=True, env=env)
+    if done.returncode:
+        sys.exit(f"the worker failed with {folder}:\n{done.stderr[-2000:]}")
+    return done.stdout
+
+
 def run_worker(folder, work, a):
     """The mutants of one version."""
     version = version_in(folder)
@@ -339,12 +358,7 @@ def run_worker(folder, work, a):
     if not told.exists():
         shutil.rmtree(of_version, ignore_errors=True)
         of_version.mkdir(parents=True)
-        rows = of_version / "rows.jsonl"
-        rows.write_text("".join(json.dumps({**json.loads(line), "number": n}) + "\n" for n, line in enumerate(CONFIGS.read_text().splitlines())))
-        env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": "", "PYTHONHASHSEED": "0"}
-        done = subprocess.run([sys.executable, __file__, "--worker", rows, of_version, a.seed, str(a.mutants), str(a.classes)], capture_output=True, text=True, env=env)
-        if done.returncode:
-            sys.exit(f"the worker failed with {folder}:\n{done.stderr[-2000:]}")
+        start_worker(__file__, folder, of_version, a.seed, str(a.mutants), str(a.classes))
     return version, [json.loads(line) for line in told.read_text().splitlines()]
 
 

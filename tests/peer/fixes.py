@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import struct
@@ -24,9 +23,9 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from differential import BYTES, CONFIGS, SECONDS, SHARD, TooLong, bases, mutate_index, mutate_tensors, too_long
+from differential import SECONDS, TooLong, bases, mutate_index, mutate_tensors, prepared, start_worker
 from fresh import version_in
-from peer import INDEX, Tally, read_shard, workplace
+from peer import Tally, read_shard, workplace
 
 PROGRAM = os.environ.get("CKPT_DOCTOR", "ckpt-doctor")
 
@@ -133,16 +132,9 @@ def names(shard):
 
 def worker(rows_file, work, seed, mutants, classes, unsafe):
     """Under one version: makes models, damages copies, and loads them before and after the fix."""
-    import torch
     import transformers
 
-    torch.set_num_threads(1)
-    resource.setrlimit(resource.RLIMIT_DATA, (BYTES, BYTES))
-    signal.signal(signal.SIGALRM, too_long)
-    transformers.utils.logging.disable_progress_bar()
-    rng = random.Random(f"{seed} {transformers.__version__}")
-    rows = [json.loads(line) for line in Path(rows_file).read_text().splitlines()]
-    rng.shuffle(rows)
+    rng, rows = prepared(rows_file, seed)
     work = Path(work)
     # Several configs of one class may come; `bases` takes the first that it can make small.
     made = list(bases(rng, rows * 3, work, classes))
@@ -206,14 +198,8 @@ def run_worker(folder, work, a):
     version = version_in(folder)
     place = work / version
     place.mkdir()
-    rows = place / "rows.jsonl"
-    rows.write_text("".join(json.dumps({**json.loads(line), "number": n}) + "\n" for n, line in enumerate(CONFIGS.read_text().splitlines())))
-    env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": "", "PYTHONHASHSEED": "0"}
-    args = [sys.executable, __file__, "--worker", rows, place, a.seed, str(a.mutants), str(a.classes), str(a.unsafe)]
-    done = subprocess.run(args, capture_output=True, text=True, env=env)
-    if done.returncode:
-        sys.exit(f"the worker failed with {folder}:\n{done.stderr[-2000:]}")
-    return version, [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    told = start_worker(__file__, folder, place, a.seed, str(a.mutants), str(a.classes), str(a.unsafe))
+    return version, [json.loads(line) for line in told.splitlines() if line.startswith("{")]
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@ use std::process::Command;
 
 use tempfile::TempDir;
 
-use super::shape::{Excess, Random};
+use super::shape::Excess;
+use crate::support::Draw;
 
 /// A text that is repeated: before, after, and around what.
 fn repeated(open: &str, inner: &str, close: &str, n: usize) -> String {
@@ -31,7 +32,7 @@ fn files_of_a_user_are_refused_with_their_name() {
     let dir = TempDir::new().unwrap();
     let checkpoint = dir.path().join("model");
     fs::create_dir(&checkpoint).unwrap();
-    Excess::Nesting.write(&checkpoint, 1, &mut Random::new(1));
+    Excess::Nesting.write(&checkpoint, 1, &mut Draw::new(1));
     for n in [9, 300, 3_000] {
         let glob = repeated("{a,", "b", "}", n);
         let settings = dir.path().join("settings.json5");

@@ -5,22 +5,7 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::Path;
 
-/// Numbers from a seed (`SplitMix64`).
-pub struct Random(u64);
-
-impl Random {
-    pub const fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    /// A number below `n`.
-    pub fn below(&mut self, n: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) % n as u64) as usize
-    }
-}
+use crate::support::Draw;
 
 /// What a directory has too much of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -77,15 +62,15 @@ impl Excess {
     ];
 
     /// Writes a directory; a `size` of 1000 exceeds the budget of a checkpoint, or comes near it.
-    pub fn write(self, dir: &Path, size: usize, random: &mut Random) -> Made {
+    pub fn write(self, dir: &Path, size: usize, draw: &mut Draw) -> Made {
         // At most 190 000 entries in a header, which are read whole.
-        let shards = 4 + random.below(3);
+        let shards = 4 + draw.below(3);
         fs::write(dir.join("config.json"), CONFIG).unwrap();
         match self {
             Self::Tensors => return empty_tensors(dir, shards, size * 600 / shards, 0, false),
             Self::IndexedTensors => return empty_tensors(dir, shards, size * 600 / shards, 0, true),
             Self::LongNames => {
-                return empty_tensors(dir, shards, size * 200 / shards, 100 + random.below(400), false);
+                return empty_tensors(dir, shards, size * 200 / shards, 100 + draw.below(400), false);
             }
             // Names above 16 KiB are those of no tensor.
             Self::HugeNames => drop(empty_tensors(dir, shards, size / 4 / shards + 1, 250_000, false)),
@@ -98,7 +83,7 @@ impl Excess {
             Self::Modules => modules(dir, size / 10),
             Self::Entries => unreadable(dir, size * 110),
             Self::Tokens => tokens(dir, size * 1_400),
-            Self::Nesting => nesting(dir, random.below(3)),
+            Self::Nesting => nesting(dir, draw.below(3)),
             Self::All => {
                 documents(dir, size / 40, &format!("[{}0]", "0,".repeat(90_000)));
                 modules(dir, size / 40);

@@ -5,7 +5,8 @@ use std::process::Command;
 
 use tempfile::TempDir;
 
-use super::shape::{Excess, Random};
+use super::shape::Excess;
+use crate::support::Draw;
 
 /// What a shell does before it starts the program, and redirections.
 const SURROUNDINGS: [(&str, &str); 10] = [
@@ -24,7 +25,7 @@ const SURROUNDINGS: [(&str, &str); 10] = [
 #[test]
 fn every_command_ends_with_a_code_of_its_own() {
     let dir = TempDir::new().unwrap();
-    Excess::Nesting.write(dir.path(), 1, &mut Random::new(1));
+    Excess::Nesting.write(dir.path(), 1, &mut Draw::new(1));
     let checkpoint = dir.path().to_str().unwrap();
     let commands: [&[&str]; 9] = [
         &["check", checkpoint],

@@ -10,7 +10,8 @@ use ckpt_doctor::checkpoint::Checkpoint;
 use serde_json::{Map, Value, json};
 use tempfile::TempDir;
 
-use super::{Draw, base, cases};
+use super::{base, cases};
+use crate::support::Draw;
 
 const INDEX: &str = "model.safetensors.index.json";
 
@@ -43,15 +44,15 @@ fn scatter(draw: &mut Draw, dir: &Path) -> BTreeSet<String> {
     let (mut header, data) = read(&dir.join("model.safetensors"));
     fs::remove_file(dir.join("model.safetensors")).unwrap();
     let metadata = header.remove("__metadata__");
-    let lost = *draw.one(&[0, 0, 1, 3, header.len()]);
-    let count = 1 + draw.0.below(3);
+    let lost = draw.one(&[0, 0, 1, 3, header.len()]);
+    let count = 1 + draw.below(3);
     let mut shards = vec![Vec::new(); count];
     let mut map = Map::new();
     let name = |number: usize| format!("model-{:05}-of-{count:05}.safetensors", number + 1);
     for (at, (tensor, entry)) in header.into_iter().enumerate() {
         let offsets: Vec<usize> = serde_json::from_value(entry["data_offsets"].clone()).unwrap();
-        let number = draw.0.below(count);
-        let mapped = match draw.0.below(40) {
+        let number = draw.below(count);
+        let mapped = match draw.below(40) {
             0 => Some(json!("config.json")),
             1 => Some(json!(INDEX)),
             2 => Some(json!("../outside.safetensors")),
@@ -77,7 +78,7 @@ fn scatter(draw: &mut Draw, dir: &Path) -> BTreeSet<String> {
         let file = if whole { "model.safetensors".to_owned() } else { name(number) };
         write(&dir.join(file), metadata.clone(), shard);
     }
-    match draw.0.below(8) {
+    match draw.below(8) {
         0 => map.clear(),
         1 => drop(map.shift_remove("lm_head.weight")),
         _ => {}

@@ -7,7 +7,8 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::{Draw, base, cases};
+use super::{base, cases};
+use crate::support::Draw;
 
 /// Folders of a case, from the top to the checkpoint.
 const LEVELS: [&str; 5] = ["", "home", "home/download", "home/download/sub", "home/download/sub/checkpoint"];
@@ -33,7 +34,7 @@ fn comma(dir: &Path) {
 /// A checkpoint with a tensor missing, a shard that is a pointer, or a document that is not JSON.
 fn make(draw: &mut Draw, dir: &Path) {
     base(dir);
-    match draw.0.below(3) {
+    match draw.below(3) {
         0 => comma(dir),
         1 => {
             let oid = "0123456789abcdef".repeat(4);
@@ -82,7 +83,7 @@ fn no_byte_below_a_checked_path_decides_how_it_is_judged() {
         let mut planted = Vec::new();
         for level in &levels {
             if draw.once_in(2) {
-                fs::write(level.join("ckpt-doctor.json5"), *draw.one(&SILENCING)).unwrap();
+                fs::write(level.join("ckpt-doctor.json5"), draw.one(&SILENCING)).unwrap();
                 fs::write(level.join("other.json5"), "{ ignore: ['LFS', 'JSN'] }").unwrap();
                 planted.push(level.join("ckpt-doctor.json5"));
             }
@@ -92,8 +93,8 @@ fn no_byte_below_a_checked_path_decides_how_it_is_judged() {
                 fs::write(level.join(".gitattributes"), "*.safetensors filter=lfs -text\n").unwrap();
             }
         }
-        let given = &levels[2 + draw.0.below(3)];
-        let here = &levels[draw.0.below(levels.len())];
+        let given = &levels[2 + draw.below(3)];
+        let here = &levels[draw.below(levels.len())];
         let shown = match given.strip_prefix(here) {
             Ok(below) if below.as_os_str().is_empty() => ".".to_owned(),
             Ok(below) if draw.once_in(2) => below.display().to_string(),
@@ -142,10 +143,10 @@ fn a_verdict_under_settings_says_so_in_every_format() {
             let start: String = shown.chars().take(2000).collect();
             assert!(shown.contains("ckpt-doctor.json5"), "{format} under {silencing}: {start}");
         }
-        for format in formats {
-            let shown = doctor(room.path(), &["check", "model", "--isolated", "--output-format", format]);
-            assert!(!String::from_utf8(shown.stdout).unwrap().contains("ckpt-doctor.json5"), "{format}");
-        }
+    }
+    for format in formats {
+        let shown = doctor(room.path(), &["check", "model", "--isolated", "--output-format", format]);
+        assert!(!String::from_utf8(shown.stdout).unwrap().contains("ckpt-doctor.json5"), "{format}");
     }
 }
 

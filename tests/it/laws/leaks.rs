@@ -8,8 +8,9 @@ use std::process::Command;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::{Draw, base, cases};
+use super::{base, cases};
 use crate::support;
+use crate::support::Draw;
 
 /// Stands in every file outside, as a value, a key, a name and a line.
 const SECRET: &str = "hf_5ecretOutside";
@@ -40,7 +41,7 @@ const NAMES: [&str; 18] = [
 fn secret(draw: &mut Draw, inside: &Path) -> Vec<u8> {
     let own = fs::read(inside).unwrap_or_default();
     let name = inside.file_name().unwrap().to_str().unwrap();
-    match draw.0.below(4) {
+    match draw.below(4) {
         0 => format!("machine example.org login x password {SECRET}\n").into_bytes(),
         1 if name.ends_with(".json") => {
             let mut value: Value = serde_json::from_slice(&own).unwrap_or_else(|_| serde_json::json!({}));
@@ -62,13 +63,13 @@ fn secret(draw: &mut Draw, inside: &Path) -> Vec<u8> {
 /// Puts files outside of `dir` and links to them in their place.
 fn plant(draw: &mut Draw, dir: &Path, outside: &Path) -> Vec<PathBuf> {
     let mut secrets = Vec::new();
-    for number in 0..=draw.0.below(3) {
-        let name = *draw.one(&NAMES);
+    for number in 0..=draw.below(3) {
+        let name = draw.one(&NAMES);
         let inside = dir.join(name);
         let target = outside.join(format!("{number}-secret"));
         fs::write(&target, secret(draw, &inside)).unwrap();
         let _ = fs::remove_file(&inside);
-        match draw.0.below(4) {
+        match draw.below(4) {
             0 => symlink(Path::new("../outside").join(target.file_name().unwrap()), &inside).unwrap(),
             1 => {
                 // By way of a second link, which has an innocent name.
@@ -136,9 +137,9 @@ fn no_file_outside_reaches_a_report_or_a_copy() {
         let before: Vec<Vec<u8>> = secrets.iter().map(|secret| fs::read(secret).unwrap()).collect();
         let context = format!("seed {seed}");
         let path = dir.to_str().unwrap();
-        run(&["check", path, "--output-format", *draw.one(&formats)], &[], &context);
+        run(&["check", path, "--output-format", draw.one(&formats)], &[], &context);
         run(&["check", path, "--diff", "--unsafe-fixes"], &[], &context);
-        run(&[*draw.one(&["inspect", "expect"]), path], &[], &context);
+        run(&[draw.one(&["inspect", "expect"]), path], &[], &context);
         run(&["check", path, "--fix", "--unsafe-fixes", "--output", copy.to_str().unwrap()], &[&copy], &context);
         hold(&secrets, &before, &context);
         run(&["check", path, "--fix", "--unsafe-fixes"], &[&dir], &context);
@@ -160,12 +161,12 @@ fn no_file_outside_reaches_a_merge() {
         support::copy(&donors.join("spatialvla-tiny"), &vision);
         fs::create_dir(&language).unwrap();
         support::copy(&donors.join("llava3d-tiny"), &language);
-        let donor = [&vision, &language][draw.0.below(2)];
+        let donor = [&vision, &language][draw.below(2)];
         let secrets = plant(&mut draw, donor, &outside);
         let before: Vec<Vec<u8>> = secrets.iter().map(|secret| fs::read(secret).unwrap()).collect();
         let context = format!("seed {seed}");
         let [vision, language] = [&vision, &language].map(|path| path.to_str().unwrap());
-        let alias = *draw.one(&["alias=self-contained", "alias=forward:spatialvla"]);
+        let alias = draw.one(&["alias=self-contained", "alias=forward:spatialvla"]);
         let args = ["build-merged", "--vision", vision, "--language", language, "--set", alias, "--out"];
         run(&[&args[..], &[out.to_str().unwrap()]].concat(), &[&out], &context);
         hold(&secrets, &before, &context);

@@ -18,7 +18,7 @@ use ckpt_doctor::{Merge, MergeStage, Report};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::mutation::mutate::Mutator;
+use crate::support::Draw;
 use recipes::Request;
 
 /// Number of recipes in a plain `cargo test`.
@@ -159,7 +159,7 @@ fn a_merge_writes_inside_its_target_or_nothing() {
             if number >= wanted {
                 return (outcomes, broken);
             }
-            let request = Request::new(&mut Mutator::new(number as u64), room.all.path());
+            let request = Request::new(&mut Draw::new(number as u64), room.all.path());
             if let Ok(outcome) = catch_unwind(AssertUnwindSafe(|| room.run(&request, &before))) {
                 *outcomes.entry(outcome).or_insert(0_usize) += 1;
             } else {

@@ -1,5 +1,7 @@
 //! Random changes of bytes, like those by disks, editors and attackers.
 
+use crate::support::Draw;
+
 /// Text to insert: brackets, literals, encodings, numbers at the limits of a type.
 const PIECES: &[&[u8]] = &[
     b"{",
@@ -56,36 +58,18 @@ const PIECES: &[&[u8]] = &[
     b"f'{",
 ];
 
-/// A generator of changes, determined by its seed.
-pub struct Mutator(u64);
+/// Changes bytes, by choices that follow from a seed.
+pub struct Mutator(pub Draw);
 
 impl Mutator {
-    /// A generator with this seed.
-    pub fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x2545_f491_4f6c_dd1d) | 1)
-    }
-
-    /// The next number. Source: Marsaglia, "Xorshift RNGs" (2003).
-    fn next(&mut self) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0
-    }
-
-    /// A number less than `end`; 0 if `end` is 0.
-    pub fn below(&mut self, end: usize) -> usize {
-        usize::try_from(self.next() >> 1).map_or(0, |n| n.checked_rem(end).unwrap_or(0))
-    }
-
     /// Returns `bytes` after one to four changes; `other` is another file whose parts may be inserted.
     pub fn mutate(&mut self, bytes: &[u8], other: &[u8]) -> Vec<u8> {
         let mut bytes = bytes.to_vec();
-        for _ in 0..=self.below(4) {
+        for _ in 0..=self.0.below(4) {
             self.change(&mut bytes, other);
         }
         // Without this, half of the changed headers would fail because of their length.
-        if self.below(2) == 0 {
+        if self.0.below(2) == 0 {
             mend_length(&mut bytes);
         }
         bytes
@@ -93,32 +77,32 @@ impl Mutator {
 
     fn change(&mut self, bytes: &mut Vec<u8>, other: &[u8]) {
         // Headers and important keys are at the start of a file.
-        let reach = if self.below(2) == 0 { bytes.len().min(600) } else { bytes.len() };
-        let at = self.below(reach + 1).min(bytes.len());
-        let end = (at + self.below(12)).min(bytes.len());
-        match self.below(10) {
+        let reach = if self.0.below(2) == 0 { bytes.len().min(600) } else { bytes.len() };
+        let at = self.0.below(reach + 1).min(bytes.len());
+        let end = (at + self.0.below(12)).min(bytes.len());
+        match self.0.below(10) {
             0 => bytes.truncate(at),
             1 => drop(bytes.drain(at..end)),
             2 => bytes.splice(at..at, bytes[at..end].to_vec()).for_each(drop),
             3 | 4 => {
-                let piece = PIECES[self.below(PIECES.len())];
+                let piece = PIECES[self.0.below(PIECES.len())];
                 bytes.splice(at..end, piece.iter().copied()).for_each(drop);
             }
             5 => {
-                let piece = PIECES[self.below(PIECES.len())];
-                let times = 1 << self.below(9);
+                let piece = PIECES[self.0.below(PIECES.len())];
+                let times = 1 << self.0.below(9);
                 bytes.splice(at..at, piece.repeat(times)).for_each(drop);
             }
             6 => self.number(bytes, at),
             7 => {
-                let from = self.below(other.len());
-                let part = &other[from..(from + self.below(400)).min(other.len())];
+                let from = self.0.below(other.len());
+                let part = &other[from..(from + self.0.below(400)).min(other.len())];
                 bytes.splice(at..end, part.iter().copied()).for_each(drop);
             }
             _ => {
-                for _ in 0..=self.below(3) {
-                    let at = self.below(reach);
-                    let flip = 1 << self.below(8);
+                for _ in 0..=self.0.below(3) {
+                    let at = self.0.below(reach);
+                    let flip = 1 << self.0.below(8);
                     if let Some(byte) = bytes.get_mut(at) {
                         *byte ^= flip;
                     }
@@ -132,13 +116,13 @@ impl Mutator {
         let Some(start) = bytes[at..].iter().position(u8::is_ascii_digit).map(|n| at + n) else { return };
         let len = bytes[start..].iter().take_while(|b| b.is_ascii_digit()).count();
         let old: u64 = std::str::from_utf8(&bytes[start..start + len]).unwrap().parse().unwrap_or(0);
-        let new = match self.below(6) {
+        let new = match self.0.below(6) {
             0 => old.wrapping_add(1),
             1 => old.wrapping_sub(1),
             2 => old.wrapping_mul(2),
             3 => 0,
             4 => u64::MAX - old % 16,
-            _ => 1_u64 << self.below(64),
+            _ => 1_u64 << self.0.below(64),
         };
         bytes.splice(start..start + len, new.to_string().into_bytes()).for_each(drop);
     }

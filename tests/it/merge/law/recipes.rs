@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use crate::mutation::mutate::Mutator;
+use crate::support::Draw;
 
 /// A merge to be tried.
 pub struct Request {
@@ -75,30 +75,26 @@ const EXPRESSIONS: [&str; 5] = [
 
 impl Request {
     /// A request that follows from the state of the generator; `folder` is a place outside of the target.
-    pub fn new(random: &mut Mutator, folder: &Path) -> Self {
+    pub fn new(draw: &mut Draw, folder: &Path) -> Self {
         let mut recipe = sound();
-        let changes = if random.below(3) == 0 { 2 } else { 1 };
+        let changes = if draw.below(3) == 0 { 2 } else { 1 };
         for _ in 0..changes {
-            change(random, &mut recipe, folder);
+            change(draw, &mut recipe, folder);
         }
-        let bin = random.below(20) == 0;
+        let bin = draw.below(20) == 0;
         let mut donors = vec![("a", if bin { "bin" } else { "one" }), ("b", "two")];
-        if random.below(3) == 0 {
+        if draw.below(3) == 0 {
             donors.push(("c", "code"));
         }
         let mut options = Vec::new();
-        if random.below(3) == 0 {
-            options.push(("alias", one(random, ALIASES).to_owned()));
+        if draw.below(3) == 0 {
+            options.push(("alias", draw.one(ALIASES).to_owned()));
         }
-        if random.below(8) == 0 {
-            options.push((one(random, &["shard-size", "alias", "nothing", "../x"]), one(random, WORDS).to_owned()));
+        if draw.below(8) == 0 {
+            options.push((draw.one(&["shard-size", "alias", "nothing", "../x"]), draw.one(WORDS).to_owned()));
         }
         Self { recipe, donors, options }
     }
-}
-
-fn one<'t>(random: &mut Mutator, of: &[&'t str]) -> &'t str {
-    of[random.below(of.len())]
 }
 
 const ALIASES: &[&str] = &[
@@ -148,14 +144,14 @@ const VALUES: &[&str] = &[
     "7",
 ];
 
-fn name(random: &mut Mutator, folder: &Path) -> String {
+fn name(draw: &mut Draw, folder: &Path) -> String {
     let inside = |file: &str| folder.join(file).to_str().unwrap().to_owned();
-    match random.below(12) {
-        10 | 11 => one(random, &["notes.json", "chat_template.json", "helper.py", "x.json"]).to_owned(),
+    match draw.below(12) {
+        10 | 11 => draw.one(&["notes.json", "chat_template.json", "helper.py", "x.json"]).to_owned(),
         0 => inside("absolute.json"),
-        1 => format!("../{}.json", random.below(3)),
+        1 => format!("../{}.json", draw.below(3)),
         2 => "x".repeat(300),
-        _ => one(random, NAMES_OF_FILES).to_owned(),
+        _ => draw.one(NAMES_OF_FILES).to_owned(),
     }
 }
 
@@ -229,57 +225,57 @@ fn put(recipe: &mut Value, at: &str, value: Value) {
     }
 }
 
-fn change(random: &mut Mutator, recipe: &mut Value, folder: &Path) {
-    match random.below(16) {
+fn change(draw: &mut Draw, recipe: &mut Value, folder: &Path) {
+    match draw.below(16) {
         0 | 1 => {
-            let name = name(random, folder);
-            put(recipe, one(random, &NAMES), json!(name));
+            let name = name(draw, folder);
+            put(recipe, draw.one(&NAMES), json!(name));
         }
         2 => {
-            let (name, from) = (name(random, folder), one(random, ROLE_NAMES));
-            push(recipe, "/documents", json!({ "name": name, "from": from, "optional": random.below(2) == 0 }));
+            let (name, from) = (name(draw, folder), draw.one(ROLE_NAMES));
+            push(recipe, "/documents", json!({ "name": name, "from": from, "optional": draw.below(2) == 0 }));
         }
         3 => {
             let text =
-                one(random, &["modeling_spatialvla_llava3d.py", "../../checks/aut/AUT011.json5", "/etc/passwd", "no"]);
-            let template = json!({ "name": name(random, folder), "text": format!("spatialvla-llava3d/{text}") });
+                draw.one(&["modeling_spatialvla_llava3d.py", "../../checks/aut/AUT011.json5", "/etc/passwd", "no"]);
+            let template = json!({ "name": name(draw, folder), "text": format!("spatialvla-llava3d/{text}") });
             push(recipe, "/files", json!({ "template": template }));
         }
         4 | 5 => {
-            let names = [name(random, folder), one(random, NAMES_OF_FILES).to_owned()];
-            push(recipe, "/files", json!({ "copy": { "from": one(random, &["a", "b", "c"]), "names": names } }));
+            let names = [name(draw, folder), draw.one(NAMES_OF_FILES).to_owned()];
+            push(recipe, "/files", json!({ "copy": { "from": draw.one(&["a", "b", "c"]), "names": names } }));
         }
         6 => {
-            let root = one(random, &["configuration_x", "helper", "broken", "keyword", "../x", "a.b", "nothing", ""]);
+            let root = draw.one(&["configuration_x", "helper", "broken", "keyword", "../x", "a.b", "nothing", ""]);
             push(recipe, "/files", json!({ "modules": { "from": ["c", "b"], "roots": [root] } }));
         }
         7..=9 => {
-            let edit = json!({ "set": { "at": one(random, TARGETS), "to": one(random, VALUES) } });
-            push(recipe, &format!("/documents/{}/edits", random.below(2)), edit);
+            let edit = json!({ "set": { "at": draw.one(TARGETS), "to": draw.one(VALUES) } });
+            push(recipe, &format!("/documents/{}/edits", draw.below(2)), edit);
         }
         10 => {
-            let graft = json!({ "graft": { "at": one(random, TARGETS), "from": one(random, &["a", "b", "c", "d"]) } });
+            let graft = json!({ "graft": { "at": draw.one(TARGETS), "from": draw.one(&["a", "b", "c", "d"]) } });
             push(recipe, "/documents/0/edits", graft);
         }
-        11 => put(recipe, one(random, &ROLES), json!(one(random, ROLE_NAMES))),
-        12 => put(recipe, one(random, &EXPRESSIONS), json!(one(random, FORMULAS))),
-        13 => tensors(random, recipe),
-        14 => swap_type(random, recipe),
+        11 => put(recipe, draw.one(&ROLES), json!(draw.one(ROLE_NAMES))),
+        12 => put(recipe, draw.one(&EXPRESSIONS), json!(draw.one(FORMULAS))),
+        13 => tensors(draw, recipe),
+        14 => swap_type(draw, recipe),
         _ => {
-            let name = one(random, &["notes.json", "chat_template.json", "added_tokens.json"]);
+            let name = draw.one(&["notes.json", "chat_template.json", "added_tokens.json"]);
             push(recipe, "/documents", json!({ "name": name, "from": "b", "edits": [] }));
         }
     }
 }
 
-fn tensors(random: &mut Mutator, recipe: &mut Value) {
-    let (key, value) = match random.below(6) {
+fn tensors(draw: &mut Draw, recipe: &mut Value) {
+    let (key, value) = match draw.below(6) {
         0 => ("names", "^nothing$"),
         1 => ("names", "("),
-        2 => ("as", one(random, &["same", "../$0", "", "x.$0", "{hidden}$0"])),
+        2 => ("as", draw.one(&["same", "../$0", "", "x.$0", "{hidden}$0"])),
         3 => ("drop", "no"),
-        4 => ("fit", one(random, &["'bogus'", "'pad'", "'reinit'", "opt.alias", "own ? 'copy' : 'x'"])),
-        _ => ("when", one(random, &["false", "own", "7"])),
+        4 => ("fit", draw.one(&["'bogus'", "'pad'", "'reinit'", "opt.alias", "own ? 'copy' : 'x'"])),
+        _ => ("when", draw.one(&["false", "own", "7"])),
     };
     if let Some(entry) = recipe.pointer_mut("/tensors/0").and_then(Value::as_object_mut) {
         entry.insert(key.to_owned(), json!(value));
@@ -287,25 +283,25 @@ fn tensors(random: &mut Mutator, recipe: &mut Value) {
 }
 
 /// Replaces a random value anywhere in the recipe by one of another type, or removes a key.
-fn swap_type(random: &mut Mutator, value: &mut Value) {
+fn swap_type(draw: &mut Draw, value: &mut Value) {
     let size = value.as_object().map_or(0, serde_json::Map::len) + value.as_array().map_or(0, Vec::len);
-    if size == 0 || random.below(4) == 0 {
+    if size == 0 || draw.below(4) == 0 {
         let values = [json!(null), json!(3), json!([]), json!({}), json!(true), json!("x".repeat(5000)), json!(-0.5)];
-        *value = values[random.below(values.len())].clone();
+        *value = values[draw.below(values.len())].clone();
         return;
     }
     match value {
         Value::Object(map) => {
-            let key = map.keys().nth(random.below(size)).unwrap().clone();
-            if random.below(12) == 0 {
+            let key = map.keys().nth(draw.below(size)).unwrap().clone();
+            if draw.below(12) == 0 {
                 map.remove(&key);
             } else {
-                swap_type(random, &mut map[&key]);
+                swap_type(draw, &mut map[&key]);
             }
         }
         Value::Array(items) => {
-            let at = random.below(size);
-            swap_type(random, &mut items[at]);
+            let at = draw.below(size);
+            swap_type(draw, &mut items[at]);
         }
         _ => unreachable!(),
     }
