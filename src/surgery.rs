@@ -12,10 +12,12 @@ pub mod plan;
 pub mod repair;
 mod staging;
 mod stop;
+mod stream;
 mod system;
 mod target;
 pub mod transform;
 pub mod verify;
+pub mod written;
 
 pub use apply::apply;
 pub use error::{ApplyError, RepairError};

@@ -5,13 +5,13 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::context::{Donor, Options};
-use super::draft::MergeDraft;
 use crate::checkpoint::{Checkpoint, FileName};
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::ToolInfo;
 use crate::surgery::ApplyError;
 use crate::surgery::donor::sha256;
-use crate::surgery::plan::TensorTransform;
+use crate::surgery::plan::{Plan, PlannedFile, TensorTransform};
+use crate::surgery::written::WrittenShard;
 
 /// File name in the merged directory.
 pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
@@ -23,7 +23,7 @@ pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct Manifest {
-    /// Version of this contract: 1.
+    /// Version of this contract: 2.
     pub schema: u32,
     /// The program that made the merge.
     pub tool: ToolInfo,
@@ -33,8 +33,20 @@ pub(crate) struct Manifest {
     pub options: Options,
     /// The files of each donor, by role.
     pub donors: BTreeMap<String, DonorFiles>,
+    /// Every file of the result except this one, by file name.
+    pub files: BTreeMap<String, FileDigest>,
     /// Every tensor of the result, in the order of the shards.
     pub tensors: Vec<TensorOrigin>,
+}
+
+/// A file of the result.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct FileDigest {
+    /// Its size.
+    pub bytes: u64,
+    /// SHA-256 of the file.
+    pub sha256: String,
 }
 
 /// The files of a donor that were read.
@@ -72,6 +84,8 @@ pub(crate) struct TensorOrigin {
     pub dtype: String,
     /// Shape in the result.
     pub shape: Vec<u64>,
+    /// SHA-256 of its bytes.
+    pub sha256: String,
     /// How it was made.
     pub transform: TensorTransform,
     /// The donor tensor that it was made from, or that it replaces.
@@ -90,37 +104,47 @@ pub(crate) struct DonorTensor {
     pub shape: Vec<u64>,
 }
 
-/// The manifest of a planned merge. With `all_bytes`, whole shards are hashed, otherwise only their headers.
+/// The files of each donor, by role. With `all_bytes`, whole shards are hashed, otherwise only their headers.
 ///
 /// # Errors
 /// When a donor's file cannot be read, or a signal arrived.
-pub(super) fn manifest(
+pub(super) fn donor_digests(donors: &[Donor], all_bytes: bool) -> Result<BTreeMap<String, DonorFiles>, ApplyError> {
+    donors.iter().map(|donor| Ok((donor.role.clone(), donor_files(&donor.checkpoint, all_bytes)?))).collect()
+}
+
+/// The manifest of a merge whose shards are written; `others` are its other files.
+pub(super) fn manifest<'f>(
     recipe: &Recipe,
     options: &Options,
-    donors: &[Donor],
-    draft: &MergeDraft,
-    all_bytes: bool,
-) -> Result<Manifest, ApplyError> {
-    let files = |donor: &Donor| Ok((donor.role.clone(), donor_files(&donor.checkpoint, all_bytes)?));
-    let tensors = draft.plan.tensors().map(|(shard, t)| {
+    donors: &BTreeMap<String, DonorFiles>,
+    plan: &Plan,
+    written: &[WrittenShard],
+    others: impl Iterator<Item = &'f PlannedFile>,
+) -> Manifest {
+    let shards = written.iter().map(|s| (s.name.to_string(), FileDigest { bytes: s.bytes, sha256: s.sha256.clone() }));
+    let others = others.map(|f| (f.name.to_string(), FileDigest { bytes: f.bytes.len() as u64, sha256: f.sha256() }));
+    let digests = written.iter().flat_map(|shard| &shard.tensors);
+    let tensors = plan.tensors().zip(digests).map(|((shard, t), written)| {
         let from = t.source.donor();
         TensorOrigin {
             name: t.name.clone(),
             shard: shard.name.to_string(),
             dtype: t.dtype.name().to_owned(),
             shape: t.shape.clone(),
+            sha256: written.sha256.clone(),
             transform: t.source.transform(),
             source: DonorTensor { donor: from.donor.clone(), name: from.name.clone(), shape: from.shape.clone() },
         }
     });
-    Ok(Manifest {
-        schema: 1,
+    Manifest {
+        schema: 2,
         tool: ToolInfo::this(),
         recipe: recipe.recipe.clone(),
         options: options.clone(),
-        donors: donors.iter().map(files).collect::<Result<_, ApplyError>>()?,
+        donors: donors.clone(),
+        files: shards.chain(others).collect(),
         tensors: tensors.collect(),
-    })
+    }
 }
 
 fn donor_files(checkpoint: &Checkpoint, all_bytes: bool) -> Result<DonorFiles, ApplyError> {

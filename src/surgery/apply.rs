@@ -4,22 +4,26 @@
 //! never exists incomplete.
 
 use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::path::Path;
 
 use super::donor::{DonorFile, DonorSnapshot};
 use super::error::{ApplyError, io_at};
 use super::leftover::Leftover;
-use super::plan::{Plan, PlannedShard, PlannedTensor, TensorRef, TensorSource};
+use super::plan::{Plan, PlannedFile, PlannedShard, PlannedTensor, TensorRef, TensorSource};
 use super::staging::Staging;
 use super::stop::interrupted;
+use super::stream::{BLOCK, stream};
 use super::system::{check_space, copy_in_kernel, create, with_figures};
-use super::transform;
 use super::verify::accepted_by_safetensors;
+use super::written::{ShardDigests, WrittenShard};
 use crate::checkpoint::open::open_regular;
 
 /// Writes `plan` as the directory `out` (a path from [`super::claim_target`]); `progress` receives the bytes written.
 /// Returns the staging directory if it could not be removed afterwards.
+///
+/// `record` is called once, after the shards and before the other files are written: it returns the files whose content
+/// depends on what was written, such as the manifest of a merge.
 ///
 /// Fails when a donor no longer matches its snapshot.
 ///
@@ -29,6 +33,7 @@ pub fn apply(
     plan: &Plan,
     donors: &[DonorSnapshot],
     out: &Path,
+    record: &mut dyn FnMut(&[WrittenShard]) -> Vec<PlannedFile>,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Option<Leftover>, ApplyError> {
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
@@ -38,7 +43,7 @@ pub fn apply(
     let staging = Staging::new(out).map_err(explained)?;
     // After `Staging::new`, which removes the files of a killed run: these may fill the disk.
     let written = check_space(parent, &sizes)
-        .and_then(|()| write(plan, staging.content(), progress))
+        .and_then(|()| write(plan, staging.content(), record, progress))
         .and_then(|()| donors.iter().try_for_each(DonorSnapshot::unchanged))
         .and_then(|()| interrupted())
         .and_then(|()| staging.publish(out));
@@ -49,26 +54,55 @@ pub fn apply(
     }
 }
 
-fn write(plan: &Plan, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+fn write(
+    plan: &Plan,
+    dir: &Path,
+    record: &mut dyn FnMut(&[WrittenShard]) -> Vec<PlannedFile>,
+    progress: &mut dyn FnMut(u64),
+) -> Result<(), ApplyError> {
+    let mut written = Vec::new();
     for shard in &plan.shards {
-        write_shard(&dir.join(&shard.name), shard, progress)?;
+        let mut digests = ShardDigests::default();
+        write_content(&dir.join(&shard.name), shard, Some(&mut digests), progress)?;
+        written.push(digests.finish(&shard.name, shard.file_len()));
+    }
+    for file in record(&written) {
+        write_file(dir, &file)?;
     }
     for file in &plan.files {
-        interrupted()?;
-        let path = dir.join(&file.name);
-        let mut f = create(&path)?;
-        f.write_all(&file.bytes).map_err(io_at(&path, "writing"))?;
-        f.sync_all().map_err(io_at(&path, "syncing"))?;
+        write_file(dir, file)?;
         progress(file.bytes.len() as u64);
     }
     Ok(())
 }
 
+fn write_file(dir: &Path, file: &PlannedFile) -> Result<(), ApplyError> {
+    interrupted()?;
+    let path = dir.join(&file.name);
+    let mut f = create(&path)?;
+    f.write_all(&file.bytes).map_err(io_at(&path, "writing"))?;
+    f.sync_all().map_err(io_at(&path, "syncing"))
+}
+
+/// Writes a shard of a repair.
 pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn FnMut(u64)) -> Result<(), ApplyError> {
+    write_content(path, shard, None, progress)
+}
+
+/// Writes a shard; `digests` receives its bytes.
+fn write_content(
+    path: &Path,
+    shard: &PlannedShard,
+    mut digests: Option<&mut ShardDigests>,
+    progress: &mut dyn FnMut(u64),
+) -> Result<(), ApplyError> {
     let mut out = create(path)?;
     let header = shard.header();
     out.write_all(&header).map_err(io_at(path, "writing"))?;
     progress(header.len() as u64);
+    if let Some(digests) = &mut digests {
+        digests.header(&header);
+    }
     let mut donor: Option<DonorFile> = None;
     for tensor in &shard.tensors {
         interrupted()?;
@@ -78,7 +112,8 @@ pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn 
             donor = Some(DonorFile::open(&from.path)?);
         }
         if let Some(d) = &donor {
-            write_tensor(&mut out, path, d, tensor, progress)?;
+            let mut out = ShardWriter { path, file: &mut out, digests: digests.as_deref_mut() };
+            out.write_tensor(d, tensor, progress)?;
         }
     }
     let want = shard.file_len();
@@ -96,88 +131,107 @@ pub(super) fn write_shard(path: &Path, shard: &PlannedShard, progress: &mut dyn 
 /// Bytes copied between two checks for a signal.
 const SLICE: u64 = 64 * 1024 * 1024;
 
-fn write_tensor(
-    out: &mut File,
-    path: &Path,
-    donor: &DonorFile,
-    tensor: &PlannedTensor,
-    progress: &mut dyn FnMut(u64),
-) -> Result<(), ApplyError> {
-    match &tensor.source {
-        TensorSource::Copy(from) => copy_range(out, path, donor, from, progress),
-        source => {
-            let from = source.donor();
-            let elem = tensor.dtype.bits() / 8;
-            let mut failed_read = None;
-            let result = {
-                let mut writer = BufWriter::with_capacity(256 * 1024, &mut *out);
-                let mut read = |at: u64, buf: &mut [u8]| {
-                    if interrupted().is_err() {
-                        return Err(io::Error::from(io::ErrorKind::Other));
-                    }
-                    donor.read_at(buf, from.offset.saturating_add(at)).map_err(|e| {
-                        let kind = e.kind();
-                        failed_read = Some(e);
-                        io::Error::from(kind)
-                    })
-                };
-                let made = match source {
-                    TensorSource::Pad(_) => transform::pad(&mut read, elem, &from.shape, &tensor.shape, &mut writer),
-                    TensorSource::GrowRows(_) => {
-                        let rows = from.shape.first().copied().unwrap_or_default();
-                        let width = tensor.shape.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d));
-                        let more = tensor.shape.first().copied().unwrap_or_default().saturating_sub(rows);
-                        transform::grow_rows(&mut read, tensor.dtype, rows, width, more, &mut writer)
-                    }
-                    TensorSource::Copy(_) | TensorSource::Reinit { .. } => {
-                        transform::reinit(&tensor.name, tensor.dtype, &tensor.shape, &mut writer)
-                    }
-                };
-                made.and_then(|()| writer.flush())
-            };
-            interrupted()?;
-            if let Some(e) = failed_read {
-                return Err(donor.read_error(e));
-            }
-            result.map_err(io_at(path, "writing"))?;
-            progress(tensor.len());
-            Ok(())
+/// A shard that is being written, with the digests of its bytes.
+struct ShardWriter<'a> {
+    path: &'a Path,
+    file: &'a mut File,
+    digests: Option<&'a mut ShardDigests>,
+}
+
+impl Write for ShardWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let n = self.file.write(bytes)?;
+        if let Some(digests) = &mut self.digests {
+            digests.update(bytes.get(..n).unwrap_or_default());
         }
+        Ok(n)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
     }
 }
 
-/// Copies a byte range, inside the kernel if supported, otherwise through a buffer.
-fn copy_range(
-    out: &mut File,
-    path: &Path,
-    donor: &DonorFile,
-    from: &TensorRef,
-    progress: &mut dyn FnMut(u64),
-) -> Result<(), ApplyError> {
-    let mut at = from.offset;
-    let mut left = from.len;
-    let mut buffer = Vec::new();
-    while left > 0 {
-        interrupted()?;
-        let in_kernel = if buffer.is_empty() {
-            copy_in_kernel(donor.file(), at, out, left.min(SLICE)).map_err(io_at(path, "copying from a donor"))?
+impl ShardWriter<'_> {
+    fn write_tensor(
+        &mut self,
+        donor: &DonorFile,
+        tensor: &PlannedTensor,
+        progress: &mut dyn FnMut(u64),
+    ) -> Result<(), ApplyError> {
+        if let TensorSource::Copy(from) = &tensor.source {
+            self.copy_range(donor, from, progress)?;
         } else {
-            None
-        };
-        let copied = if let Some(n) = in_kernel {
-            n
-        } else {
-            buffer.resize(usize::try_from(left.min(BUFFER)).unwrap_or_default(), 0);
-            donor.read_at(&mut buffer, at).map_err(|e| donor.read_error(e))?;
-            out.write_all(&buffer).map_err(io_at(path, "writing"))?;
-            buffer.len() as u64
-        };
-        progress(copied);
-        at = at.saturating_add(copied);
-        left = left.saturating_sub(copied);
+            let path = self.path;
+            stream(donor, tensor, path, self)?;
+            progress(tensor.len());
+        }
+        if let Some(digests) = &mut self.digests {
+            digests.end_tensor();
+        }
+        Ok(())
     }
-    Ok(())
+
+    /// Copies a byte range, inside the kernel if supported, otherwise through a buffer.
+    fn copy_range(
+        &mut self,
+        donor: &DonorFile,
+        from: &TensorRef,
+        progress: &mut dyn FnMut(u64),
+    ) -> Result<(), ApplyError> {
+        let mut at = from.offset;
+        let mut left = from.len;
+        let mut kernel_copies = true;
+        let mut buffer = Vec::new();
+        while left > 0 {
+            interrupted()?;
+            let in_kernel = if kernel_copies {
+                copy_in_kernel(donor.file(), at, self.file, left.min(SLICE))
+                    .map_err(io_at(self.path, "copying from a donor"))?
+            } else {
+                None
+            };
+            let copied = if let Some(n) = in_kernel {
+                self.hash_range(donor, at, n, &mut buffer)?;
+                n
+            } else {
+                kernel_copies = false;
+                let block = block(&mut buffer, left);
+                donor.read_at(block, at).map_err(|e| donor.read_error(e))?;
+                self.write_all(block).map_err(io_at(self.path, "writing"))?;
+                block.len() as u64
+            };
+            progress(copied);
+            at = at.saturating_add(copied);
+            left = left.saturating_sub(copied);
+        }
+        Ok(())
+    }
+
+    /// Adds a range that the kernel copied to the digests. It has just been read, so it is in the page cache.
+    fn hash_range(
+        &mut self,
+        donor: &DonorFile,
+        mut at: u64,
+        mut left: u64,
+        buffer: &mut Vec<u8>,
+    ) -> Result<(), ApplyError> {
+        let Some(digests) = &mut self.digests else { return Ok(()) };
+        while left > 0 {
+            interrupted()?;
+            let block = block(buffer, left);
+            donor.read_at(block, at).map_err(|e| donor.read_error(e))?;
+            digests.update(block);
+            at = at.saturating_add(block.len() as u64);
+            left = left.saturating_sub(block.len() as u64);
+        }
+        Ok(())
+    }
 }
 
-/// Bytes copied at a time when the kernel cannot copy.
-const BUFFER: u64 = 1024 * 1024;
+/// The part of the buffer for the next of `left` bytes.
+fn block(buffer: &mut Vec<u8>, left: u64) -> &mut [u8] {
+    let len = usize::try_from(left).map_or(BLOCK, |n| n.min(BLOCK));
+    buffer.resize(len, 0);
+    buffer
+}

@@ -60,7 +60,10 @@ fn zeros(out: &mut dyn Write, mut count: u64) -> io::Result<()> {
 }
 
 /// Copies `len` bytes from `offset` of the donor tensor.
-fn copy(read: &mut ReadAt<'_>, mut offset: u64, mut len: u64, out: &mut dyn Write) -> io::Result<()> {
+///
+/// # Errors
+/// Errors of reading or writing.
+pub fn copy(read: &mut ReadAt<'_>, mut offset: u64, mut len: u64, out: &mut dyn Write) -> io::Result<()> {
     let mut block = vec![0_u8; usize::try_from(len).map_or(256 * 1024, |n| n.min(256 * 1024))];
     while len > 0 {
         let n = usize::try_from(len).map_or(block.len(), |c| c.min(block.len()));

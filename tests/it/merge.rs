@@ -2,6 +2,7 @@
 
 mod law;
 mod recipes;
+mod record;
 mod refused;
 mod writing;
 

@@ -1,0 +1,66 @@
+//! Digests of written shards and tensors, computed while they are written.
+
+use sha2::{Digest as _, Sha256};
+
+use super::plan::PlannedFile;
+use crate::checkpoint::{FileName, hex};
+
+/// A shard that [`super::apply()`] wrote.
+#[derive(Debug, Clone)]
+pub struct WrittenShard {
+    /// Name in the target directory.
+    pub name: FileName,
+    /// Its size in bytes.
+    pub bytes: u64,
+    /// SHA-256 of the whole file in hexadecimal.
+    pub sha256: String,
+    /// Its tensors, in the order of [`super::plan::PlannedShard::tensors`].
+    pub tensors: Vec<WrittenTensor>,
+}
+
+/// Facts about one tensor that are known only after it was written.
+#[derive(Debug, Clone)]
+pub struct WrittenTensor {
+    /// SHA-256 of its bytes in hexadecimal.
+    pub sha256: String,
+}
+
+/// Digests of the shard that is being written.
+#[derive(Default)]
+pub(super) struct ShardDigests {
+    file: Sha256,
+    tensor: Sha256,
+    tensors: Vec<WrittenTensor>,
+}
+
+impl ShardDigests {
+    /// Adds bytes of the header.
+    pub(super) fn header(&mut self, bytes: &[u8]) {
+        self.file.update(bytes);
+    }
+
+    /// Adds bytes of the current tensor.
+    pub(super) fn update(&mut self, bytes: &[u8]) {
+        self.file.update(bytes);
+        self.tensor.update(bytes);
+    }
+
+    /// Ends the current tensor.
+    pub(super) fn end_tensor(&mut self) {
+        let sha256 = hex(&self.tensor.finalize_reset());
+        self.tensors.push(WrittenTensor { sha256 });
+    }
+
+    /// The record of the shard.
+    pub(super) fn finish(self, name: &FileName, bytes: u64) -> WrittenShard {
+        WrittenShard { name: name.clone(), bytes, sha256: hex(&self.file.finalize()), tensors: self.tensors }
+    }
+}
+
+impl PlannedFile {
+    /// SHA-256 of the file in hexadecimal.
+    #[must_use]
+    pub fn sha256(&self) -> String {
+        hex(&Sha256::digest(&self.bytes))
+    }
+}
