@@ -41,6 +41,7 @@ pub use entry::{Entry, EntryKind};
 pub use fault::FaultSource;
 pub use fault::{Fault, FaultKind, Place};
 pub use file_name::FileName;
+pub use glob::FilePattern;
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::PythonModule;

@@ -13,6 +13,7 @@ mod inspect;
 mod library;
 mod output;
 mod paths;
+mod recipes;
 mod rules;
 mod settings;
 mod signals;
@@ -69,6 +70,7 @@ fn run() -> ExitCode {
         args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
         args::Command::Explain(args) => rules::explain(args, rules.as_deref()),
         args::Command::Rules(args) => rules::list(args, rules.as_deref()),
+        args::Command::Recipes(args) => recipes::list(args, rules.as_deref()),
         args::Command::Init(args) => init::run(args),
     };
     match result {

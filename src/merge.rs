@@ -4,6 +4,7 @@
 //! nothing is written before the stage `write`. This stage combines checks, plans, writes and reports; it is the only
 //! one above `report`.
 
+mod choice;
 mod context;
 mod documents;
 mod donors;
@@ -66,17 +67,17 @@ pub fn run(
     let Target { path: out, cleared } = target(&request.out, &dirs)?;
     if let Some(recipe) = &request.recipe {
         // A request that does not fit is refused before a donor is read.
-        donors::check_roles(recipe, request)?;
+        choice::check_roles(recipe, request)?;
         options::resolve(recipe, &request.options)?;
     }
 
     let (donors, snapshots) = donors::open(request, knowledge, &mut run)?;
     let recipe = match &request.recipe {
         Some(recipe) => recipe,
-        None => donors::choose_recipe(&knowledge.recipes, &run)?,
+        None => choice::choose_recipe(&knowledge.recipes, &run)?,
     };
     run.record.recipe.clone_from(&recipe.recipe);
-    donors::check_roles(recipe, request)?;
+    choice::check_roles(recipe, request)?;
     let options = options::resolve(recipe, &request.options)?;
     run.record.options.clone_from(&options);
     if !donors::are_sound(recipe, &mut run) {
@@ -84,7 +85,7 @@ pub fn run(
     }
     run.note("recipe", &format!("{}: {}", recipe.recipe, recipe.summary));
 
-    donors::check_architectures(recipe, &run)?;
+    choice::check_architectures(recipe, &run)?;
     let draft = plan::plan(recipe, &donors, &options, knowledge)?;
     run.record_draft(&draft);
     if !draft.seams.is_empty() {
@@ -95,7 +96,7 @@ pub fn run(
     let planned = format!("{} tensors, {} bytes in {shards}", run.record.tensors, run.record.bytes);
     run.note("plan", &planned);
 
-    if !run.check(Role::Planned, &request.out, draft.preview(&out), knowledge) {
+    if !run.check(Role::Planned, &request.out, draft.preview(&out), knowledge, &recipe.tolerates) {
         return Ok(run.end(MergeStage::Planned));
     }
     publish::check(recipe, &draft)?;
@@ -116,7 +117,7 @@ pub fn run(
 
     let reopen = |error| PipelineError::Reopen { out: request.out.clone(), error };
     let written = Checkpoint::open(&out).map_err(reopen)?;
-    run.check(Role::Written, &request.out, written, knowledge);
+    run.check(Role::Written, &request.out, written, knowledge, &recipe.tolerates);
     Ok(run.end(MergeStage::Written))
 }
 

@@ -25,6 +25,8 @@ mod merge;
 pub mod model;
 mod overview;
 #[cfg(feature = "cli")]
+pub mod recipes;
+#[cfg(feature = "cli")]
 mod statistics;
 #[cfg(feature = "cli")]
 mod style;

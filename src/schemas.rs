@@ -25,6 +25,7 @@ use crate::merge::manifest::Manifest;
 use crate::report::Report;
 use crate::report::baseline::Baseline;
 use crate::report::inspect::InspectDocument;
+use crate::report::recipes::RecipesDocument;
 
 macro_rules! text {
     ($type:ty, $name:literal, $about:literal) => {
@@ -84,6 +85,7 @@ fn outputs() -> Vec<(&'static str, Value)> {
     vec![
         ("report", schema::<Report>("The JSON report of ckpt-doctor check and build-merged", settings())),
         ("inspect", schema::<InspectDocument<'_>>("The JSON report of ckpt-doctor inspect", settings())),
+        ("recipes", schema::<RecipesDocument<'_>>("The JSON list of ckpt-doctor recipes", settings())),
         ("manifest", schema::<Manifest>("merge-manifest.json of ckpt-doctor build-merged", settings())),
     ]
 }

@@ -1,6 +1,12 @@
 //! File name patterns, within limits.
 
+use std::borrow::Cow;
+use std::fmt;
+
 use globset::{GlobBuilder, GlobSet, GlobSetBuilder};
+use serde::{Deserialize, Deserializer};
+
+use super::FileName;
 
 /// Maximum length of a pattern in bytes.
 const MAX_LENGTH: usize = 4096;
@@ -22,6 +28,36 @@ pub(crate) fn glob(pattern: &str) -> Result<GlobSet, String> {
     let glob = GlobBuilder::new(pattern).literal_separator(true).build().map_err(|error| error.kind().to_string())?;
     // Unlike the matcher of a single glob, a set does not panic where the regular expression is refused.
     GlobSetBuilder::new().add(glob).build().map_err(|error| error.kind().to_string())
+}
+
+/// Name of a file, or a pattern for names of files, as written in a recipe.
+#[derive(Debug, Clone)]
+pub enum FilePattern {
+    /// A name, without `*`, `?`, `[` and `{`.
+    Name(FileName),
+    /// A pattern, as written and compiled.
+    Pattern(String, GlobSet),
+}
+
+impl fmt::Display for FilePattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Name(name) => f.write_str(name),
+            Self::Pattern(text, _) => f.write_str(text),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for FilePattern {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = Cow::<str>::deserialize(deserializer)?;
+        let pattern = text.contains(['*', '?', '[', '{']);
+        if pattern {
+            let refused = |reason| serde::de::Error::custom(format!("not a pattern for file names: {reason}"));
+            return glob(&text).map(|set| Self::Pattern(text.into_owned(), set)).map_err(refused);
+        }
+        FileName::parse(&text).map(Self::Name).map_err(serde::de::Error::custom)
+    }
 }
 
 /// The greatest number of braces that are open at one place. Braces in brackets, which are literal, count as well.

@@ -36,10 +36,12 @@ pub enum Command {
     Inspect(InspectArgs),
     /// Print the tensors that a model class expects, from its config alone
     Expect(ExpectArgs),
-    /// Print the documentation of a rule
+    /// Print the documentation of a rule or a recipe
     Explain(ExplainArgs),
     /// List the rules
     Rules(SettingsArgs),
+    /// List the recipes of build-merged, with what each donor has to be
+    Recipes(RecipesArgs),
     /// Write a settings file, ckpt-doctor.json5, with every key explained
     Init(InitArgs),
 }
@@ -129,12 +131,29 @@ pub enum ExpectFormat {
 /// Arguments of `explain`.
 #[derive(Debug, Args)]
 pub struct ExplainArgs {
-    /// Code, name or family: IDX005, shard-missing, IDX
-    #[arg(value_name = "RULE")]
+    /// Code, name or family of rules (IDX005, shard-missing, IDX), or name of a recipe
+    #[arg(value_name = "RULE|RECIPE")]
     pub rule: String,
     /// Settings file selection.
     #[command(flatten)]
     pub settings: SettingsArgs,
+}
+
+/// Arguments of `recipes`.
+#[derive(Debug, Args)]
+pub struct RecipesArgs {
+    /// Output format
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "text")]
+    pub output_format: ListFormat,
+}
+
+/// Formats of `recipes`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ListFormat {
+    /// For a terminal
+    Text,
+    /// One JSON object, complete
+    Json,
 }
 
 /// Report formats, files and the exit code.
@@ -267,6 +286,8 @@ pub struct UndoArgs {
 
 /// Arguments of `build-merged`.
 #[derive(Debug, Args)]
+#[command(disable_help_flag = true)]
+#[expect(clippy::struct_excessive_bools, reason = "one for each flag of the command")]
 #[command(after_help = "Without --recipe, the architectures of the donors determine the recipe.\n\n\
 Exit codes:\n  0  the merged checkpoint is written (or, with --dry-run, planned) without findings at or above --fail-on\n  \
 1  the merged checkpoint is written (or planned), and has findings at or above --fail-on\n  \
@@ -275,9 +296,15 @@ pub struct BuildMergedArgs {
     /// A merge file (JSON5) with the recipe, donors, options and output directory
     #[arg(value_name = "MERGE_FILE", conflicts_with_all = ["recipe", "donor", "vision", "language"])]
     pub file: Option<PathBuf>,
-    /// Name of a built-in recipe, or a JSON5 file
+    /// Name of a recipe (see `ckpt-doctor recipes`), or a JSON5 file
     #[arg(long, value_name = "NAME|FILE")]
     pub recipe: Option<String>,
+    /// Print the text of the recipe, and do nothing else
+    #[arg(long, requires = "recipe")]
+    pub print_recipe: bool,
+    /// Print help; with --recipe, print the donors and options of the recipe
+    #[arg(short, long)]
+    pub help: bool,
     /// Checkpoint that supplies the parts of a role; may be repeated
     #[arg(long, value_name = "ROLE=DIR", value_parser = parse_pair)]
     pub donor: Vec<(String, String)>,
@@ -288,7 +315,7 @@ pub struct BuildMergedArgs {
     #[arg(long, value_name = "DIR")]
     pub language: Option<PathBuf>,
     /// Output directory; it must not exist, or be empty
-    #[arg(long, value_name = "DIR", required_unless_present = "file")]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["file", "print_recipe", "help"])]
     pub out: Option<PathBuf>,
     /// Set an option of the recipe; may be repeated
     #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]

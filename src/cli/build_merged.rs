@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use super::args::{BuildMergedArgs, SeverityName};
+use clap::CommandFactory as _;
+
+use super::args::{BuildMergedArgs, Cli, SeverityName};
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::{library, output, signals};
 use crate::check::Severity;
@@ -14,10 +16,15 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::rule::RuleSet;
 use crate::merge::{self, MergeRequest, MergeRun, ResolvedMergeFile};
 use crate::report::model::{MergeStage, Role};
+use crate::report::recipes;
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let knowledge = library::knowledge(RuleSet::embedded()?, rules)?;
+    if args.help || args.print_recipe {
+        output::print(&about(args, &knowledge)?)?;
+        return Ok(CLEAN);
+    }
     let request = request(args, &knowledge)?;
     signals::install()?;
     let terminal = std::io::stderr().is_terminal();
@@ -42,6 +49,27 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         Some(MergeStage::Written | MergeStage::DryRun) => FINDINGS,
         _ => FAILED,
     })
+}
+
+/// The text of the recipe, its page, or without a recipe the help of the command.
+fn about(args: &BuildMergedArgs, knowledge: &Knowledge) -> anyhow::Result<String> {
+    let mut wanted = ResolvedMergeFile::default();
+    wanted.recipe.clone_from(&args.recipe);
+    let Some(recipe) = wanted.find_recipe(knowledge)? else {
+        let mut cli = Cli::command();
+        cli.build();
+        let help = cli.find_subcommand_mut("build-merged").map(clap::Command::render_help);
+        return Ok(help.map(|help| help.to_string()).unwrap_or_default());
+    };
+    if args.print_recipe {
+        return Ok(recipe.origin.text.into_owned());
+    }
+    Ok(format!(
+        "{}
+Other options
+  `ckpt-doctor build-merged --help` prints them\n",
+        recipes::page(&recipe)
+    ))
 }
 
 fn result_fails(run: &MergeRun, args: &BuildMergedArgs) -> bool {

@@ -12,6 +12,7 @@ use super::settings::{Typed, resolve};
 use crate::knowledge::rule::{Fix, Object, Rule, RuleSet, Safety, example};
 use crate::knowledge::settings::Surroundings;
 use crate::knowledge::{Loader, Template};
+use crate::report::recipes;
 
 /// Runs `rules`: lists the selected rules.
 pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -21,13 +22,15 @@ pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(CLEAN)
 }
 
-/// Runs `explain`: prints the page of a rule, or the list of a family.
+/// Runs `explain`: prints the page of a rule or a recipe, or the list of a family.
 pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let here = resolve(&Typed::new(&args.settings, rules), &Surroundings::new([]))?;
     let rules = &here.knowledge.rules;
-    let text = match family(rules, &args.rule) {
-        Some(list) => list,
-        None => page(rules.find(&args.rule)?)?,
+    let recipe = here.knowledge.recipes.iter().find(|recipe| recipe.recipe == args.rule);
+    let text = match (recipe, family(rules, &args.rule)) {
+        (Some(recipe), _) => recipes::page(recipe),
+        (None, Some(list)) => list,
+        (None, None) => page(rules.find(&args.rule)?)?,
     };
     output::print(&text)?;
     Ok(CLEAN)

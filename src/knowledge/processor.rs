@@ -8,7 +8,7 @@ use super::source::{self, DataError};
 /// A processor, as read from its file in `rules/processors/`.
 ///
 /// Expressions see `processor` (the `processor_config.json` of the checkpoint) and the names that `let` defined so far.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Default, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Processor {

@@ -9,13 +9,14 @@ use serde_json::{Map, Value};
 use super::expression::{Expression, Template};
 use super::processor::{Let, Processor};
 use super::source::{self, DataError};
-use crate::checkpoint::FileName;
+use crate::checkpoint::{FileName, FilePattern};
 
 /// A recipe, as read from its file in `rules/recipes/`.
 ///
 /// Expressions see `opt` (the options), a variable for each donor role (its config with the defaults of the class filled in),
-/// `processor`, `preprocessor`, `tokens`, the names that `let` defined so far, and the functions `shape(role, tensor)` and
-/// `has(role, prefix)`.
+/// `stored` (the config of each role as it is in the file: `stored.vision`), `processor`, `preprocessor`, `tokens`, the names
+/// that `let` defined so far, and the functions `shape(role, tensor)`, `has(role, prefix)` and `id_of(token)`: the id in the
+/// tokenizer of the result, null when it has no such token.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -48,6 +49,10 @@ pub struct Recipe {
     /// Notes in the report about decisions of the merge.
     #[serde(default)]
     pub notes: Vec<Note>,
+    /// Rules whose findings on the result do not stop the merge, for a result that is meant to have the fault, such as tensor
+    /// names that no class has. The findings are still reported, and the exit code is 1.
+    #[serde(default)]
+    pub tolerates: Vec<String>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
     #[allow(dead_code, reason = "for editors")]
@@ -79,7 +84,8 @@ pub struct DonorSpec {
     pub role: String,
     /// Description of the donor.
     pub what: String,
-    /// Architectures that the donor may have; empty for a directory that is not a checkpoint.
+    /// Architectures that the donor may have; `["*"]` for a checkpoint of any class, also of an unknown one; empty for a
+    /// directory that is not a checkpoint, whose errors do not count.
     #[serde(default)]
     pub architectures: Vec<String>,
     /// Whether the donor may be left out.
@@ -90,6 +96,23 @@ pub struct DonorSpec {
     pub tolerates: Vec<String>,
 }
 
+impl DonorSpec {
+    /// Whether errors of the donor stop the merge; otherwise it is a directory that only provides files.
+    #[must_use]
+    pub fn is_checkpoint(&self) -> bool {
+        !self.architectures.is_empty()
+    }
+
+    /// Whether the role takes a checkpoint of any class.
+    #[must_use]
+    pub fn takes_any(&self) -> bool {
+        self.architectures.iter().any(|name| name == ANY)
+    }
+}
+
+/// The entry of `architectures` for a checkpoint of any class.
+pub const ANY: &str = "*";
+
 /// An option.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
@@ -98,13 +121,52 @@ pub struct OptionSpec {
     /// Name of the option on the command line.
     pub name: String,
     /// Effect of the option.
-    #[allow(dead_code, reason = "for readers of the file")]
     pub help: String,
-    /// Allowed values; a value that ends in `:` takes any text after the colon. Empty for a size such as `5GB`.
+    /// Kind of the values; `choice` when missing and `values` is given, otherwise `size`.
+    #[serde(default)]
+    pub kind: Option<OptionKind>,
+    /// Allowed values of a `choice`; one that ends in `:` takes a dotted module name after the colon, which expressions see as
+    /// `arg.NAME`.
     #[serde(default)]
     pub values: Vec<String>,
     /// Default value.
     pub default: String,
+}
+
+impl OptionSpec {
+    /// The kind of the values.
+    #[must_use]
+    pub fn kind(&self) -> OptionKind {
+        self.kind.unwrap_or(if self.values.is_empty() { OptionKind::Size } else { OptionKind::Choice })
+    }
+}
+
+/// Kind of the values of an option.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum OptionKind {
+    /// One of `values`; expressions see a string.
+    Choice,
+    /// A size such as `5GB`, `300MiB` or `1000`; expressions see the text.
+    Size,
+    /// An integer; expressions see a number.
+    Integer,
+    /// Any text of one line; expressions see a string.
+    Text,
+}
+
+impl OptionKind {
+    /// The name in a recipe file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Choice => "choice",
+            Self::Size => "size",
+            Self::Integer => "integer",
+            Self::Text => "text",
+        }
+    }
 }
 
 /// Processor and tokenizer of the result.
@@ -114,8 +176,10 @@ pub struct OptionSpec {
 pub struct TokenSpec {
     /// Role of the donor whose tokenizer is used.
     pub base: String,
-    /// Name of a processor in `rules/processors/`, or the path of a `.json5` file below the folder of the recipe.
-    pub processor: String,
+    /// Name of a processor in `rules/processors/`, or the path of a `.json5` file below the folder of the recipe. When missing,
+    /// no token is added.
+    #[serde(default)]
+    pub processor: Option<String>,
 }
 
 /// A condition that the donors must meet.
@@ -196,8 +260,8 @@ pub enum DocumentEdit {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TokensEdit {
-    /// JSON pointer.
-    pub at: String,
+    /// JSON pointer, as a template.
+    pub at: Template,
     /// Form of the tokens.
     pub form: TokensForm,
     /// Condition for this entry.
@@ -221,8 +285,9 @@ pub enum TokensForm {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SetEdit {
-    /// JSON pointer. Of the keys that make a loader run code, only `/auto_map` can be set.
-    pub at: String,
+    /// JSON pointer, as a template; empty for the whole document. Of the keys that make a loader run code, only `/auto_map` can
+    /// be set.
+    pub at: Template,
     /// The value, without the keys that make a loader run code; `auto_map` may name modules of the result only.
     pub to: Expression,
     /// Condition for this entry.
@@ -235,8 +300,8 @@ pub struct SetEdit {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct GraftEdit {
-    /// JSON pointer.
-    pub at: String,
+    /// JSON pointer, as a template.
+    pub at: Template,
     /// Role of the donor. Keys that make a loader run code are left out.
     pub from: String,
     /// Keys to leave out: exact names, or prefixes that end in `*`.
@@ -249,8 +314,8 @@ pub struct GraftEdit {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct RemoveEdit {
-    /// JSON pointers.
-    pub at: Vec<String>,
+    /// JSON pointers, as templates.
+    pub at: Vec<Template>,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
@@ -305,8 +370,10 @@ pub enum FileSpec {
 pub struct CopySpec {
     /// Role of the donor.
     pub from: String,
-    /// File names.
-    pub names: Vec<FileName>,
+    /// File names, or patterns such as `tokenizer*`. A pattern never matches weights, `README.md`, Python modules, the documents
+    /// of the recipe, and files of earlier entries.
+    #[cfg_attr(test, schemars(with = "Vec<String>"))]
+    pub names: Vec<FilePattern>,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
@@ -407,7 +474,7 @@ impl Recipe {
     /// The processor of `tokens`: the one in the folder of the recipe, or else the known one of this name.
     #[must_use]
     pub fn processor<'p>(&'p self, known: &'p [Processor]) -> Option<&'p Processor> {
-        let name = &self.tokens.as_ref()?.processor;
+        let name = self.tokens.as_ref()?.processor.as_ref()?;
         self.origin.processor.as_ref().or_else(|| known.iter().find(|processor| processor.processor == *name))
     }
 }

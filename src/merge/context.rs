@@ -1,16 +1,16 @@
 //! The donors of a merge, and the scope in which the recipe's expressions are evaluated.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
 use super::error::MergeError;
-use super::explain;
+use super::{explain, options};
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
-use crate::knowledge::recipe::{Recipe, SeamTensor};
+use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor};
 use crate::knowledge::{EvalError, Expression, Scope};
 use crate::report::model::ShapedName;
 
@@ -70,6 +70,15 @@ impl<'a> Context<'a> {
         let mut opt = Map::new();
         let mut arg = Map::new();
         for (name, value) in options {
+            let kind = recipe.options.iter().find(|spec| spec.name == *name).map(OptionSpec::kind);
+            if kind == Some(OptionKind::Integer) {
+                opt.insert(name.clone(), json!(options::parse_integer(name, value)?));
+                continue;
+            }
+            if kind == Some(OptionKind::Text) {
+                opt.insert(name.clone(), json!(value));
+                continue;
+            }
             // In `forward:PACKAGE`, `forward` is the value and `PACKAGE` its argument.
             let (head, tail) = value.split_once(':').unwrap_or((value, ""));
             opt.insert(name.clone(), json!(head));
@@ -80,6 +89,11 @@ impl<'a> Context<'a> {
         for donor in donors {
             scope.bind(&donor.role, &donor.config);
         }
+        let stored = |donor: &Donor| {
+            let config = donor.checkpoint.document("config.json").and_then(|document| document.value.clone());
+            (donor.role.clone(), config.unwrap_or_default())
+        };
+        scope.bind("stored", &Value::Object(donors.iter().map(stored).collect()));
         for (name, file) in [("processor", "processor_config.json"), ("preprocessor", "preprocessor_config.json")] {
             scope.bind(name, &document(donors, file).unwrap_or_default());
         }
@@ -94,7 +108,7 @@ impl<'a> Context<'a> {
         });
         let mut context = Self { recipe, donors, scope, tokens: None, processors };
         for item in &recipe.lets {
-            if context.tokens.is_none() && item.is.variables().iter().any(|v| v == "tokens") {
+            if context.tokens.is_none() && needs_tokens(&item.is) {
                 context.add_tokens()?;
             }
             let value = item.is.eval(&context.scope).map_err(context.at(format!("let {}", item.name)))?;
@@ -109,15 +123,20 @@ impl Context<'_> {
     fn add_tokens(&mut self) -> Result<(), MergeError> {
         let Some(spec) = &self.recipe.tokens else { return Ok(()) };
         if self.tokens.is_none() {
-            let processor = self.recipe.processor(self.processors).ok_or_else(|| {
-                MergeError::Recipe(format!("{}: no processor {}", self.recipe.recipe, spec.processor))
-            })?;
+            let none = Processor::default();
+            let processor = match &spec.processor {
+                None => &none,
+                Some(name) => self
+                    .recipe
+                    .processor(self.processors)
+                    .ok_or_else(|| MergeError::Recipe(format!("{}: no processor {name}", self.recipe.recipe)))?,
+            };
             let donor = self
                 .donor(&spec.base)
                 .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;
             let config = document(self.donors, "processor_config.json").unwrap_or_default();
             let opened = open_tokenizer(&donor.checkpoint.tokenizer, processor, &config)
-                .map_err(self.at(format!("processor {}", spec.processor)))?
+                .map_err(self.at(format!("processor {}", processor.processor)))?
                 .ok_or_else(|| {
                     MergeError::Donor(format!(
                         "the {} donor has no vocabulary file (tokenizer.model or tokenizer.json), so the ids of the added tokens are unknown; put its tokenizer files beside its config.json",
@@ -125,10 +144,21 @@ impl Context<'_> {
                     ))
                 })?;
             self.scope.bind("tokens", &opened.summary());
+            let new: HashMap<String, u64> = opened.new.iter().map(|(id, token)| (token.content.clone(), *id)).collect();
+            let base = Arc::clone(&donor.checkpoint);
+            self.scope.function1("id_of", move |token| {
+                base.tokenizer.id_of(token).or_else(|| new.get(token).copied()).map_or(Value::Null, Value::from)
+            });
             self.tokens = Some(opened);
         }
         Ok(())
     }
+}
+
+/// Whether an expression can be evaluated only after the tokenizer of the result is opened.
+fn needs_tokens(expression: &Expression) -> bool {
+    expression.variables().iter().any(|name| name == "tokens")
+        || expression.references().calls.iter().any(|call| call.function == "id_of")
 }
 
 /// The document of this name from the first donor that has it.

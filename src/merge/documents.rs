@@ -6,9 +6,11 @@ use super::context::Context;
 use super::draft::MergeDraft;
 use super::error::MergeError;
 use super::switches::{self, Removed};
+use super::validate::misplaced;
 use crate::check::clamped;
 use crate::check::tokens::OpenedTokenizer;
 use crate::checkpoint::{Document, FaultKind, FileName, Vocabulary, pointer};
+use crate::knowledge::Template;
 use crate::knowledge::recipe::{AUTO_MAP, DocumentEdit, DocumentSpec, GraftEdit, TokensForm};
 
 /// A document of the result and its origin.
@@ -90,11 +92,12 @@ fn start<'c>(context: &Context<'c>, spec: &DocumentSpec) -> Result<Option<(Value
 fn serialised(context: &Context<'_>, spec: &DocumentSpec, source: Option<&Document>, value: Value) -> Document {
     // Later edits lie over earlier ones: the spelling of a graft goes before that of the document it is in.
     let grafts = spec.edits.iter().rev().filter_map(|edit| match edit {
-        DocumentEdit::Graft(graft) => Some((donor_config(context, graft)?, graft.at.as_str())),
+        DocumentEdit::Graft(graft) => Some((donor_config(context, graft)?, graft.at.render(&context.scope))),
         _ => None,
     });
-    let copies = grafts.chain(source.map(|source| (source, "")));
-    copies.fold(Document::from_value(&*spec.name, value), |document, (copied, at)| document.with_numbers_of(copied, at))
+    let copies = grafts.chain(source.map(|source| (source, String::new())));
+    copies
+        .fold(Document::from_value(&*spec.name, value), |document, (copied, at)| document.with_numbers_of(copied, &at))
 }
 
 /// Replaces a donor's infinities with finite numbers if the recipe allows it, as the fix of JSN001 does. Otherwise
@@ -140,27 +143,37 @@ fn apply_edit(
     match edit {
         DocumentEdit::Set(set) => {
             if context.holds(set.when.as_ref(), &spec.name)? {
-                let place = format!("{}{}", spec.name, set.at);
-                put(&set.at, set.to.eval(&context.scope).map_err(context.at(place))?)?;
+                let at = place(context, spec, &set.at, true)?;
+                let name = format!("{}{at}", spec.name);
+                put(&at, set.to.eval(&context.scope).map_err(context.at(name))?)?;
             }
         }
         DocumentEdit::Tokens(edit) => {
             if context.holds(edit.when.as_ref(), &spec.name)?
                 && let Some(tokens) = &context.tokens
             {
-                put(&edit.at, added(context, tokens, edit.form))?;
+                put(&place(context, spec, &edit.at, false)?, added(context, tokens, edit.form))?;
             }
         }
-        DocumentEdit::Graft(graft) => put(&graft.at, grafted(context, graft)?)?,
+        DocumentEdit::Graft(graft) => put(&place(context, spec, &graft.at, false)?, grafted(context, graft)?)?,
         DocumentEdit::Remove(remove) => {
             if context.holds(remove.when.as_ref(), &spec.name)? {
-                for pointer in &remove.at {
-                    pointer::remove(value, pointer);
+                for at in &remove.at {
+                    pointer::remove(value, &at.try_render(&context.scope).map_err(context.at(at.source()))?);
                 }
             }
         }
     }
     Ok(removed)
+}
+
+/// The JSON pointer that an edit writes to; `sets` for an edit `set`.
+fn place(context: &Context<'_>, spec: &DocumentSpec, at: &Template, sets: bool) -> Result<String, MergeError> {
+    let at = at.try_render(&context.scope).map_err(context.at(format!("{}{}", spec.name, at.source())))?;
+    match misplaced(&at, sets) {
+        None => Ok(at),
+        Some(reason) => Err(MergeError::Recipe(format!("{}: {}: {reason}", context.recipe.recipe, spec.name))),
+    }
 }
 
 /// The added tokens in one of transformers' forms: those stated by the base donor, then the new ones.

@@ -1,16 +1,15 @@
-//! The donors of a merge: opens and checks them, and matches them with the recipe.
+//! The donors of a merge: opens, checks and judges them.
 
 use std::sync::Arc;
 
 use super::context::Donor;
-use super::error::{MergeError, PipelineError};
+use super::error::PipelineError;
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
 use crate::checkpoint::Checkpoint;
 use crate::checkpoint::open::{OpenError, real_target};
 use crate::knowledge::Knowledge;
-use crate::knowledge::recipe::{DonorSpec, Recipe};
-use crate::knowledge::source::hint;
+use crate::knowledge::recipe::Recipe;
 use crate::report::model::Role;
 use crate::surgery::donor::DonorSnapshot;
 
@@ -40,91 +39,31 @@ pub(super) fn open(
     Ok((donors, snapshots))
 }
 
-/// Selects the only recipe whose roles match the donors' architectures.
-pub(super) fn choose_recipe<'k>(recipes: &'k [Recipe], run: &MergeRun) -> Result<&'k Recipe, MergeError> {
-    let plays = |spec: &DonorSpec| {
-        run.donor(&spec.role).map_or(spec.optional, |donor| {
-            spec.architectures.is_empty()
-                || donor.outcome.architecture.as_ref().is_some_and(|a| spec.architectures.contains(a))
-        })
-    };
-    let fitting: Vec<&Recipe> = recipes.iter().filter(|recipe| recipe.donors.iter().all(plays)).collect();
-    match fitting.as_slice() {
-        [one] => Ok(one),
-        [] => {
-            let is = |donor: &CheckedCheckpoint| {
-                let architecture = donor.outcome.architecture.as_deref();
-                format!("{} is {}", donor.role, architecture.unwrap_or("of an unknown architecture"))
-            };
-            let donors: Vec<String> = run.checked.iter().map(is).collect();
-            let donors = donors.join(", ");
-            Err(MergeError::Donor(format!("no recipe fits these donors: {donors}; select one with --recipe")))
-        }
-        several => {
-            let names: Vec<&str> = several.iter().map(|r| r.recipe.as_str()).collect();
-            let names = names.join(", ");
-            Err(MergeError::Donor(format!("several recipes fit these donors: {names}; select one with --recipe")))
-        }
-    }
-}
-
-/// Fails unless the donors match the roles of the recipe.
-pub(super) fn check_roles(recipe: &Recipe, request: &MergeRequest) -> Result<(), MergeError> {
-    for role in request.donors.keys() {
-        if !recipe.donors.iter().any(|d| d.role == *role) {
-            let known: Vec<&str> = recipe.donors.iter().map(|d| d.role.as_str()).collect();
-            let hint = hint(role, &known);
-            return Err(MergeError::Option(format!("recipe {} has no donor {role}; {hint}", recipe.recipe)));
-        }
-    }
-    for spec in recipe.donors.iter().filter(|d| !d.optional) {
-        if !request.donors.contains_key(&spec.role) {
-            return Err(MergeError::Option(format!(
-                "recipe {} needs a {} donor, {}: --donor {}=DIR",
-                recipe.recipe, spec.role, spec.what, spec.role
-            )));
-        }
-    }
-    Ok(())
-}
-
-/// Fails unless the architecture of each donor is allowed for its role.
-pub(super) fn check_architectures(recipe: &Recipe, run: &MergeRun) -> Result<(), MergeError> {
-    for spec in recipe.donors.iter().filter(|s| !s.architectures.is_empty()) {
-        let Some(donor) = run.donor(&spec.role) else { continue };
-        let is = donor.outcome.architecture.as_deref();
-        if !is.is_some_and(|a| spec.architectures.iter().any(|s| s == a)) {
-            return Err(MergeError::Donor(format!(
-                "{}: the {} donor must be {} ({}), but this is {}",
-                donor.path.display(),
-                spec.role,
-                spec.architectures.join(" or "),
-                spec.what,
-                is.unwrap_or("of an unknown architecture")
-            )));
-        }
-    }
-    Ok(())
-}
-
 /// Whether no donor has errors, except those that the recipe tolerates; records the result.
 pub(super) fn are_sound(recipe: &Recipe, run: &mut MergeRun) -> bool {
-    let mut unsound = Vec::new();
+    let (mut judged, mut unsound, mut tolerated, mut unjudged) = (0_usize, Vec::new(), Vec::new(), Vec::new());
     for spec in &recipe.donors {
-        // A directory that only provides Python modules is not checked as a checkpoint.
-        let Some(donor) = run.donor(&spec.role).filter(|_| !spec.architectures.is_empty()) else { continue };
-        let stops = |f: &&Finding| f.severity == Severity::Error && !spec.tolerates.contains(&f.code);
-        let errors = donor.outcome.findings.iter().filter(stops).count();
-        if errors > 0 {
-            unsound.push(format!("{} has {}", donor.role, count(errors, "error", "errors")));
+        let Some(donor) = run.donor(&spec.role) else { continue };
+        if !spec.is_checkpoint() {
+            unjudged.push(format!("{} only provides files", spec.role));
+            continue;
+        }
+        judged = judged.saturating_add(1);
+        let is_error = |f: &&Finding| f.severity == Severity::Error;
+        let errors = donor.outcome.findings.iter().filter(is_error);
+        let (spared, stopping): (Vec<_>, Vec<_>) = errors.partition(|f| spec.tolerates.contains(&f.code));
+        let has = |n: usize| format!("{} has {}", spec.role, count(n, "error", "errors"));
+        if !stopping.is_empty() {
+            unsound.push(has(stopping.len()));
+        } else if !spared.is_empty() {
+            tolerated.push(format!("{} that the recipe tolerates", has(spared.len())));
         }
     }
     let sound = unsound.is_empty();
-    let outcome = if sound {
-        count(run.checked.len(), "donor has no errors", "donors have no errors")
-    } else {
-        unsound.join(", ")
-    };
-    run.note("donors", &outcome);
+    let clean = judged.saturating_sub(tolerated.len());
+    let clean = (clean > 0).then(|| count(clean, "donor has no errors", "donors have no errors"));
+    let outcome: Vec<String> =
+        if sound { clean.into_iter().chain(tolerated).chain(unjudged).collect() } else { unsound };
+    run.note("donors", &outcome.join(", "));
     sound
 }

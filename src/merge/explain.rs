@@ -13,7 +13,7 @@ pub(super) fn cause(context: &Context<'_>, error: &EvalError) -> String {
     let references = Expression::parse(&error.source_text).map(|e| e.references()).unwrap_or_default();
     let missing_value = || references.paths.iter().find_map(|path| missing_value(context, path));
     let missing_tensor = || references.calls.iter().find_map(|call| missing_tensor(context, call));
-    let words = missing_value().or_else(missing_tensor).or_else(|| in_words(&error.cause).map(str::to_owned));
+    let words = missing_value().or_else(missing_tensor).or_else(|| in_words(&error.cause));
     words.map_or_else(|| error.to_string(), |words| format!("{words} ({error})"))
 }
 
@@ -76,18 +76,30 @@ pub(super) fn without_tensors(donor: &Donor) -> Option<String> {
     ))
 }
 
+/// The starts of errors of the crate `cel` 0.15, and their meaning.
+const WORDS: [(&str, &str); 9] = [
+    ("No such key", "a value has no such key"),
+    ("found no matching overload", "a value is missing, or of another type than the expression needs"),
+    ("Unexpected type", "a value is missing, or of another type than the expression needs"),
+    ("Unable to use value", "a value cannot be used as a key"),
+    ("Undeclared reference", "a name is not defined"),
+    ("Index out of bounds", "a list is shorter than the expression needs"),
+    ("Division by zero", "a divisor is zero"),
+    ("Remainder by zero", "a divisor is zero"),
+    ("Overflow", "a number exceeds 64 bits"),
+];
+
+/// The start of an error that a function of this program states: `Error executing function 'pow': …`.
+const OF_A_FUNCTION: &str = "Error executing function '";
+
 /// An error of the crate `cel` as a sentence; `None` for the errors of this program, which are sentences.
-fn in_words(cause: &str) -> Option<&'static str> {
-    const WORDS: [(&str, &str); 9] = [
-        ("No such key", "a value has no such key"),
-        ("found no matching overload", "a value is missing, or of another type than the expression needs"),
-        ("Unexpected type", "a value is missing, or of another type than the expression needs"),
-        ("Unable to use value", "a value cannot be used as a key"),
-        ("Undeclared reference", "a name is not defined"),
-        ("Index out of bounds", "a list is shorter than the expression needs"),
-        ("Division by zero", "a divisor is zero"),
-        ("Remainder by zero", "a divisor is zero"),
-        ("Overflow", "a number exceeds 64 bits"),
-    ];
-    WORDS.iter().find(|(start, _)| cause.starts_with(start)).map(|(_, words)| *words)
+fn in_words(cause: &str) -> Option<String> {
+    if let Some((function, reason)) = cause.strip_prefix(OF_A_FUNCTION).and_then(|rest| rest.split_once("': ")) {
+        return Some(format!("{function}(…) fails: {reason}"));
+    }
+    if cause.contains(" expected, got ") {
+        return None;
+    }
+    let known = WORDS.iter().find(|(start, _)| cause.starts_with(start)).map(|(_, words)| *words);
+    Some(known.unwrap_or("the expression cannot be evaluated with these donors").to_owned())
 }

@@ -9,11 +9,11 @@ use super::context::Context;
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::error::MergeError;
-use super::switches;
+use super::{REPORT, manifest, switches};
 use crate::check::modules::relative_modules;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
-use crate::checkpoint::{Document, FileName, INDEX_NAME};
-use crate::knowledge::recipe::{FileSpec, ModulesSpec, TemplateSpec};
+use crate::checkpoint::{Document, FileName, FilePattern, INDEX_NAME};
+use crate::knowledge::recipe::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
 use crate::report::model::MergedFile;
 use crate::surgery::plan::PlannedFile;
 
@@ -30,8 +30,8 @@ pub(super) fn plan(
         match spec {
             FileSpec::Copy(copy) => {
                 if context.holds(copy.when.as_ref(), "files")? {
-                    for name in &copy.names {
-                        files.extend(copy_of(context, &copy.from, name, draft)?);
+                    for name in names_of(context, copy, &files)? {
+                        files.extend(copy_of(context, &copy.from, &name, draft)?);
                     }
                 }
             }
@@ -76,6 +76,59 @@ pub(super) fn plan(
 
 fn bytes_of(document: &Document) -> Arc<[u8]> {
     document.text.as_deref().unwrap_or_default().as_bytes().into()
+}
+
+/// Names that the merge gives to its own files, in any case.
+pub(super) fn is_own(name: &str) -> bool {
+    let lower = name.to_ascii_lowercase();
+    [&*manifest::NAME, &*REPORT].contains(&lower.as_str())
+        || lower.ends_with(".safetensors")
+        || lower.ends_with(".safetensors.index.json")
+}
+
+/// Endings of names that no pattern matches: weights, which a merge does not copy as files, and Python modules, which are
+/// named or imported.
+const NOT_BY_PATTERN: [&str; 12] =
+    [".bin", ".pt", ".pth", ".ckpt", ".pkl", ".h5", ".msgpack", ".onnx", ".gguf", ".index.json", ".py", "readme.md"];
+
+/// Most bytes of the files that the patterns of one entry match: they are held in memory.
+const MAX_MATCHED: u64 = 4 * TOKENIZER_CAP;
+
+/// The names of an entry, with those of the donor's files that its patterns match.
+///
+/// `files` are those of earlier entries.
+fn names_of(context: &Context<'_>, copy: &CopySpec, files: &[PlannedFile]) -> Result<Vec<FileName>, MergeError> {
+    let Some(donor) = context.donor(&copy.from) else { return Ok(Vec::new()) };
+    let mut names: Vec<FileName> = Vec::new();
+    let mut bytes = 0_u64;
+    for pattern in &copy.names {
+        let pattern = match pattern {
+            FilePattern::Name(name) => {
+                names.push(name.clone());
+                continue;
+            }
+            FilePattern::Pattern(_, pattern) => pattern,
+        };
+        for (name, entry) in donor.checkpoint.entries.iter().filter(|(name, _)| pattern.is_match(name.as_str())) {
+            let Ok(plain) = FileName::parse(name) else { continue };
+            let lower = name.to_lowercase();
+            let is_same = |other: &FileName| other.to_lowercase() == lower;
+            let is_written = files.iter().map(|file| &file.name).chain(&names).any(is_same)
+                || context.recipe.documents.iter().any(|document| is_same(&document.name));
+            if is_written || is_own(name) || NOT_BY_PATTERN.iter().any(|end| lower.ends_with(end)) {
+                continue;
+            }
+            bytes = bytes.saturating_add(entry.size);
+            if bytes > MAX_MATCHED {
+                return Err(MergeError::Donor(format!(
+                    "recipe {}: the files of the {} donor that the patterns of `files` match have more than {MAX_MATCHED} bytes, the last one is {name}; name the files that are needed",
+                    context.recipe.recipe, copy.from
+                )));
+            }
+            names.push(plain);
+        }
+    }
+    Ok(names)
 }
 
 /// A donor's file; `None` when the donor lacks it. A JSON file is copied without the keys that make a loader run code.

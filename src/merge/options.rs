@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::context::Options;
 use super::error::MergeError;
 use crate::checkpoint::module::is_dotted_name;
-use crate::knowledge::recipe::{OptionSpec, Recipe};
+use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe};
 use crate::knowledge::source::hint;
 
 /// Shard size of a recipe without this option: the default of `save_pretrained`.
@@ -39,8 +39,11 @@ pub(super) fn resolve(recipe: &Recipe, given: &BTreeMap<String, String>) -> Resu
 /// # Errors
 /// [`MergeError::Option`] with the allowed values.
 pub(super) fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
-    if spec.values.is_empty() {
-        return parse_size(value).map(drop);
+    match spec.kind() {
+        OptionKind::Size => return parse_size(&spec.name, value).map(drop),
+        OptionKind::Integer => return parse_integer(&spec.name, value).map(drop),
+        OptionKind::Text => return check_text(&spec.name, value),
+        OptionKind::Choice => {}
     }
     let takes = |v: &String| match v.strip_suffix(':') {
         // The argument after the colon becomes part of a Python import, so it must be a dotted module path.
@@ -55,12 +58,33 @@ pub(super) fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
     Err(MergeError::Option(format!("{}={value} is not one of {}", spec.name, forms.join(", "))))
 }
 
+/// The value of an option of kind `integer`.
+///
+/// # Errors
+/// [`MergeError::Option`] for anything else.
+pub(super) fn parse_integer(name: &str, text: &str) -> Result<i64, MergeError> {
+    text.parse().map_err(|_| MergeError::Option(format!("{name}={text} is not an integer")))
+}
+
+/// Longest value of an option of kind `text`, in bytes.
+const MAX_TEXT: usize = 1000;
+
+fn check_text(name: &str, text: &str) -> Result<(), MergeError> {
+    if text.len() > MAX_TEXT {
+        return Err(MergeError::Option(format!("{name} has {} bytes; at most {MAX_TEXT} are allowed", text.len())));
+    }
+    match text.chars().find(|c| c.is_control()) {
+        Some(c) => Err(MergeError::Option(format!("{name} contains the control character {c:?}; remove it"))),
+        None => Ok(()),
+    }
+}
+
 /// Bytes of a size such as `5GB` (5·10⁹), `300MiB` (300·2²⁰) or `1000`; at least one.
 ///
 /// # Errors
 /// [`MergeError::Option`] for anything else.
-pub(super) fn parse_size(text: &str) -> Result<u64, MergeError> {
-    let bad = || MergeError::Option(format!("shard-size={text} is not a size such as 5GB, 300MiB or 1000000"));
+pub(super) fn parse_size(name: &str, text: &str) -> Result<u64, MergeError> {
+    let bad = || MergeError::Option(format!("{name}={text} is not a size such as 5GB, 300MiB or 1000000"));
     let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let (number, unit) = text.split_at(digits);
     let number: u64 = number.parse().map_err(|_| bad())?;
@@ -85,11 +109,11 @@ mod tests {
 
     #[test]
     fn sizes() {
-        assert_eq!(parse_size("5GB").unwrap(), 5_000_000_000);
-        assert_eq!(parse_size("5GiB").unwrap(), 5 << 30);
-        assert_eq!(parse_size("300").unwrap(), 300);
+        assert_eq!(parse_size("o", "5GB").unwrap(), 5_000_000_000);
+        assert_eq!(parse_size("o", "5GiB").unwrap(), 5 << 30);
+        assert_eq!(parse_size("o", "300").unwrap(), 300);
         for bad in ["", "GB", "0", "-1", "5 parsecs", "99999999999TB"] {
-            assert!(parse_size(bad).is_err(), "{bad}");
+            assert!(parse_size("o", bad).is_err(), "{bad}");
         }
     }
 

@@ -39,7 +39,8 @@ pub(super) fn plan(
         });
     }
     let documents = documents::plan(&context, &mut draft)?;
-    let limit = options.get("shard-size").map_or(Ok(options::DEFAULT_SHARD), |s| options::parse_size(s))?;
+    let limit =
+        options.get("shard-size").map_or(Ok(options::DEFAULT_SHARD), |s| options::parse_size("shard-size", s))?;
     tensors::plan(&context, &documents, &knowledge.library, limit, &mut draft)?;
     files::plan(&context, documents, &mut draft)?;
     for note in &recipe.notes {

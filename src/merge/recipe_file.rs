@@ -24,10 +24,11 @@ pub fn read(path: &Path, knowledge: &Knowledge) -> Result<Recipe, DataError> {
             recipe.origin.templates.insert(template.text.clone(), text);
         }
     }
-    if let Some(tokens) = recipe.tokens.as_ref().filter(|tokens| tokens.processor.ends_with(".json5")) {
-        let found = folder.file("processor", &tokens.processor)?;
+    let processor = recipe.tokens.as_ref().and_then(|tokens| tokens.processor.as_ref());
+    if let Some(path) = processor.filter(|path| path.ends_with(".json5")) {
+        let found = folder.file("processor", path)?;
         let processor = found.map(|(name, text)| Processor::parse(&name, &text)).transpose()?;
-        let missing = || folder.wrong("processor", &tokens.processor, "no such file in the folder of the recipe");
+        let missing = || folder.wrong("processor", path, "no such file in the folder of the recipe");
         recipe.origin.processor = Some(processor.ok_or_else(missing)?);
     }
     validate(&recipe, &name, &text, knowledge)?;

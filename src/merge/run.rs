@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::draft::MergeDraft;
-use crate::check::{Outcome, Severity, check};
+use crate::check::{Finding, Outcome, Severity, check};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
@@ -107,20 +107,30 @@ impl MergeRun {
         }
     }
 
-    /// Checks the planned or written checkpoint, and records the verdict; returns false when it has errors.
-    pub(super) fn check(&mut self, role: Role, path: &Path, checkpoint: Checkpoint, knowledge: &Knowledge) -> bool {
+    /// Checks the planned or written checkpoint, and records the verdict; returns false when it has errors of other rules than
+    /// the `tolerated` ones.
+    pub(super) fn check(
+        &mut self,
+        role: Role,
+        path: &Path,
+        checkpoint: Checkpoint,
+        knowledge: &Knowledge,
+        tolerated: &[String],
+    ) -> bool {
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);
         let found = |severity| outcome.findings.iter().filter(|f| f.severity == severity).count();
-        let errors = found(Severity::Error);
-        let verdict = match (errors, found(Severity::Warning)) {
+        let stops = |f: &&Finding| f.severity == Severity::Error && !tolerated.contains(&f.code);
+        let stopping = outcome.findings.iter().filter(stops).count();
+        let verdict = match (found(Severity::Error), found(Severity::Warning)) {
             (0, 0) => "clean".to_owned(),
             (0, n) => count(n, "warning", "warnings"),
+            (n, _) if stopping == 0 => format!("{} that the recipe tolerates", count(n, "error", "errors")),
             (n, _) => count(n, "error", "errors"),
         };
         self.note(&format!("check {role}"), &verdict);
         self.checked.push(CheckedCheckpoint { role, path: path.to_owned(), checkpoint, outcome });
-        errors == 0
+        stopping == 0
     }
 
     /// The report of the run.

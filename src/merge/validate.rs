@@ -6,17 +6,20 @@ mod expressions;
 mod files;
 mod places;
 
+pub(super) use places::misplaced;
+
 use std::collections::BTreeSet;
 
 use regex::Regex;
 
 use super::options;
 use crate::knowledge::Knowledge;
-use crate::knowledge::recipe::{OptionSpec, Recipe, SeamTensor};
+use crate::knowledge::recipe::{ANY, OptionKind, OptionSpec, Recipe, SeamTensor};
 use crate::knowledge::source::{DataError, hint};
 
 /// Names of the scope of expressions that no role and no `let` may take.
-const RESERVED: [&str; 9] = ["opt", "arg", "tokens", "processor", "preprocessor", "true", "false", "null", "in"];
+const RESERVED: [&str; 10] =
+    ["opt", "arg", "stored", "tokens", "processor", "preprocessor", "true", "false", "null", "in"];
 
 /// A recipe with its text, for the places of errors.
 struct Validator<'a> {
@@ -65,23 +68,31 @@ impl Validator<'_> {
     /// Roles are names of variables and of the command line; architectures and tolerated rules exist.
     fn roles(&self) -> Result<(), DataError> {
         let architectures: Vec<&str> = self.knowledge.library.names().collect();
-        let rules: Vec<&str> = self.knowledge.rules.all().map(|rule| rule.code.as_str()).collect();
         let mut seen = BTreeSet::new();
         for donor in &self.recipe.donors {
             self.name("role", &donor.role)?;
             if !seen.insert(donor.role.as_str()) {
                 return Err(self.wrong("role", &donor.role, format!("the role `{}` is defined twice", donor.role)));
             }
-            for architecture in &donor.architectures {
+            for architecture in donor.architectures.iter().filter(|name| *name != ANY) {
                 self.known("architectures", "architecture", architecture, &architectures)?;
             }
-            for code in &donor.tolerates {
-                if let Some(current) = self.knowledge.rules.catalogue.current(code) {
-                    let reason = format!("the rule {code} is retired; write {current}");
-                    return Err(self.wrong("tolerates", code, reason));
-                }
-                self.known("tolerates", "rule", code, &rules)?;
+            if donor.takes_any() && donor.architectures.len() > 1 {
+                let reason = "`*` stands for every architecture; remove the others";
+                return Err(self.wrong("architectures", ANY, reason));
             }
+            self.tolerated(&donor.tolerates)?;
+        }
+        self.tolerated(&self.recipe.tolerates)
+    }
+
+    fn tolerated(&self, codes: &[String]) -> Result<(), DataError> {
+        let rules: Vec<&str> = self.knowledge.rules.all().map(|rule| rule.code.as_str()).collect();
+        for code in codes {
+            if let Some(current) = self.knowledge.rules.catalogue.current(code) {
+                return Err(self.wrong("tolerates", code, format!("the rule {code} is retired; write {current}")));
+            }
+            self.known("tolerates", "rule", code, &rules)?;
         }
         Ok(())
     }
@@ -108,6 +119,17 @@ impl Validator<'_> {
             if !seen.insert(option.name.as_str()) {
                 return Err(self.wrong("name", &option.name, format!("the option `{}` is defined twice", option.name)));
             }
+            match (option.kind(), option.values.is_empty()) {
+                (OptionKind::Choice, true) => {
+                    let reason = format!("the option `{}` is a choice, but has no `values`; add them", option.name);
+                    return Err(self.wrong("name", &option.name, reason));
+                }
+                (OptionKind::Choice, false) | (_, true) => {}
+                (kind, false) => {
+                    let reason = format!("the option `{}` has `values`, so it is no {}", option.name, kind.name());
+                    return Err(self.wrong("name", &option.name, reason));
+                }
+            }
             options::check(option, &option.default)
                 .map_err(|error| self.wrong("default", &option.default, format!("the default: {error}")))?;
         }
@@ -133,11 +155,11 @@ impl Validator<'_> {
     fn tokens(&self) -> Result<(), DataError> {
         let Some(tokens) = &self.recipe.tokens else { return Ok(()) };
         self.role("base", &tokens.base)?;
-        if self.recipe.origin.processor.is_some() {
+        let Some(processor) = tokens.processor.as_ref().filter(|_| self.recipe.origin.processor.is_none()) else {
             return Ok(());
-        }
+        };
         let known: Vec<&str> = self.knowledge.processors.iter().map(|p| p.processor.as_str()).collect();
-        self.known("processor", "processor", &tokens.processor, &known)
+        self.known("processor", "processor", processor, &known)
     }
 
     fn tensors(&self) -> Result<(), DataError> {

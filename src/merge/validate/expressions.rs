@@ -15,10 +15,13 @@ const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "nul
 /// Functions of a merge's scope, with a role as the first argument.
 const ROLE_FUNCTIONS: [&str; 2] = ["shape", "has"];
 
+/// The function that gives the id of a token.
+const ID_OF: &str = "id_of";
+
 impl Validator<'_> {
     pub(super) fn expressions(&self) -> Result<(), DataError> {
         let mut variables: BTreeSet<&str> = self.role_names().into_iter().collect();
-        variables.extend(["opt", "arg", "processor", "preprocessor"]);
+        variables.extend(["opt", "arg", "stored", "processor", "preprocessor"]);
         variables.extend(self.recipe.tokens.iter().map(|_| "tokens"));
         for item in &self.recipe.lets {
             self.name("name", &item.name)?;
@@ -51,12 +54,19 @@ impl Validator<'_> {
             for edit in &document.edits {
                 match edit {
                     DocumentEdit::Set(set) => {
+                        template("at", &set.at)?;
                         check("to", &set.to)?;
                         some("when", set.when.as_ref())?;
                     }
-                    DocumentEdit::Remove(remove) => some("when", remove.when.as_ref())?,
-                    DocumentEdit::Tokens(tokens) => some("when", tokens.when.as_ref())?,
-                    DocumentEdit::Graft(_) => {}
+                    DocumentEdit::Remove(remove) => {
+                        remove.at.iter().try_for_each(|at| template("at", at))?;
+                        some("when", remove.when.as_ref())?;
+                    }
+                    DocumentEdit::Tokens(tokens) => {
+                        template("at", &tokens.at)?;
+                        some("when", tokens.when.as_ref())?;
+                    }
+                    DocumentEdit::Graft(graft) => template("at", &graft.at)?,
                 }
             }
         }
@@ -90,8 +100,15 @@ impl Validator<'_> {
             }
         }
         for FunctionCall { function, arguments } in &calls {
+            if function == ID_OF {
+                if self.recipe.tokens.is_none() {
+                    return wrong(format!("`{ID_OF}` is defined only in a recipe with the key `tokens`; add it"));
+                }
+                continue;
+            }
             if !ROLE_FUNCTIONS.contains(&function.as_str()) && !is_function(function) {
-                let near = nearest(function, ROLE_FUNCTIONS).map(|near| format!("; did you mean `{near}`?"));
+                let near = nearest(function, ROLE_FUNCTIONS.into_iter().chain([ID_OF]))
+                    .map(|near| format!("; did you mean `{near}`?"));
                 return wrong(format!("unknown function `{function}`{}", near.unwrap_or_default()));
             }
             let role = arguments.first().and_then(Option::as_deref).filter(|_| arguments.len() == 2);
@@ -118,6 +135,7 @@ impl Validator<'_> {
         let key = keys.first()?;
         let (what, known) = match variable.as_str() {
             "opt" | "arg" => ("option", self.recipe.options.iter().map(|option| option.name.as_str()).collect()),
+            "stored" => ("role", self.role_names()),
             "tokens" => ("key of `tokens`", self.token_keys()),
             _ => return None,
         };

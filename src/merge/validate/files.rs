@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 
 use super::Validator;
-use crate::checkpoint::FileName;
 use crate::checkpoint::module::is_dotted_name;
+use crate::checkpoint::{FileName, FilePattern};
 use crate::knowledge::recipe::{CopySpec, DocumentSpec, FileSpec, ModulesSpec, TemplateSpec};
 use crate::knowledge::source::{self, DataError};
-use crate::merge::{REPORT, manifest};
+use crate::merge::files::is_own;
 
 impl Validator<'_> {
     /// Documents and files have names that the merge does not write itself, and are written once.
@@ -40,11 +40,7 @@ impl Validator<'_> {
 
     /// Fails for the names that the merge gives to its own files.
     fn free(&self, key: &str, name: &FileName) -> Result<(), DataError> {
-        let lower = name.to_ascii_lowercase();
-        let own = [&*manifest::NAME, &*REPORT].contains(&lower.as_str())
-            || lower.ends_with(".safetensors")
-            || lower.ends_with(".safetensors.index.json");
-        if own {
+        if is_own(name) {
             return Err(self.wrong(key, name, format!("{name} is reserved for files that the merge generates")));
         }
         Ok(())
@@ -64,7 +60,10 @@ impl Validator<'_> {
 
     fn copy(&self, copy: &CopySpec) -> Result<(), DataError> {
         self.role("from", &copy.from)?;
-        copy.names.iter().try_for_each(|name| self.free("names", name))
+        copy.names.iter().try_for_each(|name| match name {
+            FilePattern::Name(name) => self.free("names", name),
+            FilePattern::Pattern(..) => Ok(()),
+        })
     }
 
     fn modules(&self, modules: &ModulesSpec) -> Result<(), DataError> {

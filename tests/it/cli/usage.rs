@@ -18,7 +18,7 @@ fn doctor(dir: &Path, args: &[&str]) -> Output {
 #[test]
 fn every_command_has_its_help() {
     let mut all = String::new();
-    for command in ["", "check", "undo", "build-merged", "inspect", "expect", "explain", "rules", "init"] {
+    for command in ["", "check", "undo", "build-merged", "inspect", "expect", "explain", "rules", "recipes", "init"] {
         let args: Vec<&str> = [command, "-h"].into_iter().filter(|arg| !arg.is_empty()).collect();
         let output = doctor(project(), &args);
         assert!(output.status.success());

@@ -7,7 +7,7 @@ use std::process::Command;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::{copy, donor, merge, names, state, text, tiny};
+use super::{copy, doctor, donor, merge, names, state, text, tiny};
 
 #[test]
 fn an_occupied_target_is_refused() {
@@ -149,10 +149,36 @@ fn bad_requests_exit_with_2_and_a_message() {
         assert!(text(&run).contains(reason), "{more:?}: {}", text(&run));
         assert!(!out.exists());
     }
-    // With swapped roles, no recipe fits.
-    let run = merge(&language, &vision, &out, &[]);
-    assert_eq!(run.status.code(), Some(2));
-    assert!(text(&run).contains("no recipe fits"), "{}", text(&run));
+    assert_eq!(merge(&vision, &language, &out, &["--recipe", "paligemma-llama"]).status.code(), Some(2));
+}
+
+/// Donors in each other's role, a missing donor, and donors that no recipe takes.
+#[test]
+fn donors_that_no_recipe_takes_are_explained() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    let (vision, language) = (donor("spatialvla-tiny"), donor("llava3d-tiny"));
+    let (vision, language, out) = (vision.to_str().unwrap(), language.to_str().unwrap(), out.to_str().unwrap());
+    let run = |args: &[&str]| {
+        let run = doctor(&[&["merge"], args, &["--out", out]].concat());
+        assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+        text(&run)
+    };
+    let swapped = "the vision donor is llava_llama and the language donor spatialvla: exchange them";
+    let texts = run(&["--vision", language, "--language", vision]);
+    assert!(texts.contains(swapped), "{texts}");
+    let texts = run(&["--vision", language, "--language", vision, "--recipe", "spatialvla-llava3d"]);
+    assert!(texts.contains(swapped), "{texts}");
+    let texts = run(&["--vision", vision]);
+    let missing = "not spatialvla-llava3d (the language donor is missing: --donor language=DIR";
+    assert!(texts.contains(missing), "{texts}");
+    let texts = run(&["--vision", language, "--language", language]);
+    assert!(
+        texts.contains("not paligemma-llama (the vision donor must be paligemma, but this is llava_llama"),
+        "{texts}"
+    );
+    let texts = run(&["--donor", &format!("nobody={language}")]);
+    assert!(texts.contains("not paligemma-llama (it has no nobody donor"), "{texts}");
 }
 
 #[test]

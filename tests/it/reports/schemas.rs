@@ -112,3 +112,11 @@ fn inspections_follow_their_schema() {
     fs::copy(project().join(shard), room.path().join("model.safetensors")).unwrap();
     holds(&inspect, &printed(room.path(), &["inspect", ".", "--output-format", "json"]));
 }
+
+#[test]
+fn the_list_of_recipes_follows_its_schema() {
+    let recipes = jsonschema::draft202012::new(&schema("recipes")).unwrap();
+    let list = printed(project(), &["recipes", "--output-format", "json"]);
+    holds(&recipes, &list);
+    assert!(list["recipes"].as_array().unwrap().iter().any(|recipe| recipe["name"] == "spatialvla-llava3d"));
+}
