@@ -2,6 +2,7 @@
 
 mod apply;
 mod changes;
+pub mod convert;
 pub mod donor;
 mod error;
 pub mod journal;
@@ -16,6 +17,7 @@ mod stream;
 mod system;
 mod target;
 pub mod transform;
+pub mod values;
 pub mod verify;
 pub mod written;
 

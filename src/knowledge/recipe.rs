@@ -15,8 +15,9 @@ use crate::checkpoint::{FileName, FilePattern};
 ///
 /// Expressions see `opt` (the options), a variable for each donor role (its config with the defaults of the class filled in),
 /// `stored` (the config of each role as it is in the file: `stored.vision`), `processor`, `preprocessor`, `tokens`, the names
-/// that `let` defined so far, and the functions `shape(role, tensor)`, `has(role, prefix)` and `id_of(token)`: the id in the
-/// tokenizer of the result, null when it has no such token.
+/// that `let` defined so far, and the functions `shape(role, tensor)`, `has(role, prefix)`, `dtype(role)`: the floating-point
+/// type of most bytes of a donor as torch names it (`'bfloat16'`), and `id_of(token)`: the id in the tokenizer of the result,
+/// null when it has no such token.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -253,6 +254,18 @@ pub enum DocumentEdit {
     Remove(RemoveEdit),
     /// Writes the added tokens of the tokenizer, including those that the processor adds.
     Tokens(TokensEdit),
+    /// Writes the dtype of the weights.
+    Dtype(DtypeEdit),
+}
+
+/// Writes the dtype of the weights: every `torch_dtype` and `dtype` of the document and of the configs in it gets the value,
+/// and the document has one of them.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct DtypeEdit {
+    /// The dtype as torch names it; null changes nothing.
+    pub to: Expression,
 }
 
 /// Writes the added tokens.
@@ -336,9 +349,20 @@ pub struct TensorSpec {
     /// Name in the result: a template, in which `$1` is the first group of `names`. The name of the donor when missing.
     #[serde(rename = "as", default)]
     pub rename: Option<Template>,
-    /// Treatment of a shape that does not match: an expression that gives `copy`, `pad`, `grow-rows` or `reinit`.
+    /// First row and number of rows of the donor that are used: a list of two integers. All rows when missing or null.
+    #[serde(default)]
+    pub slice: Option<Expression>,
+    /// Treatment of a shape that does not match: an expression that gives `copy`, `pad`, `grow-rows`, `sample-rows` or
+    /// `reinit`.
     #[serde(default)]
     pub fit: Option<Expression>,
+    /// Factor on all values, except those of `reinit`: a number. None when missing, null or 1.
+    #[serde(default)]
+    pub scale: Option<Expression>,
+    /// Type to which float16, bfloat16, float32 and float64 tensors are cast: one of these names. As stored when missing or
+    /// null.
+    #[serde(default)]
+    pub dtype: Option<Expression>,
     /// Reason for leaving the tensors out.
     #[serde(default)]
     pub drop: Option<String>,

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
+use super::dtypes;
 use super::error::MergeError;
 use super::{explain, options};
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
@@ -99,6 +100,10 @@ impl<'a> Context<'a> {
         }
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
+        let all = Arc::clone(&checkpoints);
+        scope.function1("dtype", move |role| {
+            all.get(role).and_then(|c| dtypes::of_most_bytes(c)).map_or(Value::Null, |name| json!(name))
+        });
         let all = Arc::clone(&checkpoints);
         scope.function2("shape", move |role, name| {
             all.get(role).and_then(|c| c.tensor(name)).map_or(Value::Null, |(_, t)| json!(t.shape))

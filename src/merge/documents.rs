@@ -4,6 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::context::Context;
 use super::draft::MergeDraft;
+use super::dtypes;
 use super::error::MergeError;
 use super::switches::{self, Removed};
 use super::validate::misplaced;
@@ -153,6 +154,11 @@ fn apply_edit(
                 && let Some(tokens) = &context.tokens
             {
                 put(&place(context, spec, &edit.at, false)?, added(context, tokens, edit.form))?;
+            }
+        }
+        DocumentEdit::Dtype(edit) => {
+            if let Value::String(name) = edit.to.eval(&context.scope).map_err(context.at(spec.name.to_string()))? {
+                dtypes::set(value, &name);
             }
         }
         DocumentEdit::Graft(graft) => put(&place(context, spec, &graft.at, false)?, grafted(context, graft)?)?,

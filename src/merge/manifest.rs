@@ -10,7 +10,7 @@ use crate::knowledge::recipe::Recipe;
 use crate::report::model::ToolInfo;
 use crate::surgery::ApplyError;
 use crate::surgery::donor::sha256;
-use crate::surgery::plan::{Plan, PlannedFile, TensorTransform};
+use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorTransform};
 use crate::surgery::written::WrittenShard;
 
 /// File name in the merged directory.
@@ -20,7 +20,7 @@ pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 ///
 /// Donors are named by their role and hashes, never by a path, so that the same merge made elsewhere has the same
 /// manifest.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct Manifest {
     /// Version of this contract: 2.
@@ -73,7 +73,7 @@ pub(crate) struct DonorShard {
 }
 
 /// A tensor of the result and its source.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct TensorOrigin {
     /// Name in the result.
@@ -88,6 +88,9 @@ pub(crate) struct TensorOrigin {
     pub sha256: String,
     /// How it was made.
     pub transform: TensorTransform,
+    /// Factor on all values.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
     /// The donor tensor that it was made from, or that it replaces.
     pub source: DonorTensor,
 }
@@ -100,8 +103,13 @@ pub(crate) struct DonorTensor {
     pub donor: String,
     /// Name in the donor.
     pub name: String,
-    /// Shape in the donor.
+    /// Element type in the donor; the values were cast if it differs from that of the result.
+    pub dtype: String,
+    /// Shape of the part that was used.
     pub shape: Vec<u64>,
+    /// The rows that were used, if not all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub slice: Option<RowSlice>,
 }
 
 /// The files of each donor, by role. With `all_bytes`, whole shards are hashed, otherwise only their headers.
@@ -125,15 +133,22 @@ pub(super) fn manifest<'f>(
     let others = others.map(|f| (f.name.to_string(), FileDigest { bytes: f.bytes.len() as u64, sha256: f.sha256() }));
     let digests = written.iter().flat_map(|shard| &shard.tensors);
     let tensors = plan.tensors().zip(digests).map(|((shard, t), written)| {
-        let from = t.source.donor();
+        let from = &t.source.from;
         TensorOrigin {
             name: t.name.clone(),
             shard: shard.name.to_string(),
             dtype: t.dtype.name().to_owned(),
             shape: t.shape.clone(),
             sha256: written.sha256.clone(),
-            transform: t.source.transform(),
-            source: DonorTensor { donor: from.donor.clone(), name: from.name.clone(), shape: from.shape.clone() },
+            transform: t.transform(),
+            scale: t.source.scale,
+            source: DonorTensor {
+                donor: from.donor.clone(),
+                name: from.name.clone(),
+                dtype: from.dtype.name().to_owned(),
+                shape: from.shape.clone(),
+                slice: from.slice,
+            },
         }
     });
     Manifest {

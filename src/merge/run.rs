@@ -1,6 +1,6 @@
 //! State of a merge: the checkpoints checked so far, and the record for the report.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -10,8 +10,11 @@ use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::Report;
-use crate::report::model::{CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
+use crate::report::model::{ChangedTensor, CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
 use crate::surgery::Leftover;
+use crate::surgery::convert::CastLosses;
+use crate::surgery::plan::Plan;
+use crate::surgery::written::WrittenShard;
 
 /// A request for a merge.
 #[derive(Debug, Clone)]
@@ -102,8 +105,26 @@ impl MergeRun {
         record.bytes = draft.plan.tensor_bytes();
         record.transforms.clear();
         for (_, tensor) in draft.plan.tensors() {
-            let count = record.transforms.entry(tensor.source.transform()).or_default();
+            let count = record.transforms.entry(tensor.transform()).or_default();
             *count = count.saturating_add(1);
+        }
+    }
+
+    /// Adds to the record what scaling and casting lost, as known after writing.
+    pub(super) fn record_losses(&mut self, plan: &Plan, written: &[WrittenShard]) {
+        let tensors = plan.tensors().zip(written.iter().flat_map(|shard| &shard.tensors));
+        let losses: HashMap<&str, CastLosses> = tensors.map(|((_, t), w)| (t.name.as_str(), w.losses)).collect();
+        for changed in self.record.changed.iter_mut().filter(|c| c.cast.is_some() || c.scale.is_some()) {
+            changed.losses = losses.get(changed.name.as_str()).copied();
+        }
+        let overflows = |changed: &&ChangedTensor| changed.losses.is_some_and(|losses| losses.overflow > 0);
+        let affected: Vec<&ChangedTensor> = self.record.changed.iter().filter(overflows).collect();
+        if let Some(first) = affected.first() {
+            self.record.notes.push(format!(
+                "{} values that became infinite because they are too large for the type, the first one {}: the model computes NaN. Set dtype=bfloat16 or dtype=float32.",
+                count(affected.len(), "tensor has", "tensors have"),
+                first.name,
+            ));
         }
     }
 

@@ -8,22 +8,27 @@ use serde_json::Value;
 use super::context::{Context, Donor};
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
+use super::dtypes;
 use super::error::MergeError;
 use super::explain;
 use super::run::count;
-use crate::checkpoint::{Shard, Tensor};
+use crate::checkpoint::{Dtype, Shard, Tensor, byte_len};
+use crate::knowledge::quantization;
 use crate::knowledge::recipe::TensorSpec;
-use crate::knowledge::{Evidence, Library, Loader};
-use crate::report::model::{ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
-use crate::surgery::transform::can_compute;
+use crate::knowledge::{Evidence, Expression, Library, Loader};
+use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
+use crate::surgery::plan::{PlannedTensor, RowSlice, TensorRef, TensorSource, TensorTransform, into_shards};
+use crate::surgery::values::can_compute;
 
 /// A tensor spec with its parts evaluated once.
 struct TensorRule<'a> {
     spec: &'a TensorSpec,
     names: Regex,
     rename: Option<String>,
+    slice: Option<[u64; 2]>,
     fit: TensorTransform,
+    scale: Option<f64>,
+    dtype: Option<Dtype>,
 }
 
 /// A donor tensor that the recipe selects, with its name in the result.
@@ -33,6 +38,22 @@ struct TakenTensor<'a> {
     shard: &'a Shard,
     tensor: &'a Tensor,
     rule: &'a TensorRule<'a>,
+}
+
+impl TakenTensor<'_> {
+    /// The shape of the rows that are used.
+    fn shape(&self) -> Vec<u64> {
+        let mut shape = self.tensor.shape.clone();
+        if let (Some(rows), Some([_, count])) = (shape.first_mut(), self.rule.slice) {
+            *rows = count;
+        }
+        shape
+    }
+
+    /// The element type in the result.
+    fn dtype(&self) -> Dtype {
+        self.rule.dtype.filter(|_| can_compute(self.tensor.dtype)).unwrap_or(self.tensor.dtype)
+    }
 }
 
 /// Plans the shards of the result; shape mismatches become seams of the draft.
@@ -49,7 +70,8 @@ pub(super) fn plan(
         return Err(nothing_taken(context, &rules));
     }
     draft.dropped = dropped;
-    let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.tensor.shape.clone()))).collect();
+    draft.seams.extend(context.donors.iter().filter_map(|donor| quantised(donor, &taken)));
+    let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
     let names = taken.iter().map(|t| t.name.as_str());
     let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
     let expected = expected_shapes(library, config, names, &evidence);
@@ -64,13 +86,15 @@ pub(super) fn plan(
         }
         let (position, shape) = match expected.get(&taken.name) {
             Some((position, shape)) => (*position, shape.clone()),
-            None => (usize::MAX, taken.tensor.shape.clone()),
+            None => (usize::MAX, taken.shape()),
         };
         match source(&taken, &shape) {
             Ok(source) => tensors.push((position, planned(taken, shape, source, draft))),
             Err(why) => draft.seams.push(misfit(context, &taken, shape, &why)),
         }
     }
+    // Tensors with another shape first: there may be hundreds of casts.
+    draft.changed.sort_by_key(|changed| changed.transform == TensorTransform::Convert);
     // In the order of the class, so that shards are split where save_pretrained would split them.
     tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
     draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
@@ -128,18 +152,44 @@ fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTenso
     (taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect())
 }
 
-/// The planned tensor; if it is not a byte copy, the draft lists it as changed.
+/// The planned tensor; if it is not a byte copy of the whole donor tensor, the draft lists it as changed.
 fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft: &mut MergeDraft) -> PlannedTensor {
+    let dtype = taken.dtype();
     let TakenTensor { name, tensor, .. } = taken;
-    if !matches!(source, TensorSource::Copy(_)) {
+    let planned = PlannedTensor { name, dtype, shape, source };
+    let transform = planned.transform();
+    if transform != TensorTransform::Copy || planned.source.from.slice.is_some() {
         draft.changed.push(ChangedTensor {
-            name: name.clone(),
-            transform: source.transform(),
+            name: planned.name.clone(),
+            transform,
             from: Some(tensor.shape.clone()),
-            to: shape.clone(),
+            to: planned.shape.clone(),
+            scale: planned.source.scale.filter(|_| transform != TensorTransform::Reinit),
+            cast: (tensor.dtype != dtype).then(|| Cast { from: tensor.dtype.name(), to: dtype.name() }),
+            losses: None,
         });
     }
-    PlannedTensor { name, dtype: tensor.dtype, shape, source }
+    planned
+}
+
+/// The seam for a donor whose quantised weights would be cast in part: its scales belong to their type.
+fn quantised(donor: &Donor, taken: &[TakenTensor<'_>]) -> Option<Seam> {
+    let config = donor.checkpoint.document("config.json")?.value.as_ref()?;
+    quantization::block(config)?;
+    let cast = taken.iter().find(|t| t.donor.role == donor.role && t.dtype() != t.tensor.dtype)?;
+    Some(Seam {
+        message: format!(
+            "the {} donor is quantised, and a cast of {} from {} to {} would not fit its quantisation; dequantise the donor, or keep its types",
+            donor.role,
+            cast.tensor.name,
+            cast.tensor.dtype,
+            cast.dtype(),
+        ),
+        tensor: None,
+        meets: None,
+        needed: None,
+        options: Vec::new(),
+    })
 }
 
 fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
@@ -156,21 +206,64 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             .map(|t| t.try_render(&context.scope))
             .transpose()
             .map_err(context.at(spec.names.as_str()))?;
-        let fit = match &spec.fit {
-            None => TensorTransform::Copy,
-            Some(e) => {
-                let value = e.eval(&context.scope).map_err(context.at(spec.names.as_str()))?;
-                serde_json::from_value(value.clone()).map_err(|_| {
-                    MergeError::Recipe(format!(
-                        "{}: fit of {} is {value}, not copy, pad, grow-rows or reinit",
-                        context.recipe.recipe, spec.names
-                    ))
-                })?
-            }
+        let value = |key: &str, expression: &Option<Expression>| match expression {
+            None => Ok(Value::Null),
+            Some(e) => e.eval(&context.scope).map_err(context.at(format!("{key} of {}", spec.names))),
         };
-        out.push(TensorRule { spec, names, rename, fit });
+        let wrong = |key: &str, value: &Value, expected: &str| {
+            let recipe = &context.recipe.recipe;
+            MergeError::Recipe(format!("{recipe}: {key} of {} is {value}, not {expected}", spec.names))
+        };
+        let (slice, fit) = (value("slice", &spec.slice)?, value("fit", &spec.fit)?);
+        let (scale, dtype) = (value("scale", &spec.scale)?, value("dtype", &spec.dtype)?);
+        out.push(TensorRule {
+            spec,
+            names,
+            rename,
+            slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
+            fit: parse_fit(&fit).map_err(|expected| wrong("fit", &fit, expected))?,
+            scale: parse_scale(&scale).map_err(|expected| wrong("scale", &scale, expected))?,
+            dtype: parse_dtype(&dtype).map_err(|expected| wrong("dtype", &dtype, expected))?,
+        });
     }
     Ok(out)
+}
+
+// Each parser takes the value of an expression, null when it is missing, and fails with what was expected.
+
+fn parse_slice(value: &Value) -> Result<Option<[u64; 2]>, &'static str> {
+    if value.is_null() {
+        return Ok(None);
+    }
+    let expected = "a list of the first row and the number of rows";
+    let items: Option<Vec<u64>> = value.as_array().and_then(|list| list.iter().map(Value::as_u64).collect());
+    items.and_then(|items| items.try_into().ok()).map(Some).ok_or(expected)
+}
+
+fn parse_fit(value: &Value) -> Result<TensorTransform, &'static str> {
+    let known = |name: &str| TensorTransform::FITS.into_iter().find(|fit| fit.name() == name);
+    match value {
+        Value::Null => Ok(TensorTransform::Copy),
+        Value::String(name) => known(name).ok_or("copy, pad, grow-rows, sample-rows or reinit"),
+        _ => Err("copy, pad, grow-rows, sample-rows or reinit"),
+    }
+}
+
+#[expect(clippy::float_cmp, reason = "a factor of exactly 1 changes nothing")]
+fn parse_scale(value: &Value) -> Result<Option<f64>, &'static str> {
+    if value.is_null() {
+        return Ok(None);
+    }
+    let scale = value.as_f64().filter(|scale| scale.is_finite() && *scale != 0.0);
+    scale.map(|scale| Some(scale).filter(|scale| *scale != 1.0)).ok_or("a finite number other than 0")
+}
+
+fn parse_dtype(value: &Value) -> Result<Option<Dtype>, &'static str> {
+    match value {
+        Value::Null => Ok(None),
+        Value::String(name) => dtypes::from_name(name).map(Some).ok_or("bfloat16, float16, float32 or float64"),
+        _ => Err("bfloat16, float16, float32 or float64"),
+    }
 }
 
 /// Position and shape of each tensor that the class has with the planned config.
@@ -190,38 +283,62 @@ fn expected_shapes<'n>(
 
 /// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used.
 fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String> {
+    let TakenTensor { tensor, rule, .. } = taken;
+    let from = tensor_ref(taken)?;
+    let changes = rule.scale.is_some() || taken.dtype() != tensor.dtype;
+    let fits = from.shape == shape && rule.fit != TensorTransform::Reinit;
+    if (changes || !(fits || rule.fit == TensorTransform::Copy)) && !can_compute(tensor.dtype) {
+        return Err(format!("values of type {} can only be copied", tensor.dtype));
+    }
+    let nests = nests(&from.shape, shape);
+    let fit = match rule.fit {
+        _ if fits => TensorTransform::Copy,
+        TensorTransform::Reinit => TensorTransform::Reinit,
+        TensorTransform::Pad if nests => TensorTransform::Pad,
+        TensorTransform::Pad => return Err(CANNOT_SHRINK.to_owned()),
+        rows @ (TensorTransform::GrowRows | TensorTransform::SampleRows) => {
+            if !nests || !from.shape.iter().skip(1).eq(shape.iter().skip(1)) {
+                return Err("only rows can be added".to_owned());
+            }
+            rows
+        }
+        TensorTransform::Copy | TensorTransform::Convert => return Err(String::new()),
+    };
+    Ok(TensorSource { from, fit, scale: rule.scale })
+}
+
+/// Why `pad` does not help.
+const CANNOT_SHRINK: &str = "padding cannot shrink a tensor";
+
+/// The part of a donor tensor that is used, or the reason why the tensor lacks it.
+fn tensor_ref(taken: &TakenTensor<'_>) -> Result<TensorRef, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
-    let from = TensorRef {
+    let mut from = TensorRef {
         donor: donor.role.clone(),
         path: donor.checkpoint.root.join(&shard.name),
         name: tensor.name.clone(),
-        shape: tensor.shape.clone(),
+        dtype: tensor.dtype,
+        shape: taken.shape(),
         offset: shard.data_start.saturating_add(tensor.begin),
         len: tensor.len(),
+        slice: None,
     };
-    if rule.fit != TensorTransform::Reinit && tensor.shape == shape {
-        return Ok(TensorSource::Copy(from));
+    if let Some([first, count]) = rule.slice {
+        let of = tensor.shape.first().copied().unwrap_or_default();
+        let missing = || format!("it has no {count} rows from row {first} on");
+        let row = byte_len(tensor.dtype, tensor.shape.get(1..).unwrap_or_default()).ok_or_else(missing)?;
+        let end = first.checked_add(count).filter(|end| *end <= of && count > 0).ok_or_else(missing)?;
+        from.offset = from.offset.saturating_add(row.saturating_mul(first));
+        from.len = row.saturating_mul(end.saturating_sub(first));
+        from.slice = (count != of).then_some(RowSlice { first, of });
     }
-    if rule.fit != TensorTransform::Copy && !can_compute(tensor.dtype) {
-        return Err(format!("values of type {} can only be copied", tensor.dtype));
-    }
-    let same_rank = tensor.shape.len() == shape.len();
-    let nests = same_rank && tensor.shape.iter().zip(shape).all(|(have, want)| have <= want);
-    match rule.fit {
-        TensorTransform::Copy => Err(String::new()),
-        TensorTransform::Reinit => Ok(TensorSource::Reinit { instead_of: from }),
-        TensorTransform::Pad if nests => Ok(TensorSource::Pad(from)),
-        TensorTransform::Pad => Err("padding cannot shrink a tensor".to_owned()),
-        TensorTransform::GrowRows if nests && tensor.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
-            Ok(TensorSource::GrowRows(from))
-        }
-        TensorTransform::GrowRows => Err("only rows can be added".to_owned()),
-    }
+    Ok(from)
 }
 
 /// The seam for a tensor with a shape mismatch.
 fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why: &str) -> Seam {
     let TakenTensor { name, donor, tensor, rule, .. } = taken;
+    let options = helpful(context, taken, &needed);
     Seam {
         message: format!(
             "{} of the {} donor is {:?}, {} must be {needed:?}{}{why}",
@@ -234,6 +351,30 @@ fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why:
         tensor: Some(ShapedName { donor: donor.role.clone(), name: tensor.name.clone(), shape: tensor.shape.clone() }),
         meets: rule.spec.meets.as_ref().and_then(|m| context.shaped(m)),
         needed: Some(needed),
-        options: rule.spec.options.iter().map(|o| format!("--set {o}")).collect(),
+        options,
     }
+}
+
+/// The options of the entry that would change how the tensor is made: without the values in effect, and without `pad` where
+/// padding cannot help.
+fn helpful(context: &Context<'_>, taken: &TakenTensor<'_>, shape: &[u64]) -> Vec<String> {
+    let spec = taken.rule.spec;
+    let Some(Value::Object(current)) = context.scope.get("opt") else { return Vec::new() };
+    let helps = |option: &&String| {
+        let Some((name, value)) = option.split_once('=') else { return true };
+        let mut changed = current.clone();
+        if changed.insert(name.to_owned(), value.into()).is_some_and(|old| old == value) {
+            return false;
+        }
+        let mut scope = context.scope.child();
+        scope.bind_map("opt", &changed);
+        let fit = spec.fit.as_ref().and_then(|fit| fit.eval(&scope).ok());
+        fit.is_none_or(|fit| fit != TensorTransform::Pad.name() || nests(&taken.shape(), shape))
+    };
+    spec.options.iter().filter(helps).map(|option| format!("--set {option}")).collect()
+}
+
+/// Whether a tensor has the rank of `shape` and is at most as large in each dimension.
+fn nests(from: &[u64], shape: &[u64]) -> bool {
+    from.len() == shape.len() && from.iter().zip(shape).all(|(have, want)| have <= want)
 }

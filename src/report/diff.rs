@@ -87,7 +87,7 @@ fn shard(out: &mut String, at: &str, repair: &Repair, new: &PlannedShard) {
     let renamed: Vec<(&str, &str)> = new
         .tensors
         .iter()
-        .map(|t| (t.source.donor().name.as_str(), t.name.as_str()))
+        .map(|t| (t.source.from.name.as_str(), t.name.as_str()))
         .filter(|(before, after)| before != after)
         .collect();
     let before = collapse(renamed.iter().map(|(before, _)| *before));

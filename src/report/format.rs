@@ -109,6 +109,20 @@ pub fn tensors(message: &str, locations: &[Location], cap: usize) -> Vec<String>
     lines
 }
 
+/// Name, treatment, and type and shape before and after of the changed tensors of a merge. Plain casts have their own
+/// sentences, [`MergeReport::casts`].
+pub fn changed(merge: &MergeReport) -> impl Iterator<Item = [String; 4]> {
+    merge.changed.iter().filter(|changed| !changed.is_plain_cast()).map(|changed| {
+        let typed = |dtype: Option<&str>, dims: &[u64]| match dtype {
+            Some(dtype) => format!("{dtype} {}", shape(dims)),
+            None => shape(dims),
+        };
+        let from = |dims: &Vec<u64>| typed(changed.cast.as_ref().map(|cast| cast.from), dims);
+        let to = typed(changed.cast.as_ref().map(|cast| cast.to), &changed.to);
+        [name(&changed.name), changed.how(), changed.from.as_ref().map_or_else(|| "new".to_owned(), from), to]
+    })
+}
+
 /// Name pattern, stored shape and expected shape of mismatched tensors, grouped by shapes.
 pub fn mismatched(load: &LoadReport) -> Vec<[String; 3]> {
     let mut alike: BTreeMap<(&[u64], &[u64]), Vec<&str>> = BTreeMap::new();

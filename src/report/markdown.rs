@@ -225,12 +225,13 @@ fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
         let (tensors, size) = (plural(merge.tensors, "tensor"), bytes(merge.bytes));
         let _ok = writeln!(out, "\n## Tensors\n\n{tensors}, {size}: {}", how.join(", "));
     }
-    if !merge.changed.is_empty() {
-        let from = |from: Option<&[u64]>| from.map_or_else(|| "new".to_owned(), shape);
-        let changed = merge.changed.iter();
-        let row = changed
-            .map(|c| [code(&name(&c.name)), c.transform.name().to_owned(), from(c.from.as_deref()), shape(&c.to)]);
-        table(out, ["changed tensor", "how", "from", "to"], &row.collect::<Vec<_>>(), cap);
+    for cast in merge.casts() {
+        let _ok = writeln!(out, "\n{cast}");
+    }
+    let changed: Vec<_> =
+        format::changed(merge).map(|[tensor, how, from, to]| [code(&tensor), how, from, to]).collect();
+    if !changed.is_empty() {
+        table(out, ["changed tensor", "how", "from", "to"], &changed, cap);
     }
     if !merge.dropped.is_empty() {
         let dropped = merge.dropped.iter();

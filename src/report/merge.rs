@@ -5,6 +5,7 @@ use std::fmt;
 
 use serde::{Serialize, Serializer};
 
+use crate::surgery::convert::CastLosses;
 use crate::surgery::plan::TensorTransform;
 
 /// The record of a merge.
@@ -142,6 +143,68 @@ pub struct ChangedTensor {
     pub from: Option<Vec<u64>>,
     /// Shape in the result.
     pub to: Vec<u64>,
+    /// Factor on all values.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
+    /// The cast of its values.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cast: Option<Cast>,
+    /// Values that scaling or casting could not keep; null before the tensor is written.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub losses: Option<CastLosses>,
+}
+
+impl ChangedTensor {
+    /// Whether its values were only cast, and all of them were kept.
+    #[must_use]
+    pub(crate) fn is_plain_cast(&self) -> bool {
+        let lost = self.losses.is_some_and(|losses| losses != CastLosses::default());
+        self.transform == TensorTransform::Convert && self.scale.is_none() && !lost
+    }
+
+    /// How its bytes were made, in words: `pad, scale 8, cast`.
+    #[must_use]
+    pub(crate) fn how(&self) -> String {
+        let fit = (self.transform != TensorTransform::Convert).then(|| self.transform.name().to_owned());
+        let scale = self.scale.map(|scale| format!("scale {scale}"));
+        let cast = self.cast.as_ref().map(|_| "cast".to_owned());
+        fit.into_iter().chain(scale).chain(cast).collect::<Vec<_>>().join(", ")
+    }
+}
+
+impl MergeReport {
+    /// One sentence for each pair of types of which values were cast: the number of tensors, and the lost values.
+    #[must_use]
+    pub(crate) fn casts(&self) -> Vec<String> {
+        let mut casts: BTreeMap<(&str, &str), (usize, Option<CastLosses>)> = BTreeMap::new();
+        for changed in &self.changed {
+            let Some(cast) = &changed.cast else { continue };
+            let (tensors, losses) = casts.entry((cast.from, cast.to)).or_default();
+            *tensors = tensors.saturating_add(1);
+            if let Some(more) = changed.losses {
+                losses.get_or_insert_default().add(more);
+            }
+        }
+        let sentence = |((from, to), (tensors, losses)): ((&str, &str), (usize, Option<CastLosses>))| {
+            let lost = losses.map(|lost| {
+                let CastLosses { overflow, underflow, nan } = lost;
+                format!("; {overflow} values overflowed to infinity, {underflow} underflowed to zero, {nan} are NaN")
+            });
+            let noun = if tensors == 1 { "tensor" } else { "tensors" };
+            format!("{tensors} {noun} cast from {from} to {to}{}", lost.unwrap_or_default())
+        };
+        casts.into_iter().map(sentence).collect()
+    }
+}
+
+/// Element types before and after a cast, as safetensors spells them.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct Cast {
+    /// Type in the donor.
+    pub from: &'static str,
+    /// Type in the result.
+    pub to: &'static str,
 }
 
 /// Donor tensors that the result does not contain.

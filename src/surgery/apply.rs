@@ -7,10 +7,11 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::Path;
 
+use super::convert::CastLosses;
 use super::donor::{DonorFile, DonorSnapshot};
 use super::error::{ApplyError, io_at};
 use super::leftover::Leftover;
-use super::plan::{Plan, PlannedFile, PlannedShard, PlannedTensor, TensorRef, TensorSource};
+use super::plan::{Plan, PlannedFile, PlannedShard, PlannedTensor, TensorRef, TensorTransform};
 use super::staging::Staging;
 use super::stop::interrupted;
 use super::stream::{BLOCK, stream};
@@ -106,7 +107,7 @@ fn write_content(
     let mut donor: Option<DonorFile> = None;
     for tensor in &shard.tensors {
         interrupted()?;
-        let from = tensor.source.donor();
+        let from = &tensor.source.from;
         // Adjacent tensors are usually in the same donor file, so it stays open.
         if donor.as_ref().is_none_or(|d| d.path != from.path) {
             donor = Some(DonorFile::open(&from.path)?);
@@ -159,15 +160,17 @@ impl ShardWriter<'_> {
         tensor: &PlannedTensor,
         progress: &mut dyn FnMut(u64),
     ) -> Result<(), ApplyError> {
-        if let TensorSource::Copy(from) = &tensor.source {
-            self.copy_range(donor, from, progress)?;
+        let losses = if tensor.transform() == TensorTransform::Copy {
+            self.copy_range(donor, &tensor.source.from, progress)?;
+            CastLosses::default()
         } else {
             let path = self.path;
-            stream(donor, tensor, path, self)?;
+            let losses = stream(donor, tensor, path, self)?;
             progress(tensor.len());
-        }
+            losses
+        };
         if let Some(digests) = &mut self.digests {
-            digests.end_tensor();
+            digests.end_tensor(losses);
         }
         Ok(())
     }

@@ -61,7 +61,7 @@ pub struct PlannedTensor {
     pub source: TensorSource,
 }
 
-/// A tensor of a donor, with its byte range.
+/// A tensor of a donor, or some of its rows, with the byte range.
 #[derive(Debug, Clone)]
 pub struct TensorRef {
     /// Donor role.
@@ -70,31 +70,43 @@ pub struct TensorRef {
     pub path: PathBuf,
     /// Name in the donor.
     pub name: String,
-    /// Shape in the donor.
+    /// Element type in the donor.
+    pub dtype: Dtype,
+    /// Shape of the part that is used.
     pub shape: Vec<u64>,
-    /// First byte, from the start of the file.
+    /// First byte of the part, from the start of the file.
     pub offset: u64,
-    /// Number of bytes.
+    /// Number of bytes of the part.
     pub len: u64,
+    /// The rows that are used, if not all.
+    pub slice: Option<RowSlice>,
 }
 
-/// Source of a tensor's bytes.
+/// Consecutive rows of a tensor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct RowSlice {
+    /// Index of the first row.
+    pub first: u64,
+    /// Number of rows of the whole tensor.
+    pub of: u64,
+}
+
+/// Source of a tensor's bytes: rows of a donor tensor, fitted to the shape of the planned tensor, multiplied by a constant,
+/// and cast to its type.
 #[derive(Debug, Clone)]
-pub enum TensorSource {
-    /// The donor's bytes, unchanged.
-    Copy(TensorRef),
-    /// The donor's values in the leading corner of a larger shape, zeros elsewhere.
-    Pad(TensorRef),
-    /// The donor's rows, then rows with the mean of the donor's rows.
-    GrowRows(TensorRef),
-    /// Seeded normal values with standard deviation 0.02; zeros for vectors (biases).
-    Reinit {
-        /// The tensor that it replaces.
-        instead_of: TensorRef,
-    },
+pub struct TensorSource {
+    /// The donor tensor that is used, or that [`TensorTransform::Reinit`] replaces.
+    pub from: TensorRef,
+    /// How it gets its shape: one of [`TensorTransform::FITS`].
+    pub fit: TensorTransform,
+    /// Factor on all values.
+    pub scale: Option<f64>,
 }
 
-/// How the bytes of a tensor are made from those of a donor.
+/// How the bytes of a tensor are made from those of a donor. All values except [`Self::Copy`] and [`Self::Reinit`] may also
+/// be scaled and cast.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -102,24 +114,30 @@ pub enum TensorSource {
 pub enum TensorTransform {
     /// The donor's bytes as they are.
     Copy,
+    /// The donor's values in their shape, scaled or cast.
+    Convert,
     /// The donor's rows, then rows that hold their mean.
     GrowRows,
+    /// The donor's rows, then seeded random rows with their mean and, times 1e-9, their covariance.
+    SampleRows,
     /// The donor's values in the leading corner, zeros elsewhere.
     Pad,
-    /// Seeded random values.
+    /// Seeded normal values with standard deviation 0.02; zeros for vectors (biases).
     Reinit,
 }
 
 impl TensorTransform {
-    /// All transforms.
-    pub const ALL: [Self; 4] = [Self::Copy, Self::GrowRows, Self::Pad, Self::Reinit];
+    /// The values of `fit` in a recipe.
+    pub const FITS: [Self; 5] = [Self::Copy, Self::GrowRows, Self::SampleRows, Self::Pad, Self::Reinit];
 
     /// The name in recipes, options and reports.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Copy => "copy",
+            Self::Convert => "convert",
             Self::GrowRows => "grow-rows",
+            Self::SampleRows => "sample-rows",
             Self::Pad => "pad",
             Self::Reinit => "reinit",
         }
@@ -127,22 +145,21 @@ impl TensorTransform {
 }
 
 impl TensorSource {
-    /// The transform of this source.
+    /// The bytes of a donor tensor, unchanged.
     #[must_use]
-    pub const fn transform(&self) -> TensorTransform {
-        match self {
-            Self::Copy(_) => TensorTransform::Copy,
-            Self::Pad(_) => TensorTransform::Pad,
-            Self::GrowRows(_) => TensorTransform::GrowRows,
-            Self::Reinit { .. } => TensorTransform::Reinit,
-        }
+    pub const fn copy(from: TensorRef) -> Self {
+        Self { from, fit: TensorTransform::Copy, scale: None }
     }
+}
 
-    /// The donor tensor that is transformed or replaced.
+impl PlannedTensor {
+    /// How its bytes are made.
     #[must_use]
-    pub const fn donor(&self) -> &TensorRef {
-        match self {
-            Self::Copy(t) | Self::Pad(t) | Self::GrowRows(t) | Self::Reinit { instead_of: t } => t,
+    pub fn transform(&self) -> TensorTransform {
+        let converts = self.source.scale.is_some() || self.dtype != self.source.from.dtype;
+        match self.source.fit {
+            TensorTransform::Copy if converts => TensorTransform::Convert,
+            fit => fit,
         }
     }
 }

@@ -1,47 +1,64 @@
-//! Tensors that are not byte copies: padding, added rows, reinitialised values.
+//! The bytes of a planned tensor: the donor's rows, fitted to the shape, scaled and cast.
 //!
 //! Each function streams into a writer and keeps at most a few rows in memory.
 
 use std::io::{self, Write};
 
-use half::{bf16, f16};
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
-use rand_distr::{Distribution, Normal};
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use rand_distr::{Distribution, Normal, StandardNormal};
 use sha2::{Digest, Sha256};
 
+use super::convert::{CastLosses, Converter};
+use super::plan::{PlannedTensor, TensorTransform};
+use super::values::Codec;
 use crate::checkpoint::Dtype;
 
 /// Standard deviation of reinitialised weights: the usual `initializer_range` of transformers.
 const INIT_STD: f64 = 0.02;
 
-/// Whether values of `dtype` can be computed, not only copied.
-#[must_use]
-pub const fn can_compute(dtype: Dtype) -> bool {
-    matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64)
+/// Factor on the covariance of sampled rows. Source: `_init_added_embeddings_weights_with_mean` in transformers 4.47 to 5.23.
+const SAMPLE_VARIANCE: f64 = 1e-9;
+/// Donor rows that a sampled row combines.
+const SAMPLE_TERMS: u32 = 64;
+
+/// Writes the bytes of a planned tensor; returns the values that its cast could not keep.
+///
+/// `read` reads the part of the donor tensor that is used.
+///
+/// # Errors
+/// Errors of reading or writing.
+pub fn write(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<CastLosses> {
+    let source = &tensor.source;
+    if source.fit == TensorTransform::Reinit {
+        reinit(&tensor.name, tensor.dtype, &tensor.shape, out)?;
+        return Ok(CastLosses::default());
+    }
+    if tensor.dtype == source.from.dtype && source.scale.is_none() {
+        fit(read, tensor, out)?;
+        return Ok(CastLosses::default());
+    }
+    let mut converter = Converter::new(source.from.dtype, tensor.dtype, source.scale, out);
+    fit(read, tensor, &mut converter)?;
+    Ok(converter.losses())
 }
 
-/// Encodes one value.
-fn encode(dtype: Dtype, value: f64, out: &mut Vec<u8>) {
-    match dtype {
-        Dtype::F16 => out.extend_from_slice(&f16::from_f64(value).to_le_bytes()),
-        Dtype::BF16 => out.extend_from_slice(&bf16::from_f64(value).to_le_bytes()),
-        #[expect(clippy::cast_possible_truncation, reason = "rounding to the tensor's own precision is the point")]
-        Dtype::F32 => out.extend_from_slice(&(value as f32).to_le_bytes()),
-        _ => out.extend_from_slice(&value.to_le_bytes()),
-    }
-}
-
-/// Decodes whole elements; a partial element at the end is ignored.
-fn decode(dtype: Dtype, bytes: &[u8]) -> Vec<f64> {
-    fn each<const N: usize>(bytes: &[u8], f: impl Fn([u8; N]) -> f64) -> Vec<f64> {
-        bytes.as_chunks::<N>().0.iter().map(|c| f(*c)).collect()
-    }
-    match dtype {
-        Dtype::F16 => each::<2>(bytes, |b| f16::from_le_bytes(b).to_f64()),
-        Dtype::BF16 => each::<2>(bytes, |b| bf16::from_le_bytes(b).to_f64()),
-        Dtype::F32 => each::<4>(bytes, |b| f64::from(f32::from_le_bytes(b))),
-        _ => each::<8>(bytes, f64::from_le_bytes),
+/// Writes the donor's values in the planned shape, in the donor's type.
+fn fit(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<()> {
+    let from = &tensor.source.from;
+    let to = &tensor.shape;
+    let rows = from.shape.first().copied().unwrap_or_default();
+    let table = Table {
+        dtype: from.dtype,
+        rows,
+        width: to.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d)),
+        more: to.first().copied().unwrap_or_default().saturating_sub(rows),
+    };
+    match tensor.source.fit {
+        TensorTransform::Pad => pad(read, from.dtype.bits() / 8, &from.shape, to, out),
+        TensorTransform::GrowRows => grow_rows(read, table, out),
+        TensorTransform::SampleRows => sample_rows(read, table, &tensor.name, out),
+        TensorTransform::Copy | TensorTransform::Convert | TensorTransform::Reinit => copy(read, 0, from.len, out),
     }
 }
 
@@ -122,68 +139,133 @@ pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut
     inner(read, &mut 0, elem, from, to, out)
 }
 
-/// Copies `rows` rows of `width` elements and appends `more` rows, each the mean of the copied ones.
-///
-/// transformers initialises added tokens with the same mean plus noise (`mean_resizing`). Without noise, two runs give
-/// the same bytes.
+/// A donor's matrix that gets more rows.
+#[derive(Debug, Clone, Copy)]
+pub struct Table {
+    /// Type of its values.
+    pub dtype: Dtype,
+    /// Rows of the donor.
+    pub rows: u64,
+    /// Values in a row.
+    pub width: u64,
+    /// Rows to append.
+    pub more: u64,
+}
+
+impl Table {
+    /// Bytes of a row.
+    fn row_len(self) -> io::Result<usize> {
+        usize::try_from(self.width.saturating_mul(self.dtype.bits() / 8)).map_err(io::Error::other)
+    }
+
+    /// Copies the rows and returns their mean; zeros without rows.
+    fn copy_rows(self, read: &mut ReadAt<'_>, codec: &mut Codec, out: &mut dyn Write) -> io::Result<Vec<f64>> {
+        let mut row = vec![0_u8; self.row_len()?];
+        let mut mean = vec![0_f64; usize::try_from(self.width).map_err(io::Error::other)?];
+        let mut at = 0_u64;
+        for _ in 0..self.rows {
+            read(at, &mut row)?;
+            out.write_all(&row)?;
+            for (sum, value) in mean.iter_mut().zip(codec.decode(self.dtype, &row)) {
+                *sum += *value;
+            }
+            at = at.saturating_add(row.len() as u64);
+        }
+        #[expect(clippy::cast_precision_loss, reason = "row counts are far below 2^52")]
+        let count = self.rows.max(1) as f64;
+        for sum in &mut mean {
+            *sum /= count;
+        }
+        Ok(mean)
+    }
+}
+
+/// Copies the rows and appends rows that hold their mean.
 ///
 /// # Errors
 /// Errors of reading or writing.
-pub fn grow_rows(
-    read: &mut ReadAt<'_>,
-    dtype: Dtype,
-    rows: u64,
-    width: u64,
-    more: u64,
-    out: &mut dyn Write,
-) -> io::Result<()> {
-    let row_len = usize::try_from(width.saturating_mul(dtype.bits() / 8)).map_err(io::Error::other)?;
-    let mut row = vec![0_u8; row_len];
-    let mut sums = vec![0_f64; usize::try_from(width).map_err(io::Error::other)?];
-    let mut at = 0_u64;
-    for _ in 0..rows {
-        read(at, &mut row)?;
+pub fn grow_rows(read: &mut ReadAt<'_>, table: Table, out: &mut dyn Write) -> io::Result<()> {
+    let mut codec = Codec::default();
+    let mean = table.copy_rows(read, &mut codec, out)?;
+    let mut row = Vec::new();
+    codec.encode_values(table.dtype, &mean, &mut row);
+    for _ in 0..table.more {
         out.write_all(&row)?;
-        for (sum, v) in sums.iter_mut().zip(decode(dtype, &row)) {
-            *sum += v;
-        }
-        at = at.saturating_add(row_len as u64);
-    }
-    #[expect(clippy::cast_precision_loss, reason = "row counts are far below 2^52")]
-    let count = rows.max(1) as f64;
-    let mut mean = Vec::with_capacity(row_len);
-    for sum in sums {
-        encode(dtype, sum / count, &mut mean);
-    }
-    for _ in 0..more {
-        out.write_all(&mean)?;
     }
     Ok(())
 }
 
-/// Writes reinitialised values: normal with standard deviation 0.02 for matrices, zeros for vectors.
+/// Copies the rows and appends rows with their mean and, times 1e-9, their covariance, as transformers initialises added
+/// tokens (`mean_resizing`).
 ///
-/// The generator is seeded with the tensor's name, so that merges are reproducible.
+/// A new row is `mean + sqrt(1e-9 / k) * sum of g * (x - mean)` over `k` = 64 rows `x`, drawn with replacement, and standard
+/// normal numbers `g`. Its mean and covariance are exactly those of transformers, without a matrix of `width` squared
+/// values in memory. The generator is seeded with the name of the tensor.
+///
+/// # Errors
+/// Errors of reading or writing.
+pub fn sample_rows(read: &mut ReadAt<'_>, table: Table, name: &str, out: &mut dyn Write) -> io::Result<()> {
+    let mut codec = Codec::default();
+    let mean = table.copy_rows(read, &mut codec, out)?;
+    let mut rng = seeded(name);
+    let factor = (SAMPLE_VARIANCE / f64::from(SAMPLE_TERMS)).sqrt();
+    let mut donor_row = vec![0_u8; table.row_len()?];
+    let mut row = Vec::new();
+    for _ in 0..table.more {
+        let mut values = mean.clone();
+        for _ in 0..if table.rows == 0 { 0 } else { SAMPLE_TERMS } {
+            let g: f64 = StandardNormal.sample(&mut rng);
+            let weight = factor * g;
+            read(below(&mut rng, table.rows).saturating_mul(donor_row.len() as u64), &mut donor_row)?;
+            for ((value, x), mean) in values.iter_mut().zip(codec.decode(table.dtype, &donor_row)).zip(&mean) {
+                *value += weight * (*x - mean);
+            }
+        }
+        row.clear();
+        codec.encode_values(table.dtype, &values, &mut row);
+        out.write_all(&row)?;
+    }
+    Ok(())
+}
+
+/// The generator for the fresh values of a tensor, seeded with its name, so that merges are reproducible.
+fn seeded(name: &str) -> ChaCha8Rng {
+    ChaCha8Rng::from_seed(Sha256::digest(name.as_bytes()).into())
+}
+
+/// A number from 0 to below `limit`. The bias is below 2^-32 for limits below 2^32.
+fn below(rng: &mut ChaCha8Rng, limit: u64) -> u64 {
+    let product = u128::from(rng.next_u64()).wrapping_mul(u128::from(limit));
+    u64::try_from(product >> 64).unwrap_or_default()
+}
+
+/// Writes reinitialised values: normal with standard deviation 0.02 for matrices, zeros for vectors.
 ///
 /// # Errors
 /// Errors of writing.
 pub fn reinit(name: &str, dtype: Dtype, shape: &[u64], out: &mut dyn Write) -> io::Result<()> {
-    let count = shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
+    let mut left = shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
     if shape.len() < 2 {
-        return zeros(out, count.saturating_mul(dtype.bits() / 8));
+        return zeros(out, left.saturating_mul(dtype.bits() / 8));
     }
-    let mut rng = ChaCha8Rng::from_seed(Sha256::digest(name.as_bytes()).into());
+    let mut rng = seeded(name);
     let normal = Normal::new(0.0, INIT_STD).map_err(io::Error::other)?;
-    let mut block = Vec::new();
-    for i in 0..count {
-        encode(dtype, normal.sample(&mut rng), &mut block);
-        if block.len() >= 64 * 1024 || i.saturating_add(1) == count {
-            out.write_all(&block)?;
-            block.clear();
-        }
+    let mut codec = Codec::default();
+    let (mut values, mut block) = (Vec::new(), Vec::new());
+    while left > 0 {
+        let n = usize::try_from(left).map_or(RANDOM_BLOCK, |n| n.min(RANDOM_BLOCK));
+        values.clear();
+        values.extend((0..n).map(|_| normal.sample(&mut rng)));
+        block.clear();
+        codec.encode_values(dtype, &values, &mut block);
+        out.write_all(&block)?;
+        left = left.saturating_sub(n as u64);
     }
     Ok(())
 }
+
+/// Random values computed at a time.
+const RANDOM_BLOCK: usize = 8 * 1024;
 
 #[cfg(test)]
 mod tests {
@@ -214,8 +296,50 @@ mod tests {
         let values = [1.0_f32, 2.0, 3.0, 6.0];
         let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
         let mut out = Vec::new();
-        grow_rows(&mut reader(bytes), Dtype::F32, 2, 2, 2, &mut out).unwrap();
-        assert_eq!(decode(Dtype::F32, &out), [1.0, 2.0, 3.0, 6.0, 2.0, 4.0, 2.0, 4.0]);
+        let table = Table { dtype: Dtype::F32, rows: 2, width: 2, more: 2 };
+        grow_rows(&mut reader(bytes), table, &mut out).unwrap();
+        assert_eq!(*Codec::default().decode(Dtype::F32, &out), [1.0, 2.0, 3.0, 6.0, 2.0, 4.0, 2.0, 4.0]);
+    }
+
+    #[test]
+    fn sampled_rows_have_the_mean_and_the_covariance_of_the_others() {
+        // Two columns of opposite sign, so that their covariance is negative.
+        let rows: Vec<[f64; 2]> = (0..100).map(|i| f64::from(i) - 49.5).map(|x| [3.0 + x, 5.0 - 2.0 * x]).collect();
+        let bytes: Vec<u8> = rows.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+        let table = Table { dtype: Dtype::F64, rows: 100, width: 2, more: 4000 };
+        let make = |name| {
+            let mut out = Vec::new();
+            sample_rows(&mut reader(bytes.clone()), table, name, &mut out).unwrap();
+            out
+        };
+        let out = make("a");
+        assert_eq!(out, make("a"));
+        assert_ne!(out, make("b"));
+        assert_eq!(out[..bytes.len()], bytes);
+        let values = Codec::default().decode(Dtype::F64, &out[bytes.len()..]).clone();
+        let fresh: Vec<&[f64]> = values.chunks(2).collect();
+        assert_ne!(fresh[0], fresh[1]);
+        let mean = |i: usize| fresh.iter().map(|row| row[i]).sum::<f64>() / 4000.0;
+        let product = |i: usize, j: usize| {
+            fresh.iter().map(|row| (row[i] - mean(i)) * (row[j] - mean(j))).sum::<f64>() / 4000.0 / SAMPLE_VARIANCE
+        };
+        assert!((mean(0) - 3.0).abs() < 1e-4 && (mean(1) - 5.0).abs() < 1e-4, "{} {}", mean(0), mean(1));
+        // The variance of 0..100 is 833.25; 4000 samples estimate it to a few per cent.
+        for (i, j, want) in [(0, 0, 833.25), (0, 1, -1666.5), (1, 1, 3333.0)] {
+            assert!((product(i, j) / want - 1.0).abs() < 0.1, "{i} {j}: {}", product(i, j));
+        }
+    }
+
+    #[test]
+    fn rows_appended_to_none_are_zero() {
+        let table = Table { dtype: Dtype::F16, rows: 0, width: 3, more: 2 };
+        for sample in [false, true] {
+            let mut out = Vec::new();
+            let mut read = reader(Vec::new());
+            if sample { sample_rows(&mut read, table, "a", &mut out) } else { grow_rows(&mut read, table, &mut out) }
+                .unwrap();
+            assert_eq!(out, [0; 12]);
+        }
     }
 
     #[test]
@@ -227,7 +351,7 @@ mod tests {
         };
         assert_eq!(make("a"), make("a"));
         assert_ne!(make("a"), make("b"));
-        let values = decode(Dtype::BF16, &make("a"));
+        let values = Codec::default().decode(Dtype::BF16, &make("a")).clone();
         let spread = (values.iter().map(|v| v * v).sum::<f64>() / 4096.0).sqrt();
         assert!((spread - INIT_STD).abs() < 0.002, "{spread}");
         let mut bias = Vec::new();

@@ -2,6 +2,7 @@
 
 use sha2::{Digest as _, Sha256};
 
+use super::convert::CastLosses;
 use super::plan::PlannedFile;
 use crate::checkpoint::{FileName, hex};
 
@@ -23,6 +24,8 @@ pub struct WrittenShard {
 pub struct WrittenTensor {
     /// SHA-256 of its bytes in hexadecimal.
     pub sha256: String,
+    /// Values of the donor that scaling and casting could not keep.
+    pub losses: CastLosses,
 }
 
 /// Digests of the shard that is being written.
@@ -46,9 +49,9 @@ impl ShardDigests {
     }
 
     /// Ends the current tensor.
-    pub(super) fn end_tensor(&mut self) {
+    pub(super) fn end_tensor(&mut self, losses: CastLosses) {
         let sha256 = hex(&self.tensor.finalize_reset());
-        self.tensors.push(WrittenTensor { sha256 });
+        self.tensors.push(WrittenTensor { sha256, losses });
     }
 
     /// The record of the shard.

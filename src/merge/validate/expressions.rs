@@ -7,13 +7,14 @@ use crate::knowledge::expression::{FunctionCall, References, is_function};
 use crate::knowledge::recipe::{DocumentEdit, FileSpec};
 use crate::knowledge::source::{DataError, hint, nearest};
 use crate::knowledge::{Expression, Template};
+use crate::merge::dtypes::FLOAT_NAMES;
 use crate::surgery::plan::TensorTransform;
 
 /// Names of CEL's types, which expressions may compare with `type(…)`.
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
 
 /// Functions of a merge's scope, with a role as the first argument.
-const ROLE_FUNCTIONS: [&str; 2] = ["shape", "has"];
+const ROLE_FUNCTIONS: [&str; 3] = ["shape", "has", "dtype"];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
@@ -31,8 +32,15 @@ impl Validator<'_> {
             }
         }
         self.all(|key, expression| self.expression(key, expression, &variables))?;
-        for fit in self.recipe.tensors.iter().filter_map(|tensor| tensor.fit.as_ref()) {
-            self.fit(fit)?;
+        for tensor in &self.recipe.tensors {
+            self.one_of("fit", "treatment", tensor.fit.as_ref(), &TensorTransform::FITS.map(TensorTransform::name))?;
+            self.one_of("dtype", "dtype", tensor.dtype.as_ref(), &FLOAT_NAMES)?;
+        }
+        let edits = self.recipe.documents.iter().flat_map(|document| &document.edits);
+        for edit in edits {
+            if let DocumentEdit::Dtype(dtype) = edit {
+                self.one_of("to", "dtype", Some(&dtype.to), &FLOAT_NAMES)?;
+            }
         }
         Ok(())
     }
@@ -67,12 +75,16 @@ impl Validator<'_> {
                         some("when", tokens.when.as_ref())?;
                     }
                     DocumentEdit::Graft(graft) => template("at", &graft.at)?,
+                    DocumentEdit::Dtype(dtype) => check("to", &dtype.to)?,
                 }
             }
         }
         for tensor in &self.recipe.tensors {
             some("when", tensor.when.as_ref())?;
             some("fit", tensor.fit.as_ref())?;
+            some("dtype", tensor.dtype.as_ref())?;
+            some("scale", tensor.scale.as_ref())?;
+            some("slice", tensor.slice.as_ref())?;
             tensor.rename.as_ref().map_or(Ok(()), |rename| template("as", rename))?;
         }
         for file in &self.recipe.files {
@@ -111,7 +123,7 @@ impl Validator<'_> {
                     .map(|near| format!("; did you mean `{near}`?"));
                 return wrong(format!("unknown function `{function}`{}", near.unwrap_or_default()));
             }
-            let role = arguments.first().and_then(Option::as_deref).filter(|_| arguments.len() == 2);
+            let role = arguments.first().and_then(Option::as_deref);
             if let Some(role) = role.filter(|_| ROLE_FUNCTIONS.contains(&function.as_str()))
                 && !self.role_names().contains(&role)
             {
@@ -150,13 +162,13 @@ impl Validator<'_> {
         ["length", "scattered"].into_iter().chain(lets).chain(runs).collect()
     }
 
-    /// The strings in `fit` that may be its value.
-    fn fit(&self, fit: &Expression) -> Result<(), DataError> {
-        let known = TensorTransform::ALL.map(TensorTransform::name);
-        match fit.references().results.iter().find(|result| !known.contains(&result.as_str())) {
+    /// Fails unless the strings that may be the value of an expression are among the known words of a kind.
+    fn one_of(&self, key: &str, what: &str, expression: Option<&Expression>, known: &[&str]) -> Result<(), DataError> {
+        let Some(expression) = expression else { return Ok(()) };
+        match expression.references().results.iter().find(|result| !known.contains(&result.as_str())) {
             Some(word) => {
-                let reason = format!("unknown treatment `{word}` in `fit`; {}", hint(word, &known));
-                Err(self.wrong("fit", fit.source(), reason))
+                let reason = format!("unknown {what} `{word}` in `{key}`; {}", hint(word, known));
+                Err(self.wrong(key, expression.source(), reason))
             }
             None => Ok(()),
         }

@@ -19,6 +19,7 @@ impl Validator<'_> {
             }
             DocumentEdit::Tokens(tokens) => self.place(&tokens.at, |at| misplaced(at, false)),
             DocumentEdit::Remove(remove) => remove.at.iter().try_for_each(|at| self.place(at, malformed)),
+            DocumentEdit::Dtype(_) => Ok(()),
         }
     }
 

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::super::Style;
-use super::super::format::{bytes, more, name, plural, sentence, shape, wrap};
+use super::super::format::{self, bytes, more, name, plural, sentence, shape, wrap};
 use super::super::model::{MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
 use super::paint::Paint;
@@ -89,21 +89,13 @@ fn changed(out: &mut String, merge: &MergeReport, style: Style) {
     }
     let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
     let _ok = writeln!(out, "\n  tensors: {}", how.join(", "));
-    if merge.changed.is_empty() {
+    for cast in merge.casts() {
+        let _ok = writeln!(out, "  {cast}");
+    }
+    let rows: Vec<_> = format::changed(merge).collect();
+    if rows.is_empty() {
         return;
     }
-    let rows: Vec<_> = merge
-        .changed
-        .iter()
-        .map(|c| {
-            [
-                name(&c.name),
-                c.transform.name().to_owned(),
-                c.from.as_deref().map_or_else(|| "new".to_owned(), shape),
-                shape(&c.to),
-            ]
-        })
-        .collect();
     table(out, ["changed tensor", "how", "from", "to"], &rows, style);
 }
 

@@ -290,13 +290,15 @@ impl RepairDraft {
             name: t.name.clone(),
             dtype: t.dtype,
             shape: t.shape.clone(),
-            source: TensorSource::Copy(TensorRef {
+            source: TensorSource::copy(TensorRef {
                 donor: String::new(),
                 path: path.clone(),
                 name: t.name.clone(),
+                dtype: t.dtype,
                 shape: t.shape.clone(),
                 offset: shard.data_start.saturating_add(t.begin),
                 len: t.len(),
+                slice: None,
             }),
         });
         let metadata = shard.metadata.clone().unwrap_or_default();

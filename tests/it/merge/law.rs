@@ -5,6 +5,7 @@
 
 mod donors;
 mod recipes;
+mod tensors;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;

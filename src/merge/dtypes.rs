@@ -1,0 +1,62 @@
+//! Floating-point types of donors and results.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use crate::checkpoint::{Checkpoint, Dtype};
+
+/// The types to which values can be cast, as torch names them.
+pub(super) const FLOAT_NAMES: [&str; 4] = ["bfloat16", "float16", "float32", "float64"];
+
+/// The type that torch gives this name; only types to which values can be cast.
+pub(super) fn from_name(name: &str) -> Option<Dtype> {
+    [Dtype::BF16, Dtype::F16, Dtype::F32, Dtype::F64].into_iter().find(|dtype| float_name(*dtype) == Some(name))
+}
+
+/// The name in torch of a type to which values can be cast.
+fn float_name(dtype: Dtype) -> Option<&'static str> {
+    match dtype {
+        Dtype::BF16 => Some("bfloat16"),
+        Dtype::F16 => Some("float16"),
+        Dtype::F32 => Some("float32"),
+        Dtype::F64 => Some("float64"),
+        _ => None,
+    }
+}
+
+/// The floating-point type of most bytes of a checkpoint, as torch names it; `None` without such tensors.
+pub(super) fn of_most_bytes(checkpoint: &Checkpoint) -> Option<&'static str> {
+    let mut bytes: BTreeMap<Dtype, u64> = BTreeMap::new();
+    for (_, tensor) in checkpoint.tensors().filter(|(_, t)| float_name(t.dtype).is_some()) {
+        let sum = bytes.entry(tensor.dtype).or_default();
+        *sum = sum.saturating_add(tensor.len());
+    }
+    bytes.into_iter().max_by_key(|(_, bytes)| *bytes).and_then(|(dtype, _)| float_name(dtype))
+}
+
+/// Sets every `torch_dtype` and `dtype` of a config and of the configs in it; adds `torch_dtype` if it has neither.
+///
+/// Versions of transformers before 4.56 read `torch_dtype`, later ones prefer `dtype`; with `torch_dtype="auto"` they take
+/// that of the top, and older ones those of nested configs.
+pub(super) fn set(config: &mut Value, name: &str) {
+    set_existing(config, name);
+    if let Value::Object(map) = config
+        && !KEYS.iter().any(|key| map.contains_key(*key))
+    {
+        map.insert("torch_dtype".to_owned(), name.into());
+    }
+}
+
+const KEYS: [&str; 2] = ["torch_dtype", "dtype"];
+
+fn set_existing(config: &mut Value, name: &str) {
+    let Value::Object(map) = config else { return };
+    for (key, value) in map {
+        if KEYS.contains(&key.as_str()) && (value.is_string() || value.is_null()) {
+            *value = name.into();
+        } else if key.ends_with("_config") {
+            set_existing(value, name);
+        }
+    }
+}
