@@ -1,6 +1,8 @@
 //! The law of planned tensors: whatever their types, shapes, slices, factors and treatment, the bytes that are streamed are
 //! those of an implementation that holds all values and rounds by comparing neighbours.
 
+#![expect(clippy::cast_precision_loss, clippy::float_cmp, reason = "mantissas and ties are exact")]
+
 use std::path::PathBuf;
 
 use ckpt_doctor::checkpoint::{Dtype, byte_len};
@@ -74,7 +76,7 @@ struct Case {
 fn case(random: &mut Draw) -> Case {
     let (from, to) = (TYPES[random.below(4)], TYPES[random.below(4)]);
     let fit = TensorTransform::FITS[random.below(4)];
-    let shape: Vec<u64> = (0..1 + random.below(3)).map(|_| random.below(6) as u64).collect();
+    let shape: Vec<u64> = (0..=random.below(3)).map(|_| random.below(6) as u64).collect();
     let mut wanted = shape.clone();
     match fit {
         TensorTransform::Pad => wanted.iter_mut().for_each(|dim| *dim += random.below(4) as u64),
@@ -88,7 +90,7 @@ fn case(random: &mut Draw) -> Case {
     for _ in 0..count {
         let bits = ((random.below(1 << 32) as u64) << 32) | random.below(1 << 32) as u64;
         // Half of the values have a usual magnitude, so that products and means are finite.
-        let bits = if random.below(2) == 0 { nearest(from, (bits as i64) as f64 / 2_f64.powi(62)) } else { bits };
+        let bits = if random.below(2) == 0 { nearest(from, bits.cast_signed() as f64 / 2_f64.powi(62)) } else { bits };
         bytes.extend_from_slice(&bits.to_le_bytes()[..width]);
     }
     let scale = [None, Some(64.0), Some(1.0 / 3.0), Some(-2e6)][random.below(4)];
