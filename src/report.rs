@@ -5,6 +5,7 @@
 #[cfg(feature = "cli")]
 pub mod baseline;
 mod build;
+pub(crate) mod card;
 #[cfg(feature = "cli")]
 mod ci;
 mod collapse;

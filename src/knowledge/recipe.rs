@@ -366,6 +366,10 @@ pub struct TensorSpec {
     /// Reason for leaving the tensors out.
     #[serde(default)]
     pub drop: Option<String>,
+    /// Whether the tensors must be trained even if they are copied, as a projector in front of another language model. A
+    /// tensor with padded, appended or new values is always one to train.
+    #[serde(default)]
+    pub train: bool,
     /// Donor tensor that it must match, for the message.
     #[serde(default)]
     pub meets: Option<SeamTensor>,

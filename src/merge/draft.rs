@@ -1,5 +1,6 @@
 //! The draft of a merge: plan, documents, and facts for the report.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -19,6 +20,8 @@ pub(super) struct MergeDraft {
     pub(super) seams: Vec<Seam>,
     /// Tensors that are not byte copies.
     pub(super) changed: Vec<ChangedTensor>,
+    /// Names of the tensors that must be trained.
+    pub(super) train: BTreeSet<String>,
     /// Donor tensors that are not in the result.
     pub(super) dropped: Vec<Dropped>,
     /// Repairs of donor documents.

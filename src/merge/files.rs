@@ -81,7 +81,7 @@ fn bytes_of(document: &Document) -> Arc<[u8]> {
 /// Names that the merge gives to its own files, in any case.
 pub(super) fn is_own(name: &str) -> bool {
     let lower = name.to_ascii_lowercase();
-    [&*manifest::NAME, &*REPORT].contains(&lower.as_str())
+    [&*manifest::NAME, &*REPORT, "readme.md"].contains(&lower.as_str())
         || lower.ends_with(".safetensors")
         || lower.ends_with(".safetensors.index.json")
 }

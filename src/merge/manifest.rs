@@ -1,15 +1,22 @@
 //! `merge-manifest.json`: what went into a merged checkpoint, so that it can be made again and compared.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
+use sha2::{Digest as _, Sha256};
 
+use super::CARD;
 use super::context::{Donor, Options};
-use crate::checkpoint::{Checkpoint, FileName};
+use super::hub::HubOrigin;
+use super::record::Recorded;
+use super::run::MergeRun;
+use crate::checkpoint::tokenizer::VOCABULARY_FILES;
+use crate::checkpoint::{Checkpoint, FileName, Shard, hex};
 use crate::knowledge::recipe::Recipe;
-use crate::report::model::ToolInfo;
+use crate::knowledge::source;
+use crate::report::model::{ToolInfo, Training};
 use crate::surgery::ApplyError;
-use crate::surgery::donor::sha256;
+use crate::surgery::donor::{digest_own, sha256};
 use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorTransform};
 use crate::surgery::written::WrittenShard;
 
@@ -18,8 +25,8 @@ pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 
 /// `merge-manifest.json`: how a merged checkpoint was made.
 ///
-/// Donors are named by their role and hashes, never by a path, so that the same merge made elsewhere has the same
-/// manifest.
+/// Donors are named by their role, their origin on the Hub and the digests of their files, never by a path, so that the
+/// same merge made elsewhere has the same manifest.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct Manifest {
@@ -27,12 +34,14 @@ pub(crate) struct Manifest {
     pub schema: u32,
     /// The program that made the merge.
     pub tool: ToolInfo,
-    /// Name of the recipe.
-    pub recipe: String,
+    /// The recipe.
+    pub recipe: RecipeDigest,
     /// Options in effect, defaults included.
     pub options: Options,
-    /// The files of each donor, by role.
-    pub donors: BTreeMap<String, DonorFiles>,
+    /// The donors, by role.
+    pub donors: BTreeMap<String, DonorDigests>,
+    /// Tensors to train, and to freeze meanwhile.
+    pub training: Training,
     /// Every file of the result except this one, by file name.
     pub files: BTreeMap<String, FileDigest>,
     /// Every tensor of the result, in the order of the shards.
@@ -49,12 +58,28 @@ pub(crate) struct FileDigest {
     pub sha256: String,
 }
 
-/// The files of a donor that were read.
+/// The recipe of a merge.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
-pub(crate) struct DonorFiles {
-    /// SHA-256 of each document, by file name.
-    pub documents: BTreeMap<String, String>,
+pub(crate) struct RecipeDigest {
+    /// Its name.
+    pub name: String,
+    /// SHA-256 of its file.
+    pub sha256: String,
+    /// Text of its file; missing for a recipe of the program.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub text: Option<String>,
+}
+
+/// A donor, identified by the content of the files that were read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct DonorDigests {
+    /// Its origin on the Hugging Face Hub, where the files or the folder tell.
+    #[serde(skip_serializing_if = "HubOrigin::is_unknown")]
+    pub hub: HubOrigin,
+    /// Its documents, modules and tokenizer files, and its model card, by file name.
+    pub files: BTreeMap<String, FileDigest>,
     /// The shards, by file name.
     pub shards: BTreeMap<String, DonorShard>,
 }
@@ -110,29 +135,40 @@ pub(crate) struct DonorTensor {
     /// The rows that were used, if not all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub slice: Option<RowSlice>,
+    /// SHA-256 of this part; missing if they were copied, so that the digest is the one of the result, or not read.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sha256: Option<String>,
 }
 
-/// The files of each donor, by role. With `all_bytes`, whole shards are hashed, otherwise only their headers.
+/// The donors by content. With `all_bytes`, whole shards are hashed, otherwise only their headers.
 ///
 /// # Errors
 /// When a donor's file cannot be read, or a signal arrived.
-pub(super) fn donor_digests(donors: &[Donor], all_bytes: bool) -> Result<BTreeMap<String, DonorFiles>, ApplyError> {
-    donors.iter().map(|donor| Ok((donor.role.clone(), donor_files(&donor.checkpoint, all_bytes)?))).collect()
+pub(super) fn donor_digests(
+    donors: &[Donor],
+    plan: &Plan,
+    all_bytes: bool,
+) -> Result<BTreeMap<String, DonorDigests>, ApplyError> {
+    let digests = |donor: &Donor| {
+        let hub = HubOrigin::find(&donor.checkpoint);
+        let files = small_files(&donor.checkpoint, plan)?;
+        Ok((donor.role.clone(), DonorDigests { hub, files, shards: shards(&donor.checkpoint, all_bytes)? }))
+    };
+    donors.iter().map(digests).collect()
 }
 
-/// The manifest of a merge whose shards are written; `others` are its other files.
-pub(super) fn manifest<'f>(
-    recipe: &Recipe,
-    options: &Options,
-    donors: &BTreeMap<String, DonorFiles>,
-    plan: &Plan,
+/// The manifest of a merge whose shards are written; `described` are the other files of its record.
+pub(super) fn manifest(
+    merge: &Recorded<'_>,
+    run: &MergeRun,
     written: &[WrittenShard],
-    others: impl Iterator<Item = &'f PlannedFile>,
+    described: &[&PlannedFile],
 ) -> Manifest {
+    let others = merge.plan.files.iter().chain(described.iter().copied());
     let shards = written.iter().map(|s| (s.name.to_string(), FileDigest { bytes: s.bytes, sha256: s.sha256.clone() }));
     let others = others.map(|f| (f.name.to_string(), FileDigest { bytes: f.bytes.len() as u64, sha256: f.sha256() }));
     let digests = written.iter().flat_map(|shard| &shard.tensors);
-    let tensors = plan.tensors().zip(digests).map(|((shard, t), written)| {
+    let tensors = merge.plan.tensors().zip(digests).map(|((shard, t), written)| {
         let from = &t.source.from;
         TensorOrigin {
             name: t.name.clone(),
@@ -148,31 +184,53 @@ pub(super) fn manifest<'f>(
                 dtype: from.dtype.name().to_owned(),
                 shape: from.shape.clone(),
                 slice: from.slice,
+                sha256: written.source_sha256.clone(),
             },
         }
     });
     Manifest {
         schema: 2,
         tool: ToolInfo::this(),
-        recipe: recipe.recipe.clone(),
-        options: options.clone(),
-        donors: donors.clone(),
+        recipe: recipe_digest(merge.recipe),
+        options: run.record.options.clone(),
+        donors: merge.digests.clone(),
+        training: run.record.training.clone().unwrap_or_default(),
         files: shards.chain(others).collect(),
         tensors: tensors.collect(),
     }
 }
 
-fn donor_files(checkpoint: &Checkpoint, all_bytes: bool) -> Result<DonorFiles, ApplyError> {
-    let mut files = DonorFiles { documents: BTreeMap::new(), shards: BTreeMap::new() };
-    for (name, document) in &checkpoint.documents {
-        if document.value.is_some() {
-            files.documents.insert(name.clone(), sha256(&checkpoint.root.join(name))?);
+fn recipe_digest(recipe: &Recipe) -> RecipeDigest {
+    let text = &*recipe.origin.text;
+    let is_built_in = source::text(&format!("recipes/{}.json5", recipe.recipe)) == Some(text);
+    RecipeDigest {
+        name: recipe.recipe.clone(),
+        sha256: hex(&Sha256::digest(text)),
+        text: (!is_built_in).then(|| text.to_owned()),
+    }
+}
+
+/// The documents, modules and vocabularies of a donor, its model card, and files with the name of a file of the result.
+fn small_files(checkpoint: &Checkpoint, plan: &Plan) -> Result<BTreeMap<String, FileDigest>, ApplyError> {
+    let documents = checkpoint.documents.iter().filter(|(_, d)| d.value.is_some()).map(|(name, _)| name.as_str());
+    let modules = checkpoint.modules.keys().map(String::as_str);
+    let card = CARD;
+    let others = VOCABULARY_FILES.into_iter().chain([&*card]).chain(plan.files.iter().map(|file| &*file.name));
+    let names: BTreeSet<&str> = documents.chain(modules).chain(others).collect();
+    let mut files = BTreeMap::new();
+    for name in names.into_iter().filter(|name| checkpoint.has_file(name)) {
+        if let Some((bytes, sha256)) = digest_own(&checkpoint.root, name)? {
+            files.insert(name.to_owned(), FileDigest { bytes, sha256 });
         }
     }
-    for (name, shard) in &checkpoint.shards {
-        let sha256 = all_bytes.then(|| sha256(&checkpoint.root.join(name))).transpose()?;
-        let entry = DonorShard { bytes: shard.file_len, header_sha256: shard.header_sha256.clone(), sha256 };
-        files.shards.insert(name.clone(), entry);
-    }
     Ok(files)
+}
+
+fn shards(checkpoint: &Checkpoint, all_bytes: bool) -> Result<BTreeMap<String, DonorShard>, ApplyError> {
+    let digest = |(name, shard): (&String, &Shard)| {
+        let sha256 = all_bytes.then(|| sha256(&checkpoint.root.join(name))).transpose()?;
+        let header_sha256 = shard.header_sha256.clone();
+        Ok((name.clone(), DonorShard { bytes: shard.file_len, header_sha256, sha256 }))
+    };
+    checkpoint.shards.iter().map(digest).collect()
 }

@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::draft::MergeDraft;
+use super::training::training;
+use super::usage::Usage;
 use crate::check::{Finding, Outcome, Severity, check};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
@@ -55,6 +57,8 @@ pub struct MergeRun {
     pub record: MergeReport,
     /// Temporary files of an earlier run that were removed, and those of this run that were not; for standard error.
     pub notices: Vec<String>,
+    /// How the result is loaded.
+    usage: Usage,
 }
 
 impl MergeRun {
@@ -97,6 +101,11 @@ impl MergeRun {
         let record = &mut self.record;
         record.seams.clone_from(&draft.seams);
         record.changed.clone_from(&draft.changed);
+        let names = draft.plan.tensors().map(|(_, tensor)| tensor.name.as_str());
+        record.training = Some(training(names, &draft.train));
+        self.usage = Usage::find(draft);
+        let record = &mut self.record;
+        record.usage = self.usage.statements(&record.out);
         record.dropped.clone_from(&draft.dropped);
         record.repairs.clone_from(&draft.repairs);
         record.notes.clone_from(&draft.notes);
@@ -163,7 +172,8 @@ impl MergeRun {
     /// The report without the names of directories, for the file inside the result: the same merge of donors that lie
     /// elsewhere has the same bytes. The manifest identifies the donors by hashes.
     pub(super) fn portable_report(&self) -> Report {
-        let record = MergeReport { out: String::new(), donors: BTreeMap::new(), ..self.record.clone() };
+        let usage = self.usage.statements("path/to/this/directory");
+        let record = MergeReport { out: String::new(), donors: BTreeMap::new(), usage, ..self.record.clone() };
         self.report_with(record, |checked| checked.role.to_string())
     }
 

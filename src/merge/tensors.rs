@@ -155,9 +155,18 @@ fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTenso
 /// The planned tensor; if it is not a byte copy of the whole donor tensor, the draft lists it as changed.
 fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft: &mut MergeDraft) -> PlannedTensor {
     let dtype = taken.dtype();
-    let TakenTensor { name, tensor, .. } = taken;
+    let TakenTensor { name, tensor, rule, .. } = taken;
     let planned = PlannedTensor { name, dtype, shape, source };
     let transform = planned.transform();
+    let has_new_values = match transform {
+        TensorTransform::Copy | TensorTransform::Convert => false,
+        TensorTransform::GrowRows | TensorTransform::SampleRows | TensorTransform::Pad | TensorTransform::Reinit => {
+            true
+        }
+    };
+    if has_new_values || rule.spec.train {
+        draft.train.insert(planned.name.clone());
+    }
     if transform != TensorTransform::Copy || planned.source.from.slice.is_some() {
         draft.changed.push(ChangedTensor {
             name: planned.name.clone(),

@@ -211,6 +211,8 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
     merged_tensors(out, merge, cap);
     sentences(out, "Repaired", &merge.repairs, cap);
     sentences(out, "Notes", &merge.notes, usize::MAX);
+    training(out, merge);
+    usage(out, merge);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
         let _ok = writeln!(out, "\n## Files");
@@ -242,8 +244,73 @@ fn merged_tensors(out: &mut String, merge: &MergeReport, cap: usize) {
     }
 }
 
+/// The tensors to train, with the lines of Python that select them.
+pub(super) fn training(out: &mut String, merge: &MergeReport) {
+    let Some(training) = &merge.training else { return };
+    let Some(pattern) = &training.pattern else { return };
+    let (train, all) = (training.train.len(), plural(merge.tensors, "tensor"));
+    let _ok = writeln!(
+        out,
+        "\n## Training\n\n{train} of {all} have new values, or meet tensors of another donor, and must be trained. The \
+         others can be frozen meanwhile.\n"
+    );
+    for group in collapse(training.train.iter().map(String::as_str)) {
+        let _ok = writeln!(out, "- {}", code(&name(&group.pattern)));
+    }
+    let lines = [
+        "import re".to_owned(),
+        format!("train = re.compile({})", python_string(pattern)),
+        "for name, p in model.named_parameters(): p.requires_grad_(train.match(name) is not None)".to_owned(),
+    ];
+    block(out, &lines);
+    let _ok = writeln!(
+        out,
+        "\nThe names are those in the files. Where a version of transformers renames tensors when it loads them, compare \
+         them with `model.named_parameters()` first."
+    );
+}
+
+/// A string as Python spells it: raw if that is possible. Names of tensors in it may be chosen to end the string.
+fn python_string(text: &str) -> String {
+    if !text.contains(|c| c == '"' || format::hostile(c)) && !text.ends_with('\\') {
+        return format!("r\"{text}\"");
+    }
+    let mut out = String::from("\"");
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            c if format::hostile(c) => {
+                let _ok = write!(out, "\\U{:08x}", u32::from(c));
+            }
+            c => out.push(c),
+        }
+    }
+    out.push('"');
+    out
+}
+
+/// The statements that load the result.
+pub(super) fn usage(out: &mut String, merge: &MergeReport) {
+    if !merge.usage.is_empty() {
+        out.push_str("\n## Load it like this\n");
+        block(out, &merge.usage);
+    }
+}
+
+/// A block of Python; characters that no reader would see are replaced.
+fn block(out: &mut String, lines: &[String]) {
+    let longest = lines.iter().flat_map(|line| line.split(|c| c != '`')).map(str::len).max().unwrap_or(0);
+    let fence = "`".repeat(longest.saturating_add(1).max(3));
+    let _ok = writeln!(out, "\n{fence}python");
+    for line in lines {
+        let line: String = line.chars().map(|c| if format::hostile(c) { '\u{fffd}' } else { c }).collect();
+        let _ok = writeln!(out, "{line}");
+    }
+    let _ok = writeln!(out, "{fence}");
+}
+
 /// A titled list of sentences; nothing for an empty list.
-fn sentences(out: &mut String, title: &str, sentences: &[String], cap: usize) {
+pub(super) fn sentences(out: &mut String, title: &str, sentences: &[String], cap: usize) {
     if sentences.is_empty() {
         return;
     }
@@ -288,7 +355,7 @@ fn seams(out: &mut String, merge: &MergeReport, cap: usize) {
 }
 
 /// A table of at most `cap` rows; cells are Markdown, except that pipes are not escaped yet.
-fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N]], cap: usize) {
+pub(super) fn table<const N: usize>(out: &mut String, header: [&str; N], rows: &[[String; N]], cap: usize) {
     let _ok = writeln!(out, "\n| {} |\n|{}", header.join(" | "), " --- |".repeat(N));
     for row in rows.iter().take(cap) {
         let cells: Vec<String> = row.iter().map(|cell| cell.replace('|', "\\|")).collect();
@@ -304,12 +371,12 @@ fn last(path: &str) -> &str {
     path.trim_end_matches('/').rsplit('/').next().unwrap_or(path)
 }
 
-fn text_name(raw: &str) -> String {
+pub(super) fn text_name(raw: &str) -> String {
     text(&name(raw))
 }
 
 /// Escapes every character that Markdown or HTML would interpret, except pipes (see [`table`]).
-fn text(plain: &str) -> String {
+pub(super) fn text(plain: &str) -> String {
     let mut out = String::with_capacity(plain.len());
     let mut before = ' ';
     let mut chars = plain.chars().peekable();
@@ -332,7 +399,7 @@ fn text(plain: &str) -> String {
 }
 
 /// A code span for a text without line breaks.
-fn code(plain: &str) -> String {
+pub(super) fn code(plain: &str) -> String {
     let longest = plain.split(|c| c != '`').map(str::len).max().unwrap_or(0);
     let fence = "`".repeat(longest.saturating_add(1));
     let pad = if plain.starts_with('`') || plain.ends_with('`') || plain.is_empty() { " " } else { "" };

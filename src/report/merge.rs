@@ -31,6 +31,10 @@ pub struct MergeReport {
     pub transforms: BTreeMap<TensorTransform, usize>,
     /// Tensors that are not byte copies.
     pub changed: Vec<ChangedTensor>,
+    /// Tensors to train, and to freeze meanwhile; null before the tensors are planned.
+    pub training: Option<Training>,
+    /// Python code that loads the result, one statement each; empty when nothing is known about its class.
+    pub usage: Vec<String>,
     /// Donor tensors that the result does not contain, by role and pattern.
     pub dropped: Vec<Dropped>,
     /// Repairs of donor documents, one sentence each.
@@ -205,6 +209,20 @@ pub struct Cast {
     pub from: &'static str,
     /// Type in the result.
     pub to: &'static str,
+}
+
+/// The tensors of a result by what a training has to do with them. Names are those in the files of the result.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct Training {
+    /// An anchored regular expression that matches the names in `train` and no other name of the result; null without
+    /// any.
+    pub pattern: Option<String>,
+    /// Tensors with new values, and those that meet tensors of another donor.
+    pub train: Vec<String>,
+    /// All others.
+    pub freeze: Vec<String>,
 }
 
 /// Donor tensors that the result does not contain.

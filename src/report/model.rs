@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::Serialize;
 
 pub use super::merge::{
-    Cast, ChangedTensor, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName, StageOutcome,
+    Cast, ChangedTensor, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName, StageOutcome, Training,
 };
 use crate::check::finding::Suppressed;
 use crate::check::verdict::PredictedLoad;

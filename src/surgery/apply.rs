@@ -7,14 +7,13 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::convert::CastLosses;
 use super::donor::{DonorFile, DonorSnapshot};
 use super::error::{ApplyError, io_at};
 use super::leftover::Leftover;
 use super::plan::{Plan, PlannedFile, PlannedShard, PlannedTensor, TensorRef, TensorTransform};
 use super::staging::Staging;
 use super::stop::interrupted;
-use super::stream::{BLOCK, stream};
+use super::stream::{Streamed, block, stream};
 use super::system::{check_space, copy_in_kernel, create, with_figures};
 use super::verify::accepted_by_safetensors;
 use super::written::{ShardDigests, WrittenShard};
@@ -160,17 +159,17 @@ impl ShardWriter<'_> {
         tensor: &PlannedTensor,
         progress: &mut dyn FnMut(u64),
     ) -> Result<(), ApplyError> {
-        let losses = if tensor.transform() == TensorTransform::Copy {
+        let streamed = if tensor.transform() == TensorTransform::Copy {
             self.copy_range(donor, &tensor.source.from, progress)?;
-            CastLosses::default()
+            Streamed::default()
         } else {
             let path = self.path;
-            let losses = stream(donor, tensor, path, self)?;
+            let streamed = stream(donor, tensor, path, self)?;
             progress(tensor.len());
-            losses
+            streamed
         };
         if let Some(digests) = &mut self.digests {
-            digests.end_tensor(losses);
+            digests.end_tensor(streamed);
         }
         Ok(())
     }
@@ -230,11 +229,4 @@ impl ShardWriter<'_> {
         }
         Ok(())
     }
-}
-
-/// The part of the buffer for the next of `left` bytes.
-fn block(buffer: &mut Vec<u8>, left: u64) -> &mut [u8] {
-    let len = usize::try_from(left).map_or(BLOCK, |n| n.min(BLOCK));
-    buffer.resize(len, 0);
-    buffer
 }

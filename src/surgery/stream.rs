@@ -3,19 +3,31 @@
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
+use sha2::{Digest as _, Sha256};
+
 use super::convert::CastLosses;
 use super::donor::DonorFile;
 use super::error::{ApplyError, io_at};
-use super::plan::PlannedTensor;
+use super::plan::{PlannedTensor, TensorRef};
 use super::stop::interrupted;
 use super::transform;
+use crate::checkpoint::hex;
 
 /// Bytes held in memory between the donor and the writer.
-pub(super) const BLOCK: usize = 256 * 1024;
+const BLOCK: usize = 256 * 1024;
+
+/// Facts about a streamed tensor; the default is that of a byte copy.
+#[derive(Debug, Default)]
+pub(super) struct Streamed {
+    /// Values of the donor that scaling and casting could not keep.
+    pub(super) losses: CastLosses,
+    /// SHA-256 of the donor's tensor; `None` if none of its bytes were read.
+    pub(super) source_sha256: Option<String>,
+}
 
 /// Writes the bytes of a planned tensor into `out`: a file of the result, or the comparison of a verification.
 ///
-/// Returns the values that its cast could not keep. `donor` is the open file of the tensor's source; `path` names `out` in errors of writing.
+/// `donor` is the open file of the tensor's source; `path` names `out` in errors of writing.
 ///
 /// # Errors
 /// [`ApplyError::Changed`] when the donor is shorter than the source, [`ApplyError::Io`] for other errors of reading and
@@ -25,9 +37,10 @@ pub(super) fn stream(
     tensor: &PlannedTensor,
     path: &Path,
     out: &mut dyn Write,
-) -> Result<CastLosses, ApplyError> {
+) -> Result<Streamed, ApplyError> {
     let from = &tensor.source.from;
     let mut failed_read = None;
+    let mut digest = SourceDigest::default();
     let result = {
         let mut writer = BufWriter::with_capacity(BLOCK, out);
         let mut read = |at: u64, buf: &mut [u8]| {
@@ -38,7 +51,9 @@ pub(super) fn stream(
                 let kind = e.kind();
                 failed_read = Some(e);
                 io::Error::from(kind)
-            })
+            })?;
+            digest.add(at, buf);
+            Ok(())
         };
         let losses = transform::write(&mut read, tensor, &mut writer);
         losses.and_then(|losses| writer.flush().map(|()| losses))
@@ -47,5 +62,48 @@ pub(super) fn stream(
     if let Some(e) = failed_read {
         return Err(donor.read_error(e));
     }
-    result.map_err(io_at(path, "writing"))
+    let losses = result.map_err(io_at(path, "writing"))?;
+    Ok(Streamed { losses, source_sha256: digest.finish(donor, from)? })
+}
+
+/// The digest of a donor's tensor that a transform reads, usually once and in order.
+#[derive(Default)]
+struct SourceDigest {
+    hash: Sha256,
+    /// Number of bytes in `hash`, from the start of the tensor.
+    len: u64,
+    is_read: bool,
+}
+
+impl SourceDigest {
+    /// Adds bytes read at an offset in the tensor, unless they are already included.
+    fn add(&mut self, at: u64, bytes: &[u8]) {
+        self.is_read = true;
+        if at == self.len {
+            self.hash.update(bytes);
+            self.len = self.len.saturating_add(bytes.len() as u64);
+        }
+    }
+
+    /// The digest, after the bytes that the transform left out are read.
+    fn finish(mut self, donor: &DonorFile, from: &TensorRef) -> Result<Option<String>, ApplyError> {
+        if !self.is_read {
+            return Ok(None);
+        }
+        let mut buffer = Vec::new();
+        while self.len < from.len {
+            interrupted()?;
+            let block = block(&mut buffer, from.len.saturating_sub(self.len));
+            donor.read_at(block, from.offset.saturating_add(self.len)).map_err(|e| donor.read_error(e))?;
+            self.add(self.len, block);
+        }
+        Ok(Some(hex(&self.hash.finalize())))
+    }
+}
+
+/// The part of the buffer for the next of `left` bytes.
+pub(super) fn block(buffer: &mut Vec<u8>, left: u64) -> &mut [u8] {
+    let len = usize::try_from(left).map_or(BLOCK, |n| n.min(BLOCK));
+    buffer.resize(len, 0);
+    buffer
 }

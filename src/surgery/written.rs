@@ -4,6 +4,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::convert::CastLosses;
 use super::plan::PlannedFile;
+use super::stream::Streamed;
 use crate::checkpoint::{FileName, hex};
 
 /// A shard that [`super::apply()`] wrote.
@@ -26,6 +27,8 @@ pub struct WrittenTensor {
     pub sha256: String,
     /// Values of the donor that scaling and casting could not keep.
     pub losses: CastLosses,
+    /// SHA-256 of the donor's tensor, if it was read and is not equal by the transform.
+    pub source_sha256: Option<String>,
 }
 
 /// Digests of the shard that is being written.
@@ -49,9 +52,10 @@ impl ShardDigests {
     }
 
     /// Ends the current tensor.
-    pub(super) fn end_tensor(&mut self, losses: CastLosses) {
+    pub(super) fn end_tensor(&mut self, streamed: Streamed) {
+        let Streamed { losses, source_sha256 } = streamed;
         let sha256 = hex(&self.tensor.finalize_reset());
-        self.tensors.push(WrittenTensor { sha256, losses });
+        self.tensors.push(WrittenTensor { sha256, losses, source_sha256 });
     }
 
     /// The record of the shard.

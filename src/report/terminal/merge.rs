@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use super::super::Style;
+use super::super::collapse::collapse;
 use super::super::format::{self, bytes, more, name, plural, sentence, shape, wrap};
 use super::super::model::{MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
@@ -36,11 +37,35 @@ pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
     list(out, "repaired", merge.repairs.len(), style, repairs.take(style.cap).collect());
     let notes = merge.notes.iter().map(|n| sentence(n));
     list(out, "notes", merge.notes.len(), style, notes.take(style.cap).collect());
+    next_steps(out, merge, style);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [name(&f.name), sentence(&f.origin)]).collect();
         let size = format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
         let _ok = writeln!(out, "\n  {}: {size}", plural(merge.files.len(), "file"));
         table(out, ["file", "from"], &rows, style);
+    }
+}
+
+/// The tensors to train, and the statements that load the result.
+fn next_steps(out: &mut String, merge: &MergeReport, style: Style) {
+    if let Some(training) = &merge.training
+        && !training.train.is_empty()
+    {
+        let (train, all) = (training.train.len(), plural(merge.tensors, "tensor"));
+        let _ok = writeln!(out, "\n  train {train} of {all} (names and pattern: merge-report.md)");
+        let groups = collapse(training.train.iter().map(String::as_str));
+        for group in groups.iter().take(style.cap) {
+            let _ok = writeln!(out, "    - {}", name(&group.pattern));
+        }
+        if let Some(more) = more(groups.len(), style.cap) {
+            let _ok = writeln!(out, "    {more}");
+        }
+    }
+    if !merge.usage.is_empty() {
+        out.push_str("\n  load it like this\n");
+    }
+    for line in &merge.usage {
+        let _ok = writeln!(out, "    {}", sentence(line));
     }
 }
 

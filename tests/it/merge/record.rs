@@ -76,3 +76,89 @@ fn donors_with_other_weights_give_another_manifest() {
     let differ = |key: &str| manifest(&a)[key] != manifest(&b)[key];
     assert!(differ("tensors") && differ("files"));
 }
+
+/// Donors in a cache of the Hub, with model cards.
+#[test]
+fn the_card_names_donors_and_licences() {
+    let work = TempDir::new().unwrap();
+    let commit = "0123456789abcdef0123456789abcdef01234567";
+    let place = |name: &str, repository: &str, card: &str| {
+        let folder = work.path().join(repository).join("snapshots");
+        fs::create_dir_all(&folder).unwrap();
+        let dir = folder.join(commit);
+        copy(&donor(name), &dir);
+        fs::write(dir.join("README.md"), card).unwrap();
+        dir
+    };
+    let vision = place("spatialvla-tiny", "models--lab--Spatial-4b", "---\nlicense: mit\ntags: [a]\n---\n# hello");
+    let language = place("llava3d-tiny", "models--org--llava", "---\nlicense: other\nlicense_name: \"own \\t\"\n---\n");
+    let out = work.path().join("out");
+    let run = merge(&vision, &language, &out, &[]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let recorded = manifest(&out);
+    assert_eq!(recorded["donors"]["vision"]["hub"]["id"], "lab/Spatial-4b");
+    assert_eq!(recorded["donors"]["language"]["hub"]["revision"], commit);
+    assert!(recorded["donors"]["vision"]["files"]["README.md"]["sha256"].is_string());
+    let card = fs::read_to_string(out.join("README.md")).unwrap();
+    let version = env!("CARGO_PKG_VERSION");
+    snapshot!("merge-card", card.replace(version, "VERSION"));
+    // No path of this machine is in a file of the result.
+    let here = work.path().to_str().unwrap().as_bytes();
+    for (name, bytes) in content(&out) {
+        assert!(!bytes.windows(here.len()).any(|part| part == here), "{name}");
+    }
+}
+
+#[test]
+fn equal_licences_are_the_licence_of_the_result() {
+    let work = TempDir::new().unwrap();
+    let (vision, language) = (work.path().join("vision"), work.path().join("language"));
+    copy(&donor("spatialvla-tiny"), &vision);
+    copy(&donor("llava3d-tiny"), &language);
+    let front = |first: &str, second: &str| {
+        fs::write(vision.join("README.md"), first).unwrap();
+        fs::write(language.join("README.md"), second).unwrap();
+        let out = work.path().join("out");
+        assert_eq!(merge(&vision, &language, &out, &[]).status.code(), Some(0));
+        let card = fs::read_to_string(out.join("README.md")).unwrap();
+        fs::remove_dir_all(&out).unwrap();
+        card.split("---")
+            .nth(1)
+            .unwrap()
+            .lines()
+            .filter(|line| line.starts_with("license"))
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    let (mit, llama) = ("---\nlicense: mit\n---\n", "---\nlicense: llama2\n---\n");
+    assert_eq!(front(mit, mit), "license: \"mit\"");
+    assert_eq!(front(mit, llama), "license: other");
+    assert_eq!(front(mit, "no front matter"), "license: other");
+    assert_eq!(front("", ""), "");
+}
+
+/// The pattern of the manifest matches the names to train and no others.
+#[test]
+fn the_pattern_matches_exactly_the_tensors_to_train() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    for (options, projector) in [(["--set", "projector=pad"], "pad"), (["--set", "projector=reinit"], "reinit")] {
+        assert_eq!(tiny(&out, &options).status.code(), Some(0));
+        let manifest = manifest(&out);
+        let training = &manifest["training"];
+        let list = |key: &str| -> Vec<String> {
+            training[key].as_array().unwrap().iter().map(|n| n.as_str().unwrap().to_owned()).collect()
+        };
+        let pattern = regex::Regex::new(training["pattern"].as_str().unwrap()).unwrap();
+        assert!(list("train").iter().all(|name| pattern.is_match(name)));
+        assert!(!list("freeze").iter().any(|name| pattern.is_match(name)));
+        assert_eq!(list("train").len() + list("freeze").len(), manifest["tensors"].as_array().unwrap().len());
+        for tensor in manifest["tensors"].as_array().unwrap() {
+            let is_trained = list("train").iter().any(|name| tensor["name"] == name.as_str());
+            assert_eq!(is_trained, tensor["transform"] != "copy", "{}", tensor["name"]);
+            let is_projector = tensor["name"].as_str().unwrap().starts_with("multi_modal_projector");
+            assert!(!is_projector || tensor["transform"] == projector);
+        }
+        fs::remove_dir_all(&out).unwrap();
+    }
+}

@@ -9,7 +9,7 @@ use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName,
-    StageOutcome, UncheckedPath,
+    StageOutcome, Training, UncheckedPath,
 };
 use ckpt_doctor::surgery::plan::TensorTransform;
 use serde_json::{Map, Value, json};
@@ -401,6 +401,12 @@ fn merge() -> MergeReport {
                 losses: None,
             },
         ],
+        training: Some(Training {
+            pattern: Some(r"^(?:fresh\.weight|language_model\.lm_head\.weight)$".to_owned()),
+            train: vec!["fresh.weight".to_owned(), "language_model.lm_head.weight".to_owned()],
+            freeze: vec!["vision_tower.x".to_owned()],
+        }),
+        usage: vec!["from transformers import AutoModel".to_owned()],
         dropped: vec![Dropped {
             donor: "language".to_owned(),
             pattern: "model.vision_tower.**".to_owned(),
