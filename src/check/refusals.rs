@@ -231,7 +231,9 @@ fn rope_type(rope: &Map<String, Value>) -> Option<(&'static str, &str)> {
 
 fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<String, Value>) -> Option<Rejection> {
     let (key, name) = rope_type(rope)?;
-    knowledge.names.lacks(version, NameKind::RopeType, name).then(|| Rejection {
+    // The classes with sections for time, height and width read this type, once written by themselves, as `default`.
+    let is_sectioned = rope.contains_key("mrope_section") && rope.get("type").is_some_and(|name| name == "mrope");
+    (!is_sectioned && knowledge.names.lacks(version, NameKind::RopeType, name)).then(|| Rejection {
         pointer: format!("{pointer}/{key}"),
         value: name.into(),
         because: "which is no type of rope".to_owned(),

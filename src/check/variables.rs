@@ -63,7 +63,9 @@ pub fn scope(
     }
     scope.bind("arch", &json!(architecture.unwrap_or_default()));
     scope.bind("model", model);
-    let text = model.get("text_config").or_else(|| model.get("llm_config")).unwrap_or(model);
+    // A flat config of a class with parts has the key with the value null.
+    let part = |key: &str| model.get(key).filter(|part| part.is_object());
+    let text = part("text_config").or_else(|| part("llm_config")).unwrap_or(model);
     scope.bind("text", text);
     scope.bind("tokenizer", &tokenizer(checkpoint));
     scope.bind("chat_templates", &chat_templates(checkpoint));
@@ -77,6 +79,8 @@ pub fn scope(
     scope.bind("all_read", &json!(has_weights && index::all_read(checkpoint)));
     let here = Arc::clone(checkpoint);
     scope.function1("shape", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.shape)));
+    let here = Arc::clone(checkpoint);
+    scope.function1("dtype", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.dtype.name())));
     let here = Arc::clone(checkpoint);
     scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
     scope.bind("of_transformers", &json!(model_type::is_of_transformers(checkpoint)));

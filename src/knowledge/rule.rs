@@ -172,7 +172,7 @@ pub struct FaultCheck {
 /// - `groups_heads`: the class reads `num_key_value_heads`, or is unknown.
 ///
 /// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
-/// loaders; `shape(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard
+/// loaders; `shape(tensor)`, `dtype(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard
 /// of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and `stays_random(tensor)`:
 /// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
 /// `join(list)`, `plural(count, noun)` and `filesize(bytes)`.

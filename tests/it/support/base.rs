@@ -16,7 +16,7 @@ use super::{cases, project};
 
 /// Names of all bases.
 ///
-/// `llama` and `paligemma` are documents in `fixtures/bases` with generated weights; `spatialvla` is the donor without
+/// `llama`, `paligemma` and `qwen2-vl` are documents in `fixtures/bases` with generated weights; `spatialvla` is the donor without
 /// the data set whose statistics contain three `Infinity`; the merged ones are built from the donors; `llama-gptq` is
 /// the sound case of that name; `lora` is an adapter of `llama`.
 pub const BASES: &[&str] = &[
@@ -25,6 +25,7 @@ pub const BASES: &[&str] = &[
     "llama-gptq",
     "lora",
     "paligemma",
+    "qwen2-vl",
     "spatialvla",
     "llava3d",
     "merged",
@@ -55,7 +56,7 @@ pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
             apply_all(&case.name, &case.changes, dir);
         }
         "lora" => lora(dir),
-        "paligemma" => documents("paligemma", dir, 1, knowledge),
+        "paligemma" | "qwen2-vl" => documents(name, dir, 1, knowledge),
         "spatialvla" => {
             copy(&project().join("fixtures/donors/spatialvla-tiny"), dir);
             let file = dir.join("processor_config.json");
