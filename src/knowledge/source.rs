@@ -39,13 +39,16 @@ impl DataError {
     pub fn about_value(file: &str, text: &str, key: &str, word: &str, reason: impl Into<String>) -> Self {
         let quoted = serde_json::to_string(word).unwrap_or_default();
         let spelled = quoted.get(1..quoted.len().saturating_sub(1)).unwrap_or_default();
-        let member = |word: &str| {
-            let pattern = format!(r#"\b{}["']?\s*:\s*["']({})["']"#, regex::escape(key), regex::escape(word));
-            let found = regex::Regex::new(&pattern).ok()?.captures(text)?.get(1)?;
-            Some(line_column(text, found.start()))
+        let member = || {
+            let string = r#""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"#;
+            let pattern = format!(r#"(?s)\b{}["']?\s*:\s*({string})"#, regex::escape(key));
+            let members = regex::Regex::new(&pattern).ok()?;
+            let mut values = members.captures_iter(text).filter_map(|found| found.get(1));
+            let found = values.find(|value| json5::from_str(value.as_str()) == Ok(word.to_owned()))?;
+            Some(line_column(text, found.start().saturating_add(1)))
         };
         let other = || Self::about(file, text, if text.contains(word) { word } else { spelled }, "").place;
-        let place = member(word).or_else(|| member(spelled)).or_else(other);
+        let place = member().or_else(other).or_else(|| Self::about(file, text, key, "").place);
         Self { place, ..Self::new(file, reason) }
     }
 }

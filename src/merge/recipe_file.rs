@@ -28,7 +28,7 @@ pub fn read(path: &Path, knowledge: &Knowledge) -> Result<Recipe, DataError> {
     if let Some(path) = processor.filter(|path| path.ends_with(".json5")) {
         let found = folder.file("processor", path)?;
         let processor = found.map(|(name, text)| Processor::parse(&name, &text)).transpose()?;
-        let missing = || folder.wrong("processor", path, "no such file in the folder of the recipe");
+        let missing = || folder.wrong("processor", path, "does not exist in the folder of the recipe");
         recipe.origin.processor = Some(processor.ok_or_else(missing)?);
     }
     validate(&recipe, &name, &text, knowledge)?;
@@ -44,14 +44,14 @@ struct Folder<'r> {
 
 impl Folder<'_> {
     fn wrong(&self, key: &str, word: &str, reason: &str) -> DataError {
-        DataError::about_value(self.recipe, self.text, key, word, format!("{word}: {reason}"))
+        DataError::about_value(self.recipe, self.text, key, word, format!("`{word}` {reason}"))
     }
 
     /// Path and text of a file below the folder; `None` when it does not exist.
     ///
     /// Fails for a path that leads out of the folder, also through a symbolic link.
     fn file(&self, key: &str, word: &str) -> Result<Option<(String, String)>, DataError> {
-        let outside = || self.wrong(key, word, "not below the folder of the recipe");
+        let outside = || self.wrong(key, word, "is not below the folder of the recipe");
         let mut steps = Path::new(word).components();
         if word.is_empty() || !steps.all(|step| matches!(step, Component::Normal(_) | Component::CurDir)) {
             return Err(outside());

@@ -276,6 +276,9 @@ fn parse_dtype(value: &Value) -> Result<Option<Dtype>, &'static str> {
 }
 
 /// Position and shape of each tensor that the class has with the planned config.
+///
+/// Under its names of every loader, those of the loader that the config names first: `save_pretrained` of transformers 4.57
+/// writes names that the classes of 4.47 have.
 fn expected_shapes<'n>(
     library: &Library,
     config: Option<&Value>,
@@ -283,11 +286,16 @@ fn expected_shapes<'n>(
     evidence: &Evidence,
 ) -> HashMap<String, (usize, Vec<u64>)> {
     let Some(config) = config else { return HashMap::new() };
-    let found =
-        library.find(config, names, Loader::of_config(config)).and_then(|a| a.expect_given(config, evidence).ok());
-    found.map_or_else(HashMap::new, |e| {
-        e.tensors.iter().enumerate().map(|(i, (name, t))| (name.clone(), (i, t.shape.clone()))).collect()
-    })
+    let names: Vec<&str> = names.collect();
+    let mut shapes = HashMap::new();
+    for loader in std::iter::once(Loader::of_config(config)).chain(Loader::ALL) {
+        let class = library.find(config, names.iter().copied(), loader);
+        let Some(expected) = class.and_then(|class| class.expect_given(config, evidence).ok()) else { continue };
+        for (i, (name, tensor)) in expected.tensors.iter().enumerate() {
+            shapes.entry(name.clone()).or_insert_with(|| (i, tensor.shape.clone()));
+        }
+    }
+    shapes
 }
 
 /// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used.

@@ -4,6 +4,7 @@ mod law;
 mod recipes;
 mod record;
 mod refused;
+mod users;
 mod writing;
 
 use std::collections::BTreeMap;

@@ -4,7 +4,7 @@
 //! `fixtures/sound/<case>.json5` is unusual but valid. The checkpoint itself is created in a temporary directory, so
 //! that the repository contains no broken weights.
 
-mod base;
+pub mod base;
 mod change;
 pub mod data;
 mod draw;

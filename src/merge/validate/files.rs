@@ -87,6 +87,7 @@ impl Validator<'_> {
             return Ok(());
         }
         let templates = source::paths("recipes").into_iter().filter(|path| path.ends_with(".py"));
-        self.known("text", "template", &template.text, &templates.collect::<Vec<_>>())
+        let what = "template, neither in the folder of the recipe nor built in:";
+        self.known("text", what, &template.text, &templates.collect::<Vec<_>>())
     }
 }

@@ -23,8 +23,11 @@ impl Validator<'_> {
         }
     }
 
-    /// A pointer with placeholders is validated again when they have values.
+    /// A pointer with placeholders is validated again when they have values; one may give its first steps, too.
     fn place(&self, at: &Template, reason: impl Fn(&str) -> Option<String>) -> Result<(), DataError> {
+        if at.source().starts_with('{') {
+            return Ok(());
+        }
         reason(&at.outline()).map_or(Ok(()), |reason| Err(self.wrong("at", at.source(), reason)))
     }
 }

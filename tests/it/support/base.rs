@@ -48,15 +48,15 @@ pub fn make_all(root: &Path, names: &[&'static str], knowledge: &Knowledge) -> B
 /// Builds one base.
 pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
     match name {
-        "llama" => documents("llama", dir, 1, knowledge),
-        "llama-sharded" => documents("llama", dir, 2, knowledge),
+        "llama" => documents(&folder("llama"), dir, 1, knowledge),
+        "llama-sharded" => documents(&folder("llama"), dir, 2, knowledge),
         "llama-gptq" => {
-            documents("llama", dir, 1, knowledge);
+            documents(&folder("llama"), dir, 1, knowledge);
             let case = cases().into_iter().find(|c| c.name == "sound/quantized-gptq").expect("the case");
             apply_all(&case.name, &case.changes, dir);
         }
         "lora" => lora(dir),
-        "paligemma" | "qwen2-vl" => documents(name, dir, 1, knowledge),
+        "paligemma" | "qwen2-vl" => documents(&folder(name), dir, 1, knowledge),
         "spatialvla" => {
             copy(&project().join("fixtures/donors/spatialvla-tiny"), dir);
             let file = dir.join("processor_config.json");
@@ -84,13 +84,22 @@ pub fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// Writes the documents of `fixtures/bases/<name>`, and the tensors of their class.
-fn documents(name: &str, dir: &Path, shards: usize, knowledge: &Knowledge) {
-    copy(&project().join("fixtures/bases").join(name), dir);
+fn folder(name: &str) -> PathBuf {
+    project().join("fixtures/bases").join(name)
+}
+
+/// Writes the documents in `from`, and the tensors of their class.
+pub fn documents(from: &Path, dir: &Path, shards: usize, knowledge: &Knowledge) {
+    copy(from, dir);
+    tensors(dir, shards, knowledge);
+}
+
+/// Writes the tensors of the class that the `config.json` in `dir` names.
+pub fn tensors(dir: &Path, shards: usize, knowledge: &Knowledge) {
     let config: Value =
         serde_json::from_str(&fs::read_to_string(dir.join("config.json")).expect("text")).expect("JSON");
     let architecture = knowledge.library.find(&config, [], Loader::of_config(&config)).expect("a known class");
-    let expected = architecture.expect(&config).unwrap_or_else(|e| panic!("{name}: {e:?}"));
+    let expected = architecture.expect(&config).unwrap_or_else(|e| panic!("{}: {e:?}", dir.display()));
     let tensors: Vec<_> = expected.tensors.iter().filter(|(_, t)| t.tied_to.is_none()).collect();
     let mut weights = Weights::default();
     let each = tensors.len().div_ceil(shards);
