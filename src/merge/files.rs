@@ -9,7 +9,7 @@ use super::context::Context;
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::error::MergeError;
-use super::{REPORT, manifest, switches};
+use super::{CARD, REPORT, manifest, switches};
 use crate::check::modules::relative_modules;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::checkpoint::{Document, FileName, FilePattern, INDEX_NAME};
@@ -81,15 +81,15 @@ fn bytes_of(document: &Document) -> Arc<[u8]> {
 /// Names that the merge gives to its own files, in any case.
 pub(super) fn is_own(name: &str) -> bool {
     let lower = name.to_ascii_lowercase();
-    [&*manifest::NAME, &*REPORT, "readme.md"].contains(&lower.as_str())
+    [manifest::NAME, REPORT, CARD].iter().any(|own| own.eq_ignore_ascii_case(name))
         || lower.ends_with(".safetensors")
         || lower.ends_with(".safetensors.index.json")
 }
 
 /// Endings of names that no pattern matches: weights, which a merge does not copy as files, and Python modules, which are
 /// named or imported.
-const NOT_BY_PATTERN: [&str; 12] =
-    [".bin", ".pt", ".pth", ".ckpt", ".pkl", ".h5", ".msgpack", ".onnx", ".gguf", ".index.json", ".py", "readme.md"];
+const NOT_BY_PATTERN: [&str; 11] =
+    [".bin", ".pt", ".pth", ".ckpt", ".pkl", ".h5", ".msgpack", ".onnx", ".gguf", ".index.json", ".py"];
 
 /// Most bytes of the files that the patterns of one entry match: they are held in memory.
 const MAX_MATCHED: u64 = 4 * TOKENIZER_CAP;

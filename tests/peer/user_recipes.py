@@ -35,6 +35,7 @@ RUNS = [
     ("reshard.json5", {"from": "idefics3"}, ("shard-size=20KB",), "AutoModelForImageTextToText"),
     ("add-prefix.json5", {"from": "llama"}, (), None),
     ("llava-names.json5", {"from": "llava"}, (), "AutoModelForImageTextToText 5"),
+    ("cast.json5", {"from": "llava"}, ("dtype=float32",), "AutoModelForImageTextToText"),
 ]
 
 

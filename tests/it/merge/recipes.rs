@@ -127,11 +127,39 @@ fn places() -> Vec<(&'static str, Value)> {
     ]
 }
 
+fn keys_of_users() -> Vec<(&'static str, Value)> {
+    let donor =
+        |architectures: &[&str]| json!({ "donors": [{ "role": "from", "what": "w", "architectures": architectures }] });
+    let option = |kind: &str, default: &str, values: &[&str]| json!({ "options": [{ "name": "o", "help": "h", "kind": kind, "default": default, "values": values }] });
+    let tokens =
+        |value: Value, expression: &str| json!({ "tokens": value, "let": [{ "name": "n", "is": expression }] });
+    vec![
+        ("any and another", donor(&["llama", "*"])),
+        ("pattern of architectures", donor(&["lla*"])),
+        ("choice without values", option("choice", "a", &[])),
+        ("integer with values", option("integer", "1", &["1"])),
+        ("integer", option("integer", "1.5", &[])),
+        ("text of two lines", option("text", "a\nb", &[])),
+        ("kind", option("number", "1", &[])),
+        ("id without tokens", json!({ "let": [{ "name": "n", "is": "id_of('<pad>')" }] })),
+        ("name near id_of", tokens(json!({ "base": "from" }), "idof('<pad>')")),
+        ("token without a processor", tokens(json!({ "base": "from" }), "tokens.image")),
+        ("role of a stored config", set("/x", "stored.form.hidden_size")),
+        ("role with the name stored", json!({ "donors": [{ "role": "stored", "what": "w" }] })),
+        ("expression in a pointer", set("/x/{opt.nothing}", "1")),
+        ("pointer with an expression", set("x/{opt.rows}", "1")),
+        ("switch with an expression", set("/use_kernels/{opt.rows}", "1")),
+        ("pattern", file(&json!({ "copy": { "from": "from", "names": ["{tokenizer"] } }))),
+        ("model card", file(&json!({ "copy": { "from": "from", "names": ["readme.MD"] } }))),
+        ("tolerated rule", json!({ "tolerates": ["ARC099"] })),
+    ]
+}
+
 #[test]
 fn a_recipe_is_refused_before_a_donor_is_opened() {
     let work = TempDir::new().unwrap();
     let mut table = String::new();
-    for (label, changes) in [roles(), names(), places()].concat() {
+    for (label, changes) in [roles(), names(), places(), keys_of_users()].concat() {
         let file = work.path().join("r.json5");
         fs::write(&file, serde_json::to_string_pretty(&recipe(changes)).unwrap()).unwrap();
         // The donor does not exist: an error about it would show that it was opened first.

@@ -10,7 +10,7 @@ use tempfile::TempDir;
 
 use super::{doctor, donor, json as report, names, text};
 use crate::support::base::{copy, documents, tensors};
-use crate::support::{knowledge, project};
+use crate::support::{knowledge, project, texts};
 
 /// Donors of `fixtures/recipes`, with the changes of their configs.
 fn donors(work: &Path) {
@@ -50,6 +50,7 @@ const RUNS: &[Run] = &[
     ("reshard.json5", &[("from", "idefics3")], &["shard-size=20KB"]),
     ("add-prefix.json5", &[("from", "llama")], &["prefix=x."]),
     ("llava-names.json5", &[("from", "llava")], &[]),
+    ("cast.json5", &[("from", "siglip")], &["dtype=float32"]),
 ];
 
 #[test]
@@ -224,10 +225,38 @@ fn patterns_leave_out_weights_code_and_what_is_written() {
         ["config.json", "extra.json", "tokenizer.model", "tokenizer_config.json"]
     );
     // A name is meant.
-    assert_eq!(run(json!(["README.md", "*.txt"])), ["README.md", "config.json", "notes.txt"]);
+    assert_eq!(run(json!(["evil.py", "*.txt"])), ["config.json", "evil.py", "notes.txt"]);
 }
 
 fn names_without_weights(out: &Path) -> Vec<String> {
-    let own = |name: &String| !name.contains("safetensors") && !name.starts_with("merge-");
+    let own = |name: &String| !name.contains("safetensors") && !name.starts_with("merge-") && name != "README.md";
     names(out).into_iter().filter(own).collect()
+}
+
+/// The recipes that docs/recipes.md quotes are those of the fixtures, and its tables name what the code defines.
+#[test]
+fn the_page_of_recipes_quotes_and_names_what_exists() {
+    let page = fs::read_to_string(project().join("docs/recipes.md")).unwrap();
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+    let recipes: Vec<String> = texts("fixtures/recipes").iter().map(|(_, text)| words(text)).collect();
+    let blocks: Vec<&str> = page.split("```json5\n").skip(1).map(|rest| rest.split("```").next().unwrap()).collect();
+    for block in &blocks {
+        assert!(recipes.iter().any(|recipe| recipe.contains(&words(block))), "no recipe contains:\n{block}");
+    }
+    assert!(blocks.len() >= 10, "{} blocks", blocks.len());
+    for (path, _) in texts("fixtures/recipes").iter().filter(|(_, text)| text.contains("donors:")) {
+        let name = path.strip_prefix("fixtures/recipes/").unwrap();
+        assert!(page.contains(&format!("`{name}`")), "{name} is missing from the page");
+    }
+
+    let code = ["src/knowledge/expression/functions.rs", "src/merge/context.rs"]
+        .map(|path| fs::read_to_string(project().join(path)).unwrap());
+    let name = regex::Regex::new(r#"scope\.(?:function[12]?|add|bind)\("([a-z_]+)""#).unwrap();
+    let named: Vec<&str> =
+        code.iter().flat_map(|code| name.captures_iter(code)).map(|c| c.get(1).unwrap().as_str()).collect();
+    assert!(named.len() > 15, "{named:?}");
+    for name in named {
+        let call = page.contains(&format!("`{name}(")) || page.contains(&format!("`{name}`"));
+        assert!(call, "the function or variable {name} is missing from docs/recipes.md");
+    }
 }
