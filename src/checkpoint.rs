@@ -11,7 +11,7 @@ use serde_json::Value;
 
 pub mod adapter;
 mod budget;
-mod contents;
+pub(crate) mod contents;
 mod discover;
 pub mod document;
 mod entry;

@@ -20,6 +20,7 @@ mod signals;
 mod skipped;
 mod stack;
 mod undo;
+mod verify;
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -68,6 +69,7 @@ fn run() -> ExitCode {
         args::Command::Inspect(args) => inspect::run(args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(args, rules.as_deref()),
         args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
+        args::Command::Verify(args) => verify::run(args),
         args::Command::Explain(args) => rules::explain(args, rules.as_deref()),
         args::Command::Rules(args) => rules::list(args, rules.as_deref()),
         args::Command::Recipes(args) => recipes::list(args, rules.as_deref()),

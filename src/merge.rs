@@ -28,6 +28,8 @@ mod tensors;
 mod training;
 mod usage;
 mod validate;
+#[cfg(feature = "cli")]
+mod verify;
 
 use std::path::Path;
 
@@ -38,6 +40,8 @@ pub(crate) use recipe_file::read as read_recipe;
 pub use run::{MergeRequest, MergeRun};
 #[cfg(feature = "internals")]
 pub use validate::validate;
+#[cfg(feature = "cli")]
+pub use verify::{VerifyError, verify};
 
 use record::Recorded;
 use run::count;

@@ -33,6 +33,8 @@ mod statistics;
 mod style;
 #[cfg(feature = "cli")]
 mod terminal;
+#[cfg(feature = "cli")]
+pub mod verification;
 
 pub use model::Report;
 #[cfg(feature = "cli")]

@@ -26,6 +26,7 @@ use crate::report::Report;
 use crate::report::baseline::Baseline;
 use crate::report::inspect::InspectDocument;
 use crate::report::recipes::RecipesDocument;
+use crate::report::verification::Verification;
 
 macro_rules! text {
     ($type:ty, $name:literal, $about:literal) => {
@@ -86,6 +87,7 @@ fn outputs() -> Vec<(&'static str, Value)> {
         ("report", schema::<Report>("The JSON report of ckpt-doctor check and build-merged", settings())),
         ("inspect", schema::<InspectDocument<'_>>("The JSON report of ckpt-doctor inspect", settings())),
         ("recipes", schema::<RecipesDocument<'_>>("The JSON list of ckpt-doctor recipes", settings())),
+        ("verification", schema::<Verification>("The JSON report of ckpt-doctor verify", settings())),
         ("manifest", schema::<Manifest>("merge-manifest.json of ckpt-doctor build-merged", settings())),
     ]
 }

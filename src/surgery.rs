@@ -2,6 +2,8 @@
 
 mod apply;
 mod changes;
+#[cfg(feature = "cli")]
+pub mod compare;
 pub mod convert;
 pub mod donor;
 mod error;

@@ -13,6 +13,8 @@ use super::shard::tail::zero_tail;
 use super::text::hex;
 use super::{Entry, Fault, FaultKind, Shard, Tensor};
 
+#[cfg(feature = "cli")]
+pub(crate) mod digests;
 mod numbers;
 mod pieces;
 

@@ -81,6 +81,13 @@ impl Shard {
         !self.unread && self.faults.is_empty()
     }
 
+    /// Whether the file has the bytes of every tensor that its header lists.
+    #[must_use]
+    pub(crate) fn is_whole(&self) -> bool {
+        let region = self.file_len.saturating_sub(self.data_start);
+        !self.unread && self.tensors.iter().all(|tensor| tensor.begin <= tensor.end && tensor.end <= region)
+    }
+
     /// A shard that could not be read at all.
     #[must_use]
     pub(crate) fn unread(name: impl Into<String>, fault: Fault) -> Self {

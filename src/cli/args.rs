@@ -32,6 +32,8 @@ pub enum Command {
     /// Build one checkpoint from parts of two others
     #[command(visible_alias = "merge")]
     BuildMerged(BuildMergedArgs),
+    /// Compare a merged checkpoint with its manifest and, byte for byte, with its donors
+    Verify(VerifyArgs),
     /// Summarise a checkpoint: tensors, model class, inferred config values
     Inspect(InspectArgs),
     /// Print the tensors that a model class expects, from its config alone
@@ -108,7 +110,7 @@ pub struct InspectArgs {
     pub color: Color,
 }
 
-/// Formats of `inspect`.
+/// Formats of `inspect` and `verify`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum InspectFormat {
     /// For a terminal
@@ -329,6 +331,28 @@ pub struct BuildMergedArgs {
     /// Report formats and the exit code.
     #[command(flatten)]
     pub report: ReportArgs,
+}
+
+/// Arguments of `verify`.
+#[derive(Debug, Args)]
+#[command(
+    arg(hidden_rules()),
+    after_help = "Exit codes:\n  0  everything is equal\n  1  a file or tensor differs, is missing, or is not in the manifest\n  \
+2  the manifest or a file could not be read, or not everything could be verified"
+)]
+pub struct VerifyArgs {
+    /// A directory that build-merged wrote
+    #[arg(value_name = "DIR", default_value = ".")]
+    pub path: PathBuf,
+    /// Recompute the tensors that were made from this donor, and compare them byte for byte; may be repeated
+    #[arg(long, value_name = "ROLE=DIR", value_parser = parse_pair)]
+    pub donor: Vec<(String, String)>,
+    /// Output format
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
+    pub output_format: InspectFormat,
+    /// When to print colours; auto respects `NO_COLOR`
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    pub color: Color,
 }
 
 /// Severity as an argument.

@@ -12,12 +12,12 @@ use super::dtypes;
 use super::error::MergeError;
 use super::explain;
 use super::run::count;
-use crate::checkpoint::{Dtype, Shard, Tensor, byte_len};
+use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::quantization;
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Expression, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::plan::{PlannedTensor, RowSlice, TensorRef, TensorSource, TensorTransform, into_shards};
+use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
 use crate::surgery::values::can_compute;
 
 /// A tensor spec with its parts evaluated once.
@@ -300,8 +300,8 @@ fn expected_shapes<'n>(
 
 /// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used.
 fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String> {
-    let TakenTensor { tensor, rule, .. } = taken;
-    let from = tensor_ref(taken)?;
+    let TakenTensor { donor, shard, tensor, rule, .. } = taken;
+    let from = TensorRef::new(&donor.role, &donor.checkpoint.root, shard, tensor, rule.slice)?;
     let changes = rule.scale.is_some() || taken.dtype() != tensor.dtype;
     let fits = from.shape == shape && rule.fit != TensorTransform::Reinit;
     if (changes || !(fits || rule.fit == TensorTransform::Copy)) && !can_compute(tensor.dtype) {
@@ -326,31 +326,6 @@ fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String
 
 /// Why `pad` does not help.
 const CANNOT_SHRINK: &str = "padding cannot shrink a tensor";
-
-/// The part of a donor tensor that is used, or the reason why the tensor lacks it.
-fn tensor_ref(taken: &TakenTensor<'_>) -> Result<TensorRef, String> {
-    let TakenTensor { donor, shard, tensor, rule, .. } = taken;
-    let mut from = TensorRef {
-        donor: donor.role.clone(),
-        path: donor.checkpoint.root.join(&shard.name),
-        name: tensor.name.clone(),
-        dtype: tensor.dtype,
-        shape: taken.shape(),
-        offset: shard.data_start.saturating_add(tensor.begin),
-        len: tensor.len(),
-        slice: None,
-    };
-    if let Some([first, count]) = rule.slice {
-        let of = tensor.shape.first().copied().unwrap_or_default();
-        let missing = || format!("it has no {count} rows from row {first} on");
-        let row = byte_len(tensor.dtype, tensor.shape.get(1..).unwrap_or_default()).ok_or_else(missing)?;
-        let end = first.checked_add(count).filter(|end| *end <= of && count > 0).ok_or_else(missing)?;
-        from.offset = from.offset.saturating_add(row.saturating_mul(first));
-        from.len = row.saturating_mul(end.saturating_sub(first));
-        from.slice = (count != of).then_some(RowSlice { first, of });
-    }
-    Ok(from)
-}
 
 /// The seam for a tensor with a shape mismatch.
 fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why: &str) -> Seam {

@@ -4,11 +4,12 @@
 //! ([`PlannedShard::preview`]), so that the same rules check it before it is written.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::values::can_compute;
 use crate::checkpoint::{Dtype, FileName, Shard, Tensor, byte_len};
 
 /// A checkpoint to be written.
@@ -144,6 +145,42 @@ impl TensorTransform {
     }
 }
 
+impl TensorRef {
+    /// A tensor of a shard in `root`, or some of its rows: the index of the first one and their number.
+    ///
+    /// # Errors
+    /// The reason why the tensor lacks these rows.
+    pub fn new(
+        donor: &str,
+        root: &Path,
+        shard: &Shard,
+        tensor: &Tensor,
+        rows: Option<[u64; 2]>,
+    ) -> Result<Self, String> {
+        let mut from = Self {
+            donor: donor.to_owned(),
+            path: root.join(&shard.name),
+            name: tensor.name.clone(),
+            dtype: tensor.dtype,
+            shape: tensor.shape.clone(),
+            offset: shard.data_start.saturating_add(tensor.begin),
+            len: tensor.len(),
+            slice: None,
+        };
+        if let Some([first, count]) = rows {
+            let of = tensor.shape.first().copied().unwrap_or_default();
+            let missing = || format!("it has no {count} rows from row {first} on");
+            let row = byte_len(tensor.dtype, tensor.shape.get(1..).unwrap_or_default()).ok_or_else(missing)?;
+            let end = first.checked_add(count).filter(|end| *end <= of && count > 0).ok_or_else(missing)?;
+            from.shape.iter_mut().take(1).for_each(|rows| *rows = count);
+            from.offset = from.offset.saturating_add(row.saturating_mul(first));
+            from.len = row.saturating_mul(end.saturating_sub(first));
+            from.slice = (count != of).then_some(RowSlice { first, of });
+        }
+        Ok(from)
+    }
+}
+
 impl TensorSource {
     /// The bytes of a donor tensor, unchanged.
     #[must_use]
@@ -153,6 +190,24 @@ impl TensorSource {
 }
 
 impl PlannedTensor {
+    /// Whether its transform can make its shape and type from its source.
+    #[must_use]
+    pub fn is_possible(&self) -> bool {
+        let (from, to) = (&self.source.from.shape, &self.shape);
+        let is_computed = self.transform() != TensorTransform::Copy;
+        let nests = from.len() == to.len() && from.iter().zip(to).all(|(have, want)| have <= want);
+        let fits = match self.source.fit {
+            TensorTransform::Copy | TensorTransform::Convert => from == to,
+            TensorTransform::Pad => nests,
+            TensorTransform::GrowRows | TensorTransform::SampleRows => {
+                nests && !to.is_empty() && from.iter().skip(1).eq(to.iter().skip(1))
+            }
+            TensorTransform::Reinit => true,
+        };
+        let types = !is_computed || (can_compute(self.dtype) && can_compute(self.source.from.dtype));
+        fits && types && self.source.scale.is_none_or(|scale| scale.is_finite() && scale != 0.0)
+    }
+
     /// How its bytes are made.
     #[must_use]
     pub fn transform(&self) -> TensorTransform {

@@ -5,6 +5,7 @@ mod recipes;
 mod record;
 mod refused;
 mod users;
+mod verify;
 mod writing;
 
 use std::collections::BTreeMap;

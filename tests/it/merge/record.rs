@@ -19,7 +19,7 @@ fn manifest(dir: &Path) -> Value {
 }
 
 /// Changes the last byte of a tensor, wherever it is stored.
-fn flip(dir: &Path, tensor: &str) {
+pub fn flip(dir: &Path, tensor: &str) {
     for (name, mut bytes) in content(dir).into_iter().filter(|(name, _)| name.ends_with(".safetensors")) {
         let data = 8 + usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
         let header: Value = serde_json::from_slice(&bytes[8..data]).unwrap();

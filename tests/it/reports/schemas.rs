@@ -88,6 +88,7 @@ fn reports_of_checks_and_fixes_follow_their_schema() {
 fn reports_and_manifests_of_merges_follow_their_schemas() {
     let report = jsonschema::draft202012::new(&schema("report")).unwrap();
     let manifest = jsonschema::draft202012::new(&schema("manifest")).unwrap();
+    let verification = jsonschema::draft202012::new(&schema("verification")).unwrap();
     let room = TempDir::new().unwrap();
     for (name, more) in [("plain", [].as_slice()), ("hashed", &["--hash"]), ("seam", &["--set", "projector=keep"])] {
         let out = room.path().join(name);
@@ -95,7 +96,12 @@ fn reports_and_manifests_of_merges_follow_their_schemas() {
         let args = ["merge", "fixtures/merge.json5", "--out", out, "--output-format", "json"];
         holds(&report, &printed(project(), &[&args, more].concat()));
         match fs::read_to_string(Path::new(out).join("merge-manifest.json")) {
-            Ok(text) => holds(&manifest, &serde_json::from_str(&text).unwrap()),
+            Ok(text) => {
+                holds(&manifest, &serde_json::from_str(&text).unwrap());
+                let donor = "vision=fixtures/donors/llava3d-tiny";
+                let verify = printed(project(), &["verify", out, "--donor", donor, "--output-format", "json"]);
+                holds(&verification, &verify);
+            }
             Err(_) => assert_eq!(name, "seam"),
         }
     }

@@ -1,0 +1,32 @@
+//! `verify`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use anyhow::bail;
+
+use super::args::{InspectFormat, VerifyArgs};
+use super::exit::{CLEAN, FAILED, FINDINGS};
+use super::output;
+use crate::merge;
+use crate::report::verification::{self, VerificationVerdict};
+
+/// Runs `verify`.
+pub fn run(args: &VerifyArgs) -> anyhow::Result<u8> {
+    let mut donors = BTreeMap::new();
+    for (role, dir) in &args.donor {
+        if donors.insert(role.clone(), PathBuf::from(dir)).is_some() {
+            bail!("donor {role} is given more than once");
+        }
+    }
+    let verification = merge::verify(&args.path, &donors)?;
+    output::print(&match args.output_format {
+        InspectFormat::Full => verification::full(&verification, output::style(args.color)),
+        InspectFormat::Json => verification::json(&verification),
+    })?;
+    Ok(match verification.verdict {
+        VerificationVerdict::Equal => CLEAN,
+        VerificationVerdict::Differs => FINDINGS,
+        VerificationVerdict::Incomplete => FAILED,
+    })
+}

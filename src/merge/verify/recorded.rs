@@ -1,0 +1,129 @@
+//! Reads `merge-manifest.json` of versions 1 and 2. It is untrusted, like every file of a checkpoint.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::VerifyError;
+use crate::checkpoint::is_plain_file_name;
+use crate::checkpoint::open::{JSON_CAP, read_own};
+use crate::merge::manifest;
+use crate::surgery::plan::{RowSlice, TensorTransform};
+
+/// A recorded merge. Keys of one version only are optional.
+#[derive(Debug, Deserialize)]
+pub(super) struct Recorded {
+    pub(super) schema: u32,
+    /// An object in version 2, a name in version 1.
+    recipe: Value,
+    #[serde(default)]
+    pub(super) donors: BTreeMap<String, RecordedDonor>,
+    #[serde(default)]
+    pub(super) files: BTreeMap<String, RecordedFile>,
+    pub(super) tensors: Vec<RecordedTensor>,
+}
+
+/// A recorded donor.
+#[derive(Debug, Deserialize)]
+pub(super) struct RecordedDonor {
+    #[serde(default)]
+    pub(super) files: BTreeMap<String, RecordedFile>,
+    /// Version 1: SHA-256 of documents.
+    #[serde(default)]
+    documents: BTreeMap<String, String>,
+    #[serde(default)]
+    pub(super) shards: BTreeMap<String, RecordedShard>,
+}
+
+/// A recorded file.
+#[derive(Debug, Clone, Deserialize)]
+pub(super) struct RecordedFile {
+    pub(super) bytes: Option<u64>,
+    pub(super) sha256: String,
+}
+
+/// A recorded shard of a donor.
+#[derive(Debug, Deserialize)]
+pub(super) struct RecordedShard {
+    pub(super) bytes: u64,
+    pub(super) header_sha256: String,
+    pub(super) sha256: Option<String>,
+}
+
+/// A recorded tensor of the result.
+#[derive(Debug, Deserialize)]
+pub(super) struct RecordedTensor {
+    pub(super) name: String,
+    pub(super) shard: String,
+    pub(super) dtype: String,
+    pub(super) shape: Vec<u64>,
+    pub(super) sha256: Option<String>,
+    pub(super) transform: TensorTransform,
+    pub(super) scale: Option<f64>,
+    pub(super) source: RecordedSource,
+}
+
+/// The donor tensor of a recorded tensor.
+#[derive(Debug, Deserialize)]
+pub(super) struct RecordedSource {
+    pub(super) donor: String,
+    pub(super) name: String,
+    pub(super) dtype: Option<String>,
+    pub(super) shape: Vec<u64>,
+    pub(super) slice: Option<RowSlice>,
+    pub(super) sha256: Option<String>,
+}
+
+impl Recorded {
+    /// Reads the manifest of the result in `root`.
+    ///
+    /// # Errors
+    /// [`VerifyError::Manifest`] when it is missing, not JSON of a known version, or names something that no merge writes.
+    pub(super) fn read(root: &Path) -> Result<Self, VerifyError> {
+        let wrong = |reason: String| VerifyError::Manifest { path: root.join(&*manifest::NAME), reason };
+        if !root.join(&*manifest::NAME).exists() {
+            return Err(wrong(
+                "does not exist; `verify` compares a result of build-merged with its manifest".to_owned(),
+            ));
+        }
+        let bytes = read_own(root, &manifest::NAME, JSON_CAP).map_err(|error| wrong(error.to_string()))?;
+        let damaged = |reason: String| wrong(format!("{reason}; the manifest is damaged"));
+        let value: Value = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
+        let schema = value.get("schema").and_then(Value::as_u64);
+        if !matches!(schema, Some(1 | 2)) {
+            let schema = value.get("schema").map_or_else(|| "missing".to_owned(), Value::to_string);
+            return Err(wrong(format!(
+                "its schema is {schema}, and this version of ckpt-doctor reads 1 and 2; use a newer version"
+            )));
+        }
+        let mut recorded: Self = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
+        for donor in recorded.donors.values_mut() {
+            let documents = std::mem::take(&mut donor.documents).into_iter();
+            donor.files.extend(documents.map(|(name, sha256)| (name, RecordedFile { bytes: None, sha256 })));
+        }
+        recorded.check().map_err(damaged)?;
+        Ok(recorded)
+    }
+
+    /// Fails for names that are no file names, and for tensors that are recorded twice.
+    fn check(&self) -> Result<(), String> {
+        let of_donors = self.donors.values().flat_map(|donor| donor.files.keys().chain(donor.shards.keys()));
+        let of_tensors = self.tensors.iter().map(|tensor| &tensor.shard);
+        let mut names = self.files.keys().chain(of_donors).chain(of_tensors);
+        if let Some(name) = names.find(|name| !is_plain_file_name(name)) {
+            return Err(format!("{name:?} is not the name of a file"));
+        }
+        let mut seen = BTreeSet::new();
+        match self.tensors.iter().find(|tensor| !seen.insert(&tensor.name)) {
+            Some(tensor) => Err(format!("{:?} is recorded twice", tensor.name)),
+            None => Ok(()),
+        }
+    }
+
+    /// Name of the recipe.
+    pub(super) fn recipe(&self) -> &str {
+        self.recipe.as_str().or_else(|| self.recipe.get("name")?.as_str()).unwrap_or_default()
+    }
+}

@@ -1,0 +1,244 @@
+//! `verify`: a result against its manifest, and byte for byte against its donors.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use super::record::flip;
+use super::{copy, doctor, donor, merge, text, tiny};
+
+/// Donors in the order of the merge, all options that change bytes, and a result.
+struct Room {
+    work: TempDir,
+    out: PathBuf,
+}
+
+impl Room {
+    fn new(options: &[&str]) -> Self {
+        let work = TempDir::new().unwrap();
+        let out = work.path().join("out");
+        let run = tiny(&out, &[&["--set", "shard-size=300KB"], options].concat());
+        assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+        Self { work, out }
+    }
+
+    fn verify(&self, more: &[&str]) -> Output {
+        doctor(&[&["verify", self.out.to_str().unwrap()], more].concat())
+    }
+
+    /// The output without the place of the result.
+    fn shown(&self, more: &[&str]) -> (Option<i32>, String) {
+        let output = self.verify(more);
+        (output.status.code(), text(&output).replace(self.work.path().to_str().unwrap(), "WORK"))
+    }
+
+    fn edit(&self, file: &str, change: impl Fn(String) -> String) {
+        let path = self.out.join(file);
+        fs::write(&path, change(fs::read_to_string(&path).unwrap())).unwrap();
+    }
+
+    fn manifest(&self, change: impl Fn(&mut Value)) {
+        self.edit("merge-manifest.json", |text| {
+            let mut value = serde_json::from_str(&text).unwrap();
+            change(&mut value);
+            value.to_string()
+        });
+    }
+}
+
+fn donors() -> [String; 4] {
+    let given = |role: &str, name: &str| format!("{role}={}", donor(name).display());
+    ["--donor".to_owned(), given("vision", "spatialvla-tiny"), "--donor".to_owned(), given("language", "llava3d-tiny")]
+}
+
+#[test]
+fn a_result_is_equal_to_its_manifest_and_its_donors() {
+    for options in [&[][..], &["--set", "projector=reinit", "--set", "tokenizer=baked"], &["--hash"]] {
+        let room = Room::new(options);
+        let donors = donors();
+        let given: Vec<&str> = donors.iter().map(String::as_str).collect();
+        let run = room.verify(&[&given, &["--output-format", "json"][..]].concat());
+        assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+        let report: Value = serde_json::from_slice(&run.stdout).unwrap();
+        assert_eq!(report["verdict"], "equal");
+        let equal = |part: usize| report["parts"][part]["equal"].as_u64().unwrap();
+        assert_eq!((equal(1), equal(3) + equal(5)), (354, 354), "{report:#}");
+        assert!(equal(0) > 15 && equal(2) > 5 && equal(4) > 10, "{report:#}");
+    }
+}
+
+#[test]
+fn what_differs_is_named() {
+    let room = Room::new(&[]);
+    flip(&room.out, "multi_modal_projector.linear.weight");
+    room.edit("config.json", |text| text.replacen("\"hidden_size\": 64", "\"hidden_size\": 65", 1));
+    room.edit("README.md", |text| text + "more\n");
+    fs::remove_file(room.out.join("generation_config.json")).unwrap();
+    fs::write(room.out.join("notes.txt"), "mine").unwrap();
+    fs::write(room.out.join(".gitattributes"), "mine").unwrap();
+    let language = room.work.path().join("language");
+    copy(&donor("llava3d-tiny"), &language);
+    flip(&language, "model.embed_tokens.weight");
+    flip(&language, "model.layers.0.self_attn.q_proj.weight");
+    fs::write(language.join("tokenizer_config.json"), "{}").unwrap();
+    let language = format!("language={}", language.display());
+    let vision = format!("vision={}", donor("spatialvla-tiny").display());
+    let (alone, alone_text) = room.shown(&[]);
+    let (both, both_text) = room.shown(&["--donor", &vision, "--donor", &language]);
+    assert_eq!((alone, both), (Some(1), Some(1)), "{both_text}");
+    assert!(both_text.starts_with(alone_text.split("\n\nFound").next().unwrap()), "{both_text}");
+    snapshot!("verify-differences", both_text);
+}
+
+/// One byte of any tensor, and one byte of any file, is found.
+#[test]
+fn every_file_is_compared() {
+    let room = Room::new(&[]);
+    for entry in fs::read_dir(&room.out).unwrap().map(|entry| entry.unwrap()) {
+        let name = entry.file_name().into_string().unwrap();
+        if name == "merge-manifest.json" {
+            continue;
+        }
+        let bytes = fs::read(entry.path()).unwrap();
+        let mut changed = bytes.clone();
+        *changed.last_mut().unwrap() ^= 1;
+        fs::write(entry.path(), changed).unwrap();
+        let run = room.verify(&[]);
+        assert_eq!(run.status.code(), Some(1), "{name}: {}", text(&run));
+        assert!(text(&run).contains(&format!("differs  {name}")), "{name}: {}", text(&run));
+        fs::write(entry.path(), bytes).unwrap();
+    }
+    assert_eq!(room.verify(&[]).status.code(), Some(0));
+}
+
+/// Version 1 had no digests of the result: without donors, little can be verified.
+#[test]
+fn a_manifest_of_version_1_is_read() {
+    let room = Room::new(&[]);
+    room.manifest(|manifest| {
+        manifest["schema"] = json!(1);
+        manifest["recipe"] = manifest["recipe"]["name"].clone();
+        for key in ["files", "training"] {
+            manifest.as_object_mut().unwrap().remove(key);
+        }
+        for tensor in manifest["tensors"].as_array_mut().unwrap() {
+            tensor.as_object_mut().unwrap().remove("sha256");
+            for key in ["sha256", "dtype"] {
+                tensor["source"].as_object_mut().unwrap().remove(key);
+            }
+        }
+        for donor in manifest["donors"].as_object_mut().unwrap().values_mut() {
+            let files = donor["files"].as_object().unwrap().clone();
+            let documents = files.into_iter().filter(|(name, _)| name.ends_with(".json"));
+            donor["documents"] = documents.map(|(name, file)| (name, file["sha256"].clone())).collect();
+            donor.as_object_mut().unwrap().remove("files");
+        }
+    });
+    let given = donors();
+    let given: Vec<&str> = given.iter().map(String::as_str).collect();
+    let (code, shown) = room.shown(&given);
+    assert_eq!(code, Some(2), "{shown}");
+    snapshot!("verify-version-1", shown);
+    flip(&room.out, "multi_modal_projector.linear.weight");
+    assert_eq!(room.verify(&given).status.code(), Some(1));
+}
+
+#[test]
+fn a_manifest_that_cannot_be_used_is_refused() {
+    let room = Room::new(&[]);
+    let original = fs::read(room.out.join("merge-manifest.json")).unwrap();
+    let restore = || fs::write(room.out.join("merge-manifest.json"), &original).unwrap();
+    let mut table = String::new();
+    let mut refused = |label: &str, more: &[&str]| {
+        let (code, shown) = room.shown(more);
+        assert_eq!(code, Some(2), "{label}: {shown}");
+        table.push_str(&format!("{label}: {shown}"));
+        restore();
+    };
+    let set =
+        |pointer: &str, value: Value| room.manifest(|manifest| *manifest.pointer_mut(pointer).unwrap() = value.clone());
+    set("/schema", json!(3));
+    refused("newer", &[]);
+    set("/tensors/0/shard", json!("../../etc/passwd"));
+    refused("path", &[]);
+    room.manifest(|manifest| manifest["files"]["/etc/passwd"] = json!({ "bytes": 1, "sha256": "" }));
+    refused("file", &[]);
+    room.manifest(|manifest| manifest["tensors"][1] = manifest["tensors"][0].clone());
+    refused("twice", &[]);
+    set("/tensors/0/transform", json!("melt"));
+    refused("transform", &[]);
+    room.edit("merge-manifest.json", |_| "[".repeat(100_000));
+    refused("deep", &[]);
+    room.edit("merge-manifest.json", |text| text[..text.len() / 2].to_owned());
+    refused("cut", &[]);
+    refused("role", &["--donor", "vison=/none"]);
+    refused("donor", &["--donor", "vision=/none"]);
+    fs::remove_file(room.out.join("merge-manifest.json")).unwrap();
+    refused("missing", &[]);
+    snapshot!("verify-refused", table);
+}
+
+/// A manifest that claims more than the files have: no value of it becomes a size of memory or a place to read.
+#[test]
+fn a_hostile_manifest_is_bounded() {
+    let room = Room::new(&[]);
+    let original = fs::read(room.out.join("merge-manifest.json")).unwrap();
+    let huge = json!([u64::MAX, u64::MAX]);
+    let given = donors();
+    let given: Vec<&str> = given.iter().map(String::as_str).collect();
+    let changes: [(&str, Value); 8] = [
+        ("/tensors/0/shape", huge.clone()),
+        ("/tensors/0/source/shape", huge),
+        ("/tensors/0/source/slice", json!({ "first": u64::MAX, "of": u64::MAX })),
+        ("/tensors/0/source/shape", json!([])),
+        ("/tensors/0/transform", json!("pad")),
+        ("/tensors/0/dtype", json!("I64")),
+        ("/tensors/0/source/dtype", json!("F4")),
+        ("/tensors/0/scale", json!(0.0)),
+    ];
+    for (pointer, value) in changes {
+        room.manifest(|manifest| {
+            let (parent, key) = pointer.rsplit_once('/').unwrap();
+            manifest.pointer_mut(parent).unwrap()[key] = value.clone();
+        });
+        let run = room.verify(&given);
+        assert_eq!(run.status.code(), Some(1), "{pointer}: {}", text(&run));
+        fs::write(room.out.join("merge-manifest.json"), &original).unwrap();
+    }
+    assert_eq!(room.verify(&given).status.code(), Some(0));
+}
+
+/// The result is not read through a link that leads out of it.
+#[test]
+fn a_link_out_of_the_result_differs() {
+    let room = Room::new(&[]);
+    let config = room.out.join("config.json");
+    let elsewhere = room.work.path().join("config.json");
+    fs::rename(&config, &elsewhere).unwrap();
+    std::os::unix::fs::symlink(&elsewhere, &config).unwrap();
+    let run = room.verify(&[]);
+    assert_eq!(run.status.code(), Some(1), "{}", text(&run));
+    assert!(text(&run).contains("outside the directory"), "{}", text(&run));
+}
+
+/// Another language donor of the same shapes: every copied tensor of it that differs is found.
+#[test]
+fn another_donor_is_detected() {
+    let work = TempDir::new().unwrap();
+    let other = work.path().join("other");
+    copy(&donor("llava3d-tiny"), &other);
+    flip(&other, "model.norm.weight");
+    let out = work.path().join("out");
+    assert_eq!(merge(&donor("spatialvla-tiny"), &other, &out, &[]).status.code(), Some(0));
+    let verify = |dir: &Path| {
+        let given = format!("language={}", dir.display());
+        doctor(&["verify", out.to_str().unwrap(), "--donor", &given])
+    };
+    assert_eq!(verify(&other).status.code(), Some(0));
+    let run = verify(&donor("llava3d-tiny"));
+    assert_eq!(run.status.code(), Some(1));
+    assert!(text(&run).contains("differs  language_model.model.norm.weight"), "{}", text(&run));
+}
