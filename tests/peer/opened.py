@@ -1,0 +1,221 @@
+"""One version of transformers opens the directories that surgery.py made, and runs them.
+
+surgery.py calls it as a program, `opened.py CELLS TOLD`: CELLS has a line of JSON for each directory, and TOLD gets one, with
+what failed in it, stage by stage: an empty list when everything holds, null when this version has no class for it.
+"""
+
+import importlib
+import inspect
+import json
+import sys
+from functools import cache
+from pathlib import Path
+
+from peer import quiet
+from stock import IMAGE_IN_TEXT, allow_without_num2words
+
+TEXT = "pick the red cup"
+# These attend to the whole prompt, and guests only backwards: one token is the same for both.
+ONE_TOKEN = {"paligemma", "paligemma2", "spatialvla"}
+CLOSE = 2e-4  # of logits in float32
+
+
+def dtype_key():
+    import transformers
+
+    return "torch_dtype" if transformers.__version__.startswith("4.47") else "dtype"
+
+
+@cache
+def picture():
+    import numpy
+    from PIL import Image
+
+    return Image.fromarray(numpy.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=numpy.uint8))
+
+
+@cache
+def guest_of(path, dtype):
+    """The donor of the language model by its own classes: tokenizer, and model in float32 after rounding to `dtype`."""
+    import torch
+    from transformers import AutoModelForCausalLM, AutoTokenizer
+
+    model, info = AutoModelForCausalLM.from_pretrained(path, output_loading_info=True, **{dtype_key(): torch.float32})
+    with torch.no_grad():
+        for parameter in model.parameters():  # buffers are computed in float32
+            parameter.copy_(parameter.to(getattr(torch, dtype)))
+    return AutoTokenizer.from_pretrained(path), model.eval(), faults_of(info)
+
+
+@cache
+def processor_name(path):
+    return type(processor_of(path)).__name__
+
+
+def processor_of(path):
+    from transformers import AutoProcessor
+
+    return AutoProcessor.from_pretrained(path, trust_remote_code=True)
+
+
+def class_of(path, host):
+    """The class that config.json names, perhaps one that only the module of the host has; None without one in this version."""
+    import transformers
+    from transformers.dynamic_module_utils import get_class_from_dynamic_module
+
+    config = json.loads((Path(path) / "config.json").read_text())
+    if "AutoModel" in config.get("auto_map", {}):
+        # The modules of the fixture are written for this version.
+        ours = transformers.__version__.startswith("4.47")
+        return get_class_from_dynamic_module(config["auto_map"]["AutoModel"], str(path)) if ours else None
+    name, kind = (config.get("architectures") or ["none"])[0], {"paligemma2": "paligemma"}.get(host, host)
+    if kind not in transformers.CONFIG_MAPPING:
+        return None
+    module = importlib.import_module(f"transformers.models.{kind}.modeling_{kind}")
+    return getattr(transformers, name, None) or getattr(module, name, None)
+
+
+def faults_of(info):
+    return [f"{kind} {len(names)}: {sorted(map(str, names))[:2]}" for kind, names in info.items() if names]
+
+
+def load(cls, path, dtype):
+    """The model in a dtype, and what is wrong with the load."""
+    from transformers import PreTrainedModel
+
+    # SpatialVLA's own from_pretrained does not return the report.
+    model, info = PreTrainedModel.from_pretrained.__func__(cls, path, output_loading_info=True, **{dtype_key(): dtype})
+    wrong = faults_of(info)
+    if dtype != "auto":
+        others = sorted({str(p.dtype) for p in model.parameters()} - {str(dtype)})
+        wrong += [f"parameters of {others}"] if others else []
+    return model.eval(), wrong
+
+
+def run(model, processor, host):
+    """Forward and generate with an image; returns what is wrong."""
+    import torch
+
+    text = TEXT if host == "spatialvla" else IMAGE_IN_TEXT.get(host, "<image>") + TEXT
+    inputs = processor(images=[picture()], text=[text], return_tensors="pt").to(model.dtype)
+    wrong = []
+    with torch.no_grad():
+        logits = model(**inputs).logits
+        if not torch.isfinite(logits).all():
+            wrong.append("forward: logits are not finite")
+        rows = model.get_input_embeddings().weight.shape[0]
+        if logits.shape[-1] != rows:
+            wrong.append(f"forward: {logits.shape[-1]} logits, {rows} rows")
+        if len(processor.tokenizer) > rows:
+            wrong.append(f"tokenizer: {len(processor.tokenizer)} tokens, {rows} rows")
+        made = model.generate(**inputs, min_new_tokens=3, max_new_tokens=3, do_sample=False)
+    if made.shape[1] != inputs["input_ids"].shape[1] + 3:
+        wrong.append(f"generate: {made.shape[1] - inputs['input_ids'].shape[1]} tokens")
+    return wrong
+
+
+def as_guest(model, tokenizer, host, guest_dir, dtype):
+    """Text alone gives the ids and, in float32, the logits that the language model alone gives."""
+    import torch
+
+    own, guest, wrong = guest_of(guest_dir, dtype)
+    ids, wanted = (t(TEXT, add_special_tokens=False)["input_ids"] for t in (tokenizer, own))
+    if ids != wanted:
+        return wrong + [f"ids {ids[:8]}, the guest's {wanted[:8]}"]
+    batch = torch.tensor([wanted[:1] if host in ONE_TOKEN else wanted])
+    # The LLaVAs of 4.47 do not run without an image; the language model in them is a whole one there.
+    inside = getattr(model, "language_model", None)
+    speaker = inside if hasattr(inside, "lm_head") else model
+    with torch.no_grad():
+        want = guest(input_ids=batch, attention_mask=torch.ones_like(batch)).logits
+        got = speaker(input_ids=batch, attention_mask=torch.ones_like(batch)).logits[..., : want.shape[-1]]
+    far = (want[..., : got.shape[-1]] - got).abs().max().item()
+    return wrong + ([f"logits of text differ from the guest's by {far:.3g}"] if not far <= CLOSE else [])
+
+
+def whole(cell, cls):
+    """A model with its processor, in three dtypes."""
+    import torch
+
+    yield "processor"
+    processor = processor_of(cell["out"])
+    if type(processor).__name__ != processor_name(cell["host_dir"]):
+        yield "processor", [f"it is a {type(processor).__name__}"]
+    for dtype in (torch.float32, torch.bfloat16, "auto"):
+        yield f"load {dtype}"
+        model, wrong = load(cls, cell["out"], dtype)
+        yield f"load {dtype}", wrong
+        yield f"run {dtype}"
+        yield f"run {dtype}", run(model, processor, cell["host"])
+        if dtype == torch.float32 and cell.get("guest_dir"):
+            yield "text"
+            yield "text", as_guest(model, processor.tokenizer, cell["host"], cell["guest_dir"], cell["stored"])
+
+
+def language_part(cell, cls):
+    """A language model that was taken out gives what its host gives for text alone."""
+    import torch
+
+    yield "host"
+    host, _ = load(class_of(cell["host_dir"], cell["host"]), cell["host_dir"], torch.float32)
+    tokenizer = processor_of(cell["host_dir"]).tokenizer
+    yield "part"
+    yield "part", as_guest(host, tokenizer, cell["host"], cell["out"], cell["stored"])
+
+
+def vision_part(cell, cls):
+    """A tower that was taken out opens in its own class, and sees an image of its own image processor."""
+    import torch
+    from transformers import AutoImageProcessor
+
+    yield "image processor"
+    images = AutoImageProcessor.from_pretrained(cell["out"])
+    yield "load"
+    model, wrong = load(cls, cell["out"], torch.float32)
+    yield "load", wrong
+    yield "run"
+    inputs = images(images=[picture()], return_tensors="pt")
+    kept = {"pixel_values", "image_grid_thw", "pixel_attention_mask"} & inputs.keys()
+    given = {key: inputs[key].flatten(0, inputs[key].dim() - 4) if inputs[key].dim() > 4 else inputs[key] for key in kept}
+    if "image_grid_thw" in given:
+        given = {"hidden_states": given["pixel_values"], "grid_thw": given["image_grid_thw"]}
+    given = {key: value for key, value in given.items() if key in inspect.signature(model.forward).parameters}
+    with torch.no_grad():
+        model(**given)
+
+
+def open_cell(cell):
+    """What failed under this version, each with its stage."""
+    cls, wrong, stage = class_of(cell["out"], cell["host"]), [], "class"
+    if cls is None:
+        return None
+    how = {"part language": language_part, "part vision": vision_part}.get(cell["what"], whole)
+    try:
+        for told in how(cell, cls):
+            if isinstance(told, str):
+                stage = told
+            else:
+                wrong += [f"{told[0]}: {fault}" for fault in told[1]]
+    except Exception as error:  # a result may break the loader in any way
+        words = str(error).strip().splitlines() or [""]
+        wrong.append(f"{stage}: {type(error).__name__}: {words[0][:200]}")
+    return wrong
+
+
+def main():
+    cells, told = map(Path, sys.argv[1:])
+    import torch
+    import transformers
+
+    torch.set_num_threads(1)
+    quiet()
+    allow_without_num2words()
+    with told.open("w") as file:
+        for line in cells.read_text().splitlines():
+            cell = json.loads(line)
+            file.write(json.dumps({"name": cell["name"], "version": transformers.__version__, "wrong": open_cell(cell)}) + "\n")
+            file.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+#!/usr/bin/env python3
+"""Parts of stock models put together by the tool, opened and run by every version of transformers.
+
+    surgery.py FOLDER... [--all] [--only REGEX] [--page FILE] [--keep DIRECTORY] [--list]
+
+Each FOLDER has one version of transformers, oldest first, for the Python that runs this. Tiny models are saved by the oldest
+version that has their class (stock.py). The tool exchanges language models and vision towers, and takes parts out and puts them
+back (cells.py). Every version then opens each result (opened.py): processor, load in float32, bfloat16 and "auto", forward and
+generate with an image, and text alone as the guest alone.
+
+A result that `check` calls sound for a version runs there, and one that it calls broken does not. A refusal has to be one of
+REFUSED. The tensors are the donors', apart from those that the report names. `--all` tries every pair in every variant; without
+it each pair is tried in one. `--page` compares the tables with a page, and CKPT_DOCTOR_WRITE=1 writes it.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from cells import OPENVLA, Language, Part, Tower, all_cells
+from fresh import version_in
+from peer import Tally, workplace
+from stock import TOWERS, WIDTH, build, donor_name
+
+HERE = Path(__file__).parent
+# Refusals that are right: regular expressions for the name of the cell and for the tool's reason, and the fact behind it.
+OWN = "the class of the host builds one kind of language model, whatever the config says"
+REFUSED = [
+    (r"(qwen2_vl|qwen2_5_vl) x (?!qwen2 ).*", "builds its own", OWN),
+    (r"gemma3 x (?!gemma3_text ).*", "builds its own", OWN),
+    (r"openvla x (?!llama|mistral).*", "builds its own", OWN),
+    (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
+    (r"(qwen2_vl|qwen2_5_vl) x qwen2 (reinit|pad)", "mrope|head", "the positions of image patches divide the heads of another width"),
+    (r"(llava|llava_next) x gemma2 .*", "4.47 cannot generate", "the host was saved by 4.47, which cannot generate with this language model"),
+    (r".* sees with siglip2", "", "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP"),
+    (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
+    (r"llava_onevision sees with (clip|dinov2)", "builds its own", "the host counts the patches of a tower without class token"),
+    (r"idefics3 sees with .*", "", "the class of the host builds its own tower, whatever the config says"),
+]
+
+
+def start(folder, program, *arguments):
+    env = {**os.environ, "PYTHONPATH": str(folder), "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": "", "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run([sys.executable, program, *map(str, arguments)], capture_output=True, text=True, env=env)
+    if done.returncode:
+        sys.exit(f"the worker failed with {folder}:\n{done.stderr[-3000:]}")
+
+
+def open_all(folder, lines, work):
+    """What a version does with the cells: {name: what failed, or None when it has no such class}."""
+    version = version_in(folder)
+    cells, told = work / f"cells-{version}.jsonl", work / f"told-{version}.jsonl"
+    cells.write_text("".join(line + "\n" for line in lines))
+    start(folder, HERE / "opened.py", cells, told)
+    return version, {t["name"]: t["wrong"] for t in map(json.loads, told.read_text().splitlines())}
+
+
+def control(path, host):
+    """The host as it is, which has to run before anything can be said of what is made of it."""
+    return json.dumps(dict(name=host, what="control", host=host, out=str(path), host_dir=str(path)))
+
+
+def judge(tally, cell, happened):
+    """Compares what the tool said of a result with what each version did; returns the versions that run it."""
+    said, runs = cell.said(), []
+    for version, told in happened.items():
+        wrong, verdict = told[cell.name], said.get(version)
+        if wrong is None or told[cell.host] != []:
+            continue  # no such class in this version, or the host alone does not run there
+        if verdict is None:
+            pass  # the report says nothing of this version
+        elif isinstance(verdict, list):
+            tally.expect(wrong, f"{cell.name} {version}: runs, and the tool says {verdict}")
+        else:
+            tally.expect(not wrong, f"{cell.name} {version}: the tool says {verdict}", "\n    ".join(wrong))
+        runs += [] if wrong else [version]
+    return runs
+
+
+def refusal(tally, cell):
+    """The fact behind a right refusal; any other is reported, and its reason is the outcome."""
+    for name, why, fact in REFUSED:
+        if re.fullmatch(name, cell.name) and re.search(why, cell.reason):
+            return fact
+    tally.expect(False, f"{cell.name}: refused, exit {cell.code}", cell.reason)
+    return cell.reason
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("folder", nargs="+")
+    p.add_argument("--all", action="store_true", help="every pair in every variant")
+    p.add_argument("--only", default="", help="cells whose name has this regular expression")
+    p.add_argument("--page", type=Path)
+    p.add_argument("--keep", type=Path, help="directory for donors and results")
+    p.add_argument("--list", action="store_true", help="print every cell")
+    p.add_argument("--build", nargs=2, help=argparse.SUPPRESS)
+    a = p.parse_args()
+    if a.build:
+        return build(json.loads(a.build[0]), Path(a.build[1]))
+    tally = Tally()
+    with workplace() as temporary:
+        cells = [cell for cell in all_cells(a.all, TOWERS) if re.search(a.only, cell.name)]
+        outcomes = run(tally, cells, a.folder, (a.keep or temporary).resolve())
+        for cell in cells if a.list else []:
+            print(f"{cell.name}: {outcomes[cell.name]}")
+        if a.page:
+            compare_page(tally, a.page, page(cells, outcomes))
+    tally.finish()
+
+
+def run(tally, cells, folders, work):
+    """All cells; returns {name: the versions that run it, or why it was refused}."""
+    donors, results = work / "donors", work / "results"
+    donors.mkdir(parents=True, exist_ok=True)
+    results.mkdir(exist_ok=True)
+    hosts = {cell.host: ("host", cell.host, WIDTH, "f32") for cell in cells if cell.host != OPENVLA}
+    wanted = sorted({donor for cell in cells for donor in cell.donors} | set(hosts.values()))
+    for folder in folders:
+        start(folder, __file__, folder, "--build", json.dumps(wanted), donors)
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda cell: cell.run(donors, results), cells))
+        written = [cell for cell in cells if cell.reason is None and cell.host != OPENVLA]
+        # A control lies where the cells find the host.
+        lines = [control(next(c for c in cells if c.host == host).path(donor), host) for host, donor in hosts.items()]
+        happened = dict(pool.map(lambda folder: open_all(folder, lines + [cell.line() for cell in written], work), folders))
+    for version, told in happened.items():
+        print(*(f"{host} alone in {version}: {told[host]}\n" for host in hosts if told[host]), sep="", end="")
+    outcomes = {}
+    for cell in cells:
+        if cell.reason is None and cell.host == OPENVLA:
+            planned = cell.report["checkpoints"][-1]
+            tally.expect(planned["verdict"] != "error", f"{cell.name}: planned with {planned['verdict']}")
+            outcomes[cell.name] = ["planned"]
+        elif cell.reason is None:
+            cell.compare(tally)
+            outcomes[cell.name] = judge(tally, cell, happened)
+        else:
+            outcomes[cell.name] = refusal(tally, cell)
+    print(f"{len(cells)} cells, {len(written)} written")
+    return outcomes
+
+
+# The page.
+
+HEAD = """# What goes together
+
+Generated by `CKPT_DOCTOR_WRITE=1 .ci/run peer-surgery`, which builds every pair below from tiny models and runs the result.
+
+A field has the versions of transformers that open the result, run it with an image, and generate: in float32, in bfloat16
+and in the dtype of the files. In a version that is not there, the class of the host or of the guest does not exist, or the
+report of the merge says that the result does not load there. A letter is the reason why the tool refuses the pair; below
+each table. OpenVLA's merges are planned and checked, and not opened here, because its code needs the package timm.
+"""
+TABLES = {
+    Language: "## Language models\n\n`ckpt-doctor build-merged --vision HOST --language GUEST --out OUT`, hosts in rows and guests in columns. A guest of another\nwidth needs `--set projector=pad` or `projector=reinit`.\n",
+    Tower: "## Vision towers\n\n`ckpt-doctor build-merged --vision TOWER --language HOST --out OUT`, hosts in rows and towers in columns.\n",
+    Part: "## Parts\n\n`ckpt-doctor extract HOST --part PART --out OUT`: versions that open the part in its own class. `ckpt-doctor insert` of the\npart gives the files of the host again, byte for byte.\n",
+}
+
+
+def page(cells, outcomes):
+    parts = [HEAD]
+    for kind, text in TABLES.items():
+        of_kind = [cell for cell in cells if isinstance(cell, kind)]
+        parts.append(text)
+        parts.append(matrix(of_kind, outcomes))
+    return "\n".join(parts)
+
+
+def matrix(cells, outcomes):
+    columns = list(dict.fromkeys(cell.column for cell in cells))
+    reasons, rows = {}, {}
+    for cell in cells:
+        outcome = outcomes[cell.name]
+        if isinstance(outcome, str):
+            field = reasons.setdefault(outcome, chr(ord("a") + len(reasons)))
+        else:
+            field = " ".join(version.rpartition(".")[0] or version for version in outcome) or "none"
+        # Of several variants the first is shown that is written.
+        if cell.column not in rows.setdefault(cell.row, {}) or rows[cell.row][cell.column] in reasons.values():
+            rows[cell.row][cell.column] = field
+    lines = [f"| | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+    lines += [f"| {row} | {' | '.join(fields.get(column, '') for column in columns)} |" for row, fields in rows.items()]
+    lines += [""] + [f"- {letter}: {why}" for why, letter in reasons.items()]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def compare_page(tally, path, text):
+    if os.environ.get("CKPT_DOCTOR_WRITE"):
+        path.write_text(text)
+    tally.expect(path.exists() and path.read_text() == text, f"{path} is not current: CKPT_DOCTOR_WRITE=1 .ci/run peer-surgery")
+
+
+if __name__ == "__main__":
+    main()
