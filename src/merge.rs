@@ -36,7 +36,7 @@ use std::path::Path;
 pub use error::PipelineError;
 pub use file::ResolvedMergeFile;
 #[cfg(feature = "cli")]
-pub(crate) use recipe_file::read as read_recipe;
+pub(crate) use recipe_file::{processor_of, read as read_recipe};
 pub use run::{MergeRequest, MergeRun};
 #[cfg(feature = "internals")]
 pub use validate::validate;

@@ -6,10 +6,9 @@ use anyhow::{Context, bail};
 
 use crate::checkpoint::list::list;
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
-use crate::knowledge::processor::Processor;
 use crate::knowledge::rule::RuleSet;
 use crate::knowledge::{Knowledge, Library};
-use crate::merge::read_recipe;
+use crate::merge::{processor_of, read_recipe};
 
 /// Maximum depth of folders in a directory of rules.
 const MAX_DEPTH: usize = 8;
@@ -38,7 +37,7 @@ pub fn rules(rules: Option<&Path>) -> anyhow::Result<RuleSet> {
 pub fn knowledge(set: RuleSet, rules: Option<&Path>) -> anyhow::Result<Knowledge> {
     let mut knowledge = Knowledge::with(set, with(rules)?)?;
     for (name, text) in texts(rules, "processors")? {
-        let processor = Processor::parse(&name, &text)?;
+        let processor = processor_of(&name, &text, &knowledge)?;
         knowledge.processors.retain(|other| other.processor != processor.processor);
         knowledge.processors.insert(0, processor);
     }

@@ -14,17 +14,27 @@ pub(super) fn cause(context: &Context<'_>, error: &EvalError) -> String {
     let missing_value = || references.paths.iter().find_map(|path| missing_value(context, path));
     let missing_tensor = || references.calls.iter().find_map(|call| missing_tensor(context, call));
     let words = missing_value().or_else(missing_tensor).or_else(|| in_words(&error.cause));
-    words.map_or_else(|| error.to_string(), |words| format!("{words} ({error})"))
+    let Some(words) = words else { return error.to_string() };
+    if error.cause.starts_with(OF_A_FUNCTION) {
+        format!("{words} (`{}`)", error.source_text)
+    } else {
+        format!("{words} ({error})")
+    }
 }
 
 /// The first key of a path that a donor's config lacks.
 fn missing_value(context: &Context<'_>, path: &[String]) -> Option<String> {
+    let (stored, path) = match path.split_first() {
+        Some((first, path)) if first == "stored" => (true, path),
+        _ => (false, path),
+    };
     let (role, keys) = path.split_first()?;
     let spec = context.recipe.donors.iter().find(|spec| spec.role == *role)?;
     let Some(donor) = context.donor(role) else {
         return Some(format!("no {role} donor is given, {}; pass --donor {role}=DIR", spec.what));
     };
-    let mut here = &donor.config;
+    let file = donor.checkpoint.document("config.json").and_then(|document| document.value.as_ref());
+    let mut here = if stored { file.unwrap_or(&Value::Null) } else { &donor.config };
     if here.is_null() && !keys.is_empty() {
         return Some(format!("the {role} donor has no readable config.json"));
     }

@@ -2,7 +2,7 @@
 
 use std::path::{Component, Path};
 
-use super::validate::validate;
+use super::validate::{validate, validate_processor};
 use crate::checkpoint::open::{JSON_CAP, read_capped};
 use crate::knowledge::Knowledge;
 use crate::knowledge::processor::Processor;
@@ -27,12 +27,22 @@ pub fn read(path: &Path, knowledge: &Knowledge) -> Result<Recipe, DataError> {
     let processor = recipe.tokens.as_ref().and_then(|tokens| tokens.processor.as_ref());
     if let Some(path) = processor.filter(|path| path.ends_with(".json5")) {
         let found = folder.file("processor", path)?;
-        let processor = found.map(|(name, text)| Processor::parse(&name, &text)).transpose()?;
+        let processor = found.map(|(name, text)| processor_of(&name, &text, knowledge)).transpose()?;
         let missing = || folder.wrong("processor", path, "does not exist in the folder of the recipe");
         recipe.origin.processor = Some(processor.ok_or_else(missing)?);
     }
     validate(&recipe, &name, &text, knowledge)?;
     Ok(recipe)
+}
+
+/// Parses and validates the text of a processor; `name` is its path.
+///
+/// # Errors
+/// [`DataError`] with the place.
+pub fn processor_of(name: &str, text: &str, knowledge: &Knowledge) -> Result<Processor, DataError> {
+    let processor = Processor::parse(name, text)?;
+    validate_processor(&processor, name, text, knowledge)?;
+    Ok(processor)
 }
 
 /// The folder of a recipe, with the recipe's path and text for the places of errors.

@@ -5,8 +5,10 @@
 mod expressions;
 mod files;
 mod places;
+mod processors;
 
 pub(super) use places::misplaced;
+pub(super) use processors::validate_processor;
 
 use std::collections::BTreeSet;
 

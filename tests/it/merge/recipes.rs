@@ -214,6 +214,12 @@ fn an_expression_that_fails_is_explained() {
         set("/x", "from.hidden_size.x"),
         set("/x", "from.mm_projector_type.size()[7]"),
         set("/x", "1 / (from.hidden_size - from.hidden_size)"),
+        set("/x", "pow(2, -1)"),
+        set("/x", "from.hidden_size < 'a'"),
+        set("/x", "[1, 2]['a']"),
+        set("/x", "stored.from.nothing"),
+        set("/x/{from.nothing}", "1"),
+        json!({ "seams": [{ "that": "from.hidden_size", "message": "m" }] }),
         json!({ "let": [{ "name": "n", "is": "shape('from', 'nothing')[0]" }] }),
         json!({ "tensors": [{ "from": "from", "names": "^nothing$" }] }),
     ] {

@@ -32,6 +32,10 @@ fn donors(work: &Path) {
     };
     changed(&llama, "llama-wide", json!({ "hidden_size": 32, "intermediate_size": 40 }));
     changed(&recipes.join("t5"), "t5-deep", json!({ "num_decoder_layers": 3 }));
+    // transformers 4.57 writes the names that the class of 4.47 has.
+    copy(&work.join("llava"), &work.join("llava-later"));
+    let config = work.join("llava-later/config.json");
+    fs::write(&config, fs::read_to_string(&config).unwrap().replace("4.47.0", "4.57.6")).unwrap();
 }
 
 /// A recipe with donors by role, and options.
@@ -43,6 +47,7 @@ const RUNS: &[Run] = &[
     ("llava-llama/recipe.json5", &[("vision", "llava"), ("language", "llama")], &[]),
     ("llava-llama/recipe.json5", &[("vision", "llava"), ("language", "llama-wide")], &[]),
     ("llava-llama/recipe.json5", &[("vision", "llava"), ("language", "llama-wide")], &["projector=reinit"]),
+    ("llava-llama/recipe.json5", &[("vision", "llava-later"), ("language", "llama-wide")], &["projector=reinit"]),
     ("llava-tower.json5", &[("from", "llava"), ("tower", "siglip")], &[]),
     ("idefics3-llama.json5", &[("vision", "idefics3"), ("language", "llama")], &["connector=reinit"]),
     ("t5-halves.json5", &[("encoder", "t5"), ("decoder", "t5-deep")], &[]),
@@ -148,6 +153,8 @@ fn files_of_a_recipe_lie_in_its_folder() {
     symlink("../outside.py", folder.join("link.py")).unwrap();
     symlink("deep/inside.py", folder.join("inner.py")).unwrap();
     fs::write(folder.join("broken.json5"), "{ processor: 'x', ad: [] }").unwrap();
+    fs::write(folder.join("class.json5"), "{ processor: 'x', architectures: ['lama'], add: [] }").unwrap();
+    fs::write(folder.join("name.json5"), "{ processor: 'x', add: [{ content: '<a{j}>', count: 'n' }] }").unwrap();
     let llama = donor("llava3d-tiny");
     let given = format!("from={}", llama.display());
     let run = |text: &str| {
@@ -171,7 +178,7 @@ fn files_of_a_recipe_lie_in_its_folder() {
         assert_eq!(code, Some(2), "{text}: {error}");
         writeln!(table, "{text:<22} {}", error.trim_end()).unwrap();
     }
-    for processor in ["../x.json5", "nothing.json5", "broken.json5"] {
+    for processor in ["../x.json5", "nothing.json5", "broken.json5", "class.json5", "name.json5"] {
         let (code, error) = run(&recipe(&copy, Some(processor)));
         assert_eq!(code, Some(2), "{processor}: {error}");
         writeln!(table, "{processor:<22} {}", error.trim_end()).unwrap();
@@ -231,6 +238,52 @@ fn patterns_leave_out_weights_code_and_what_is_written() {
 fn names_without_weights(out: &Path) -> Vec<String> {
     let own = |name: &String| !name.contains("safetensors") && !name.starts_with("merge-") && name != "README.md";
     names(out).into_iter().filter(own).collect()
+}
+
+/// Numbers and texts of options, in pointers and values.
+#[test]
+fn options_have_kinds_and_pointers_are_templates() {
+    let work = TempDir::new().unwrap();
+    let (out, file) = (work.path().join("out"), work.path().join("r.json5"));
+    let mut whole: Value =
+        serde_json::from_str(&recipe(&json!({ "copy": { "from": "from", "names": [] } }), None)).unwrap();
+    whole["options"] = json!([
+        { "name": "n", "help": "h", "kind": "integer", "default": "7" },
+        { "name": "key", "help": "h", "kind": "text", "default": "a:b" },
+    ]);
+    whole["tokens"] = json!({ "base": "from" });
+    whole["documents"][0]["edits"] = json!([
+        { "set": { "at": "/x_{opt.n}", "to": "opt.n + 1" } },
+        { "set": { "at": "/{opt.key}", "to": "{'id': id_of('<s>'), 'none': id_of('<nothing>'), 'length': tokens.length}" } },
+        { "set": { "at": "/stored", "to": "has(stored.from.pad_token_id)", "when": "opt.n < 100" } },
+        { "remove": { "at": ["/{['mm', 'vision', 'tower'].filter(x, x != '').map(x, x)[0]}_vision_tower"] } },
+    ]);
+    fs::write(&file, whole.to_string()).unwrap();
+    let given = format!("from={}", donor("llava3d-tiny").display());
+    let args = ["merge", "--recipe", file.to_str().unwrap(), "--donor", &given, "--out", out.to_str().unwrap()];
+    let run = doctor(&args);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let read = |name: &str| -> Value { serde_json::from_slice(&fs::read(name).unwrap()).unwrap() };
+    let before = read(donor("llava3d-tiny").join("config.json").to_str().unwrap());
+    let config = read(out.join("config.json").to_str().unwrap());
+    assert_eq!(config["x_7"], 8);
+    assert_eq!(config["a:b"], json!({ "id": 1, "none": null, "length": config["a:b"]["length"] }));
+    assert!(config["a:b"]["length"].as_u64().unwrap() >= 340);
+    assert_eq!(config["stored"], before.get("pad_token_id").is_some());
+    assert!(before.get("mm_vision_tower").is_some() && config.get("mm_vision_tower").is_none(), "{config}");
+
+    fs::remove_dir_all(&out).unwrap();
+    for (option, reason) in [
+        ("n=x", "n=x is not an integer"),
+        ("key=use_kernels", "use_kernels makes a loader run code"),
+        ("key=auto_map", "Nothing written: the planned checkpoint has errors"),
+        ("key=a\u{7}", "control character"),
+    ] {
+        let run = doctor(&[args.as_slice(), &["--set", option]].concat());
+        assert_eq!(run.status.code(), Some(2), "{option}: {}", text(&run));
+        assert!(text(&run).contains(reason), "{option}: {}", text(&run));
+        assert!(!out.exists());
+    }
 }
 
 /// The recipes that docs/recipes.md quotes are those of the fixtures, and its tables name what the code defines.
