@@ -8,6 +8,7 @@ pub mod library;
 pub mod loader;
 pub mod names;
 mod ordered;
+pub mod parts;
 pub mod processor;
 pub mod quantization;
 pub mod recipe;
@@ -26,6 +27,7 @@ pub use loader::Loader;
 
 use embeddings::TokenEmbedding;
 use names::LoaderNames;
+use parts::ModelParts;
 use processor::Processor;
 use quantization::Scheme;
 use recipe::Recipe;
@@ -42,6 +44,8 @@ pub struct Knowledge {
     pub library: Library,
     /// Processors.
     pub processors: Vec<Processor>,
+    /// Parts of models.
+    pub parts: Vec<ModelParts>,
     /// Recipes; a merge selects one by its donors.
     pub recipes: Vec<Recipe>,
     /// Quantisation schemes.
@@ -74,6 +78,7 @@ impl Knowledge {
             rules,
             library,
             processors: Processor::embedded()?,
+            parts: ModelParts::embedded()?,
             recipes: Recipe::embedded()?,
             schemes: Scheme::embedded()?,
             names: LoaderNames::embedded()?,

@@ -18,6 +18,7 @@ mod files;
 mod hub;
 pub(crate) mod manifest;
 mod options;
+mod parts;
 mod plan;
 mod publish;
 mod recipe_file;

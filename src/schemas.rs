@@ -15,6 +15,7 @@ use crate::checkpoint::FileName;
 use crate::knowledge::architecture::Blueprint;
 use crate::knowledge::expression::{Expression, Template};
 use crate::knowledge::loader::Loader;
+use crate::knowledge::parts::ModelParts;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::quantization::Scheme;
 use crate::knowledge::recipe::{MergeFile, Recipe};
@@ -64,6 +65,7 @@ fn inputs() -> Vec<Input> {
         input::<Rule>("rule", "A rule of ckpt-doctor", values("rules/checks")),
         input::<Blueprint>("architecture", "An architecture of ckpt-doctor", values("rules/architectures")),
         input::<Recipe>("recipe", "A recipe of ckpt-doctor", values("rules/recipes")),
+        input::<ModelParts>("parts", "The parts of a model of ckpt-doctor", values("rules/parts")),
         input::<Processor>("processor", "A processor of ckpt-doctor", values("rules/processors")),
         input::<Scheme>("quantization", "A quantisation scheme of ckpt-doctor", values("rules/quantization")),
         input::<Settings>("settings", "Settings of ckpt-doctor: ckpt-doctor.json5", settings()),

@@ -138,6 +138,13 @@ impl Library {
         self.all_of_model_type(model_type).next().is_some()
     }
 
+    /// The class that `AutoModel…` builds for a model type: under `loader`, or the newest loader that knows one.
+    #[must_use]
+    pub fn auto_class(&self, model_type: &str, mapping: &str, loader: Loader) -> Option<&str> {
+        let mut loaders = std::iter::once(loader).chain(Loader::ALL.into_iter().rev());
+        loaders.find_map(|loader| self.of_model_type(model_type, loader)?.auto(mapping, loader))
+    }
+
     /// The model type of the class of this name; `None` for an unknown class, or when several have it.
     #[must_use]
     pub fn model_type_of(&self, class: &str) -> Option<&str> {

@@ -17,7 +17,9 @@ use crate::checkpoint::{FileName, FilePattern};
 /// `stored` (the config of each role as it is in the file: `stored.vision`), `processor`, `preprocessor`, `tokens`, the names
 /// that `let` defined so far, and the functions `shape(role, tensor)`, `has(role, prefix)`, `dtype(role)`: the floating-point
 /// type of most bytes of a donor as torch names it (`'bfloat16'`), and `id_of(token)`: the id in the tokenizer of the result,
-/// null when it has no such token.
+/// null when it has no such token. `part(role, name)` is a part of a donor: its config with defaults (`config`), as it is
+/// written (`stored`), its JSON pointer (`at`), its model type (`type`), the types that may stand there (`takes`), and the names
+/// of its `embedding` and `head`. `tokenizer_config` is that of the donor whose tokenizer is used.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -89,6 +91,12 @@ pub struct DonorSpec {
     /// directory that is not a checkpoint, whose errors do not count.
     #[serde(default)]
     pub architectures: Vec<String>,
+    /// Parts that the donor must have, instead of `architectures`; `rules/parts/` describes the parts of models.
+    #[serde(default)]
+    pub parts: Vec<String>,
+    /// Parts that the donor must not have, for the choice of a recipe.
+    #[serde(default)]
+    pub no_parts: Vec<String>,
     /// Whether the donor may be left out.
     #[serde(default)]
     pub optional: bool,
@@ -101,7 +109,7 @@ impl DonorSpec {
     /// Whether errors of the donor stop the merge; otherwise it is a directory that only provides files.
     #[must_use]
     pub fn is_checkpoint(&self) -> bool {
-        !self.architectures.is_empty()
+        !self.architectures.is_empty() || !self.parts.is_empty()
     }
 
     /// Whether the role takes a checkpoint of any class.
@@ -177,10 +185,13 @@ impl OptionKind {
 pub struct TokenSpec {
     /// Role of the donor whose tokenizer is used.
     pub base: String,
-    /// Name of a processor in `rules/processors/`, or the path of a `.json5` file below the folder of the recipe. When missing,
-    /// no token is added.
+    /// Name of a processor in `rules/processors/`, or the path of a `.json5` file below the folder of the recipe. When
+    /// missing, as `of`, no token is added.
     #[serde(default)]
     pub processor: Option<String>,
+    /// Role of the donor whose processor needs the tokens, instead of `processor`: `rules/parts/` names them.
+    #[serde(default)]
+    pub of: Option<String>,
 }
 
 /// A condition that the donors must meet.
@@ -256,6 +267,10 @@ pub enum DocumentEdit {
     Tokens(TokensEdit),
     /// Writes the dtype of the weights.
     Dtype(DtypeEdit),
+    /// Inserts the config of a part of a donor.
+    Part(PartEdit),
+    /// Sets what follows from a part: the entries of `rules/parts/` for this document.
+    Follow(FollowEdit),
 }
 
 /// Writes the dtype of the weights: every `torch_dtype` and `dtype` of the document and of the configs in it gets the value,
@@ -266,6 +281,43 @@ pub enum DocumentEdit {
 pub struct DtypeEdit {
     /// The dtype as torch names it; null changes nothing.
     pub to: Expression,
+}
+
+/// Inserts the config of a part of a donor.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct PartEdit {
+    /// Name of the part.
+    pub part: Template,
+    /// Role of the donor. Keys that make a loader run code are left out.
+    pub from: String,
+    /// Role of the donor in whose model the part is inserted: its place is that of the same part. When missing, the document
+    /// becomes the config of the part as a model of its own.
+    #[serde(default)]
+    pub into: Option<String>,
+    /// Whether only the keys are written that differ from those of the part that stands there.
+    #[serde(default)]
+    pub changes: bool,
+    /// Keys to leave out: exact names, or prefixes that end in `*`.
+    #[serde(default)]
+    pub without: Vec<String>,
+    /// Values of keys of the part's config, over those of the donor.
+    #[serde(default)]
+    pub set: BTreeMap<String, Expression>,
+}
+
+/// Sets what follows from a part.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct FollowEdit {
+    /// Name of the part.
+    pub part: Template,
+    /// Role of the donor that the part comes from.
+    pub from: String,
+    /// Role of the donor in whose model the part is inserted.
+    pub into: String,
 }
 
 /// Writes the added tokens.
@@ -341,8 +393,18 @@ pub struct RemoveEdit {
 pub struct TensorSpec {
     /// Role of the donor.
     pub from: String,
-    /// Regular expression for tensor names of the donor.
+    /// Regular expression for tensor names of the donor; all when missing.
+    #[serde(default)]
     pub names: String,
+    /// Name of the part of the donor that the tensors belong to, as `rules/parts/` describes it.
+    #[serde(default)]
+    pub part: Option<Template>,
+    /// Role of the donor in whose model the part is inserted: the tensors get its names for the same part.
+    #[serde(default)]
+    pub into: Option<String>,
+    /// Whether the tensors get the names that they have in a model of the part alone.
+    #[serde(default)]
+    pub alone: bool,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
@@ -415,7 +477,11 @@ pub struct ModulesSpec {
     /// Roles of the donors; the first one that has the module is used.
     pub from: Vec<String>,
     /// Modules to start from, without `.py`.
+    #[serde(default)]
     pub roots: Vec<String>,
+    /// Whether to start from the modules that `auto_map` in the documents of the first donor names, too.
+    #[serde(default)]
+    pub auto_map: bool,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,

@@ -11,7 +11,7 @@ use crate::report::model::Role;
 pub(super) fn choose_recipe<'k>(recipes: &'k [Recipe], run: &MergeRun) -> Result<&'k Recipe, MergeError> {
     let fitting: Vec<&Recipe> = recipes.iter().filter(|recipe| misfits(recipe, run).is_empty()).collect();
     let (unspecific, named): (Vec<&Recipe>, Vec<&Recipe>) =
-        fitting.into_iter().partition(|recipe| recipe.donors.iter().any(DonorSpec::takes_any));
+        fitting.into_iter().partition(|recipe| recipe.donors.iter().any(|spec| spec.takes_any() || !spec.parts.is_empty()));
     let fitting = if named.is_empty() { unspecific } else { named };
     match fitting.as_slice() {
         [one] => Ok(one),
@@ -60,9 +60,20 @@ pub(super) fn check_architectures(recipe: &Recipe, run: &MergeRun) -> Result<(),
 
 /// Why a donor cannot take a role; `None` when it can.
 fn misfit(spec: &DonorSpec, donor: &CheckedCheckpoint) -> Option<String> {
+    let has = |name: &&String| donor.parts.as_ref().is_some_and(|parts| parts.part(name).is_some());
+    if let Some(part) = spec.parts.iter().find(|part| !has(part)) {
+        return Some(format!(
+            "the {} donor must have a {part} part, but none is known of {}",
+            spec.role,
+            architecture(donor)
+        ));
+    }
+    if let Some(part) = spec.no_parts.iter().find(has) {
+        return Some(format!("the {} donor, {}, has a {part} part", spec.role, architecture(donor)));
+    }
     let is = donor.outcome.architecture.as_deref();
     let named = || is.is_some_and(|name| spec.architectures.iter().any(|one| one == name));
-    if !spec.is_checkpoint() || spec.takes_any() || named() {
+    if spec.architectures.is_empty() || spec.takes_any() || named() {
         return None;
     }
     let wanted = spec.architectures.join(" or ");

@@ -1,5 +1,6 @@
 //! The donors of a merge, and the scope in which the recipe's expressions are evaluated.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
@@ -7,12 +8,13 @@ use serde_json::{Map, Value, json};
 
 use super::dtypes;
 use super::error::MergeError;
+use super::parts::{DonorParts, PartOf, value_of};
 use super::{explain, options};
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
-use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor};
-use crate::knowledge::{EvalError, Expression, Scope};
+use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor, TokenSpec};
+use crate::knowledge::{EvalError, Expression, Knowledge, Library, Scope};
 use crate::report::model::ShapedName;
 
 /// Options with their values, by name.
@@ -27,6 +29,8 @@ pub struct Donor {
     pub checkpoint: Arc<Checkpoint>,
     /// The config with defaults of the class filled in; null for a directory without a checkpoint.
     pub config: Value,
+    /// The parts of its model; `None` when none are known of its architecture.
+    pub(super) parts: Option<DonorParts>,
 }
 
 /// The donors, and the scope for expressions of the recipe.
@@ -36,6 +40,7 @@ pub(super) struct Context<'a> {
     pub(super) scope: Scope<'static>,
     pub(super) tokens: Option<OpenedTokenizer>,
     processors: &'a [Processor],
+    pub(super) library: &'a Library,
 }
 
 impl<'a> Context<'a> {
@@ -65,7 +70,7 @@ impl<'a> Context<'a> {
         recipe: &'a Recipe,
         donors: &'a [Donor],
         options: &Options,
-        processors: &'a [Processor],
+        knowledge: &'a Knowledge,
     ) -> Result<Self, MergeError> {
         let mut scope = Scope::new();
         let mut opt = Map::new();
@@ -98,6 +103,9 @@ impl<'a> Context<'a> {
         for (name, file) in [("processor", "processor_config.json"), ("preprocessor", "preprocessor_config.json")] {
             scope.bind(name, &document(donors, file).unwrap_or_default());
         }
+        let base = recipe.tokens.as_ref().and_then(|tokens| donors.iter().find(|donor| donor.role == tokens.base));
+        let tokenizer = base.and_then(|donor| value_of(donor, "tokenizer_config.json"));
+        scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
         let all = Arc::clone(&checkpoints);
@@ -111,7 +119,12 @@ impl<'a> Context<'a> {
         scope.function2("has", move |role, prefix| {
             json!(checkpoints.get(role).is_some_and(|c| c.tensors().any(|(_, t)| t.name.starts_with(prefix))))
         });
-        let mut context = Self { recipe, donors, scope, tokens: None, processors };
+        let parts: BTreeMap<String, BTreeMap<String, Value>> = donors.iter().map(part_summaries).collect();
+        scope.function2("part", move |role, name| {
+            parts.get(role).and_then(|of| of.get(name)).cloned().unwrap_or(Value::Null)
+        });
+        let (processors, library) = (&*knowledge.processors, &knowledge.library);
+        let mut context = Self { recipe, donors, scope, tokens: None, processors, library };
         for item in &recipe.lets {
             if context.tokens.is_none() && needs_tokens(&item.is) {
                 context.add_tokens()?;
@@ -128,19 +141,12 @@ impl Context<'_> {
     fn add_tokens(&mut self) -> Result<(), MergeError> {
         let Some(spec) = &self.recipe.tokens else { return Ok(()) };
         if self.tokens.is_none() {
-            let none = Processor::default();
-            let processor = match &spec.processor {
-                None => &none,
-                Some(name) => self
-                    .recipe
-                    .processor(self.processors)
-                    .ok_or_else(|| MergeError::Recipe(format!("{}: no processor {name}", self.recipe.recipe)))?,
-            };
+            let processor = self.processor(spec)?;
             let donor = self
                 .donor(&spec.base)
                 .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;
             let config = document(self.donors, "processor_config.json").unwrap_or_default();
-            let opened = open_tokenizer(&donor.checkpoint.tokenizer, processor, &config)
+            let opened = open_tokenizer(&donor.checkpoint.tokenizer, &processor, &config)
                 .map_err(self.at(format!("processor {}", processor.processor)))?
                 .ok_or_else(|| {
                     MergeError::Donor(format!(
@@ -164,6 +170,40 @@ impl Context<'_> {
 fn needs_tokens(expression: &Expression) -> bool {
     expression.variables().iter().any(|name| name == "tokens")
         || expression.references().calls.iter().any(|call| call.function == "id_of")
+}
+
+impl Context<'_> {
+    /// The processor that a recipe names, or what the model of a donor needs.
+    fn processor(&self, spec: &TokenSpec) -> Result<Cow<'_, Processor>, MergeError> {
+        let recipe = &self.recipe.recipe;
+        let model = spec.of.as_ref().and_then(|role| self.donor(role)?.parts.as_ref()).map(DonorParts::model);
+        if let Some(processor) = self.recipe.processor(self.processors) {
+            return Ok(Cow::Borrowed(processor));
+        }
+        if let Some(name) = spec.processor.as_ref().or_else(|| model?.processor.as_ref()) {
+            let processor = self.processors.iter().find(|p| p.processor == *name);
+            return processor
+                .map(Cow::Borrowed)
+                .ok_or_else(|| MergeError::Recipe(format!("{recipe}: no processor {name}")));
+        }
+        let Some(role) = &spec.of else { return Ok(Cow::Owned(Processor::default())) };
+        let model =
+            model.ok_or_else(|| MergeError::Recipe(format!("{recipe}: the {role} donor has no known parts")))?;
+        Ok(Cow::Owned(Processor {
+            processor: model.model.clone(),
+            architectures: model.architectures.clone(),
+            lets: Vec::new(),
+            add: model.tokens.clone(),
+            schema: None,
+        }))
+    }
+}
+
+/// What `part(role, name)` gives for each part of a donor.
+fn part_summaries(donor: &Donor) -> (String, BTreeMap<String, Value>) {
+    let names = donor.parts.iter().flat_map(DonorParts::names);
+    let summary = |name: &str| Some((name.to_owned(), PartOf::find(donor, name)?.summary()));
+    (donor.role.clone(), names.filter_map(summary).collect())
 }
 
 /// The document of this name from the first donor that has it.

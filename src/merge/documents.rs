@@ -6,13 +6,15 @@ use super::context::Context;
 use super::draft::MergeDraft;
 use super::dtypes;
 use super::error::MergeError;
+use super::parts::{PartOf, is_of_model, value_of};
 use super::switches::{self, Removed};
 use super::validate::misplaced;
 use crate::check::clamped;
 use crate::check::tokens::OpenedTokenizer;
 use crate::checkpoint::{Document, FaultKind, FileName, Vocabulary, pointer};
-use crate::knowledge::Template;
-use crate::knowledge::recipe::{AUTO_MAP, DocumentEdit, DocumentSpec, GraftEdit, TokensForm};
+use crate::knowledge::loader::version_numbers;
+use crate::knowledge::{Expression, Template};
+use crate::knowledge::recipe::{AUTO_MAP, DocumentEdit, DocumentSpec, FollowEdit, GraftEdit, PartEdit, TokensForm};
 
 /// A document of the result and its origin.
 pub(super) struct MergedDocument {
@@ -129,6 +131,12 @@ fn finite(spec: &DocumentSpec, source: &Document, value: &mut Value, draft: &mut
     Ok(())
 }
 
+/// The key of the version that wrote a config.
+const VERSION: &str = "transformers_version";
+
+/// A pointer with its new value; without one, the key is removed.
+type Change = (String, Option<Value>);
+
 /// Applies one edit; returns the switches removed from the value that it brings.
 fn apply_edit(
     context: &Context<'_>,
@@ -137,38 +145,19 @@ fn apply_edit(
     value: &mut Value,
 ) -> Result<Removed, MergeError> {
     let mut removed = Removed::new();
-    let mut put = |at: &str, mut new: Value| {
+    if let DocumentEdit::Dtype(edit) = edit {
+        if let Value::String(name) = edit.to.eval(&context.scope).map_err(context.at(spec.name.to_string()))? {
+            dtypes::set(value, &name);
+        }
+        return Ok(removed);
+    }
+    for (at, new) in changes(context, spec, edit)? {
+        let Some(mut new) = new else {
+            pointer::remove(value, &at);
+            continue;
+        };
         removed.extend(switches::strip(&spec.name, &mut new));
-        pointer::put(value, &Value::Null, at, new).ok_or_else(|| not_there(context, spec, at))
-    };
-    match edit {
-        DocumentEdit::Set(set) => {
-            if context.holds(set.when.as_ref(), &spec.name)? {
-                let at = place(context, spec, &set.at, true)?;
-                let name = format!("{}{at}", spec.name);
-                put(&at, set.to.eval(&context.scope).map_err(context.at(name))?)?;
-            }
-        }
-        DocumentEdit::Tokens(edit) => {
-            if context.holds(edit.when.as_ref(), &spec.name)?
-                && let Some(tokens) = &context.tokens
-            {
-                put(&place(context, spec, &edit.at, false)?, added(context, tokens, edit.form))?;
-            }
-        }
-        DocumentEdit::Dtype(edit) => {
-            if let Value::String(name) = edit.to.eval(&context.scope).map_err(context.at(spec.name.to_string()))? {
-                dtypes::set(value, &name);
-            }
-        }
-        DocumentEdit::Graft(graft) => put(&place(context, spec, &graft.at, false)?, grafted(context, graft)?)?,
-        DocumentEdit::Remove(remove) => {
-            if context.holds(remove.when.as_ref(), &spec.name)? {
-                for at in &remove.at {
-                    pointer::remove(value, &at.try_render(&context.scope).map_err(context.at(at.source()))?);
-                }
-            }
-        }
+        pointer::put(value, &Value::Null, &at, new).ok_or_else(|| not_there(context, spec, &at))?;
     }
     Ok(removed)
 }
@@ -180,6 +169,92 @@ fn place(context: &Context<'_>, spec: &DocumentSpec, at: &Template, sets: bool) 
         None => Ok(at),
         Some(reason) => Err(MergeError::Recipe(format!("{}: {}: {reason}", context.recipe.recipe, spec.name))),
     }
+}
+
+/// What an edit changes.
+fn changes(context: &Context<'_>, spec: &DocumentSpec, edit: &DocumentEdit) -> Result<Vec<Change>, MergeError> {
+    let holds = |when: &Option<Expression>| context.holds(when.as_ref(), &spec.name);
+    Ok(match edit {
+        DocumentEdit::Set(set) if holds(&set.when)? => {
+            let at = place(context, spec, &set.at, true)?;
+            let name = format!("{}{at}", spec.name);
+            vec![(at, Some(set.to.eval(&context.scope).map_err(context.at(name))?))]
+        }
+        DocumentEdit::Tokens(edit) if holds(&edit.when)? => {
+            let added = context.tokens.as_ref().map(|tokens| added(context, tokens, edit.form));
+            let at = place(context, spec, &edit.at, false)?;
+            added.map(|added| (at, Some(added))).into_iter().collect()
+        }
+        DocumentEdit::Remove(remove) if holds(&remove.when)? => {
+            let at = |at: &Template| Ok((at.try_render(&context.scope).map_err(context.at(at.source()))?, None));
+            remove.at.iter().map(at).collect::<Result<_, MergeError>>()?
+        }
+        DocumentEdit::Graft(graft) => {
+            vec![(place(context, spec, &graft.at, false)?, Some(grafted(context, graft)?))]
+        }
+        DocumentEdit::Part(edit) => part_config(context, edit)?,
+        DocumentEdit::Follow(edit) => followed(context, spec, edit)?,
+        // Its condition does not hold, or it changes more than values at pointers.
+        DocumentEdit::Set(_) | DocumentEdit::Tokens(_) | DocumentEdit::Remove(_) | DocumentEdit::Dtype(_) => Vec::new(),
+    })
+}
+
+/// The config of a part where the part stands in the model, or as the config of a model of its own.
+fn part_config(context: &Context<'_>, edit: &PartEdit) -> Result<Vec<Change>, MergeError> {
+    let name = edit.part.try_render(&context.scope).map_err(context.at("part"))?;
+    let own = PartOf::get(context, &edit.from, &name)?.own_config(context.library)?;
+    let Some(into) = &edit.into else { return Ok(vec![(String::new(), Some(Value::Object(own)))]) };
+    let place = PartOf::get(context, into, &name)?;
+    let (at, _) = place
+        .stored()
+        .ok_or_else(|| MergeError::Donor(format!("the part {name} of the {into} donor has no config to replace")))?;
+    let before = if edit.changes { place.own_config(context.library)? } else { Map::new() };
+    let left_out =
+        |key: &str| edit.without.iter().any(|w| w.strip_suffix('*').map_or(w == key, |p| key.starts_with(p)));
+    let is_new = |key: &str, new: &Value| !edit.changes || before.get(key) != Some(new);
+    let mut written: Map<String, Value> = own
+        .into_iter()
+        .filter(|(key, new)| is_of_model(key) && !left_out(key) && is_new(key, new))
+        .filter(|(key, _)| !(at.is_empty() && key == "model_type"))
+        .collect();
+    if let Some(fixed) = place.part.model_type.as_ref().filter(|_| !at.is_empty() && !edit.changes) {
+        written.insert("model_type".to_owned(), fixed.as_str().into());
+    }
+    for (key, to) in &edit.set {
+        written.insert(key.clone(), to.eval(&context.scope).map_err(context.at(format!("{key} of the part {name}")))?);
+    }
+    let mut changes = newest_version(context, edit, place);
+    // A config that stands in the whole among other keys, and one of which only some keys change, keeps the others.
+    if at.is_empty() || edit.changes {
+        changes.extend(written.into_iter().map(|(key, new)| (pointer::join(at, &key), Some(new))));
+    } else {
+        changes.push((at.to_owned(), Some(Value::Object(written))));
+    }
+    Ok(changes)
+}
+
+/// `transformers_version` of a model with a part that a newer version wrote: an older one may not know the part.
+fn newest_version(context: &Context<'_>, edit: &PartEdit, place: PartOf<'_>) -> Vec<Change> {
+    let part = context.donor(&edit.from).and_then(|donor| value_of(donor, "config.json")?.get(VERSION)?.as_str());
+    let host = place.host().get(VERSION).and_then(Value::as_str);
+    let is_newer = |part: &&str| host.is_some_and(|host| version_numbers(part) > version_numbers(host));
+    part.filter(is_newer).map(|part| (format!("/{VERSION}"), Some(part.into()))).into_iter().collect()
+}
+
+/// What follows in a document from the part that comes to stand in a model.
+fn followed(context: &Context<'_>, spec: &DocumentSpec, edit: &FollowEdit) -> Result<Vec<Change>, MergeError> {
+    let name = edit.part.try_render(&context.scope).map_err(context.at("part"))?;
+    let place = PartOf::get(context, &edit.into, &name)?;
+    let scope = place.scope(context, PartOf::get(context, &edit.from, &name)?)?;
+    let mut values = Vec::new();
+    for follow in place.part.follows.iter().filter(|follow| follow.document == spec.name) {
+        let error = || context.at(format!("{}{} of {}", spec.name, follow.at.source(), place.name));
+        if follow.when.as_ref().map_or(Ok(true), |when| when.eval_bool(&scope)).map_err(error())? {
+            let to = follow.to.as_ref().map(|to| to.eval(&scope)).transpose().map_err(error())?;
+            values.push((follow.at.try_render(&scope).map_err(error())?, to));
+        }
+    }
+    Ok(values)
 }
 
 /// The added tokens in one of transformers' forms: those stated by the base donor, then the new ones.

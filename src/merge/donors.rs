@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::context::Donor;
 use super::error::PipelineError;
+use super::parts::DonorParts;
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
 use crate::checkpoint::Checkpoint;
@@ -33,8 +34,11 @@ pub(super) fn open(
         }
         let checkpoint = Arc::new(checkpoint);
         let outcome = check(&checkpoint, knowledge);
-        donors.push(Donor { role: role.clone(), checkpoint: Arc::clone(&checkpoint), config: outcome.config.clone() });
-        run.checked.push(CheckedCheckpoint { role: Role::Donor(role.clone()), path: dir.clone(), checkpoint, outcome });
+        let parts = DonorParts::of(&checkpoint, &outcome, knowledge);
+        let config = outcome.config.clone();
+        donors.push(Donor { role: role.clone(), checkpoint: Arc::clone(&checkpoint), config, parts: parts.clone() });
+        let role = Role::Donor(role.clone());
+        run.checked.push(CheckedCheckpoint { role, path: dir.clone(), checkpoint, outcome, parts });
     }
     Ok((donors, snapshots))
 }

@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::context::{Context, Donor, Options};
 use super::draft::MergeDraft;
 use super::error::MergeError;
-use super::{documents, files, options, tensors};
+use super::{documents, files, options, parts, tensors};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::Seam;
@@ -22,7 +22,7 @@ pub(super) fn plan(
     options: &Options,
     knowledge: &Knowledge,
 ) -> Result<MergeDraft, MergeError> {
-    let context = Context::new(recipe, donors, options, &knowledge.processors)?;
+    let context = Context::new(recipe, donors, options, knowledge)?;
     let mut draft = MergeDraft::default();
     for (i, seam) in recipe.seams.iter().enumerate() {
         let place = format!("seam {}", i.saturating_add(1));
@@ -37,6 +37,11 @@ pub(super) fn plan(
             needed,
             options: seam.options.iter().map(|o| format!("--set {o}")).collect(),
         });
+    }
+    let refused = parts::seams(&context)?;
+    if !refused.is_empty() {
+        draft.seams.extend(refused);
+        return Ok(draft);
     }
     let documents = documents::plan(&context, &mut draft)?;
     let limit =

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use super::draft::MergeDraft;
 use super::training::training;
 use super::usage::Usage;
+use super::parts::DonorParts;
 use crate::check::{Finding, Outcome, Severity, check};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
@@ -46,6 +47,8 @@ pub struct CheckedCheckpoint {
     pub checkpoint: Arc<Checkpoint>,
     /// The result of checking it.
     pub outcome: Outcome,
+    /// The parts of a donor's model.
+    pub(super) parts: Option<DonorParts>,
 }
 
 /// A merge run: the checked checkpoints and the record for the reports.
@@ -159,7 +162,7 @@ impl MergeRun {
             (n, _) => count(n, "error", "errors"),
         };
         self.note(&format!("check {role}"), &verdict);
-        self.checked.push(CheckedCheckpoint { role, path: path.to_owned(), checkpoint, outcome });
+        self.checked.push(CheckedCheckpoint { role, path: path.to_owned(), checkpoint, outcome, parts: None });
         stopping == 0
     }
 

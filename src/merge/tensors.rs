@@ -11,6 +11,7 @@ use super::draft::MergeDraft;
 use super::dtypes;
 use super::error::MergeError;
 use super::explain;
+use super::parts::PartOf;
 use super::run::count;
 use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::quantization;
@@ -29,6 +30,35 @@ struct TensorRule<'a> {
     fit: TensorTransform,
     scale: Option<f64>,
     dtype: Option<Dtype>,
+    /// The part that the tensors belong to, and the one whose place they take.
+    part: Option<PartOf<'a>>,
+    into: Option<PartOf<'a>>,
+}
+
+impl TensorRule<'_> {
+    /// What the tensors are, for the report.
+    fn pattern(&self) -> &str {
+        self.part.filter(|_| self.spec.names.is_empty()).map_or(self.spec.names.as_str(), |part| part.name)
+    }
+
+    /// Whether a donor tensor is meant.
+    fn takes(&self, donor: &Donor, tensor: &Tensor) -> bool {
+        self.spec.from == donor.role
+            && self.names.is_match(&tensor.name)
+            && self.part.is_none_or(|part| part.inside(&tensor.name).is_some())
+    }
+
+    /// The name of a donor tensor in the result; `None` when the place of its part has none for it.
+    fn name(&self, tensor: &Tensor) -> Option<String> {
+        if let Some(to) = &self.rename {
+            return Some(self.names.replace(&tensor.name, to.as_str()).into_owned());
+        }
+        match (self.part.and_then(|part| part.inside(&tensor.name)), self.into) {
+            (Some(inside), Some(place)) => place.name_of(&inside),
+            (Some(inside), None) if self.spec.alone => Some(inside),
+            _ => Some(tensor.name.clone()),
+        }
+    }
 }
 
 /// A donor tensor that the recipe selects, with its name in the result.
@@ -65,7 +95,7 @@ pub(super) fn plan(
     draft: &mut MergeDraft,
 ) -> Result<(), MergeError> {
     let rules = rules(context)?;
-    let (taken, dropped) = take(context.donors, &rules);
+    let (taken, dropped) = take(context.donors, &rules)?;
     if taken.is_empty() {
         return Err(nothing_taken(context, &rules));
     }
@@ -74,7 +104,15 @@ pub(super) fn plan(
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
     let names = taken.iter().map(|t| t.name.as_str());
     let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
-    let expected = expected_shapes(library, config, names, &evidence);
+    let mut expected = expected_shapes(library, config, names, &evidence);
+    if let Some(place) = rules.iter().find_map(|rule| rule.into) {
+        // The class of a newer version has other names than the checkpoint, which it renames when it loads.
+        let spelled = |(name, shape): (String, _)| Some((place.model_parts().spelled(&name)?, shape));
+        let renamed: Vec<_> = expected.clone().into_iter().filter_map(spelled).collect();
+        for (name, shape) in renamed {
+            expected.entry(name).or_insert(shape);
+        }
+    }
     let mut tensors = Vec::new();
     let mut seen: HashMap<String, String> = HashMap::new();
     for taken in taken {
@@ -123,23 +161,30 @@ fn nothing_taken(context: &Context<'_>, rules: &[TensorRule<'_>]) -> MergeError 
 }
 
 /// The tensors that the recipe selects, and the others.
-fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTensor<'a>>, Vec<Dropped>) {
+fn take<'a>(
+    donors: &'a [Donor],
+    rules: &'a [TensorRule<'a>],
+) -> Result<(Vec<TakenTensor<'a>>, Vec<Dropped>), MergeError> {
     let mut taken = Vec::new();
     let mut dropped: BTreeMap<(String, String, String), usize> = BTreeMap::new();
     for donor in donors {
         for (shard, tensor) in donor.checkpoint.tensors() {
-            let rule = rules.iter().find(|r| r.spec.from == donor.role && r.names.is_match(&tensor.name));
+            let rule = rules.iter().find(|rule| rule.takes(donor, tensor));
             match rule {
                 Some(rule) if rule.spec.drop.is_none() => {
-                    let name = match &rule.rename {
-                        Some(to) => rule.names.replace(&tensor.name, to.as_str()).into_owned(),
-                        None => tensor.name.clone(),
-                    };
+                    let name = rule.name(tensor).ok_or_else(|| {
+                        MergeError::Donor(format!(
+                            "{} of the {} donor has no place in the model of the {} donor",
+                            tensor.name,
+                            donor.role,
+                            rule.spec.into.as_deref().unwrap_or_default()
+                        ))
+                    })?;
                     taken.push(TakenTensor { name, donor, shard, tensor, rule });
                 }
                 other => {
                     let (pattern, why) = other.map_or(("", "no entry of the recipe matches them"), |r| {
-                        (r.spec.names.as_str(), r.spec.drop.as_deref().unwrap_or_default())
+                        (r.pattern(), r.spec.drop.as_deref().unwrap_or_default())
                     });
                     let key = (donor.role.clone(), pattern.to_owned(), why.to_owned());
                     let count = dropped.entry(key).or_default();
@@ -149,7 +194,7 @@ fn take<'a>(donors: &'a [Donor], rules: &'a [TensorRule<'a>]) -> (Vec<TakenTenso
         }
     }
     let dropped = dropped.into_iter();
-    (taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect())
+    Ok((taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect()))
 }
 
 /// The planned tensor; if it is not a byte copy of the whole donor tensor, the draft lists it as changed.
@@ -219,6 +264,11 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             None => Ok(Value::Null),
             Some(e) => e.eval(&context.scope).map_err(context.at(format!("{key} of {}", spec.names))),
         };
+        let name =
+            spec.part.as_ref().map(|part| part.try_render(&context.scope)).transpose().map_err(context.at("part"))?;
+        let part_of = |role: &str| name.as_ref().map(|name| PartOf::get(context, role, name)).transpose();
+        let part = part_of(&spec.from)?;
+        let into = spec.into.as_deref().map_or(Ok(None), part_of)?;
         let wrong = |key: &str, value: &Value, expected: &str| {
             let recipe = &context.recipe.recipe;
             MergeError::Recipe(format!("{recipe}: {key} of {} is {value}, not {expected}", spec.names))
@@ -229,6 +279,8 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             spec,
             names,
             rename,
+            part,
+            into,
             slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
             fit: parse_fit(&fit).map_err(|expected| wrong("fit", &fit, expected))?,
             scale: parse_scale(&scale).map_err(|expected| wrong("scale", &scale, expected))?,

@@ -20,8 +20,8 @@ use crate::knowledge::recipe::{ANY, OptionKind, OptionSpec, Recipe, SeamTensor};
 use crate::knowledge::source::{DataError, hint};
 
 /// Names of the scope of expressions that no role and no `let` may take.
-const RESERVED: [&str; 10] =
-    ["opt", "arg", "stored", "tokens", "processor", "preprocessor", "true", "false", "null", "in"];
+const RESERVED: [&str; 11] =
+    ["opt", "arg", "stored", "tokens", "processor", "preprocessor", "tokenizer_config", "true", "false", "null", "in"];
 
 /// A recipe with its text, for the places of errors.
 struct Validator<'a> {
@@ -83,6 +83,9 @@ impl Validator<'_> {
                 let reason = "`*` stands for every architecture; remove the others";
                 return Err(self.wrong("architectures", ANY, reason));
             }
+            for part in donor.parts.iter().chain(&donor.no_parts) {
+                self.part("parts", part)?;
+            }
             self.tolerated(&donor.tolerates)?;
         }
         self.tolerated(&self.recipe.tolerates)
@@ -97,6 +100,13 @@ impl Validator<'_> {
             self.known("tolerates", "rule", code, &rules)?;
         }
         Ok(())
+    }
+
+    /// The name of a part.
+    fn part(&self, key: &str, part: &str) -> Result<(), DataError> {
+        let known: BTreeSet<&str> =
+            self.knowledge.parts.iter().flat_map(|model| model.parts.keys()).map(String::as_str).collect();
+        self.known(key, "part", part, &known.into_iter().collect::<Vec<_>>())
     }
 
     /// A role or a name of `let`: a variable of expressions that no other variable hides.
@@ -157,6 +167,13 @@ impl Validator<'_> {
     fn tokens(&self) -> Result<(), DataError> {
         let Some(tokens) = &self.recipe.tokens else { return Ok(()) };
         self.role("base", &tokens.base)?;
+        if let Some(role) = &tokens.of {
+            if tokens.processor.is_some() {
+                let reason = "`tokens` needs either `processor` or `of`, not both";
+                return Err(self.wrong("of", role, reason));
+            }
+            self.role("of", role)?;
+        }
         let Some(processor) = tokens.processor.as_ref().filter(|_| self.recipe.origin.processor.is_none()) else {
             return Ok(());
         };
@@ -167,6 +184,13 @@ impl Validator<'_> {
     fn tensors(&self) -> Result<(), DataError> {
         for tensor in &self.recipe.tensors {
             self.role("from", &tensor.from)?;
+            if let Some(role) = &tensor.into {
+                self.role("into", role)?;
+            }
+            if tensor.part.is_none() && (tensor.into.is_some() || tensor.alone) {
+                let reason = "`into` and `alone` name the tensors of a part; add `part`";
+                return Err(self.wrong("from", &tensor.from, reason));
+            }
             self.seam_tensor(tensor.meets.as_ref())?;
             if let Err(error) = Regex::new(&tensor.names) {
                 let error = error.to_string();

@@ -107,7 +107,7 @@ pub struct StageOutcome {
 }
 
 /// A seam that does not fit: two parts that must agree and do not.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Default)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Seam {

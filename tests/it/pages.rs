@@ -200,11 +200,12 @@ fn the_page_of_rules_is_fresh() {
 }
 
 /// The schemas of files that people write, in page order.
-const SCHEMAS: [(&str, &str); 6] = [
+const SCHEMAS: [(&str, &str); 7] = [
     ("rule", "Keys of a rule"),
     ("architecture", "Keys of an architecture"),
     ("quantization", "Keys of a quantisation scheme"),
     ("processor", "Keys of a processor"),
+    ("parts", "Keys of the parts of a model"),
     ("recipe", "Keys of a recipe and of a merge file"),
     ("settings", "Keys of a settings file"),
 ];
@@ -218,6 +219,7 @@ fn the_page_of_data_files_is_fresh() {
          | `architectures/` | model classes: names and shapes of their tensors |\n\
          | `quantization/` | quantisation schemes: the tensors that replace a plain weight |\n\
          | `processors/` | tokens that a processor adds to a tokenizer |\n\
+         | `parts/` | the language model, vision tower and projector inside model classes |\n\
          | `recipes/` | merges, with the Python modules that they write |\n\
          | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
          | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\

@@ -84,7 +84,13 @@ impl<'e> Spelling<'e> {
 }
 
 /// Keys but for which more of the file would be recognised: they start with the prefix, and so decide for all others.
-pub(super) fn hijackers<'f>(expected: &Expected, file: &'f BTreeSet<String>) -> Vec<&'f str> {
+///
+/// `recognised` counts the tensors of the class that a file with these names has.
+pub(super) fn hijackers<'f>(
+    expected: &Expected,
+    file: &'f BTreeSet<String>,
+    recognised: impl Fn(&BTreeSet<String>) -> usize,
+) -> Vec<&'f str> {
     if expected.base_model_prefix.is_empty() {
         return Vec::new();
     }
@@ -93,13 +99,15 @@ pub(super) fn hijackers<'f>(expected: &Expected, file: &'f BTreeSet<String>) -> 
     if others.is_empty() || others.len() == file.len() {
         return Vec::new();
     }
-    let recognised = |file: &BTreeSet<String>| {
-        let spelling = Spelling::of(expected, file);
-        expected.tensors.keys().filter(|name| file.contains(&spelling.in_file(name))).count()
-    };
     if recognised(&others) > recognised(file) {
         file.iter().filter(is_stray).map(String::as_str).collect()
     } else {
         Vec::new()
     }
+}
+
+/// Tensors of the class that a file with these names has, as transformers 4.47 spells them.
+pub(super) fn recognised(expected: &Expected, file: &BTreeSet<String>) -> usize {
+    let spelling = Spelling::of(expected, file);
+    expected.tensors.keys().filter(|name| file.contains(&spelling.in_file(name))).count()
 }

@@ -11,7 +11,7 @@ use super::{LoadReport, Mismatch, Silent, SilentReason, Stored, absent_groups, k
 use crate::knowledge::{Evidence, Expected};
 
 pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
-    let renaming = Renaming::of(expected, stored);
+    let renaming = Renaming::of(expected, stored.names());
     // The last of several keys that come to one name is the one that is read.
     let mut file: BTreeMap<String, &str> = BTreeMap::new();
     let mut unexpected: BTreeSet<String> = BTreeSet::new();
@@ -67,7 +67,14 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::IndexedButAbsent, by: None });
     }
     let all: BTreeSet<String> = stored.names().map(str::to_owned).collect();
-    for name in keys::hijackers(expected, &all) {
+    let recognised = |file: &BTreeSet<String>| {
+        let renaming = Renaming::of(expected, file.iter().map(String::as_str));
+        let named = file
+            .iter()
+            .filter(|key| matches!(renaming.name(key), Renamed::Is(name) if expected.tensors.contains_key(&name)));
+        named.count()
+    };
+    for name in keys::hijackers(expected, &all, recognised) {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None });
     }
     silent.sort_by(|a, b| (a.reason, &a.name).cmp(&(b.reason, &b.name)));
@@ -86,7 +93,7 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
 
 /// The stored tensors under the class's names.
 pub(super) fn in_model(expected: &Expected, stored: &Stored) -> Evidence {
-    let renaming = Renaming::of(expected, stored);
+    let renaming = Renaming::of(expected, stored.names());
     let shapes: BTreeMap<&str, &[u64]> = stored.shapes().collect();
     let names: BTreeSet<&str> = stored.names().chain(shapes.keys().copied()).collect();
     let named = |key: &str| match renaming.name(key) {
@@ -127,9 +134,9 @@ struct Renaming<'e> {
 
 impl<'e> Renaming<'e> {
     /// By whether any key of the file starts with the prefix, as it stands there; the loader does not ask for a dot.
-    fn of(expected: &'e Expected, stored: &Stored) -> Self {
+    fn of<'n>(expected: &'e Expected, mut names: impl Iterator<Item = &'n str>) -> Self {
         let name = expected.base_model_prefix.as_str();
-        let has = stored.names().any(|key| key.starts_with(name));
+        let has = names.any(|key| key.starts_with(name));
         let prefix = match (has, expected.has_head) {
             _ if name.is_empty() => Prefix::Same,
             (false, true) => Prefix::Added,

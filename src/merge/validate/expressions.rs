@@ -14,7 +14,7 @@ use crate::surgery::plan::TensorTransform;
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
 
 /// Functions of a merge's scope, with a role as the first argument.
-const ROLE_FUNCTIONS: [&str; 3] = ["shape", "has", "dtype"];
+const ROLE_FUNCTIONS: [&str; 4] = ["shape", "has", "dtype", "part"];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
@@ -22,7 +22,7 @@ const ID_OF: &str = "id_of";
 impl Validator<'_> {
     pub(super) fn expressions(&self) -> Result<(), DataError> {
         let mut variables: BTreeSet<&str> = self.role_names().into_iter().collect();
-        variables.extend(["opt", "arg", "stored", "processor", "preprocessor"]);
+        variables.extend(["opt", "arg", "stored", "processor", "preprocessor", "tokenizer_config"]);
         variables.extend(self.recipe.tokens.iter().map(|_| "tokens"));
         for item in &self.recipe.lets {
             self.name("name", &item.name)?;
@@ -76,6 +76,11 @@ impl Validator<'_> {
                     }
                     DocumentEdit::Graft(graft) => template("at", &graft.at)?,
                     DocumentEdit::Dtype(dtype) => check("to", &dtype.to)?,
+                    DocumentEdit::Part(part) => {
+                        template("part", &part.part)?;
+                        part.set.values().try_for_each(|expression| check("set", expression))?;
+                    }
+                    DocumentEdit::Follow(follow) => template("part", &follow.part)?,
                 }
             }
         }
@@ -86,6 +91,7 @@ impl Validator<'_> {
             some("scale", tensor.scale.as_ref())?;
             some("slice", tensor.slice.as_ref())?;
             tensor.rename.as_ref().map_or(Ok(()), |rename| template("as", rename))?;
+            tensor.part.as_ref().map_or(Ok(()), |part| template("part", part))?;
         }
         for file in &self.recipe.files {
             match file {
@@ -148,6 +154,8 @@ impl Validator<'_> {
         let (what, known) = match variable.as_str() {
             "opt" | "arg" => ("option", self.recipe.options.iter().map(|option| option.name.as_str()).collect()),
             "stored" => ("role", self.role_names()),
+            // The tokens of a donor's processor are known when the donors are.
+            "tokens" if self.recipe.tokens.as_ref().is_some_and(|tokens| tokens.of.is_some()) => return None,
             "tokens" => ("key of `tokens`", self.token_keys()),
             _ => return None,
         };

@@ -17,6 +17,14 @@ impl Validator<'_> {
                 self.role("from", &graft.from)?;
                 self.place(&graft.at, |at| misplaced(at, false))
             }
+            DocumentEdit::Part(part) => {
+                self.role("from", &part.from)?;
+                part.into.as_ref().map_or(Ok(()), |role| self.role("into", role))
+            }
+            DocumentEdit::Follow(follow) => {
+                self.role("from", &follow.from)?;
+                self.role("into", &follow.into)
+            }
             DocumentEdit::Tokens(tokens) => self.place(&tokens.at, |at| misplaced(at, false)),
             DocumentEdit::Remove(remove) => remove.at.iter().try_for_each(|at| self.place(at, malformed)),
             DocumentEdit::Dtype(_) => Ok(()),

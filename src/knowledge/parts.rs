@@ -1,0 +1,227 @@
+//! Parts of models: where the language model, the vision tower and the projector of a model class stand in its config and
+//! among its tensors.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::expression::{Expression, Template};
+use super::processor::{Let, TokenRun};
+use super::source::{self, DataError};
+use crate::checkpoint::FileName;
+
+/// The parts of a model, as read from its file in `rules/parts/`.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct ModelParts {
+    /// Name: the stem of the file.
+    pub model: String,
+    /// Architectures that have these parts.
+    pub architectures: Vec<String>,
+    /// Sources of the facts.
+    pub sources: Vec<String>,
+    /// The parts, by name.
+    pub parts: BTreeMap<String, Part>,
+    /// Ways in which tensors are named in checkpoints: by part, the start of a name inside the part and what replaces it in the
+    /// checkpoint. The longest start that matches applies, and the layout that names most tensors.
+    pub layouts: Vec<BTreeMap<String, BTreeMap<String, String>>>,
+    /// Tokens that the processor needs in the tokenizer, in the order in which a merge adds them.
+    #[serde(default)]
+    pub tokens: Vec<TokenRun>,
+    /// Name of the processor in `rules/processors/` that adds its tokens itself, instead of `tokens`.
+    #[serde(default)]
+    pub processor: Option<String>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
+    pub schema: Option<String>,
+}
+
+/// A part of a model.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Part {
+    /// JSON pointers of the config of the part; the first that config.json has applies, an empty one is the whole. Without
+    /// any, the part has no config.
+    #[serde(default)]
+    pub config: Vec<String>,
+    /// Model types that the class builds in this place; any that Auto classes know when missing.
+    #[serde(default)]
+    pub takes: Option<Vec<String>>,
+    /// The `model_type` that the config of the part has in this place, whatever the type of the part's own checkpoint.
+    #[serde(default)]
+    pub model_type: Option<String>,
+    /// What the part is as a model of its own.
+    #[serde(default)]
+    pub own: Own,
+    /// Names for expressions of `follows` and `needs`, in order.
+    #[serde(rename = "let", default)]
+    pub lets: Vec<Let>,
+    /// Values of the model's documents that follow from the part that stands in this place.
+    #[serde(default)]
+    pub follows: Vec<Follow>,
+    /// Conditions on a part that stands in this place, besides its model type.
+    #[serde(default)]
+    pub needs: Vec<Need>,
+}
+
+/// A part as a model of its own.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Own {
+    /// Model types by the type that the config has inside the model; the same when missing.
+    #[serde(default)]
+    pub model_type: BTreeMap<String, String>,
+    /// Classes by model type, where Auto classes do not name the one that has the tensors of the part.
+    #[serde(default)]
+    pub class: BTreeMap<String, String>,
+    /// Keys to leave out of its config: exact names, or prefixes that end in `*`.
+    #[serde(default)]
+    pub without: Vec<String>,
+}
+
+/// A value that follows from a part. Expressions see `part` (its config with defaults), `host` (the config of the model
+/// around it, with defaults), `host_stored` (the same as written), the names in `let`, and the
+/// variables of the recipe.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Follow {
+    /// The document; `config.json` when missing.
+    #[serde(default = "config_json")]
+    pub document: FileName,
+    /// JSON pointer; `{at}` is that of the part's config.
+    pub at: Template,
+    /// The value; the key is removed when missing.
+    #[serde(default)]
+    pub to: Option<Expression>,
+    /// Condition for this entry.
+    #[serde(default)]
+    pub when: Option<Expression>,
+}
+
+/// A condition on a part: see [`Follow`] for the variables.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Need {
+    /// The condition.
+    pub that: Expression,
+    /// Why the merge stops without it, as one sentence.
+    pub message: Template,
+}
+
+fn config_json() -> FileName {
+    FileName::constant("config.json")
+}
+
+impl ModelParts {
+    /// The built-in files.
+    ///
+    /// # Errors
+    /// [`DataError`] for a malformed file; the tests parse all of them.
+    pub fn embedded() -> Result<Vec<Self>, DataError> {
+        source::embedded("parts").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
+    }
+
+    /// A checkpoint that is one part as a whole: its tensor names and its config are those of the part.
+    #[must_use]
+    pub fn whole(part: &str) -> Self {
+        let own = Part { config: vec![String::new()], ..Part::default() };
+        let names = BTreeMap::from([(String::new(), String::new())]);
+        Self {
+            parts: BTreeMap::from([(part.to_owned(), own)]),
+            layouts: vec![BTreeMap::from([(part.to_owned(), names)])],
+            ..Self::default()
+        }
+    }
+
+    /// Every layout. The last one comes first: newer classes name their tensors as it does.
+    pub fn all_layouts(&self) -> impl Iterator<Item = Layout> {
+        self.layouts.iter().rev().map(Layout::new)
+    }
+
+    /// The layout that names most of these tensors; the first one when none names any.
+    #[must_use]
+    pub fn layout_of(&self, names: &[&str]) -> Option<Layout> {
+        let score = |layout: &Layout| names.iter().filter(|name| layout.locate(name).is_some()).count();
+        // The first of the best: `max_by_key` returns the last.
+        self.all_layouts().max_by_key(score)
+    }
+}
+
+/// One way of naming the tensors of a model's parts.
+#[derive(Debug, Clone, Default)]
+pub struct Layout {
+    /// Part, start of the name inside the part, start of the name in the checkpoint; the longest of the latter first.
+    starts: Vec<(String, String, String)>,
+}
+
+impl Layout {
+    fn new(of: &BTreeMap<String, BTreeMap<String, String>>) -> Self {
+        let of_part = |(part, names): (&String, &BTreeMap<String, String>)| {
+            let part = part.clone();
+            let names: Vec<_> =
+                names.iter().map(|(inside, stored)| (part.clone(), inside.clone(), stored.clone())).collect();
+            names
+        };
+        let mut starts: Vec<_> = of.iter().flat_map(of_part).collect();
+        starts.sort_by(|a, b| b.2.len().cmp(&a.2.len()).then_with(|| a.cmp(b)));
+        Self { starts }
+    }
+
+    /// The part that a tensor of a checkpoint belongs to, and its name inside the part.
+    #[must_use]
+    pub fn locate(&self, stored: &str) -> Option<(&str, String)> {
+        self.starts.iter().find_map(|(part, inside, start)| {
+            let rest = stored.strip_prefix(start.as_str())?;
+            Some((part.as_str(), format!("{inside}{rest}")))
+        })
+    }
+
+    /// The name in a checkpoint of a tensor inside a part; `None` when this layout has no place for it.
+    #[must_use]
+    pub fn stored(&self, part: &str, inside: &str) -> Option<String> {
+        let starts = self.starts.iter().filter(|(of, start, _)| of == part && inside.starts_with(start.as_str()));
+        let (_, from, to) = starts.max_by_key(|(_, start, _)| start.len())?;
+        Some(format!("{to}{}", inside.strip_prefix(from.as_str())?))
+    }
+}
+
+impl Part {
+    /// The pointer of the part's config in this config.json.
+    #[must_use]
+    pub fn pointer(&self, config: &Value) -> Option<&str> {
+        self.config.iter().map(String::as_str).find(|at| config.pointer(at).is_some_and(Value::is_object))
+    }
+
+    /// Whether a key of the part's config does not belong to a model of its own.
+    #[must_use]
+    pub fn leaves_out(&self, key: &str) -> bool {
+        self.own.without.iter().any(|w| w.strip_suffix('*').map_or(w == key, |prefix| key.starts_with(prefix)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_layout_translates_names_both_ways() {
+        let parts = ModelParts::embedded().unwrap();
+        let llava = parts.iter().find(|p| p.model == "llava").expect("llava");
+        let new = ["model.language_model.norm.weight", "lm_head.weight", "model.vision_tower.x"];
+        for names in [["language_model.model.norm.weight", "language_model.lm_head.weight", "vision_tower.x"], new] {
+            let layout = llava.layout_of(&names).unwrap();
+            let inside = ["model.norm.weight", "lm_head.weight", "x"];
+            for ((name, part), inside) in names.into_iter().zip(["language", "language", "vision"]).zip(inside) {
+                assert_eq!(layout.locate(name), Some((part, inside.to_owned())), "{name}");
+                assert_eq!(layout.stored(part, inside).as_deref(), Some(name));
+            }
+        }
+    }
+}

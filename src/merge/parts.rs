@@ -1,0 +1,268 @@
+//! The parts of donors: which of their tensors and configs a recipe means by `part: "language"`.
+
+use serde_json::{Map, Value, json};
+
+use super::context::{Context, Donor};
+use super::error::MergeError;
+use super::switches;
+use crate::check::Outcome;
+use crate::checkpoint::Checkpoint;
+use crate::knowledge::parts::{Layout, ModelParts, Part};
+use crate::knowledge::{Knowledge, Library, Loader, Scope};
+use crate::report::model::Seam;
+
+/// Keys of a config that speak of the directory it was read from, and not of the model.
+const BOOKKEEPING: [&str; 5] = ["_name_or_path", "architectures", "auto_map", "transformers_version", "_commit_hash"];
+
+/// The parts of one donor, and how its tensors are named.
+#[derive(Debug, Clone)]
+pub(super) struct DonorParts {
+    model: ModelParts,
+    layout: Layout,
+}
+
+impl DonorParts {
+    /// The parts of a checkpoint: those that `rules/parts/` gives its architecture; a causal language model is one part.
+    pub(super) fn of(checkpoint: &Checkpoint, outcome: &Outcome, knowledge: &Knowledge) -> Option<Self> {
+        let architecture = outcome.architecture.as_ref()?;
+        let described = knowledge.parts.iter().find(|m| m.architectures.contains(architecture));
+        let model =
+            described.cloned().or_else(|| is_causal(checkpoint, knowledge).then(|| ModelParts::whole("language")))?;
+        let names: Vec<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+        let layout = model.layout_of(&names)?;
+        Some(Self { model, layout })
+    }
+
+    /// Names of the parts.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.model.parts.keys().map(String::as_str)
+    }
+
+    /// The part of this name, or whose config stands at this pointer.
+    pub(super) fn part(&self, name: &str) -> Option<(&str, &Part)> {
+        let named = self.model.parts.get_key_value(name);
+        let pointed =
+            || self.model.parts.iter().find(|(_, part)| !name.is_empty() && part.config.iter().any(|at| at == name));
+        named.or_else(pointed).map(|(name, part)| (name.as_str(), part))
+    }
+
+    /// The name in this donor's layout of a tensor that a class has under the name of any layout.
+    pub(super) fn spelled(&self, of_class: &str) -> Option<String> {
+        self.model.all_layouts().find_map(|layout| {
+            let (part, inside) = layout.locate(of_class)?;
+            self.layout.stored(part, &inside)
+        })
+    }
+
+    /// What the model's processor needs in the tokenizer.
+    pub(super) fn model(&self) -> &ModelParts {
+        &self.model
+    }
+}
+
+/// Whether a checkpoint is a causal language model as a whole.
+fn is_causal(checkpoint: &Checkpoint, knowledge: &Knowledge) -> bool {
+    let Some(config) = checkpoint.document("config.json").and_then(|d| d.value.as_ref()) else { return false };
+    let names = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str());
+    let class = knowledge.library.find(config, names, Loader::of_config(config)).map(|a| a.class());
+    class.is_some_and(|class| class.ends_with("ForCausalLM") || class.ends_with("LMHeadModel"))
+}
+
+/// A part of a donor.
+#[derive(Clone, Copy)]
+pub(super) struct PartOf<'a> {
+    donor: &'a Donor,
+    parts: &'a DonorParts,
+    /// Its name.
+    pub(super) name: &'a str,
+    /// Its description.
+    pub(super) part: &'a Part,
+}
+
+impl<'a> PartOf<'a> {
+    /// The part of a donor; `None` when the donor has no such part.
+    pub(super) fn find(donor: &'a Donor, name: &str) -> Option<Self> {
+        let parts = donor.parts.as_ref()?;
+        let (name, part) = parts.part(name)?;
+        Some(Self { donor, parts, name, part })
+    }
+
+    /// As [`Self::find`], with an error that names the parts of the donor.
+    pub(super) fn get(context: &Context<'a>, role: &str, name: &str) -> Result<Self, MergeError> {
+        let Some(donor) = context.donor(role) else {
+            return Err(MergeError::Recipe(format!("{}: no {role} donor is given", context.recipe.recipe)));
+        };
+        Self::find(donor, name).ok_or_else(|| {
+            let names: Vec<&str> = donor.parts.iter().flat_map(DonorParts::names).collect();
+            let has = if names.is_empty() { "none is known of its architecture".to_owned() } else { names.join(", ") };
+            MergeError::Donor(format!("the {role} donor has no part {name}; its parts: {has}"))
+        })
+    }
+
+    /// The config of the part as written; `None` for a part without one.
+    pub(super) fn stored(self) -> Option<(&'a str, &'a Map<String, Value>)> {
+        let config = self.donor.checkpoint.document("config.json")?.value.as_ref()?;
+        let at = self.part.pointer(config)?;
+        Some((at, config.pointer(at)?.as_object()?))
+    }
+
+    /// The config of the part with the defaults of its class; null for a part without one.
+    pub(super) fn config(self) -> &'a Value {
+        let config = &self.donor.config;
+        self.part.pointer(config).and_then(|at| config.pointer(at)).unwrap_or(&Value::Null)
+    }
+
+    /// The config of the whole model, with the defaults of its class.
+    pub(super) fn host(self) -> &'a Value {
+        &self.donor.config
+    }
+
+    /// The model type of the part as a model of its own.
+    pub(super) fn model_type(self) -> Option<&'a str> {
+        let given = || self.stored()?.1.get("model_type")?.as_str();
+        let inside =
+            self.part.model_type.as_deref().or_else(given).or_else(|| self.config().get("model_type")?.as_str())?;
+        Some(self.part.own.model_type.get(inside).map_or(inside, String::as_str))
+    }
+
+    /// What expressions see of the part.
+    pub(super) fn summary(self) -> Value {
+        let (at, stored) = self.stored().map_or((Value::Null, Value::Null), |(at, map)| (json!(at), json!(map)));
+        let tensor = |inside: &str| {
+            let name = self.parts.layout.stored(self.name, inside)?;
+            self.donor.checkpoint.tensor(&name).is_some().then_some(name)
+        };
+        json!({
+            "at": at, "stored": stored, "config": self.config(), "type": self.model_type(), "takes": self.part.takes,
+            "embedding": tensor("model.embed_tokens.weight"), "head": tensor("lm_head.weight"),
+        })
+    }
+
+    /// The name of a tensor inside the part; `None` when it belongs to another one.
+    pub(super) fn inside(self, stored: &str) -> Option<String> {
+        self.parts.layout.locate(stored).filter(|(part, _)| *part == self.name).map(|(_, inside)| inside)
+    }
+
+    /// The parts of the same donor.
+    pub(super) const fn model_parts(self) -> &'a DonorParts {
+        self.parts
+    }
+
+    /// The name in this donor's model of a tensor inside the part.
+    pub(super) fn name_of(self, inside: &str) -> Option<String> {
+        self.parts.layout.stored(self.name, inside)
+    }
+
+    /// Variables of [`crate::knowledge::parts::Follow`] and [`crate::knowledge::parts::Need`]: `self` is the place in the
+    /// model, `new` the part that comes to stand there.
+    pub(super) fn scope<'s>(self, context: &'s Context<'_>, new: PartOf<'_>) -> Result<Scope<'s>, MergeError> {
+        let mut scope = context.scope.child();
+        let at = self.stored().map_or("", |(at, _)| at);
+        scope.bind("at", &json!(at));
+        scope.bind("part", new.config());
+        scope.bind("host", self.host());
+        scope.bind("host_stored", value_of(self.donor, "config.json").unwrap_or(&Value::Null));
+        for item in &self.part.lets {
+            let value = item.is.eval(&scope).map_err(context.at(format!("{} of the part {}", item.name, self.name)))?;
+            scope.bind(&item.name, &value);
+        }
+        Ok(scope)
+    }
+
+    /// Why a part cannot stand in this place, by its model type.
+    fn refuses(self, new: Self) -> Option<String> {
+        let (takes, model_type) = (self.part.takes.as_ref()?, new.model_type().unwrap_or("of an unknown type"));
+        let class = self.host().get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
+        (!takes.iter().any(|t| t == model_type)).then(|| {
+            format!(
+                "{} builds its own {} part, with the tensors of {}; the {} donor is {model_type}",
+                class.unwrap_or("the class of the model"),
+                self.name,
+                takes.join(" or "),
+                new.donor.role
+            )
+        })
+    }
+
+    /// The config of the part as a model of its own.
+    ///
+    /// Fails when the part has no config, or no class is known that is the part alone.
+    pub(super) fn own_config(self, library: &Library) -> Result<Map<String, Value>, MergeError> {
+        let role = &self.donor.role;
+        let (_, stored) = self.stored().ok_or_else(|| {
+            MergeError::Donor(format!(
+                "the part {} of the {role} donor has no config, so it is no model of its own",
+                self.name
+            ))
+        })?;
+        let none = || {
+            MergeError::Donor(format!(
+                "the part {} of the {role} donor is no model of its own in transformers",
+                self.name
+            ))
+        };
+        let whole = self.donor.checkpoint.document("config.json").and_then(|d| d.value.as_ref());
+        let loader = whole.map_or(Loader::NEWEST, Loader::of_config);
+        let model_type = self.model_type().ok_or_else(none)?;
+        let mapping = if self.name == "language" { "causal_lm" } else { "model" };
+        let class = self.part.own.class.get(model_type).map(String::as_str);
+        let class = class.or_else(|| library.auto_class(model_type, mapping, loader)).ok_or_else(none)?;
+        let mut own = Map::from_iter([
+            ("architectures".to_owned(), json!([class])),
+            ("model_type".to_owned(), json!(model_type)),
+        ]);
+        let kept = |key: &str| !BOOKKEEPING.contains(&key) && key != "model_type" && !self.part.leaves_out(key);
+        let flat_parts: Vec<&str> =
+            self.parts.model.parts.values().flat_map(|p| &p.config).filter_map(|at| at.strip_prefix('/')).collect();
+        own.extend(
+            stored
+                .iter()
+                .filter(|(key, _)| kept(key) && !flat_parts.contains(&key.as_str()))
+                .map(|(k, v)| (k.clone(), v.clone())),
+        );
+        // What the whole says of its weights and of the version that wrote it holds for the part, too.
+        for key in ["torch_dtype", "dtype", "transformers_version"] {
+            if let Some(value) = whole.and_then(|whole| whole.get(key)).filter(|_| !own.contains_key(key)) {
+                own.insert(key.to_owned(), value.clone());
+            }
+        }
+        let mut own = Value::Object(own);
+        switches::strip("config.json", &mut own);
+        Ok(own.as_object().cloned().unwrap_or_default())
+    }
+}
+
+/// The seams of parts that come to stand in another model: types that its class does not build there, and what else it
+/// needs of them.
+pub(super) fn seams(context: &Context<'_>) -> Result<Vec<Seam>, MergeError> {
+    let mut seams = Vec::new();
+    for spec in context.recipe.tensors.iter().filter(|spec| spec.drop.is_none()) {
+        let (Some(name), Some(into)) = (&spec.part, &spec.into) else { continue };
+        if !context.holds(spec.when.as_ref(), "tensors")? {
+            continue;
+        }
+        let name = name.try_render(&context.scope).map_err(context.at("part"))?;
+        let (place, new) = (PartOf::get(context, into, &name)?, PartOf::get(context, &spec.from, &name)?);
+        if let Some(message) = place.refuses(new) {
+            seams.push(Seam { message, ..Seam::default() });
+            continue;
+        }
+        let scope = place.scope(context, new)?;
+        for need in &place.part.needs {
+            if !need.that.eval_bool(&scope).map_err(context.at(format!("the part {name} of {into}")))? {
+                seams.push(Seam { message: need.message.render(&scope), ..Seam::default() });
+            }
+        }
+    }
+    Ok(seams)
+}
+
+/// The content of a document of a donor.
+pub(super) fn value_of<'d>(donor: &'d Donor, name: &str) -> Option<&'d Value> {
+    donor.checkpoint.document(name)?.value.as_ref()
+}
+
+/// Whether a key of a config speaks of the model.
+pub(super) fn is_of_model(key: &str) -> bool {
+    !BOOKKEEPING.contains(&key)
+}
