@@ -63,17 +63,19 @@ fn run() -> ExitCode {
         return ExitCode::from(exit::FAILED);
     }
     let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
-    let result = match &command {
-        args::Command::Check(args) => check::run(args, rules.as_deref()),
-        args::Command::Undo(args) => undo::run(args),
-        args::Command::Inspect(args) => inspect::run(args, rules.as_deref()),
-        args::Command::Expect(args) => expect::run(args, rules.as_deref()),
-        args::Command::BuildMerged(args) => build_merged::run(args, rules.as_deref()),
-        args::Command::Verify(args) => verify::run(args),
-        args::Command::Explain(args) => rules::explain(args, rules.as_deref()),
-        args::Command::Rules(args) => rules::list(args, rules.as_deref()),
-        args::Command::Recipes(args) => recipes::list(args, rules.as_deref()),
-        args::Command::Init(args) => init::run(args),
+    let result = match command {
+        args::Command::Check(args) => check::run(&args, rules.as_deref()),
+        args::Command::Undo(args) => undo::run(&args),
+        args::Command::Inspect(args) => inspect::run(&args, rules.as_deref()),
+        args::Command::Expect(args) => expect::run(&args, rules.as_deref()),
+        args::Command::BuildMerged(args) => build_merged::run(&args, rules.as_deref()),
+        args::Command::Verify(args) => verify::run(&args),
+        args::Command::Explain(args) => rules::explain(&args, rules.as_deref()),
+        args::Command::Rules(args) => rules::list(&args, rules.as_deref()),
+        args::Command::Recipes(args) => recipes::list(&args, rules.as_deref()),
+        args::Command::Init(args) => init::run(&args),
+        args::Command::Extract(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
+        args::Command::Insert(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
     };
     match result {
         Ok(code) => ExitCode::from(code),

@@ -32,6 +32,10 @@ pub enum Command {
     /// Build one checkpoint from parts of two others
     #[command(visible_alias = "merge")]
     BuildMerged(BuildMergedArgs),
+    /// Take a part out of a model, as a checkpoint of its own class
+    Extract(ExtractArgs),
+    /// Put a part into a model, such as a language model that was trained on text alone
+    Insert(InsertArgs),
     /// Compare a merged checkpoint with its manifest and, byte for byte, with its donors
     Verify(VerifyArgs),
     /// Summarise a checkpoint: tensors, model class, inferred config values
@@ -353,6 +357,96 @@ pub struct VerifyArgs {
     /// When to print colours; auto respects `NO_COLOR`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
+}
+
+/// Arguments of `extract`.
+#[derive(Debug, Args)]
+#[command(after_help = "This is `build-merged --recipe extract`.\n\nExit codes: those of build-merged")]
+pub struct ExtractArgs {
+    /// The model
+    #[arg(value_name = "DIR")]
+    pub dir: PathBuf,
+    /// Name of the part, such as language or vision, or the JSON pointer of its config
+    #[arg(long, value_name = "PART")]
+    pub part: String,
+    /// Output and report.
+    #[command(flatten)]
+    pub write: PartWriteArgs,
+}
+
+/// Arguments of `insert`.
+#[derive(Debug, Args)]
+#[command(after_help = "This is `build-merged --recipe insert`.\n\nExit codes: those of build-merged")]
+pub struct InsertArgs {
+    /// The model; it is not changed
+    #[arg(value_name = "DIR")]
+    pub dir: PathBuf,
+    /// Name of the part, such as language or vision, or the JSON pointer of its config
+    #[arg(long, value_name = "PART")]
+    pub part: String,
+    /// The part as a checkpoint of its own
+    #[arg(long, value_name = "DIR")]
+    pub from: PathBuf,
+    /// Output and report.
+    #[command(flatten)]
+    pub write: PartWriteArgs,
+}
+
+/// What `extract` and `insert` have in common.
+#[derive(Debug, Args)]
+pub struct PartWriteArgs {
+    /// Output directory; it must not exist, or be empty
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Set an option of the recipe, such as shard-size=2GB; may be repeated
+    #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
+    pub set: Vec<(String, String)>,
+    /// Plan and check, and write nothing
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Report formats and the exit code.
+    #[command(flatten)]
+    pub report: ReportArgs,
+}
+
+impl ExtractArgs {
+    /// The same as a merge.
+    #[must_use]
+    pub fn into_merge(self) -> BuildMergedArgs {
+        let donor = vec![("model".to_owned(), self.dir.display().to_string())];
+        self.write.into_merge("extract", self.part, donor)
+    }
+}
+
+impl InsertArgs {
+    /// The same as a merge.
+    #[must_use]
+    pub fn into_merge(self) -> BuildMergedArgs {
+        let dirs = [("model", self.dir), ("part", self.from)];
+        let donor = dirs.map(|(role, dir)| (role.to_owned(), dir.display().to_string())).to_vec();
+        self.write.into_merge("insert", self.part, donor)
+    }
+}
+
+impl PartWriteArgs {
+    fn into_merge(self, recipe: &str, part: String, donor: Vec<(String, String)>) -> BuildMergedArgs {
+        let mut set = self.set;
+        set.push(("part".to_owned(), part));
+        BuildMergedArgs {
+            file: None,
+            recipe: Some(recipe.to_owned()),
+            print_recipe: false,
+            help: false,
+            donor,
+            vision: None,
+            language: None,
+            out: Some(self.out),
+            set,
+            dry_run: self.dry_run,
+            hash: false,
+            report: self.report,
+        }
+    }
 }
 
 /// Severity as an argument.

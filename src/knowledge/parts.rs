@@ -85,8 +85,8 @@ pub struct Own {
 }
 
 /// A value that follows from a part. Expressions see `part` (its config with defaults), `host` (the config of the model
-/// around it, with defaults), `host_stored` (the same as written), the names in `let`, and the
-/// variables of the recipe.
+/// around it, with defaults), `host_stored` (the same as written), `host_preprocessor` and
+/// `part_preprocessor` (the `preprocessor_config.json` of either donor), the names in `let`, and the variables of the recipe.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]

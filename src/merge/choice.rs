@@ -10,8 +10,9 @@ use crate::report::model::Role;
 /// any.
 pub(super) fn choose_recipe<'k>(recipes: &'k [Recipe], run: &MergeRun) -> Result<&'k Recipe, MergeError> {
     let fitting: Vec<&Recipe> = recipes.iter().filter(|recipe| misfits(recipe, run).is_empty()).collect();
-    let (unspecific, named): (Vec<&Recipe>, Vec<&Recipe>) =
-        fitting.into_iter().partition(|recipe| recipe.donors.iter().any(|spec| spec.takes_any() || !spec.parts.is_empty()));
+    let (unspecific, named): (Vec<&Recipe>, Vec<&Recipe>) = fitting
+        .into_iter()
+        .partition(|recipe| recipe.donors.iter().any(|spec| spec.takes_any() || !spec.parts.is_empty()));
     let fitting = if named.is_empty() { unspecific } else { named };
     match fitting.as_slice() {
         [one] => Ok(one),

@@ -13,8 +13,8 @@ use crate::check::clamped;
 use crate::check::tokens::OpenedTokenizer;
 use crate::checkpoint::{Document, FaultKind, FileName, Vocabulary, pointer};
 use crate::knowledge::loader::version_numbers;
-use crate::knowledge::{Expression, Template};
 use crate::knowledge::recipe::{AUTO_MAP, DocumentEdit, DocumentSpec, FollowEdit, GraftEdit, PartEdit, TokensForm};
+use crate::knowledge::{Expression, Template};
 
 /// A document of the result and its origin.
 pub(super) struct MergedDocument {

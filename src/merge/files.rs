@@ -10,7 +10,7 @@ use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::error::MergeError;
 use super::{CARD, REPORT, manifest, switches};
-use crate::check::modules::relative_modules;
+use crate::check::modules::{entries, relative_modules};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::checkpoint::{Document, FileName, FilePattern, INDEX_NAME};
 use crate::knowledge::recipe::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
@@ -153,6 +153,10 @@ fn copy_of(
 fn modules(context: &Context<'_>, spec: &ModulesSpec, draft: &mut MergeDraft) -> Result<Vec<PlannedFile>, MergeError> {
     let mut found: BTreeMap<FileName, PlannedFile> = BTreeMap::new();
     let mut pending = spec.roots.clone();
+    let first = spec.from.first().and_then(|role| context.donor(role)).filter(|_| spec.auto_map);
+    for entry in first.iter().flat_map(|donor| entries(&donor.checkpoint)) {
+        pending.extend(entry.parts().map(|(module, _)| module.to_owned()));
+    }
     while let Some(module) = pending.pop() {
         // An import of something that no file name can spell leads to no module of a donor.
         let Ok(name) = FileName::parse(&format!("{module}.py")) else { continue };

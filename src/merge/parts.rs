@@ -162,6 +162,9 @@ impl<'a> PartOf<'a> {
         scope.bind("part", new.config());
         scope.bind("host", self.host());
         scope.bind("host_stored", value_of(self.donor, "config.json").unwrap_or(&Value::Null));
+        for (name, donor) in [("host_preprocessor", self.donor), ("part_preprocessor", new.donor)] {
+            scope.bind(name, value_of(donor, "preprocessor_config.json").unwrap_or(&json!({})));
+        }
         for item in &self.part.lets {
             let value = item.is.eval(&scope).map_err(context.at(format!("{} of the part {}", item.name, self.name)))?;
             scope.bind(&item.name, &value);
@@ -225,6 +228,11 @@ impl<'a> PartOf<'a> {
             if let Some(value) = whole.and_then(|whole| whole.get(key)).filter(|_| !own.contains_key(key)) {
                 own.insert(key.to_owned(), value.clone());
             }
+        }
+        let has = |inside: &str| self.name_of(inside).is_some_and(|name| self.donor.checkpoint.tensor(&name).is_some());
+        if self.name == "language" && has("model.embed_tokens.weight") && !has("lm_head.weight") {
+            // The model around it says so, if not in the config of the part.
+            own.insert("tie_word_embeddings".to_owned(), true.into());
         }
         let mut own = Value::Object(own);
         switches::strip("config.json", &mut own);
