@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::draft::MergeDraft;
+use super::parts::DonorParts;
 use super::training::training;
 use super::usage::Usage;
-use super::parts::DonorParts;
 use crate::check::{Finding, Outcome, Severity, check};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
