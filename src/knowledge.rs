@@ -15,6 +15,7 @@ pub mod recipe;
 pub mod refusals;
 pub mod resemblance;
 pub mod rule;
+pub mod scales;
 pub mod selection;
 pub mod settings;
 pub mod source;
@@ -33,6 +34,7 @@ use quantization::Scheme;
 use recipe::Recipe;
 use refusals::Refusals;
 use rule::RuleSet;
+use scales::Scales;
 use settings::Policy;
 use source::DataError;
 
@@ -56,6 +58,8 @@ pub struct Knowledge {
     pub refusals: Refusals,
     /// Names of token embeddings.
     pub token_embedding: TokenEmbedding,
+    /// Factors of classes on embeddings and image features.
+    pub scales: Scales,
     /// Severities and suppressions of a settings file for single findings.
     pub policy: Policy,
 }
@@ -84,6 +88,7 @@ impl Knowledge {
             names: LoaderNames::embedded()?,
             refusals: Refusals::embedded(),
             token_embedding: TokenEmbedding::embedded()?,
+            scales: Scales::embedded()?,
             policy: Policy::default(),
         })
     }

@@ -15,6 +15,7 @@ mod error;
 mod explain;
 mod file;
 mod files;
+mod functions;
 mod hub;
 pub(crate) mod manifest;
 mod options;

@@ -15,11 +15,17 @@ use crate::checkpoint::{FileName, FilePattern};
 ///
 /// Expressions see `opt` (the options), a variable for each donor role (its config with the defaults of the class filled in),
 /// `stored` (the config of each role as it is in the file: `stored.vision`), `processor`, `preprocessor`, `tokens`, the names
-/// that `let` defined so far, and the functions `shape(role, tensor)`, `has(role, prefix)`, `dtype(role)`: the floating-point
-/// type of most bytes of a donor as torch names it (`'bfloat16'`), and `id_of(token)`: the id in the tokenizer of the result,
-/// null when it has no such token. `part(role, name)` is a part of a donor: its config with defaults (`config`), as it is
-/// written (`stored`), its JSON pointer (`at`), its model type (`type`), the types that may stand there (`takes`), and the names
-/// of its `embedding` and `head`. `tokenizer_config` is that of the donor whose tokenizer is used.
+/// that `let` defined so far, and the functions
+/// - `shape(role, tensor)`, and `has(role, prefix)`: whether the donor has a tensor with the prefix;
+/// - `dtype(role)`: the floating-point type of most bytes of a donor as torch names it, `'bfloat16'`;
+/// - `id_of(token)`: the id in the tokenizer of the result, null when it has no such token;
+/// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;
+/// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host when its class
+///   has the guest's language model; `with` and `without` list the versions of transformers that need the factor, or none.
+/// - `part(role, name)`: a part of a donor: its config with defaults (`config`), as it is written (`stored`), its JSON pointer
+///   (`at`), its model type (`type`), the types that may stand there (`takes`), and the names of its `embedding` and `head`.
+///
+/// `tokenizer_config` is that of the donor whose tokenizer is used.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -273,8 +279,8 @@ pub enum DocumentEdit {
     Follow(FollowEdit),
 }
 
-/// Writes the dtype of the weights: every `torch_dtype` and `dtype` of the document and of the configs in it gets the value,
-/// and the document has one of them.
+/// Writes the dtype of the weights: every `torch_dtype` and `dtype` of the document and of the configs in it that is not null
+/// gets the value, and the document has one of them.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]

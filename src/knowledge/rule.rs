@@ -8,7 +8,7 @@ mod effect;
 mod fix;
 
 pub use catalogue::{Catalogue, example};
-pub use effect::{Consequence, Effect, Harm, Object};
+pub use effect::{Consequence, Effect, Harm, LoaderRange, Object};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template};

@@ -6,10 +6,9 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use super::dtypes;
 use super::error::MergeError;
 use super::parts::{DonorParts, PartOf, value_of};
-use super::{explain, options};
+use super::{explain, functions, options};
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
@@ -108,10 +107,7 @@ impl<'a> Context<'a> {
         scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
-        let all = Arc::clone(&checkpoints);
-        scope.function1("dtype", move |role| {
-            all.get(role).and_then(|c| dtypes::of_most_bytes(c)).map_or(Value::Null, |name| json!(name))
-        });
+        functions::register(&mut scope, donors, &knowledge.scales);
         let all = Arc::clone(&checkpoints);
         scope.function2("shape", move |role, name| {
             all.get(role).and_then(|c| c.tensor(name)).map_or(Value::Null, |(_, t)| json!(t.shape))

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use crate::checkpoint::{Checkpoint, Dtype};
+use crate::surgery::values;
 
 /// The types to which values can be cast, as torch names them.
 pub(super) const FLOAT_NAMES: [&str; 4] = ["bfloat16", "float16", "float32", "float64"];
@@ -25,6 +26,12 @@ fn float_name(dtype: Dtype) -> Option<&'static str> {
     }
 }
 
+/// A number rounded to the type that torch gives this name, as `torch.tensor(number, dtype=…)` rounds it; unchanged without
+/// a type.
+pub(super) fn round(number: f64, name: Option<&str>) -> f64 {
+    name.and_then(from_name).map_or(number, |dtype| values::round(dtype, number))
+}
+
 /// The floating-point type of most bytes of a checkpoint, as torch names it; `None` without such tensors.
 pub(super) fn of_most_bytes(checkpoint: &Checkpoint) -> Option<&'static str> {
     let mut bytes: BTreeMap<Dtype, u64> = BTreeMap::new();
@@ -35,14 +42,15 @@ pub(super) fn of_most_bytes(checkpoint: &Checkpoint) -> Option<&'static str> {
     bytes.into_iter().max_by_key(|(_, bytes)| *bytes).and_then(|(dtype, _)| float_name(dtype))
 }
 
-/// Sets every `torch_dtype` and `dtype` of a config and of the configs in it; adds `torch_dtype` if it has neither.
+/// Sets every `torch_dtype` and `dtype` of a config and of the configs in it, except null; adds `torch_dtype` to the top if
+/// it has neither.
 ///
 /// Versions of transformers before 4.56 read `torch_dtype`, later ones prefer `dtype`; with `torch_dtype="auto"` they take
 /// that of the top, and older ones those of nested configs.
 pub(super) fn set(config: &mut Value, name: &str) {
     set_existing(config, name);
     if let Value::Object(map) = config
-        && !KEYS.iter().any(|key| map.contains_key(*key))
+        && !KEYS.iter().any(|key| map.get(*key).is_some_and(Value::is_string))
     {
         map.insert("torch_dtype".to_owned(), name.into());
     }
@@ -53,7 +61,7 @@ const KEYS: [&str; 2] = ["torch_dtype", "dtype"];
 fn set_existing(config: &mut Value, name: &str) {
     let Value::Object(map) = config else { return };
     for (key, value) in map {
-        if KEYS.contains(&key.as_str()) && (value.is_string() || value.is_null()) {
+        if KEYS.contains(&key.as_str()) && value.is_string() {
             *value = name.into();
         } else if key.ends_with("_config") {
             set_existing(value, name);

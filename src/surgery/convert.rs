@@ -57,20 +57,18 @@ impl<'a> Converter<'a> {
 
     fn convert(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.encoded.clear();
-        let before = if self.scale.is_some() || [self.from, self.to].contains(&Dtype::F64) {
+        if self.scale.is_some() || [self.from, self.to].contains(&Dtype::F64) {
             let values = self.codec.decode(self.from, bytes);
             if let Some(scale) = self.scale {
                 for value in values.iter_mut() {
                     *value *= scale;
                 }
             }
-            let census = Census::of_values(values.iter().copied());
             self.codec.encode(self.to, &mut self.encoded);
-            census
         } else {
             self.codec.cast(self.from, self.to, bytes, &mut self.encoded);
-            Census::of_bytes(self.from, bytes)
-        };
+        }
+        let before = Census::of_bytes(self.from, bytes);
         let after = Census::of_bytes(self.to, &self.encoded);
         self.losses.add(CastLosses {
             overflow: after.infinite.saturating_sub(before.infinite),

@@ -15,6 +15,14 @@ pub const fn can_compute(dtype: Dtype) -> bool {
     matches!(dtype, Dtype::F16 | Dtype::BF16 | Dtype::F32 | Dtype::F64)
 }
 
+/// A number rounded to a type for which [`can_compute`] holds.
+#[must_use]
+pub fn round(dtype: Dtype, number: f64) -> f64 {
+    let (mut codec, mut bytes) = (Codec::default(), Vec::new());
+    codec.encode_values(dtype, &[number], &mut bytes);
+    codec.decode(dtype, &bytes).first().copied().unwrap_or(number)
+}
+
 /// Infinities, zeros and NaNs of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Census {
@@ -50,7 +58,7 @@ impl Census {
         Self { infinite: infinite.into(), zero: zero.into(), nan: nan.into() }
     }
 
-    pub(super) fn of_values(values: impl Iterator<Item = f64>) -> Self {
+    fn of_values(values: impl Iterator<Item = f64>) -> Self {
         values.fold(Self::default(), |census, value| Self {
             infinite: census.infinite.wrapping_add(u64::from(value.is_infinite())),
             zero: census.zero.wrapping_add(u64::from(value == 0.0)),

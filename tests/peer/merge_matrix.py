@@ -1,9 +1,11 @@
 #!/usr/bin/env python3
-"""Every combination of the options of spatialvla-llava3d: each one stops at the expected seam, or loads.
+"""Every combination of the options of spatialvla-llava3d: each one stops at the expected seam, or loads. Then language
+donors in other types, loaded in the types that users ask for.
 
-    merge_matrix.py [VISION LANGUAGE [CODE]]
+    merge_matrix.py [--full] [VISION LANGUAGE [CODE]]
 
-The donors default to those of the fixtures; CODE is a directory with SpatialVLA's Python modules.
+The donors default to those of the fixtures; CODE is a directory with SpatialVLA's Python modules. With --full, the donors
+in other types are merged with every combination that loads, otherwise with one in six.
 """
 
 import itertools
@@ -15,13 +17,13 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from peer import DONORS, SHARED, Tally, check, doctor, quiet, workplace
+from peer import DONORS, INDEX, SHARED, Tally, check, doctor, quiet, read_tensors, workplace
 
 OPTIONS = {
     "projector": ("pad", "reinit", "keep"),
     "spatial": ("off", "pad"),
     "zoe": ("on", "off"),
-    "rows": ("grow", "keep"),
+    "rows": ("mean", "keep"),
     "tokenizer": ("plain", "baked"),
     "layout": ("upstream", "wrapped"),
 }
@@ -99,6 +101,79 @@ def faults_on_loading(directory):
     return wrong
 
 
+def faults_in_types(directory):
+    """Runs forward in each type that users ask for; returns the problems."""
+    import numpy
+    import torch
+    from PIL import Image
+    from transformers import AutoModel, AutoProcessor
+
+    path, wrong = str(directory), []
+    processor = AutoProcessor.from_pretrained(path, trust_remote_code=True)
+    side = processor.image_processor.size["height"]
+    pixels = numpy.random.default_rng(0).integers(0, 255, (side, side, 3), dtype=numpy.uint8)
+    inputs = processor(images=[Image.fromarray(pixels)], text="pick the red cup", return_tensors="pt")
+    for asked in (torch.bfloat16, "auto", torch.float32):
+        model = AutoModel.from_pretrained(path, torch_dtype=asked, trust_remote_code=True).eval()
+        types = {p.dtype for p in model.parameters()}
+        if len(types) > 1:
+            wrong.append(f"torch_dtype={asked}: {types}")
+        try:
+            with torch.no_grad():
+                logits = model(**inputs.to(model.dtype)).logits
+        except RuntimeError as error:
+            wrong.append(f"forward with torch_dtype={asked}: {error}")
+        else:
+            if not torch.isfinite(logits).all():
+                wrong.append(f"logits with torch_dtype={asked} are not finite")
+    return wrong
+
+
+def save_in_type(donor, path, name):
+    """A copy of a donor with its tensors in the type that torch gives this name."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(donor, path)
+    for shard in path.glob("*.safetensors"):
+        tensors = {k: t.to(getattr(torch, name)) if t.is_floating_point() else t for k, t in load_file(shard).items()}
+        save_file(tensors, shard, metadata={"format": "pt"})
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps({**config, "torch_dtype": name}))
+    index = path / INDEX
+    if index.exists():
+        text = json.loads(index.read_text())
+        text["metadata"]["total_size"] = sum(len(data) for _, _, data in read_tensors(path).values())
+        index.write_text(json.dumps(text))
+
+
+def other_types(tally, donors, work, full):
+    """Merges language donors in other types than the vision donor's; returns the number of merges that load."""
+    choices = [dict(zip(OPTIONS, values)) for values in itertools.product(*OPTIONS.values())]
+    choices = [choice for choice in choices if not blame(choice)]
+    vision, language, *code = donors
+    loaded = 0
+    for name in ("float16", "float32"):
+        donor = work / f"language-{name}"
+        save_in_type(language, donor, name)
+        for number, choice in enumerate(choices):
+            if not full and number % 6 != (name == "float32"):
+                continue
+            for dtype, stored in (("host", "BF16"), ("float32", "F32"), ("float16", "F16"))[: 3 if number < 6 else 1]:
+                what = " ".join(f"{k}={v}" for k, v in {"donor": name, "dtype": dtype, **choice}.items())
+                out = work / "merged-type"
+                exit_code, stdout, stderr = build((vision, donor, *code), out, {**choice, "dtype": dtype})
+                if tally.expect(exit_code == 0, f"{what}: exit {exit_code}", (stdout + stderr)[-1500:]):
+                    ok = tally.equal({t[0] for t in read_tensors(out).values()}, {stored}, f"{what}: stored types")
+                    ok &= judge(tally, what, out)
+                    loaded += ok and tally.equal(faults_in_types(out), [], f"{what}: types")
+                shutil.rmtree(out, ignore_errors=True)
+        exit_code, stdout, stderr = build((vision, donor, *code), work / "kept", {"dtype": "keep"})
+        tally.equal(exit_code, 2, f"{name} dtype=keep: exit code")
+        tally.expect(f"language donor in {name}" in stdout + stderr, f"{name} dtype=keep: message", stdout + stderr)
+    return loaded
+
+
 def second_opinion(directory):
     """Problems found by an independent loader script, if ../shared has one."""
     script = SHARED / "tools" / "load_merged.py"
@@ -144,7 +219,8 @@ def forwarded(tally, donors, work, out):
 
 
 def main():
-    donors = sys.argv[1:] or [DONORS / "spatialvla-tiny", DONORS / "llava3d-tiny"]
+    full = "--full" in sys.argv
+    donors = [word for word in sys.argv[1:] if word != "--full"] or [DONORS / "spatialvla-tiny", DONORS / "llava3d-tiny"]
     if len(donors) not in (2, 3):
         sys.exit(__doc__)
     tally, table = Tally(), []
@@ -167,6 +243,7 @@ def main():
                 result = "loads" if ok else "WRONG"
             table.append((*values, result))
             shutil.rmtree(out, ignore_errors=True)
+        print(f"{other_types(tally, donors, work, full)} merges of donors in other types load and run")
         forwarded(tally, donors, work, work / "forwarded")
         tally.equal([p.name for p in work.iterdir() if p.name.startswith(".")], [], "other files beside the outputs")
     widths = [max(map(len, column)) for column in zip(OPTIONS, *(row[:-1] for row in table))]

@@ -36,7 +36,7 @@ def save_paligemma(path, work, width):
     )).to(torch.bfloat16).save_pretrained(path, max_shard_size="60KB")
 
 
-def save_llama(path, work, width, tied):
+def save_llama(path, work, width, tied, dtype="bfloat16"):
     from transformers import LlamaConfig, LlamaForCausalLM, LlamaTokenizerFast
     import torch
 
@@ -48,7 +48,7 @@ def save_llama(path, work, width, tied):
         hidden_size=width, intermediate_size=80, num_hidden_layers=3, num_attention_heads=4, num_key_value_heads=2,
         vocab_size=len(tokenizer), max_position_embeddings=512, tie_word_embeddings=tied, bos_token_id=1, eos_token_id=2,
         pad_token_id=0,
-    )).to(torch.bfloat16).save_pretrained(path, max_shard_size="80KB")
+    )).to(getattr(torch, dtype)).save_pretrained(path, max_shard_size="80KB")
 
 
 def compare_tensors(tally, what, vision, language, out, padded):
@@ -99,6 +99,83 @@ def open_stock(tally, what, language, out):
     tally.expect(made.shape[1] > inputs["input_ids"].shape[1], f"{what}: generate returned no tokens")
 
 
+def example(path, dtype):
+    """The inputs of a picture and a prompt."""
+    import numpy
+    from PIL import Image
+    from transformers import AutoProcessor
+
+    pixels = numpy.random.default_rng(0).integers(0, 255, (40, 40, 3), dtype=numpy.uint8)
+    processor = AutoProcessor.from_pretrained(path)
+    return processor(images=Image.fromarray(pixels), text="<image>" + PROMPT, return_tensors="pt").to(dtype)
+
+
+def open_in_types(tally, what, out):
+    """Runs forward and generate in each type that users ask for."""
+    import torch
+    from transformers import PaliGemmaForConditionalGeneration
+
+    for asked in (torch.bfloat16, "auto", torch.float32):
+        model = PaliGemmaForConditionalGeneration.from_pretrained(out, torch_dtype=asked)
+        types = {p.dtype for p in model.parameters()}
+        tally.equal(len(types), 1, f"{what}: types of the parameters with torch_dtype={asked}: {types}")
+        try:
+            with torch.no_grad():
+                inputs = example(out, model.dtype)
+                finite = torch.isfinite(model(**inputs).logits).all()
+                model.generate(**inputs, max_new_tokens=2, do_sample=False)
+            tally.expect(finite, f"{what}: logits with torch_dtype={asked} are not finite")
+        except RuntimeError as error:
+            tally.expect(False, f"{what}: forward with torch_dtype={asked}: {error}")
+
+
+def image_rows(path):
+    """The features of an image as they enter the first layer, in float32."""
+    import torch
+    from transformers import PaliGemmaForConditionalGeneration
+
+    model, seen = PaliGemmaForConditionalGeneration.from_pretrained(path), []
+    first = model.language_model.model.layers[0]
+    first.register_forward_pre_hook(lambda _, args, kwargs: seen.append((args or [kwargs["hidden_states"]])[0]),
+                                    with_kwargs=True)
+    inputs = example(path, model.dtype)
+    with torch.no_grad():
+        model(**inputs)
+    return seen[0][inputs["input_ids"] == model.config.image_token_index]
+
+
+def compare_types(tally, work):
+    """Language models in other types than the vision side: cast, or refused; what the options say is what is stored."""
+    for dtype in ("float16", "float32"):
+        save_llama(work / f"llama-{dtype}", work, 64, tied=False, dtype=dtype)
+        for option, stored in (("host", "BF16"), ("float32", "F32"), ("float16", "F16")):
+            what, out = f"paligemma llama-{dtype} dtype={option}", work / f"merged-{dtype}-{option}"
+            code, stdout, stderr = merge(work / "paligemma", work / f"llama-{dtype}", out, f"dtype={option}")
+            if tally.expect(code == 0, f"{what}: exit {code}", (stdout + stderr)[-2000:]):
+                tally.equal({tensor[0] for tensor in read_tensors(out).values()}, {stored}, f"{what}: stored types")
+                tally.equal(errors(next(iter(check(out)[0].values()))), [], f"{what}: check")
+                open_in_types(tally, what, out)
+        code, stdout, stderr = merge(work / "paligemma", work / f"llama-{dtype}", work / "kept", "dtype=keep")
+        tally.equal(code, 2, f"paligemma llama-{dtype} dtype=keep: exit code")
+        tally.expect(f"bfloat16 and the language donor in {dtype}" in stdout + stderr, "dtype=keep: message", stdout)
+
+
+def compare_scales(tally, work):
+    """The image features that enter the first layer: as in the vision donor with scale=fold, divided with scale=keep."""
+    import torch
+
+    host = image_rows(work / "paligemma")
+    for option, factor in (("fold", 1), ("keep", 8)):
+        out = work / f"merged-{option}"
+        code, stdout, stderr = merge(work / "paligemma", work / "llama", out, f"scale={option}")
+        if not tally.expect(code == 0, f"scale={option}: exit {code}", (stdout + stderr)[-2000:]):
+            continue
+        rows = image_rows(out)
+        rms = [float(r.pow(2).mean().sqrt()) for r in (host, rows)]
+        print(f"scale={option}: rms of image features at the first layer {rms[1]:.6f}, of the vision donor {rms[0]:.6f}")
+        tally.expect(torch.allclose(rows * factor, host, rtol=1e-4, atol=1e-6), f"scale={option}: image features", f"{rms}")
+
+
 def merge(vision, language, out, *settings):
     options = [word for setting in settings for word in ("--set", setting)]
     return doctor("build-merged", "--recipe", "paligemma-llama", "--vision", vision, "--language", language,
@@ -130,6 +207,9 @@ def main():
             tally.expect("auto_map" not in json.loads((out / "config.json").read_text()), f"{what}: auto_map in config")
             compare_tensors(tally, what, work / "paligemma", work / language, out, padded)
             open_stock(tally, what, work / language, out)
+
+        compare_types(tally, work)
+        compare_scales(tally, work)
 
         # The widths of projector and language model differ: the merge must stop at the seam.
         out = work / "merged-seam"

@@ -19,7 +19,7 @@ type FunctionResult = Result<Value, String>;
 
 impl Scope<'static> {
     /// A root scope with the standard functions of CEL and those of the data files:
-    /// `pow isqrt sum floor ceil range min max get keys zpad glob`.
+    /// `pow isqrt sqrt sum floor ceil range min max get keys zpad glob`.
     #[must_use]
     pub fn new() -> Self {
         let mut scope = Self::bare();
@@ -49,6 +49,12 @@ pub(crate) fn is_function(name: &str) -> bool {
 fn register(scope: &mut Scope<'static>) {
     scope.function("pow", pow);
     scope.function("isqrt", isqrt);
+    scope.function("sqrt", |a| match a {
+        [n] => {
+            n.as_f64().filter(|n| *n >= 0.0).map(|n| n.sqrt().into()).ok_or_else(|| format!("{n} has no square root"))
+        }
+        _ => Err("sqrt(n) takes one number".to_owned()),
+    });
     scope.function("sum", sum);
     scope.function("floor", |a| round(a, f64::floor));
     scope.function("ceil", |a| round(a, f64::ceil));

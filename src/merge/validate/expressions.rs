@@ -14,7 +14,7 @@ use crate::surgery::plan::TensorTransform;
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
 
 /// Functions of a merge's scope, with a role as the first argument.
-const ROLE_FUNCTIONS: [&str; 4] = ["shape", "has", "dtype", "part"];
+const ROLE_FUNCTIONS: [&str; 6] = ["shape", "has", "dtype", "part", "row_scale", "image_fold"];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";

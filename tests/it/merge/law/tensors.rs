@@ -188,9 +188,10 @@ fn planned_tensors_are_streamed_as_computed_at_once() {
             }
             let after = value(tensor.dtype, got);
             if !copies {
-                want_losses.nan += u64::from(before.is_nan());
-                want_losses.overflow += u64::from(before.is_finite() && after.is_infinite());
-                want_losses.underflow += u64::from(before != 0.0 && after == 0.0);
+                let source = value(from.dtype, donor);
+                want_losses.nan += u64::from(source.is_nan());
+                want_losses.overflow += u64::from(source.is_finite() && after.is_infinite());
+                want_losses.underflow += u64::from(source != 0.0 && after == 0.0);
             }
         }
         if !sampled {

@@ -1,0 +1,48 @@
+//! Functions of recipes that compare the weights of donors, besides those of [`super::context`].
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use serde_json::{Value, json};
+
+use super::context::Donor;
+use super::dtypes;
+use crate::knowledge::scales::Scales;
+use crate::knowledge::{Loader, Scope};
+
+/// Adds `dtype`, `image_fold` and `row_scale`.
+pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], scales: &Scales) {
+    let dtypes: BTreeMap<String, &'static str> = donors
+        .iter()
+        .filter_map(|donor| Some((donor.role.clone(), dtypes::of_most_bytes(&donor.checkpoint)?)))
+        .collect();
+    let of_role = dtypes.clone();
+    scope.function1("dtype", move |role| of_role.get(role).map_or(Value::Null, |name| json!(name)));
+    let configs: Arc<BTreeMap<String, Value>> =
+        Arc::new(donors.iter().map(|donor| (donor.role.clone(), donor.config.clone())).collect());
+    let (of_roles, of_models) = (Arc::clone(&configs), scales.clone());
+    scope.function2("image_fold", move |host, guest| match (of_roles.get(host), of_roles.get(guest)) {
+        (Some(host), Some(guest)) => image_fold(&of_models, host, guest),
+        _ => Value::Null,
+    });
+    let of_models = scales.clone();
+    scope.function1("row_scale", move |role| {
+        let scale = configs.get(role).map(|config| of_models.of_rows(config, Loader::NEWEST));
+        scale.map_or(Value::Null, |scale| json!(dtypes::round(scale, dtypes.get(role).copied())))
+    });
+}
+
+/// The factor that keeps image features as large as in the host when its class has the language model of the guest, with the
+/// versions of transformers for which it is right and those that need none.
+fn image_fold(scales: &Scales, host: &Value, guest: &Value) -> Value {
+    let factor = |loader: Loader| {
+        let factor = scales.of_images(host, host, loader) / scales.of_images(host, guest, loader);
+        // Square roots do not cancel to the last bit of binary64.
+        dtypes::round(factor, Some("float32"))
+    };
+    let needs = |loader: &Loader| (factor(*loader) - 1.0).abs() > f64::EPSILON;
+    let (with, without): (Vec<Loader>, Vec<Loader>) = Loader::ALL.into_iter().partition(needs);
+    let versions = |loaders: &[Loader]| loaders.iter().map(|loader| loader.version()).collect::<Vec<_>>();
+    let common = with.first().map_or(1.0, |loader| factor(*loader));
+    json!({ "factor": common, "with": versions(&with), "without": versions(&without) })
+}
