@@ -147,7 +147,7 @@ fn copied_tensors_are_the_donors_bytes() {
                 // A factor of 8 changes only the exponent; that of Gemma 2 is rounded to bfloat16 like its products.
                 let (scale, [was, is]) = (entry["scale"].as_f64().unwrap(), [&source.2, &result.2].map(|b| bf16(b)));
                 for (was, is) in was.iter().zip(is).take(8) {
-                    let tolerance = if scale == 8.0 { 0.0 } else { 2_f64.powi(-8) };
+                    let tolerance = if entry["scale"] == 8.0 { 0.0 } else { 2_f64.powi(-8) };
                     assert!((is - was * scale).abs() <= is.abs() * tolerance, "{}", entry["name"]);
                 }
             }

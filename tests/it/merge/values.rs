@@ -202,7 +202,7 @@ fn a_factor_of_one_changes_nothing_and_the_projector_keeps_its_bytes() {
 }
 
 /// A recipe that copies one tensor of the language donor into a smaller class, with more keys for its entry.
-fn narrowed(work: &Path, entry: Value, hidden: u64) -> String {
+fn narrowed(work: &Path, entry: &Value, hidden: u64) -> String {
     let mut tensor = json!({ "from": "from", "names": "^model\\.norm\\.weight$" });
     tensor.as_object_mut().unwrap().extend(entry.as_object().unwrap().clone());
     let recipe = json!({
@@ -225,10 +225,10 @@ fn narrowed(work: &Path, entry: Value, hidden: u64) -> String {
 fn padding_is_offered_only_where_it_helps() {
     let work = TempDir::new().unwrap();
     let entry = json!({ "fit": "opt.fit", "options": ["fit=copy", "fit=pad", "fit=reinit"] });
-    let narrow = narrowed(work.path(), entry.clone(), 32);
+    let narrow = narrowed(work.path(), &entry, 32);
     assert!(narrow.contains("--set fit=reinit") && !narrow.contains("--set fit=pad"), "{narrow}");
     assert!(!narrow.contains("--set fit=copy"), "the value in effect: {narrow}");
-    let wide = narrowed(work.path(), entry, 96);
+    let wide = narrowed(work.path(), &entry, 96);
     assert!(wide.contains("--set fit=reinit") && wide.contains("--set fit=pad"), "{wide}");
 }
 
@@ -244,9 +244,9 @@ fn slices_scales_and_types_that_do_not_fit_are_refused_in_words() {
         (json!({ "dtype": "'float8'" }), "unknown dtype `float8` in `dtype`"),
         (json!({ "fit": "'conv' + 'ert'" }), "not copy, pad, grow-rows, sample-rows or reinit"),
     ] {
-        let refused = narrowed(work.path(), entry.clone(), 64);
+        let refused = narrowed(work.path(), &entry, 64);
         assert!(refused.contains(words), "{entry}: {refused}");
     }
-    let sliced = narrowed(work.path(), json!({ "slice": "[8, 32]", "scale": "0.5" }), 32);
+    let sliced = narrowed(work.path(), &json!({ "slice": "[8, 32]", "scale": "0.5" }), 32);
     assert!(sliced.contains("scale 0.5") && sliced.contains("[32]"), "{sliced}");
 }
