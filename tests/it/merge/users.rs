@@ -302,7 +302,7 @@ fn the_page_of_recipes_quotes_and_names_what_exists() {
         assert!(page.contains(&format!("`{name}`")), "{name} is missing from the page");
     }
 
-    let code = ["src/knowledge/expression/functions.rs", "src/merge/context.rs"]
+    let code = ["src/knowledge/expression/functions.rs", "src/merge/context.rs", "src/merge/functions.rs"]
         .map(|path| fs::read_to_string(project().join(path)).unwrap());
     let name = regex::Regex::new(r#"scope\.(?:function[12]?|add|bind)\("([a-z_]+)""#).unwrap();
     let named: Vec<&str> =
