@@ -17,7 +17,7 @@ from stock import IMAGE_IN_TEXT, allow_without_num2words
 TEXT = "pick the red cup"
 # These attend to the whole prompt, and guests only backwards: one token is the same for both.
 ONE_TOKEN = {"paligemma", "paligemma2", "spatialvla"}
-CLOSE = 2e-4  # of logits in float32
+CLOSE = 5e-4  # of logits in float32; those of another rounding differ by more than twice that
 
 
 def dtype_key():

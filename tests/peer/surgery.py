@@ -37,11 +37,17 @@ REFUSED = [
     (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
     (r"(qwen2_vl|qwen2_5_vl) x qwen2 (reinit|pad)", "mrope|head", "the positions of image patches divide the heads of another width"),
     (r"(llava|llava_next) x gemma2 .*", "4.47 cannot generate", "the host was saved by 4.47, which cannot generate with this language model"),
+    (r"spatialvla x gemma2 .*", "Infinity", "the processor's statistics have an Infinity, and a document of a result is strict JSON"),
+    (r"vision of qwen2_(5_)?vl", "ARC003", "the config of the part names the type of the whole model, and a loader would build that"),
     (r".* sees with siglip2", "", "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP"),
     (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
+    (r"llava_next sees with siglip", "4.47 cannot see", "the host was saved by 4.47, which wants a class token of the tower"),
     (r"llava_onevision sees with (clip|dinov2)", "builds its own", "the host counts the patches of a tower without class token"),
     (r"idefics3 sees with .*", "", "the class of the host builds its own tower, whatever the config says"),
 ]
+
+# Known defects: cells that are written and do not run. One that runs has to leave this list.
+BROKEN = [r"spatialvla x llama3 .*"]
 
 
 def start(folder, program, *arguments):
@@ -72,7 +78,9 @@ def judge(tally, cell, happened):
         wrong, verdict = told[cell.name], said.get(version)
         if wrong is None or told[cell.host] != []:
             continue  # no such class in this version, or the host alone does not run there
-        if verdict is None:
+        if any(re.fullmatch(name, cell.name) for name in BROKEN):
+            tally.expect(wrong, f"{cell.name} {version}: runs now, and is in BROKEN")
+        elif verdict is None:
             pass  # the report says nothing of this version
         elif isinstance(verdict, list):
             tally.expect(wrong, f"{cell.name} {version}: runs, and the tool says {verdict}")
