@@ -42,8 +42,10 @@ struct DonorSummary<'a> {
     role: &'a str,
     /// Description of the donor.
     what: &'a str,
-    /// Architectures that the donor may have; `*` for any. Empty for a directory that only provides files.
+    /// Architectures that the donor may have; `*` for any. Without these and `parts`, a directory that only provides files.
     architectures: &'a [String],
+    /// Parts that the donor's model must have, such as `language`.
+    parts: &'a [String],
     /// Whether the donor may be left out.
     optional: bool,
 }
@@ -77,8 +79,8 @@ impl<'a> RecipeSummary<'a> {
 }
 
 impl<'a> DonorSummary<'a> {
-    fn new(DonorSpec { role, what, architectures, optional, .. }: &'a DonorSpec) -> Self {
-        Self { role, what, architectures, optional: *optional }
+    fn new(DonorSpec { role, what, architectures, parts, optional, .. }: &'a DonorSpec) -> Self {
+        Self { role, what, architectures, parts, optional: *optional }
     }
 }
 
@@ -154,6 +156,7 @@ fn argument(spec: &DonorSpec) -> String {
 fn donors(out: &mut String, recipe: &Recipe) {
     for spec in &recipe.donors {
         let architectures = match spec.architectures.as_slice() {
+            [] if !spec.parts.is_empty() => format!("any with a known {} part", spec.parts.join(" and ")),
             [] => "files only".to_owned(),
             [any] if any == ANY => "any architecture".to_owned(),
             names => names.join(" or "),
