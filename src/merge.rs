@@ -10,6 +10,7 @@ mod context;
 mod documents;
 mod donors;
 mod draft;
+pub(crate) mod dry_run;
 mod dtypes;
 mod error;
 mod explain;
@@ -112,6 +113,8 @@ pub fn run(
     }
     publish::check(recipe, &draft)?;
     if request.dry_run {
+        run.record.dry_run = Some(dry_run::facts(&draft, recipe, &donors, &out)?);
+        run.plan = Some(dry_run::document(&draft, recipe));
         run.note("write", "skipped (--dry-run)");
         return Ok(run.end(MergeStage::DryRun));
     }

@@ -20,7 +20,7 @@ pub mod fixes;
 mod format;
 #[cfg(feature = "cli")]
 pub mod inspect;
-mod json;
+pub(crate) mod json;
 pub(crate) mod markdown;
 mod merge;
 pub mod model;

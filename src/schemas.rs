@@ -22,6 +22,7 @@ use crate::knowledge::recipe::{MergeFile, Recipe};
 use crate::knowledge::rule::Rule;
 use crate::knowledge::settings::Settings;
 use crate::knowledge::source::{self, DataError};
+use crate::merge::dry_run::PlanDocument;
 use crate::merge::manifest::Manifest;
 use crate::report::Report;
 use crate::report::baseline::Baseline;
@@ -90,6 +91,7 @@ fn outputs() -> Vec<(&'static str, Value)> {
         ("inspect", schema::<InspectDocument<'_>>("The JSON report of ckpt-doctor inspect", settings())),
         ("recipes", schema::<RecipesDocument<'_>>("The JSON list of ckpt-doctor recipes", settings())),
         ("verification", schema::<Verification>("The JSON report of ckpt-doctor verify", settings())),
+        ("plan", schema::<PlanDocument>("The plan of ckpt-doctor build-merged --dry-run --plan", settings())),
         ("manifest", schema::<Manifest>("merge-manifest.json of ckpt-doctor build-merged", settings())),
     ]
 }

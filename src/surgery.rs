@@ -28,4 +28,5 @@ pub use error::{ApplyError, RepairError};
 pub use leftover::Leftover;
 pub use overlay::overlay;
 pub use stop::stop_on;
+pub use system::free_space;
 pub use target::{Target, check_target, claim_target};

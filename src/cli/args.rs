@@ -329,6 +329,9 @@ pub struct BuildMergedArgs {
     /// Plan and check the merge, and write nothing
     #[arg(long)]
     pub dry_run: bool,
+    /// With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON
+    #[arg(long, value_name = "FILE", requires = "dry_run")]
+    pub plan: Option<PathBuf>,
     /// Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers
     #[arg(long)]
     pub hash: bool,
@@ -443,6 +446,7 @@ impl PartWriteArgs {
             out: Some(self.out),
             set,
             dry_run: self.dry_run,
+            plan: None,
             hash: false,
             report: self.report,
         }

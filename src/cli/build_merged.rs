@@ -15,6 +15,7 @@ use crate::check::Severity;
 use crate::knowledge::Knowledge;
 use crate::knowledge::rule::RuleSet;
 use crate::merge::{self, MergeRequest, MergeRun, ResolvedMergeFile};
+use crate::report::json;
 use crate::report::model::{MergeStage, Role};
 use crate::report::recipes;
 
@@ -39,6 +40,9 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let run = merge::run(&request, &knowledge, &mut progress)?;
     run.notices.iter().for_each(|notice| output::note(&output::safe(notice)));
     let stage = run.record.stage;
+    if let (Some(file), Some(plan)) = (&args.plan, &run.plan) {
+        output::write(file, &json::pretty(plan)).with_context(|| format!("writing {}", file.display()))?;
+    }
     output::finish(&run.report(), &args.report, false, false).with_context(|| match stage {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
         _ => "the report could not be written".to_owned(),

@@ -17,7 +17,7 @@ use crate::knowledge::source;
 use crate::report::model::{ToolInfo, Training};
 use crate::surgery::ApplyError;
 use crate::surgery::donor::{digest_own, sha256};
-use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorTransform};
+use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorRef, TensorTransform};
 use crate::surgery::written::WrittenShard;
 
 /// File name in the merged directory.
@@ -140,6 +140,20 @@ pub(crate) struct DonorTensor {
     pub sha256: Option<String>,
 }
 
+impl DonorTensor {
+    /// The record of a source.
+    pub(super) fn new(from: &TensorRef, sha256: Option<String>) -> Self {
+        Self {
+            donor: from.donor.clone(),
+            name: from.name.clone(),
+            dtype: from.dtype.name().to_owned(),
+            shape: from.shape.clone(),
+            slice: from.slice,
+            sha256,
+        }
+    }
+}
+
 /// The donors by content. With `all_bytes`, whole shards are hashed, otherwise only their headers.
 ///
 /// # Errors
@@ -178,14 +192,7 @@ pub(super) fn manifest(
             sha256: written.sha256.clone(),
             transform: t.transform(),
             scale: t.source.scale,
-            source: DonorTensor {
-                donor: from.donor.clone(),
-                name: from.name.clone(),
-                dtype: from.dtype.name().to_owned(),
-                shape: from.shape.clone(),
-                slice: from.slice,
-                sha256: written.source_sha256.clone(),
-            },
+            source: DonorTensor::new(from, written.source_sha256.clone()),
         }
     });
     Manifest {

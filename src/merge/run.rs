@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::draft::MergeDraft;
+use super::dry_run::PlanDocument;
 use super::parts::DonorParts;
 use super::training::training;
 use super::usage::Usage;
@@ -60,6 +61,8 @@ pub struct MergeRun {
     pub record: MergeReport,
     /// Temporary files of an earlier run that were removed, and those of this run that were not; for standard error.
     pub notices: Vec<String>,
+    /// The plan; only of a dry run.
+    pub(crate) plan: Option<PlanDocument>,
     /// How the result is loaded.
     usage: Usage,
 }

@@ -36,6 +36,13 @@ pub fn render(path: &str, repair: &Repair) -> String {
     out
 }
 
+/// The unified diff of two texts, escaped for display.
+pub(super) fn texts(before: &str, after: &str, old: &str, new: &str) -> String {
+    let mut out = String::new();
+    text(&mut out, after, Some(old), new);
+    out.replacen(&format!("--- {after}"), &format!("--- {before}"), 1)
+}
+
 fn text(out: &mut String, at: &str, old: Option<&str>, new: &str) {
     let from = if old.is_some() { at } else { "/dev/null" };
     let old = old.unwrap_or_default();

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::sync::Arc;
 
 use serde::{Serialize, Serializer};
 
@@ -35,6 +36,9 @@ pub struct MergeReport {
     pub training: Option<Training>,
     /// Python code that loads the result, one statement each; empty when nothing is known about its class.
     pub usage: Vec<String>,
+    /// What a dry run says in addition; missing for other runs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dry_run: Option<DryRun>,
     /// Donor tensors that the result does not contain, by role and pattern.
     pub dropped: Vec<Dropped>,
     /// Repairs of donor documents, one sentence each.
@@ -223,6 +227,48 @@ pub struct Training {
     pub train: Vec<String>,
     /// All others.
     pub freeze: Vec<String>,
+}
+
+/// The facts of a dry run.
+#[derive(Debug, Clone, Default, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct DryRun {
+    /// Bytes of the files to write, without the report, the manifest and the model card.
+    pub needed: u64,
+    /// Bytes free on the file system of the target; null when it does not report them.
+    pub free: Option<u64>,
+    /// The shards in order.
+    pub shards: Vec<PlannedShardSize>,
+    /// The change of config.json; for renderers that show text.
+    #[serde(skip)]
+    pub config: Option<ConfigChange>,
+}
+
+/// A shard to be written.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct PlannedShardSize {
+    /// File name.
+    pub name: String,
+    /// Number of tensors.
+    pub tensors: usize,
+    /// Bytes of the file.
+    pub bytes: u64,
+}
+
+/// config.json of a result, and of the donor that it starts from.
+#[derive(Debug, Clone)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub struct ConfigChange {
+    /// Role of the donor.
+    pub donor: String,
+    /// Text in the donor.
+    pub old: Arc<str>,
+    /// Text in the result.
+    pub new: Arc<str>,
 }
 
 /// Donor tensors that the result does not contain.

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use serde::Serialize;
 
 pub use super::merge::{
-    Cast, ChangedTensor, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName, StageOutcome, Training,
+    Cast, ChangedTensor, ConfigChange, Dropped, DryRun, MergeReport, MergeStage, MergedFile, PlannedShardSize, Role,
+    Seam, ShapedName, StageOutcome, Training,
 };
 use crate::check::finding::Suppressed;
 use crate::check::verdict::PredictedLoad;

@@ -113,6 +113,14 @@ fn room(dir: &Path) -> Result<Option<Room>, ApplyError> {
     Ok((stats.f_blocks > 0).then_some(room))
 }
 
+/// Bytes that this user can write to the file system of `dir`; `None` when it does not report them.
+///
+/// # Errors
+/// [`ApplyError::Io`] when the file system cannot be queried.
+pub fn free_space(dir: &Path) -> Result<Option<u64>, ApplyError> {
+    Ok(room(dir)?.map(|room| room.bytes))
+}
+
 /// Fails when files of these sizes do not fit into `dir`, before any of them is written.
 ///
 /// Each file takes whole blocks. Metadata of the file system is not counted, so writing can still fail; see

@@ -265,4 +265,35 @@ fn a_dry_run_writes_nothing_and_reports_the_plan() {
     assert_eq!(report["merge"]["stage"], "dry-run");
     assert_eq!(report["merge"]["tensors"], 354);
     assert_eq!(names(work.path()), Vec::<String>::new());
+    let planned = &report["merge"]["dry_run"];
+    assert_eq!(
+        planned["shards"],
+        serde_json::json!([{ "name": "model.safetensors", "tensors": 354, "bytes": 1_619_878 }])
+    );
+    assert!(planned["free"].as_u64() > planned["needed"].as_u64(), "{planned}");
+}
+
+#[test]
+fn a_dry_run_shows_the_config_and_writes_the_plan() {
+    let work = TempDir::new().unwrap();
+    let plan = work.path().join("plan.json");
+    let run =
+        tiny(&work.path().join("out"), &["--dry-run", "--plan", plan.to_str().unwrap(), "--set", "shard-size=300KB"]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    assert_eq!(names(work.path()), ["plan.json"]);
+    for line in ["\n  space: ", " to write, ", "model-00006-of-00006.safetensors", "-  \"image_token_index\": 1572,"] {
+        assert!(text(&run).contains(line), "{line}: {}", text(&run));
+    }
+    assert!(text(&run).contains("--- config.json of donor vision\n+++ config.json\n@@"), "{}", text(&run));
+    // The plan is what a merge does.
+    assert_eq!(tiny(&work.path().join("out"), &["--set", "shard-size=300KB"]).status.code(), Some(0));
+    let read = |path: &Path| -> Value { serde_json::from_slice(&fs::read(path).unwrap()).unwrap() };
+    let (plan, mut manifest) = (read(&plan), read(&work.path().join("out/merge-manifest.json")));
+    for tensor in manifest["tensors"].as_array_mut().unwrap() {
+        tensor.as_object_mut().unwrap().remove("sha256");
+        tensor["source"].as_object_mut().unwrap().remove("sha256");
+    }
+    assert_eq!(plan["tensors"], manifest["tensors"]);
+    let refused = tiny(&work.path().join("b"), &["--plan", "x.json"]);
+    assert_eq!(refused.status.code(), Some(2), "{}", text(&refused));
 }

@@ -4,8 +4,9 @@ use std::fmt::Write as _;
 
 use super::super::Style;
 use super::super::collapse::collapse;
+use super::super::diff;
 use super::super::format::{self, bytes, more, name, plural, sentence, shape, wrap};
-use super::super::model::{MergeReport, Seam, ShapedName, Verdict};
+use super::super::model::{DryRun, MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
 use super::paint::Paint;
 
@@ -37,12 +38,28 @@ pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
     list(out, "repaired", merge.repairs.len(), style, repairs.take(style.cap).collect());
     let notes = merge.notes.iter().map(|n| sentence(n));
     list(out, "notes", merge.notes.len(), style, notes.take(style.cap).collect());
+    if let Some(dry_run) = &merge.dry_run {
+        planned(out, dry_run, style);
+    }
     next_steps(out, merge, style);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [name(&f.name), sentence(&f.origin)]).collect();
         let size = format!("{}, {}", plural(merge.tensors, "tensor"), bytes(merge.bytes));
         let _ok = writeln!(out, "\n  {}: {size}", plural(merge.files.len(), "file"));
         table(out, ["file", "from"], &rows, style);
+    }
+}
+
+/// The facts of a dry run: space, shards and the change of the config.
+fn planned(out: &mut String, dry_run: &DryRun, style: Style) {
+    let free = dry_run.free.map_or_else(|| "not reported".to_owned(), bytes);
+    let verdict = if dry_run.free.is_some_and(|free| free < dry_run.needed) { ": too little" } else { "" };
+    let _ok = writeln!(out, "\n  space: {} to write, {free} free{verdict}\n", bytes(dry_run.needed));
+    let rows: Vec<_> = dry_run.shards.iter().map(|s| [name(&s.name), s.tensors.to_string(), bytes(s.bytes)]).collect();
+    table(out, ["shard", "tensors", "size"], &rows, style);
+    if let Some(change) = &dry_run.config {
+        let before = format!("config.json of donor {}", name(&change.donor));
+        let _ok = writeln!(out, "\n{}", diff::texts(&before, "config.json", &change.old, &change.new));
     }
 }
 

@@ -407,6 +407,7 @@ fn merge() -> MergeReport {
             freeze: vec!["vision_tower.x".to_owned()],
         }),
         usage: vec!["from transformers import AutoModel".to_owned()],
+        dry_run: None,
         dropped: vec![Dropped {
             donor: "language".to_owned(),
             pattern: "model.vision_tower.**".to_owned(),
