@@ -63,7 +63,8 @@ pub struct Part {
     /// Values of the model's documents that follow from the part that stands in this place.
     #[serde(default)]
     pub follows: Vec<Follow>,
-    /// Conditions on a part that stands in this place, besides its model type.
+    /// Conditions on a part that stands in this place, besides its model type, and on the tokenizer that comes with it; a
+    /// recipe that keeps the model's tokenizer does not ask them.
     #[serde(default)]
     pub needs: Vec<Need>,
 }
@@ -130,8 +131,8 @@ impl ModelParts {
 
     /// A checkpoint that is one part as a whole: its tensor names and its config are those of the part.
     #[must_use]
-    pub fn whole(part: &str) -> Self {
-        let own = Part { config: vec![String::new()], ..Part::default() };
+    pub fn whole(part: &str, own: Own) -> Self {
+        let own = Part { config: vec![String::new()], own, ..Part::default() };
         let names = BTreeMap::from([(String::new(), String::new())]);
         Self {
             parts: BTreeMap::from([(part.to_owned(), own)]),

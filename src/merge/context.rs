@@ -103,7 +103,7 @@ impl<'a> Context<'a> {
             scope.bind(name, &document(donors, file).unwrap_or_default());
         }
         let base = recipe.tokens.as_ref().and_then(|tokens| donors.iter().find(|donor| donor.role == tokens.base));
-        let tokenizer = base.and_then(|donor| value_of(donor, "tokenizer_config.json"));
+        let tokenizer = base.and_then(|donor| value_of(&donor.checkpoint, "tokenizer_config.json"));
         scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());

@@ -235,7 +235,8 @@ fn part_config(context: &Context<'_>, edit: &PartEdit) -> Result<Vec<Change>, Me
 
 /// `transformers_version` of a model with a part that a newer version wrote: an older one may not know the part.
 fn newest_version(context: &Context<'_>, edit: &PartEdit, place: PartOf<'_>) -> Vec<Change> {
-    let part = context.donor(&edit.from).and_then(|donor| value_of(donor, "config.json")?.get(VERSION)?.as_str());
+    let part =
+        context.donor(&edit.from).and_then(|donor| value_of(&donor.checkpoint, "config.json")?.get(VERSION)?.as_str());
     let host = place.host().get(VERSION).and_then(Value::as_str);
     let is_newer = |part: &&str| host.is_some_and(|host| version_numbers(part) > version_numbers(host));
     part.filter(is_newer).map(|part| (format!("/{VERSION}"), Some(part.into()))).into_iter().collect()

@@ -7,7 +7,7 @@ use super::error::MergeError;
 use super::switches;
 use crate::check::Outcome;
 use crate::checkpoint::Checkpoint;
-use crate::knowledge::parts::{Layout, ModelParts, Part};
+use crate::knowledge::parts::{Layout, ModelParts, Own, Part};
 use crate::knowledge::{Knowledge, Library, Loader, Scope};
 use crate::report::model::Seam;
 
@@ -24,10 +24,12 @@ pub(super) struct DonorParts {
 impl DonorParts {
     /// The parts of a checkpoint: those that `rules/parts/` gives its architecture; a causal language model is one part.
     pub(super) fn of(checkpoint: &Checkpoint, outcome: &Outcome, knowledge: &Knowledge) -> Option<Self> {
-        let architecture = outcome.architecture.as_ref()?;
-        let described = knowledge.parts.iter().find(|m| m.architectures.contains(architecture));
-        let model =
-            described.cloned().or_else(|| is_causal(checkpoint, knowledge).then(|| ModelParts::whole("language")))?;
+        let described = outcome
+            .architecture
+            .as_ref()
+            .and_then(|architecture| knowledge.parts.iter().find(|model| model.architectures.contains(architecture)));
+        let alone = || part_alone(checkpoint, knowledge).map(|(name, own)| ModelParts::whole(name, own));
+        let model = described.cloned().or_else(alone)?;
         let names: Vec<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
         let layout = model.layout_of(&names)?;
         Some(Self { model, layout })
@@ -60,12 +62,19 @@ impl DonorParts {
     }
 }
 
-/// Whether a checkpoint is a causal language model as a whole.
-fn is_causal(checkpoint: &Checkpoint, knowledge: &Knowledge) -> bool {
-    let Some(config) = checkpoint.document("config.json").and_then(|d| d.value.as_ref()) else { return false };
-    let names = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str());
-    let class = knowledge.library.find(config, names, Loader::of_config(config)).map(|a| a.class());
-    class.is_some_and(|class| class.ends_with("ForCausalLM") || class.ends_with("LMHeadModel"))
+/// The part that a checkpoint is as a whole: a causal language model, or a class that `rules/parts/` gives a part alone.
+fn part_alone<'k>(checkpoint: &Checkpoint, knowledge: &'k Knowledge) -> Option<(&'k str, Own)> {
+    let config = value_of(checkpoint, "config.json")?;
+    let written = config.get("architectures").and_then(|classes| classes.get(0)).and_then(Value::as_str);
+    let is_alone = |part: &Part| written.is_some_and(|class| part.own.class.values().any(|own| own == class));
+    let mut parts = knowledge.parts.iter().flat_map(|model| &model.parts);
+    let named = parts.find(|(_, part)| is_alone(part)).map(|(name, part)| (name.as_str(), part.own.clone()));
+    let causal = || {
+        let names = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str());
+        let class = knowledge.library.find(config, names, Loader::of_config(config))?.class();
+        (class.ends_with("ForCausalLM") || class.ends_with("LMHeadModel")).then(|| ("language", Own::default()))
+    };
+    named.or_else(causal)
 }
 
 /// A part of a donor.
@@ -161,9 +170,9 @@ impl<'a> PartOf<'a> {
         scope.bind("at", &json!(at));
         scope.bind("part", new.config());
         scope.bind("host", self.host());
-        scope.bind("host_stored", value_of(self.donor, "config.json").unwrap_or(&Value::Null));
+        scope.bind("host_stored", value_of(&self.donor.checkpoint, "config.json").unwrap_or(&Value::Null));
         for (name, donor) in [("host_preprocessor", self.donor), ("part_preprocessor", new.donor)] {
-            scope.bind(name, value_of(donor, "preprocessor_config.json").unwrap_or(&json!({})));
+            scope.bind(name, value_of(&donor.checkpoint, "preprocessor_config.json").unwrap_or(&json!({})));
         }
         for item in &self.part.lets {
             let value = item.is.eval(&scope).map_err(context.at(format!("{} of the part {}", item.name, self.name)))?;
@@ -255,6 +264,10 @@ pub(super) fn seams(context: &Context<'_>) -> Result<Vec<Seam>, MergeError> {
             seams.push(Seam { message, ..Seam::default() });
             continue;
         }
+        // Without a tokenizer of the part's donor, the model keeps what it has.
+        if context.recipe.tokens.is_none() {
+            continue;
+        }
         let scope = place.scope(context, new)?;
         for need in &place.part.needs {
             if !need.that.eval_bool(&scope).map_err(context.at(format!("the part {name} of {into}")))? {
@@ -265,9 +278,9 @@ pub(super) fn seams(context: &Context<'_>) -> Result<Vec<Seam>, MergeError> {
     Ok(seams)
 }
 
-/// The content of a document of a donor.
-pub(super) fn value_of<'d>(donor: &'d Donor, name: &str) -> Option<&'d Value> {
-    donor.checkpoint.document(name)?.value.as_ref()
+/// The content of a document.
+pub(super) fn value_of<'d>(checkpoint: &'d Checkpoint, name: &str) -> Option<&'d Value> {
+    checkpoint.document(name)?.value.as_ref()
 }
 
 /// Whether a key of a config speaks of the model.
