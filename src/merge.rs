@@ -44,7 +44,7 @@ pub use run::{MergeRequest, MergeRun};
 #[cfg(feature = "internals")]
 pub use validate::validate;
 #[cfg(feature = "cli")]
-pub use verify::{VerifyError, verify};
+pub use verify::verify;
 
 use record::Recorded;
 use run::count;
