@@ -65,6 +65,12 @@ pub struct Knowledge {
 }
 
 impl Knowledge {
+    /// The processor of an architecture, if it is known.
+    #[must_use]
+    pub fn processor_of(&self, architecture: &str) -> Option<&Processor> {
+        self.processors.iter().find(|processor| processor.architectures.iter().any(|name| name == architecture))
+    }
+
     /// The built-in data files.
     ///
     /// # Errors

@@ -11,14 +11,16 @@ use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{self, LoadReport, Stored, Target};
 use super::model_type::Asked;
 use super::outcome::Outcome;
+use super::tokens::OpenedTokenizer;
 use super::verdict::Basis;
 use super::{adapter, index, inspect, judge, model_type, modules, policy, refusals, tokens, variables};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, pointer};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
+use crate::knowledge::processor::Processor;
 use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Object, Rule};
-use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
+use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
 
 /// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
 const CAP: usize = 1000;
@@ -74,14 +76,12 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
     faults.extend(tokens::faults(checkpoint, rows));
-    let opened = outcome.architecture.as_deref().and_then(|name| {
-        let processor = knowledge.processors.iter().find(|p| p.architectures.iter().any(|a| a == name))?;
-        let config =
-            checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
-        tokens::open_tokenizer(&checkpoint.tokenizer, processor, config).ok().flatten()
-    });
+    let processor = outcome.architecture.as_deref().and_then(|name| knowledge.processor_of(name));
+    let leading = load::wanted(config, versions);
+    let opened = processor.and_then(|processor| opened_first(checkpoint, processor, &leading));
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     bind_run(&mut scope, knowledge, config, versions, outcome.architecture.as_deref());
+    bind_opened(&mut scope, checkpoint, processor);
     variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
     outcome.loads.iter_mut().for_each(LoadReport::shorten);
     let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &outcome.loads);
@@ -111,6 +111,29 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     outcome.findings = bounded(std::mem::take(&mut outcome.findings));
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
+}
+
+/// The tokenizer as the processor of the first leading version opens it.
+fn opened_first(checkpoint: &Checkpoint, processor: &Processor, targets: &[Target]) -> Option<OpenedTokenizer> {
+    let leading = targets.iter().find(|target| target.leads).map(|target| target.loader.version());
+    opened_under(checkpoint, processor, leading)
+}
+
+fn opened_under(checkpoint: &Checkpoint, processor: &Processor, version: Option<&str>) -> Option<OpenedTokenizer> {
+    let config = checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
+    tokens::open_tokenizer(&checkpoint.tokenizer, processor, config, version).ok().flatten()
+}
+
+/// Binds `opened`: by version of transformers, the tokenizer as the version's processor opens it, and the class.
+fn bind_opened(scope: &mut Scope<'_>, checkpoint: &Checkpoint, processor: Option<&Processor>) {
+    let of_version = |loader: &Loader| {
+        let processor = processor?;
+        let mut summary = opened_under(checkpoint, processor, Some(loader.version()))?.summary();
+        let class = processor.opens_with(loader.version()).map(|class| class.class.as_str());
+        summary.as_object_mut()?.insert("class".to_owned(), json!(class));
+        Some((loader.version().to_owned(), summary))
+    };
+    scope.bind("opened", &Value::Object(Loader::ALL.iter().filter_map(of_version).collect()));
 }
 
 /// Binds what the run asks for, and what is known of the class.

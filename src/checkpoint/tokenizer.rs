@@ -91,6 +91,8 @@ pub struct Tokenizer {
     /// `added_tokens_decoder`, from `special_tokens_map.json`. Each additional special token has the attribute
     /// `additional_special_tokens`.
     pub special_tokens: Vec<(String, String)>,
+    /// Attributes of special tokens that these files have, null included: a class's own default does not apply to them.
+    pub named_special: BTreeSet<String>,
     /// The file from which the loader takes the vocabulary.
     pub source: Option<String>,
     /// Faults of vocabulary files that are not documents.
@@ -154,6 +156,7 @@ impl Tokenizer {
             added_tokens_json: json,
             tokenizer_json_added: own,
             special_tokens: special_tokens(&special_from, &get),
+            named_special: named_special(&special_from, &get),
             faults,
             ..Self::default()
         };
@@ -247,6 +250,22 @@ impl Tokenizer {
         self.id_of(token).is_some()
     }
 
+    /// The tokenizer as a class opens it that has these special tokens by default.
+    ///
+    /// The processor's model calls it with the defaults of a fixed tokenizer class. An attribute of the files, null
+    /// included, takes precedence. Source: `PreTrainedTokenizerFast.__init__` of transformers 4, which adds every special
+    /// token that the vocabulary lacks.
+    #[must_use]
+    pub fn with_defaults(&self, defaults: &BTreeMap<String, String>) -> Self {
+        let mut opened = self.clone();
+        let missing = defaults.iter().filter(|(attribute, _)| !self.named_special.contains(*attribute));
+        opened.special_tokens.extend(missing.map(|(attribute, token)| (attribute.clone(), token.clone())));
+        let order = |attribute: &str| SPECIAL.iter().position(|name| *name == attribute);
+        opened.special_tokens.sort_by_key(|(attribute, _)| order(attribute));
+        opened.resolve();
+        opened
+    }
+
     /// Computes ids and length as transformers does on load: stated tokens first, then special ones.
     fn resolve(&mut self) {
         let base = self.base().cloned();
@@ -308,4 +327,10 @@ fn special_tokens<'v>(files: &[&str], get: &impl Fn(&str, &str) -> Option<&'v Va
         }
     }
     tokens
+}
+
+/// The attributes of special tokens that the files have, null included.
+fn named_special<'v>(files: &[&str], get: &impl Fn(&str, &str) -> Option<&'v Value>) -> BTreeSet<String> {
+    let is_named = |name: &&str| files.iter().any(|file| get(file, &format!("/{name}")).is_some());
+    SPECIAL.into_iter().filter(is_named).map(str::to_owned).collect()
 }

@@ -1,8 +1,11 @@
 //! Processors: the tokens that a processor adds to a tokenizer when it is opened.
 
+use std::collections::BTreeMap;
+
 use serde::Deserialize;
 
 use super::expression::{Expression, Template};
+use super::rule::LoaderRange;
 use super::source::{self, DataError};
 
 /// A processor, as read from its file in `rules/processors/`.
@@ -17,6 +20,10 @@ pub struct Processor {
     /// Architectures that use the processor: checks of their checkpoints add its tokens. Empty for one that only recipes name.
     #[serde(default)]
     pub architectures: Vec<String>,
+    /// Tokenizer classes with which it opens the tokenizer, whatever `tokenizer_class` is; without one for a version, that
+    /// of `tokenizer_config.json`.
+    #[serde(default)]
+    pub opens: Vec<OpensWith>,
     /// Names for expressions, in order; each may use the names before it.
     #[serde(rename = "let", default)]
     pub lets: Vec<Let>,
@@ -26,6 +33,23 @@ pub struct Processor {
     #[serde(default, rename = "$schema")]
     #[allow(dead_code, reason = "for editors")]
     pub schema: Option<String>,
+}
+
+/// The tokenizer class with which a processor opens the tokenizer.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct OpensWith {
+    /// Versions of transformers whose processor does so, as bounds: `<5`; all when missing.
+    #[serde(default)]
+    #[cfg_attr(test, schemars(with = "Option<String>"))]
+    pub loaders: LoaderRange,
+    /// The class.
+    pub class: String,
+    /// Special tokens that the class gives the tokenizer, by attribute (`pad_token`), unless `tokenizer_config.json`
+    /// names another one or null.
+    #[serde(default)]
+    pub special: BTreeMap<String, String>,
 }
 
 /// A name for an expression.
@@ -61,6 +85,12 @@ pub struct TokenRun {
 }
 
 impl Processor {
+    /// The class with which the processor of this version of transformers opens every tokenizer.
+    #[must_use]
+    pub fn opens_with(&self, version: &str) -> Option<&OpensWith> {
+        self.opens.iter().find(|class| class.loaders.contains(version))
+    }
+
     /// Parses a processor.
     ///
     /// # Errors

@@ -162,7 +162,8 @@ pub struct FaultCheck {
 /// - `tokenizer`: `length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`, `highest`,
 ///   `highest_token` (null for one of the vocabulary), `has_vocabulary`;
 /// - `tokens`: ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and
-///   `scattered`; `processor_tokenizers`: tokenizer classes that the processor's module names;
+///   `scattered`; `opened`: the same by loader, with the `class` with which its processor opens the tokenizer;
+///   `processor_tokenizers`: tokenizer classes that the processor's module names;
 /// - `chat_templates`: templates by file;
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
 ///   `of_transformers`: config.json is one of transformers;

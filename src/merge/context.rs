@@ -142,7 +142,7 @@ impl Context<'_> {
                 .donor(&spec.base)
                 .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;
             let config = document(self.donors, "processor_config.json").unwrap_or_default();
-            let opened = open_tokenizer(&donor.checkpoint.tokenizer, &processor, &config)
+            let opened = open_tokenizer(&donor.checkpoint.tokenizer, &processor, &config, None)
                 .map_err(self.at(format!("processor {}", processor.processor)))?
                 .ok_or_else(|| {
                     MergeError::Donor(format!(

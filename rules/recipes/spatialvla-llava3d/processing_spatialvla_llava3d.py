@@ -1,6 +1,6 @@
-"""SpatialVLA's processor over a Llama tokenizer.
+"""SpatialVLA's processor over the language model's own tokenizer.
 
-Only the class names differ: with those of SpatialVLA, AutoProcessor wraps the Llama vocabulary in Gemma's tokenizer,
+Only the class name differs: with those of SpatialVLA, AutoProcessor wraps the other vocabulary in Gemma's tokenizer,
 which raises no error and gives other ids.
 """
 
@@ -11,4 +11,4 @@ from .processing_spatialvla import SpatialVLAProcessor as _SpatialVLAProcessor
 
 
 class SpatialVLAProcessor(_SpatialVLAProcessor):
-    tokenizer_class = ("LlamaTokenizer", "LlamaTokenizerFast")
+    tokenizer_class = "AutoTokenizer"

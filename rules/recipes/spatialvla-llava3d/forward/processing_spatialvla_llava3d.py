@@ -1,6 +1,7 @@
-"""SpatialVLA's processor, taken from the installed package `{{package}}`, over a Llama tokenizer.
+"""SpatialVLA's processor, taken from the installed package `{{package}}`, over the language
+model's own tokenizer.
 
-Only the class names differ: with those of SpatialVLA, AutoProcessor wraps the Llama vocabulary in Gemma's tokenizer,
+Only the class name differs: with those of SpatialVLA, AutoProcessor wraps the other vocabulary in Gemma's tokenizer,
 which raises no error and gives other ids.
 """
 
@@ -8,4 +9,4 @@ from {{package}}.processing_spatialvla import SpatialVLAProcessor as _SpatialVLA
 
 
 class SpatialVLAProcessor(_SpatialVLAProcessor):
-    tokenizer_class = ("LlamaTokenizer", "LlamaTokenizerFast")
+    tokenizer_class = "AutoTokenizer"
