@@ -188,9 +188,8 @@ impl Context<'_> {
         Ok(Cow::Owned(Processor {
             processor: model.model.clone(),
             architectures: model.architectures.clone(),
-            lets: Vec::new(),
             add: model.tokens.clone(),
-            schema: None,
+            ..Processor::default()
         }))
     }
 }
