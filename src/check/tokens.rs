@@ -20,9 +20,6 @@ pub struct OpenedTokenizer {
     pub named: BTreeMap<String, Value>,
     /// The tokens that the processor adds, by id; those the tokenizer had are not among them.
     pub new: BTreeMap<u64, NewToken>,
-    /// Texts of the special tokens of the tokenizer's files by attribute (`pad_token`), null where it has none; an attribute
-    /// that the files lack is left out unless the class has no default for it.
-    pub special: Map<String, Value>,
     /// The first token of a numbered run whose id does not follow the one before it.
     pub scattered: Option<String>,
 }
@@ -45,7 +42,6 @@ impl OpenedTokenizer {
         let mut map: Map<String, Value> = self.named.clone().into_iter().collect();
         map.insert("length".to_owned(), json!(self.length));
         map.insert("scattered".to_owned(), json!(self.scattered));
-        map.insert("special".to_owned(), Value::Object(self.special.clone()));
         Value::Object(map)
     }
 }
@@ -65,12 +61,11 @@ pub fn open_tokenizer(
 ) -> Result<Option<OpenedTokenizer>, EvalError> {
     let class = version.and_then(|version| processor.opens_with(version));
     let reopened = class.map(|class| tokenizer.with_defaults(&class.special));
-    let special = special_texts(tokenizer);
     let tokenizer = reopened.as_ref().unwrap_or(tokenizer);
     let Some(length) = tokenizer.length() else { return Ok(None) };
     let mut scope = Scope::new();
     scope.bind("processor", config);
-    let mut out = OpenedTokenizer { length, special, ..OpenedTokenizer::default() };
+    let mut out = OpenedTokenizer { length, ..OpenedTokenizer::default() };
     for item in &processor.lets {
         let value = item.is.eval(&scope)?;
         scope.bind(&item.name, &value);
@@ -105,20 +100,6 @@ pub fn open_tokenizer(
         }
     }
     Ok(Some(out))
-}
-
-/// Texts of the special tokens by attribute, for [`OpenedTokenizer::special`].
-fn special_texts(tokenizer: &Tokenizer) -> Map<String, Value> {
-    // These classes have no special tokens of their own.
-    let is_plain =
-        matches!(tokenizer.tokenizer_class.as_deref(), Some("PreTrainedTokenizerFast" | "TokenizersBackend"));
-    let text = |attribute: &str| {
-        let found = tokenizer.special_tokens.iter().find(|(name, _)| name == attribute);
-        found.map_or(Value::Null, |(_, text)| json!(text))
-    };
-    let known = |attribute: &&str| is_plain || tokenizer.named_special.contains(*attribute);
-    let attributes = ["bos_token", "eos_token", "unk_token", "pad_token"].into_iter().filter(known);
-    attributes.map(|attribute| (attribute.to_owned(), text(attribute))).collect()
 }
 
 /// Faults of the tokenizer files among themselves and against the embedding.
