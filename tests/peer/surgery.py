@@ -37,8 +37,6 @@ REFUSED = [
     (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
     (r"(qwen2_vl|qwen2_5_vl) x qwen2 (reinit|pad)", "mrope|head", "the positions of image patches divide the heads of another width"),
     (r"(llava|llava_next) x gemma2 .*", "4.47 cannot generate", "the host was saved by 4.47, which cannot generate with this language model"),
-    (r"spatialvla x gemma2 .*", "Infinity", "the processor's statistics have an Infinity, and a document of a result is strict JSON"),
-    (r"vision of qwen2_(5_)?vl", "ARC003", "the config of the part names the type of the whole model, and a loader would build that"),
     (r".* sees with siglip2", "", "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP"),
     (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
     (r"llava_next sees with siglip", "4.47 cannot see", "the host was saved by 4.47, which wants a class token of the tower"),
@@ -48,6 +46,10 @@ REFUSED = [
 
 # Known defects: cells that are written and do not run. One that runs has to leave this list.
 BROKEN = [r"spatialvla x llama3 .*"]
+
+
+# Parts that are opened here by their class, because Auto classes of some versions do not know their model type.
+BY_CLASS = r"vision of qwen2(_5)?_vl"
 
 
 def start(folder, program, *arguments):
@@ -82,6 +84,8 @@ def judge(tally, cell, happened):
             tally.expect(wrong, f"{cell.name} {version}: runs now, and is in BROKEN")
         elif verdict is None:
             pass  # the report says nothing of this version
+        elif isinstance(verdict, list) and re.fullmatch(BY_CLASS, cell.name):
+            pass  # the verdict is on AutoModel
         elif isinstance(verdict, list):
             tally.expect(wrong, f"{cell.name} {version}: runs, and the tool says {verdict}")
         else:
