@@ -44,9 +44,6 @@ REFUSED = [
     (r"idefics3 sees with .*", "", "the class of the host builds its own tower, whatever the config says"),
 ]
 
-# Known defects: cells that are written and do not run. One that runs has to leave this list.
-BROKEN = [r"spatialvla x llama3 .*"]
-
 
 # Parts that are opened here by their class, because Auto classes of some versions do not know their model type.
 BY_CLASS = r"vision of qwen2(_5)?_vl"
@@ -80,9 +77,7 @@ def judge(tally, cell, happened):
         wrong, verdict = told[cell.name], said.get(version)
         if wrong is None or told[cell.host] != []:
             continue  # no such class in this version, or the host alone does not run there
-        if any(re.fullmatch(name, cell.name) for name in BROKEN):
-            tally.expect(wrong, f"{cell.name} {version}: runs now, and is in BROKEN")
-        elif verdict is None:
+        if verdict is None:
             pass  # the report says nothing of this version
         elif isinstance(verdict, list) and re.fullmatch(BY_CLASS, cell.name):
             pass  # the verdict is on AutoModel
