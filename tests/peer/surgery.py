@@ -35,7 +35,6 @@ REFUSED = [
     (r"gemma3 x (?!gemma3_text ).*", "builds its own", OWN),
     (r"openvla x (?!llama|mistral).*", "builds its own", OWN),
     (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
-    (r"(qwen2_vl|qwen2_5_vl) x qwen2 (reinit|pad)", "mrope|head", "the positions of image patches divide the heads of another width"),
     (r"(llava|llava_next) x gemma2 .*", "4.47 cannot generate", "the host was saved by 4.47, which cannot generate with this language model"),
     (r".* sees with siglip2", "", "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP"),
     (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
