@@ -1,6 +1,7 @@
 //! `build-merged` from the outside: what it writes, what it refuses, and unchanged donors.
 
 mod law;
+mod parts;
 mod recipes;
 mod record;
 mod refused;
