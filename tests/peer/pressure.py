@@ -297,7 +297,7 @@ class Pressure:
         outcome = job.run()
         job.promises(outcome, before, done_is_fine=False)
         # The manifest, the report and the card are made after the tensors, and are not counted before.
-        told = re.search(r"no space: need (\d+) bytes, have ", outcome.output)
+        told = re.search(r"(?i)no space.*need (\d+) bytes, have ", outcome.output)
         if outcome.code != 0 and not (told and need * 3 // 4 <= int(told.group(1)) <= need):
             raise Broken(f"size {size}: the message does not say a need near {need} bytes\n{outcome.output}")
         return outcome.code == 0
