@@ -12,6 +12,12 @@ pub use error::Error;
 pub use merge::Merge;
 
 use crate::knowledge::Knowledge;
+use crate::knowledge::loader;
+
+/// A version of transformers, as the builders take it.
+fn version(text: &str) -> Result<String, Error> {
+    loader::parse_requirement(&format!("transformers=={text}")).map_err(|_| Error::Version(text.to_owned()))
+}
 
 /// The data files inside the crate, parsed at the first call.
 fn knowledge() -> Result<&'static Knowledge, Error> {

@@ -2,6 +2,8 @@
 
 pub mod adapter;
 mod bounded;
+mod class_names;
+mod directory;
 pub mod engine;
 mod exceptions;
 pub mod finding;
@@ -14,11 +16,19 @@ pub mod load;
 mod model_type;
 pub mod modules;
 mod outcome;
+mod pickles;
 mod policy;
+mod processor;
+mod programs;
 pub mod quantization;
 mod refusals;
+mod robots;
+mod ropes;
 pub mod size;
+mod statistics;
 mod suppressions;
+mod templates;
+mod tokenizer_json;
 pub mod tokens;
 pub mod variables;
 pub mod verdict;

@@ -3,6 +3,7 @@
 //! Malformed content is never an error here. A broken `config.json` is a [`Document`] with faults and no value; a
 //! broken shard is a [`Shard`] with faults and the entries that could be read.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -23,7 +24,9 @@ pub mod index;
 mod lfs;
 pub mod list;
 pub mod module;
+mod nested;
 pub mod open;
+pub mod pickle;
 pub(crate) mod pointer;
 mod read;
 mod scan;
@@ -45,11 +48,16 @@ pub use glob::FilePattern;
 pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
 pub use lfs::LfsPointer;
 pub use module::PythonModule;
+pub use nested::Nested;
 pub use open::{OpenError, is_plain_file_name, open_regular};
+pub use pickle::{PICKLE_NAME, PickleGlobal};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
+#[cfg(feature = "internals")]
+pub use text::hex;
+#[cfg(not(feature = "internals"))]
 pub(crate) use text::hex;
 pub use text::{escape, file_size, line_column};
-pub use tokenizer::{Tokenizer, Vocabulary};
+pub use tokenizer::{Tokenizer, Vocabulary, has_paired_merges};
 
 /// Folder in a checkpoint with the journal and the saved originals of a repair.
 pub const REPAIR_FOLDER: &str = ".ckpt-doctor";
@@ -65,8 +73,11 @@ pub struct Checkpoint {
     pub entries: BTreeMap<String, Entry>,
     /// JSON documents, by file name.
     pub documents: BTreeMap<String, Document>,
-    /// Safetensors shards on disk, by file name, including shards that no index lists.
+    /// Shards on disk, by file name: safetensors files, including those that no index lists, and the pickles that a loader
+    /// opens in their place.
     pub shards: BTreeMap<String, Shard>,
+    /// Other pickles, by file name: only what they import is read of them.
+    pub pickles: BTreeMap<String, Shard>,
     /// The index; `None` when the directory has none.
     pub index: Option<Index>,
     /// Python modules, by file name.
@@ -75,8 +86,10 @@ pub struct Checkpoint {
     pub tokenizer: Tokenizer,
     /// Text of files that are neither documents nor modules, by name: `chat_template.jinja`.
     pub texts: BTreeMap<String, Arc<str>>,
-    /// Whether the base model that `adapter_config.json` names by a relative path exists there.
-    pub has_base: bool,
+    /// The base model that `adapter_config.json` names by a relative path; `None` when it is not there.
+    pub base: Option<adapter::AdapterBase>,
+    /// Files below its folders.
+    pub nested: Nested,
     /// Digests of the tensors' bytes; `None` unless [`Checkpoint::read_contents`] ran.
     pub contents: Option<Contents>,
     /// Faults of the directory itself; [`Checkpoint::all_faults`] adds those of the files.
@@ -150,7 +163,7 @@ impl Checkpoint {
         for (name, vocabulary) in kept {
             vocabularies.entry(name.clone()).or_insert_with(|| Arc::clone(vocabulary));
         }
-        let indexed = documents.iter().any(|d| Index::is_index(&d.name));
+        let indexed = documents.iter().any(|d| Index::is_index(&d.name) || d.name == PICKLE_INDEX_NAME);
         for document in documents {
             entry(&document.name, len(&document.text));
             next.documents.insert(document.name.clone(), document);
@@ -180,7 +193,8 @@ impl Checkpoint {
         let name = if self.documents.contains_key(INDEX_NAME) {
             Some(INDEX_NAME.to_owned())
         } else {
-            let pickles = || self.documents.keys().find(|name| *name == PICKLE_INDEX_NAME && self.shards.is_empty());
+            let only_pickles = self.shards.values().all(Shard::is_pickle);
+            let pickles = || self.documents.keys().find(|name| *name == PICKLE_INDEX_NAME && only_pickles);
             self.documents.keys().find(|name| Index::is_index(name)).or_else(pickles).cloned()
         };
         if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
@@ -202,10 +216,20 @@ impl Checkpoint {
         self.faults.iter().any(|fault| fault.kind == FaultKind::CheckpointTooLarge)
     }
 
-    /// The document of this file name.
+    /// The document of this file name, or of this path below a folder.
     #[must_use]
     pub fn document(&self, name: &str) -> Option<&Document> {
-        self.documents.get(name)
+        self.documents.get(name).or_else(|| self.nested.documents.get(name))
+    }
+
+    /// Names of the entries, and paths below folders; those of folders end with `/`.
+    pub fn names(&self) -> impl Iterator<Item = Cow<'_, str>> {
+        let name = |(name, entry): (&'_ String, &Entry)| match entry.kind {
+            EntryKind::Directory => Cow::Owned(format!("{name}/")),
+            _ => Cow::Owned(name.clone()),
+        };
+        let links = self.entries.iter().filter(|(_, entry)| entry.kind != EntryKind::Directory || entry.link.is_some());
+        links.map(name).chain(self.nested.names.iter().map(|name| Cow::Borrowed(name.as_str())))
     }
 
     /// Whether a file of this name exists; directories and broken links do not count.
@@ -217,6 +241,13 @@ impl Checkpoint {
     /// Every tensor of every shard, by shard name and then in header order.
     pub fn tensors(&self) -> impl Iterator<Item = (&Shard, &Tensor)> {
         self.shards.values().flat_map(|shard| shard.tensors.iter().map(move |tensor| (shard, tensor)))
+    }
+
+    /// The same without the tensors of pickles, for those who copy tensors.
+    #[must_use]
+    pub fn without_pickles(mut self) -> Self {
+        self.shards.retain(|_, shard| !shard.is_pickle());
+        self
     }
 
     /// The tensor of this name: from the shard that the index maps it to, otherwise from the first shard that contains
@@ -237,12 +268,18 @@ impl Checkpoint {
         contents::sample(&self.root, shard, tensor)
     }
 
+    /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.
+    #[must_use]
+    pub fn numbers(&self, shard: &Shard, tensor: &Tensor) -> Option<Vec<f64>> {
+        contents::numbers(&self.root, shard, tensor)
+    }
+
     /// Faults of the directory, then of documents, index, shards, modules and tokenizer; by file name within each
     /// group.
     pub fn all_faults(&self) -> impl Iterator<Item = &Fault> {
         let documents = self.documents.values().flat_map(|d| &d.faults);
         let index = self.index.iter().flat_map(|i| &i.faults);
-        let shards = self.shards.values().flat_map(|s| &s.faults);
+        let shards = self.shards.values().chain(self.pickles.values()).flat_map(|s| &s.faults);
         let modules = self.modules.values().flat_map(|m| &m.faults);
         self.faults.iter().chain(documents).chain(index).chain(shards).chain(modules).chain(&self.tokenizer.faults)
     }

@@ -1,6 +1,8 @@
 //! Rules, architectures, processors, recipes and quantisation schemes, read from `rules/`, and their expressions.
 
 pub mod architecture;
+pub mod classes;
+pub mod directories;
 pub mod embeddings;
 pub mod evidence;
 pub mod expression;
@@ -9,16 +11,21 @@ pub mod loader;
 pub mod names;
 mod ordered;
 pub mod parts;
+pub mod peft;
+pub mod pickles;
 pub mod processor;
+pub mod program;
 pub mod quantization;
 pub mod recipe;
 pub mod refusals;
 pub mod resemblance;
+pub mod ropes;
 pub mod rule;
 pub mod scales;
 pub mod selection;
 pub mod settings;
 pub mod source;
+pub mod statistics;
 
 pub use architecture::{Architecture, Conversion, Doubt, Expected, ExpectedTensor, Refusal};
 pub use evidence::Evidence;
@@ -26,17 +33,24 @@ pub use expression::{EvalError, Expression, Scope, Template};
 pub use library::Library;
 pub use loader::Loader;
 
+use classes::ClassNames;
+use directories::Directories;
 use embeddings::TokenEmbedding;
 use names::LoaderNames;
 use parts::ModelParts;
+use peft::PeftKeys;
+use pickles::Pickles;
 use processor::Processor;
+use program::Programs;
 use quantization::Scheme;
 use recipe::Recipe;
 use refusals::Refusals;
+use ropes::RopeKeys;
 use rule::RuleSet;
 use scales::Scales;
 use settings::Policy;
 use source::DataError;
+use statistics::StatisticsPlaces;
 
 /// Data used by a check or a merge. The caller loads it once and passes it down.
 pub struct Knowledge {
@@ -54,10 +68,24 @@ pub struct Knowledge {
     pub schemes: Vec<Scheme>,
     /// Names that transformers accepts in config.json.
     pub names: LoaderNames,
+    /// Tokenizer and processor classes that transformers opens by name.
+    pub classes: ClassNames,
+    /// Keys of adapter configs by version of PEFT.
+    pub peft: PeftKeys,
+    /// Other programs that load checkpoints.
+    pub programs: Programs,
     /// Values of config.json that classes refuse.
     pub refusals: Refusals,
+    /// Keys of rotary embeddings that classes read.
+    pub ropes: RopeKeys,
+    /// What torch accepts in pickles, and imports that harm.
+    pub pickles: Pickles,
     /// Names of token embeddings.
     pub token_embedding: TokenEmbedding,
+    /// Kinds of directories that are no checkpoints of transformers.
+    pub directories: Directories,
+    /// Where policies keep their statistics.
+    pub statistics: StatisticsPlaces,
     /// Factors of classes on embeddings and image features.
     pub scales: Scales,
     /// Severities and suppressions of a settings file for single findings.
@@ -92,8 +120,15 @@ impl Knowledge {
             recipes: Recipe::embedded()?,
             schemes: Scheme::embedded()?,
             names: LoaderNames::embedded()?,
+            classes: ClassNames::embedded()?,
+            peft: PeftKeys::embedded()?,
+            programs: Programs::embedded()?,
             refusals: Refusals::embedded(),
+            ropes: RopeKeys::embedded()?,
+            pickles: Pickles::embedded()?,
             token_embedding: TokenEmbedding::embedded()?,
+            directories: Directories::embedded()?,
+            statistics: StatisticsPlaces::embedded()?,
             scales: Scales::embedded()?,
             policy: Policy::default(),
         })

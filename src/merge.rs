@@ -98,7 +98,7 @@ pub fn run(
     run.note("recipe", &format!("{}: {}", recipe.recipe, recipe.summary));
 
     choice::check_architectures(recipe, &run)?;
-    let draft = plan::plan(recipe, &donors, &options, knowledge)?;
+    let draft = plan::plan(recipe, &donors, &options, &request.versions, knowledge)?;
     run.record_draft(&draft);
     if !draft.seams.is_empty() {
         run.note("plan", &count(draft.seams.len(), "seam does not fit", "seams do not fit"));
@@ -123,8 +123,9 @@ pub fn run(
     let total = draft.plan.len();
     let mut done = 0_u64;
     let recorded = Recorded { recipe, donors: &donors, digests: &digests, plan: &draft.plan };
+    let sizes = record::sizes(&run, &recorded);
     let mut record = |written: &[WrittenShard]| record::files(&mut run, &recorded, written);
-    let leftover = apply(&draft.plan, &snapshots, &out, &mut record, &mut |bytes| {
+    let leftover = apply(&draft.plan, &snapshots, &out, &sizes, &mut record, &mut |bytes| {
         done = done.saturating_add(bytes);
         progress(done, total);
     })?;

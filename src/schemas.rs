@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 
 use crate::checkpoint::FileName;
 use crate::knowledge::architecture::Blueprint;
+use crate::knowledge::directories::Directories;
 use crate::knowledge::expression::{Expression, Template};
 use crate::knowledge::loader::Loader;
 use crate::knowledge::parts::ModelParts;
@@ -22,6 +23,7 @@ use crate::knowledge::recipe::{MergeFile, Recipe};
 use crate::knowledge::rule::Rule;
 use crate::knowledge::settings::Settings;
 use crate::knowledge::source::{self, DataError};
+use crate::knowledge::statistics::Pattern;
 use crate::merge::dry_run::PlanDocument;
 use crate::merge::manifest::Manifest;
 use crate::report::Report;
@@ -47,6 +49,7 @@ macro_rules! text {
 text!(Expression, "Expression", "An expression in CEL, the Common Expression Language: https://cel.dev");
 text!(Template, "Template", "Text with expressions in braces; a literal brace is doubled.");
 text!(FileName, "FileName", "The name of a file in the result: no folder, no `:`, no control character, not hidden.");
+text!(Pattern, "Pattern", "A pattern for the name of an entry; that of a folder ends with `/`.");
 text!(Loader, "Loader", "A version of transformers; it is mapped to the nearest known one.");
 
 fn project() -> &'static Path {
@@ -69,6 +72,11 @@ fn inputs() -> Vec<Input> {
         input::<ModelParts>("parts", "The parts of a model of ckpt-doctor", values("rules/parts")),
         input::<Processor>("processor", "A processor of ckpt-doctor", values("rules/processors")),
         input::<Scheme>("quantization", "A quantisation scheme of ckpt-doctor", values("rules/quantization")),
+        input::<Directories>(
+            "directories",
+            "Kinds of directories of ckpt-doctor",
+            vec![value(&project().join("rules/directories.json5"))],
+        ),
         input::<Settings>("settings", "Settings of ckpt-doctor: ckpt-doctor.json5", settings()),
         input::<MergeFile>(
             "merge",

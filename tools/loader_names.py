@@ -13,6 +13,9 @@ import transformers
 from transformers.activations import ACT2FN
 from transformers.modeling_rope_utils import ROPE_INIT_FUNCTIONS
 from transformers.models.auto.configuration_auto import CONFIG_MAPPING_NAMES
+from transformers.models.auto.feature_extraction_auto import FEATURE_EXTRACTOR_MAPPING_NAMES
+from transformers.models.auto.image_processing_auto import IMAGE_PROCESSOR_MAPPING_NAMES
+from transformers.models.auto.processing_auto import PROCESSOR_MAPPING_NAMES
 from transformers.quantizers.auto import AUTO_QUANTIZATION_CONFIG_MAPPING
 
 FILE = Path(__file__).resolve().parents[1] / "rules" / "names.json"
@@ -25,6 +28,8 @@ def main():
         "activations": sorted(ACT2FN),
         "dtypes": sorted(name for name, value in vars(torch).items() if isinstance(value, torch.dtype)),
         "model_types": sorted(CONFIG_MAPPING_NAMES),
+        # Model types whose processor has an image processor or a feature extractor.
+        "processors": sorted(set(PROCESSOR_MAPPING_NAMES) & {*IMAGE_PROCESSOR_MAPPING_NAMES, *FEATURE_EXTRACTOR_MAPPING_NAMES}),
         "quantization": sorted(AUTO_QUANTIZATION_CONFIG_MAPPING),
         # `default` has no function of its own in transformers 5, which all the same takes it.
         "rope_types": sorted({*ROPE_INIT_FUNCTIONS, "default"}),

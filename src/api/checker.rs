@@ -6,7 +6,6 @@ use std::sync::Arc;
 use super::{Error, knowledge};
 use crate::check::check_for;
 use crate::checkpoint::Checkpoint;
-use crate::knowledge::loader;
 use crate::report::model::CheckpointReport;
 
 /// Checks checkpoint directories with the rules of this crate.
@@ -31,9 +30,7 @@ impl Checker {
     /// # Errors
     /// [`Error::Version`] when the text is not a version number.
     pub fn loader(mut self, version: &str) -> Result<Self, Error> {
-        let version = loader::parse_requirement(&format!("transformers=={version}"))
-            .map_err(|_| Error::Version(version.to_owned()))?;
-        self.versions.push(version);
+        self.versions.push(super::version(version)?);
         Ok(self)
     }
 

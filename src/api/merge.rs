@@ -21,6 +21,7 @@ use crate::report::Report;
 #[derive(Debug, Clone, Default)]
 pub struct Merge {
     parts: ResolvedMergeFile,
+    versions: Vec<String>,
     hash: bool,
 }
 
@@ -28,7 +29,7 @@ impl Merge {
     /// A merge into this directory, which must not exist yet or be empty.
     #[must_use]
     pub fn new(out: impl Into<PathBuf>) -> Self {
-        Self { parts: ResolvedMergeFile::new(out.into()), hash: false }
+        Self { parts: ResolvedMergeFile::new(out.into()), ..Self::default() }
     }
 
     /// The merge that a merge file describes; paths in it are relative to its folder.
@@ -36,7 +37,7 @@ impl Merge {
     /// # Errors
     /// [`Error::Data`] when the file cannot be read or is not a merge file.
     pub fn from_file(path: impl AsRef<Path>) -> Result<Self, Error> {
-        Ok(Self { parts: ResolvedMergeFile::read(path.as_ref())?, hash: false })
+        Ok(Self { parts: ResolvedMergeFile::read(path.as_ref())?, ..Self::default() })
     }
 
     /// Uses the recipe of this name, or the one in this `.json5` file. Without a recipe, the architectures of the donors
@@ -67,6 +68,17 @@ impl Merge {
     pub fn output(mut self, out: impl Into<PathBuf>) -> Self {
         self.parts.out = out.into();
         self
+    }
+
+    /// Makes the result for this version of transformers, `4.57` for example. Several calls add several versions.
+    ///
+    /// The result is checked for it, and options whose default depends on the version follow it.
+    ///
+    /// # Errors
+    /// [`Error::Version`] when the text is not a version number.
+    pub fn loader(mut self, version: &str) -> Result<Self, Error> {
+        self.versions.push(super::version(version)?);
+        Ok(self)
     }
 
     /// Whether the manifest of the result has a hash of every byte of the donors, not only of documents and headers.
@@ -103,7 +115,8 @@ impl Merge {
         let knowledge = knowledge()?;
         let recipe = self.parts.find_recipe(knowledge)?;
         let ResolvedMergeFile { donors, options, out, .. } = self.parts.clone();
-        let request = MergeRequest { recipe, donors, options, out, dry_run, hash: self.hash };
+        let request =
+            MergeRequest { recipe, donors, options, out, versions: self.versions.clone(), dry_run, hash: self.hash };
         Ok(run(&request, knowledge, &mut |_, _| {})?.report())
     }
 }

@@ -4,6 +4,9 @@
 //! `tuners/tuners_utils.py` (`check_target_module_exists`) and `tuners/lora`. PEFT loads with `strict=False`: a name that
 //! fits nothing is dropped with a warning at best, a tensor of another shape raises.
 
+mod base;
+mod config;
+mod formats;
 mod keys;
 mod targets;
 
@@ -11,44 +14,45 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use crate::checkpoint::adapter::{Adapter, CONFIG};
+use crate::checkpoint::adapter::{Adapter, CONFIG, PREFIX, WEIGHTS};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
+use crate::knowledge::peft::PeftKeys;
 use keys::{AdapterKey, MatrixRole};
 use targets::Targets;
 
 /// The tensors of one module.
 type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
-/// Faults of the adapter in this directory; none without an adapter.
+/// Faults of the adapter in this directory, for these versions of PEFT; without an adapter, the LoRA files of other programs.
 #[must_use]
-pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return Vec::new() };
+pub fn faults(checkpoint: &Checkpoint, table: &PeftKeys, versions: &[String]) -> Vec<Fault> {
+    let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return formats::faults(checkpoint) };
     let mut faults = Vec::new();
     if let Some((key, library)) = adapter.config().and_then(other_library) {
         let at = Place::file(CONFIG).pointer(format!("/{key}"));
         return vec![Fault::new(FaultKind::AdapterTypeUnchecked).at(at).with("peft_type", library)];
     }
-    match adapter.file() {
-        None => faults.push(Fault::new(FaultKind::AdapterWeightsMissing).at(Place::file(CONFIG))),
-        Some(file) if !file.ends_with(".safetensors") => {
-            faults.push(Fault::new(FaultKind::PickleWeights).at(Place::file(file)));
-        }
-        Some(_) => {}
+    if adapter.file().is_none() {
+        faults.push(Fault::new(FaultKind::AdapterWeightsMissing).at(Place::file(CONFIG)));
     }
     // A config that is not an object has a fault of its own.
     let Some(config) = adapter.config() else { return faults };
     let text = |key: &str| config.get(key).and_then(Value::as_str);
     let base = text("base_model_name_or_path").unwrap_or_default();
-    if is_path(base) && !checkpoint.has_base {
+    faults.extend(beside_model(checkpoint, base, adapter.file().is_some()));
+    faults.extend(config::faults(config, table, versions));
+    if is_path(base) && checkpoint.base.is_none() {
         let at = Place::file(CONFIG).pointer("/base_model_name_or_path");
         faults.push(Fault::new(FaultKind::AdapterBaseIsAPath).at(at).with("base", base));
     }
     let kind = text("peft_type").unwrap_or_default();
     if kind != "LORA" {
         let at = Place::file(CONFIG).pointer("/peft_type");
-        let fault =
-            Fault::new(if kind.is_empty() { FaultKind::AdapterTypeMissing } else { FaultKind::AdapterTypeUnchecked });
-        faults.push(fault.at(at).with("peft_type", kind));
+        if kind.is_empty() {
+            faults.push(Fault::new(FaultKind::AdapterTypeMissing).at(at));
+        } else if table.of_type(kind).is_some() {
+            faults.push(Fault::new(FaultKind::AdapterTypeUnchecked).at(at).with("peft_type", kind));
+        }
         return faults;
     }
     let base = if base.is_empty() { "a base model it does not name" } else { base };
@@ -60,9 +64,25 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
         faults.push(Fault::new(FaultKind::AdapterRankUnusable).at(at).with("rank", rank.cloned().unwrap_or_default()));
     }
     if let Some(tensors) = adapter.tensors() {
-        lora(config, tensors, &mut faults);
+        lora(checkpoint, config, tensors, &mut faults);
     }
     faults
+}
+
+/// The fault of an adapter in the directory of a whole model, which transformers does not open as that model. One whose base
+/// is the directory itself is meant to be there.
+fn beside_model(checkpoint: &Checkpoint, base: &str, has_weights: bool) -> Option<Fault> {
+    let is_weights = |name: &String| {
+        name == "model.safetensors"
+            || name.starts_with("model-") && name.ends_with(".safetensors")
+            || name.starts_with("pytorch_model")
+    };
+    let is_model = checkpoint.config().is_some() && checkpoint.entries.keys().any(is_weights);
+    let is_own =
+        !base.is_empty() && base.split('/').all(|part| part == "." || part.is_empty()) && !base.starts_with('/');
+    let base = if base.is_empty() { "the model that it names" } else { base };
+    let fault = Fault::new(FaultKind::AdapterBesideModel).at(Place::file(CONFIG));
+    (is_model && !is_own).then(|| fault.with("base", base).with("weights", has_weights))
 }
 
 /// The library other than PEFT that wrote an adapter config, and the key that shows it. Both have other weights files:
@@ -80,7 +100,7 @@ fn is_path(base: &str) -> bool {
     drive || base.starts_with(['/', '.', '~']) || base.contains('\\') || base.matches('/').count() > 1
 }
 
-fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
+fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
     let empty: Vec<&str> = tensors.iter().filter(|t| t.shape.contains(&0)).map(|t| t.name.as_str()).collect();
     if let Some(first) = empty.first() {
         let fault = Fault::new(FaultKind::AdapterTensorsEmpty).at(Place::tensor(*first)).with("count", empty.len());
@@ -89,18 +109,23 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
         return;
     }
     let mut modules: BTreeMap<&str, AdapterModule<'_>> = BTreeMap::new();
-    let mut whole: BTreeSet<&str> = BTreeSet::new();
+    let mut whole: BTreeMap<&str, &Tensor> = BTreeMap::new();
     for tensor in tensors {
         match AdapterKey::parse(&tensor.name) {
             AdapterKey::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
-            AdapterKey::Whole(name) => drop(whole.insert(name)),
-            AdapterKey::Foreign(reason) => {
-                let fault = Fault::new(FaultKind::AdapterKeyUnread).at(Place::tensor(&*tensor.name));
-                faults.push(fault.with("tensor", tensor.name.as_str()).with("reason", reason));
+            AdapterKey::Whole(name) => drop(whole.insert(name, tensor)),
+            AdapterKey::Named { module, role } => {
+                modules.entry(module).or_default().insert(role, tensor);
+                faults.push(unread(tensor, "its name contains the name of the adapter").with("named", true));
             }
+            AdapterKey::Foreign(reason) => faults.push(unread(tensor, reason).with("named", false)),
         }
     }
     let targets = Targets::from_config(config);
+    if let Some(cut) = names_cut(&targets, &whole).filter(|_| modules.is_empty()) {
+        faults.push(cut);
+        return;
+    }
     let vectors = modules.values().filter(|module| module.contains_key(&MatrixRole::Magnitude)).count();
     let alike = vectors == 0 || vectors == modules.len();
     let trained = if targets.is_uniform() { trained_rank(&modules) } else { None };
@@ -114,16 +139,40 @@ fn lora(config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
         }
     }
     untargeted(config, &modules, &targets, faults);
-    if modules.is_empty() && !tensors.is_empty() && !faults.iter().any(|f| f.kind == FaultKind::AdapterKeyUnread) {
-        faults.push(Fault::new(FaultKind::AdapterWithoutMatrices).at(Place::file(CONFIG)));
+    faults.extend(checkpoint.base.iter().flat_map(|base| base::faults(base, &modules, &whole)));
+    if modules.is_empty() && !faults.iter().any(|f| f.kind == FaultKind::AdapterKeyUnread) {
+        let fault = Fault::new(FaultKind::AdapterWithoutMatrices).at(Place::file(WEIGHTS[0]));
+        faults.push(fault.with("tensors", tensors.len()));
     }
     // PEFT lists `classifier` and `score` for every sequence classification, and a model has one of them: only a file
     // with none of the list has lost something. It matches the last segments of a module's name.
-    let is_saved = |module: &&str| whole.iter().any(|name| format!(".{name}").contains(&format!(".{module}.")));
+    let is_saved = |module: &&str| whole.keys().any(|name| format!(".{name}").contains(&format!(".{module}.")));
     if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
         let at = Place::file(CONFIG).pointer("/modules_to_save");
         faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.clone()));
     }
+}
+
+fn unread(tensor: &Tensor, reason: &str) -> Fault {
+    let fault = Fault::new(FaultKind::AdapterKeyUnread).at(Place::tensor(&*tensor.name));
+    fault.with("tensor", tensor.name.as_str()).with("reason", reason)
+}
+
+/// The fault of names from which `.lora` was cut, with the names that they had: PEFT removes the name of the adapter from the
+/// names that it saves, and an adapter called `lora` loses that part of `.lora_A` as well (huggingface/peft#2699).
+fn names_cut(targets: &Targets<'_>, whole: &BTreeMap<&str, &Tensor>) -> Option<Fault> {
+    let restored = |name: &str| {
+        let cut = ["_A.weight", "_B.weight"].into_iter().find(|end| name.ends_with(end))?;
+        let module = name.strip_suffix(cut)?;
+        targets.covers(module).then(|| format!("{PREFIX}{module}.lora{cut}"))
+    };
+    let names: Vec<(&Tensor, String)> =
+        whole.iter().filter_map(|(name, tensor)| Some((*tensor, restored(name)?))).collect();
+    let (first, new) = names.first()?;
+    let pairs = names.iter().map(|(tensor, new)| Value::from(vec![tensor.name.as_str(), new])).collect::<Vec<_>>();
+    let fault =
+        Fault::new(FaultKind::AdapterNamesCut).at(Place::tensor(&*first.name)).with("tensor", first.name.as_str());
+    Some(fault.with("new", new.as_str()).with("count", names.len()).with("names", pairs))
 }
 
 /// One fault for all modules that have matrices and get none, with the list that would name them.

@@ -13,13 +13,18 @@ use super::model_type::Asked;
 use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
 use super::verdict::Basis;
-use super::{adapter, index, inspect, judge, model_type, modules, policy, refusals, tokens, variables};
+use super::{
+    adapter, class_names, directory, index, inspect, judge, model_type, modules, pickles, policy, processor, programs,
+    refusals, robots, ropes, statistics, templates, tokenizer_json, tokens, variables,
+};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, pointer};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::expression::within;
+use crate::knowledge::loader::Requirements;
 use crate::knowledge::processor::Processor;
-use crate::knowledge::rule::{Assert, At, Check, FaultCheck, Object, Rule};
+use crate::knowledge::program::AskedProgram;
+use crate::knowledge::rule::{Assert, At, Check, Effect, FaultCheck, Object, Rule};
 use crate::knowledge::{EvalError, Expression, Knowledge, Loader, Scope};
 
 /// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
@@ -36,15 +41,22 @@ struct Context<'a> {
     bench: Bench<'a>,
     /// The versions of transformers of the run.
     targets: Vec<Target>,
+    /// The other programs of the run.
+    programs: &'a [AskedProgram<'a>],
     /// Whether the load fails under a version that its own loader predicts.
     fails_for_certain: bool,
 }
 
 impl<'a> Context<'a> {
-    fn new(checkpoint: &'a Checkpoint, targets: Vec<Target>, loads: &[LoadReport]) -> Self {
+    fn new(
+        checkpoint: &'a Checkpoint,
+        targets: Vec<Target>,
+        programs: &'a [AskedProgram<'a>],
+        loads: &[LoadReport],
+    ) -> Self {
         let is_certain = |version: &str| targets.iter().any(|t| t.loader.version() == version && t.is_certain());
         let fails_for_certain = loads.iter().any(|load| !load.is_whole() && is_certain(&load.loader));
-        Self { bench: Bench::new(checkpoint), targets, fails_for_certain }
+        Self { bench: Bench::new(checkpoint), targets, programs, fails_for_certain }
     }
 }
 
@@ -54,13 +66,18 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
     check_for(checkpoint, knowledge, &[])
 }
 
-/// As [`check`], for these versions of transformers unless the list is empty.
+/// As [`check`], for these versions of transformers unless the list is empty; `peft==0.13.2` is one of PEFT.
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
+    let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
+    let (versions, programs) = (versions.as_slice(), knowledge.programs.asked(&programs));
     let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
     faults.extend(index::faults(checkpoint));
     faults.extend(modules::faults(checkpoint));
-    faults.extend(adapter::faults(checkpoint));
+    faults.extend(adapter::faults(checkpoint, &knowledge.peft, &peft));
+    faults.extend(statistics::faults(checkpoint, &knowledge.statistics));
+    faults.extend(programs::faults(checkpoint, &programs));
+    faults.extend(pickles::faults(checkpoint, knowledge));
     let stored = Stored::of(checkpoint);
     let judged = judge::judge(checkpoint, knowledge, versions, &stored);
     faults.extend(judged.faults.into_iter().map(|fault| with_likely_class(fault, knowledge, &stored)));
@@ -76,20 +93,30 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
     faults.extend(tokens::faults(checkpoint, rows));
-    let processor = outcome.architecture.as_deref().and_then(|name| knowledge.processor_of(name));
+    faults.extend(templates::faults(checkpoint));
+    let of_class = outcome.architecture.as_deref().and_then(|name| knowledge.processor_of(name));
     let leading = load::wanted(config, versions);
-    let opened = processor.and_then(|processor| opened_first(checkpoint, processor, &leading));
+    let opened = of_class.and_then(|processor| opened_first(checkpoint, processor, &leading));
     let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
     bind_run(&mut scope, knowledge, config, versions, outcome.architecture.as_deref());
-    bind_opened(&mut scope, checkpoint, processor);
+    scope.bind("robot", &robots::policy(checkpoint));
+    bind_opened(&mut scope, checkpoint, of_class);
+    scope.bind("missing_attributes", &processor::missing_attributes(checkpoint, of_class));
+    scope.bind("placeholders", &processor::placeholders(checkpoint, of_class, opened.as_ref()));
     variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
     outcome.loads.iter_mut().for_each(LoadReport::shorten);
-    let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &outcome.loads);
+    scope.bind("programs", &programs.iter().map(|asked| asked.program.name()).collect());
+    let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &programs, &outcome.loads);
     let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
     let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
     faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
+    directory::recognise(checkpoint, &knowledge.directories, &mut scope, &mut faults);
     let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
     faults.extend(refused);
+    faults.extend(class_names::faults(checkpoint, knowledge, &asked));
+    faults.extend(tokenizer_json::faults(checkpoint, &asked));
+    faults.extend(ropes::faults(checkpoint, knowledge, &context.targets));
+    faults.extend(processor::faults(checkpoint, knowledge, &asked, of_class, &model));
     run_rules(knowledge, &context, &faults, &scope, &mut outcome);
     let unselected = knowledge.rules.unselected.iter();
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
@@ -107,7 +134,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         unpredicted: &judged.unpredicted,
         unjudged: &unjudged.collect(),
     };
-    outcome.verdicts = basis.verdicts(&context.targets);
+    outcome.verdicts = basis.verdicts(&context.targets, &programs);
     outcome.findings = bounded(std::mem::take(&mut outcome.findings));
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
@@ -197,7 +224,8 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
     let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(named);
     // Without a loader: these faults concern no load.
-    let context = Context { bench: Bench::new(checkpoint), targets: Vec::new(), fails_for_certain: false };
+    let context =
+        Context { bench: Bench::new(checkpoint), targets: Vec::new(), programs: &[], fails_for_certain: false };
     let mut findings: Vec<Finding> =
         rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);
@@ -476,6 +504,15 @@ impl Caused {
             let file = scope.get("file");
             let reader = || Object::reading(file.as_ref()?.as_str()?);
             let Some(object) = effect.object.or_else(reader) else { continue };
+            if let Some(program) = effect.program {
+                self.add_of_program(
+                    effect,
+                    object,
+                    context.programs.iter().find(|asked| asked.program == program),
+                    scope,
+                );
+                continue;
+            }
             for target in &context.targets {
                 let loader = target.loader.version();
                 let is_meant = loaders.is_empty() || loaders.contains(&loader);
@@ -500,6 +537,14 @@ impl Caused {
                 });
             }
         }
+    }
+
+    /// Adds an effect under a program, if the run asks for it.
+    fn add_of_program(&mut self, effect: &Effect, object: Object, asked: Option<&AskedProgram<'_>>, scope: &Scope<'_>) {
+        let Some(asked) = asked else { return };
+        (self.leading, self.certain) = (Leading::Yes, true);
+        let (loader, text) = (asked.loader(), effect.text.render(scope));
+        self.effects.push(FindingEffect { object, loader, stands_for: None, outcome: effect.consequence, text });
     }
 }
 

@@ -87,7 +87,7 @@ const fn is_zero(n: &u64) -> bool {
 pub struct FindingEffect {
     /// The object that fails.
     pub object: Object,
-    /// Version of transformers that was read for this effect: `4.47.0`.
+    /// Version of transformers that was read for this effect: `4.47.0`; or another program with its version: `vllm 0.19.1`.
     pub loader: String,
     /// The version that the user named, or that wrote config.json, when `loader` stands for it.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -259,6 +259,14 @@ fn made(specs: &[EditSpec], site: &Site<'_>) -> Option<Vec<Edit>> {
                 }
                 edits.push(Edit::Write { file, text });
             }
+            EditSpec::Create { file, to } => {
+                let (file, value) = (text(file)?, to.eval(site.scope).ok()?);
+                if !value.is_object() || site.checkpoint().entries.contains_key(&file) {
+                    return None;
+                }
+                let text = serde_json::to_string_pretty(&value).ok()?;
+                edits.push(Edit::Write { file, text: format!("{text}\n") });
+            }
             EditSpec::Repair(repair) => edits.extend(repairs::run(*repair, site)?),
         }
     }

@@ -7,14 +7,21 @@ use unicode_normalization::UnicodeNormalization as _;
 
 use super::model_type::is_model;
 use crate::checkpoint::fault::Faults;
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, Place, Shard, pointer};
+use crate::checkpoint::pickle::is_training_state;
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_NAME, Place, Shard, pointer};
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
 
+/// The file that the loader opens in place of the shards of an index, if it exists.
+fn single(checkpoint: &Checkpoint) -> Option<&'static str> {
+    let of_pickles = || checkpoint.index.as_ref().is_none_or(Index::is_of_pickles) && checkpoint.has_file(PICKLE_NAME);
+    if checkpoint.has_file(SINGLE) { Some(SINGLE) } else { of_pickles().then_some(PICKLE_NAME) }
+}
+
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
 pub(super) fn readable(shard: &Shard) -> bool {
-    const UNREADABLE: [FaultKind; 11] = [
+    const UNREADABLE: [FaultKind; 17] = [
         FaultKind::LfsPointer,
         FaultKind::NotSafetensors,
         FaultKind::EmptyFile,
@@ -26,6 +33,12 @@ pub(super) fn readable(shard: &Shard) -> bool {
         FaultKind::HeaderTooDeep,
         FaultKind::UnreadableFile,
         FaultKind::NotARegularFile,
+        FaultKind::NotATorchFile,
+        FaultKind::PickleCutShort,
+        FaultKind::PickleMalformed,
+        FaultKind::PickleNested,
+        FaultKind::PickleNotAStateDict,
+        FaultKind::PickleTooLarge,
     ];
     !shard.unread && !shard.faults.iter().any(|f| UNREADABLE.contains(&f.kind))
 }
@@ -90,8 +103,9 @@ fn no_tensors(checkpoint: &Checkpoint) -> Option<Fault> {
 
 /// The fault of an index that lists no tensor.
 fn empty_map(checkpoint: &Checkpoint) -> Option<Fault> {
-    let map = checkpoint.document(INDEX_NAME)?.get("/weight_map")?.as_object()?;
-    let place = Place::file(INDEX_NAME).pointer("/weight_map");
+    let name = checkpoint.index.as_ref().map_or(INDEX_NAME, |index| index.document.as_str());
+    let map = checkpoint.document(name)?.get("/weight_map")?.as_object()?;
+    let place = Place::file(name).pointer("/weight_map");
     map.is_empty().then(|| Fault::new(FaultKind::WeightMapMalformed).at(place).with("found", "an empty object"))
 }
 
@@ -135,7 +149,7 @@ pub fn first_absent_shard(checkpoint: &Checkpoint) -> Option<&str> {
     let index = checkpoint.index.as_ref()?;
     let mut named = index.weight_map.values();
     let is_there = |name: &&String| checkpoint.has_file(name);
-    let some = named.clone().any(|name| is_there(&name)) && !checkpoint.has_file(SINGLE);
+    let some = named.clone().any(|name| is_there(&name)) && single(checkpoint).is_none();
     named.find(|name| some && !is_there(name)).map(String::as_str)
 }
 
@@ -170,7 +184,6 @@ impl<'c> IndexComparison<'c> {
         let mut faults = Faults::of_comparison();
         faults.extend(pointers_below_total(self.checkpoint, self.referenced.keys().copied()));
         faults.extend(self.absent_shards());
-        faults.extend(self.pickles());
         faults.extend(self.entries_without_shard());
         self.misplaced_entries(&mut faults);
         self.tensors_without_entry(&mut faults);
@@ -205,14 +218,6 @@ impl<'c> IndexComparison<'c> {
             fault.at(place).with("shard", name).with("tensors", tensors)
         };
         absent.into_iter().map(fault).collect()
-    }
-
-    /// The first pickle file of an index of pickles.
-    fn pickles(&self) -> Option<Fault> {
-        let checkpoint = self.checkpoint;
-        let is_pickle = |name: &&&str| checkpoint.has_file(name) && !is_pointer(checkpoint, name);
-        let name = self.referenced.keys().find(is_pickle).filter(|_| self.index.is_of_pickles())?;
-        Some(Fault::new(FaultKind::PickleWeights).at(Place::file(*name)))
     }
 
     /// Files that an index of safetensors names, and that are no safetensors file by their name.
@@ -287,7 +292,7 @@ impl<'c> IndexComparison<'c> {
         let fault = |name: &str| {
             let twice = shared.get(name).copied().unwrap_or_default();
             let kind = match name {
-                SINGLE => FaultKind::SingleFileBesideIndex,
+                SINGLE | PICKLE_NAME => FaultKind::SingleFileBesideIndex,
                 _ if twice > 0 || numbered(name).is_some() => FaultKind::StrayShard,
                 _ => return None,
             };
@@ -317,7 +322,8 @@ impl<'c> IndexComparison<'c> {
 
 /// Number and count of `model-00001-of-00002.safetensors`.
 pub(super) fn numbered(name: &str) -> Option<(&str, u32, u32)> {
-    let stem = name.strip_suffix(".safetensors")?;
+    let pickle = || name.strip_suffix(".bin").filter(|stem| stem.starts_with("pytorch_model"));
+    let stem = name.strip_suffix(".safetensors").or_else(pickle)?;
     let (rest, count) = stem.rsplit_once("-of-")?;
     let (prefix, number) = rest.rsplit_once('-')?;
     Some((prefix, number.parse().ok()?, count.parse().ok()?))
@@ -326,13 +332,14 @@ pub(super) fn numbered(name: &str) -> Option<(&str, u32, u32)> {
 /// Faults of a checkpoint that has no index.
 fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     let names = shard_names(checkpoint);
-    if names.contains(&SINGLE) {
+    if names.contains(&SINGLE) || names.contains(&PICKLE_NAME) {
         return Vec::new();
     }
     let numbers: Vec<(&str, u32, u32)> = names.iter().filter_map(|n| numbered(n)).collect();
     if let Some((prefix, _, count)) = numbers.first().copied() {
         let present: BTreeSet<u32> = numbers.iter().map(|n| n.1).collect();
-        return missing_index(prefix, count, numbers.len(), &present);
+        let ending = if names.iter().all(|name| name.ends_with(".bin")) { "bin" } else { "safetensors" };
+        return missing_index((prefix, ending), count, numbers.len(), &present);
     }
     if names.is_empty() && checkpoint.has_file("config.json") {
         return weights_elsewhere(checkpoint).into_iter().collect();
@@ -347,7 +354,7 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
 /// `consolidated.safetensors` to mistral-inference, `open_clip_model.safetensors` to `open_clip`.
 pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
     match &checkpoint.index {
-        _ if checkpoint.has_file(SINGLE) => name == SINGLE,
+        _ if single(checkpoint).is_some() => single(checkpoint) == Some(name),
         Some(index) => index.weight_map.values().any(|file| file == name),
         None => numbered(name).is_some(),
     }
@@ -365,15 +372,16 @@ fn unread_weights(checkpoint: &Checkpoint, names: &[&str]) -> Option<Fault> {
 }
 
 /// For numbered shards without an index: the index, and the numbers that are missing.
-fn missing_index(prefix: &str, count: u32, shards: usize, present: &BTreeSet<u32>) -> Vec<Fault> {
+fn missing_index(family: (&str, &str), count: u32, shards: usize, present: &BTreeSet<u32>) -> Vec<Fault> {
+    let (prefix, ending) = family;
     let index = Fault::new(FaultKind::IndexMissing)
         .with("shards", shards)
-        .with("index", format!("{prefix}.safetensors.index.json"));
+        .with("index", format!("{prefix}.{ending}.index.json"));
     // Numbering from 00000 loads too; only then is number `count` not expected. `count` is a name's word: bounded.
     let first = u32::from(!present.contains(&0));
     let last = if first == 0 { count.saturating_sub(1) } else { count };
     let missing = (first..=last.min(10_000)).filter(|n| !present.contains(n)).map(|n| {
-        let name = format!("{prefix}-{n:05}-of-{count:05}.safetensors");
+        let name = format!("{prefix}-{n:05}-of-{count:05}.{ending}");
         let fault = Fault::new(FaultKind::ShardMissing).at(Place::file(&name));
         fault.with("shard", name.as_str()).with("tensors", Value::Null)
     });
@@ -399,11 +407,6 @@ const FOREIGN: [&str; 15] = [
     "onnx",
     "openvino",
 ];
-
-/// Whether a pickle file contains the state of a training run besides the weights, by the names of `Trainer`.
-fn is_training_state(name: &str) -> bool {
-    ["optimizer", "scheduler", "scaler", "rng_state", "training_args"].iter().any(|start| name.starts_with(start))
-}
 
 /// For a config without shards: pickled weights, those of another program, or none at all.
 fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {

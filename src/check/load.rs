@@ -13,6 +13,7 @@ mod target;
 mod v4;
 mod v4_57;
 mod v5;
+mod wrapped;
 
 use std::collections::BTreeSet;
 

@@ -2,12 +2,14 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde_json::{Map, Value, json};
 
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
 use super::{exceptions, index, model_type, modules};
+use crate::checkpoint::glob::glob;
 use crate::checkpoint::tokenizer::is_vocabulary;
 use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
 use crate::knowledge::{Expression, Scope};
@@ -83,6 +85,17 @@ pub fn scope(
     scope.function1("dtype", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.dtype.name())));
     let here = Arc::clone(checkpoint);
     scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
+    let here = Arc::clone(checkpoint);
+    let left = Allowance::new(DOCUMENT_BYTES);
+    scope.function1("document", move |name| {
+        let Some(document) = here.document(name) else { return Value::Null };
+        let cost = document.text.as_ref().map_or(0, |text| text.len());
+        if left.take(cost) { document.value.clone().unwrap_or_default() } else { Value::Null }
+    });
+    let here = Arc::clone(checkpoint);
+    let left = Allowance::new(NAMES_MATCHED);
+    let count = checkpoint.names().count();
+    scope.function1("names", move |pattern| if left.take(count) { names(&here, pattern) } else { Value::Null });
     scope.bind("of_transformers", &json!(model_type::is_of_transformers(checkpoint)));
     let here = Arc::clone(checkpoint);
     scope.function1("is_opened", move |name| json!(index::is_opened(&here, name)));
@@ -98,6 +111,36 @@ pub fn scope(
     let here = Arc::clone(checkpoint);
     scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));
     scope
+}
+
+/// Bytes of documents that the expressions of one check may get from `document`, for those of hostile size: a rule asks for one
+/// again for each of its elements.
+const DOCUMENT_BYTES: usize = 64 << 20;
+/// Names that `names` compares in one check, for the same reason.
+const NAMES_MATCHED: usize = 10_000_000;
+
+/// What is left of a limit on the work of a function. Rules run one after the other, so that its end is always at the same place.
+struct Allowance(AtomicUsize);
+
+impl Allowance {
+    const fn new(total: usize) -> Self {
+        Self(AtomicUsize::new(total))
+    }
+
+    /// Takes `cost` from what is left; `false`, and nothing is left, when it is more than that.
+    fn take(&self, cost: usize) -> bool {
+        let left = self.0.load(Ordering::Relaxed).checked_sub(cost);
+        self.0.store(left.unwrap_or(0), Ordering::Relaxed);
+        left.is_some()
+    }
+}
+
+/// The names of entries, and the paths below folders, that match a pattern; those of folders end with `/`.
+fn names(checkpoint: &Checkpoint, pattern: &str) -> Value {
+    let Ok(pattern) = glob(pattern) else { return Value::Null };
+    let mut found: Vec<_> = checkpoint.names().filter(|name| pattern.is_match(name.as_ref())).collect();
+    found.sort_unstable();
+    json!(found)
 }
 
 /// Binds `stays_random` and `complete`, which depend on the predicted loads.

@@ -10,6 +10,7 @@ use serde::Serialize;
 use super::finding::{Finding, FindingEffect};
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
 use crate::checkpoint::Checkpoint;
+use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
 
 /// The answer of one loader, the worst last.
@@ -71,7 +72,7 @@ pub struct ObjectVerdict {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct PredictedLoad {
-    /// Version of transformers that was read for this prediction: `4.47.0`.
+    /// Version of transformers that was read for this prediction: `4.47.0`; or another program with its version: `vllm 0.19.1`.
     pub loader: String,
     /// The version that the user named, or that wrote config.json, when `loader` stands for it.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -124,31 +125,43 @@ pub(super) struct Basis<'a> {
 }
 
 impl Basis<'_> {
-    /// The verdicts of the targets, in their order. Called by the engine for each checkpoint.
-    pub(super) fn verdicts(&self, targets: &[Target]) -> Vec<PredictedLoad> {
-        let offered = offered(self.checkpoint);
-        let verdict = |target: &Target| {
-            let mut objects: Vec<ObjectVerdict> =
-                offered.iter().map(|object| self.object(*object, target.loader.version())).collect();
+    /// The verdicts of the targets and then of the programs, in their order. Called by the engine for each checkpoint.
+    pub(super) fn verdicts(&self, targets: &[Target], programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
+        let mut offered = offered(self.checkpoint);
+        // The file that makes a processor of the directory may be the one that is missing.
+        let is_processor = |effect: &FindingEffect| effect.object == Object::Processor;
+        let is_judged = self.findings.iter().flat_map(|finding| &finding.effects).any(is_processor);
+        if is_judged && !offered.contains(&Object::Processor) {
+            offered.push(Object::Processor);
+        }
+        let verdict = |loader: &str, stands_for: Option<String>| {
+            let mut objects: Vec<ObjectVerdict> = offered.iter().map(|object| self.object(*object, loader)).collect();
             objects.sort_by_key(|object| (std::cmp::Reverse(object.verdict), object.object));
             let judged = objects
                 .iter()
                 .filter(|o| o.verdict != LoadVerdict::NotPredicted || matches!(o.object, Object::Model))
                 .map(|o| o.verdict);
             PredictedLoad {
-                loader: target.loader.version().to_owned(),
-                stands_for: target.stands_for.clone(),
+                loader: loader.to_owned(),
+                stands_for,
                 verdict: judged.max().unwrap_or(LoadVerdict::NotPredicted),
-                tensors: self.report(target.loader.version()).cloned(),
+                tensors: self.report(loader).cloned(),
                 objects,
             }
         };
-        targets.iter().map(verdict).collect()
+        let own = targets.iter().map(|target| verdict(target.loader.version(), target.stands_for.clone()));
+        own.chain(programs.iter().map(|asked| verdict(&asked.loader(), None))).collect()
     }
 
     /// Whether any shard was read; the names of an index alone tell nothing of a load.
     fn was_read(&self) -> bool {
         self.checkpoint.shards.values().any(|shard| shard.is_sound() || !shard.tensors.is_empty())
+    }
+
+    /// A pickle with a construct that is not modelled, and the construct.
+    fn doubt(&self) -> Option<(&str, &str)> {
+        let mut pickles = self.checkpoint.shards.values().filter_map(|shard| Some((shard, shard.pickle.as_ref()?)));
+        pickles.find_map(|(shard, pickle)| Some((shard.name.as_str(), pickle.doubt.as_deref()?)))
     }
 
     fn report(&self, loader: &str) -> Option<&LoadReport> {
@@ -191,7 +204,7 @@ impl Basis<'_> {
 
     /// The verdict on an object without the effects of findings.
     fn alone(&self, object: Object, loader: &str) -> (LoadVerdict, Option<String>) {
-        if object != Object::Model {
+        if object != Object::Model || is_program(loader) {
             return (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
         }
         if self.checkpoint.config().is_none() {
@@ -202,6 +215,9 @@ impl Basis<'_> {
         }
         if let Some(program) = self.program {
             return (LoadVerdict::NotPredicted, Some(format!("the weights are quantised for {program}")));
+        }
+        if let Some((shard, doubt)) = self.doubt() {
+            return (LoadVerdict::NotPredicted, Some(format!("{shard} was not understood: {doubt}")));
         }
         match self.report(loader) {
             Some(_) if !self.was_read() => {
@@ -219,6 +235,11 @@ impl Basis<'_> {
         let known = self.unpredicted.iter().find(|(of, _)| *of == loader).map(|(_, why)| why.clone());
         (LoadVerdict::NotPredicted, Some(known.unwrap_or_else(|| "its class is unknown".to_owned())))
     }
+}
+
+/// Whether a loader is another program than transformers: `vllm 0.19.1`.
+pub(crate) fn is_program(loader: &str) -> bool {
+    !loader.starts_with(|c: char| c.is_ascii_digit())
 }
 
 /// Whether this is the error for shapes that differ, which follows all others.

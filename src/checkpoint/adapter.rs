@@ -1,8 +1,14 @@
 //! A PEFT adapter: a small set of weights that changes another model, and its config.
 
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Component, Path};
+
 use serde_json::Value;
 
-use super::{Checkpoint, Document, Tensor};
+use super::budget::Budget;
+use super::list::list;
+use super::{Checkpoint, Document, Dtype, Shard, Tensor, is_plain_file_name};
 
 /// The document that marks an adapter directory. Source: `CONFIG_NAME` in peft/utils/constants.py.
 pub const CONFIG: &str = "adapter_config.json";
@@ -33,10 +39,10 @@ impl<'c> Adapter<'c> {
         self.document.value.as_ref().filter(|value| value.is_object())
     }
 
-    /// The tensors; `None` unless they are in a safetensors file with a readable header.
+    /// The tensors; `None` unless they are in a file that could be read.
     #[must_use]
     pub fn tensors(&self) -> Option<&'c [Tensor]> {
-        let shard = self.checkpoint.shards.get(WEIGHTS[0]).filter(|shard| !shard.unread)?;
+        let shard = self.checkpoint.shards.get(self.file()?).filter(|shard| !shard.unread)?;
         Some(&shard.tensors)
     }
 
@@ -45,4 +51,56 @@ impl<'c> Adapter<'c> {
     pub fn file(&self) -> Option<&'static str> {
         WEIGHTS.into_iter().find(|name| self.checkpoint.has_file(name))
     }
+}
+
+/// Shards of a base model that are read.
+const MAX_SHARDS: usize = 300;
+
+/// The base model beside an adapter, or in a folder of it: the shapes of its floating-point tensors.
+#[derive(Debug, Clone, Default)]
+pub struct AdapterBase {
+    shapes: BTreeMap<String, Vec<u64>>,
+}
+
+impl AdapterBase {
+    /// Reads the shard headers of the base model that `adapter_config.json` names by a relative path of at most four parts;
+    /// `None` when there is no `config.json`. No other file there is opened, and no path from the root is tried.
+    pub(super) fn read(checkpoint: &Checkpoint, budget: &mut Budget) -> Option<Self> {
+        let base = checkpoint.document(CONFIG)?.get("/base_model_name_or_path")?.as_str().map(Path::new)?;
+        let is_near = |c: Component<'_>| matches!(c, Component::ParentDir | Component::CurDir | Component::Normal(_));
+        let is_relative = base.starts_with("..") || base.starts_with(".");
+        let place = checkpoint.root.join(base);
+        let is_there = is_relative
+            && base.components().all(is_near)
+            && base.components().count() <= 4
+            && fs::symlink_metadata(place.join("config.json")).is_ok();
+        is_there.then(|| Self { shapes: shapes(&place, budget) })
+    }
+
+    /// The shape of a tensor by its name in the base model; a head that is tied and not stored has that of the embedding.
+    #[must_use]
+    pub fn shape(&self, name: &str) -> Option<&[u64]> {
+        let embedding = || {
+            let mut tied = self.shapes.iter().filter(|_| name == "lm_head.weight");
+            tied.find(|(name, _)| name.ends_with("embed_tokens.weight")).map(|(_, shape)| shape)
+        };
+        self.shapes.get(name).or_else(embedding).map(Vec::as_slice)
+    }
+}
+
+fn shapes(place: &Path, budget: &mut Budget) -> BTreeMap<String, Vec<u64>> {
+    let Ok(entries) = list(place) else { return BTreeMap::new() };
+    let names = entries.take(MAX_SHARDS * 10).filter_map(|entry| entry.ok()?.name.into_string().ok());
+    let is_shard = |name: &String| {
+        name.ends_with(".safetensors")
+            && !name.starts_with("adapter_")
+            && !name.starts_with('.')
+            && is_plain_file_name(name)
+    };
+    let mut names: Vec<String> = names.filter(is_shard).collect();
+    names.sort();
+    let shards = names.iter().take(MAX_SHARDS).map(|name| Shard::read_within(place, name, budget));
+    let tensors = shards.flat_map(|shard| shard.tensors);
+    let plain = tensors.filter(|tensor| matches!(tensor.dtype, Dtype::F32 | Dtype::F16 | Dtype::BF16 | Dtype::F64));
+    plain.map(|tensor| (tensor.name, tensor.shape)).collect()
 }

@@ -11,7 +11,7 @@ use std::path::Path;
 use super::open::{Opened, open_regular};
 use super::shard::tail::zero_tail;
 use super::text::hex;
-use super::{Entry, Fault, FaultKind, Shard, Tensor};
+use super::{Dtype, Entry, Fault, FaultKind, Shard, Tensor};
 
 #[cfg(feature = "cli")]
 pub(crate) mod digests;
@@ -71,6 +71,9 @@ pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<
     if shard.unread || opened.identity.size != shard.file_len {
         return None;
     }
+    if !shard.is_contiguous(&tensor.name) {
+        return None;
+    }
     let length = tensor.len().min(SAMPLE);
     let last = tensor.len().checked_sub(length)?;
     let start = shard.data_start.checked_add(tensor.begin)?;
@@ -81,6 +84,27 @@ pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<
         bytes.append(&mut block);
     }
     Some(bytes)
+}
+
+/// Maximum number of bytes of a tensor whose numbers are read: statistics have some hundred.
+const NUMBERS: u64 = 64 << 10;
+
+/// The numbers of a small tensor of floats; `None` for another dtype, a large tensor, and when the file does not have them.
+pub(super) fn numbers(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<f64>> {
+    let is_small = tensor.len() <= NUMBERS && !shard.unread;
+    let opened = is_small.then(|| open_regular(&root.join(&shard.name), u64::MAX).ok()).flatten()?;
+    if opened.identity.size != shard.file_len {
+        return None;
+    }
+    let mut bytes = vec![0; usize::try_from(tensor.len()).ok()?];
+    opened.file.read_exact_at(&mut bytes, shard.data_start.checked_add(tensor.begin)?).ok()?;
+    Some(match tensor.dtype {
+        Dtype::F64 => bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect(),
+        Dtype::F32 => bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b).into()).collect(),
+        Dtype::BF16 => bytes.as_chunks().0.iter().map(|b| half::bf16::from_le_bytes(*b).into()).collect(),
+        Dtype::F16 => bytes.as_chunks().0.iter().map(|b| half::f16::from_le_bytes(*b).into()).collect(),
+        _ => return None,
+    })
 }
 
 /// State of reading one shard.
@@ -123,14 +147,31 @@ impl ContentsReader<'_> {
         // The file is hashed in the order of its tensors, which must cover all of it.
         let stated =
             entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == FaultKind::ZeroTail));
-        let mut whole = stated.as_ref().map_or_else(Hash::none, |_| Hash::new());
+        // Storages of a pickle are in any order, with other bytes between them, so its hash takes a pass of its own.
+        let (mut whole, stated) = if self.shard.is_pickle() {
+            self.pickle_hash(opened, stated, &mut buffer)?;
+            (Hash::none(), None)
+        } else {
+            (stated.as_ref().map_or_else(Hash::none, |_| Hash::new()), stated)
+        };
         each_piece(opened, 0, self.shard.data_start, &mut buffer, |piece| whole.add(&piece, self.zeros_left))?;
         // End of the last nonzero byte, counted from the start of the data.
         let mut last_value = 0_u64;
         let mut read = 0_u64;
+        let mut shared: Option<&Tensor> = None;
         // The other tensors of a truncated shard can still be read.
         for tensor in tensors.iter().filter(|tensor| tensor.end <= region) {
             // Tensors that overlap could name the same bytes any number of times.
+            if !self.shard.is_contiguous(&tensor.name) {
+                continue;
+            }
+            // Those of a pickle that share a storage whole are read once.
+            if let Some(same) = shared.filter(|same: &&Tensor| (same.begin, same.end) == (tensor.begin, tensor.end)) {
+                let digest = self.digests.get(&same.name).copied();
+                self.digests.extend(digest.map(|digest| (tensor.name.clone(), digest)));
+                continue;
+            }
+            shared = Some(*tensor).filter(|_| self.shard.is_pickle());
             read = read.saturating_add(tensor.len());
             if read > region.saturating_mul(2) {
                 self.unread("its tensors overlap");
@@ -157,7 +198,7 @@ impl ContentsReader<'_> {
             self.digests.extend(digest.finish().map(|digest| (tensor.name.clone(), digest)));
             self.faults.extend(numbers.fault(self.shard, tensor));
         }
-        if last_value < region {
+        if last_value < region && !self.shard.is_pickle() {
             let tail = zero_tail(self.shard, &tensors, last_value);
             self.faults.extend(tail);
         }
@@ -168,6 +209,24 @@ impl ContentsReader<'_> {
             }
             (None, Some(_)) => self.unread("its holes have more zeros than are hashed"),
             _ => {}
+        }
+        Ok(())
+    }
+}
+
+impl ContentsReader<'_> {
+    /// Compares the hash of a pickle with the one that its name states.
+    fn pickle_hash(&mut self, opened: &Opened, stated: Option<String>, buffer: &mut [u8]) -> std::io::Result<()> {
+        let Some(stated) = stated else { return Ok(()) };
+        let mut whole = Hash::new();
+        each_piece(opened, 0, self.shard.file_len, buffer, |piece| whole.add(&piece, self.zeros_left))?;
+        match whole.finish().map(|found| hex(&found)) {
+            Some(found) if found != stated => {
+                let fault = Fault::new(FaultKind::ContentHashDiffers).at(self.shard.place());
+                self.faults.push(fault.with("stated", stated).with("found", found));
+            }
+            Some(_) => {}
+            None => self.unread("its holes have more zeros than are hashed"),
         }
         Ok(())
     }

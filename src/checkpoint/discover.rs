@@ -29,22 +29,28 @@ pub struct ForeignFiles {
     pub count: usize,
 }
 
-/// Finds the checkpoint directories at or below `path`.
+/// Folders to leave out of a search, when the names in their directory mark it as one of a known kind.
 ///
-/// A file stands for its checkpoint, if any, even when it was deleted ([`owner`]). A directory that is a checkpoint is the only result, and
-/// folders inside it (`checkpoint-500`, ONNX copies) are not searched; any other directory is searched to a depth of
-/// six. Hidden folders and links to folders are not followed.
+/// Called with the sorted names in a directory; those of folders end with `/`. `None` for a directory of no known kind.
+pub type Recognise<'r> = &'r dyn Fn(&[String]) -> Option<Vec<String>>;
+
+/// Finds the checkpoint directories at or below `path`, to a depth of six.
+///
+/// A file stands for its checkpoint, if any, even when it was deleted ([`owner`]). A directory is a result when it has a file of
+/// a checkpoint, or when `recognise` knows its kind. The folders in it are searched too: the parts of a pipeline,
+/// `checkpoint-500`. Below the first level, a config without weights makes no checkpoint there: it may be any program's. Hidden
+/// folders and links to folders are not followed.
 #[must_use]
-pub fn find_checkpoints(path: &Path) -> Found {
+pub fn find_checkpoints(path: &Path, recognise: Recognise<'_>) -> Found {
     let mut found = Found::default();
     if path.is_dir() {
-        found.search(path, MAX_DEPTH);
+        found.search(path, MAX_DEPTH, 0, recognise);
         found.checkpoints.sort();
         found.unlisted.sort_by(|(a, _), (b, _)| a.cmp(b));
     } else if let Some(owner) = owner(path) {
         found.checkpoints.push(owner);
     } else if path.exists()
-        && let Some(format) = foreign_format(&path.file_name().unwrap_or_default().to_string_lossy(), false)
+        && let Some(format) = foreign_format(&path.file_name().unwrap_or_default().to_string_lossy())
     {
         found.add_foreign(format, path.to_owned());
     }
@@ -52,32 +58,43 @@ pub fn find_checkpoints(path: &Path) -> Found {
 }
 
 impl Found {
-    fn search(&mut self, dir: &Path, depth: usize) {
+    /// `inside`: number of folders below the nearest checkpoint above; 0 when there is none.
+    fn search(&mut self, dir: &Path, depth: usize, inside: usize, recognise: Recognise<'_>) {
         let entries = match list(dir) {
             Ok(entries) => entries,
+            // Only what is inside of a checkpoint may be left out.
+            Err(_) if inside > 0 => return,
             Err(error) => return self.unlisted.push((dir.to_owned(), error)),
         };
-        let mut folders = Vec::new();
-        let mut foreign = Vec::new();
-        for entry in entries.flatten() {
-            let name = entry.name.to_string_lossy();
-            let path = dir.join(&entry.name);
-            let is_folder = entry.is_folder;
-            if !is_folder && marks_checkpoint(&name) {
-                return self.checkpoints.push(dir.to_owned());
-            }
-            if let Some(format) = foreign_format(&name, is_folder) {
-                foreign.push((format, path));
-            } else if is_folder && !name.starts_with('.') {
-                folders.push(path);
+        let named = |entry: ListedEntry| {
+            let slash = if entry.is_folder { "/" } else { "" };
+            (format!("{}{slash}", entry.name.to_string_lossy()), dir.join(entry.name))
+        };
+        let mut entries: Vec<(String, PathBuf)> = entries.flatten().map(named).collect();
+        entries.retain(|(name, _)| !name.starts_with('.'));
+        entries.sort_unstable();
+        let names: Vec<String> = entries.iter().map(|(name, _)| name.clone()).collect();
+        let recognised = recognise(&names);
+        let is_checkpoint = match inside {
+            0 => recognised.is_some() || names.iter().any(|name| marks_checkpoint(name)),
+            levels => names.iter().any(|name| marks_checkpoint(name) && (levels == 1 || name != "config.json")),
+        };
+        if is_checkpoint {
+            self.checkpoints.push(dir.to_owned());
+        }
+        if !is_checkpoint && inside == 0 {
+            for (name, path) in &entries {
+                if let Some(format) = foreign_format(name) {
+                    self.add_foreign(format, path.clone());
+                }
             }
         }
-        for (format, path) in foreign {
-            self.add_foreign(format, path);
-        }
-        if let Some(depth) = depth.checked_sub(1) {
-            for folder in folders {
-                self.search(&folder, depth);
+        let Some(depth) = depth.checked_sub(1) else { return };
+        let left_out = recognised.unwrap_or_default();
+        let inside = if is_checkpoint { 1 } else { inside.saturating_add(usize::from(inside > 0)) };
+        for (name, path) in &entries {
+            if name.ends_with('/') && !left_out.contains(name) {
+                self.search(path, depth, inside, recognise);
             }
         }
     }
@@ -95,13 +112,8 @@ impl Found {
     }
 }
 
-/// The format of weights that is not read, by the name of a file or folder.
-fn foreign_format(name: &str, is_folder: bool) -> Option<&'static str> {
-    if is_folder {
-        let step = name.strip_prefix("global_step")?;
-        let is_step = !step.is_empty() && step.chars().all(|c| c.is_ascii_digit());
-        return is_step.then_some("a DeepSpeed checkpoint");
-    }
+/// The format of weights that is not read, by the name of a file.
+fn foreign_format(name: &str) -> Option<&'static str> {
     let (stem, ending) = name.rsplit_once('.')?;
     Some(match ending {
         "gguf" => "GGUF",
@@ -109,7 +121,6 @@ fn foreign_format(name: &str, is_folder: bool) -> Option<&'static str> {
         "pth" | "pt" | "ckpt" => "a PyTorch pickle",
         // Other files of this ending hold any data.
         "bin" if stem.contains("model") => "a PyTorch pickle",
-        "distcp" => "a part of an FSDP checkpoint",
         "msgpack" => "Flax msgpack",
         "h5" | "keras" => "TensorFlow HDF5",
         "tflite" => "TensorFlow Lite",

@@ -156,6 +156,11 @@ impl Faults {
         faults.into_iter().for_each(|fault| self.push(fault));
     }
 
+    /// Whether no fault was added.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.list.is_empty()
+    }
+
     /// The faults kept; the last of a kind that had too many counts the others as hidden.
     pub(crate) fn into_vec(mut self) -> Vec<Fault> {
         for (kind, (count, last)) in &self.seen {

@@ -12,8 +12,7 @@ use super::{Document, Fault, FaultKind, Place};
 
 /// The index name that transformers tries first.
 pub const INDEX_NAME: &str = "model.safetensors.index.json";
-/// The index of pickled shards, which transformers uses when no safetensors file exists. These shards are never opened;
-/// only their names and sizes are used.
+/// The index of pickled shards, which transformers uses when no safetensors file and no `pytorch_model.bin` exists.
 pub const PICKLE_INDEX_NAME: &str = "pytorch_model.bin.index.json";
 
 /// Content of `*.safetensors.index.json`.

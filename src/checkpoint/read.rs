@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::path::{Component, Path};
+use std::path::Path;
 use std::sync::Arc;
 
-use super::adapter;
+use super::adapter::AdapterBase;
 use super::budget::{Budget, text_cost};
 use super::contents::Contents;
 use super::git;
@@ -13,9 +13,10 @@ use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::list::list;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_own, real_target};
+use super::pickle::{is_pickle_name, may_be_pickle, starts_like_pickle};
 use super::tokenizer::is_vocabulary;
 use super::{
-    Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, OpenError, Place, PythonModule,
+    Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Nested, OpenError, Place, PythonModule,
     REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Vocabulary,
 };
 
@@ -23,13 +24,17 @@ use super::{
 const UNFINISHED: [&str; 5] = [".incomplete", ".aria2", ".part", ".crdownload", ".download"];
 
 /// Documents read by their full name; `*config.json` and `*.index.json` are read as well.
-const DOCUMENTS: [&str; 6] = [
+const DOCUMENTS: [&str; 10] = [
     "added_tokens.json",
     "chat_template.json",
     "special_tokens_map.json",
     "tokenizer.json",
     "vocab.json",
     "dataset_statistics.json",
+    "model_index.json",
+    "modules.json",
+    "policy_preprocessor.json",
+    "policy_postprocessor.json",
 ];
 
 /// Vocabulary files that are not JSON documents.
@@ -107,28 +112,17 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
         reader.checkpoint.entries.insert(name, entry);
     }
     reader.report_unread();
-    let DirectoryReader { mut checkpoint, vocabularies, vocabulary_faults, .. } = reader;
+    reader.read_folders();
+    let DirectoryReader { mut checkpoint, vocabularies, vocabulary_faults, mut budget, .. } = reader;
     if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
         let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
         checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(place));
     }
+    checkpoint.place_pickles();
     checkpoint.derive(vocabularies);
-    checkpoint.has_base = has_base(&checkpoint);
+    checkpoint.base = AdapterBase::read(&checkpoint, &mut budget);
     checkpoint.tokenizer.faults.extend(vocabulary_faults);
     Ok(checkpoint)
-}
-
-/// Whether the base model of an adapter lies in a directory beside it or in it. Nothing in there is opened, and no path
-/// from the root is tried.
-fn has_base(checkpoint: &Checkpoint) -> bool {
-    let base = checkpoint.document(adapter::CONFIG).and_then(|document| document.get("/base_model_name_or_path"));
-    let Some(base) = base.and_then(serde_json::Value::as_str).map(Path::new) else { return false };
-    let is_near = |c: Component<'_>| matches!(c, Component::ParentDir | Component::CurDir | Component::Normal(_));
-    let is_relative = base.starts_with("..") || base.starts_with(".");
-    is_relative
-        && base.components().all(is_near)
-        && base.components().count() <= 4
-        && fs::symlink_metadata(checkpoint.root.join(base).join("config.json")).is_ok()
 }
 
 /// State of reading a directory.
@@ -151,7 +145,7 @@ impl DirectoryReader {
     /// Reads the content of this file if a loader would, and if enough of the budget is left.
     fn read_within_budget(&mut self, name: &str, entry: &Entry) {
         let is_module = has_ending(name, "py");
-        let is_shard = name.ends_with(".safetensors");
+        let is_shard = name.ends_with(".safetensors") || self.is_pickle(name, entry);
         let is_text = is_module || is_document(name) || TEXTS.contains(&name) || VOCABULARIES.contains(&name);
         let cap = if is_module { MODULE_CAP } else { TOKENIZER_CAP };
         if !is_text && !is_shard || entry.kind != EntryKind::Regular {
@@ -168,7 +162,9 @@ impl DirectoryReader {
             self.unread.first.get_or_insert_with(|| name.to_owned());
             self.unread.count = self.unread.count.saturating_add(1);
         }
-        if !is_left && is_shard {
+        if !is_left && is_shard && may_be_pickle(name) {
+            self.checkpoint.pickles.insert(name.to_owned(), Shard::unopened_pickle(name));
+        } else if !is_left && is_shard {
             self.checkpoint.shards.insert(name.to_owned(), Shard::counted(&self.checkpoint.root, name));
         } else if !is_left && is_module {
             let module = PythonModule { name: name.to_owned(), unread: true, ..PythonModule::default() };
@@ -185,11 +181,21 @@ impl DirectoryReader {
             self.budget.spend_values(document);
             self.budget.spend_faults(&document.faults);
         }
-        let shard = self.checkpoint.shards.get(name).map(|shard| &shard.faults);
+        let shard = self.checkpoint.shards.get(name).or_else(|| self.checkpoint.pickles.get(name));
+        let shard = shard.map(|shard| &shard.faults);
         let module = self.checkpoint.modules.get(name).map(|module| &module.faults);
         for faults in shard.into_iter().chain(module) {
             self.budget.spend_faults(faults);
         }
+    }
+
+    /// Reads the names below the folders, and the documents that say what they are.
+    fn read_folders(&mut self) {
+        let Self { checkpoint, budget, .. } = self;
+        let is_real = |entry: &Entry| entry.kind == EntryKind::Directory && entry.link.is_none();
+        let folders = checkpoint.entries.iter().filter(|(_, entry)| is_real(entry)).map(|(name, _)| name.clone());
+        let has_parts = ["model_index.json", "modules.json"].iter().any(|name| checkpoint.has_file(name));
+        checkpoint.nested = Nested::read(&checkpoint.root, folders.collect(), has_parts, budget);
     }
 
     /// Adds the fault of a checkpoint that is larger than the budget.
@@ -211,6 +217,9 @@ impl DirectoryReader {
         } else if is_shard {
             let shard = own_shard(root, name, Shard::read_within(root, name, &mut self.budget));
             self.checkpoint.shards.insert(name.to_owned(), shard);
+        } else if self.is_pickle(name, entry) {
+            let pickle = own_shard(root, name, Shard::read_pickle(root, name, &mut self.budget));
+            self.checkpoint.pickles.insert(name.to_owned(), pickle);
         } else if is_document(name) {
             let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
             let document = match read_own(root, name, cap) {
@@ -241,6 +250,15 @@ impl DirectoryReader {
         {
             self.checkpoint.faults.push(OpenError::from_io(&root.join(name), error).fault(name));
         }
+    }
+
+    /// Whether a file is read as a pickle.
+    fn is_pickle(&self, name: &str, entry: &Entry) -> bool {
+        let is_file = entry.lfs.is_none() && !matches!(entry.kind, EntryKind::Directory | EntryKind::Broken);
+        is_file
+            && may_be_pickle(name)
+            && (is_pickle_name(name)
+                || entry.kind == EntryKind::Regular && starts_like_pickle(&self.checkpoint.root, name))
     }
 
     /// Adds the faults that show without reading the content.
@@ -309,7 +327,7 @@ fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
 fn own_shard(root: &Path, name: &str, shard: Shard) -> Shard {
     match real_target(root, &root.join(name)) {
         Err(error @ OpenError::Outside { .. }) if shard.tensors.is_empty() && !shard.is_sound() => {
-            Shard::unread(name, error.fault(name))
+            Shard { pickle: shard.pickle.map(|_| Box::default()), ..Shard::unread(name, error.fault(name)) }
         }
         _ => shard,
     }

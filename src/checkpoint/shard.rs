@@ -5,11 +5,12 @@
 
 use std::collections::BTreeMap;
 
+use super::pickle::Pickle;
 use super::{Fault, Place};
 
 mod dtype;
 mod entry;
-mod header;
+pub(super) mod header;
 mod layout;
 mod read;
 pub(super) mod tail;
@@ -48,7 +49,7 @@ impl Tensor {
     }
 }
 
-/// One safetensors file: its header and its faults.
+/// One file of tensors: names, types, shapes and places of the tensors, and its faults. A safetensors file or a pickle.
 #[derive(Debug, Clone, Default)]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Shard {
@@ -56,7 +57,7 @@ pub struct Shard {
     pub name: String,
     /// Length of the file in bytes.
     pub file_len: u64,
-    /// Where the data region starts: 8 + header length.
+    /// Where the data region starts: 8 + header length; 0 in a pickle.
     pub data_start: u64,
     /// Readable entries, in header order.
     pub tensors: Vec<Tensor>,
@@ -70,6 +71,8 @@ pub struct Shard {
     pub further: u64,
     /// SHA-256 of the first `data_start` bytes, in hexadecimal; empty for a planned shard.
     pub header_sha256: String,
+    /// What only a pickle has; `None` for a safetensors file.
+    pub pickle: Option<Box<Pickle>>,
     /// Faults of the container.
     pub faults: Vec<Fault>,
 }
@@ -85,7 +88,9 @@ impl Shard {
     #[must_use]
     pub(crate) fn is_whole(&self) -> bool {
         let region = self.file_len.saturating_sub(self.data_start);
-        !self.unread && self.tensors.iter().all(|tensor| tensor.begin <= tensor.end && tensor.end <= region)
+        !self.unread
+            && (!self.is_pickle() || self.faults.is_empty())
+            && self.tensors.iter().all(|tensor| tensor.begin <= tensor.end && tensor.end <= region)
     }
 
     /// A shard that could not be read at all.

@@ -10,7 +10,7 @@ use super::{Document, Fault, FaultKind, Place, pointer};
 mod sentencepiece;
 mod vocabulary;
 
-pub use vocabulary::Vocabulary;
+pub use vocabulary::{Vocabulary, has_paired_merges};
 
 /// Vocabulary files that are read, in the order in which a tokenizer takes its ids from them: M2M100 and `Speech2Text` take
 /// those of `vocab.json`, and use `sentencepiece.bpe.model` to split text.
@@ -97,6 +97,8 @@ pub struct Tokenizer {
     pub source: Option<String>,
     /// Faults of vocabulary files that are not documents.
     pub faults: Vec<Fault>,
+    /// Whether tokenizer.json has its vocabulary as a list.
+    is_list: bool,
     /// Every token outside the base vocabulary, with its id after loading.
     added: BTreeMap<String, u64>,
     length: Option<u64>,
@@ -158,6 +160,7 @@ impl Tokenizer {
             special_tokens: special_tokens(&special_from, &get),
             named_special: named_special(&special_from, &get),
             faults,
+            is_list: get("tokenizer.json", "/model/type").and_then(Value::as_str) == Some("Unigram"),
             ..Self::default()
         };
         let prefix = get(config, "/add_prefix_space").is_some_and(|v| !v.is_null());
@@ -266,6 +269,32 @@ impl Tokenizer {
         opened
     }
 
+    /// Whether the vocabulary is a list of pieces with scores, numbered by their places: that of a Unigram model.
+    #[must_use]
+    pub const fn has_list_of_pieces(&self) -> bool {
+        self.is_list
+    }
+
+    /// Whether the tokenizer begins text with the begin-of-sequence token: the post-processor of tokenizer.json, or
+    /// `add_bos_token` of a class that has it. Unknown is no.
+    #[must_use]
+    pub fn adds_bos(&self, checkpoint: &super::Checkpoint) -> bool {
+        let bos = self.special_tokens.iter().find(|(name, _)| name == "bos_token").map(|(_, token)| token.as_str());
+        let get = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer);
+        match get("tokenizer_config.json", "/add_bos_token").and_then(Value::as_bool) {
+            Some(adds) if self.has_bos_flag() => adds,
+            _ => get("tokenizer.json", "/post_processor").is_some_and(|part| begins_with(part, bos)),
+        }
+    }
+
+    /// Whether the class of the tokenizer takes `add_bos_token` in every version.
+    fn has_bos_flag(&self) -> bool {
+        let class = self.tokenizer_class.as_deref().unwrap_or_default();
+        ["Llama", "CodeLlama", "Gemma", "Cohere"]
+            .iter()
+            .any(|name| class.strip_prefix(name).is_some_and(|rest| rest.starts_with("Tokenizer")))
+    }
+
     /// Computes ids and length as transformers does on load: stated tokens first, then special ones.
     fn resolve(&mut self) {
         let base = self.base().cloned();
@@ -302,6 +331,16 @@ impl Tokenizer {
         self.length = base.filter(|_| known).map(|_| base_len.saturating_add(more));
         self.added = ids;
     }
+}
+
+/// Whether a post-processor of tokenizer.json writes this token first.
+fn begins_with(part: &Value, token: Option<&str>) -> bool {
+    let parts = part.get("processors").and_then(Value::as_array);
+    if let Some(parts) = parts {
+        return parts.iter().any(|part| begins_with(part, token));
+    }
+    let first = part.pointer("/single/0/SpecialToken/id").or_else(|| part.pointer("/cls/0"));
+    first.and_then(Value::as_str).is_some_and(|first| Some(first) == token)
 }
 
 /// Whether `tokenizers` accepts the id of this entry of `added_tokens`, which it reads as a `u32`.

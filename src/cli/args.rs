@@ -6,7 +6,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
 
 use crate::check::Severity;
-use crate::knowledge::loader::{parse_requirement, parse_requirement_or_all};
+use crate::knowledge::loader::{parse_program, parse_requirement, parse_requirement_or_all};
 use crate::report::Format;
 
 /// Validates, repairs and merges model checkpoint directories by reading their files; nothing of a model is run.
@@ -206,9 +206,10 @@ pub struct CheckArgs {
     /// Checkpoint directories, directories that contain checkpoints, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
-    /// Predict the load for these versions: 4.57, transformers==4.57.3, or all; may be repeated [default: the version that
-    /// wrote config.json, and the newest known of each major version]
-    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_requirement_or_all)]
+    /// Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm and mlx-lm
+    /// for what is known of them; may be repeated [default: the version that wrote config.json, and the newest known of each
+    /// major version]
+    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_program)]
     pub versions: Vec<String>,
     /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub
     /// checksums
@@ -326,6 +327,10 @@ pub struct BuildMergedArgs {
     /// Set an option of the recipe; may be repeated
     #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
     pub set: Vec<(String, String)>,
+    /// Version of transformers that the result is for: 4.57, transformers==4.57.3, or all; may be repeated. The result is
+    /// checked for it, and options whose default depends on the version follow it
+    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_requirement_or_all)]
+    pub versions: Vec<String>,
     /// Plan and check the merge, and write nothing
     #[arg(long)]
     pub dry_run: bool,
@@ -445,6 +450,7 @@ impl PartWriteArgs {
             language: None,
             out: Some(self.out),
             set,
+            versions: Vec::new(),
             dry_run: self.dry_run,
             plan: None,
             hash: false,

@@ -13,6 +13,7 @@ use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::{library, output, signals};
 use crate::check::Severity;
 use crate::knowledge::Knowledge;
+use crate::knowledge::loader::expanded;
 use crate::knowledge::rule::RuleSet;
 use crate::merge::{self, MergeRequest, MergeRun, ResolvedMergeFile};
 use crate::report::json;
@@ -108,5 +109,6 @@ fn request(args: &BuildMergedArgs, knowledge: &Knowledge) -> anyhow::Result<Merg
     }
     options.extend(typed);
     let out = out.context("no output directory given; pass --out DIR")?;
-    Ok(MergeRequest { recipe, donors, options, out, dry_run: args.dry_run, hash: args.hash })
+    let versions = expanded(args.versions.clone());
+    Ok(MergeRequest { recipe, donors, options, versions, out, dry_run: args.dry_run, hash: args.hash })
 }

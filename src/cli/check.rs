@@ -27,7 +27,11 @@ struct Checked {
 
 /// Runs `check`.
 pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let Targets { dirs, mut unchecked } = paths::targets(&args.paths, args.quiet);
+    let Targets { mut dirs, mut unchecked } = paths::targets(&args.paths, args.quiet)?;
+    // One output takes the given checkpoint, without those in its folders.
+    if args.fix.output.is_some() && dirs.iter().any(|dir| args.paths.contains(dir)) {
+        dirs.retain(|dir| args.paths.contains(dir));
+    }
     let surroundings = Surroundings::new(args.paths.iter().chain(&dirs).map(PathBuf::as_path));
     let by = &resolve(&Typed::check(args, rules), &surroundings)?;
     let run = CheckRun { args, by, surroundings: &surroundings };

@@ -9,6 +9,7 @@ use super::exit::CLEAN;
 use super::{library, output, paths};
 use crate::check::inspect::inspect;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
+use crate::knowledge::directories::Directories;
 use crate::report::inspect as report;
 
 /// Runs `inspect`.
@@ -20,7 +21,12 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let checkpoint = if let Some(shard) = alone(path) {
         shard
     } else {
-        let found = find_checkpoints(path);
+        let kinds = Directories::embedded()?;
+        let mut found = find_checkpoints(path, &|names| kinds.recognise(names));
+        // Those in the folders of a checkpoint are inspected on their own.
+        if found.checkpoints.contains(path) {
+            found.checkpoints.retain(|dir| dir == path);
+        }
         let [dir] = found.checkpoints.as_slice() else {
             if let Some(reason) = paths::nothing(path, &found) {
                 bail!("{}: {reason}", path.display());

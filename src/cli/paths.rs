@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 use super::output;
 use crate::checkpoint::{ForeignFiles, Found, find_checkpoints};
+use crate::knowledge::directories::Directories;
+use crate::knowledge::source::DataError;
 use crate::report::model::UncheckedPath;
 
 /// The checkpoints to check, and the paths that cannot be checked.
@@ -18,12 +20,16 @@ pub struct Targets {
 
 /// Finds the checkpoints for the paths given by the user. Notes on standard error name weights that are not read, unless
 /// `quiet`.
-pub fn targets(paths: &[PathBuf], quiet: bool) -> Targets {
+///
+/// # Errors
+/// [`DataError`] when the built-in kinds of directories are malformed.
+pub fn targets(paths: &[PathBuf], quiet: bool) -> Result<Targets, DataError> {
+    let kinds = Directories::embedded()?;
     let mut targets = Targets::default();
     let mut seen = BTreeSet::new();
     let mut outside: Vec<&Path> = Vec::new();
     for path in paths {
-        let found = find_checkpoints(path);
+        let found = find_checkpoints(path, &|names| kinds.recognise(names));
         for (folder, error) in &found.unlisted {
             let reason = format!("cannot be listed: {error}");
             targets.unchecked.push(UncheckedPath { path: folder.display().to_string(), reason });
@@ -51,7 +57,7 @@ pub fn targets(paths: &[PathBuf], quiet: bool) -> Targets {
         };
         output::note(&output::safe(&format!("note: {}: the file belongs to no checkpoint{more}", first.display())));
     }
-    targets
+    Ok(targets)
 }
 
 /// Why there is nothing to check at a path; `None` if there is a checkpoint.

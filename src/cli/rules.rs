@@ -97,10 +97,9 @@ fn effects(rule: &Rule) -> String {
     table.add_row(header);
     for effect in &rule.effects {
         let under = |loader: Loader| {
-            if effect.loaders.contains(loader.version()) { effect.consequence.name() } else { "-" }
+            if effect.is_under(loader.version()) { effect.consequence.name() } else { "-" }
         };
-        let happens = effect.text.prose();
-        let happens = if effect.when.is_some() { format!("{happens} (in some cases)") } else { happens };
+        let happens = effect.prose();
         let object = effect.object.map_or("by file", Object::name);
         table.add_row([object].into_iter().chain(Loader::ALL.map(under)).chain([happens.as_str()]));
     }

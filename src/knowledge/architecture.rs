@@ -74,6 +74,12 @@ impl<'l> Architecture<'l> {
         self.has_auto() && !self.file.model_types.iter().any(|own| own == model_type)
     }
 
+    /// Whether the config class of this loader makes a config of its own of the object under a key.
+    #[must_use]
+    pub fn builds_config(&self, key: &str) -> bool {
+        self.file.config(self.loader).configs.iter().any(|(name, _)| name == key)
+    }
+
     /// Whether a key of a config is a word of its file.
     #[must_use]
     pub fn speaks_of(&self, key: &str) -> bool {

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use super::program::Program;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
@@ -138,12 +139,58 @@ pub fn parse_requirement(text: &str) -> Result<String, String> {
 /// The word for all known versions, where several can be named.
 const ALL: &str = "all";
 
+/// Start of a requirement on PEFT, which loads adapters.
+const PEFT: &str = "peft==";
+
 /// As [`parse_requirement`], for a place that takes several versions: `all` stays, for [`expanded`].
 ///
 /// # Errors
 /// As for one.
 pub fn parse_requirement_or_all(text: &str) -> Result<String, String> {
     if text == ALL { Ok(text.to_owned()) } else { parse_requirement(text) }
+}
+
+/// As [`parse_requirement_or_all`], for a check: `peft==VERSION` and the names of other programs stay, for
+/// [`Requirements::new`].
+///
+/// # Errors
+/// As for a version of transformers.
+pub fn parse_program(text: &str) -> Result<String, String> {
+    if Program::from_name(text).is_some() {
+        return Ok(text.to_owned());
+    }
+    if let Some(version) = text.strip_prefix(PEFT) {
+        return parse_requirement(version).map(|version| format!("{PEFT}{version}"));
+    }
+    let names = Program::ALL.map(Program::name).join(", ");
+    parse_requirement_or_all(text).map_err(|error| format!("{error}; peft==VERSION, {names} are known as well"))
+}
+
+/// What a checkpoint must load with, by program.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Requirements {
+    /// Versions of transformers.
+    pub transformers: Vec<String>,
+    /// Versions of PEFT.
+    pub peft: Vec<String>,
+    /// Other programs.
+    pub programs: Vec<Program>,
+}
+
+impl Requirements {
+    /// The requirements of a list that [`parse_program`] read.
+    #[must_use]
+    pub fn new(texts: &[String]) -> Self {
+        let mut all = Self::default();
+        for text in texts {
+            match (Program::from_name(text), text.strip_prefix(PEFT)) {
+                (Some(program), _) => all.programs.push(program),
+                (None, Some(version)) => all.peft.push(version.to_owned()),
+                (None, None) => all.transformers.push(text.clone()),
+            }
+        }
+        all
+    }
 }
 
 /// The versions of a list that [`parse_requirement_or_all`] read; the start of a known version, `4.57`, is that one.
@@ -203,5 +250,10 @@ mod tests {
         let asked = |texts: &[&str]| expanded(texts.iter().map(|t| parse_requirement_or_all(t).unwrap()).collect());
         assert_eq!(asked(&["all"]), ["4.47.0", "4.57.6", "5.23.0"]);
         assert_eq!(asked(&["4.57", "5", "4.5", "4.51.3"]), ["4.57.6", "5.23.0", "4.5", "4.51.3"]);
+        let all = Requirements::new(&["peft==0.13.2", "4.57", "vllm"].map(|t| parse_program(t).unwrap()));
+        assert_eq!((all.peft, all.transformers), (vec!["0.13.2".to_owned()], vec!["4.57".to_owned()]));
+        assert_eq!(all.programs, [Program::Vllm]);
+        assert!(parse_program("vlm").unwrap_err().contains("vllm"));
+        assert!(parse_program("peft==new").is_err());
     }
 }

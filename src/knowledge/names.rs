@@ -14,6 +14,7 @@ struct Lists {
     activations: BTreeSet<String>,
     dtypes: BTreeSet<String>,
     model_types: BTreeSet<String>,
+    processors: BTreeSet<String>,
     quantization: BTreeSet<String>,
     rope_types: BTreeSet<String>,
 }
@@ -27,6 +28,8 @@ pub enum NameKind {
     Dtype,
     /// `CONFIG_MAPPING`: model types.
     ModelType,
+    /// Model types of `PROCESSOR_MAPPING` whose processor has an image processor or a feature extractor.
+    Processor,
     /// `AUTO_QUANTIZATION_CONFIG_MAPPING`: values of `quant_method`.
     QuantMethod,
     /// `ROPE_INIT_FUNCTIONS`: values of `rope_type`.
@@ -39,6 +42,7 @@ impl Lists {
             NameKind::Activation => &self.activations,
             NameKind::Dtype => &self.dtypes,
             NameKind::ModelType => &self.model_types,
+            NameKind::Processor => &self.processors,
             NameKind::QuantMethod => &self.quantization,
             NameKind::RopeType => &self.rope_types,
         }

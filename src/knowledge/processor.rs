@@ -7,10 +7,12 @@ use serde::Deserialize;
 use super::expression::{Expression, Template};
 use super::rule::LoaderRange;
 use super::source::{self, DataError};
+use crate::checkpoint::FileName;
 
 /// A processor, as read from its file in `rules/processors/`.
 ///
-/// Expressions see `processor` (the `processor_config.json` of the checkpoint) and the names that `let` defined so far.
+/// Expressions of `let` and `add` see `processor` (the `processor_config.json` of the checkpoint) and the names that `let`
+/// defined so far.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -29,6 +31,22 @@ pub struct Processor {
     pub lets: Vec<Let>,
     /// Tokens in the order in which they are added; a token that the tokenizer has already keeps its id.
     pub add: Vec<TokenRun>,
+    /// Class of the processor; the values in `reads` concern no checkpoint whose files name another one.
+    #[serde(default)]
+    pub class: Option<String>,
+    /// Tokens that the model replaces with features of images or videos, and the keys of config.json that hold their ids.
+    #[serde(default)]
+    pub placeholders: Vec<Placeholder>,
+    /// Attributes of the tokenizer that the processor reads, with the text of each token. In transformers 4 a
+    /// tokenizer has those that `extra_special_tokens` names.
+    #[serde(default)]
+    pub attributes: BTreeMap<String, String>,
+    /// Names for expressions of `reads`, in order; one that cannot be evaluated has no value.
+    #[serde(default)]
+    pub facts: Vec<Let>,
+    /// Values of the processor's files that follow from the model.
+    #[serde(default)]
+    pub reads: Vec<ReadValue>,
     /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
     #[serde(default, rename = "$schema")]
     #[allow(dead_code, reason = "for editors")]
@@ -50,6 +68,51 @@ pub struct OpensWith {
     /// names another one or null.
     #[serde(default)]
     pub special: BTreeMap<String, String>,
+}
+
+/// A token that the model replaces with features.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Placeholder {
+    /// Keys of config.json that hold its id, newest first; the first that the config has applies.
+    pub keys: Vec<String>,
+    /// Text of the token, unless `named_by` is set.
+    pub content: String,
+    /// Attribute of the tokenizer, and key of `processor_config.json`, that sets another text: `image_token`.
+    #[serde(default)]
+    pub named_by: Option<String>,
+    /// Whether the model embeds another token in its place, so that its id may be out of range for the embedding.
+    #[serde(default)]
+    pub is_replaced: bool,
+}
+
+/// A value of a processor's file that follows from the model. Expressions see `model` (config.json with the defaults of the
+/// class), `processor`, `preprocessor` (the settings of the image processor, wherever they stand), and the names in `facts`.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct ReadValue {
+    /// The file.
+    pub file: FileName,
+    /// JSON pointer of the value.
+    pub at: String,
+    /// Versions of transformers that read it so, as bounds: `<5`; all when missing.
+    #[serde(default)]
+    #[cfg_attr(test, schemars(with = "Option<String>"))]
+    pub loaders: LoaderRange,
+    /// Condition for this entry; an expression that cannot be evaluated counts as false.
+    #[serde(default)]
+    pub when: Option<Expression>,
+    /// Value that the class takes when the key is missing; without it, a missing key is not judged.
+    #[serde(default)]
+    pub absent: Option<Expression>,
+    /// The value that fits the model.
+    pub is: Expression,
+    /// Where the value comes from, after "but": `the vision tower has patch_size 14`.
+    pub because: Template,
+    /// What happens with another value.
+    pub wrong: Template,
 }
 
 /// A name for an expression.

@@ -166,14 +166,17 @@ pub struct FaultCheck {
 ///   `processor_tokenizers`: tokenizer classes that the processor's module names;
 /// - `chat_templates`: templates by file;
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
-///   `of_transformers`: config.json is one of transformers;
+///   `of_transformers`: config.json is one of transformers; `program`: the program that opens the directory, by
+///   `rules/directories.json5`;
+/// - `robot`: features of a policy of `LeRobot`, with the statistics that each needs and has; null for other configs;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
 /// - `loaders`: versions of transformers to check for; `named`: whether the user named them;
 /// - `metadata_only`: weights may be missing;
 /// - `groups_heads`: the class reads `num_key_value_heads`, or is unknown.
 ///
 /// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
-/// loaders; `shape(tensor)`, `dtype(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard
+/// loaders; `document(name)`: the value of a document that was read, also below a folder; `names(pattern)`: names of entries and paths
+/// below folders, of which those of folders end with `/` (both null beyond a limit on their work); `shape(tensor)`, `dtype(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard
 /// of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and `stays_random(tensor)`:
 /// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
 /// `join(list)`, `plural(count, noun)` and `filesize(bytes)`.

@@ -69,6 +69,7 @@ impl<'a> Context<'a> {
         recipe: &'a Recipe,
         donors: &'a [Donor],
         options: &Options,
+        versions: &[String],
         knowledge: &'a Knowledge,
     ) -> Result<Self, MergeError> {
         let mut scope = Scope::new();
@@ -107,7 +108,7 @@ impl<'a> Context<'a> {
         scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
-        functions::register(&mut scope, donors, &knowledge.scales);
+        functions::register(&mut scope, donors, versions, &knowledge.scales);
         let all = Arc::clone(&checkpoints);
         scope.function2("shape", move |role, name| {
             all.get(role).and_then(|c| c.tensor(name)).map_or(Value::Null, |(_, t)| json!(t.shape))

@@ -25,6 +25,7 @@ pub(super) fn open(
     for (role, dir) in &request.donors {
         let seen = DonorSnapshot::record(dir);
         let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
+        let checkpoint = checkpoint.without_pickles();
         snapshots.push(seen?);
         for name in checkpoint.shards.keys() {
             // Other errors of a link are findings.

@@ -67,7 +67,7 @@ fn missing_tensor(context: &Context<'_>, call: &FunctionCall) -> Option<String> 
     Some(format!("the {role} donor has no tensor {name}{reason}"))
 }
 
-/// File name extensions of weights that are read by running them.
+/// File name extensions of weights from which no merge copies.
 const PICKLES: [&str; 5] = [".bin", ".pt", ".pth", ".ckpt", ".pkl"];
 
 /// The reason why no tensor of the donor was read; `None` when it has tensors.
@@ -80,7 +80,7 @@ pub(super) fn without_tensors(donor: &Donor) -> Option<String> {
         || "it has no safetensors file with a tensor in it".to_owned(),
         |pickle| {
             format!(
-                "its weights are in {pickle}, which is not read because that runs code; convert it where running its code is safe: from_pretrained(DIR).save_pretrained(NEW_DIR, safe_serialization=True)"
+                "its weights are in {pickle}, a pickle, and a merge copies tensors of safetensors files only; convert it: from_pretrained(DIR).save_pretrained(NEW_DIR, safe_serialization=True)"
             )
         },
     ))

@@ -1,6 +1,6 @@
 //! Functions of recipes that compare the weights of donors, besides those of [`super::context`].
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use serde_json::{Value, json};
@@ -10,8 +10,8 @@ use super::dtypes;
 use crate::knowledge::scales::Scales;
 use crate::knowledge::{Loader, Scope};
 
-/// Adds `dtype`, `image_fold` and `row_scale`.
-pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], scales: &Scales) {
+/// Adds `dtype`, `image_fold` and `row_scale`; `versions` are those of transformers that the result is for, or none.
+pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
         .filter_map(|donor| Some((donor.role.clone(), dtypes::of_most_bytes(&donor.checkpoint)?)))
@@ -21,8 +21,10 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], scales: &Sc
     let configs: Arc<BTreeMap<String, Value>> =
         Arc::new(donors.iter().map(|donor| (donor.role.clone(), donor.config.clone())).collect());
     let (of_roles, of_models) = (Arc::clone(&configs), scales.clone());
+    let asked: BTreeSet<Loader> = versions.iter().map(|version| Loader::nearest(version)).collect();
+    let loaders: Vec<Loader> = Loader::ALL.into_iter().filter(|l| asked.is_empty() || asked.contains(l)).collect();
     scope.function2("image_fold", move |host, guest| match (of_roles.get(host), of_roles.get(guest)) {
-        (Some(host), Some(guest)) => image_fold(&of_models, host, guest),
+        (Some(host), Some(guest)) => image_fold(&of_models, host, guest, &loaders),
         _ => Value::Null,
     });
     let of_models = scales.clone();
@@ -32,16 +34,16 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], scales: &Sc
     });
 }
 
-/// The factor that keeps image features as large as in the host when its class has the language model of the guest, with the
-/// versions of transformers for which it is right and those that need none.
-fn image_fold(scales: &Scales, host: &Value, guest: &Value) -> Value {
+/// The factor that keeps image features as large as in the host when its class has the language model of the guest, with those
+/// of the loaders for which it is right and those that need none.
+fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) -> Value {
     let factor = |loader: Loader| {
         let factor = scales.of_images(host, host, loader) / scales.of_images(host, guest, loader);
         // Square roots do not cancel to the last bit of binary64.
         dtypes::round(factor, Some("float32"))
     };
     let needs = |loader: &Loader| (factor(*loader) - 1.0).abs() > f64::EPSILON;
-    let (with, without): (Vec<Loader>, Vec<Loader>) = Loader::ALL.into_iter().partition(needs);
+    let (with, without): (Vec<Loader>, Vec<Loader>) = loaders.iter().copied().partition(needs);
     let versions = |loaders: &[Loader]| loaders.iter().map(|loader| loader.version()).collect::<Vec<_>>();
     let common = with.first().map_or(1.0, |loader| factor(*loader));
     json!({ "factor": common, "with": versions(&with), "without": versions(&without) })

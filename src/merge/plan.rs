@@ -12,7 +12,7 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::Seam;
 
-/// Turns a recipe into a draft: seams, documents, tensors, files, notes.
+/// Turns a recipe into a draft for these versions of transformers, or any: seams, documents, tensors, files, notes.
 ///
 /// # Errors
 /// A [`MergeError`] when the recipe cannot be applied to these donors and options.
@@ -20,9 +20,10 @@ pub(super) fn plan(
     recipe: &Recipe,
     donors: &[Donor],
     options: &Options,
+    versions: &[String],
     knowledge: &Knowledge,
 ) -> Result<MergeDraft, MergeError> {
-    let context = Context::new(recipe, donors, options, knowledge)?;
+    let context = Context::new(recipe, donors, options, versions, knowledge)?;
     let mut draft = MergeDraft::default();
     for (i, seam) in recipe.seams.iter().enumerate() {
         let place = format!("seam {}", i.saturating_add(1));

@@ -42,3 +42,9 @@ pub(super) fn files(run: &mut MergeRun, merge: &Recorded<'_>, written: &[Written
     let text = serde_json::to_string_pretty(&manifest).unwrap_or_default();
     vec![card, report, file(manifest::NAME, format!("{text}\n"))]
 }
+
+/// Sizes in bytes that [`files`] will have; the figures of a lossy cast may make the report a few bytes longer.
+pub(super) fn sizes(run: &MergeRun, merge: &Recorded<'_>) -> Vec<u64> {
+    let files = files(&mut run.clone(), merge, &WrittenShard::expected(merge.plan));
+    files.iter().map(|file| file.bytes.len() as u64).collect()
+}

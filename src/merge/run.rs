@@ -9,7 +9,7 @@ use super::dry_run::PlanDocument;
 use super::parts::DonorParts;
 use super::training::training;
 use super::usage::Usage;
-use crate::check::{Finding, Outcome, Severity, check};
+use crate::check::{Finding, Outcome, Severity, check_for};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
@@ -29,6 +29,8 @@ pub struct MergeRequest {
     pub donors: BTreeMap<String, PathBuf>,
     /// Options, as given.
     pub options: BTreeMap<String, String>,
+    /// Versions of transformers that the result is for; empty: any.
+    pub versions: Vec<String>,
     /// Directory to create.
     pub out: PathBuf,
     /// Whether to stop before writing.
@@ -63,6 +65,8 @@ pub struct MergeRun {
     pub notices: Vec<String>,
     /// The plan; only of a dry run.
     pub(crate) plan: Option<PlanDocument>,
+    /// Versions of transformers that the result is for; empty: any.
+    pub(super) versions: Vec<String>,
     /// How the result is loaded.
     usage: Usage,
 }
@@ -72,7 +76,7 @@ impl MergeRun {
     pub(super) fn new(request: &MergeRequest) -> Self {
         let donors = request.donors.iter().map(|(role, dir)| (role.clone(), dir.display().to_string())).collect();
         let record = MergeReport { out: request.out.display().to_string(), donors, ..MergeReport::default() };
-        Self { record, ..Self::default() }
+        Self { record, versions: request.versions.clone(), ..Self::default() }
     }
 
     /// The donor in a role of the recipe; `None` before it was checked.
@@ -154,7 +158,7 @@ impl MergeRun {
         tolerated: &[String],
     ) -> bool {
         let checkpoint = Arc::new(checkpoint);
-        let outcome = check(&checkpoint, knowledge);
+        let outcome = check_for(&checkpoint, knowledge, &self.versions);
         let found = |severity| outcome.findings.iter().filter(|f| f.severity == severity).count();
         let stops = |f: &&Finding| f.severity == Severity::Error && !tolerated.contains(&f.code);
         let stopping = outcome.findings.iter().filter(stops).count();

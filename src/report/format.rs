@@ -6,7 +6,7 @@ use super::collapse::{NameGroup, collapse};
 use super::model::{CheckpointReport, Counts, MergeReport, MergeStage, Report};
 use crate::check::finding::Object;
 use crate::check::load::{LoadReport, SilentReason};
-use crate::check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad};
+use crate::check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad, is_program};
 use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
 pub use crate::checkpoint::file_size as bytes;
@@ -274,8 +274,21 @@ pub fn agreeing(loads: &[PredictedLoad]) -> Vec<(&LoadReport, Vec<&PredictedLoad
 
 /// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
 pub fn versions(loaders: &[&PredictedLoad]) -> String {
-    let versions: Vec<String> = loaders.iter().map(|load| name(&load.version())).collect();
-    format!("transformers {}", and(&versions))
+    listed(loaders, "transformers ")
+}
+
+/// The versions of transformers after `title`, and then the other programs.
+fn listed(loaders: &[&PredictedLoad], title: &str) -> String {
+    let (programs, own): (Vec<&PredictedLoad>, Vec<&PredictedLoad>) =
+        loaders.iter().copied().partition(|load| is_program(&load.loader));
+    let names = |loads: Vec<&PredictedLoad>| loads.iter().map(|load| name(&load.version())).collect::<Vec<_>>();
+    let own = and(&names(own));
+    let programs = and(&names(programs));
+    match (own.is_empty(), programs.is_empty()) {
+        (false, false) => format!("{title}{own}, and {programs}"),
+        (false, true) => format!("{title}{own}"),
+        (true, _) => programs,
+    }
 }
 
 /// `a`, `a and b`, `a, b and c`.
@@ -323,11 +336,10 @@ pub fn headline(loads: &[PredictedLoad]) -> String {
     let order = [LoadVerdict::Raises, LoadVerdict::LoadsWrong, LoadVerdict::Loads, LoadVerdict::NotPredicted];
     let mut parts: Vec<String> = Vec::new();
     for verdict in order {
-        let loaders = loads.iter().filter(|load| load.verdict == verdict);
-        let versions: Vec<String> = loaders.map(|load| name(&load.version())).collect();
-        if !versions.is_empty() {
-            let transformers = if parts.is_empty() { "transformers " } else { "" };
-            parts.push(format!("{} with {transformers}{}", verdict.name(), and(&versions)));
+        let loaders: Vec<&PredictedLoad> = loads.iter().filter(|load| load.verdict == verdict).collect();
+        if !loaders.is_empty() {
+            let title = if parts.iter().any(|part| part.contains("transformers ")) { "" } else { "transformers " };
+            parts.push(format!("{} with {}", verdict.name(), listed(&loaders, title)));
         }
     }
     parts.join("; ")

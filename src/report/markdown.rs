@@ -8,7 +8,7 @@ use super::format::{self, advice, bytes, capped, details, more, name, plural, se
 use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
 use super::overview::Overview;
 use crate::check::load::LoadReport;
-use crate::check::verdict::{LoadVerdict, PredictedLoad};
+use crate::check::verdict::{LoadVerdict, PredictedLoad, is_program};
 use crate::check::{Finding, Location};
 
 pub fn render(report: &Report, cap: usize) -> String {
@@ -37,7 +37,10 @@ pub fn render(report: &Report, cap: usize) -> String {
 
 /// The table of several checkpoints.
 fn checkpoints(out: &mut String, overview: &Overview<'_>) {
-    let loaders = overview.loaders.iter().map(|loader| format!("transformers {}", text_name(loader)));
+    let loaders = overview.loaders.iter().map(|loader| {
+        let title = if is_program(loader) { "" } else { "transformers " };
+        format!("{title}{}", text_name(loader))
+    });
     let mut header: Vec<String> = ["model", "class", "parameters", "size"].map(str::to_owned).into();
     header.extend(loaders);
     header.extend(["errors", "warnings"].map(str::to_owned));

@@ -23,7 +23,8 @@ use crate::checkpoint::open::open_regular;
 /// Returns the staging directory if it could not be removed afterwards.
 ///
 /// `record` is called once, after the shards and before the other files are written: it returns the files whose content
-/// depends on what was written, such as the manifest of a merge.
+/// depends on what was written, such as the manifest of a merge. `recorded` are the expected sizes of these files in
+/// bytes, for the check for free space.
 ///
 /// Fails when a donor no longer matches its snapshot.
 ///
@@ -33,12 +34,14 @@ pub fn apply(
     plan: &Plan,
     donors: &[DonorSnapshot],
     out: &Path,
+    recorded: &[u64],
     record: &mut dyn FnMut(&[WrittenShard]) -> Vec<PlannedFile>,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Option<Leftover>, ApplyError> {
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let files = plan.files.iter().map(|f| f.bytes.len() as u64);
-    let sizes: Vec<u64> = files.chain(plan.shards.iter().map(PlannedShard::file_len)).collect();
+    let shards = plan.shards.iter().map(PlannedShard::file_len);
+    let sizes: Vec<u64> = files.chain(shards).chain(recorded.iter().copied()).collect();
     let explained = |error| with_figures(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
     // After `Staging::new`, which removes the files of a killed run: these may fill the disk.

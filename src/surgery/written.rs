@@ -3,7 +3,7 @@
 use sha2::{Digest as _, Sha256};
 
 use super::convert::CastLosses;
-use super::plan::PlannedFile;
+use super::plan::{Plan, PlannedFile, PlannedTensor, TensorTransform};
 use super::stream::Streamed;
 use crate::checkpoint::{FileName, hex};
 
@@ -29,6 +29,28 @@ pub struct WrittenTensor {
     pub losses: CastLosses,
     /// SHA-256 of the donor's tensor, if it was read and is not equal by the transform.
     pub source_sha256: Option<String>,
+}
+
+impl WrittenShard {
+    /// Records of the length that those of `plan` will have, with digests of zeros.
+    ///
+    /// A merge makes its manifest from them to know its size before it writes.
+    #[must_use]
+    pub fn expected(plan: &Plan) -> Vec<Self> {
+        let zeros = || "0".repeat(64);
+        let tensor = |tensor: &PlannedTensor| {
+            let is_read = tensor.transform() != TensorTransform::Copy && tensor.source.fit != TensorTransform::Reinit;
+            WrittenTensor { sha256: zeros(), losses: CastLosses::default(), source_sha256: is_read.then(zeros) }
+        };
+        let shards = plan.shards.iter();
+        let expected = shards.map(|shard| Self {
+            name: shard.name.clone(),
+            bytes: shard.file_len(),
+            sha256: zeros(),
+            tensors: shard.tensors.iter().map(tensor).collect(),
+        });
+        expected.collect()
+    }
 }
 
 /// Digests of the shard that is being written.

@@ -15,6 +15,7 @@ mod place;
 mod run;
 mod sound;
 mod system;
+mod templates;
 mod values;
 
 use std::fmt::Write as _;
@@ -69,6 +70,7 @@ fn cases() -> Vec<Case> {
         values::cases,
         code::cases,
         system::cases,
+        templates::cases,
         sound::cases,
     ] {
         cases.extend(part());

@@ -291,7 +291,7 @@ fn fixtures_are_small() {
         files.iter().map(|f| fs::metadata(f).expect("a file").len()).sum()
     };
     let total = size("rules") + size("sound") + size("bases") + size("recipes");
-    assert!(total < 200_000, "{total} bytes; weights are made when the tests run");
+    assert!(total < 400_000, "{total} bytes; weights are made when the tests run");
 }
 
 #[test]
@@ -305,7 +305,7 @@ fn every_built_in_repair_is_used_by_some_rule() {
 /// The README of the fixtures describes every folder.
 #[test]
 fn every_folder_of_fixtures_is_described() {
-    let known = ["bases", "donors", "recipes", "rules", "sound"];
+    let known = ["bases", "donors", "recipes", "reported", "rules", "sound"];
     let folders = fs::read_dir(project().join("fixtures")).expect("a folder").map(|e| e.expect("an entry").path());
     let unknown: Vec<String> = folders
         .filter(|p| p.is_dir())

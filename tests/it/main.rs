@@ -30,5 +30,6 @@ mod merge;
 mod mutation;
 mod pages;
 mod readers;
+mod reported;
 mod reports;
 mod rules;

@@ -19,7 +19,7 @@ const GENERATED: &str = "<!-- Generated: `CKPT_DOCTOR_WRITE=1 cargo test --test 
 
 /// Compares a file with its generated content; writes it when `CKPT_DOCTOR_WRITE` is set.
 #[track_caller]
-fn fresh(path: &str, text: &str) {
+pub fn fresh(path: &str, text: &str) {
     let file = project().join(path);
     if std::env::var_os("CKPT_DOCTOR_WRITE").is_some() {
         fs::write(&file, text).expect("write");
@@ -121,7 +121,7 @@ fn advice(fix: &Fix) -> (String, Option<String>) {
 /// The consequence under each known loader, as cells.
 fn loaders_of(effect: &Effect) -> String {
     let cell = |loader: Loader| {
-        if effect.loaders.contains(loader.version()) { effect.consequence.name() } else { "-" }
+        if effect.is_under(loader.version()) { effect.consequence.name() } else { "-" }
     };
     Loader::ALL.map(cell).join(" | ")
 }
@@ -144,9 +144,8 @@ fn rule_page(rule: &Rule, example: &str) -> String {
     for effect in &rule.effects {
         let under = loaders_of(effect);
         let object = effect.object.map_or("by file", Object::name);
-        let case = if effect.when.is_some() { " (in some cases)" } else { "" };
-        let text = markdown(&effect.text.prose()).replace('|', "\\|");
-        let _ = writeln!(page, "| {object} | {under} | {text}{case} |");
+        let text = markdown(&effect.prose()).replace('|', "\\|");
+        let _ = writeln!(page, "| {object} | {under} | {text} |");
     }
     let _ = writeln!(page, "\n**Example**\n\n```text\n{example}\n```");
     for fix in &rule.fixes {
@@ -221,8 +220,13 @@ fn the_page_of_data_files_is_fresh() {
          | `processors/` | tokens that a processor adds to a tokenizer |\n\
          | `parts/` | the language model, vision tower and projector inside model classes |\n\
          | `recipes/` | merges, with the Python modules that they write |\n\
+         | `ropes.json` | rope keys that config classes read before transformers 5, written by `tools/loader_ropes.py` |\n\
          | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
+         | `classes.json` | tokenizer and processor classes that each version opens by name, written by `tools/loader_classes.py` |\n\
+         | `peft.json` | keys of `adapter_config.json` by version of PEFT, written by `tools/peft_keys.py` |\n\
          | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\
+         | `directories.json5` | kinds of directories that other programs open, or none, with what to do |\n\
+         | `statistics.json5` | where policies of robots keep their statistics |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\n\
          All files are JSON5. The keys below come from the JSON Schemas in [`schemas/`](../schemas). *Expression* means an \

@@ -10,6 +10,7 @@ mod contents;
 mod directories;
 mod documents;
 mod modules;
+mod pickles;
 mod properties;
 mod shards;
 mod tokenizers;
@@ -42,8 +43,15 @@ fn hold(cases: &[Case]) {
 
 #[test]
 fn every_kind_of_a_reader_is_produced_by_some_case() {
-    let tables =
-        [&documents::CASES, &shards::CASES, &contents::CASES, &modules::CASES, &tokenizers::CASES, &directories::CASES];
+    let tables = [
+        &documents::CASES,
+        &shards::CASES,
+        &contents::CASES,
+        &modules::CASES,
+        &tokenizers::CASES,
+        &directories::CASES,
+        &pickles::CASES,
+    ];
     let produced: BTreeSet<_> = tables.iter().flat_map(|t| t.iter()).flat_map(|c| &c.faults).map(|f| f.kind).collect();
     let readers = FaultKind::ALL.iter().copied().filter(|kind| kind.source() == FaultSource::Reader);
     assert_eq!(produced, readers.collect());

@@ -2,6 +2,7 @@
 //! rules.
 
 pub mod failure_modes;
+mod peft;
 mod seeded;
 
 use std::collections::BTreeSet;

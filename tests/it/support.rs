@@ -5,10 +5,11 @@
 //! that the repository contains no broken weights.
 
 pub mod base;
-mod change;
+pub mod change;
 pub mod data;
 mod draw;
 pub mod invariants;
+pub mod pickle;
 pub mod repairs;
 pub mod weights;
 
@@ -18,7 +19,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Outcome, Safety, check, unused_suppressions};
+use ckpt_doctor::check::{Outcome, Safety, check, check_for, unused_suppressions};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
@@ -61,6 +62,9 @@ pub struct Case {
     /// Whether to read the tensors' bytes, as `check --deep` does; always for sound cases.
     #[serde(default)]
     pub deep: bool,
+    /// Values of `--for`.
+    #[serde(default)]
+    pub loaders: Vec<String>,
     /// Settings for the check.
     #[serde(default)]
     pub settings: Option<serde_json::Value>,
@@ -220,6 +224,7 @@ pub fn cases() -> Vec<Case> {
         base: (*base).to_owned(),
         changes: Vec::new(),
         deep: true,
+        loaders: Vec::new(),
         settings: None,
         expect: None,
     });
@@ -235,16 +240,17 @@ pub fn tried() -> &'static [Tried] {
 
 /// Opens and checks a directory.
 pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
-    open(dir, deep, knowledge).1
+    open(dir, deep, &[], knowledge).1
 }
 
-fn open(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
+/// As [`look`], for the loaders of `--for`.
+fn open(dir: &Path, deep: bool, loaders: &[String], knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let mut checkpoint = read(dir);
     if deep {
         checkpoint.read_contents();
     }
     let checkpoint = Arc::new(checkpoint);
-    let outcome = check(&checkpoint, knowledge);
+    let outcome = check_for(&checkpoint, knowledge, loaders);
     (checkpoint, outcome)
 }
 
@@ -372,7 +378,7 @@ fn try_all() -> Vec<Tried> {
         let before = before.get_or_init(|| bases.iter().map(|(name, dir)| (*name, codes(dir))).collect());
         let (checkpoint, mut outcome) = match &case.settings {
             Some(settings) => under(settings, made, with_kinds()),
-            None => open(made, case.deep, &observing),
+            None => open(made, case.deep, &case.loaders, &observing),
         };
         let kinds = take_kinds(&mut outcome);
         let example = case.code.as_ref().and_then(|code| example(code, &checkpoint, &outcome)).unwrap_or_default();

@@ -132,6 +132,8 @@ class Language(Cell):
     def words(self):
         self.host_dir, self.guest_dir = map(self.path, self.donors)
         options = ["--set", f"projector={self.projector}"] if self.projector else []
+        # One result is opened by every version, although some scale image features.
+        options += [] if self.host == SPATIALVLA else ["--set", "scale=keep"]
         options += ["--dry-run"] if self.host == OPENVLA else []
         return ["build-merged", "--vision", self.host_dir, "--language", self.guest_dir, "--out", self.out, *options]
 

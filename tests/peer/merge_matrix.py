@@ -5,7 +5,7 @@ donors in other types, loaded in the types that users ask for.
     merge_matrix.py [--full] [VISION LANGUAGE [CODE]]
 
 The donors default to those of the fixtures; CODE is a directory with SpatialVLA's Python modules. With --full, the donors
-in other types are merged with every combination that loads, otherwise with one in six.
+in other types are merged with every combination that loads, otherwise with one in twelve.
 """
 
 import itertools
@@ -157,7 +157,7 @@ def other_types(tally, donors, work, full):
         donor = work / f"language-{name}"
         save_in_type(language, donor, name)
         for number, choice in enumerate(choices):
-            if not full and number % 6 != (name == "float32"):
+            if not full and number % 12 != (name == "float32"):
                 continue
             for dtype, stored in (("host", "BF16"), ("float32", "F32"), ("float16", "F16"))[: 3 if number < 6 else 1]:
                 what = " ".join(f"{k}={v}" for k, v in {"donor": name, "dtype": dtype, **choice}.items())

@@ -163,11 +163,12 @@ def compare_types(tally, work):
 def compare_scales(tally, work):
     """The image features that enter the first layer: as in the vision donor with scale=fold, divided with scale=keep."""
     import torch
+    import transformers
 
     host = image_rows(work / "paligemma")
-    for option, factor in (("fold", 1), ("keep", 8)):
+    for option, factor, versions in (("fold", 1, ()), ("keep", 8, ()), ("auto", 1, ("--for", transformers.__version__))):
         out = work / f"merged-{option}"
-        code, stdout, stderr = merge(work / "paligemma", work / "llama", out, f"scale={option}")
+        code, stdout, stderr = merge(work / "paligemma", work / "llama", out, f"scale={option}", versions=versions)
         if not tally.expect(code == 0, f"scale={option}: exit {code}", (stdout + stderr)[-2000:]):
             continue
         rows = image_rows(out)
@@ -176,10 +177,12 @@ def compare_scales(tally, work):
         tally.expect(torch.allclose(rows * factor, host, rtol=1e-4, atol=1e-6), f"scale={option}: image features", f"{rms}")
 
 
-def merge(vision, language, out, *settings):
+def merge(vision, language, out, *settings, versions=()):
+    if not any(setting.startswith("scale=") for setting in settings):
+        settings = (*settings, "scale=keep")
     options = [word for setting in settings for word in ("--set", setting)]
     return doctor("build-merged", "--recipe", "paligemma-llama", "--vision", vision, "--language", language,
-                  "--out", out, *options)
+                  "--out", out, *options, *versions)
 
 
 def main():

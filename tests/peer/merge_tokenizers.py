@@ -51,7 +51,8 @@ def main():
         for recipe, kind, form in itertools.product(visions, KINDS, ("plain", "baked")):
             what, out = f"{recipe} {kind} {form}", work / f"{recipe}-{kind}-{form}"
             code, stdout, stderr = doctor("build-merged", "--recipe", recipe, "--vision", visions[recipe],
-                                          "--language", work / kind, "--out", out, "--set", f"tokenizer={form}")
+                                          "--language", work / kind, "--out", out, "--set", f"tokenizer={form}",
+                                          *(("--set", "scale=keep") if recipe == "paligemma-llama" else ()))
             if not tally.expect(code == 0, f"{what}: exit {code}", (stdout + stderr)[-2000:]):
                 continue
             entry = next(iter(check(out)[0].values()))

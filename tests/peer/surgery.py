@@ -164,7 +164,7 @@ report of the merge says that the result does not load there. A letter is the re
 each table. OpenVLA's merges are planned and checked, and not opened here, because its code needs the package timm.
 """
 TABLES = {
-    Language: "## Language models\n\n`ckpt-doctor build-merged --vision HOST --language GUEST --out OUT`, hosts in rows and guests in columns. A guest of another\nwidth needs `--set projector=pad` or `projector=reinit`.\n",
+    Language: "## Language models\n\n`ckpt-doctor build-merged --vision HOST --language GUEST --out OUT`, hosts in rows and guests in columns. A guest of another\nwidth needs `--set projector=pad` or `projector=reinit`; where versions scale image features differently, the merge asks for a\nversion (`--for 5.23`) or for `--set scale=`.\n",
     Tower: "## Vision towers\n\n`ckpt-doctor build-merged --vision TOWER --language HOST --out OUT`, hosts in rows and towers in columns.\n",
     Part: "## Parts\n\n`ckpt-doctor extract HOST --part PART --out OUT`: versions that open the part in its own class. `ckpt-doctor insert` of the\npart gives the files of the host again, byte for byte.\n",
 }

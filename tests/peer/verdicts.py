@@ -59,7 +59,7 @@ def save_bases(out):
     )
     transformers.LlavaForConditionalGeneration(config).save_pretrained(out / "llava")
     images = transformers.CLIPImageProcessor(size={"shortest_edge": 16}, crop_size={"height": 16, "width": 16})
-    processor = transformers.LlavaProcessor(images, tokenizer, patch_size=8, vision_feature_select_strategy="default", image_token="<image>")
+    processor = transformers.LlavaProcessor(images, tokenizer, patch_size=8, vision_feature_select_strategy="default", image_token="<image>", num_additional_image_tokens=1)
     processor.save_pretrained(out / "llava")
 
     t5 = transformers.T5Config(vocab_size=64, d_model=32, d_kv=8, d_ff=48, num_layers=2, num_heads=4, decoder_start_token_id=0)

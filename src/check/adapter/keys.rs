@@ -34,6 +34,8 @@ impl MatrixRole {
 pub(super) enum AdapterKey<'n> {
     /// A tensor of a LoRA, and the base model's module it belongs to.
     Lora { module: &'n str, role: MatrixRole },
+    /// The same with the name of the adapter `default`, which PEFT 0.21 loads and older versions drop.
+    Named { module: &'n str, role: MatrixRole },
     /// A tensor of the base model, stored whole: an embedding, a trained bias, one of `modules_to_save`.
     Whole(&'n str),
     /// PEFT finds no place for it, for this reason.
@@ -51,13 +53,27 @@ const ENDINGS: [(&str, MatrixRole); 7] = [
     (".lora_magnitude_vector.weight", MatrixRole::Magnitude),
 ];
 
+/// Endings in a state dict of the model, of an adapter that is called `default`.
+const NAMED_ENDINGS: [(&str, MatrixRole); 4] = [
+    (".lora_A.default.weight", MatrixRole::A),
+    (".lora_B.default.weight", MatrixRole::B),
+    (".lora_embedding_A.default", MatrixRole::EmbeddingA),
+    (".lora_embedding_B.default", MatrixRole::EmbeddingB),
+];
+
 impl<'n> AdapterKey<'n> {
     pub(super) fn parse(name: &'n str) -> Self {
         let Some(bare) = name.strip_prefix(PREFIX) else {
             return Self::Foreign("it does not start with base_model.model.");
         };
-        if let Some((module, role)) = ENDINGS.iter().find_map(|(end, role)| Some((bare.strip_suffix(end)?, *role))) {
+        let of = |endings: &[(&str, MatrixRole)]| {
+            endings.iter().find_map(|(end, role)| Some((bare.strip_suffix(end)?, *role)))
+        };
+        if let Some((module, role)) = of(&ENDINGS) {
             return Self::Lora { module, role };
+        }
+        if let Some((module, role)) = of(&NAMED_ENDINGS) {
+            return Self::Named { module, role };
         }
         // Variants of LoRA (`lora_ga`, `lora_sparse…`) have tensors of their own; only what is plainly misspelled counts.
         let named = ["lora_A", "lora_B", "lora_embedding_A", "lora_embedding_B"].into_iter().any(|word| {
@@ -81,12 +97,10 @@ mod tests {
             ("base_model.model.wte.lora_embedding_B", lora("wte", MatrixRole::EmbeddingB)),
             ("base_model.model.q.lora_magnitude_vector", lora("q", MatrixRole::Magnitude)),
             ("base_model.model.lm_head.weight", AdapterKey::Whole("lm_head.weight")),
+            ("base_model.model.q.lora_A.default.weight", AdapterKey::Named { module: "q", role: MatrixRole::A }),
+            ("base_model.model.q.lora_A.mine.weight", AdapterKey::Foreign("its name contains the name of an adapter")),
             (
-                "base_model.model.q.lora_A.default.weight",
-                AdapterKey::Foreign("its name contains the name of an adapter"),
-            ),
-            (
-                "base_model.model.wte.lora_embedding_A.default",
+                "base_model.model.wte.lora_embedding_A.mine",
                 AdapterKey::Foreign("its name contains the name of an adapter"),
             ),
             ("h.0.c_attn.lora_A.weight", AdapterKey::Foreign("it does not start with base_model.model.")),

@@ -65,6 +65,11 @@ impl<'c> Targets<'c> {
         }
     }
 
+    /// Whether the config certainly means this module.
+    pub(super) fn covers(&self, module: &str) -> bool {
+        !matches!(self.modules, Modules::Any) && self.may_cover(module)
+    }
+
     /// Whether all modules have the same rank.
     pub(super) fn is_uniform(&self) -> bool {
         self.ranks.is_empty()

@@ -4,6 +4,7 @@
 
 use std::collections::BTreeSet;
 
+mod configs;
 mod modules;
 mod names;
 mod texts;
@@ -13,7 +14,7 @@ pub(super) use names::rename;
 
 use super::{Edit, Site};
 use crate::check::index::{by_tensor, numbered, readable, shard_names, similar};
-use crate::checkpoint::{Checkpoint, FaultKind, INDEX_NAME, Shard};
+use crate::checkpoint::{Checkpoint, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Shard};
 use crate::knowledge::rule::BuiltInRepair;
 
 /// The edits of a repair; `None` when the checkpoint lacks what they need.
@@ -25,6 +26,7 @@ pub(super) fn run(repair: BuiltInRepair, site: &Site<'_>) -> Option<Vec<Edit>> {
         BuiltInRepair::CutNulBytes => texts::cut_nul_bytes(site),
         BuiltInRepair::DropEqualKey => texts::drop_equal_key(site),
         BuiltInRepair::FillTokenHoles => tokens::fill_token_holes(site.checkpoint()),
+        BuiltInRepair::FlattenTextConfig => configs::flatten_text_config(site.checkpoint()),
         BuiltInRepair::QuoteString => texts::quote_string(site),
         BuiltInRepair::RebuildIndex => {
             let edit = site.bench.index.get_or_init(|| rebuild_index(site.checkpoint()));
@@ -77,6 +79,7 @@ fn family(checkpoint: &Checkpoint) -> Option<(String, Vec<String>)> {
     let document = checkpoint.index.as_ref().map(|index| index.document.clone());
     let file = document.unwrap_or_else(|| match prefix {
         "model" => INDEX_NAME.to_owned(),
+        "pytorch_model" if names.iter().all(|name| name.ends_with(".bin")) => PICKLE_INDEX_NAME.to_owned(),
         other => format!("{other}.safetensors.index.json"),
     });
     complete.then(|| (file, names.into_iter().map(str::to_owned).collect()))
@@ -100,7 +103,7 @@ const OF_THE_HEADER: [FaultKind; 7] = [
 
 /// Whether a header rebuilt from the entries that were read loses nothing of the old one.
 fn is_rewritable(shard: &Shard) -> bool {
-    is_whole(shard) && shard.faults.iter().all(|f| OF_THE_HEADER.contains(&f.kind))
+    is_whole(shard) && !shard.is_pickle() && shard.faults.iter().all(|f| OF_THE_HEADER.contains(&f.kind))
 }
 
 /// Rewrites the header of every shard that the finding names.

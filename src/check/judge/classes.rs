@@ -44,7 +44,7 @@ pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a
     let is_unnamed = inputs.config.pointer("/architectures/0").is_none() && inputs.is_plain();
     let fitting = comparable.map(|one| if is_unnamed { with_fitting_class(inputs, one) } else { one });
     let built = fitting.map(|TargetClass { target, architecture }| BuiltClass {
-        class: load::build(architecture, inputs.config, inputs.stored).and_then(|mut class| {
+        class: with_flat_config(inputs, &architecture).and_then(|mut class| {
             class.doubts.extend(own_code(inputs, &architecture));
             covered(class, inputs.stored)
         }),
@@ -52,6 +52,25 @@ pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a
         architecture,
     });
     leading(inputs, built.collect())
+}
+
+/// The exception of a class that can generate when `text_config` stayed an object: its generation config is made of it.
+///
+/// Source: `GenerationConfig.from_model_config` of transformers 4.47.0, 4.57.6 and 5.23.0, run.
+const NESTED: &str = "AttributeError: 'dict' object has no attribute 'to_dict'";
+
+/// The class, unless this loader reads its values at the top of config.json and finds them in `text_config`, as a later
+/// version writes them.
+fn with_flat_config(inputs: &Inputs<'_>, architecture: &Architecture<'_>) -> Result<Expected, Refusal> {
+    let generates = ["ForCausalLM", "ForConditionalGeneration", "LMHeadModel"];
+    let is_nested = inputs.config.get("text_config").is_some_and(Value::is_object)
+        && architecture.has_auto()
+        && !architecture.builds_config("text_config")
+        && generates.iter().any(|end| architecture.class().ends_with(end));
+    if is_nested {
+        return Err(Refusal::Raises(NESTED.to_owned()));
+    }
+    load::build(*architecture, inputs.config, inputs.stored)
 }
 
 /// The class of this config class whose tensors are stored, where config.json names none: an encoder of T5, for one. Without
@@ -141,6 +160,7 @@ fn unbuildable(built: &[BuiltClass<'_>]) -> Vec<Fault> {
                 first.loaders.push(one.target.loader.version());
             }
             (Err(Refusal::Raises(exception)), _) => {
+                let fault = if exception == NESTED { fault.with("nested", true) } else { fault };
                 faults.push(fault.with("raises", exception.as_str()).with("loader", one.target.version()));
             }
             // A version that nobody named and that cannot build the class is passed over.

@@ -10,6 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 
 use super::LoadReport;
+use super::wrapped::Wrapped;
 use super::{Stored, build, predict, with_names};
 use crate::checkpoint::{Fault, FaultKind};
 use crate::knowledge::{Architecture, Expected};
@@ -32,11 +33,11 @@ pub struct Moved {
     pub expected: Expected,
     /// The load of the renamed tensors.
     pub report: LoadReport,
-    /// One for each prefix.
+    /// One for each prefix, and one for parts inside of names.
     pub faults: Vec<Fault>,
 }
 
-/// Finds prefixes under which tensors of the class lie; `None` when there are none, or renaming does not help.
+/// Finds prefixes under which tensors of the class lie, and parts of their names that wrappers added; `None` when there are none, or renaming does not help.
 #[must_use]
 pub fn moved(
     architecture: Architecture<'_>,
@@ -52,7 +53,19 @@ pub fn moved(
         if !listed && found.report.raises.is_none() {
             break;
         }
-        let Some(mut step) = best(&found.expected, &found.stored) else { break };
+        let step = best(&found.expected, &found.stored);
+        let moving = step.as_ref().map_or(0, |step| step.names.len());
+        if let Some(wrapped) = Wrapped::find(&found.expected, &found.stored).filter(|wrapped| wrapped.len() > moving) {
+            let renamed = wrapped.renamed(&found.stored);
+            let report = predict(&found.expected, &renamed);
+            if size(&found.report).saturating_sub(size(&report)) < wrapped.len() {
+                break;
+            }
+            found = Moved { stored: renamed, report, ..found };
+            found.faults.push(wrapped.fault());
+            continue;
+        }
+        let Some(mut step) = step else { break };
         if architecture.reads_tensors() {
             // With all of them renamed, the class may have more of these tensors.
             let strays = strays(&found.expected, &found.stored);

@@ -2,11 +2,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::checkpoint::{Checkpoint, Shard};
+use crate::checkpoint::{Checkpoint, PICKLE_NAME, Shard};
 use crate::knowledge::Evidence;
 
 /// The file a loader takes before it looks for an index.
 const SINGLE: &str = "model.safetensors";
+
+/// Whether a shard without an index is one of the model, and not of an adapter or another program, by its name.
+fn is_of_model(name: &str) -> bool {
+    name.starts_with("model") || name.starts_with("pytorch_model")
+}
 
 /// Maximum number of stored tensors for which causes are searched; the largest published models have some 210 000.
 const SEARCHED: usize = 300_000;
@@ -36,14 +41,14 @@ impl Stored {
 
     /// From an index, tensor name to file name, and the shards that are there.
     ///
-    /// A `model.safetensors` beside an index wins. Without either no loader opens anything; then the shards that
+    /// A `model.safetensors` or `pytorch_model.bin` beside an index wins. Without either no loader opens anything; then the shards that
     /// an index would name are taken together.
     #[must_use]
     pub fn new<'s>(index: Option<&BTreeMap<String, String>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
         let shards: BTreeMap<&str, &Shard> = shards.into_iter().map(|s| (s.name.as_str(), s)).collect();
-        match (shards.get(SINGLE), index) {
+        match (shards.get(SINGLE).or_else(|| shards.get(PICKLE_NAME)), index) {
             (Some(single), _) => Self::together([*single]),
-            (None, None) => Self::together(shards.into_values().filter(|s| s.name.starts_with("model"))),
+            (None, None) => Self::together(shards.into_values().filter(|s| is_of_model(&s.name))),
             (None, Some(index)) => {
                 let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
                 let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();

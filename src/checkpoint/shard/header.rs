@@ -218,7 +218,7 @@ fn frame<'a>(shard: &Shard, head: &'a [u8]) -> Result<(&'a [u8], u64), Box<Fault
 }
 
 /// Describes a file whose length field is not plausible for a safetensors file.
-fn other_format(head: &[u8]) -> Option<String> {
+pub(in crate::checkpoint) fn other_format(head: &[u8]) -> Option<String> {
     if let Some(what) = looks_like(head) {
         return Some(what.to_owned());
     }

@@ -142,6 +142,18 @@ impl Vocabulary {
     }
 }
 
+/// Whether the merges of this tokenizer.json are pairs of strings, and not strings with a blank: by the first of them.
+#[must_use]
+pub fn has_paired_merges(document: &Document) -> bool {
+    let second = || {
+        document.value.as_ref()?;
+        let mut scanner = Scanner::lenient(document.text.as_deref()?, document.locate("/model/merges")?.start);
+        scanner.next().ok()??;
+        Some(scanner.next().ok()??.0)
+    };
+    matches!(second(), Some(Token::BeginArray))
+}
+
 fn token(arena: &str, (start, end, _): (u32, u32, u32)) -> &str {
     // u32 fits usize on every platform with more than 16 bits.
     arena.get(start as usize..end as usize).unwrap_or_default()

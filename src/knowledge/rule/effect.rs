@@ -4,6 +4,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::super::expression::{Expression, Template};
 use super::super::loader::version_numbers;
+use super::super::program::Program;
 use crate::checkpoint::tokenizer::is_vocabulary;
 
 /// What a loader opens from a checkpoint.
@@ -122,6 +123,8 @@ impl Consequence {
 pub struct Effect {
     /// The object that fails; `None` for the one that reads the file of the fault.
     pub object: Option<Object>,
+    /// The program that has the effect; `None` for transformers.
+    pub program: Option<Program>,
     /// The versions of transformers that have the effect.
     pub loaders: LoaderRange,
     /// Condition for the effect; an expression that cannot be evaluated counts as false.
@@ -130,6 +133,22 @@ pub struct Effect {
     pub consequence: Consequence,
     /// The exception with its message, or what becomes wrong.
     pub text: Template,
+}
+
+impl Effect {
+    /// Whether a version of transformers has the effect.
+    #[must_use]
+    pub fn is_under(&self, version: &str) -> bool {
+        self.program.is_none() && self.loaders.contains(version)
+    }
+
+    /// What happens, as text for people: under which program, and whether always.
+    #[must_use]
+    pub fn prose(&self) -> String {
+        let program = self.program.map(|program| format!("with {}: ", program.name())).unwrap_or_default();
+        let case = if self.when.is_some() { " (in some cases)" } else { "" };
+        format!("{program}{}{case}", self.text.prose())
+    }
 }
 
 /// The keys of an effect in a rule file.
@@ -141,6 +160,9 @@ pub(super) struct EffectKeys {
     /// The object that fails; when missing, the one that reads the file of the fault, and no effect if none reads it.
     #[serde(default)]
     on: Option<Object>,
+    /// Another program that has the effect, when the run asks for it: `vllm`; transformers when missing.
+    #[serde(default)]
+    program: Option<Program>,
     /// Versions of transformers that have the effect, as bounds: `<5`, `>=5`, `>=4.48,<5`; all when missing.
     #[serde(default)]
     #[cfg_attr(test, schemars(with = "Option<String>"))]
@@ -166,7 +188,7 @@ impl TryFrom<EffectKeys> for Effect {
             (None, Some(text)) => (Consequence::Wrong, text),
             _ => return Err("an effect has either `raises` or `wrong`"),
         };
-        Ok(Self { object: keys.on, loaders: keys.loaders, when: keys.when, consequence, text })
+        Ok(Self { object: keys.on, program: keys.program, loaders: keys.loaders, when: keys.when, consequence, text })
     }
 }
 

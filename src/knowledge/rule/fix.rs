@@ -111,6 +111,13 @@ pub enum EditSpec {
         /// Path below `rules/recipes/`.
         text: String,
     },
+    /// Adds a JSON document; the checkpoint must not have a file of that name.
+    Create {
+        /// File name.
+        file: Template,
+        /// The value of the document, an object.
+        to: Expression,
+    },
     /// Runs one of the repairs that need more than an expression.
     Repair(BuiltInRepair),
 }
@@ -144,6 +151,8 @@ pub enum BuiltInRepair {
     DropEqualKey,
     /// Adds the entries that `added_tokens_decoder` lacks and another tokenizer file has.
     FillTokenHoles,
+    /// Moves the values of `text_config` to the top of config.json.
+    FlattenTextConfig,
     /// Puts a single-quoted string in double quotes.
     QuoteString,
     /// Rebuilds the index from the shard headers.
@@ -164,6 +173,7 @@ impl BuiltInRepair {
         Self::CutNulBytes,
         Self::DropEqualKey,
         Self::FillTokenHoles,
+        Self::FlattenTextConfig,
         Self::QuoteString,
         Self::RebuildIndex,
         Self::Reencode,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::SettingsSource;
 use super::policy::Policy;
-use crate::knowledge::loader::{expanded, parse_requirement_or_all};
+use crate::knowledge::loader::{expanded, parse_program};
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::selection::{Choice, UnknownRule};
 use crate::knowledge::source::DataError;
@@ -83,8 +83,7 @@ impl Chain {
         let Some((source, versions)) = self.last(|s| Some((s, s.settings.versions.as_ref()?))) else {
             return Ok(Vec::new());
         };
-        let read =
-            |text: &String| parse_requirement_or_all(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
+        let read = |text: &String| parse_program(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
         Ok(expanded(versions.iter().map(read).collect::<Result<_, _>>()?))
     }
 

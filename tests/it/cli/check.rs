@@ -7,6 +7,8 @@ use std::process::{Command, Output};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+use crate::support::make_base;
+
 fn donor(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors").join(name)
 }
@@ -408,8 +410,34 @@ fn a_part_of_another_loader_is_built_as_by_that_loader() {
         )
     };
     let (loaders, codes) = loads(&[]);
-    assert_eq!(loaders, ["5.23.0"]);
+    assert_eq!(loaders, ["4.57.6", "5.23.0"]);
     assert!(!codes.iter().any(|c| c == "ARC001" || c == "ARC002"), "{codes:?}");
     let (loaders, codes) = loads(&["--for", "transformers==4.47.0"]);
     assert!(loaders.is_empty() && codes.iter().filter(|c| *c == "ARC001").count() == 1, "{codes:?}");
+}
+
+/// A program that is named is judged by the known facts alone, and transformers as without it.
+#[test]
+fn a_program_is_judged_by_known_facts() {
+    let dir = tempfile::tempdir().unwrap();
+    make_base("llama", &dir.path().join("model"));
+    let model = dir.path().join("model");
+    let path = model.to_str().unwrap();
+    let verdicts = |more: &[&str]| {
+        let (code, report) = report(&[&["check", path, "--output-format", "json"], more].concat());
+        let loads = report["checkpoints"][0]["loads"].as_array().unwrap().clone();
+        let verdict =
+            |load: &Value| format!("{} {}", load["loader"].as_str().unwrap(), load["verdict"].as_str().unwrap());
+        (code, loads.iter().map(verdict).collect::<Vec<_>>())
+    };
+    let (_, plain) = verdicts(&[]);
+    let (code, named) = verdicts(&["--for", "vllm,mlx-lm"]);
+    let programs = ["vllm 0.19.1 not-predicted", "mlx-lm 0.32.2 not-predicted"].map(str::to_owned);
+    assert_eq!((code, &named), (Some(0), &[plain, programs.to_vec()].concat()));
+    fs::rename(model.join("model.safetensors"), model.join("weights.safetensors")).unwrap();
+    let (code, named) = verdicts(&["--for", "mlx-lm"]);
+    assert_eq!((code, named.last().map(String::as_str)), (Some(1), Some("mlx-lm 0.32.2 raises")));
+    let said = doctor(&["check", path, "--for", "mlx-lm"]);
+    let said = String::from_utf8_lossy(&said.stdout).into_owned();
+    assert!(said.contains(", and mlx-lm 0.32.2"), "{said}");
 }

@@ -118,7 +118,7 @@ fn others() -> Vec<Case> {
 fn pickles() -> Vec<Case> {
     const EVIL: &[u8] = b"\x80\x04cposix\nsystem\n(S'touch ../pwned'\ntR.";
     vec![
-        case("D6", "instead of safetensors", "FIL008", "pytorch_model.bin", |d| {
+        case("D6", "instead of safetensors", "PKL004", "pytorch_model.bin", |d| {
             d.small();
             d.remove(SHARD);
             d.put("pytorch_model.bin", EVIL);
@@ -129,7 +129,7 @@ fn pickles() -> Vec<Case> {
             d.put("training_args.bin", EVIL);
             d.put("optimizer.pt", EVIL);
         }),
-        case("D6", "an index of pickles", "FIL008", "pytorch_model", |d| {
+        case("D6", "an index of pickles", "PKL004", "pytorch_model", |d| {
             d.small();
             d.remove(SHARD);
             d.put("pytorch_model-00001-of-00001.bin", EVIL);

@@ -52,6 +52,17 @@ fn irregular() -> Vec<Case> {
             d.link(name, "pipe");
         });
     }
+    let device = |d: &Dir, name: &str| d.link(name, "/dev/zero");
+    for (what, make) in [("FIFO", Dir::fifo as fn(&Dir, &str)), ("link to a device", device)] {
+        cases.push(bounded("F1", format!("{what} as a shard of the base model of an adapter"), move |d| {
+            d.put("adapter_config.json", r#"{"peft_type": "LORA", "base_model_name_or_path": "./base", "r": 4}"#);
+            d.folder("base");
+            d.put("base/config.json", "{}");
+            make(d, "base/model.safetensors");
+            let name = "base_model.model.h.lora_A.weight";
+            d.put("adapter_model.safetensors", file(header(&entry(name, "F32", "[4,8]", 0, 128)), 128));
+        }));
+    }
     cases
 }
 

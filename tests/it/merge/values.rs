@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::{content, copy, doctor, donor, json, merge, text, tiny};
+use crate::support::make_base;
 
 /// The language donor with its tensors declared as float16: other values, in a type that differs from the vision donor's.
 fn half_donor(work: &Path) -> PathBuf {
@@ -199,6 +200,40 @@ fn a_factor_of_one_changes_nothing_and_the_projector_keeps_its_bytes() {
         assert_eq!(merged[name].2[..width], vision[name].2[..width], "{name}");
     }
     assert!(text(&written).contains("smaller by this factor"), "{}", text(&written));
+}
+
+/// PaliGemma divides image features in transformers 4 and not in 5. A merge for both is refused, with the two answers; for one
+/// of them, the projector is folded where it is divided.
+#[test]
+fn a_projector_is_made_for_the_versions_asked_for() {
+    let work = TempDir::new().unwrap();
+    let (vision, language) = (work.path().join("paligemma"), work.path().join("llama"));
+    make_base("paligemma", &vision);
+    make_base("llama", &language);
+    let run = |name: &str, more: &[&str]| {
+        let out = work.path().join(name);
+        let (vision, language) = (vision.to_str().unwrap(), language.to_str().unwrap());
+        let mut args = vec!["build-merged", "--vision", vision, "--language", language, "--out", out.to_str().unwrap()];
+        args.extend(["--set", "projector=pad"].iter().chain(more));
+        let run = doctor(&args);
+        (run.status.code(), text(&run), out)
+    };
+    for versions in [&[] as &[&str], &["--for", "all"], &["--for", "4.57", "--for", "5.23"]] {
+        let (code, said, out) = run("refused", versions);
+        assert_eq!(code, Some(2), "{versions:?}\n{said}");
+        let answers = said.contains("--set scale=fold") && said.contains("--set scale=keep") && said.contains("--for");
+        assert!(answers && !out.exists(), "{versions:?}\n{said}");
+    }
+    let projector = |out: &Path| tensors(out).remove("multi_modal_projector.linear.weight").unwrap();
+    let made = |name: &str, more: &[&str]| {
+        let (code, said, out) = run(name, more);
+        assert_eq!(code, Some(0), "{more:?}\n{said}");
+        projector(&out)
+    };
+    let (fold, keep) = (made("fold", &["--set", "scale=fold"]), made("keep", &["--set", "scale=keep"]));
+    assert_ne!(fold, keep);
+    assert_eq!(made("four", &["--for", "4.47,4.57"]), fold);
+    assert_eq!(made("five", &["--for", "transformers==5.23.0"]), keep);
 }
 
 /// A recipe that copies one tensor of the language donor into a smaller class, with more keys for its entry.

@@ -11,6 +11,7 @@ use ckpt_doctor::checkpoint::{
     Checkpoint, Document, EntryKind, FaultKind, OpenError, Shard, find_checkpoints, is_plain_file_name, open_regular,
 };
 use ckpt_doctor::checkpoint::{Parts, escape};
+use ckpt_doctor::knowledge::directories::Directories;
 use serde_json::json;
 use tempfile::TempDir;
 
@@ -208,8 +209,8 @@ fn checkpoints_are_found_below_a_folder_and_around_a_file() {
         fs::write(root.join(path), "{}").unwrap();
     }
     symlink(root, root.join("d/loop")).unwrap();
-    let found = |path: &Path| find_checkpoints(path).checkpoints;
-    assert_eq!(found(root), [root.join("a"), root.join("b/c")]);
+    let found = |path: &Path| find_checkpoints(path, &|_| None).checkpoints;
+    assert_eq!(found(root), [root.join("a"), root.join("b/c"), root.join("b/c/onnx")]);
     assert_eq!(found(&root.join("a/config.json")), [root.join("a")]);
     // The nearest checkpoint above, in the same work tree; a file in another folder belongs to none.
     assert_eq!(found(&root.join("b/c/onnx/config.json")), [root.join("b/c/onnx")]);
@@ -246,8 +247,9 @@ fn weights_that_are_not_read_are_named() {
         fs::create_dir_all(root.join(path).parent().unwrap()).unwrap();
         fs::write(root.join(path), "{}").unwrap();
     }
-    let found = find_checkpoints(root);
-    assert_eq!(found.checkpoints, [root.join("checkpoint")]);
+    let kinds = Directories::embedded().unwrap();
+    let found = find_checkpoints(root, &|names| kinds.recognise(names));
+    assert_eq!(found.checkpoints, [root.join("checkpoint"), root.join("fsdp"), root.join("zero/global_step500")]);
     let foreign: Vec<_> = found.foreign.iter().map(|(format, files)| (*format, &*files.first, files.count)).collect();
     assert_eq!(
         foreign,
@@ -256,14 +258,68 @@ fn weights_that_are_not_read_are_named() {
             ("GGUF", &root.join("gguf/a.gguf"), 2),
             ("ONNX", &root.join("model.onnx"), 1),
             ("TensorFlow HDF5", &root.join("tf_model.h5"), 1),
-            ("a DeepSpeed checkpoint", &root.join("zero/global_step500"), 1),
             ("a PyTorch pickle", &root.join("old/consolidated.00.pth"), 2),
-            ("a part of an FSDP checkpoint", &root.join("fsdp/__0_0.distcp"), 1),
         ]
     );
     // A file stands for the checkpoint around it.
-    assert!(find_checkpoints(&root.join("checkpoint/model.onnx")).foreign.is_empty());
-    assert_eq!(find_checkpoints(&root.join("gguf/b.gguf")).foreign["GGUF"].first, root.join("gguf/b.gguf"));
+    assert!(find_checkpoints(&root.join("checkpoint/model.onnx"), &|_| None).foreign.is_empty());
+    assert_eq!(find_checkpoints(&root.join("gguf/b.gguf"), &|_| None).foreign["GGUF"].first, root.join("gguf/b.gguf"));
+}
+
+/// The folders of a checkpoint are searched: one with weights at any depth, one with a config alone as a direct folder. Those that
+/// belong to a kind of directory are not, nor links and hidden folders.
+#[test]
+fn checkpoints_inside_of_a_checkpoint_are_found() {
+    let dir = TempDir::new().unwrap();
+    let root = dir.path();
+    let files = [
+        "config.json",
+        "checkpoint-500/model.safetensors",
+        "checkpoint-500/latest",
+        "checkpoint-500/global_step500/config.json",
+        "text_encoder/config.json",
+        "deep/er/config.json",
+        "deep/er/est/adapter_config.json",
+        ".cache/config.json",
+    ];
+    for path in files {
+        fs::create_dir_all(root.join(path).parent().unwrap()).unwrap();
+        fs::write(root.join(path), "{}").unwrap();
+    }
+    symlink(root.join("checkpoint-500"), root.join("last")).unwrap();
+    let kinds = Directories::embedded().unwrap();
+    let found = find_checkpoints(root, &|names| kinds.recognise(names)).checkpoints;
+    let inside = ["checkpoint-500", "deep/er/est", "text_encoder"].map(|path| root.join(path));
+    assert_eq!(found, [[root.to_owned()].as_slice(), &inside].concat());
+}
+
+/// Of the folders only names are read, to a depth of three, and the documents that say how parts belong together.
+#[test]
+fn names_below_folders_are_read() {
+    let dir = TempDir::new().unwrap();
+    let root = dir.path();
+    let files = [
+        "assets/a/b/norm_stats.json",
+        "assets/a/b/c/norm_stats.json",
+        "unet/config.json",
+        "unet/.hidden",
+        "model_index.json",
+    ];
+    for path in files {
+        fs::create_dir_all(root.join(path).parent().unwrap()).unwrap();
+        fs::write(root.join(path), "{}").unwrap();
+    }
+    symlink(root.join("unet"), root.join("link")).unwrap();
+    let checkpoint = Checkpoint::open(root).unwrap();
+    let names: Vec<&str> = checkpoint.nested.names.iter().map(String::as_str).collect();
+    assert_eq!(
+        names,
+        ["assets/", "assets/a/", "assets/a/b/", "assets/a/b/norm_stats.json", "unet/", "unet/config.json"]
+    );
+    let documents: Vec<&str> = checkpoint.nested.documents.keys().map(String::as_str).collect();
+    assert_eq!(documents, ["assets/a/b/norm_stats.json", "unet/config.json"]);
+    let all: Vec<String> = checkpoint.names().map(String::from).collect();
+    assert!(all.iter().any(|name| name == "link/") && all.iter().any(|name| name == "model_index.json"), "{all:?}");
 }
 
 #[test]

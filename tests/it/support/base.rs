@@ -16,7 +16,7 @@ use super::{cases, project};
 
 /// Names of all bases.
 ///
-/// `llama`, `paligemma` and `qwen2-vl` are documents in `fixtures/bases` with generated weights; `spatialvla` is the donor without
+/// `llama`, `paligemma`, `qwen2-vl` to `idefics3` are documents in `fixtures/bases` with generated weights; `spatialvla` is the donor without
 /// the data set whose statistics contain three `Infinity`; the merged ones are built from the donors; `llama-gptq` is
 /// the sound case of that name; `lora` is an adapter of `llama`.
 pub const BASES: &[&str] = &[
@@ -26,6 +26,12 @@ pub const BASES: &[&str] = &[
     "lora",
     "paligemma",
     "qwen2-vl",
+    "qwen2.5-vl",
+    "llava",
+    "llava-onevision",
+    "gemma3",
+    "internvl",
+    "idefics3",
     "spatialvla",
     "llava3d",
     "merged",
@@ -45,7 +51,7 @@ pub fn make_all(root: &Path, names: &[&'static str], knowledge: &Knowledge) -> B
         .collect()
 }
 
-/// Builds one base.
+/// Builds one base, an `empty` directory, or the documents of another folder in `fixtures/bases` with their weights.
 pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
     match name {
         "llama" => documents(&folder("llama"), dir, 1, knowledge),
@@ -71,7 +77,8 @@ pub fn make(name: &str, dir: &Path, knowledge: &Knowledge) {
         "merged-wrapped" => {
             merge(dir, &[("layout", "wrapped"), ("spatial", "off"), ("zoe", "off")], knowledge);
         }
-        other => panic!("no base {other}"),
+        "empty" => fs::create_dir_all(dir).expect("a directory"),
+        other => documents(&folder(other), dir, 1, knowledge),
     }
 }
 
@@ -142,6 +149,7 @@ fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {
             .map(|(role, dir)| (role.to_owned(), donors.join(dir)))
             .into(),
         options: options.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
+        versions: Vec::new(),
         out: out.to_owned(),
         dry_run: false,
         hash: false,

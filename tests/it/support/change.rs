@@ -9,6 +9,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::base;
+use super::pickle::StateDict;
 use super::weights::{Shard, Tensor, Weights, join, split};
 
 /// One change. Changes of tensors keep shards and index consistent; changes of headers and bytes do not.
@@ -74,6 +75,29 @@ pub enum Change {
     Pack { ending: String, into: Vec<(String, String, Vec<String>)> },
     /// Writes a shard with these tensors that is not in the index.
     Shard { file: String, tensors: Vec<(String, Vec<u64>)> },
+
+    /// Replaces a shard by a pickle of its tensors, as `torch.save` writes it.
+    Pickle {
+        /// The shard; `model.safetensors` when missing.
+        #[serde(default)]
+        from: Option<String>,
+        file: String,
+        /// In the format before torch 1.6.
+        #[serde(default)]
+        legacy: bool,
+        /// The key under which the tensors are.
+        #[serde(default)]
+        under: Option<String>,
+        /// Module and name of a function that the pickle calls.
+        #[serde(default)]
+        calls: Option<(String, String)>,
+        /// Numbers of storages that are missing.
+        #[serde(default)]
+        lost: Vec<usize>,
+        /// Numbers of storages that lack their last eight bytes.
+        #[serde(default)]
+        shortened: Vec<usize>,
+    },
 
     /// Sets a value in a shard's header.
     Header { file: String, at: String, to: Value },
@@ -190,6 +214,21 @@ fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
         | Change::HeaderPrepend { .. }
         | Change::Data { .. }
         | Change::HeaderLength { .. } => header(change, dir),
+        Change::Pickle { from, file, legacy, under, calls, lost, shortened } => {
+            let mut state = StateDict {
+                under: under.clone(),
+                calls: calls.clone(),
+                lost: lost.clone(),
+                shortened: shortened.clone(),
+                ..StateDict::default()
+            };
+            let from = from.as_deref().unwrap_or("model.safetensors");
+            for tensor in Weights::read(dir).shards.into_iter().filter(|s| s.file == from).flat_map(|s| s.tensors) {
+                state.add(&tensor.name, &tensor.dtype, &tensor.shape, tensor.bytes);
+            }
+            fs::remove_file(at(from))?;
+            fs::write(at(file), if *legacy { state.legacy() } else { state.zip() })
+        }
         Change::AddTensor { .. }
         | Change::DropTensors(_)
         | Change::RenameTensors { .. }

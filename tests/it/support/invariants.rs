@@ -16,6 +16,8 @@ pub mod documents;
 pub mod header;
 #[path = "invariants/module.rs"]
 pub mod module;
+#[path = "invariants/pickle.rs"]
+pub mod pickle;
 
 use ckpt_doctor::checkpoint::{Fault, FaultKind, FaultSource};
 

@@ -1,0 +1,109 @@
+//! Chat templates: their syntax, the token that ends a turn, and the begin-of-sequence token that they write.
+//!
+//! A template is parsed and rendered as `apply_chat_template` of transformers does it, in a sandbox: it opens nothing, and
+//! [`render`] bounds its steps, memory and output. An error of rendering proves nothing, because templates refuse
+//! conversations on purpose, and the engine lacks parts of Jinja2.
+
+use serde_json::Value;
+
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
+
+mod render;
+mod tame;
+
+use render::{Rendered, Rendering};
+
+/// Templates of one checkpoint that are read; published ones have at most three.
+const MAX_TEMPLATES: usize = 16;
+
+/// Characters of a token or message that a finding shows.
+const CAP: usize = 80;
+
+/// A chat template, and its place.
+struct Template<'c> {
+    text: &'c str,
+    place: Place,
+}
+
+/// The templates of a checkpoint: `chat_template.jinja`, and the key of the JSON documents, which may hold a list of named
+/// templates. Source: `apply_chat_template` of tokenizers and processors in transformers 4.47.0 to 5.23.0.
+fn templates(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
+    let mut found: Vec<Template<'_>> =
+        checkpoint.texts.iter().map(|(name, text)| Template { text, place: Place::file(name.as_str()) }).collect();
+    for name in ["tokenizer_config.json", "chat_template.json", "processor_config.json"] {
+        let Some(value) = checkpoint.document(name).and_then(|document| document.get("/chat_template")) else {
+            continue;
+        };
+        let at = |pointer: String| Place::file(name).pointer(pointer);
+        if let Some(text) = value.as_str() {
+            found.push(Template { text, place: at("/chat_template".to_owned()) });
+        }
+        for (i, item) in value.as_array().into_iter().flatten().enumerate().take(MAX_TEMPLATES) {
+            let text = item.get("template").and_then(Value::as_str);
+            let place = || at(format!("/chat_template/{i}/template"));
+            found.extend(text.map(|text| Template { text, place: place() }));
+        }
+    }
+    found.truncate(MAX_TEMPLATES);
+    found
+}
+
+/// Faults of chat templates. Called by the engine for each checkpoint.
+pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
+    let special: Vec<(&str, &str)> =
+        checkpoint.tokenizer.special_tokens.iter().map(|(name, token)| (name.as_str(), token.as_str())).collect();
+    let mut faults = Vec::new();
+    for Template { text, place } in templates(checkpoint) {
+        match Rendering::of(text, &special) {
+            Rendering::Invalid { line, reason } => {
+                let fault = Fault::new(FaultKind::TemplateSyntax).at(place);
+                faults.push(fault.with("line", line).with("reason", escape(&reason, CAP)));
+            }
+            Rendering::Done(rendered) => {
+                faults.extend(end_of_turn(checkpoint, &rendered, place.clone()));
+                faults.extend(second_begin(checkpoint, &rendered, place));
+            }
+            Rendering::Unknown => {}
+        }
+    }
+    faults
+}
+
+/// The fault of a template that ends turns with a token at which generation does not stop.
+fn end_of_turn(checkpoint: &Checkpoint, rendered: &Rendered, place: Place) -> Option<Fault> {
+    let tokenizer = &checkpoint.tokenizer;
+    let rest = rendered.after_assistant.trim_start();
+    let added = tokenizer.added().iter().filter(|(token, _)| rest.starts_with(token.as_str()));
+    let (token, id) = added.filter(|(token, _)| !token.is_empty()).max_by_key(|(token, _)| token.len())?;
+    let eos = |file: &'static str| {
+        let value = checkpoint.document(file)?.get("/eos_token_id").filter(|value| !value.is_null())?;
+        Some((file, ids(value)?))
+    };
+    let (file, ids) = eos("generation_config.json").or_else(|| eos("config.json"))?;
+    // GEN002 compares the id of the tokenizer's end-of-sequence token.
+    let of_tokenizer = tokenizer.special_tokens.iter().find(|(name, _)| name == "eos_token");
+    let agrees = of_tokenizer.is_none_or(|(_, eos)| tokenizer.id_of(eos).is_none_or(|id| ids.contains(&id)));
+    if ids.contains(id) || !agrees {
+        return None;
+    }
+    let fault = Fault::new(FaultKind::TurnEndsElsewhere).at(place).at(Place::file(file).pointer("/eos_token_id"));
+    Some(fault.with("token", escape(token, CAP)).with("id", *id).with("of", file).with("ids", ids))
+}
+
+/// The ids of `eos_token_id`: one number, or a list.
+fn ids(value: &Value) -> Option<Vec<u64>> {
+    match value {
+        Value::Array(list) => list.iter().map(Value::as_u64).collect(),
+        one => Some(vec![one.as_u64()?]),
+    }
+}
+
+/// The fault of a template that writes the begin-of-sequence token, which the tokenizer adds too.
+fn second_begin(checkpoint: &Checkpoint, rendered: &Rendered, place: Place) -> Option<Fault> {
+    let tokenizer = &checkpoint.tokenizer;
+    let (_, token) = tokenizer.special_tokens.iter().find(|(name, _)| name == "bos_token")?;
+    if token.is_empty() || !rendered.text.starts_with(token.as_str()) || !tokenizer.adds_bos(checkpoint) {
+        return None;
+    }
+    Some(Fault::new(FaultKind::BeginTwice).at(place).with("token", escape(token, CAP)))
+}

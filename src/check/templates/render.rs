@@ -1,0 +1,149 @@
+//! Renders a chat template in a sandbox with bounded work.
+
+use minijinja::syntax::SyntaxConfig;
+use minijinja::value::Rest;
+use minijinja::{Environment, Error, ErrorKind, State, Value, context};
+use minijinja_contrib::pycompat;
+use regex::Regex;
+use std::sync::LazyLock;
+
+use super::tame::is_tame;
+
+/// Longest template that is parsed, in bytes: the parser counts columns in 16 bits. Those of published models have at most
+/// some 30 000.
+const MAX_TEXT: usize = 60_000;
+
+/// Work that one rendering may do: instructions, or 64 bytes of data each. Real templates take a few thousand.
+const FUEL: u64 = 60_000;
+
+/// Longest string that a method of Python is applied to: the engine charges for their results only when they exist.
+const MAX_STRING: usize = 64 << 10;
+
+/// Depth of calls and loops.
+const MAX_DEPTH: usize = 60;
+
+/// What the messages say, so that their places in the text are known.
+const USER: &str = "qhGxUser1wVk";
+const ASSISTANT: &str = "qhGxAssistant2wVk";
+
+/// Reasons of the parser for templates that Jinja2 takes: statements that need a loader of templates, letters outside ASCII
+/// in names, tuples without parentheses, signs without a number, empty subscripts; and its own limits. Of 1 500 mutated
+/// templates, it and Jinja2 differed in these alone.
+const LIMITS: [&str; 12] = [
+    "unknown statement include",
+    "unknown statement import",
+    "unknown statement from",
+    "unknown statement extends",
+    "unknown statement block",
+    "unexpected character",
+    "unexpected end of comment",
+    "unexpected `,`, expected end of variable block",
+    "unexpected `+`",
+    "unexpected `]`",
+    "recursion",
+    "too many",
+];
+
+/// Tags of transformers' own extension, which mark the text of the assistant for training.
+static GENERATION: LazyLock<Option<Regex>> =
+    LazyLock::new(|| Regex::new(r"\{%([-+]?)\s*(end)?generation\s*([-+]?)%\}").ok());
+
+/// What became of a template.
+pub(super) enum Rendering {
+    /// It is not Jinja; the line, and the reason.
+    Invalid { line: usize, reason: String },
+    /// Text of a short conversation.
+    Done(Rendered),
+    /// It failed, or took too long.
+    Unknown,
+}
+
+/// A user's question and the assistant's answer as text.
+pub(super) struct Rendered {
+    /// All of it.
+    pub(super) text: String,
+    /// What follows the answer.
+    pub(super) after_assistant: String,
+}
+
+impl Rendering {
+    /// Renders a template for one turn of each side, with these special tokens.
+    pub(super) fn of(text: &str, special: &[(&str, &str)]) -> Self {
+        if text.len() > MAX_TEXT || !is_tame(text) {
+            return Self::Unknown;
+        }
+        let plain = without_generation(text);
+        let Some(environment) = environment() else { return Self::Unknown };
+        let template = match environment.template_from_str(&plain) {
+            Ok(template) => template,
+            Err(error) => return Self::of_error(&error),
+        };
+        // Templates of vision-language models may take a list of parts.
+        let parts = |text: &str| Value::from(vec![context! { type => "text", text => text }]);
+        let words = |text: &str| Value::from(text);
+        let contents: [&dyn Fn(&str) -> Value; 2] = [&words, &parts];
+        let rendered = contents.into_iter().find_map(|content| {
+            let text = template.render(variables(content, special)).ok()?;
+            let (_, after) = text.split_once(ASSISTANT).filter(|(before, _)| before.contains(USER))?;
+            Some(Rendered { after_assistant: after.to_owned(), text })
+        });
+        rendered.map_or(Self::Unknown, Self::Done)
+    }
+
+    fn of_error(error: &Error) -> Self {
+        let reason = error.detail().unwrap_or_default();
+        if error.kind() != ErrorKind::SyntaxError || LIMITS.iter().any(|limit| reason.contains(limit)) {
+            return Self::Unknown;
+        }
+        Self::Invalid { line: error.line().unwrap_or(1), reason: reason.to_owned() }
+    }
+}
+
+/// The variables that `apply_chat_template` passes.
+fn variables(content: &dyn Fn(&str) -> Value, special: &[(&str, &str)]) -> Value {
+    let message = |role: &str, text: &str| context! { role => role, content => content(text) };
+    let messages = vec![message("user", USER), message("assistant", ASSISTANT)];
+    let fixed = context! { messages => messages, add_generation_prompt => false };
+    let tokens = Value::from_pairs(special.iter().map(|(name, token)| (Value::from(*name), Value::from(*token))));
+    context! { ..fixed, ..tokens }
+}
+
+/// The environment of transformers: blocks take their lines with them, and break and continue are known.
+fn environment() -> Option<Environment<'static>> {
+    let mut environment = Environment::new();
+    environment.set_syntax(SyntaxConfig::builder().trim_blocks(true).lstrip_blocks(true).build().ok()?);
+    environment.set_fuel(Some(FUEL));
+    environment.set_recursion_limit(MAX_DEPTH);
+    environment.set_auto_escape_callback(|_| minijinja::AutoEscape::None);
+    environment.set_unknown_method_callback(method);
+    environment.add_function("raise_exception", |_: Rest<Value>| -> Result<Value, Error> {
+        Err(Error::new(ErrorKind::InvalidOperation, "raised by the template"))
+    });
+    environment.add_function("strftime_now", |_: Rest<Value>| "01 Jan 2026");
+    Some(environment)
+}
+
+/// Methods of Python's strings and dicts. Those that multiply their input are filters of the engine, which bounds them.
+fn method(state: &mut State<'_, '_>, value: &Value, name: &str, args: &[Value]) -> Result<Value, Error> {
+    let is_long = |value: &Value| value.as_str().is_some_and(|text| text.len() > MAX_STRING);
+    if is_long(value) || args.iter().any(is_long) {
+        return Err(ErrorKind::OutOfFuel.into());
+    }
+    match (name, args) {
+        ("replace", [from, to]) => state.apply_filter("replace", &[value.clone(), from.clone(), to.clone()]),
+        ("join", [list]) => state.apply_filter("join", &[list.clone(), value.clone()]),
+        ("replace" | "join" | "format", _) => Err(ErrorKind::UnknownMethod.into()),
+        _ => pycompat::unknown_method_callback(state, value, name, args),
+    }
+}
+
+/// The template with `generation` tags as conditions that hold.
+fn without_generation(text: &str) -> String {
+    let Some(tags) = GENERATION.as_ref() else { return text.to_owned() };
+    let tag = |found: &regex::Captures<'_>| {
+        let part = |i: usize| found.get(i).map_or("", |m| m.as_str());
+        let word = if part(2).is_empty() { "if true" } else { "endif" };
+        format!("{{%{} {word} {}%}}", part(1), part(3))
+    };
+    tags.replace_all(text, tag).into_owned()
+}

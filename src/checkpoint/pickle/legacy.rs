@@ -1,0 +1,113 @@
+//! Files that `torch.save` wrote before 1.6: pickles of a magic number, a version, sizes of the system, the state dict and
+//! the keys of the storages; then for each storage its number of elements and its bytes.
+//!
+//! Source: `_legacy_load` in `torch/serialization.py` of torch 2.15.0.
+
+use super::machine::{Machine, Stop, StorageIds};
+use super::source::Source;
+use super::storage::{Storages, Stored, claimed};
+use super::value::Value;
+use super::{PICKLE_CAP, PickleReader, Problem, state_dict};
+
+/// The pickle of the magic number.
+pub(super) const MAGIC: [u8; 15] = *b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19\x2e";
+/// The version of the format.
+const VERSION: Value = Value::Int(1001);
+
+/// The error of a machine that stopped at `offset`. `longer` is whether the file has more bytes than were given to it;
+/// `None` for a member of an archive, which is whole.
+pub(super) fn problem(stop: Stop, offset: u64, longer: Option<bool>) -> Problem {
+    match (stop, longer) {
+        (Stop::TooLarge(what), _) => Problem::TooLarge(what),
+        (Stop::Broken(reason), _) => Problem::Malformed(reason.to_owned(), offset),
+        (Stop::End, Some(true)) => Problem::TooLarge("bytes"),
+        (Stop::End, Some(false)) => Problem::Cut("the pickle".to_owned(), None),
+        (Stop::End, None) => Problem::Malformed("the pickle ends early".to_owned(), offset),
+    }
+}
+
+/// Reads a file of this format into the reader's shard.
+pub(super) fn read(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result<(), Problem> {
+    let bytes = source.bytes(0, source.len().min(PICKLE_CAP))?;
+    let longer = Some(source.len() > PICKLE_CAP);
+    let mut machine = Machine::new(&bytes, StorageIds::None);
+    machine.at = MAGIC.len();
+    let result = pickles(&mut machine);
+    reader.record(&machine);
+    reader.budget.spend(u64::try_from(machine.at).unwrap_or(u64::MAX));
+    let (value, keys) = result.map_err(|stop| problem(stop, machine.offset, longer))?;
+    if let Some(doubt) = machine.doubt.take() {
+        // The storages lie one after another, and the length of one is unknown.
+        reader.pickle.doubt = Some(doubt);
+        return Ok(());
+    }
+    let storages = storages(reader, source, &machine, keys)?;
+    state_dict::read(reader, &mut machine, value, &storages)
+}
+
+/// Reads a pickle of another program for what it imports. Returns whether it is a pickle to its end.
+pub(super) fn read_plain(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result<bool, Problem> {
+    let bytes = source.bytes(0, source.len().min(PICKLE_CAP))?;
+    let mut machine = Machine::new(&bytes, StorageIds::None);
+    let is_whole = machine.run().is_ok();
+    reader.record(&machine);
+    reader.budget.spend(u64::try_from(machine.at).unwrap_or(u64::MAX));
+    Ok(is_whole)
+}
+
+/// The state dict and the list of keys.
+fn pickles(machine: &mut Machine<'_>) -> Result<(Value, Value), Stop> {
+    if machine.run()? != VERSION {
+        return Err(Stop::Broken("the version of the format is not 1001"));
+    }
+    machine.run()?;
+    machine.ids = StorageIds::Legacy;
+    let value = machine.run()?;
+    machine.ids = StorageIds::None;
+    Ok((value, machine.run()?))
+}
+
+/// Finds the storages behind the pickles.
+fn storages(
+    reader: &mut PickleReader<'_>,
+    source: &dyn Source,
+    machine: &Machine<'_>,
+    keys: Value,
+) -> Result<Storages, Problem> {
+    let malformed = |reason: &str| Problem::Malformed(reason.to_owned(), machine.offset);
+    let keys = match keys {
+        Value::List(id) => machine.heap.list(id),
+        _ => return Err(malformed("the keys of the storages are no list")),
+    };
+    let mut claimed = claimed(machine)?;
+    let widths: std::collections::HashMap<&str, u64> =
+        machine.heap.storages.iter().rev().map(|s| (machine.text(s.key), s.element.width)).collect();
+    let mut storages = Storages::default();
+    let mut at = u64::try_from(machine.at).unwrap_or(u64::MAX);
+    let mut sizes = Vec::with_capacity(keys.len());
+    for key in keys {
+        let Value::Text(key) = key else { return Err(malformed("the key of a storage is no string")) };
+        let key = machine.text(*key);
+        let bytes = claimed.remove(key).ok_or_else(|| malformed("the file has a storage that no tensor uses"))?;
+        sizes.push((key, bytes));
+    }
+    let needed = sizes.iter().fold(at, |sum, (_, bytes)| sum.saturating_add(8).saturating_add(*bytes));
+    if needed > source.len() {
+        return Err(Problem::Cut("the storages".to_owned(), Some(needed.saturating_sub(source.len()))));
+    }
+    for (key, bytes) in sizes {
+        let stated = u64::from_le_bytes(source.array(at)?);
+        let width = widths.get(key).copied().unwrap_or(1);
+        at = at.saturating_add(8);
+        if stated.checked_mul(width) != Some(bytes) {
+            reader.storage_fault(key, None, bytes, stated.checked_mul(width));
+            return Ok(storages);
+        }
+        storages.by_key.insert(key.to_owned(), Stored { begin: at, bytes });
+        at = at.saturating_add(bytes);
+    }
+    for (key, bytes) in claimed {
+        reader.storage_fault(&key, None, bytes, None);
+    }
+    Ok(storages)
+}

@@ -1,0 +1,237 @@
+"""Compares the reader of pickles with torch.load(weights_only=True): random state dicts in both formats of torch.save, and
+mutated files.
+
+For a file that torch opens: names, dtypes, shapes, strides, offsets and digests of the bytes. For a mutated file: what the
+reader calls whole, torch opens, with the same tensors.
+
+    cargo build --example read_pickles
+    python tests/peer/pickles.py target/debug/examples/read_pickles [--dicts 300] [--mutations 3000] [--seed 1]
+"""
+
+import argparse
+import collections
+import hashlib
+import io
+import json
+import pathlib
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+
+import torch
+
+warnings.filterwarnings("ignore")
+
+DTYPES = {
+    torch.float64: "F64", torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.int64: "I64",
+    torch.int32: "I32", torch.int16: "I16", torch.int8: "I8", torch.uint8: "U8", torch.bool: "BOOL", torch.complex64: "C64",
+    torch.uint16: "U16", torch.uint32: "U32", torch.uint64: "U64", torch.float8_e4m3fn: "F8_E4M3", torch.float8_e5m2: "F8_E5M2",
+    torch.float8_e4m3fnuz: "F8_E4M3FNUZ", torch.float8_e5m2fnuz: "F8_E5M2FNUZ", torch.float8_e8m0fnu: "F8_E8M0",
+}  # fmt: skip
+
+
+def fresh(rng, dtype):
+    """A contiguous tensor of random bytes."""
+    shape = [rng.choice([0, 1, 2, 3, 5, 8]) if rng.random() < 0.2 else rng.randint(1, 6) for _ in range(rng.randint(0, 4))]
+    count = 1
+    for size in shape:
+        count *= size
+    width = torch.empty((), dtype=dtype).element_size()
+    data = bytearray(rng.randbytes(count * width) or b"")
+    if dtype == torch.bool:
+        data = bytearray(b & 1 for b in data)
+    return torch.frombuffer(data, dtype=torch.uint8).view(dtype).reshape(shape) if count else torch.empty(shape, dtype=dtype)
+
+
+def view(rng, tensor):
+    """A view of the storage of a tensor."""
+    kind = rng.choice(["transpose", "slice", "expand", "same", "step", "flat"])
+    if kind == "transpose" and tensor.dim() > 1:
+        return tensor.transpose(rng.randrange(tensor.dim()), rng.randrange(tensor.dim()))
+    if kind == "slice" and tensor.dim() and tensor.shape[0] > 1:
+        return tensor[rng.randrange(tensor.shape[0]):]
+    if kind == "step" and tensor.dim() and tensor.shape[-1] > 2:
+        return tensor[..., ::2]
+    if kind == "expand":
+        return tensor.unsqueeze(0).expand(rng.randint(1, 3), *tensor.shape)
+    if kind == "flat" and tensor.is_contiguous():
+        return tensor.reshape(-1)
+    return tensor
+
+
+# torch saves the others in the old format, and cannot open them.
+OLD = [dtype for dtype, name in DTYPES.items() if not name.startswith(("F8", "U")) or name == "U8"]
+
+
+# torch saves parameters of other floats that require a gradient, and cannot open them.
+PLAIN_FLOATS = [torch.float64, torch.float32, torch.float16, torch.bfloat16]
+
+
+def state_dict(rng, dtypes):
+    """A dict of tensors, some of which share storages, and whether the reader can read all of it."""
+    state = rng.choice([dict, collections.OrderedDict])()
+    plain = True
+    for n in range(rng.randint(1, 12)):
+        name = f"model.layers.{n}.{rng.choice(['weight', 'bias', 'ü', 'a b'])}"
+        tensors = [v for v in state.values() if isinstance(v, torch.Tensor) and v.layout == torch.strided]
+        if tensors and rng.random() < 0.4:
+            tensor = view(rng, rng.choice(tensors))
+        else:
+            tensor = fresh(rng, rng.choice(dtypes))
+        if rng.random() < 0.15:
+            tensor = torch.nn.Parameter(tensor, requires_grad=rng.random() < 0.5 and tensor.dtype in PLAIN_FLOATS)
+        state[name] = tensor
+    odd = rng.random()
+    if odd < 0.04:
+        state["sparse"], plain = torch.eye(4).to_sparse(), False
+    elif odd < 0.08:
+        state["quantised"], plain = torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8), False
+    elif odd < 0.12:
+        state["complex128"], plain = torch.ones(2, dtype=torch.complex128), False
+    elif odd < 0.2:
+        state["epoch"] = rng.choice([3, 1.5, "text", None, [1, 2], {"a": 1}, (1, 2)])
+    if rng.random() < 0.3 and isinstance(state, collections.OrderedDict):
+        state._metadata = collections.OrderedDict({"": {"version": 1}})
+    return state, plain
+
+
+def saved(state, legacy):
+    file = io.BytesIO()
+    torch.save(state, file, _use_new_zipfile_serialization=not legacy)
+    return file.getvalue()
+
+
+def opened(data):
+    """What torch reads: the tensors, or None and the exception."""
+    try:
+        value = torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")
+    except Exception as error:  # whatever torch raises
+        return None, f"{type(error).__name__}: {str(error)[:200]}"
+    return value, None
+
+
+def expected(value):
+    """By name: dtype, shape, whether it is contiguous, and the digest of its bytes if it is."""
+    out = {}
+    for name, tensor in value.items():
+        if not isinstance(tensor, torch.Tensor):
+            continue
+        tensor = tensor.detach()
+        digest = None
+        if tensor.is_contiguous():
+            storage = torch.empty(0, dtype=torch.uint8).set_(tensor.untyped_storage()).numpy().tobytes()
+            begin = tensor.storage_offset() * tensor.element_size()
+            data = storage[begin: begin + tensor.numel() * tensor.element_size()]
+            digest = hashlib.sha256(data).hexdigest()
+        out[name] = [DTYPES[tensor.dtype], list(tensor.shape), digest]
+    return out
+
+
+def read(dump, folder, files):
+    """What the reader says of each file: whole, or the faults; tensors with their digests."""
+    for name, data in files:
+        (folder / name).mkdir()
+        (folder / name / "pytorch_model.bin").write_bytes(data)
+    text = subprocess.run([dump, str(folder)], check=True, capture_output=True, text=True).stdout
+    for name, _ in files:
+        shutil.rmtree(folder / name)
+    return {line["file"]: line for line in map(json.loads, text.splitlines())}
+
+
+def mutated(rng, data):
+    """The same bytes with a few changes, most of them in the pickle."""
+    data = bytearray(data)
+    at = data.find(b"\x80\x02}")
+    at = at if at >= 0 else data.find(b"ccollections")
+    limit = min(len(data), max(at, 0) + 1500)
+    for _ in range(rng.randint(1, 3)):
+        kind = rng.random()
+        if not data:
+            break
+        place = rng.randrange(max(at, 0), max(limit, 1)) if rng.random() < 0.7 else rng.randrange(len(data))
+        place = min(place, len(data) - 1)
+        if kind < 0.6:
+            data[place] = rng.randrange(256)
+        elif kind < 0.7:
+            data[place] ^= 1 << rng.randrange(8)
+        elif kind < 0.8:
+            del data[place: place + rng.randint(1, 4)]
+        elif kind < 0.9:
+            data[place:place] = rng.randbytes(rng.randint(1, 3))
+        else:
+            del data[place:]
+    return bytes(data)
+
+
+def compare(name, data, found, plain):
+    """The differences for one sound file."""
+    value, error = opened(data)
+    if error:
+        return [f"{name}: torch raises: {error}"]
+    if not plain:
+        return [] if not found["whole"] and found["doubt"] else [f"{name}: no word about a tensor that is not plain: {found}"]
+    if not found["whole"]:
+        return [f"{name}: torch opens it, the reader says {found['faults']} {found['doubt']}"]
+    want, have = expected(value), found["tensors"]
+    return [f"{name}: {key}: torch {want.get(key)}, reader {have.get(key)}" for key in {*want, *have} if want.get(key) != have.get(key)]
+
+
+def compare_mutated(name, data, found):
+    """The differences for one mutated file: only what is called whole is compared."""
+    if not found["whole"]:
+        return []
+    value, error = opened(data)
+    if error:
+        return [f"{name}: called whole, but torch raises: {error}"]
+    if not isinstance(value, dict):
+        return [f"{name}: called whole, but it is {type(value)}"]
+    try:
+        want = expected(value)
+    except KeyError as error:
+        return [f"{name}: called whole, with an unknown dtype {error}"]
+    have = found["tensors"]
+    return [f"{name}: {key}: torch {want.get(key)}, reader {have.get(key)}" for key in {*want, *have} if want.get(key) != have.get(key)]
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("dump")
+    parser.add_argument("--dicts", type=int, default=300)
+    parser.add_argument("--mutations", type=int, default=3000)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    rng = random.Random(args.seed)
+    problems, whole, files = [], 0, []
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        sound = []
+        for n in range(args.dicts):
+            for legacy in (False, True):
+                state, plain = state_dict(rng, OLD if legacy else list(DTYPES))
+                sound.append((f"{n}-{'legacy' if legacy else 'zip'}.bin", saved(state, legacy), plain))
+        read_files = read(args.dump, folder, [(name, data) for name, data, _ in sound])
+        for name, data, plain in sound:
+            problems += compare(name, data, read_files[name], plain)
+        plain_files = [data for _, data, plain in sound if plain]
+        files = [(f"{n}.bin", mutated(rng, rng.choice(plain_files))) for n in range(args.mutations)]
+        for start in range(0, len(files), 500):
+            part = files[start:start + 500]
+            found = read(args.dump, folder, part)
+            whole += sum(found[name]["whole"] for name, _ in part)
+            for name, data in part:
+                differences = compare_mutated(name, data, found[name])
+                if differences:
+                    pathlib.Path(tempfile.gettempdir(), f"pickle-{args.seed}-{name}").write_bytes(data)
+                problems += differences
+    print(f"{len(sound)} state dicts, half in each format; {len(files)} mutated files, {whole} of them whole")
+    for problem in problems[:40]:
+        print(problem)
+    if whole == 0 or len(sound) < 2 * args.dicts:
+        sys.exit("too few files were compared")
+    sys.exit(1 if problems else 0)
+
+
+main()
