@@ -26,6 +26,7 @@ pub mod selection;
 pub mod settings;
 pub mod source;
 pub mod statistics;
+pub mod tokenizer_parts;
 
 pub use architecture::{Architecture, Conversion, Doubt, Expected, ExpectedTensor, Refusal};
 pub use evidence::Evidence;
@@ -51,6 +52,7 @@ use scales::Scales;
 use settings::Policy;
 use source::DataError;
 use statistics::StatisticsPlaces;
+use tokenizer_parts::TokenizerPart;
 
 /// Data used by a check or a merge. The caller loads it once and passes it down.
 pub struct Knowledge {
@@ -86,6 +88,8 @@ pub struct Knowledge {
     pub directories: Directories,
     /// Where policies keep their statistics.
     pub statistics: StatisticsPlaces,
+    /// Parts of tokenizer.json.
+    pub tokenizer_parts: Vec<TokenizerPart>,
     /// Factors of classes on embeddings and image features.
     pub scales: Scales,
     /// Severities and suppressions of a settings file for single findings.
@@ -129,6 +133,7 @@ impl Knowledge {
             token_embedding: TokenEmbedding::embedded()?,
             directories: Directories::embedded()?,
             statistics: StatisticsPlaces::embedded()?,
+            tokenizer_parts: TokenizerPart::embedded()?,
             scales: Scales::embedded()?,
             policy: Policy::default(),
         })

@@ -19,6 +19,8 @@ try:
 except ImportError:  # before 4.52
     video_processing_auto = None
 
+from by_version import keep
+
 FILE = Path(__file__).resolve().parents[1] / "rules" / "classes.json"
 MAJOR = int(transformers.__version__.split(".")[0])
 
@@ -100,17 +102,8 @@ def fixed():
 
 
 def main():
-    known = json.loads(FILE.read_text()) if FILE.exists() else {}
-    version = transformers.__version__
     lists = {part: classes(part) for part in PARTS} | {"fixed": fixed()}
-    if "--check" in sys.argv[1:]:
-        differing = sorted(part for part in lists if known.get(version, {}).get(part) != lists[part])
-        print(f"transformers {version}: {', '.join(f'{len(v)} {k}' for k, v in lists.items())}; differing: {differing or 'none'}")
-        return 1 if differing else 0
-    known[version] = lists
-    FILE.write_text("{\n" + ",\n".join(f" {json.dumps(v)}: {{\n{shown(known[v])}\n }}" for v in sorted(known)) + "\n}\n")
-    print(f"{FILE.name}: classes of transformers {version}")
-    return 0
+    return keep(FILE, transformers.__version__, lists, shown, indent=1)
 
 
 def shown(lists):

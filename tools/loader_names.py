@@ -18,12 +18,12 @@ from transformers.models.auto.image_processing_auto import IMAGE_PROCESSOR_MAPPI
 from transformers.models.auto.processing_auto import PROCESSOR_MAPPING_NAMES
 from transformers.quantizers.auto import AUTO_QUANTIZATION_CONFIG_MAPPING
 
+from by_version import keep
+
 FILE = Path(__file__).resolve().parents[1] / "rules" / "names.json"
 
 
 def main():
-    known = json.loads(FILE.read_text()) if FILE.exists() else {}
-    version = transformers.__version__
     lists = {
         "activations": sorted(ACT2FN),
         "dtypes": sorted(name for name, value in vars(torch).items() if isinstance(value, torch.dtype)),
@@ -34,14 +34,7 @@ def main():
         # `default` has no function of its own in transformers 5, which all the same takes it.
         "rope_types": sorted({*ROPE_INIT_FUNCTIONS, "default"}),
     }
-    if "--check" in sys.argv[1:]:
-        differing = sorted(name for name in lists if known.get(version, {}).get(name) != lists[name])
-        print(f"transformers {version}: {', '.join(f'{len(v)} {k}' for k, v in lists.items())}; differing: {differing or 'none'}")
-        return 1 if differing else 0
-    known[version] = lists
-    FILE.write_text("{\n" + ",\n".join(f"  {json.dumps(v)}: {{\n{listed(known[v])}\n  }}" for v in sorted(known)) + "\n}\n")
-    print(f"{FILE.name}: names of transformers {version}")
-    return 0
+    return keep(FILE, transformers.__version__, lists, listed)
 
 
 def listed(lists):

@@ -15,6 +15,8 @@ from pathlib import Path
 import transformers
 from transformers.models.auto.configuration_auto import CONFIG_MAPPING
 
+from by_version import keep
+
 FILE = Path(__file__).resolve().parents[1] / "rules" / "ropes.json"
 KEYS = ["rope_theta", "rope_scaling", "rope_local_base_freq", "partial_rotary_factor"]
 
@@ -27,16 +29,7 @@ def main():
     classes = {}
     for model_type in sorted(CONFIG_MAPPING.keys()):
         add(classes, model_type, CONFIG_MAPPING[model_type])
-    known = json.loads(FILE.read_text()) if FILE.exists() else {}
-    if "--check" in sys.argv[1:]:
-        differing = sorted(name for name in {*classes, *known.get(version, {})} if known.get(version, {}).get(name) != classes.get(name))
-        print(f"transformers {version}: {len(classes)} classes; differing: {differing or 'none'}")
-        return 1 if differing else 0
-    known[version] = classes
-    blocks = (f"  {json.dumps(v)}: {{\n{rows(known[v])}\n  }}" for v in sorted(known))
-    FILE.write_text("{\n" + ",\n".join(blocks) + "\n}\n")
-    print(f"{FILE.name}: {len(classes)} classes of transformers {version}")
-    return 0
+    return keep(FILE, version, classes, rows)
 
 
 def add(classes, model_type, config_class):

@@ -14,10 +14,14 @@ use crate::knowledge::classes::ClassKind::{
 };
 use crate::knowledge::names::NameKind;
 
-const PREPROCESSOR: &str = "preprocessor_config.json";
-const PROCESSOR: &str = "processor_config.json";
+/// The settings of an image processor or a feature extractor.
+pub(super) const PREPROCESSOR: &str = "preprocessor_config.json";
+/// The settings of a processor, and since transformers 5 of its parts.
+pub(super) const PROCESSOR: &str = "processor_config.json";
+/// The settings of a video processor.
 const VIDEO: &str = "video_preprocessor_config.json";
-const TOKENIZER: &str = "tokenizer_config.json";
+/// The settings of a tokenizer.
+pub(super) const TOKENIZER: &str = "tokenizer_config.json";
 
 /// Names in which transformers 5 saves a tokenizer that has no class of its own.
 const BACKENDS: [&str; 2] = ["TokenizersBackend", "TokenizersBackendFast"];
@@ -76,7 +80,7 @@ fn class_at<'c>(checkpoint: &'c Checkpoint, kind: ClassKind, file: &'static str,
 }
 
 /// Whether `auto_map` in one of the files names code for one of the Auto classes.
-fn has_code(checkpoint: &Checkpoint, files: &[&str], auto: &[&str]) -> bool {
+pub(super) fn has_code(checkpoint: &Checkpoint, files: &[&str], auto: &[&str]) -> bool {
     let maps = files.iter().filter_map(|file| checkpoint.document(file)?.get("/auto_map"));
     maps.into_iter().any(|map| match map {
         Value::Object(map) => auto.iter().any(|name| map.contains_key(*name)),
@@ -124,7 +128,7 @@ fn unknown(checkpoint: &Checkpoint, knowledge: &Knowledge, named: &Named<'_>, as
     let right = right(checkpoint, knowledge, named, model_type)
         .filter(|right| asked.targets.iter().all(|target| !lacks(knowledge, target.version(), kind, right)));
     let fault = right.into_iter().fold(fault, |fault, right| fault.with("right", right));
-    Some(lacking.into_iter().map(|target| target.loader.version()).fold(fault, Fault::under))
+    Some(fault.under_all(lacking.into_iter().map(|target| target.loader.version())))
 }
 
 /// Whether `version` certainly does not open the name. An image processor may be called a feature extractor.

@@ -12,7 +12,7 @@ use super::load::{self, LoadReport, Stored, Target};
 use super::model_type::Asked;
 use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
-use super::verdict::Basis;
+use super::verdict::{Basis, PredictedLoad};
 use super::{
     adapter, class_names, directory, index, inspect, judge, model_type, modules, pickles, policy, processor, programs,
     refusals, robots, ropes, statistics, templates, tokenizer_json, tokens, variables,
@@ -71,13 +71,8 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
     let (versions, programs) = (versions.as_slice(), knowledge.programs.asked(&programs));
-    let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
-    faults.extend(index::faults(checkpoint));
-    faults.extend(modules::faults(checkpoint));
+    let mut faults = faults_of_files(checkpoint, knowledge, &programs);
     faults.extend(adapter::faults(checkpoint, &knowledge.peft, &peft));
-    faults.extend(statistics::faults(checkpoint, &knowledge.statistics));
-    faults.extend(programs::faults(checkpoint, &programs));
-    faults.extend(pickles::faults(checkpoint, knowledge));
     let stored = Stored::of(checkpoint);
     let judged = judge::judge(checkpoint, knowledge, versions, &stored);
     faults.extend(judged.faults.into_iter().map(|fault| with_likely_class(fault, knowledge, &stored)));
@@ -93,7 +88,6 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
     let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
     faults.extend(tokens::faults(checkpoint, rows));
-    faults.extend(templates::faults(checkpoint));
     let of_class = outcome.architecture.as_deref().and_then(|name| knowledge.processor_of(name));
     let leading = load::wanted(config, versions);
     let opened = of_class.and_then(|processor| opened_first(checkpoint, processor, &leading));
@@ -113,15 +107,54 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     directory::recognise(checkpoint, &knowledge.directories, &mut scope, &mut faults);
     let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
     faults.extend(refused);
-    faults.extend(class_names::faults(checkpoint, knowledge, &asked));
-    faults.extend(tokenizer_json::faults(checkpoint, &asked));
-    faults.extend(ropes::faults(checkpoint, knowledge, &context.targets));
-    faults.extend(processor::faults(checkpoint, knowledge, &asked, of_class, &model));
+    faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
     run_rules(knowledge, &context, &faults, &scope, &mut outcome);
     let unselected = knowledge.rules.unselected.iter();
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    outcome.verdicts = verdicts(checkpoint, knowledge, &context, &faults, &outcome, &judged.unpredicted);
+    outcome.findings = bounded(std::mem::take(&mut outcome.findings));
+    policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
+    outcome
+}
+
+/// Faults that do not depend on the class or on versions of transformers.
+fn faults_of_files(checkpoint: &Checkpoint, knowledge: &Knowledge, programs: &[AskedProgram<'_>]) -> Vec<Fault> {
+    let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
+    faults.extend(index::faults(checkpoint));
+    faults.extend(modules::faults(checkpoint));
+    faults.extend(statistics::faults(checkpoint, &knowledge.statistics));
+    faults.extend(programs::faults(checkpoint, programs));
+    faults.extend(pickles::faults(checkpoint, knowledge));
+    faults.extend(templates::faults(checkpoint));
+    faults
+}
+
+/// Faults of files under some versions of transformers. `model` is config.json with the defaults of the class.
+fn faults_of_versions(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    asked: &Asked<'_>,
+    of_class: Option<&Processor>,
+    model: &Value,
+) -> Vec<Fault> {
+    let mut faults = class_names::faults(checkpoint, knowledge, asked);
+    faults.extend(tokenizer_json::faults(checkpoint, &knowledge.tokenizer_parts, asked));
+    faults.extend(ropes::faults(checkpoint, knowledge, asked.targets));
+    faults.extend(processor::faults(checkpoint, knowledge, asked, of_class, model));
+    faults
+}
+
+/// What each loader does with each object, by the findings and the predicted loads.
+fn verdicts(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    context: &Context<'_>,
+    faults: &[Fault],
+    outcome: &Outcome,
+    unpredicted: &[(&'static str, String)],
+) -> Vec<PredictedLoad> {
     // An effect without an object is on the one that reads the file of the fault, which may be any.
     let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects);
     let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
@@ -131,13 +164,10 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
         program: program.and_then(|fault| fault.detail.get("program")?.as_str()),
         findings: &outcome.findings,
         loads: &outcome.loads,
-        unpredicted: &judged.unpredicted,
+        unpredicted,
         unjudged: &unjudged.collect(),
     };
-    outcome.verdicts = basis.verdicts(&context.targets, &programs);
-    outcome.findings = bounded(std::mem::take(&mut outcome.findings));
-    policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
-    outcome
+    basis.verdicts(&context.targets, context.programs)
 }
 
 /// The tokenizer as the processor of the first leading version opens it.

@@ -121,7 +121,7 @@ fn unknown(knowledge: &Knowledge, value: &Value, place: Place, asked: &Asked<'_>
         .similar(NameKind::ModelType, name)
         .into_iter()
         .fold(fault, |fault, similar| fault.with("similar", similar));
-    Some(lacking.into_iter().map(|target| target.loader.version()).fold(fault, Fault::under))
+    Some(fault.under_all(lacking.into_iter().map(|target| target.loader.version())))
 }
 
 /// The fault of a config without `model_type`. transformers 4 takes a type that occurs in the path; only the last
@@ -142,5 +142,5 @@ fn missing(
     }
     let fault = Fault::new(FaultKind::ModelTypeMissing).at(Place::file("config.json")).with("directory", directory);
     let fault = guess.into_iter().fold(fault, |fault, guess| fault.with("guess", guess));
-    Some(raising.into_iter().fold(fault, Fault::under))
+    Some(fault.under_all(raising))
 }

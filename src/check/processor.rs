@@ -5,19 +5,17 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
+use super::class_names::{PREPROCESSOR, PROCESSOR, TOKENIZER, has_code};
 use super::load::Target;
 use super::model_type::{Asked, is_model};
 use super::tokens::OpenedTokenizer;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use crate::knowledge::classes::ClassKind;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::processor::{Placeholder, Processor, ReadValue};
 use crate::knowledge::{Knowledge, Scope};
 
-/// The settings of a processor and of its tokenizer.
-const PROCESSOR: &str = "processor_config.json";
-/// The settings of an image processor or a feature extractor.
-const PREPROCESSOR: &str = "preprocessor_config.json";
 /// Parts of a processor whose settings transformers 5 writes into [`PROCESSOR`].
 const PARTS: [&str; 3] = ["image_processor", "feature_extractor", "video_processor"];
 
@@ -31,7 +29,7 @@ pub(super) fn faults(
     model: &Value,
 ) -> Vec<Fault> {
     // Weights alone, without a tokenizer, are no directory that a processor is opened from.
-    if !is_model(checkpoint) || checkpoint.tokenizer.files.is_empty() || has_code(checkpoint) {
+    if !is_model(checkpoint) || checkpoint.tokenizer.files.is_empty() || is_code(checkpoint) {
         return Vec::new();
     }
     if let Some(missing) = missing_file(checkpoint, knowledge, asked) {
@@ -40,17 +38,14 @@ pub(super) fn faults(
     processor.map_or_else(Vec::new, |processor| values(checkpoint, asked.targets, processor, model))
 }
 
-fn value<'c>(checkpoint: &'c Checkpoint, file: &str, pointer: &str) -> Option<&'c Value> {
-    checkpoint.document(file)?.get(pointer)
+/// Whether the processor is code beside the weights or in another repository.
+fn is_code(checkpoint: &Checkpoint) -> bool {
+    let auto = [ClassKind::Processor, ClassKind::ImageProcessor, ClassKind::FeatureExtractor].map(ClassKind::auto);
+    has_code(checkpoint, &["config.json", PROCESSOR, PREPROCESSOR, TOKENIZER], &auto)
 }
 
-/// Whether the processor is code beside the weights or in another repository.
-fn has_code(checkpoint: &Checkpoint) -> bool {
-    ["config.json", PROCESSOR, PREPROCESSOR, "tokenizer_config.json"].into_iter().any(|file| {
-        ["AutoProcessor", "AutoImageProcessor", "AutoFeatureExtractor"]
-            .into_iter()
-            .any(|class| value(checkpoint, file, &format!("/auto_map/{class}")).is_some())
-    })
+fn value<'c>(checkpoint: &'c Checkpoint, file: &str, pointer: &str) -> Option<&'c Value> {
+    checkpoint.document(file)?.get(pointer)
 }
 
 /// The part whose settings stand in `processor_config.json`.
@@ -82,7 +77,7 @@ fn missing_file(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_
         .with("nested", nested)
         .with("has_processor_config", checkpoint.entries.contains_key(PROCESSOR))
         .with("content", nested.and_then(|part| with_class(checkpoint, part)));
-    (!targets.is_empty()).then(|| targets.into_iter().map(|t| t.loader.version()).fold(fault, Fault::under))
+    (!targets.is_empty()).then(|| fault.under_all(targets.into_iter().map(|target| target.loader.version())))
 }
 
 /// The settings of a nested part as `preprocessor_config.json` holds them, with the class of the processor.
@@ -106,7 +101,7 @@ struct Misfit {
 /// Values of the processor's files that do not fit the model: one fault for the missing ones of each file, and one for each
 /// other value.
 fn values(checkpoint: &Checkpoint, targets: &[Target], processor: &Processor, model: &Value) -> Vec<Fault> {
-    let named = [PROCESSOR, PREPROCESSOR, "tokenizer_config.json"]
+    let named = [PROCESSOR, PREPROCESSOR, TOKENIZER]
         .into_iter()
         .find_map(|file| value(checkpoint, file, "/processor_class")?.as_str());
     if processor.class.as_deref().zip(named).is_some_and(|(class, named)| class != named) {
@@ -125,10 +120,7 @@ fn values(checkpoint: &Checkpoint, targets: &[Target], processor: &Processor, mo
         }
         let of_files = by_file.into_iter().filter_map(|(file, missing)| absent_values(checkpoint, &file, &missing));
         for fault in of_files.chain(other.into_iter().map(Misfit::fault)) {
-            match faults.iter_mut().find(|same| same.places == fault.places && same.detail == fault.detail) {
-                Some(same) => same.loaders.push(target.loader.version()),
-                None => faults.push(fault.under(target.loader.version())),
-            }
+            fault.join(&mut faults, target.loader.version());
         }
     }
     faults
@@ -242,14 +234,14 @@ impl Misfit {
 /// tokenizer does not have, with the text of each token.
 pub(super) fn missing_attributes(checkpoint: &Checkpoint, processor: Option<&Processor>) -> Value {
     // A list, as transformers 5 writes it, has a rule of its own.
-    let extra = value(checkpoint, "tokenizer_config.json", "/extra_special_tokens");
-    if extra.is_some_and(|extra| !extra.is_object()) || checkpoint.document("tokenizer_config.json").is_none() {
+    let extra = value(checkpoint, TOKENIZER, "/extra_special_tokens");
+    if extra.is_some_and(|extra| !extra.is_object()) || checkpoint.document(TOKENIZER).is_none() {
         return Value::Array(Vec::new());
     }
     let is_missing = |name: &str| extra.is_none_or(|extra| extra.get(name).is_none());
     let missing = processor.iter().flat_map(|one| &one.attributes).filter(|(name, _)| is_missing(name));
     // transformers 5 also takes attributes from the keys of the document itself.
-    let at_top = |name: &str| value(checkpoint, "tokenizer_config.json", &format!("/{name}")).is_some();
+    let at_top = |name: &str| value(checkpoint, TOKENIZER, &format!("/{name}")).is_some();
     missing.map(|(name, content)| json!({ "name": name, "content": content, "at_top": at_top(name) })).collect()
 }
 
@@ -264,8 +256,7 @@ pub(super) fn placeholders(
         let key = placeholder.keys.iter().find(|key| value(checkpoint, "config.json", &format!("/{key}")).is_some())?;
         let id = value(checkpoint, "config.json", &format!("/{key}"))?.as_i64()?;
         let content = placeholder.named_by.as_ref().and_then(|name| {
-            let places =
-                [("tokenizer_config.json", "/"), ("tokenizer_config.json", "/extra_special_tokens/"), (PROCESSOR, "/")];
+            let places = [(TOKENIZER, "/"), (TOKENIZER, "/extra_special_tokens/"), (PROCESSOR, "/")];
             places.into_iter().find_map(|(file, start)| value(checkpoint, file, &format!("{start}{name}"))?.as_str())
         });
         let content = content.unwrap_or(&placeholder.content);

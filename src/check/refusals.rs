@@ -62,15 +62,7 @@ pub(super) fn faults(
             None => found = own.into_iter().fold(found, with_other_pointer),
         }
         for rejection in found {
-            let same = faults.iter_mut().find(|fault| {
-                let place = fault.places.first().and_then(|place| place.pointer.as_deref());
-                place == Some(&rejection.pointer)
-                    && fault.detail.get("raises") == Some(&Value::from(rejection.raises.as_str()))
-            });
-            match same {
-                Some(fault) => fault.loaders.push(loader),
-                None => faults.push(rejection.fault().under(loader)),
-            }
+            rejection.fault().join(&mut faults, loader);
         }
     }
     faults.extend(quantisation(knowledge, config, asked));
@@ -310,7 +302,7 @@ fn quantisation(knowledge: &Knowledge, config: &Value, asked: &Asked<'_>) -> Opt
     };
     let versions: Vec<&str> = raising.iter().map(|target| target.version()).collect();
     let fault = fault.with("versions", versions);
-    (!raising.is_empty()).then(|| raising.into_iter().map(|target| target.loader.version()).fold(fault, Fault::under))
+    (!raising.is_empty()).then(|| fault.under_all(raising.into_iter().map(|target| target.loader.version())))
 }
 
 /// The pointer of the object that has this one as a key.

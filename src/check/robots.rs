@@ -141,12 +141,12 @@ fn width(feature: &Value) -> Option<u64> {
 }
 
 /// The statistics by which a mode normalises. Source: `NormalizationMode` of `LeRobot` 0.6.
-const fn statistics_of(mode: &str) -> &'static [&'static str] {
-    match mode.as_bytes() {
-        b"MEAN_STD" => &["mean", "std"],
-        b"MIN_MAX" => &["min", "max"],
-        b"QUANTILES" => &["q01", "q99"],
-        b"QUANTILE10" => &["q10", "q90"],
+fn statistics_of(mode: &str) -> &'static [&'static str] {
+    match mode {
+        "MEAN_STD" => &["mean", "std"],
+        "MIN_MAX" => &["min", "max"],
+        "QUANTILES" => &["q01", "q99"],
+        "QUANTILE10" => &["q10", "q90"],
         _ => &[],
     }
 }

@@ -26,10 +26,7 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[
             let model_type = part.get("model_type").and_then(Value::as_str).unwrap_or_default();
             let Some(keys) = knowledge.ropes.of(target.loader, model_type) else { continue };
             let Some(unread) = unread(at.as_str(), part, keys) else { continue };
-            match faults.iter_mut().find(|fault| fault.places == unread.places && fault.detail == unread.detail) {
-                Some(same) => same.loaders.push(target.loader.version()),
-                None => faults.push(unread.under(target.loader.version())),
-            }
+            unread.join(&mut faults, target.loader.version());
         }
     }
     faults

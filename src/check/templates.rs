@@ -4,7 +4,7 @@
 //! [`render`] bounds its steps, memory and output. An error of rendering proves nothing, because templates refuse
 //! conversations on purpose, and the engine lacks parts of Jinja2.
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 
@@ -22,30 +22,47 @@ const CAP: usize = 80;
 /// A chat template, and its place.
 struct Template<'c> {
     text: &'c str,
-    place: Place,
+    file: &'c str,
+    /// Where it stands in a JSON document.
+    pointer: Option<String>,
+    /// Whether it is the one that is used unless a user asks for another.
+    is_default: bool,
+}
+
+impl Template<'_> {
+    fn place(&self) -> Place {
+        Place { pointer: self.pointer.clone(), ..Place::file(self.file) }
+    }
 }
 
 /// The templates of a checkpoint: `chat_template.jinja`, and the key of the JSON documents, which may hold a list of named
 /// templates. Source: `apply_chat_template` of tokenizers and processors in transformers 4.47.0 to 5.23.0.
 fn templates(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
-    let mut found: Vec<Template<'_>> =
-        checkpoint.texts.iter().map(|(name, text)| Template { text, place: Place::file(name.as_str()) }).collect();
-    for name in ["tokenizer_config.json", "chat_template.json", "processor_config.json"] {
-        let Some(value) = checkpoint.document(name).and_then(|document| document.get("/chat_template")) else {
+    let texts = checkpoint.texts.iter();
+    let own = texts.map(|(file, text)| Template { text, file, pointer: None, is_default: true });
+    let mut found: Vec<Template<'_>> = own.collect();
+    for file in ["tokenizer_config.json", "chat_template.json", "processor_config.json"] {
+        let Some(value) = checkpoint.document(file).and_then(|document| document.get("/chat_template")) else {
             continue;
         };
-        let at = |pointer: String| Place::file(name).pointer(pointer);
         if let Some(text) = value.as_str() {
-            found.push(Template { text, place: at("/chat_template".to_owned()) });
+            found.push(Template { text, file, pointer: Some("/chat_template".to_owned()), is_default: true });
         }
         for (i, item) in value.as_array().into_iter().flatten().enumerate().take(MAX_TEMPLATES) {
+            let pointer = Some(format!("/chat_template/{i}/template"));
+            let is_default = item.get("name").and_then(Value::as_str) == Some("default");
             let text = item.get("template").and_then(Value::as_str);
-            let place = || at(format!("/chat_template/{i}/template"));
-            found.extend(text.map(|text| Template { text, place: place() }));
+            found.extend(text.map(|text| Template { text, file, pointer, is_default }));
         }
     }
     found.truncate(MAX_TEMPLATES);
     found
+}
+
+/// The value of `chat_templates` in expressions: the default template by the file that holds it.
+pub(super) fn by_file(checkpoint: &Checkpoint) -> Value {
+    let default = templates(checkpoint).into_iter().filter(|template| template.is_default);
+    default.map(|template| (template.file.to_owned(), Value::from(template.text.trim()))).collect::<Map<_, _>>().into()
 }
 
 /// Faults of chat templates. Called by the engine for each checkpoint.
@@ -53,8 +70,9 @@ pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let special: Vec<(&str, &str)> =
         checkpoint.tokenizer.special_tokens.iter().map(|(name, token)| (name.as_str(), token.as_str())).collect();
     let mut faults = Vec::new();
-    for Template { text, place } in templates(checkpoint) {
-        match Rendering::of(text, &special) {
+    for template in templates(checkpoint) {
+        let place = template.place();
+        match Rendering::of(template.text, &special) {
             Rendering::Invalid { line, reason } => {
                 let fault = Fault::new(FaultKind::TemplateSyntax).at(place);
                 faults.push(fault.with("line", line).with("reason", escape(&reason, CAP)));

@@ -9,90 +9,27 @@ use serde_json::Value;
 use super::model_type::{Asked, CAP};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, escape, has_paired_merges};
 use crate::knowledge::loader::version_numbers;
+use crate::knowledge::tokenizer_parts::TokenizerPart;
 
 const FILE: &str = "tokenizer.json";
 
 /// Version of transformers whose `tokenizers`, 0.20, is the first that reads merges as pairs.
 const READS_PAIRS: [u64; 2] = [4, 45];
 
-/// The parts of a tokenizer, the key of the list in one of type `Sequence`, and the known types.
-const PARTS: [(&str, &str, &[&str]); 5] = [
-    ("/model", "", &["BPE", "Unigram", "WordLevel", "WordPiece"]),
-    (
-        "/normalizer",
-        "normalizers",
-        &[
-            "BertNormalizer",
-            "ByteLevel",
-            "Lowercase",
-            "NFC",
-            "NFD",
-            "NFKC",
-            "NFKD",
-            "Nmt",
-            "Precompiled",
-            "Prepend",
-            "Replace",
-            "Sequence",
-            "Strip",
-            "StripAccents",
-        ],
-    ),
-    (
-        "/pre_tokenizer",
-        "pretokenizers",
-        &[
-            "BertPreTokenizer",
-            "ByteLevel",
-            "CharDelimiterSplit",
-            "Digits",
-            "FixedLength",
-            "Metaspace",
-            "Punctuation",
-            "Sequence",
-            "Split",
-            "UnicodeScripts",
-            "Whitespace",
-            "WhitespaceSplit",
-        ],
-    ),
-    (
-        "/post_processor",
-        "processors",
-        &["BertProcessing", "ByteLevel", "RobertaProcessing", "Sequence", "TemplateProcessing"],
-    ),
-    (
-        "/decoder",
-        "decoders",
-        &[
-            "BPEDecoder",
-            "ByteFallback",
-            "ByteLevel",
-            "CTC",
-            "Fuse",
-            "Metaspace",
-            "Replace",
-            "Sequence",
-            "Strip",
-            "WordPiece",
-        ],
-    ),
-];
-
 /// Depth of sequences in sequences that is read.
 const MAX_DEPTH: usize = 8;
 
 /// Faults of tokenizer.json. Called by the engine with the targets of the run; a tokenizer that is built from another file
 /// has none.
-pub(super) fn faults(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Vec<Fault> {
+pub(super) fn faults(checkpoint: &Checkpoint, parts: &[TokenizerPart], asked: &Asked<'_>) -> Vec<Fault> {
     let Some(document) = checkpoint.document(FILE).filter(|_| checkpoint.tokenizer.source.as_deref() == Some(FILE))
     else {
         return Vec::new();
     };
     let mut faults = Vec::new();
-    for (pointer, list, types) in PARTS {
-        if let Some(part) = document.get(pointer) {
-            unknown_types(part, pointer, list, types, 0, &mut faults);
+    for part in parts {
+        if let Some(value) = document.get(&part.pointer) {
+            unknown_types(value, part, &part.pointer, 0, &mut faults);
         }
     }
     let old =
@@ -100,7 +37,7 @@ pub(super) fn faults(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Vec<Fault> {
     let old: Vec<&'static str> = old.map(|target| target.loader.version()).collect();
     if !old.is_empty() && has_paired_merges(document) {
         let fault = Fault::new(FaultKind::MergesArePairs).at(Place::file(FILE).pointer("/model/merges"));
-        faults.push(old.into_iter().fold(fault, Fault::under));
+        faults.push(fault.under_all(old));
     }
     let added = document.get("/added_tokens").and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
     if let Some(given) = given_ids(&checkpoint.tokenizer, added) {
@@ -115,16 +52,15 @@ pub(super) fn faults(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Vec<Fault> {
     faults
 }
 
-/// Adds faults of types that no version of the library has.
-fn unknown_types(part: &Value, pointer: &str, list: &str, types: &[&str], depth: usize, faults: &mut Vec<Fault>) {
-    if let Some(name) = part.get("type").and_then(Value::as_str).filter(|name| !types.contains(name)) {
+/// Adds faults of types that no version of the library has, in a part and in the parts of a sequence.
+fn unknown_types(value: &Value, part: &TokenizerPart, pointer: &str, depth: usize, faults: &mut Vec<Fault>) {
+    if let Some(name) = value.get("type").and_then(Value::as_str).filter(|name| !part.types.contains(*name)) {
         let fault = Fault::new(FaultKind::TokenizerPartUnknown).at(Place::file(FILE).pointer(pointer));
-        faults.push(fault.with("part", pointer.split('/').nth(1).unwrap_or_default()).with("type", escape(name, CAP)));
+        faults.push(fault.with("part", part.pointer.trim_start_matches('/')).with("type", escape(name, CAP)));
     }
-    for (i, inner) in part.get(list).and_then(Value::as_array).into_iter().flatten().enumerate() {
-        if depth < MAX_DEPTH {
-            unknown_types(inner, &format!("{pointer}/{list}/{i}"), list, types, depth.saturating_add(1), faults);
-        }
+    let Some(list) = part.list.as_deref().filter(|_| depth < MAX_DEPTH) else { return };
+    for (i, inner) in value.get(list).and_then(Value::as_array).into_iter().flatten().enumerate() {
+        unknown_types(inner, part, &format!("{pointer}/{list}/{i}"), depth.saturating_add(1), faults);
     }
 }
 

@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
-use super::{exceptions, index, model_type, modules};
+use super::{exceptions, index, model_type, modules, templates};
 use crate::checkpoint::glob::glob;
 use crate::checkpoint::tokenizer::is_vocabulary;
 use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
@@ -70,7 +70,7 @@ pub fn scope(
     let text = part("text_config").or_else(|| part("llm_config")).unwrap_or(model);
     scope.bind("text", text);
     scope.bind("tokenizer", &tokenizer(checkpoint));
-    scope.bind("chat_templates", &chat_templates(checkpoint));
+    scope.bind("chat_templates", &templates::by_file(checkpoint));
     scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
     scope.bind("rows", &rows.map_or(Value::Null, Value::from));
     scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
@@ -157,23 +157,6 @@ pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: &[
     scope.function1("stays_random", move |name| {
         random.as_ref().map_or(Value::Null, |names| json!(names.contains(name)))
     });
-}
-
-/// Chat templates by the file that holds them; of several in one list the default.
-fn chat_templates(checkpoint: &Checkpoint) -> Value {
-    let mut found = Map::new();
-    for (name, text) in &checkpoint.texts {
-        found.insert(name.clone(), json!(text.trim()));
-    }
-    for name in ["chat_template.json", "tokenizer_config.json"] {
-        let Some(value) = checkpoint.document(name).and_then(|d| d.get("/chat_template")) else { continue };
-        let is_default = |item: &&Value| item.get("name").and_then(Value::as_str) == Some("default");
-        let listed = || value.as_array()?.iter().find(is_default)?.get("template")?.as_str();
-        if let Some(text) = value.as_str().or_else(listed) {
-            found.insert(name.to_owned(), json!(text.trim()));
-        }
-    }
-    Value::Object(found)
 }
 
 fn tokenizer(checkpoint: &Checkpoint) -> Value {

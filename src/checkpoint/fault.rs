@@ -50,6 +50,21 @@ impl Fault {
         self
     }
 
+    /// As [`Self::under`], for several loaders.
+    #[must_use]
+    pub(crate) fn under_all(mut self, loaders: impl IntoIterator<Item = &'static str>) -> Self {
+        self.loaders.extend(loaders);
+        self
+    }
+
+    /// Adds itself to a list as the fault of one loader: to the same fault of other loaders, if there is one.
+    pub(crate) fn join(self, faults: &mut Vec<Self>, loader: &'static str) {
+        match faults.iter_mut().find(|same| same.places == self.places && same.detail == self.detail) {
+            Some(same) => same.loaders.push(loader),
+            None => faults.push(self.under(loader)),
+        }
+    }
+
     /// Adds a named detail.
     #[must_use]
     pub(crate) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {

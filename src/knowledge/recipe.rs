@@ -20,9 +20,9 @@ use crate::checkpoint::{FileName, FilePattern};
 /// - `dtype(role)`: the floating-point type of most bytes of a donor as torch names it, `'bfloat16'`;
 /// - `id_of(token)`: the id in the tokenizer of the result, null when it has no such token;
 /// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;
-/// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host when its class
-///   has the guest's language model; `with` and `without` list the versions of transformers, of
-///   `--for` or all, that need the factor, or none.
+/// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host, under the
+///   version that wrote it, when its class has the guest's language model; `with` and `without` list the versions of
+///   transformers, of `--for` or all, that need the factor, or none.
 /// - `part(role, name)`: a part of a donor: its config with defaults (`config`), as it is written (`stored`), its JSON pointer
 ///   (`at`), its model type (`type`), the types that may stand there (`takes`), and the names of its `embedding` and `head`.
 ///

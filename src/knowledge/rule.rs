@@ -164,22 +164,27 @@ pub struct FaultCheck {
 /// - `tokens`: ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and
 ///   `scattered`; `opened`: the same by loader, with the `class` with which its processor opens the tokenizer;
 ///   `processor_tokenizers`: tokenizer classes that the processor's module names;
-/// - `chat_templates`: templates by file;
+/// - `missing_attributes`: tokens that the processor reads as attributes of the tokenizer, which lacks them, as `name`,
+///   `content` and `at_top`; `placeholders`: tokens that stand for images or videos, as `key`, `id`, `content`,
+///   `of_tokenizer` and `is_replaced`;
+/// - `chat_templates`: the default template by file;
 /// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
 ///   `of_transformers`: config.json is one of transformers; `program`: the program that opens the directory, by
 ///   `rules/directories.json5`;
 /// - `robot`: features of a policy of `LeRobot`, with the statistics that each needs and has; null for other configs;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
-/// - `loaders`: versions of transformers to check for; `named`: whether the user named them;
+/// - `loaders`: versions of transformers to check for; `named`: whether the user named them; `programs`: names of the other
+///   programs to check for;
 /// - `metadata_only`: weights may be missing;
 /// - `groups_heads`: the class reads `num_key_value_heads`, or is unknown.
 ///
 /// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
-/// loaders; `document(name)`: the value of a document that was read, also below a folder; `names(pattern)`: names of entries and paths
-/// below folders, of which those of folders end with `/` (both null beyond a limit on their work); `shape(tensor)`, `dtype(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a shard
-/// of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and `stays_random(tensor)`:
-/// whether a loader leaves the tensor randomly initialised, null when the class is unknown. For messages there are
-/// `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
+/// loaders; `document(name)`: the value of a document that was read, also below a folder; `names(pattern)`: names of entries
+/// and paths below folders, of which those of folders end with `/` (both null beyond a limit on their work);
+/// `shape(tensor)`, `dtype(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a
+/// shard of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and
+/// `stays_random(tensor)`: whether a loader leaves the tensor randomly initialised, null when the class is unknown. For
+/// messages there are `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
 ///
 /// A condition that cannot be evaluated because a value is missing is not a finding.
 #[derive(Debug, Clone, Deserialize)]

@@ -35,10 +35,12 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
 }
 
 /// The factor that keeps image features as large as in the host when its class has the language model of the guest, with those
-/// of the loaders for which it is right and those that need none.
+/// of the loaders for which it is right and those that need none. Features of the host are as large as under the version of
+/// transformers that wrote its config: `SpatialVLA`, of 4.47, gets smaller ones under 5.23, with which it was not trained.
 fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) -> Value {
+    let trained = scales.of_images(host, host, Loader::of_config(host));
     let factor = |loader: Loader| {
-        let factor = scales.of_images(host, host, loader) / scales.of_images(host, guest, loader);
+        let factor = trained / scales.of_images(host, guest, loader);
         // Square roots do not cancel to the last bit of binary64.
         dtypes::round(factor, Some("float32"))
     };
@@ -47,4 +49,33 @@ fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) 
     let versions = |loaders: &[Loader]| loaders.iter().map(|loader| loader.version()).collect::<Vec<_>>();
     let common = with.first().map_or(1.0, |loader| factor(*loader));
     json!({ "factor": common, "with": versions(&with), "without": versions(&without) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn image_features_stay_as_large_as_they_were_trained() {
+        let scales = Scales::embedded().unwrap();
+        let host = |model_type: &str, text: &str| {
+            json!({ "model_type": model_type, "transformers_version": "4.47.0",
+                "text_config": { "model_type": text, "hidden_size": 64 } })
+        };
+        let guest = |text: &str| json!({ "model_type": text, "hidden_size": 64 });
+        let fold = |host: &Value, guest: &Value| image_fold(&scales, host, guest, &Loader::ALL);
+        let of = |factor: f64, with: &[&str], without: &[&str]| json!({ "factor": factor, "with": with, "without": without });
+        let all = ["4.47.0", "4.57.6", "5.23.0"];
+        for (host, guest, expected) in [
+            (host("paligemma", "gemma"), guest("gemma"), of(1.0, &[], &all)),
+            (host("paligemma", "gemma"), guest("llama"), of(8.0, &["4.47.0", "4.57.6"], &["5.23.0"])),
+            // Its own code divides in every version.
+            (host("spatialvla", "gemma2"), guest("mistral"), of(8.0, &all, &[])),
+            // Gemma multiplied the features of this host.
+            (host("llava", "gemma"), guest("llama"), of(8.0, &all, &[])),
+            (host("llava", "llama"), guest("mistral"), of(1.0, &[], &all)),
+        ] {
+            assert_eq!(fold(&host, &guest), expected, "{host} {guest}");
+        }
+    }
 }

@@ -227,6 +227,7 @@ fn the_page_of_data_files_is_fresh() {
          | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\
          | `directories.json5` | kinds of directories that other programs open, or none, with what to do |\n\
          | `statistics.json5` | where policies of robots keep their statistics |\n\
+         | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\n\
          All files are JSON5. The keys below come from the JSON Schemas in [`schemas/`](../schemas). *Expression* means an \

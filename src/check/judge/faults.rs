@@ -25,7 +25,7 @@ pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[
         let has_vote = |load: &&ExplainedLoad<'_>| {
             load.votes().is_some_and(|votes| votes.iter().any(|v| v.pointer == vote.pointer))
         };
-        let fault = loads.iter().filter(has_vote).map(ExplainedLoad::loader).fold(votes::fault(vote), Fault::under);
+        let fault = votes::fault(vote).under_all(loads.iter().filter(has_vote).map(ExplainedLoad::loader));
         // With the value of the config the load raises where a tensor has another shape, and is wrong otherwise.
         let mismatch = |load: &ExplainedLoad<'_>| {
             Some((load.loader(), load.prediction.report.as_ref()?.mismatched.first()?.name.clone()))
