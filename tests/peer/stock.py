@@ -404,9 +404,9 @@ def save_tower(kind, dtype, path, work):
 
     if kind == "clip":
         model, images = transformers.CLIPVisionModel(transformers.CLIPVisionConfig(**clip())), clip_images()
-    elif kind == "siglip":
-        model = transformers.SiglipVisionModel(transformers.SiglipVisionConfig(**siglip()))
-        images = transformers.SiglipImageProcessor(size={"height": SIDE, "width": SIDE})
+    elif kind == "siglip":  # for larger pictures than the towers of the hosts
+        model = transformers.SiglipVisionModel(transformers.SiglipVisionConfig(**siglip(2 * SIDE)))
+        images = transformers.SiglipImageProcessor(size={"height": 2 * SIDE, "width": 2 * SIDE})
     elif kind == "siglip2":
         vision = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, num_patches=TOKENS, patch_size=PATCH)
         model = transformers.Siglip2VisionModel(transformers.Siglip2VisionConfig(**vision))
