@@ -206,9 +206,9 @@ pub struct CheckArgs {
     /// Checkpoint directories, directories that contain checkpoints, or files of checkpoints
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
-    /// Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm and mlx-lm
-    /// for what is known of them; may be repeated [default: the version that wrote config.json, and the newest known of each
-    /// major version]
+    /// Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm, mlx-lm and
+    /// llama.cpp for what is known of them; may be repeated [default: the version that wrote config.json, and the newest
+    /// known of each major version]
     #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_program)]
     pub versions: Vec<String>,
     /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub

@@ -16,18 +16,22 @@ pub enum Program {
     Vllm,
     /// mlx-lm, which loads language models with MLX.
     MlxLm,
+    /// llama.cpp, whose converter makes a GGUF file of a directory.
+    #[serde(rename = "llama.cpp")]
+    LlamaCpp,
 }
 
 impl Program {
     /// All programs.
-    pub const ALL: [Self; 2] = [Self::Vllm, Self::MlxLm];
+    pub const ALL: [Self; 3] = [Self::Vllm, Self::MlxLm, Self::LlamaCpp];
 
-    /// The name of its package.
+    /// The name that `--for` takes: that of its package or repository.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Vllm => "vllm",
             Self::MlxLm => "mlx-lm",
+            Self::LlamaCpp => "llama.cpp",
         }
     }
 
@@ -47,6 +51,9 @@ pub struct ProgramFacts {
     /// Values of `model_type` that it loads; `None` when it falls back to the classes of transformers.
     #[serde(default)]
     pub model_types: Option<BTreeSet<String>>,
+    /// Class names in `architectures` that it loads; `None` when it does not go by them.
+    #[serde(default)]
+    pub architectures: Option<BTreeSet<String>>,
 }
 
 /// The facts of every program.
@@ -103,6 +110,8 @@ mod tests {
             assert_eq!(Program::from_name(program.name()), Some(program));
         }
         let mlx = programs.asked(&[Program::MlxLm])[0].facts.model_types.as_ref().unwrap();
+        let converter = programs.asked(&[Program::LlamaCpp])[0].facts.architectures.as_ref().unwrap();
+        assert!(converter.contains("LlamaForCausalLM") && !converter.contains("PaliGemmaProcessor"));
         assert!(mlx.contains("llama") && mlx.contains("mistral") && !mlx.contains("bert") && !mlx.contains("cache"));
     }
 }

@@ -200,6 +200,7 @@ fault_kinds! {
         PlainThoughQuantized = "plain-though-quantized",
         PostProcessorIdWrong = "post-processor-id-wrong",
         PrefixHijack = "prefix-hijack",
+        ProgramLacksClass = "program-lacks-class",
         ProgramLacksModelType = "program-lacks-model-type",
         ProgramReadsOtherFiles = "program-reads-other-files",
         ProcessorFileMissing = "processor-file-missing",
