@@ -14,6 +14,7 @@ pub mod judge;
 pub mod layers;
 pub mod load;
 mod model_type;
+mod module_imports;
 pub mod modules;
 mod outcome;
 mod pickles;

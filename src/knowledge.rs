@@ -8,6 +8,7 @@ pub mod evidence;
 pub mod expression;
 pub mod library;
 pub mod loader;
+pub mod modules;
 pub mod names;
 mod ordered;
 pub mod parts;

@@ -178,6 +178,15 @@ pub(super) fn is_imported(checkpoint: &Checkpoint, file: &str) -> bool {
     roots.into_iter().any(|root| closure(checkpoint, root).iter().any(|(name, _)| name == module))
 }
 
+/// The modules that loading imports: those that entries of `auto_map` lead to.
+pub(super) fn imported(checkpoint: &Checkpoint) -> Vec<&PythonModule> {
+    let entries = entries(checkpoint);
+    let roots: BTreeSet<&str> = entries.iter().filter(|e| !e.nested).filter_map(|e| Some(e.parts()?.0)).collect();
+    let all = roots.into_iter().flat_map(|root| closure(checkpoint, root));
+    let all: BTreeMap<String, &PythonModule> = all.filter_map(|(name, module)| Some((name, module?))).collect();
+    all.into_values().collect()
+}
+
 /// Faults of every `auto_map` entry.
 #[must_use]
 pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {

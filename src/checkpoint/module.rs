@@ -66,6 +66,10 @@ pub struct RelativeImport {
 pub struct Import {
     /// First component of the dotted name, which is the package to install.
     pub package: String,
+    /// The dotted name.
+    pub module: String,
+    /// Names taken from it; `*` for all, empty for `import x`.
+    pub names: Vec<String>,
     /// Bytes of the statement.
     pub span: Range<usize>,
     /// Whether a failure is handled (see [`RelativeImport::guarded`]).

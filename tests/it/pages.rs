@@ -223,6 +223,7 @@ fn the_page_of_data_files_is_fresh() {
          | `ropes.json` | rope keys that config classes read before transformers 5, written by `tools/loader_ropes.py` |\n\
          | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
          | `classes.json` | tokenizer and processor classes that each version opens by name, written by `tools/loader_classes.py` |\n\
+         | `modules.json` | modules and names of transformers that some version lacks, written by `tools/loader_modules.py` |\n\
          | `peft.json` | keys of `adapter_config.json` by version of PEFT, written by `tools/peft_keys.py` |\n\
          | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\
          | `directories.json5` | kinds of directories that other programs open, or none, with what to do |\n\

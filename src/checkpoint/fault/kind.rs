@@ -187,6 +187,7 @@ fault_kinds! {
         MissingTensors = "missing-tensors",
         ModelTypeMissing = "model-type-missing",
         ModelTypeUnknown = "model-type-unknown",
+        ModuleImportGone = "module-import-gone",
         ModuleNeedsPackage = "module-needs-package",
         NamesMoved = "names-moved",
         NamesWrapped = "names-wrapped",

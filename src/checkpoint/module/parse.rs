@@ -266,14 +266,16 @@ impl<'a> ModuleReader<'a> {
         let items: Vec<_> = node.children_by_field_name("name", &mut cursor).collect();
         for item in items {
             let dotted = item.child_by_field_name("name").unwrap_or(item);
-            let package = self.str(dotted).split('.').next().unwrap_or_default().trim().to_owned();
+            let module: String = self.str(dotted).chars().filter(|c| !c.is_whitespace()).collect();
+            let package = module.split('.').next().unwrap_or_default().to_owned();
             if top {
                 let bound =
                     item.child_by_field_name("alias").map_or_else(|| package.clone(), |a| self.str(a).to_owned());
                 self.module.names.insert(bound);
             }
             let span = node.byte_range();
-            self.module.imports.push(Import { package, span, guarded: scope.guarded, nested: scope.function });
+            let (guarded, nested) = (scope.guarded, scope.function);
+            self.module.imports.push(Import { package, module, names: Vec::new(), span, guarded, nested });
         }
     }
 
@@ -301,7 +303,8 @@ impl<'a> ModuleReader<'a> {
         let (span, guarded) = (node.byte_range(), scope.guarded);
         if level == 0 {
             let package = module.split('.').next().unwrap_or_default().to_owned();
-            self.module.imports.push(Import { package, span, guarded, nested: scope.function });
+            let (module, nested) = (module.to_owned(), scope.function);
+            self.module.imports.push(Import { package, module, names, span, guarded, nested });
         } else if module.is_empty() {
             for name in names {
                 let import = RelativeImport { level, module: name, names: Vec::new(), span: span.clone(), guarded };
