@@ -35,8 +35,8 @@ impl Layout {
     }
 }
 
-/// The variable `robot` of rules: `layout`, and `features` with `name`, `input`, `mode`, `width`, `document`, `state_file`, `stem`,
-/// `asks`, `lacks` and `stored_width`. Null for a config that is no policy.
+/// The variable `robot` of rules: `layout`, and `features` with `name`, `input`, `mode`, `width`, `document`, `state_file`, `state_read`,
+/// `stem`, `asks`, `lacks` and `stored_width`. Null for a config that is no policy.
 pub(super) fn policy(checkpoint: &Checkpoint) -> Value {
     let Some(config) = checkpoint.config().filter(|config| config.get("type").is_some_and(Value::is_string)) else {
         return Value::Null;
@@ -104,6 +104,7 @@ fn feature_of(checkpoint: &Checkpoint, layout: Layout, name: &str, feature: &Val
         "has_step": step.is_some(),
         "state_file": state_file,
         "has_state": state_file.is_some_and(|file| checkpoint.shards.contains_key(file)),
+        "state_read": shards.iter().all(|shard| !shard.unread),
         "stem": stem,
         "asks": asks,
         "lacks": lacks,
