@@ -6,7 +6,7 @@
 use serde_json::Value;
 
 use super::load::Target;
-use super::model_type::{Asked, CAP};
+use super::model_type::{Asked, CAP, has_code as has_config_code};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::classes::ClassKind::{
@@ -95,6 +95,8 @@ fn unknown(checkpoint: &Checkpoint, knowledge: &Knowledge, named: &Named<'_>, as
     let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
     let model_type = text("config.json", "/model_type");
     let processor = [PROCESSOR, PREPROCESSOR, TOKENIZER].into_iter().find_map(|file| text(file, "/processor_class"));
+    // Code of a repository may open its files without the Auto classes.
+    let of_code = checkpoint.config().is_some_and(has_config_code);
     let lacking: Vec<&Target> = asked
         .targets
         .iter()
@@ -103,6 +105,7 @@ fn unknown(checkpoint: &Checkpoint, knowledge: &Knowledge, named: &Named<'_>, as
         // The processor of a model that the version does not know fails for that reason.
         .filter(|target| {
             kind == Tokenizer
+                || (kind != Processor && of_code)
                 || !model_type.is_some_and(|t| knowledge.names.lacks(target.version(), NameKind::ModelType, t))
         })
         .filter(|target| {
@@ -124,6 +127,7 @@ fn unknown(checkpoint: &Checkpoint, knowledge: &Knowledge, named: &Named<'_>, as
         .with("auto", kind.auto())
         .with("class", escape(name, CAP))
         .with("versions", versions)
+        .with("of_code", of_code)
         .with("known", knowledge.classes.contains(kind, name));
     let right = right(checkpoint, knowledge, named, model_type)
         .filter(|right| asked.targets.iter().all(|target| !lacks(knowledge, target.version(), kind, right)));

@@ -67,6 +67,17 @@ pub(super) fn is_complete(checkpoint: &Checkpoint) -> bool {
         && families.iter().all(|((_, count), numbers)| whole(*count, numbers))
 }
 
+/// Names of shards that the number and count in the names of others tell, and that are absent; at most eight.
+pub(super) fn lost_shards(checkpoint: &Checkpoint) -> Vec<String> {
+    let names = shard_names(checkpoint);
+    let Some((prefix, _, count)) = names.first().and_then(|name| numbered(name)) else { return Vec::new() };
+    let ending = if names.iter().all(|name| name.ends_with(".bin")) { "bin" } else { "safetensors" };
+    let one_family = names.iter().all(|name| numbered(name).is_some_and(|(p, _, c)| p == prefix && c == count));
+    let named = (1..=count).map(|number| format!("{prefix}-{number:05}-of-{count:05}.{ending}"));
+    let lost = named.filter(|name| one_family && !names.contains(&name.as_str()) && !checkpoint.has_file(name));
+    lost.take(8).collect()
+}
+
 /// Which shard holds a tensor of that name; the first when there are several.
 pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
     let mut map: BTreeMap<&str, Vec<&str>> = BTreeMap::new();

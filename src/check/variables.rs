@@ -143,7 +143,7 @@ fn names(checkpoint: &Checkpoint, pattern: &str) -> Value {
     json!(found)
 }
 
-/// Binds `stays_random` and `complete`, which depend on the predicted loads.
+/// Binds `lost_shards`, and `stays_random` and `complete`, which depend on the predicted loads.
 pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: &[LoadReport]) {
     // Without a class no load is predicted, and a `total_size` that is too large is the only trace of a lost tensor.
     let stored = || checkpoint.tensors().fold(0_u64, |n, (_, tensor)| n.saturating_add(tensor.len()));
@@ -151,6 +151,7 @@ pub fn bind_loads(scope: &mut Scope<'static>, checkpoint: &Checkpoint, loads: &[
     let held = |name: &String| checkpoint.tensor(name).is_some();
     let whole = loads.iter().all(|load| load.missing.iter().all(held) && load.raises.is_none());
     let known = !loads.is_empty() || stated.is_none_or(|stated| stated <= stored());
+    scope.bind("lost_shards", &json!(index::lost_shards(checkpoint)));
     scope.bind("complete", &json!(whole && known && index::is_complete(checkpoint)));
     let random: Option<BTreeSet<String>> =
         (!loads.is_empty()).then(|| loads.iter().flat_map(LoadReport::left_random).map(str::to_owned).collect());

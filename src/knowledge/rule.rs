@@ -173,6 +173,7 @@ pub struct FaultCheck {
 ///   `rules/directories.json5`;
 /// - `robot`: features of a policy of `LeRobot`, with the statistics that each needs and has; null for other configs;
 ///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
+/// - `lost_shards`: absent shards that the names of the others count, at most eight;
 /// - `loaders`: versions of transformers to check for; `named`: whether the user named them; `programs`: names of the other
 ///   programs to check for;
 /// - `metadata_only`: weights may be missing;
