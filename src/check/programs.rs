@@ -41,7 +41,8 @@ fn files(checkpoint: &Checkpoint, asked: &AskedProgram<'_>) -> Option<Fault> {
         Program::MlxLm | Program::LlamaCpp => read.is_empty(),
         Program::Vllm => !read.is_empty(),
     };
-    let fault = fault(FaultKind::ProgramReadsOtherFiles, asked).with("read", read.clone()).with("others", others.clone());
+    let fault =
+        fault(FaultKind::ProgramReadsOtherFiles, asked).with("read", read.clone()).with("others", others.clone());
     (differs && !others.is_empty()).then(|| read.iter().fold(fault, |fault, name| fault.at(Place::file(*name))))
 }
 
@@ -65,7 +66,8 @@ fn class(checkpoint: &Checkpoint, asked: &AskedProgram<'_>) -> Option<Fault> {
     let mut names = places.into_iter().filter_map(|pointer| Some((pointer, config.pointer(pointer)?.as_str()?)));
     let Some((pointer, first)) = names.next() else {
         let place = Place::file("config.json");
-        return is_of_transformers(checkpoint).then(|| fault(FaultKind::ProgramLacksClass, asked).with("class", Value::Null).at(place));
+        return is_of_transformers(checkpoint)
+            .then(|| fault(FaultKind::ProgramLacksClass, asked).with("class", Value::Null).at(place));
     };
     let is_known = known.contains(first) || names.any(|(_, name)| known.contains(name));
     let place = Place::file("config.json").pointer(pointer);

@@ -27,6 +27,7 @@ pub(super) fn run(repair: BuiltInRepair, site: &Site<'_>) -> Option<Vec<Edit>> {
         BuiltInRepair::DropEqualKey => texts::drop_equal_key(site),
         BuiltInRepair::FillTokenHoles => tokens::fill_token_holes(site.checkpoint()),
         BuiltInRepair::FlattenTextConfig => configs::flatten_text_config(site.checkpoint()),
+        BuiltInRepair::JoinMerges => tokens::join_merges(site.checkpoint()),
         BuiltInRepair::QuoteString => texts::quote_string(site),
         BuiltInRepair::RebuildIndex => {
             let edit = site.bench.index.get_or_init(|| rebuild_index(site.checkpoint()));

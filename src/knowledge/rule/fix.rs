@@ -153,6 +153,8 @@ pub enum BuiltInRepair {
     FillTokenHoles,
     /// Moves the values of `text_config` to the top of config.json.
     FlattenTextConfig,
+    /// Writes the merges of tokenizer.json as strings with a blank.
+    JoinMerges,
     /// Puts a single-quoted string in double quotes.
     QuoteString,
     /// Rebuilds the index from the shard headers.
@@ -174,6 +176,7 @@ impl BuiltInRepair {
         Self::DropEqualKey,
         Self::FillTokenHoles,
         Self::FlattenTextConfig,
+        Self::JoinMerges,
         Self::QuoteString,
         Self::RebuildIndex,
         Self::Reencode,

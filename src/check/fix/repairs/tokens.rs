@@ -2,10 +2,29 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::check::fix::Edit;
 use crate::checkpoint::Checkpoint;
+
+/// Writes the merges of tokenizer.json as strings, which every version of the library reads; `None` when a piece has a blank,
+/// which only a pair can hold.
+pub(super) fn join_merges(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
+    #[derive(Deserialize)]
+    struct File {
+        model: Model,
+    }
+    #[derive(Deserialize)]
+    struct Model {
+        merges: Vec<[String; 2]>,
+    }
+    let file = "tokenizer.json";
+    let document: File = serde_json::from_str(checkpoint.document(file)?.text.as_deref()?).ok()?;
+    let join = |pair: &[String; 2]| (!pair.iter().any(|piece| piece.contains(' '))).then(|| pair.join(" "));
+    let value = document.model.merges.iter().map(join).collect::<Option<Vec<String>>>()?.into();
+    Some(vec![Edit::Set { file: file.to_owned(), pointer: "/model/merges".to_owned(), value }])
+}
 
 /// Adds to `added_tokens_decoder` the entries that it lacks and another file has, so that every id keeps its token.
 pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
