@@ -24,6 +24,9 @@ struct ModelScales {
     /// Versions of transformers.
     #[serde(default)]
     loaders: LoaderRange,
+    /// Versions of transformers that load the class; the default is all.
+    #[serde(default)]
+    loads: LoaderRange,
     /// Factor on the embeddings of tokens alone.
     #[serde(default)]
     rows: Option<Expression>,
@@ -67,6 +70,14 @@ impl Scales {
         }
         let image = self.factor(&composition, loader, |model| model.image.as_ref());
         image * self.factor(text, loader, |model| model.inputs.as_ref())
+    }
+
+    /// Whether this version of transformers loads a class of the model.
+    #[must_use]
+    pub fn loads(&self, config: &Value, loader: Loader) -> bool {
+        let model_type = config.get("model_type").and_then(Value::as_str).unwrap_or_default();
+        let mut of_type = self.models.iter().filter(|model| model.model_types.iter().any(|name| name == model_type));
+        of_type.all(|model| model.loads.contains(loader.version()))
     }
 
     /// The factor that `pick` selects for a model; 1 where none is known.

@@ -36,7 +36,7 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
 
 /// The factor that keeps image features as large as in the host when its class has the language model of the guest, with those
 /// of the loaders for which it is right and those that need none. Features of the host are as large as under the version of
-/// transformers that wrote its config: `SpatialVLA`, of 4.47, gets smaller ones under 5.23, with which it was not trained.
+/// transformers that wrote its config. Versions that do not load the host's class are left out.
 fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) -> Value {
     let trained = scales.of_images(host, host, Loader::of_config(host));
     let factor = |loader: Loader| {
@@ -45,7 +45,8 @@ fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) 
         dtypes::round(factor, Some("float32"))
     };
     let needs = |loader: &Loader| (factor(*loader) - 1.0).abs() > f64::EPSILON;
-    let (with, without): (Vec<Loader>, Vec<Loader>) = loaders.iter().copied().partition(needs);
+    let loads = |loader: &Loader| scales.loads(host, *loader);
+    let (with, without): (Vec<Loader>, Vec<Loader>) = loaders.iter().copied().filter(loads).partition(needs);
     let versions = |loaders: &[Loader]| loaders.iter().map(|loader| loader.version()).collect::<Vec<_>>();
     let common = with.first().map_or(1.0, |loader| factor(*loader));
     json!({ "factor": common, "with": versions(&with), "without": versions(&without) })
@@ -69,8 +70,9 @@ mod tests {
         for (host, guest, expected) in [
             (host("paligemma", "gemma"), guest("gemma"), of(1.0, &[], &all)),
             (host("paligemma", "gemma"), guest("llama"), of(8.0, &["4.47.0", "4.57.6"], &["5.23.0"])),
-            // Its own code divides in every version.
-            (host("spatialvla", "gemma2"), guest("mistral"), of(8.0, &all, &[])),
+            // transformers 5 does not load its code.
+            (host("spatialvla", "gemma2"), guest("mistral"), of(8.0, &all[..2], &[])),
+            (host("spatialvla", "gemma2"), guest("gemma2"), of(1.0, &[], &all[..2])),
             // Gemma multiplied the features of this host.
             (host("llava", "gemma"), guest("llama"), of(8.0, &all, &[])),
             (host("llava", "llama"), guest("mistral"), of(1.0, &[], &all)),
