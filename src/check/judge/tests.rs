@@ -100,6 +100,21 @@ fn an_unknown_class_and_one_that_cannot_be_built_are_different_faults() {
 }
 
 #[test]
+fn a_backbone_of_another_model_type_is_not_covered() {
+    let detr = |backbone: &str| {
+        let case = Case::new("llava3d-tiny").versions(&["5.23.0"]).set("architectures", json!(["DetrModel"]));
+        case.set("model_type", json!("detr")).set("backbone_config", json!({ "model_type": backbone }))
+    };
+    let class = |case: &Case| {
+        let inputs = case.inputs();
+        build_classes(&inputs, resolve_targets(&inputs)).remove(0).class
+    };
+    assert!(class(&detr("resnet")).is_ok());
+    let refusal = class(&detr("timm_backbone")).unwrap_err();
+    assert!(matches!(refusal, Refusal::NotCovered(_)), "{refusal:?}");
+}
+
+#[test]
 fn a_class_is_built_from_tensors_under_names_that_the_loader_renames() {
     let whole = Case::new("llava3d-tiny");
     // A save of the base model; the size of the vision tower is in no config.

@@ -103,6 +103,12 @@ struct Builder<'l> {
     steps: usize,
 }
 
+/// The model type of a part's config that is none of those of the one class which the description has there.
+fn named_otherwise<'c>(part: &Part, config: &'c Map<String, Value>, file: &Blueprint) -> Option<&'c str> {
+    let named = config.get("model_type").and_then(Value::as_str).filter(|_| part.class.is_some());
+    named.filter(|named| !file.model_types.iter().any(|own| own == named))
+}
+
 /// A resolved config, and the scope that has it as `c`.
 #[derive(Clone, Copy)]
 struct Config<'a> {
@@ -330,9 +336,14 @@ impl<'l> Builder<'l> {
         }
         let scope = self.resolver.scope(&map);
         let built = self.class(file, class, Config { map: &map, scope: &scope }, place);
-        built.map_err(|refusal| match &part.config {
-            Some(path) => refusal.inside(path),
-            None => refusal,
+        let Some(path) = &part.config else { return built };
+        built.map_err(|refusal| match (refusal, named_otherwise(part, given, file)) {
+            // The loader selects the class by the model type; the description was made with another one.
+            (Refusal::Impossible(_), Some(model_type)) => Refusal::NotCovered(vec![Doubt::Corner(format!(
+                "{path} is of model type {model_type}, and the class is described with {}",
+                file.architecture
+            ))]),
+            (refusal, _) => refusal.inside(path),
         })
     }
 
