@@ -28,6 +28,8 @@ MLX_LM, VLLM = "0.32.2", "0.19.1"
 LLAMA_CPP = "0.3.36"
 SOURCES = f"https://files.pythonhosted.org/packages/ec/e9/e7de2b0463ea3ffbf0ede6cb21b58c1258a8f6521aae45ca773a59fe7cf3/llama_cpp_python-{LLAMA_CPP}.tar.gz"
 SHA256 = "832db0699007f1be95a7e41ef12e88926b02ba836461e36a36372db2760c1a2e"
+# The exit code when they cannot be downloaded.
+UNREACHABLE = 3
 CONVERTER = f"llama_cpp_python-{LLAMA_CPP}/vendor/llama.cpp/"
 
 
@@ -51,8 +53,12 @@ def sources(cache):
     """The sources of llama-cpp-python, which pip would try to build."""
     path = cache / SOURCES.rsplit("/", 1)[1]
     if not path.exists():
-        with urllib.request.urlopen(SOURCES, timeout=300) as answer:
-            path.write_bytes(answer.read())
+        try:
+            with urllib.request.urlopen(SOURCES, timeout=300) as answer:
+                path.write_bytes(answer.read())
+        except OSError as error:
+            print(f"{SOURCES}: {error}", file=sys.stderr)
+            sys.exit(UNREACHABLE)
     if hashlib.sha256(path.read_bytes()).hexdigest() != SHA256:
         path.unlink()
         sys.exit(f"{SOURCES} has another content")
