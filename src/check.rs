@@ -5,6 +5,7 @@ mod bounded;
 mod class_names;
 mod directory;
 pub mod engine;
+mod evaluate;
 mod exceptions;
 pub mod finding;
 pub mod fix;

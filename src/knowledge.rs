@@ -1,6 +1,7 @@
 //! Rules, architectures, processors, recipes and quantisation schemes, read from `rules/`, and their expressions.
 
 pub mod architecture;
+mod by_version;
 pub mod classes;
 pub mod directories;
 pub mod embeddings;

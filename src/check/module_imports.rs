@@ -46,5 +46,5 @@ fn fault(known: &LoaderModules, module: &PythonModule, import: &Import, asked: &
         .with("names", names.into_iter().collect::<Vec<_>>())
         .with("whole", known.lacks_module(first.version(), path))
         .with("versions", versions);
-    Some(lacking.iter().map(|(target, _)| target.loader.version()).fold(fault, Fault::under))
+    Some(fault.under_all(lacking.iter().map(|(target, _)| target.loader.version())))
 }

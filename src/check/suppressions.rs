@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::engine;
+use super::evaluate;
 use super::finding::Finding;
 use super::outcome::Outcome;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
@@ -36,7 +36,7 @@ pub fn unused_suppressions(
             .with("path", suppression.path.as_deref().unwrap_or(""))
             .with("written", suppression.written.as_str())
             .with("reason", suppression.reason.as_str());
-        found.extend(engine::report(knowledge, checkpoint, &[fault]).into_iter().map(|finding| (at, finding)));
+        found.extend(evaluate::report(knowledge, checkpoint, &[fault]).into_iter().map(|finding| (at, finding)));
     }
     found
 }

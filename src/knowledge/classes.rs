@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::loader::version_numbers;
-use super::source::{self, DataError};
+use super::by_version::ByVersion;
+use super::source::DataError;
 
 /// A thing whose class a file names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -86,7 +86,7 @@ impl Lists {
 /// `rules/classes.json`: the classes by version of transformers; `tools/loader_classes.py` writes it.
 #[derive(Debug, Clone, Default)]
 pub struct ClassNames {
-    versions: BTreeMap<Vec<u64>, Lists>,
+    versions: ByVersion<Lists>,
 }
 
 impl ClassNames {
@@ -95,25 +95,14 @@ impl ClassNames {
     /// # Errors
     /// [`DataError`] when the file is malformed; every test that checks a checkpoint parses it.
     pub fn embedded() -> Result<Self, DataError> {
-        let file = "classes.json";
-        let lists: BTreeMap<String, Lists> = serde_json::from_str(source::text(file).unwrap_or_default())
-            .map_err(|error| DataError::new(&format!("rules/{file}"), error.to_string()))?;
-        Ok(Self { versions: lists.into_iter().map(|(version, lists)| (version_numbers(&version), lists)).collect() })
-    }
-
-    /// The lists of the next newer known version, and of the next older one. Between two versions either may hold.
-    fn around(&self, version: &str) -> (Option<&Lists>, Option<&Lists>) {
-        let numbers = version_numbers(version);
-        let newer = self.versions.range(numbers.clone()..).next();
-        let older = self.versions.range(..=numbers).next_back();
-        (newer.map(|(_, lists)| lists), older.map(|(_, lists)| lists))
+        Ok(Self { versions: ByVersion::embedded("classes.json")? })
     }
 
     /// Whether `version` certainly does not open the name: neither neighbouring known version does. A version newer than all
     /// known ones may open any name, and one without classes of this kind does not read the key.
     #[must_use]
     pub fn lacks(&self, version: &str, kind: ClassKind, name: &str) -> bool {
-        let (newer, older) = self.around(version);
+        let (newer, older) = self.versions.around(version);
         let lacks = |lists: &Lists| !lists.of(kind).is_empty() && !lists.of(kind).contains_key(name);
         newer.is_some_and(lacks) && older.is_none_or(lacks)
     }
@@ -127,7 +116,7 @@ impl ClassNames {
     /// Whether the processor of this class, or else of this model type, opens its part of `kind` by the name in the files.
     #[must_use]
     pub fn reads(&self, version: &str, kind: ClassKind, processor: Option<&str>, model_type: Option<&str>) -> bool {
-        let (newer, older) = self.around(version);
+        let (newer, older) = self.versions.around(version);
         let Some(lists) = newer.or(older) else { return true };
         let of_type = || lists.of_model_type(ClassKind::Processor, model_type?);
         let class = processor.or_else(of_type).unwrap_or_default();

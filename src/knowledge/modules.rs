@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Deserialize;
 
-use super::loader::version_numbers;
-use super::source::{self, DataError};
+use super::by_version::ByVersion;
+use super::source::DataError;
 
 /// What one version lacks.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -33,7 +33,7 @@ impl Lacking {
 /// `rules/modules.json`: what each version of transformers lacks; `tools/loader_modules.py` writes it.
 #[derive(Debug, Clone, Default)]
 pub struct LoaderModules {
-    versions: BTreeMap<Vec<u64>, Lacking>,
+    versions: ByVersion<Lacking>,
 }
 
 impl LoaderModules {
@@ -42,20 +42,15 @@ impl LoaderModules {
     /// # Errors
     /// [`DataError`] when the file is malformed; a test parses it.
     pub fn embedded() -> Result<Self, DataError> {
-        let file = "modules.json";
-        let lists: BTreeMap<String, Lacking> = serde_json::from_str(source::text(file).unwrap_or_default())
-            .map_err(|error| DataError::new(&format!("rules/{file}"), error.to_string()))?;
-        Ok(Self { versions: lists.into_iter().map(|(version, lists)| (version_numbers(&version), lists)).collect() })
+        Ok(Self { versions: ByVersion::embedded("modules.json")? })
     }
 
     /// Whether `version` certainly lacks a name of a module, or with an empty name the module: it is a known version that
     /// does, or is between two that do.
     #[must_use]
     pub fn lacks(&self, version: &str, module: &str, name: &str) -> bool {
-        let numbers = version_numbers(version);
-        let newer = self.versions.range(numbers.clone()..).next();
-        let older = self.versions.range(..=numbers).next_back();
-        [newer, older].iter().all(|around| around.is_some_and(|(_, lists)| lists.lacks(module, name)))
+        let (newer, older) = self.versions.around(version);
+        [newer, older].into_iter().all(|around| around.is_some_and(|lists| lists.lacks(module, name)))
     }
 
     /// Whether `version` certainly lacks the module.

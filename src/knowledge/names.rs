@@ -1,11 +1,11 @@
 //! The names that versions of transformers accept in config.json.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use serde::Deserialize;
 
-use super::loader::version_numbers;
-use super::source::{self, DataError};
+use super::by_version::ByVersion;
+use super::source::DataError;
 
 /// The names of one version.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -52,7 +52,7 @@ impl Lists {
 /// `rules/names.json`: the names by version of transformers; `tools/loader_names.py` writes it.
 #[derive(Debug, Clone, Default)]
 pub struct LoaderNames {
-    versions: BTreeMap<Vec<u64>, Lists>,
+    versions: ByVersion<Lists>,
 }
 
 impl LoaderNames {
@@ -61,21 +61,16 @@ impl LoaderNames {
     /// # Errors
     /// [`DataError`] when the file is malformed; every test that checks a checkpoint parses it.
     pub fn embedded() -> Result<Self, DataError> {
-        let file = "names.json";
-        let lists: BTreeMap<String, Lists> = serde_json::from_str(source::text(file).unwrap_or_default())
-            .map_err(|error| DataError::new(&format!("rules/{file}"), error.to_string()))?;
-        Ok(Self { versions: lists.into_iter().map(|(version, lists)| (version_numbers(&version), lists)).collect() })
+        Ok(Self { versions: ByVersion::embedded("names.json")? })
     }
 
     /// Whether `version` certainly does not know the name: neither the next newer known version nor the next older one
     /// does. Versions newer than all known ones may know any name.
     #[must_use]
     pub fn lacks(&self, version: &str, kind: NameKind, name: &str) -> bool {
-        let numbers = version_numbers(version);
-        let newer = self.versions.range(numbers.clone()..).next();
-        let older = self.versions.range(..=numbers).next_back();
-        newer.is_some_and(|(_, lists)| !lists.of(kind).contains(name))
-            && older.is_none_or(|(_, lists)| !lists.of(kind).contains(name))
+        let (newer, older) = self.versions.around(version);
+        let lacks = |lists: &Lists| !lists.of(kind).contains(name);
+        newer.is_some_and(lacks) && older.is_none_or(lacks)
     }
 
     /// Whether any known version knows the name.
@@ -87,7 +82,7 @@ impl LoaderNames {
     /// The model type that transformers 4 takes from a directory's name when config.json has none: the longest one in it.
     #[must_use]
     pub fn model_type_in(&self, version: &str, directory: &str) -> Option<&str> {
-        let (_, lists) = self.versions.range(version_numbers(version)..).next()?;
+        let (Some(lists), _) = self.versions.around(version) else { return None };
         let found = lists.model_types.iter().filter(|name| directory.contains(name.as_str()));
         found.max_by_key(|name| name.len()).map(String::as_str)
     }

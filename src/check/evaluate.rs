@@ -1,0 +1,445 @@
+//! Turns faults and conditions into findings, one rule at a time.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value, json};
+
+use super::finding::{Finding, FindingEffect, Location, Skipped};
+use super::fix::{self, Bench, Edit, FixHint, Site};
+use super::load::{LoadReport, Target};
+use super::outcome::Outcome;
+use super::variables;
+use crate::checkpoint::document::Locator;
+use crate::checkpoint::{Checkpoint, Fault, Place, pointer};
+use crate::knowledge::expression::within;
+use crate::knowledge::program::AskedProgram;
+use crate::knowledge::rule::{Assert, At, Check, Effect, FaultCheck, Object, Rule};
+use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
+
+/// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
+const CAP: usize = 1000;
+
+/// Steps that a user's rule may take for one checkpoint: elements that its loops visit, and values that they collect.
+const STEPS: u64 = 2_000_000;
+
+/// Places of one finding that are kept, for the same reason.
+const PLACES: usize = 1000;
+
+/// What every rule of a run sees.
+pub(super) struct Context<'a> {
+    bench: Bench<'a>,
+    /// The versions of transformers of the run.
+    pub(super) targets: Vec<Target>,
+    /// The other programs of the run.
+    pub(super) programs: &'a [AskedProgram<'a>],
+    /// Whether the load fails under a version that its own loader predicts.
+    fails_for_certain: bool,
+}
+
+impl<'a> Context<'a> {
+    pub(super) fn new(
+        checkpoint: &'a Checkpoint,
+        targets: Vec<Target>,
+        programs: &'a [AskedProgram<'a>],
+        loads: &[LoadReport],
+    ) -> Self {
+        let is_certain = |version: &str| targets.iter().any(|t| t.loader.version() == version && t.is_certain());
+        let fails_for_certain = loads.iter().any(|load| !load.is_whole() && is_certain(&load.loader));
+        Self { bench: Bench::new(checkpoint), targets, programs, fails_for_certain }
+    }
+}
+
+/// Runs the selected rules, and adds their findings and the skipped rules to the outcome.
+pub(super) fn run_rules(
+    knowledge: &Knowledge,
+    context: &Context<'_>,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+    outcome: &mut Outcome,
+) {
+    let architecture = outcome.architecture.clone();
+    for rule in &knowledge.rules.rules {
+        // Built-in rules are known to end; a user's rule gets a limit.
+        let (found, stopped) = match rule.origin {
+            Some(_) => within(STEPS, || evaluate(rule, context, faults, scope, architecture.as_deref())),
+            None => (evaluate(rule, context, faults, scope, architecture.as_deref()), false),
+        };
+        if stopped {
+            let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
+            outcome.unusable.push(Skipped { code: rule.code.clone(), why });
+        }
+        match found {
+            Ok(findings) => outcome.findings.extend(findings),
+            Err(why) => {
+                let skipped = Skipped { code: rule.code.clone(), why };
+                if rule.origin.is_some() && skipped.why.contains("Undeclared reference") {
+                    outcome.unusable.push(skipped.clone());
+                }
+                outcome.skipped.push(skipped);
+            }
+        }
+    }
+}
+
+/// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.
+pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
+    let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
+    let rules = knowledge.rules.rules.iter().filter(named);
+    // Without a loader: these faults concern no load.
+    let context =
+        Context { bench: Bench::new(checkpoint), targets: Vec::new(), programs: &[], fails_for_certain: false };
+    let mut findings: Vec<Finding> =
+        rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
+    pinpoint(checkpoint, &mut findings);
+    findings
+}
+
+/// The findings of a rule, or the reason why it was skipped.
+fn evaluate(
+    rule: &Rule,
+    context: &Context<'_>,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+    architecture: Option<&str>,
+) -> Result<Vec<Finding>, String> {
+    if !rule.applies.is_empty() && !architecture.is_some_and(|a| rule.applies.iter().any(|n| n == a)) {
+        let is = architecture.unwrap_or("unknown");
+        return Err(format!("applies to {}; the architecture is {is}", rule.applies.join(", ")));
+    }
+    let cannot =
+        |expression: &Expression, error: &EvalError| match variables::absent(context.bench.checkpoint, expression) {
+            Some(file) => format!("{file} is missing"),
+            None => format!("cannot be evaluated: {}", error.cause),
+        };
+    if let Some(when) = &rule.when {
+        match when.eval_bool(scope) {
+            Ok(true) => {}
+            // The expression means something to the author of a rule only.
+            Ok(false) if rule.origin.is_some() => return Err(format!("condition is false: {when}")),
+            Ok(false) => return Err("the condition of the rule is false".to_owned()),
+            Err(error) => return Err(cannot(when, &error)),
+        }
+    }
+    run(rule, context, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
+}
+
+/// An expression that could not be evaluated, and the error.
+type Unevaluated<'r> = (&'r Expression, EvalError);
+
+fn run<'r>(
+    rule: &'r Rule,
+    context: &Context<'_>,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+) -> Result<Vec<Finding>, Unevaluated<'r>> {
+    let mut findings = match &rule.check {
+        Check::Fault(check) => from_faults(rule, check, context, faults, scope),
+        Check::Assert(check) => from_assert(rule, check, context, scope)?,
+    };
+    let more = findings.len().saturating_sub(CAP);
+    if more > 0 {
+        findings.truncate(CAP);
+        if let Some(last) = findings.last_mut() {
+            last.hidden = last.hidden.saturating_add(more as u64);
+        }
+    }
+    Ok(findings)
+}
+
+fn from_faults(
+    rule: &Rule,
+    check: &FaultCheck,
+    context: &Context<'_>,
+    faults: &[Fault],
+    scope: &Scope<'_>,
+) -> Vec<Finding> {
+    let mut matching = faults
+        .iter()
+        .filter(|f| check.kinds.contains(&f.kind))
+        .filter(|f| check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false)));
+    if check.group {
+        let all: Vec<&Fault> = matching.collect();
+        let Some(first) = all.first() else { return Vec::new() };
+        let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
+        let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
+        let mut evidence = first.detail.clone();
+        evidence.insert("count".to_owned(), json!(count));
+        let fix = all.iter().map(|f| hint(rule, context, f, &fault_scope(scope, f, count)));
+        let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
+        let mut inner = fault_scope(scope, first, count);
+        inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
+        let mut caused = Caused::default();
+        for fault in all.iter().take(PLACES) {
+            caused.add(rule, context, &fault.loaders, &fault_scope(scope, fault, count));
+        }
+        return vec![finding(rule, &inner, caused, places, evidence, fix)];
+    }
+    let mut out = Vec::new();
+    let mut more = 0_u64;
+    for fault in matching.by_ref().take(CAP) {
+        let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
+        more = more.saturating_add(fault.hidden);
+        let inner = fault_scope(scope, fault, 1);
+        let fix = hint(rule, context, fault, &inner);
+        let mut caused = Caused::default();
+        caused.add(rule, context, &fault.loaders, &inner);
+        out.push(finding(rule, &inner, caused, locate(&places), fault.detail.clone(), fix));
+    }
+    // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
+    for fault in matching {
+        more = more.saturating_add(fault.hidden).saturating_add(1);
+        let last = out.last_mut().and_then(|last| last.fix.as_mut());
+        if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
+            && let Some(fix) = hint(rule, context, fault, &fault_scope(scope, fault, 1))
+            && fix.safety == last.safety
+        {
+            last.edits.extend(fix.edits);
+        }
+    }
+    if let Some(last) = out.last_mut() {
+        last.hidden = more;
+    }
+    out
+}
+
+/// The variables of a rule on faults, for one of `count` faults.
+fn fault_scope<'a>(scope: &'a Scope<'_>, fault: &Fault, count: u64) -> Scope<'a> {
+    let mut inner = scope.child();
+    inner.bind_int("count", count);
+    for (name, value) in &variables(fault) {
+        inner.bind(name, value);
+    }
+    inner.bind("fault", &Value::Object(fault.detail.clone()));
+    inner
+}
+
+/// Kind, first place and details of a fault, by the names that rules use.
+fn variables(fault: &Fault) -> Map<String, Value> {
+    let place = fault.places.first().cloned().unwrap_or_default();
+    let own = [
+        ("kind", json!(fault.kind)),
+        ("file", json!(place.file)),
+        ("tensor", json!(place.tensor)),
+        ("pointer", json!(place.pointer)),
+    ];
+    let own = own.into_iter().map(|(name, value)| (name.to_owned(), value));
+    own.chain(fault.detail.clone()).collect()
+}
+
+fn from_assert<'r>(
+    rule: &'r Rule,
+    check: &'r Assert,
+    context: &Context<'_>,
+    scope: &Scope<'_>,
+) -> Result<Vec<Finding>, Unevaluated<'r>> {
+    let Some(each) = &check.each else {
+        let found = one_assert(rule, check, context, scope).map_err(|error| (&check.that, error))?;
+        return Ok(found.into_iter().collect());
+    };
+    let items = match each.eval(scope).map_err(|error| (each, error))? {
+        Value::Array(items) => items,
+        _ => Vec::new(),
+    };
+    let mut out = Vec::new();
+    for item in items {
+        let mut inner = scope.child();
+        inner.bind("it", &item);
+        // A missing value cannot be wrong; another rule reports it when it is required.
+        out.extend(one_assert(rule, check, context, &inner).unwrap_or(None));
+    }
+    Ok(out)
+}
+
+fn one_assert(
+    rule: &Rule,
+    check: &Assert,
+    context: &Context<'_>,
+    scope: &Scope<'_>,
+) -> Result<Option<Finding>, EvalError> {
+    if check.that.eval_bool(scope)? {
+        return Ok(None);
+    }
+    let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();
+    let fix = fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: None, scope });
+    let mut caused = Caused::default();
+    caused.add(rule, context, &[], scope);
+    Ok(Some(finding(rule, scope, caused, locate(&places), Map::new(), fix)))
+}
+
+fn place(at: &At, scope: &Scope<'_>) -> Place {
+    let render = |t: &Option<crate::knowledge::Template>| t.as_ref().map(|t| t.render(scope));
+    Place { file: render(&at.file), span: None, pointer: render(&at.pointer), tensor: render(&at.tensor) }
+}
+
+fn hint(rule: &Rule, context: &Context<'_>, fault: &Fault, scope: &Scope<'_>) -> Option<FixHint> {
+    fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: Some(fault), scope })
+}
+
+/// The fix of a finding for several faults: all their edits, if they have the same safety.
+fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
+    let (first, next) = (first?, next?);
+    if first.safety != next.safety {
+        return Some(first.without_edits());
+    }
+    let FixHint { mut edits, .. } = first;
+    let new: Vec<_> = next.edits.into_iter().filter(|edit| edits.last() != Some(edit)).collect();
+    edits.extend(new);
+    Some(FixHint { edits, ..first })
+}
+
+fn finding(
+    rule: &Rule,
+    scope: &Scope<'_>,
+    caused: Caused,
+    locations: Vec<Location>,
+    evidence: Map<String, Value>,
+    fix: Option<FixHint>,
+) -> Finding {
+    Finding {
+        code: rule.code.clone(),
+        name: rule.name.clone(),
+        severity: rule.severity_given(caused.leads(), caused.ahead),
+        message: rule.message.render(scope),
+        details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
+        effects: caused.effects,
+        locations,
+        evidence,
+        fix,
+        hidden: 0,
+        note: rule.note,
+    }
+}
+
+/// Whether a leading version has an effect.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+enum Leading {
+    #[default]
+    No,
+    /// It is predicted by a loader that only stands for the version.
+    Perhaps,
+    Yes,
+}
+
+/// The effects of one finding.
+#[derive(Default)]
+struct Caused {
+    /// One effect for each object, loader and consequence.
+    effects: Vec<FindingEffect>,
+    /// Whether a leading version has one.
+    leading: Leading,
+    /// Whether one is predicted for a version by its own loader.
+    certain: bool,
+    /// Whether one is of a version that is not older than those that the checkpoint must load with.
+    ahead: bool,
+}
+
+impl Caused {
+    /// Whether it fails for a leading version: what is predicted by another version alone is not certain.
+    const fn leads(&self) -> bool {
+        matches!((self.leading, self.certain), (Leading::Yes, _) | (Leading::Perhaps, true))
+    }
+
+    /// Adds the effects of `rule` under the loaders of a fault; all of the run if `loaders` is empty.
+    fn add(&mut self, rule: &Rule, context: &Context<'_>, loaders: &[&str], scope: &Scope<'_>) {
+        for effect in &rule.effects {
+            let holds = |when: &Expression| when.eval_bool(scope).unwrap_or(false);
+            if !effect.when.as_ref().is_none_or(holds) {
+                continue;
+            }
+            let file = scope.get("file");
+            let reader = || Object::reading(file.as_ref()?.as_str()?);
+            let Some(object) = effect.object.or_else(reader) else { continue };
+            if let Some(program) = effect.program {
+                self.add_of_program(
+                    effect,
+                    object,
+                    context.programs.iter().find(|asked| asked.program == program),
+                    scope,
+                );
+                continue;
+            }
+            for target in &context.targets {
+                let loader = target.loader.version();
+                let is_meant = loaders.is_empty() || loaders.contains(&loader);
+                let same = |e: &FindingEffect| {
+                    (e.object, e.outcome, e.loader.as_str()) == (object, effect.consequence, loader)
+                };
+                if !is_meant || !effect.loaders.contains(target.version()) || self.effects.iter().any(same) {
+                    continue;
+                }
+                let is_stated = loaders.is_empty();
+                let leading = if is_stated || target.is_certain() { Leading::Yes } else { Leading::Perhaps };
+                self.leading = self.leading.max(if target.leads { leading } else { Leading::No });
+                self.ahead |=
+                    target.leads || context.targets.iter().all(|other| !other.leads || other.loader <= target.loader);
+                self.certain |= target.is_certain() || context.fails_for_certain;
+                self.effects.push(FindingEffect {
+                    object,
+                    loader: loader.to_owned(),
+                    stands_for: target.stands_for.clone(),
+                    outcome: effect.consequence,
+                    text: effect.text.render(scope),
+                });
+            }
+        }
+    }
+
+    /// Adds an effect under a program, if the run asks for it.
+    fn add_of_program(&mut self, effect: &Effect, object: Object, asked: Option<&AskedProgram<'_>>, scope: &Scope<'_>) {
+        let Some(asked) = asked else { return };
+        (self.leading, self.certain) = (Leading::Yes, true);
+        let (loader, text) = (asked.loader(), effect.text.render(scope));
+        self.effects.push(FindingEffect { object, loader, stands_for: None, outcome: effect.consequence, text });
+    }
+}
+
+/// Places as locations; [`pinpoint`] adds their lines and columns.
+fn locate(places: &[Place]) -> Vec<Location> {
+    let location = |place: &Place| Location {
+        file: place.file.clone(),
+        pointer: place.pointer.clone(),
+        tensor: place.tensor.clone(),
+        span: place.span.clone(),
+        ..Location::default()
+    };
+    places.iter().map(location).collect()
+}
+
+/// Gives locations their line and column; a pointer that names no value points at the nearest parent.
+///
+/// Takes all findings at once, so that each text is scanned once.
+pub(super) fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
+    let mut locators: BTreeMap<String, Option<Locator<'_>>> = BTreeMap::new();
+    for location in findings.iter_mut().flat_map(|f| &mut f.locations) {
+        let Some(file) = &location.file else { continue };
+        let document = checkpoint.document(file);
+        let text = || {
+            let document = document.and_then(|d| d.text.as_deref());
+            document.or_else(|| checkpoint.modules.get(file).and_then(|m| m.text.as_deref()))
+        };
+        let locator = locators.entry(file.clone()).or_insert_with(|| text().map(Locator::new));
+        let Some(locator) = locator else { continue };
+        if location.span.is_none() && document.is_some() {
+            location.span = location.pointer.as_deref().and_then(|pointer| nearest(locator, pointer));
+        }
+        if let Some(span) = &location.span {
+            let (line, column) = locator.line_column(span.start);
+            (location.line, location.column) = (Some(line), Some(column));
+        }
+    }
+}
+
+fn nearest(locator: &mut Locator<'_>, mut pointer: &str) -> Option<std::ops::Range<usize>> {
+    // No prefix of a pointer with too many steps is worth the time.
+    pointer::steps(pointer)?;
+    loop {
+        if let Some(span) = locator.value(pointer) {
+            return Some(span);
+        }
+        pointer = pointer.rsplit_once('/')?.0;
+        // The whole document is no place to point at.
+        if pointer.is_empty() {
+            return None;
+        }
+    }
+}
