@@ -2,6 +2,7 @@
 
 pub mod adapter;
 mod bounded;
+mod built_tokenizer;
 mod class_names;
 mod directory;
 pub mod engine;

@@ -29,6 +29,7 @@ pub mod settings;
 pub mod source;
 pub mod statistics;
 pub mod tokenizer_parts;
+pub mod tokenizers;
 
 pub use architecture::{Architecture, Conversion, Doubt, Expected, ExpectedTensor, Refusal};
 pub use evidence::Evidence;
@@ -55,6 +56,7 @@ use settings::Policy;
 use source::DataError;
 use statistics::StatisticsPlaces;
 use tokenizer_parts::TokenizerPart;
+use tokenizers::TokenizerClasses;
 
 /// Data used by a check or a merge. The caller loads it once and passes it down.
 pub struct Knowledge {
@@ -92,6 +94,8 @@ pub struct Knowledge {
     pub statistics: StatisticsPlaces,
     /// Parts of tokenizer.json.
     pub tokenizer_parts: Vec<TokenizerPart>,
+    /// Tokenizer classes that do not open tokenizer.json as it is.
+    pub tokenizers: TokenizerClasses,
     /// Factors of classes on embeddings and image features.
     pub scales: Scales,
     /// Severities and suppressions of a settings file for single findings.
@@ -136,6 +140,7 @@ impl Knowledge {
             directories: Directories::embedded()?,
             statistics: StatisticsPlaces::embedded()?,
             tokenizer_parts: TokenizerPart::embedded()?,
+            tokenizers: TokenizerClasses::embedded()?,
             scales: Scales::embedded()?,
             policy: Policy::default(),
         })

@@ -13,8 +13,9 @@ use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
 use super::verdict::{Basis, PredictedLoad};
 use super::{
-    adapter, class_names, directory, index, inspect, judge, model_type, module_imports, modules, pickles, policy,
-    processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json, tokens, variables,
+    adapter, built_tokenizer, class_names, directory, index, inspect, judge, model_type, module_imports, modules,
+    pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json, tokens,
+    variables,
 };
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
@@ -106,6 +107,7 @@ fn faults_of_versions(
     let mut faults = class_names::faults(checkpoint, knowledge, asked);
     faults.extend(module_imports::faults(checkpoint, asked));
     faults.extend(tokenizer_json::faults(checkpoint, &knowledge.tokenizer_parts, asked));
+    faults.extend(built_tokenizer::faults(checkpoint, knowledge, asked));
     faults.extend(ropes::faults(checkpoint, knowledge, asked.targets));
     faults.extend(processor::faults(checkpoint, knowledge, asked, of_class, model));
     faults

@@ -35,6 +35,11 @@ impl<T> ByVersion<T> {
         (newer.map(|(_, entry)| entry), older.map(|(_, entry)| entry))
     }
 
+    /// The entry of this very version.
+    pub(super) fn at(&self, version: &str) -> Option<&T> {
+        self.entries.get(&version_numbers(version))
+    }
+
     /// The entries, the oldest version first.
     pub(super) fn values(&self) -> impl DoubleEndedIterator<Item = &T> {
         self.entries.values()

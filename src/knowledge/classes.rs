@@ -129,6 +129,12 @@ impl ClassNames {
         self.versions.values().rev().find_map(|lists| lists.of_model_type(kind, model_type))
     }
 
+    /// The name that checkpoints of this model type have in a known version.
+    #[must_use]
+    pub fn class_of(&self, version: &str, kind: ClassKind, model_type: &str) -> Option<&str> {
+        self.versions.at(version)?.of_model_type(kind, model_type)
+    }
+
     /// The known name that differs from `name` in the case of letters alone.
     #[must_use]
     pub fn in_other_case(&self, kind: ClassKind, name: &str) -> Option<&str> {

@@ -1,0 +1,233 @@
+//! What a tokenizer class of transformers 5 makes of tokenizer.json: it takes the vocabulary and the merges, and builds the
+//! model, the post-processor and the added tokens itself.
+//!
+//! Source: `AutoTokenizer.from_pretrained` and `TokenizersBackend.convert_to_native_format` of transformers 5.23.0. A class
+//! without a constructor of its own, and every class of transformers 4, opens tokenizer.json as it is.
+
+use serde_json::Value;
+
+use super::class_names::{TOKENIZER, has_code};
+use super::model_type::{Asked, CAP};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
+use crate::knowledge::Knowledge;
+use crate::knowledge::classes::ClassKind;
+use crate::knowledge::names::NameKind;
+use crate::knowledge::tokenizers::{BuiltTokenizer, BuiltTokenizers};
+
+const FILE: &str = "tokenizer.json";
+
+/// Classes that open tokenizer.json as it is.
+const GENERIC: [&str; 4] = ["TokenizersBackend", "PythonBackend", "PreTrainedTokenizer", "MistralCommonBackend"];
+
+/// Types of models between which a vocabulary gives much the same tokens: both look up whole words.
+const OF_WORDS: [&str; 2] = ["WordLevel", "WordPiece"];
+
+/// Depth of sequences of post-processors that is read.
+const MAX_DEPTH: usize = 8;
+
+/// Tokens before and after text.
+type Around<'v> = (Vec<&'v str>, Vec<&'v str>);
+
+/// Faults of tokenizer.json in the hands of such a class. Called by the engine with the targets of the run.
+pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>) -> Vec<Fault> {
+    let mut faults = Vec::new();
+    if checkpoint.tokenizer.source.as_deref() != Some(FILE) {
+        return faults;
+    }
+    for target in asked.targets {
+        let version = target.loader.version();
+        let Some(built) = knowledge.tokenizers.of(version) else { continue };
+        let Some((name, class)) = class_of(checkpoint, knowledge, built, version) else { continue };
+        let found = match other_model(checkpoint, class) {
+            Some(fault) => vec![fault],
+            None => {
+                let around = || other_around(checkpoint, class);
+                let around = (!knowledge.tokenizers.always_replaces(name)).then(around).flatten();
+                dropped_tokens(checkpoint, class).into_iter().chain(around).collect()
+            }
+        };
+        faults.extend(found.into_iter().map(|fault| fault.with("class", name).under(version)));
+    }
+    faults
+}
+
+/// The class that `AutoTokenizer` opens, if it builds the tokenizer itself.
+fn class_of<'k>(
+    checkpoint: &'k Checkpoint,
+    knowledge: &'k Knowledge,
+    built: &'k BuiltTokenizers,
+    version: &str,
+) -> Option<(&'k str, &'k BuiltTokenizer)> {
+    let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
+    let plain = |name: &'k str| name.strip_suffix("Fast").unwrap_or(name);
+    let path = text("config.json", "/_name_or_path").unwrap_or_default().to_lowercase();
+    let is_as_is = built.as_is.iter().any(|pattern| match pattern.strip_suffix('*') {
+        Some(start) => path.starts_with(start),
+        None => path == *pattern,
+    });
+    if is_as_is || has_code(checkpoint, &[TOKENIZER], &[ClassKind::Tokenizer.auto()]) {
+        return None;
+    }
+    let named = text(TOKENIZER, "/tokenizer_class").or_else(|| text("config.json", "/tokenizer_class")).map(plain);
+    let model_type = text("config.json", "/model_type");
+    let is_overruled = model_type.is_some_and(|model_type| built.overruled.contains(model_type));
+    let own = model_type.and_then(|t| knowledge.classes.class_of(version, ClassKind::Tokenizer, t)).map(plain);
+    // Without a named class the one of the config's class is opened.
+    let own = own.filter(|_| {
+        named.is_some() || !model_type.is_some_and(|t| knowledge.names.lacks(version, NameKind::ModelType, t))
+    });
+    if named == Some("LlamaTokenizer") && !is_overruled && has_byte_level(checkpoint) {
+        return None;
+    }
+    let name = match (named, own) {
+        (Some(named), Some(own)) if named != own && GENERIC.contains(&own) => return None,
+        (Some(named), Some(own)) if named != own && is_overruled => own,
+        (named, own) => named.or(own)?,
+    };
+    built.classes.get(name).map(|class| (name, class))
+}
+
+/// Whether a part of tokenizer.json is byte-level; `AutoTokenizer` then opens it as it is instead of as `LlamaTokenizer`.
+fn has_byte_level(checkpoint: &Checkpoint) -> bool {
+    fn is_byte_level(part: &Value, depth: usize) -> bool {
+        let inner =
+            ["pretokenizers", "decoders", "processors", "normalizers"].into_iter().filter_map(|key| part.get(key));
+        part.get("type").and_then(Value::as_str) == Some("ByteLevel")
+            || depth < MAX_DEPTH
+                && inner.filter_map(Value::as_array).flatten().any(|part| is_byte_level(part, depth.saturating_add(1)))
+    }
+    let Some(document) = checkpoint.document(FILE) else { return false };
+    let parts = ["/pre_tokenizer", "/decoder", "/post_processor", "/normalizer"];
+    parts.into_iter().filter_map(|pointer| document.get(pointer)).any(|part| is_byte_level(part, 0))
+}
+
+/// The fault of a model of another type than the class builds.
+fn other_model(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fault> {
+    let document = checkpoint.document(FILE)?;
+    let stored = document.get("/model/type")?.as_str()?;
+    let is_alike = |name: &str| OF_WORDS.contains(&name);
+    if stored == class.model || (is_alike(stored) && is_alike(&class.model)) {
+        return None;
+    }
+    let fault = Fault::new(FaultKind::TokenizerModelOfOtherType)
+        .at(Place::file(FILE).pointer("/model/type"))
+        .with("type", escape(stored, CAP))
+        .with("model", class.model.as_str());
+    Some(match class.raises.get(stored) {
+        Some(error) => fault.with("raises", error.as_str()),
+        None => fault,
+    })
+}
+
+/// The fault of added tokens that only tokenizer.json has: the class takes those of `added_tokens_decoder` instead.
+fn dropped_tokens(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fault> {
+    let tokenizer = &checkpoint.tokenizer;
+    let decoder = tokenizer.added_tokens_decoder.as_ref()?;
+    let base = tokenizer.base()?;
+    let special = special_values(checkpoint, class);
+    let is_dropped = |token: &str| {
+        base.id_of(token).is_none()
+            && !decoder.iter().any(|other| other.content == token)
+            && !special.contains(&token)
+            && !class.adds.contains(token)
+    };
+    let added = tokenizer.tokenizer_json_added.as_deref()?;
+    let dropped: Vec<_> = added.iter().enumerate().filter(|(_, token)| is_dropped(&token.content)).collect();
+    let (at, first) = dropped.first()?;
+    let fault = Fault::new(FaultKind::AddedTokensDropped).at(Place::file(FILE).pointer(format!("/added_tokens/{at}")));
+    Some(fault.with("token", escape(&first.content, CAP)).with("count", dropped.len()))
+}
+
+/// Every special token that the class adds: those that `tokenizer_config.json` names, and its own.
+fn special_values<'v>(checkpoint: &'v Checkpoint, class: &'v BuiltTokenizer) -> Vec<&'v str> {
+    fn content(value: &Value) -> Option<&str> {
+        value.as_str().or_else(|| value.get("content")?.as_str())
+    }
+    let config = checkpoint.document(TOKENIZER).and_then(|document| document.get("")?.as_object());
+    let own = class.special.iter().filter(|(name, _)| config.is_none_or(|config| !config.contains_key(*name)));
+    let mut values: Vec<&str> = own.map(|(_, token)| token.as_str()).collect();
+    for (key, value) in config.into_iter().flatten() {
+        match value {
+            Value::Array(list) if key.ends_with("_special_tokens") => values.extend(list.iter().filter_map(content)),
+            Value::Object(map) if key == "extra_special_tokens" => values.extend(map.values().filter_map(content)),
+            value if key.ends_with("_token") => values.extend(content(value)),
+            _ => {}
+        }
+    }
+    values
+}
+
+/// The fault of a post-processor that the class replaces by one that writes other tokens.
+fn other_around(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fault> {
+    let config = |key: &str| checkpoint.document(TOKENIZER)?.get(&format!("/{key}")).filter(|value| !value.is_null());
+    if class.settings.iter().any(|key| config(key).is_some()) {
+        return None;
+    }
+    let part = checkpoint.document(FILE)?.get("/post_processor").unwrap_or(&Value::Null);
+    let [before, after] = if part.is_null() { &class.without } else { class.around.as_ref()? };
+    let own = (tokens(checkpoint, class, before)?, tokens(checkpoint, class, after)?);
+    let stored = around(part, 0)?;
+    if own == stored {
+        return None;
+    }
+    let shown = |(before, after): &Around<'_>| {
+        let tokens = before.iter().copied().chain(["text"]).chain(after.iter().copied());
+        escape(&tokens.collect::<Vec<_>>().join(" "), CAP)
+    };
+    let fault = Fault::new(FaultKind::PostProcessorReplaced).at(Place::file(FILE).pointer("/post_processor"));
+    Some(fault.with("stored", shown(&stored)).with("own", shown(&own)))
+}
+
+/// The tokens that these attributes have; `None` when one has no token, or a token that the vocabulary lacks.
+fn tokens<'v>(checkpoint: &'v Checkpoint, class: &'v BuiltTokenizer, names: &'v [String]) -> Option<Vec<&'v str>> {
+    let tokenizer = &checkpoint.tokenizer;
+    let of = |name: &'v String| {
+        let token = match class.special.get(name) {
+            None => name,
+            Some(default) => match tokenizer.special_tokens.iter().find(|(attribute, _)| attribute == name) {
+                Some((_, token)) => token,
+                None if tokenizer.named_special.contains(name) => return None,
+                None => default,
+            },
+        };
+        Some(token.as_str()).filter(|token| tokenizer.contains(token))
+    };
+    names.iter().map(of).collect()
+}
+
+/// What a post-processor of tokenizer.json writes around a single text; `None` for a type that is not read.
+fn around(part: &Value, depth: usize) -> Option<Around<'_>> {
+    let kind = part.get("type").and_then(Value::as_str);
+    match kind {
+        _ if part.is_null() => Some((Vec::new(), Vec::new())),
+        Some("ByteLevel") => Some((Vec::new(), Vec::new())),
+        Some("BertProcessing" | "RobertaProcessing") => {
+            let token = |key: &str| part.get(key)?.get(0)?.as_str();
+            Some((vec![token("cls")?], vec![token("sep")?]))
+        }
+        Some("TemplateProcessing") => {
+            let (mut before, mut after, mut is_after) = (Vec::new(), Vec::new(), false);
+            for piece in part.get("single")?.as_array()? {
+                let Some(name) = piece.pointer("/SpecialToken/id").and_then(Value::as_str) else {
+                    is_after = true;
+                    continue;
+                };
+                let written = part.get("special_tokens")?.get(name)?.get("tokens")?.as_array()?;
+                let written = written.iter().map(Value::as_str).collect::<Option<Vec<_>>>()?;
+                if is_after { after.extend(written) } else { before.extend(written) }
+            }
+            Some((before, after)).filter(|_| is_after)
+        }
+        Some("Sequence") if depth < MAX_DEPTH => {
+            let mut whole: Around<'_> = (Vec::new(), Vec::new());
+            for inner in part.get("processors")?.as_array()? {
+                let (mut before, after) = around(inner, depth.saturating_add(1))?;
+                before.append(&mut whole.0);
+                whole.0 = before;
+                whole.1.extend(after);
+            }
+            Some(whole)
+        }
+        _ => None,
+    }
+}
