@@ -3,6 +3,7 @@
 pub mod adapter;
 mod bounded;
 mod built_tokenizer;
+mod card;
 mod class_names;
 mod directory;
 pub mod engine;

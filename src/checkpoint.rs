@@ -12,6 +12,7 @@ use serde_json::Value;
 
 pub mod adapter;
 mod budget;
+pub mod card;
 pub(crate) mod contents;
 mod discover;
 pub mod document;
@@ -86,6 +87,8 @@ pub struct Checkpoint {
     pub tokenizer: Tokenizer,
     /// Text of files that are neither documents nor modules, by name: `chat_template.jinja`.
     pub texts: BTreeMap<String, Arc<str>>,
+    /// The model card; `None` when README.md is absent or was not read.
+    pub card: Option<card::ModelCard>,
     /// The base model that `adapter_config.json` names by a relative path; `None` when it is not there.
     pub base: Option<adapter::AdapterBase>,
     /// Files below its folders.

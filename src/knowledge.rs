@@ -28,6 +28,7 @@ pub mod selection;
 pub mod settings;
 pub mod source;
 pub mod statistics;
+pub mod text_classes;
 pub mod tokenizer_parts;
 pub mod tokenizers;
 
@@ -55,6 +56,7 @@ use scales::Scales;
 use settings::Policy;
 use source::DataError;
 use statistics::StatisticsPlaces;
+use text_classes::TextTypes;
 use tokenizer_parts::TokenizerPart;
 use tokenizers::TokenizerClasses;
 
@@ -96,6 +98,8 @@ pub struct Knowledge {
     pub tokenizer_parts: Vec<TokenizerPart>,
     /// Tokenizer classes that do not open tokenizer.json as it is.
     pub tokenizers: TokenizerClasses,
+    /// Model types of language models inside other models.
+    pub text_types: TextTypes,
     /// Factors of classes on embeddings and image features.
     pub scales: Scales,
     /// Severities and suppressions of a settings file for single findings.
@@ -141,6 +145,7 @@ impl Knowledge {
             statistics: StatisticsPlaces::embedded()?,
             tokenizer_parts: TokenizerPart::embedded()?,
             tokenizers: TokenizerClasses::embedded()?,
+            text_types: TextTypes::embedded()?,
             scales: Scales::embedded()?,
             policy: Policy::default(),
         })

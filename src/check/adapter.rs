@@ -14,6 +14,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
+use super::card::{base_on_hub, is_path};
 use crate::checkpoint::adapter::{Adapter, CONFIG, PREFIX, WEIGHTS};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
 use crate::knowledge::peft::PeftKeys;
@@ -43,7 +44,9 @@ pub fn faults(checkpoint: &Checkpoint, table: &PeftKeys, versions: &[String]) ->
     faults.extend(config::faults(config, table, versions));
     if is_path(base) && checkpoint.base.is_none() {
         let at = Place::file(CONFIG).pointer("/base_model_name_or_path");
-        faults.push(Fault::new(FaultKind::AdapterBaseIsAPath).at(at).with("base", base));
+        let fault = Fault::new(FaultKind::AdapterBaseIsAPath).at(at).with("base", base);
+        let of_card = base_on_hub(checkpoint).into_iter();
+        faults.push(of_card.fold(fault, |fault, id| fault.with("of_card", id)));
     }
     let kind = text("peft_type").unwrap_or_default();
     if kind != "LORA" {
@@ -92,12 +95,6 @@ fn other_library(config: &Value) -> Option<(&'static str, &'static str)> {
         [("model_class", "AdapterHub"), ("fine_tune_type", "MLX"), ("lora_parameters", "MLX")];
     let is_peft = config.get("peft_type").is_some();
     LIBRARIES.into_iter().find(|(key, _)| !is_peft && config.get(*key).is_some())
-}
-
-/// Whether a base model is named by a path of the machine that trained: a Hub id has at most one slash, inside.
-fn is_path(base: &str) -> bool {
-    let drive = base.get(1..3).is_some_and(|s| s == ":\\" || s == ":/");
-    drive || base.starts_with(['/', '.', '~']) || base.contains('\\') || base.matches('/').count() > 1
 }
 
 fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {

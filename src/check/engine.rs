@@ -13,7 +13,7 @@ use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
 use super::verdict::{Basis, PredictedLoad};
 use super::{
-    adapter, built_tokenizer, class_names, directory, index, inspect, judge, model_type, module_imports, modules,
+    adapter, built_tokenizer, card, class_names, directory, index, inspect, judge, model_type, module_imports, modules,
     pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json, tokens,
     variables,
 };
@@ -91,6 +91,7 @@ fn faults_of_files(checkpoint: &Checkpoint, knowledge: &Knowledge, programs: &[A
     faults.extend(modules::faults(checkpoint));
     faults.extend(statistics::faults(checkpoint, &knowledge.statistics));
     faults.extend(programs::faults(checkpoint, programs));
+    faults.extend(card::faults(checkpoint));
     faults.extend(pickles::faults(checkpoint, knowledge));
     faults.extend(templates::faults(checkpoint));
     faults

@@ -9,6 +9,7 @@ use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{LoadReport, Target};
 use super::outcome::Outcome;
 use super::variables;
+use crate::checkpoint::card::CARD;
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place, pointer};
 use crate::knowledge::expression::within;
@@ -415,7 +416,9 @@ pub(super) fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
         let document = checkpoint.document(file);
         let text = || {
             let document = document.and_then(|d| d.text.as_deref());
-            document.or_else(|| checkpoint.modules.get(file).and_then(|m| m.text.as_deref()))
+            let module = || checkpoint.modules.get(file).and_then(|m| m.text.as_deref());
+            let card = || checkpoint.card.as_ref().filter(|_| file == CARD).map(|card| &*card.text);
+            document.or_else(module).or_else(card)
         };
         let locator = locators.entry(file.clone()).or_insert_with(|| text().map(Locator::new));
         let Some(locator) = locator else { continue };

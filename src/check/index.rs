@@ -442,10 +442,22 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
         None => {
             let is_foreign = |name: &&String| FOREIGN.iter().any(|ending| name.ends_with(ending));
             let foreign: Vec<&str> = checkpoint.entries.keys().filter(is_foreign).map(String::as_str).collect();
+            let misspelt: Vec<&str> =
+                checkpoint.entries.keys().map(String::as_str).filter(|n| is_misspelt(n)).collect();
+            if !misspelt.is_empty() && foreign.is_empty() {
+                return unread_weights(checkpoint, &misspelt);
+            }
             let fault = Fault::new(FaultKind::NoWeights).with("model", is_model(checkpoint) && foreign.is_empty());
             Some(if foreign.is_empty() { fault } else { fault.with("foreign", foreign) })
         }
     }
+}
+
+/// Whether a name is that of a weight file with other separators, case or a note of a browser: `pytorch_model_bin`.
+fn is_misspelt(name: &str) -> bool {
+    let letters = name.chars().filter(char::is_ascii_alphabetic).map(|c| c.to_ascii_lowercase());
+    let letters: String = letters.collect();
+    matches!(letters.as_str(), "pytorchmodelbin" | "modelsafetensors" | "pytorchmodel")
 }
 
 /// Whether a git-lfs pointer stands in place of the file; it has a finding of its own.

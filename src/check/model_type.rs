@@ -89,7 +89,18 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
         let value = config.pointer(place.pointer.as_deref()?)?;
         Some(unknown(knowledge, value, place.clone(), asked)?.with("part", true))
     };
-    fault.into_iter().map(with_class).chain(parts.iter().filter_map(of_part)).collect()
+    let faults = fault.into_iter().map(with_class).chain(parts.iter().filter_map(of_part));
+    faults.chain(class_of_whole(knowledge, config)).collect()
+}
+
+/// The fault of a class that contains the language model which the config describes.
+fn class_of_whole(knowledge: &Knowledge, config: &Value) -> Option<Fault> {
+    let class = config.pointer("/architectures/0")?.as_str()?;
+    let model_type = config.get("model_type")?.as_str()?;
+    let classes =
+        knowledge.text_types.of(model_type).filter(|classes| classes.whole.iter().any(|name| name == class))?;
+    let fault = Fault::new(FaultKind::ClassOfWholeModel).at(Place::file("config.json").pointer("/architectures/0"));
+    Some(fault.with("class", class).with("model_type", model_type).with("own", classes.own.as_str()))
 }
 
 /// Whether the config class is code beside the weights or in another repository.

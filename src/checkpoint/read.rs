@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use super::adapter::AdapterBase;
 use super::budget::{Budget, text_cost};
+use super::card::{CARD, CARD_CAP, ModelCard};
 use super::contents::Contents;
 use super::git;
 use super::is_plain_file_name;
@@ -240,6 +241,10 @@ impl DirectoryReader {
                 }
                 Err(error) => self.checkpoint.faults.push(error.fault(name)),
             }
+        } else if name == CARD && entry.lfs.is_none() {
+            // Nothing loads it, so that it cannot be read is no fault.
+            let bytes = read_own(root, name, CARD_CAP).ok();
+            self.checkpoint.card = bytes.map(|bytes| ModelCard::parse(&String::from_utf8_lossy(&bytes)));
         } else if VOCABULARIES.contains(&name) {
             match vocabulary(root, name) {
                 Ok(vocabulary) => drop(self.vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),

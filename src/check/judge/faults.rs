@@ -19,6 +19,7 @@ pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[
     let modules = loads.first().and_then(|load| load.prediction.quantised.as_ref()).or(without_class.as_ref());
     faults.extend(quantization::faults(inputs.checkpoint, &inputs.scheme, modules));
     faults.extend(total_size(inputs, loads));
+    faults.extend(pointer_sizes(inputs, loads));
     faults.extend(integers::fault(inputs, loads));
     faults.extend(tensors(loads, inputs.stored).into_iter().map(|fault| compare_tied(inputs.checkpoint, fault)));
     faults.extend(votes.iter().map(|vote| {
@@ -52,6 +53,13 @@ fn total_size(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault>
         let report = one.report.as_ref()?;
         size::fault(inputs.checkpoint, one.architecture, inputs.config, &one.expected, inputs.stored, report)
     });
+    faults.next()
+}
+
+/// The fault of Git LFS pointers to more or fewer bytes than the class has.
+fn pointer_sizes(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault> {
+    let leading = loads.iter().map(|load| &load.prediction).filter(|one| one.target.leads && inputs.is_plain());
+    let mut faults = leading.filter_map(|one| size::pointer_fault(inputs.checkpoint, inputs.config, &one.expected));
     faults.next()
 }
 
