@@ -7,6 +7,7 @@ mod check;
 mod exit;
 mod expect;
 mod fix;
+mod generate;
 mod hints;
 mod init;
 mod inspect;
@@ -74,6 +75,8 @@ fn run() -> ExitCode {
         args::Command::Rules(args) => rules::list(&args, rules.as_deref()),
         args::Command::Recipes(args) => recipes::list(&args, rules.as_deref()),
         args::Command::Init(args) => init::run(&args),
+        args::Command::Completions(args) => generate::completions(&args),
+        args::Command::Man(args) => generate::man(&args),
         args::Command::Extract(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
         args::Command::Insert(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
     };

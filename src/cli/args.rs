@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
+use clap_complete::Shell;
 
 use crate::check::Severity;
 use crate::knowledge::loader::{parse_program, parse_requirement, parse_requirement_or_all};
@@ -50,6 +51,10 @@ pub enum Command {
     Recipes(RecipesArgs),
     /// Write a settings file, ckpt-doctor.json5, with every key explained
     Init(InitArgs),
+    /// Print the completions for a shell
+    Completions(CompletionsArgs),
+    /// Print a page of the manual
+    Man(ManArgs),
 }
 
 /// Settings file selection.
@@ -79,6 +84,32 @@ pub struct InitArgs {
     /// Also write a .pre-commit-config.yaml
     #[arg(long)]
     pub pre_commit: bool,
+}
+
+/// Arguments of `completions`.
+#[derive(Debug, Args)]
+#[command(
+    arg(hidden_rules()),
+    after_help = "Files that the shells read:\n  \
+bash        ~/.local/share/bash-completion/completions/ckpt-doctor\n  \
+zsh         _ckpt-doctor in a directory of $fpath\n  \
+fish        ~/.config/fish/completions/ckpt-doctor.fish\n  \
+elvish      ~/.config/elvish/rc.elv, to append to\n  \
+powershell  $PROFILE, to append to"
+)]
+pub struct CompletionsArgs {
+    /// The shell
+    #[arg(value_name = "SHELL")]
+    pub shell: Shell,
+}
+
+/// Arguments of `man`.
+#[derive(Debug, Args)]
+#[command(arg(hidden_rules()), after_help = "To read a page: ckpt-doctor man check | man -l -")]
+pub struct ManArgs {
+    /// The command that the page describes; without it, the program
+    #[arg(value_name = "COMMAND")]
+    pub command: Option<String>,
 }
 
 /// Arguments of `expect`.

@@ -1,7 +1,8 @@
-//! Generated pages and data: `rules/README.md`, `rules/examples.json`, `docs/rules.md`, and the lists in
-//! `docs/decisions.md`. `CKPT_DOCTOR_WRITE=1 cargo test --test it pages::` writes them.
+//! Generated pages and data: `rules/README.md`, `rules/examples.json`, `docs/rules.md`, the lists in `docs/decisions.md`,
+//! and the completions and manual pages in `packaging/`. `CKPT_DOCTOR_WRITE=1 cargo test --test it pages::` writes them.
 
 mod key_tables;
+mod share;
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -18,13 +18,48 @@ fn doctor(dir: &Path, args: &[&str]) -> Output {
 #[test]
 fn every_command_has_its_help() {
     let mut all = String::new();
-    for command in ["", "check", "undo", "build-merged", "inspect", "expect", "explain", "rules", "recipes", "init"] {
+    let commands = [
+        "",
+        "check",
+        "undo",
+        "build-merged",
+        "inspect",
+        "expect",
+        "explain",
+        "rules",
+        "recipes",
+        "init",
+        "completions",
+        "man",
+    ];
+    for command in commands {
         let args: Vec<&str> = [command, "-h"].into_iter().filter(|arg| !arg.is_empty()).collect();
         let output = doctor(project(), &args);
         assert!(output.status.success());
         let _ok = writeln!(all, "$ ckpt-doctor {}\n{}", args.join(" "), String::from_utf8(output.stdout).unwrap());
     }
     snapshot!("help", all);
+}
+
+#[test]
+fn completions_are_printed_for_every_shell() {
+    for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
+        let output = doctor(project(), &["completions", shell]);
+        let text = String::from_utf8(output.stdout).unwrap();
+        assert!(output.status.success());
+        for word in ["build-merged", "unsafe-fixes", "merge"] {
+            assert!(text.contains(word), "{word} is missing for {shell}");
+        }
+    }
+    let bash = String::from_utf8(doctor(project(), &["completions", "bash"]).stdout).unwrap();
+    let states = bash.lines().filter_map(|line| line.trim().strip_prefix("cmd=\"")?.strip_suffix('"'));
+    for state in states.filter(|state| !state.is_empty()) {
+        assert!(bash.contains(&format!("\n        {state})\n")), "no words for {state}");
+    }
+
+    let output = doctor(project(), &["man", "diff"]);
+    assert_eq!(String::from_utf8(output.stderr).unwrap(), "error: unknown command: diff\n");
+    assert_eq!(output.status.code(), Some(2));
 }
 
 #[test]
