@@ -1,18 +1,24 @@
 """Runs the hooks under the real pre-commit, in a scratch git repository with a model directory.
 
-    pre_commit.py SOURCE
+    pre_commit.py SOURCE WHEELS
 
-SOURCE is a copy of this project's files. The script turns it into a git repository, from which the `language: rust` hook is
-installed. The `language: system` hook runs the program given by CKPT_DOCTOR.
+SOURCE is a copy of this project's files. The script turns it into a git repository, from which the `language: python` hooks
+are installed: pip builds the wheel, in the dev profile and in CARGO_TARGET_DIR, so that only this crate is compiled. The
+`language: system` hook runs the program given by CKPT_DOCTOR. The hook of docs/integrations.md installs the wheel of this
+project from WHEELS, which stands for the package index and also has maturin.
 """
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
+
+import yaml
 
 DOCTOR = Path(os.environ["CKPT_DOCTOR"]).resolve()
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:{}\nsize 5000000\n"
@@ -20,7 +26,9 @@ GIT = ["git", "-c", "user.name=CI", "-c", "user.email=ci@example.invalid", "-c",
 
 
 def run(*command, cwd, ok=True):
-    done = subprocess.run([str(c) for c in command], cwd=cwd, env=ENV, capture_output=True, text=True)
+    done = subprocess.run(
+        [str(c) for c in command], cwd=cwd, env={**ENV, "PATH": os.pathsep.join(PATH)}, capture_output=True, text=True
+    )
     output = done.stdout + done.stderr
     if (done.returncode == 0) != ok:
         sys.exit(f"{' '.join(map(str, command))}: exit {done.returncode}\n{output}")
@@ -43,8 +51,22 @@ def repository(at):
 
 def configure(repo, source, rev, hook, args=None):
     text = f"repos:\n- repo: {source}\n  rev: {rev}\n  hooks:\n  - id: {hook}\n"
-    repo.joinpath(".pre-commit-config.yaml").write_text(text + (f"    args: {json.dumps(args)}\n" if args else ""))
+    write_config(repo, text + (f"    args: {json.dumps(args)}\n" if args else ""))
+
+
+def write_config(repo, text):
+    repo.joinpath(".pre-commit-config.yaml").write_text(text)
     run(sys.executable, "-m", "pre_commit", "install", cwd=repo)
+
+
+def documented(page):
+    """The configuration of the page that installs the wheel."""
+    blocks = re.findall(r"^```yaml\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    (text,) = [block for block in blocks if "additional_dependencies" in block]
+    (repository,) = yaml.safe_load(text)["repos"]
+    if [hook["language"] for hook in repository["hooks"]] != ["python"]:
+        sys.exit(f"not one hook of language python:\n{text}")
+    return text
 
 
 def expect(output, *words):
@@ -53,7 +75,7 @@ def expect(output, *words):
             sys.exit(f"missing in the output: {word}\n{output}")
 
 
-def main(files, room):
+def main(files, wheels, room):
     source, repo = room / "source", room / "repo"
     shutil.copytree(files, source)
     repository(source)
@@ -126,11 +148,40 @@ def main(files, room):
     commit(repo, "pointers of git-lfs")
     print("pointers of git-lfs are committed")
 
+    ENV.update(PIP_NO_INDEX="1", PIP_FIND_LINKS=str(wheels), MATURIN_PEP517_ARGS="--profile dev")
     configure(repo, source, rev, "ckpt-doctor")
     run(sys.executable, "-m", "pre_commit", "run", "--all-files", cwd=repo)
     index.write_text(json.dumps(broken, indent=2))
     expect(commit(repo, "broken", ok=False), "Failed", "model-00009-of-00009.safetensors")
     print("the hook that pre-commit builds reports the same")
+
+    # Deleted files are not passed to the hook, so only a check of everything sees that a model has lost its config.
+    git("checkout", "-q", "-f", "HEAD", cwd=repo)
+    model.joinpath("config.json").unlink()
+    repo.joinpath("package.json").write_text('{"changed": true}\n')
+    commit(repo, "a deleted config")
+    configure(repo, source, rev, "ckpt-doctor-all", ["models"])
+    repo.joinpath("notes.txt").write_text("unrelated\n")
+    expect(commit(repo, "an unrelated file", ok=False), "Failed", "models/a")
+    git("reset", "-q", "--hard", "HEAD~1", cwd=repo)
+    print("ckpt-doctor-all sees a deleted file")
+
+    # Neither the program on the PATH nor a Rust toolchain may run.
+    stubs = room / "stubs"
+    stubs.mkdir()
+    for name in ("ckpt-doctor", "cargo", "rustc", "cc"):
+        stubs.joinpath(name).write_text(f"#!/bin/sh\necho {name} was called >&2\nexit 99\n")
+        stubs.joinpath(name).chmod(0o755)
+    PATH.insert(0, str(stubs))
+    write_config(repo, documented(files / "docs/integrations.md"))
+    begun = time.monotonic()
+    run(sys.executable, "-m", "pre_commit", "install-hooks", cwd=repo)
+    seconds = time.monotonic() - begun
+    index.write_text(json.dumps(broken, indent=2))
+    expect(commit(repo, "broken", ok=False), "Failed", "model-00009-of-00009.safetensors")
+    index.write_text(json.dumps(kept))
+    commit(repo, "sound")
+    print(f"the hook that installs the wheel is ready after {seconds:.1f} s, and reports the same")
 
 
 if __name__ == "__main__":
@@ -138,9 +189,9 @@ if __name__ == "__main__":
         room = Path(room).resolve()
         ENV = {
             **os.environ,
-            "PATH": f"{DOCTOR.parent}:{os.environ['PATH']}",
             "PRE_COMMIT_HOME": str(room / "home"),
             "GIT_CONFIG_GLOBAL": os.devnull,
             "GIT_CONFIG_NOSYSTEM": "1",
         }
-        main(Path(sys.argv[1]).resolve(), room)
+        PATH = [str(DOCTOR.parent), *os.environ["PATH"].split(os.pathsep)]
+        main(Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve(), room)
