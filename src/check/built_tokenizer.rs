@@ -4,6 +4,8 @@
 //! Source: `AutoTokenizer.from_pretrained` and `TokenizersBackend.convert_to_native_format` of transformers 5.23.0. A class
 //! without a constructor of its own, and every class of transformers 4, opens tokenizer.json as it is.
 
+use std::collections::BTreeSet;
+
 use serde_json::Value;
 
 use super::class_names::{TOKENIZER, has_code};
@@ -38,14 +40,13 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
         let version = target.loader.version();
         let Some(built) = knowledge.tokenizers.of(version) else { continue };
         let Some((name, class)) = class_of(checkpoint, knowledge, built, version) else { continue };
-        let found = match other_model(checkpoint, class) {
-            Some(fault) => vec![fault],
-            None => {
-                let around = || other_around(checkpoint, class);
-                let around = (!knowledge.tokenizers.always_replaces(name)).then(around).flatten();
-                dropped_tokens(checkpoint, class).into_iter().chain(around).collect()
-            }
-        };
+        let mut found: Vec<Fault> = other_model(checkpoint, class).into_iter().collect();
+        // With a model of another type, everything else differs too.
+        if found.is_empty() {
+            found.extend(dropped_tokens(checkpoint, class));
+            let is_new = !knowledge.tokenizers.always_replaces(name);
+            found.extend(is_new.then(|| other_around(checkpoint, class)).flatten());
+        }
         faults.extend(found.into_iter().map(|fault| fault.with("class", name).under(version)));
     }
     faults
@@ -124,13 +125,9 @@ fn dropped_tokens(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fau
     let tokenizer = &checkpoint.tokenizer;
     let decoder = tokenizer.added_tokens_decoder.as_ref()?;
     let base = tokenizer.base()?;
-    let special = special_values(checkpoint, class);
-    let is_dropped = |token: &str| {
-        base.id_of(token).is_none()
-            && !decoder.iter().any(|other| other.content == token)
-            && !special.contains(&token)
-            && !class.adds.contains(token)
-    };
+    let mut taken: BTreeSet<&str> = special_values(checkpoint, class).into_iter().collect();
+    taken.extend(decoder.iter().map(|token| token.content.as_str()));
+    let is_dropped = |token: &str| base.id_of(token).is_none() && !taken.contains(token) && !class.adds.contains(token);
     let added = tokenizer.tokenizer_json_added.as_deref()?;
     let dropped: Vec<_> = added.iter().enumerate().filter(|(_, token)| is_dropped(&token.content)).collect();
     let (at, first) = dropped.first()?;

@@ -38,20 +38,12 @@ impl ModelCard {
                 (0, _) | (_, "---") => break,
                 _ => {}
             }
-            let value = match line.strip_prefix("base_model:") {
-                Some(value) => {
-                    in_list = value.trim().is_empty();
-                    Some(value)
-                }
-                // A list may stand at the indent of its key.
-                None if in_list => match line.trim_start().strip_prefix("- ") {
-                    Some(item) => Some(item),
-                    None => {
-                        in_list = line.trim().is_empty();
-                        None
-                    }
-                },
-                None => None,
+            // A list may stand at the indent of its key.
+            let item = line.trim_start().strip_prefix("- ").filter(|_| in_list);
+            let value = line.strip_prefix("base_model:").or(item);
+            in_list = match value {
+                Some(value) => item.is_some() || value.trim().is_empty(),
+                None => in_list && line.trim().is_empty(),
             };
             let Some(name) = value.map(plain).filter(|name| !name.is_empty()) else { continue };
             let from = line.find(name).and_then(|offset| at.checked_add(offset));
