@@ -35,6 +35,9 @@ pub struct DirectoryKind {
     /// characters within a name, and a folder ends with `/`. `check` visits directories with these names.
     #[serde(default)]
     signs: Vec<Vec<Pattern>>,
+    /// Names that a directory of this kind does not have beside its signs.
+    #[serde(default)]
+    without: Vec<Pattern>,
     /// Folders that belong to it and are no checkpoints of their own.
     #[serde(default)]
     parts: Vec<Pattern>,
@@ -53,8 +56,11 @@ pub struct DirectoryKind {
 }
 
 impl DirectoryKind {
-    /// The names that match one of the sets of signs; `None` when no set is complete.
+    /// The names that match one of the sets of signs; `None` when no set is complete, or when a name is of another kind.
     fn signs_in<'n, S: AsRef<str>>(&self, names: &'n [S]) -> Option<Vec<&'n str>> {
+        if names.iter().any(|name| self.without.iter().any(|other| other.is_match(name.as_ref()))) {
+            return None;
+        }
         let found = |sign: &Pattern| names.iter().map(AsRef::as_ref).find(|name| sign.is_match(name));
         let complete = self.signs.iter().find_map(|set| set.iter().map(found).collect::<Option<Vec<_>>>());
         complete.filter(|signs| !signs.is_empty())
