@@ -225,6 +225,16 @@ impl Checkpoint {
         self.documents.get(name).or_else(|| self.nested.documents.get(name))
     }
 
+    /// The text of a document, Python module or model card, byte for byte; `None` for other files and when it is not
+    /// UTF-8.
+    #[must_use]
+    pub fn text(&self, file: &str) -> Option<&Arc<str>> {
+        let document = || self.document(file)?.text.as_ref();
+        let module = || self.modules.get(file)?.text.as_ref();
+        let card = || self.card.as_ref().filter(|_| file == card::CARD).map(|card| &card.text);
+        document().or_else(module).or_else(card)
+    }
+
     /// Names of the entries, and paths below folders; those of folders end with `/`.
     pub fn names(&self) -> impl Iterator<Item = Cow<'_, str>> {
         let name = |(name, entry): (&'_ String, &Entry)| match entry.kind {

@@ -9,7 +9,6 @@ use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{LoadReport, Target};
 use super::outcome::Outcome;
 use super::variables;
-use crate::checkpoint::card::CARD;
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place, pointer};
 use crate::knowledge::expression::within;
@@ -414,13 +413,9 @@ pub(super) fn pinpoint(checkpoint: &Checkpoint, findings: &mut [Finding]) {
     for location in findings.iter_mut().flat_map(|f| &mut f.locations) {
         let Some(file) = &location.file else { continue };
         let document = checkpoint.document(file);
-        let text = || {
-            let document = document.and_then(|d| d.text.as_deref());
-            let module = || checkpoint.modules.get(file).and_then(|m| m.text.as_deref());
-            let card = || checkpoint.card.as_ref().filter(|_| file == CARD).map(|card| &*card.text);
-            document.or_else(module).or_else(card)
-        };
-        let locator = locators.entry(file.clone()).or_insert_with(|| text().map(Locator::new));
+        let locator =
+            || document.and_then(Locator::of).or_else(|| checkpoint.text(file).map(|text| Locator::new(text)));
+        let locator = locators.entry(file.clone()).or_insert_with(locator);
         let Some(locator) = locator else { continue };
         if location.span.is_none() && document.is_some() {
             location.span = location.pointer.as_deref().and_then(|pointer| nearest(locator, pointer));

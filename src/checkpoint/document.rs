@@ -28,9 +28,9 @@ pub struct Document {
     /// The parsed value. Non-finite and huge numbers are null here; of duplicate keys the last one counts. `None` when
     /// the text could not be parsed to its end: then a missing key proves nothing.
     pub value: Option<Value>,
-    /// JSON pointers of large parts that `value` omits because [`super::Tokenizer`] holds them in less space; these
-    /// parts were parsed, and their faults are in `faults`.
-    pub left_out: Vec<&'static str>,
+    /// Byte ranges of the vocabulary and the merges, which `value` has empty because [`super::Tokenizer`] holds them in
+    /// less space. They were parsed: their faults are in `faults`.
+    pub left_out: Vec<Range<usize>>,
     /// Faults of the document.
     pub faults: Vec<Fault>,
 }
@@ -65,12 +65,12 @@ impl Document {
     /// Byte range of the value at a JSON pointer. Scans the text on each call; for many pointers use a [`Locator`].
     #[must_use]
     pub fn locate(&self, pointer: &str) -> Option<Range<usize>> {
-        Locator::new(self.text.as_deref()?).value(pointer)
+        Locator::of(self)?.value(pointer)
     }
 
     /// Byte range of the key, quotes included, for the last step of a JSON pointer.
     #[must_use]
     pub fn locate_key(&self, pointer: &str) -> Option<Range<usize>> {
-        Locator::new(self.text.as_deref()?).key(pointer)
+        Locator::of(self)?.key(pointer)
     }
 }

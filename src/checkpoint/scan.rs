@@ -96,6 +96,8 @@ pub(crate) struct Scanner<'a> {
     stack: Vec<bool>,
     expect: Expect,
     lenient: bool,
+    /// Containers whose ends are known.
+    known: &'a [Range<usize>],
     /// End of the last token, the place of a missing comma.
     last_end: usize,
     /// The last comma, which is a trailing one if a bracket follows.
@@ -118,6 +120,7 @@ impl<'a> Scanner<'a> {
             stack: Vec::new(),
             expect: Expect::Value,
             lenient: false,
+            known: &[],
             last_end: start,
             comma: None,
             slips: Vec::new(),
@@ -128,6 +131,11 @@ impl<'a> Scanner<'a> {
     /// A scanner that accepts and records trailing and missing commas, comments and single quotes.
     pub(crate) fn lenient(text: &'a str, start: usize) -> Self {
         Self { lenient: true, ..Self::strict(text, start) }
+    }
+
+    /// This scanner, which jumps to the end of these containers when it skips them.
+    pub(crate) fn knowing(self, known: &'a [Range<usize>]) -> Self {
+        Self { known, ..self }
     }
 
     /// Number of open containers.
@@ -207,12 +215,25 @@ impl<'a> Scanner<'a> {
             return Ok(());
         }
         let depth = self.depth();
+        self.jump();
         while self.depth() >= depth {
-            if self.next()?.is_none() {
-                break;
+            match self.next()? {
+                Some((Token::BeginObject | Token::BeginArray, _)) => self.jump(),
+                Some(_) => {}
+                None => break,
             }
         }
         Ok(())
+    }
+
+    /// Moves past the container whose bracket was just read, if its end is known.
+    fn jump(&mut self) {
+        let known = self.known.iter().find(|known| known.start.saturating_add(1) == self.pos);
+        if let Some(known) = known {
+            self.pos = known.end;
+            self.stack.pop();
+            self.after_value();
+        }
     }
 
     fn peek(&self) -> Option<u8> {

@@ -1,5 +1,6 @@
 //! The files of a merge: documents, copies, Python modules, templates and the index; `config.json` is written last.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -144,8 +145,17 @@ fn copy_of(
     }
     let bytes = read_own(&donor.checkpoint.root, name, TOKENIZER_CAP)
         .map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
-    let (bytes, how) = switches::stripped_copy(role, name, &bytes, draft)?
-        .map_or_else(|| (bytes.into(), "unchanged"), |stripped| (stripped, "edited"));
+    let mut stripped = None;
+    if name.to_ascii_lowercase().ends_with(".json") && &**name != "vocab.json" {
+        let read = donor.checkpoint.documents.get(&**name);
+        let read = read.filter(|d| d.text.as_deref().is_some_and(|text| text.as_bytes() == bytes));
+        let document = read.map_or_else(|| Cow::Owned(Document::parse(&**name, &bytes)), Cow::Borrowed);
+        stripped = switches::stripped_copy(role, name, &document, draft)?;
+        if stripped.is_none() {
+            draft.documents.push(document.into_owned());
+        }
+    }
+    let (bytes, how) = stripped.map_or_else(|| (bytes.into(), "unchanged"), |stripped| (stripped, "edited"));
     Ok(Some(PlannedFile { name: name.clone(), bytes, origin: format!("{role} donor, {how}") }))
 }
 

@@ -77,17 +77,14 @@ pub(super) fn record(name: &str, removed: &Removed, draft: &mut MergeDraft) {
     }
 }
 
-/// The bytes of a JSON file that the recipe copies; `None` when they contain no switch, so that the file stays as it is.
+/// The bytes of a JSON document that the recipe copies; `None` when it contains no switch, so that the file stays as it
+/// is.
 pub(super) fn stripped_copy(
     role: &str,
     name: &FileName,
-    bytes: &[u8],
+    document: &Document,
     draft: &mut MergeDraft,
 ) -> Result<Option<Arc<[u8]>>, MergeError> {
-    if !name.to_ascii_lowercase().ends_with(".json") || &**name == "vocab.json" {
-        return Ok(None);
-    }
-    let document = Document::parse(&**name, bytes);
     let Some(mut value) = document.value.clone() else {
         return Err(MergeError::Donor(format!(
             "the {role} donor's {name} cannot be read as JSON; run `ckpt-doctor check` on it"
@@ -105,6 +102,6 @@ pub(super) fn stripped_copy(
         )));
     }
     record(name, &removed, draft);
-    let text = Document::from_value(&**name, value).with_numbers_of(&document, "").text;
+    let text = Document::from_value(&**name, value).with_numbers_of(document, "").text;
     Ok(Some(text.as_deref().unwrap_or_default().as_bytes().into()))
 }

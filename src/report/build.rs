@@ -1,6 +1,7 @@
 //! Builds reports from the results of checks.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::model::{CheckpointReport, Counts, Role};
 use crate::check::finding::{Accepted, Suppressed};
@@ -17,10 +18,8 @@ impl CheckpointReport {
         let places = outcome.findings.iter().flat_map(|f| &f.locations).filter_map(|l| l.file.as_ref());
         let edits = outcome.findings.iter().filter_map(|f| f.fix.as_ref()).flat_map(|fix| &fix.edits);
         for file in places.chain(edits.filter_map(Edit::text_file)) {
-            let document = checkpoint.document(file).and_then(|d| d.text.clone());
-            let text = document.or_else(|| checkpoint.modules.get(file).and_then(|m| m.text.clone()));
-            if let Some(text) = text {
-                sources.insert(file.clone(), text);
+            if let Some(text) = checkpoint.text(file) {
+                sources.insert(file.clone(), Arc::clone(text));
             }
         }
         let listed = checkpoint.shards.values().fold(0_u64, |sum, shard| sum.saturating_add(shard.count()));

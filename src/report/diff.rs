@@ -26,9 +26,8 @@ pub fn render(path: &str, repair: &Repair) -> String {
         let at = place(path, Some(&Location { file: Some(change.name.clone()), ..Location::default() }));
         match &change.new {
             Content::Text(new) => {
-                let document = repair.original.document(&change.name).and_then(|d| d.text.clone());
-                let old = document.or_else(|| repair.original.modules.get(&change.name).and_then(|m| m.text.clone()));
-                text(&mut out, &at, old.as_deref(), new);
+                let old = repair.original.text(&change.name);
+                text(&mut out, &at, old.map(AsRef::as_ref), new);
             }
             Content::Shard(new) => shard(&mut out, &at, repair, new),
         }

@@ -9,6 +9,7 @@ use serde_json::Value;
 
 use super::Document;
 use crate::checkpoint::pointer;
+use crate::checkpoint::scan::Scanner;
 
 mod container;
 mod layout;
@@ -32,7 +33,7 @@ impl Document {
         for (depth, step) in steps.iter().enumerate() {
             let Some(container) = Container::read(text, at) else {
                 // `null` stands for a missing object.
-                let range = super::value_at(text, at)?;
+                let range = super::value_at(Scanner::lenient(text, at))?;
                 let rest = steps.get(depth..)?;
                 let is_null = text.get(range.clone()) == Some("null");
                 return is_null.then(|| layout.replaced(text, range, &nested(rest, value)));
@@ -46,7 +47,7 @@ impl Document {
                 None => return None,
             }
         }
-        Some(layout.replaced(text, super::value_at(text, at)?, value))
+        Some(layout.replaced(text, super::value_at(Scanner::lenient(text, at))?, value))
     }
 
     /// The edit that removes the member at a JSON pointer; `None` when it does not exist.

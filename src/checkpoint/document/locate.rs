@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
+use super::Document;
 use crate::checkpoint::pointer;
 use crate::checkpoint::scan::{Scanner, Token};
 
@@ -11,6 +12,8 @@ use crate::checkpoint::scan::{Scanner, Token};
 #[derive(Debug)]
 pub struct Locator<'t> {
     text: &'t str,
+    /// Large containers that are skipped without a scan.
+    known: &'t [Range<usize>],
     /// Members of the containers scanned so far, by the offset of the container.
     containers: HashMap<usize, LocatedMembers>,
     /// Line number, start of the line, and characters since then, for every [`STRIDE`] bytes.
@@ -46,7 +49,13 @@ impl<'t> Locator<'t> {
     /// A locator for `text`; scans nothing yet.
     #[must_use]
     pub fn new(text: &'t str) -> Self {
-        Self { text, containers: HashMap::new(), lines: Vec::new() }
+        Self { text, known: &[], containers: HashMap::new(), lines: Vec::new() }
+    }
+
+    /// A locator for the text of a document; `None` when the document has none.
+    #[must_use]
+    pub fn of(document: &'t Document) -> Option<Self> {
+        Some(Self { known: &document.left_out, ..Self::new(document.text.as_deref()?) })
     }
 
     /// Byte range of the value at a JSON pointer.
@@ -79,7 +88,7 @@ impl<'t> Locator<'t> {
         for step in pointer::steps(pointer)? {
             let start = found.map_or(start, |f| f.value.start);
             if !self.containers.contains_key(&start) {
-                self.containers.insert(start, members(self.text, start)?);
+                self.containers.insert(start, members(self.scanner(start))?);
             }
             found = Some(match self.containers.get(&start)? {
                 LocatedMembers::Object(members) => members.get(&step)?.clone(),
@@ -88,7 +97,11 @@ impl<'t> Locator<'t> {
                 }
             });
         }
-        found.or_else(|| Some(MemberSpans { key: None, value: value_at(self.text, start)? }))
+        found.or_else(|| Some(MemberSpans { key: None, value: value_at(self.scanner(start))? }))
+    }
+
+    fn scanner(&self, start: usize) -> Scanner<'t> {
+        Scanner::lenient(self.text, start).knowing(self.known)
     }
 }
 
@@ -117,17 +130,15 @@ fn marks(text: &str) -> Vec<Mark> {
     marks
 }
 
-/// Bytes of the value that starts at or after `start`.
-pub(super) fn value_at(text: &str, start: usize) -> Option<Range<usize>> {
-    let mut scanner = Scanner::lenient(text, start);
+/// Bytes of the next value.
+pub(super) fn value_at(mut scanner: Scanner<'_>) -> Option<Range<usize>> {
     let (token, span) = scanner.next().ok()??;
     scanner.skip_rest_of(&token).ok()?;
     Some(span.start..scanner.position())
 }
 
-/// The members of the container that starts at `start`.
-fn members(text: &str, start: usize) -> Option<LocatedMembers> {
-    let mut scanner = Scanner::lenient(text, start);
+/// The members of the container that comes next.
+fn members(mut scanner: Scanner<'_>) -> Option<LocatedMembers> {
     match scanner.next().ok()??.0 {
         Token::BeginObject => {
             let mut members = HashMap::new();

@@ -20,8 +20,8 @@ mod spelling;
 use build::{ValueBuilder, is_huge};
 use duplicates::Duplicates;
 
-/// Parts of documents omitted from the value, because the tokenizer holds them in less space.
-fn left_out(name: &str) -> Vec<&'static str> {
+/// Pointers of containers whose members a value omits, because the tokenizer holds them in less space.
+fn to_omit(name: &str) -> Vec<&'static str> {
     match name {
         "tokenizer.json" => vec!["/model/vocab", "/model/merges"],
         "vocab.json" => vec![""],
@@ -46,12 +46,12 @@ fn parse(name: String, bytes: &[u8]) -> Document {
     let Decoded { text, verbatim, faults: of_encoding } = encoding::decode(&name, bytes);
     faults.extend(of_encoding);
 
-    let mut reader = DocumentReader { name: &name, verbatim, faults, left_out: left_out(&name) };
+    let mut reader = DocumentReader { name: &name, verbatim, faults, left_out: Vec::new() };
     let body = reader.cut_nul_bytes(&text);
     let value = reader.read(body);
     if let Some(value) = &value
         && !value.is_object()
-        && reader.left_out != [""]
+        && to_omit(&name) != [""]
         // The list of modules of sentence-transformers.
         && name != "modules.json"
     {
@@ -94,7 +94,7 @@ struct DocumentReader<'n> {
     name: &'n str,
     verbatim: bool,
     faults: Faults,
-    left_out: Vec<&'static str>,
+    left_out: Vec<Range<usize>>,
 }
 
 impl DocumentReader<'_> {
@@ -137,7 +137,7 @@ impl DocumentReader<'_> {
     fn pass(&mut self, text: &str) -> (Option<Value>, Option<ScanError>) {
         let start = if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 };
         let mut scanner = Scanner::lenient(text, start);
-        let mut builder = ValueBuilder::new(self.left_out.clone(), build::most_nodes(self.name));
+        let mut builder = ValueBuilder::new(to_omit(self.name), build::most_nodes(self.name));
         let mut duplicates = Duplicates::new(text);
         let error = loop {
             let (token, span) = match scanner.next() {
@@ -147,7 +147,7 @@ impl DocumentReader<'_> {
             };
             duplicates.on_token(&token, &span, &builder);
             self.on_token(&token, &span, &builder);
-            builder.on_token(&token);
+            builder.on_token(&token, &span);
         };
         for slip in &scanner.slips {
             let kind = match slip.kind {
@@ -170,7 +170,9 @@ impl DocumentReader<'_> {
             let fault = Fault::new(FaultKind::JsonTooManyValues).at(Place::file(self.name));
             self.faults.push(fault.with("cap", build::most_nodes(self.name)));
         }
-        (builder.finish(), error)
+        let value;
+        (value, self.left_out) = builder.finish();
+        (value, error)
     }
 
     /// Faults of single tokens.

@@ -106,7 +106,8 @@ fn a_fast_tokenizer_keeps_its_own_ids_and_appends_the_rest() {
     // Only the vocabulary is omitted from the value.
     assert_eq!(documents[0].get("/model/vocab"), Some(&json!({})));
     assert_eq!(documents[0].get("/model/type"), Some(&json!("BPE")));
-    assert_eq!(documents[0].left_out, ["/model/vocab", "/model/merges"]);
+    let omitted = ["/model/vocab", "/model/merges"].map(|pointer| documents[0].locate(pointer).unwrap());
+    assert_eq!(documents[0].left_out, omitted);
 }
 
 #[test]

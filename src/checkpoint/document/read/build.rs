@@ -1,5 +1,7 @@
 //! Builds a value from tokens, without recursion and within bounds.
 
+use std::ops::Range;
+
 use serde_json::{Map, Number, Value};
 
 use crate::checkpoint::pointer;
@@ -40,14 +42,17 @@ pub(super) struct ValueBuilder {
     root: Option<Value>,
     nodes: usize,
     most: usize,
-    left_out: Vec<&'static str>,
-    /// Depth of the omitted part, when inside one.
-    skipping: Option<usize>,
+    /// Pointers of the containers whose members the value omits.
+    omit: Vec<&'static str>,
+    /// Byte ranges of the omitted containers.
+    omitted: Vec<Range<usize>>,
+    /// Depth and first byte of the omitted container, when inside one.
+    skipping: Option<(usize, usize)>,
 }
 
 impl ValueBuilder {
-    pub(super) fn new(left_out: Vec<&'static str>, most: usize) -> Self {
-        Self { stack: Vec::new(), root: None, nodes: 0, most, left_out, skipping: None }
+    pub(super) fn new(omit: Vec<&'static str>, most: usize) -> Self {
+        Self { stack: Vec::new(), root: None, nodes: 0, most, omit, omitted: Vec::new(), skipping: None }
     }
 
     /// Whether the document has more values than the limit.
@@ -55,9 +60,10 @@ impl ValueBuilder {
         self.nodes > self.most
     }
 
-    /// The whole value; `None` when the document is empty or exceeds the limit.
-    pub(super) fn finish(self) -> Option<Value> {
-        if self.overflowed() { None } else { self.root }
+    /// The whole value, and the byte ranges of the containers whose members it omits; no value when the document is empty
+    /// or exceeds the limit.
+    pub(super) fn finish(self) -> (Option<Value>, Vec<Range<usize>>) {
+        (if self.overflowed() { None } else { self.root }, self.omitted)
     }
 
     /// JSON pointer of the next value.
@@ -83,8 +89,8 @@ impl ValueBuilder {
         })
     }
 
-    /// Adds one token.
-    pub(super) fn on_token(&mut self, token: &Token<'_>) {
+    /// Adds one token, with its bytes.
+    pub(super) fn on_token(&mut self, token: &Token<'_>, span: &Range<usize>) {
         match token {
             Token::Key(key) => {
                 if let Some(Open::Object(_, next)) = self.stack.last_mut() {
@@ -95,11 +101,11 @@ impl ValueBuilder {
                 }
             }
             Token::BeginObject => {
-                self.begin();
+                self.begin(span.start);
                 self.stack.push(Open::Object(Map::new(), String::new()));
             }
             Token::BeginArray => {
-                self.begin();
+                self.begin(span.start);
                 self.stack.push(Open::Array(Vec::new(), 0));
             }
             Token::EndObject | Token::EndArray => {
@@ -108,12 +114,16 @@ impl ValueBuilder {
                     Some(Open::Array(items, _)) => Value::Array(items),
                     None => return,
                 };
-                let inside = self.skipping.is_some_and(|depth| depth < self.stack.len());
-                // Only the members of the container are omitted.
-                if self.skipping == Some(self.stack.len()) {
-                    self.skipping = None;
+                match self.skipping {
+                    Some((depth, _)) if depth < self.stack.len() => self.advance(),
+                    // Only the members of the container are omitted.
+                    Some((_, start)) => {
+                        self.skipping = None;
+                        self.omitted.push(start..span.end);
+                        self.push_value(value);
+                    }
+                    None => self.push_value(value),
                 }
-                if inside { self.advance() } else { self.push_value(value) }
             }
             Token::String(text) => self.leaf(|| Value::String(text.decode().0.into_owned())),
             Token::Number(literal) => self.leaf(|| number(literal)),
@@ -122,11 +132,11 @@ impl ValueBuilder {
         }
     }
 
-    fn begin(&mut self) {
-        if self.skipping.is_none() && !self.left_out.is_empty() {
+    fn begin(&mut self, start: usize) {
+        if self.skipping.is_none() && !self.omit.is_empty() {
             let here = self.pointer();
-            if self.left_out.iter().any(|p| here.as_deref() == Some(p)) {
-                self.skipping = Some(self.stack.len());
+            if self.omit.iter().any(|p| here.as_deref() == Some(p)) {
+                self.skipping = Some((self.stack.len(), start));
             }
         }
     }

@@ -128,14 +128,14 @@ fn same(a: &str, b: &str) -> bool {
     let value = |text| {
         let mut scanner = Scanner::lenient(text, 0);
         let mut builder = ValueBuilder::new(Vec::new(), COMPARE_CAP);
-        while let Ok(Some((token, _))) = scanner.next() {
+        while let Ok(Some((token, span))) = scanner.next() {
             // Two such integers that differ may be the same double.
             if matches!(token, Token::Number(literal) if is_long_integer(literal)) {
                 return None;
             }
-            builder.on_token(&token);
+            builder.on_token(&token, &span);
         }
-        builder.finish()
+        builder.finish().0
     };
     value(a).is_some_and(|a| value(b) == Some(a))
 }

@@ -41,13 +41,13 @@ fn respelled(text: &str) -> Vec<(String, &str)> {
     let mut scanner = Scanner::lenient(text, if text.starts_with('\u{feff}') { '\u{feff}'.len_utf8() } else { 0 });
     let mut builder = ValueBuilder::new(Vec::new(), usize::MAX);
     let mut found = Vec::new();
-    while let Ok(Some((token, _))) = scanner.next() {
+    while let Ok(Some((token, span))) = scanner.next() {
         if let Token::Number(literal) = token
             && written(literal) != literal
         {
             found.extend(builder.pointer().map(|pointer| (pointer, literal)));
         }
-        builder.on_token(&token);
+        builder.on_token(&token, &span);
     }
     found
 }

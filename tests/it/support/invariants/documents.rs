@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use ckpt_doctor::checkpoint::document::Locator;
 use ckpt_doctor::checkpoint::{Document, FaultKind, INDEX_NAME, Index, Tokenizer, Vocabulary, is_plain_file_name};
 use serde_json::Value;
 
@@ -40,7 +41,21 @@ pub fn hold(name: &str, bytes: &[u8]) -> Document {
         }
     }
     places_are_found_again(&document);
+    omitted_parts_are_skipped(&document);
     document
+}
+
+/// A locator that jumps over omitted parts finds the same places as one that scans them.
+fn omitted_parts_are_skipped(document: &Document) {
+    let (Some(text), Some(mut jumps)) = (&document.text, Locator::of(document)) else { return };
+    // The parts are those of the text without conflict markers.
+    if super::has(&document.faults, FaultKind::MergeConflictMarker) {
+        return;
+    }
+    let mut scans = Locator::new(text);
+    for pointer in ["", "/model", "/model/vocab", "/model/merges", "/added_tokens", "/version"] {
+        assert_eq!(jumps.value(pointer), scans.value(pointer), "{pointer} {document:?}");
+    }
 }
 
 /// Whether two values are equal, but for an integer of zero with a sign, which `serde_json` reads as a double.
