@@ -10,6 +10,7 @@ use serde_json::Value;
 
 use super::class_names::{TOKENIZER, has_code};
 use super::model_type::{Asked, CAP};
+use crate::checkpoint::tokenizer::content;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::classes::ClassKind;
@@ -62,10 +63,7 @@ fn class_of<'k>(
     let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
     let plain = |name: &'k str| name.strip_suffix("Fast").unwrap_or(name);
     let path = text("config.json", "/_name_or_path").unwrap_or_default().to_lowercase();
-    let is_as_is = built.as_is.iter().any(|pattern| match pattern.strip_suffix('*') {
-        Some(start) => path.starts_with(start),
-        None => path == *pattern,
-    });
+    let is_as_is = built.as_is.iter().any(|pattern| pattern.is_match(&path));
     if is_as_is || has_code(checkpoint, &[TOKENIZER], &[ClassKind::Tokenizer.auto()]) {
         return None;
     }
@@ -137,9 +135,6 @@ fn dropped_tokens(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fau
 
 /// Every special token that the class adds: those that `tokenizer_config.json` names, and its own.
 fn special_values<'v>(checkpoint: &'v Checkpoint, class: &'v BuiltTokenizer) -> Vec<&'v str> {
-    fn content(value: &Value) -> Option<&str> {
-        value.as_str().or_else(|| value.get("content")?.as_str())
-    }
     let config = checkpoint.document(TOKENIZER).and_then(|document| document.get("")?.as_object());
     let own = class.special.iter().filter(|(name, _)| config.is_none_or(|config| !config.contains_key(*name)));
     let mut values: Vec<&str> = own.map(|(_, token)| token.as_str()).collect();

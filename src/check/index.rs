@@ -14,7 +14,7 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_
 const SINGLE: &str = "model.safetensors";
 
 /// The file that the loader opens in place of the shards of an index, if it exists.
-fn single(checkpoint: &Checkpoint) -> Option<&'static str> {
+pub(super) fn single(checkpoint: &Checkpoint) -> Option<&'static str> {
     let of_pickles = || checkpoint.index.as_ref().is_none_or(Index::is_of_pickles) && checkpoint.has_file(PICKLE_NAME);
     if checkpoint.has_file(SINGLE) { Some(SINGLE) } else { of_pickles().then_some(PICKLE_NAME) }
 }
@@ -453,7 +453,7 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
     }
 }
 
-/// Whether a name is that of a weight file with other separators, case or a note of a browser: `pytorch_model_bin`.
+/// Whether a name is almost that of a weight file: `pytorch_model_bin`, `Model.safetensors`, `model (1).safetensors`.
 fn is_misspelt(name: &str) -> bool {
     let letters = name.chars().filter(char::is_ascii_alphabetic).map(|c| c.to_ascii_lowercase());
     let letters: String = letters.collect();

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::index::numbered;
+use super::index::{numbered, single};
 use super::load::LoadReport;
 use super::load::{self, Stored};
 use super::votes::{leaves, with};
@@ -90,8 +90,8 @@ pub fn fault(
 /// Compares the sizes in Git LFS pointers with the parameters of the class: the weights are not downloaded, so nothing else
 /// tells of their shapes. Called when config.json declares no quantisation.
 ///
-/// Of 32 published directories, 29 have 2 or 4 bytes a parameter; old saves of GPT-2 have buffers that make 4.4 of it, and
-/// LLaVA stores no vision tower. So the bounds are wide.
+/// Floats take 2 or 4 bytes a parameter. The bounds are wider: old saves of GPT-2 have masks, which are no parameters, and
+/// LLaVA saves no vision tower.
 #[must_use]
 pub fn pointer_fault(checkpoint: &Checkpoint, config: &Value, expected: &Expected) -> Option<Fault> {
     let names = weight_pointers(checkpoint);
@@ -105,7 +105,7 @@ pub fn pointer_fault(checkpoint: &Checkpoint, config: &Value, expected: &Expecte
     let (least, most) = (elements(false)?, elements(true)?);
     let has_tower = ["vision_config", "mm_vision_tower"].iter().any(|key| config.get(*key).is_some());
     let is_large = bytes > most.checked_mul(5)?;
-    // 7/4: less than two bytes of an eighth of the parameters that may be left out.
+    // An eighth of the parameters may be missing from what is stored at two bytes each.
     let is_small = !has_tower && bytes.checked_mul(4)? < least.checked_mul(7)?;
     // Of a few parameters, the header of a shard takes as much as they do.
     if names.is_empty() || least < 1 << 20 || !(is_large || is_small) {
@@ -119,8 +119,7 @@ pub fn pointer_fault(checkpoint: &Checkpoint, config: &Value, expected: &Expecte
 /// The Git LFS pointers that stand for all weights: a single file, or every shard of one numbered family.
 fn weight_pointers(checkpoint: &Checkpoint) -> Vec<&str> {
     let is_pointer = |name: &&str| checkpoint.entries.get(*name).is_some_and(|entry| entry.lfs.is_some());
-    if let Some(single) = ["model.safetensors", "pytorch_model.bin"].into_iter().find(|name| checkpoint.has_file(name))
-    {
+    if let Some(single) = single(checkpoint) {
         return Some(single).filter(is_pointer).into_iter().collect();
     }
     let of = |name: &str| numbered(name).map(|(prefix, _, count)| (prefix.to_owned(), count));

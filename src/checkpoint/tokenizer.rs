@@ -348,21 +348,24 @@ fn has_valid_id(token: &Value) -> bool {
     token.get("id").and_then(Value::as_u64).is_some_and(|id| u32::try_from(id).is_ok())
 }
 
+/// The text of a token: files state it as a string, or in an object with flags.
+pub(crate) fn content(token: &Value) -> Option<&str> {
+    token.as_str().or_else(|| token.get("content")?.as_str())
+}
+
 fn added(id: u64, token: &Value) -> Option<AddedToken> {
-    let content = token.as_str().or_else(|| token.get("content")?.as_str())?;
-    Some(AddedToken { id, content: content.to_owned() })
+    Some(AddedToken { id, content: content(token)?.to_owned() })
 }
 
 /// Special tokens in the order of addition; of several files the first that states one counts.
 fn special_tokens<'v>(files: &[&str], get: &impl Fn(&str, &str) -> Option<&'v Value>) -> Vec<(String, String)> {
-    let content = |v: &Value| v.as_str().or_else(|| v.get("content")?.as_str()).map(str::to_owned);
     let mut tokens = Vec::new();
     for name in SPECIAL {
         let pointer = format!("/{name}");
         let Some(value) = files.iter().find_map(|f| get(f, &pointer)) else { continue };
         match value {
-            Value::Array(list) => tokens.extend(list.iter().filter_map(content).map(|t| (name.to_owned(), t))),
-            other => tokens.extend(content(other).map(|t| (name.to_owned(), t))),
+            Value::Array(list) => tokens.extend(list.iter().filter_map(content).map(|t| (name.to_owned(), t.to_owned()))),
+            other => tokens.extend(content(other).map(|t| (name.to_owned(), t.to_owned()))),
         }
     }
     tokens

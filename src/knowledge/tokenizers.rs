@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 use super::by_version::ByVersion;
 use super::source::DataError;
+use super::statistics::Pattern;
 
 /// A tokenizer class with a constructor of its own. Source: the class opens files that `tools/loader_tokenizers.py` writes.
 #[derive(Debug, Clone, Deserialize)]
@@ -36,8 +37,8 @@ pub struct BuiltTokenizers {
     pub classes: BTreeMap<String, BuiltTokenizer>,
     /// Model types whose own class is opened whatever `tokenizer_config.json` names.
     pub overruled: BTreeSet<String>,
-    /// Patterns of `_name_or_path`, in lower case, with which tokenizer.json is opened as it is; `*` is at the end.
-    pub as_is: Vec<String>,
+    /// Patterns of `_name_or_path`, in lower case, with which tokenizer.json is opened as it is.
+    pub as_is: Vec<Pattern>,
     /// Classes of transformers 4 that do not keep the post-processor of tokenizer.json, by the name without `Fast`.
     replaces: BTreeSet<String>,
 }

@@ -3,8 +3,8 @@
     wheel.py DIST
 
 DIST has one wheel and one source distribution. The wheel is installed, without a network and without PATH, under every
-CPython from 3.9 upwards that this machine has; `test_package.py` and the example of docs/integrations.md run there. The source distribution is built through
-its own build backend with `--profile dev`, into CARGO_TARGET_DIR, so that only this crate is compiled.
+CPython from 3.9 upwards that this machine has; `test_package.py` and the example of docs/integrations.md run there. The
+source distribution is built through its own build backend with `--profile dev`, into CARGO_TARGET_DIR, so that only this crate is compiled.
 """
 
 import os
@@ -19,6 +19,9 @@ import zipfile
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(PROJECT / "tools"))
+from release_notes import crate_version  # noqa: E402
+
 INTEGRATIONS = PROJECT / "docs/integrations.md"
 SOUND = PROJECT / "fixtures/donors/llava3d-tiny"
 LIMIT = 8_000_000
@@ -37,10 +40,6 @@ def only(files):
     if len(files) != 1:
         sys.exit(f"not exactly one: {files}")
     return files[0]
-
-
-def crate_version():
-    return re.search(r'^version = "(.*)"$', (PROJECT / "Cargo.toml").read_text(), re.MULTILINE)[1]
 
 
 def shared():
@@ -145,7 +144,7 @@ def build_sdist(sdist, place):
 
 
 def main(dist):
-    version = crate_version()
+    version = crate_version((PROJECT / "Cargo.toml").read_text())
     wheel, sdist = only(dist.glob("*.whl")), only(dist.glob("*.tar.gz"))
     inspect_wheel(wheel, version)
     inspect_sdist(sdist, version)

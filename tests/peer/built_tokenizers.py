@@ -9,22 +9,20 @@ writes around text. Directories on the command line are compared too.
 """
 import argparse
 import json
-import os
 import random
-import subprocess
-import sys
-import tempfile
 from collections import Counter
 from pathlib import Path
 
 import transformers
+from peer import ROOT, Tally, check, workplace
 from tokenizers import Tokenizer
 from transformers import AutoTokenizer
 
-ROOT = Path(__file__).resolve().parents[2]
-CLASSES = json.loads((ROOT / "rules" / "tokenizers.json").read_text())[transformers.__version__]["classes"]
-REPLACED = {name for version in json.loads((ROOT / "rules" / "tokenizers.json").read_text()).values() for name in version.get("replaces", ())}
-TYPES = {n: t for n, t in json.loads((ROOT / "rules" / "classes.json").read_text())[transformers.__version__]["tokenizer"].items() if t}
+TABLE = json.loads((ROOT / "rules" / "tokenizers.json").read_text())
+CLASSES = TABLE[transformers.__version__]["classes"]
+REPLACED = {name for version in TABLE.values() for name in version.get("replaces", ())}
+OPENED = json.loads((ROOT / "rules" / "classes.json").read_text())[transformers.__version__]["tokenizer"]
+TYPES = {name: types for name, types in OPENED.items() if types}
 RULES = {"TOK022": "model", "TOK023": "dropped", "TOK024": "around"}
 FLAGS = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False}
 TOKENS = ["<s>", "</s>", "<unk>", "<pad>", "<mask>", "[CLS]", "[SEP]", "[UNK]", "[PAD]", "[MASK]", "<cls>", "<sep>", "<bos>", "<eos>",
@@ -106,11 +104,9 @@ def draw(directory, rng):
 
 def told(directory):
     """What the tool says: the rules found, and whether one of them says that the tokenizer raises."""
-    command = [os.environ["CKPT_DOCTOR"], "check", str(directory), "--for", f"transformers=={transformers.__version__}"]
-    run = subprocess.run([*command, "--output-format", "json"], capture_output=True, text=True)
-    report = json.loads(run.stdout)
-    checkpoints = [c for c in report["checkpoints"] if Path(c["path"]).resolve() == directory.resolve()]
-    found = {f["code"]: f for c in checkpoints for f in c["findings"] if f["code"] in RULES}
+    entries, _ = check(directory, "--for", f"transformers=={transformers.__version__}")
+    entry = entries.get(str(directory.resolve()), {"findings": []})
+    found = {f["code"]: f for f in entry["findings"] if f["code"] in RULES}
     raises = any(e["outcome"] == "raises" for f in found.values() for e in f["effects"])
     return {RULES[code] for code in found}, raises
 
@@ -169,31 +165,29 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--keep", type=Path)
     parser.add_argument("directories", nargs="*", type=Path)
     args = parser.parse_args()
     transformers.logging.set_verbosity_error()
     rng = random.Random(args.seed)
-    counts, failed = Counter(), 0
-    for at in range(args.count):
-        with tempfile.TemporaryDirectory() as temporary:
-            directory = (args.keep or Path(temporary)) / f"case{at}"
-            directory.mkdir(parents=True)
+    counts, tally = Counter(), Tally()
+    with workplace() as room:
+        for at in range(args.count):
+            directory = room / f"case{at}"
+            directory.mkdir()
             draw(directory, rng)
             wrong = compare(directory, counts)
-            if wrong:
-                failed += 1
-                shown = json.loads((directory / "tokenizer_config.json").read_text())
-                shown.pop("added_tokens_decoder", None)
-                print(f"case {at}: {wrong}\n    {(directory / 'config.json').read_text()} {shown}")
+            config = json.loads((directory / "tokenizer_config.json").read_text())
+            config.pop("added_tokens_decoder", None)
+            detail = f"{wrong}\n    {(directory / 'config.json').read_text()} {config}"
+            tally.expect(not wrong, f"case {at} of seed {args.seed}", detail)
     for directory in args.directories:
         wrong = compare(directory, counts)
-        if wrong:
-            failed += 1
-            print(f"{directory}: {wrong}")
-    print(f"{args.count + len(args.directories)} directories: {dict(counts)}; {failed} failed")
-    return 1 if failed or not {"model", "dropped", "around", "same", "raises, said"} <= set(counts) else 0
+        tally.expect(not wrong, directory, wrong)
+    absent = {"model", "dropped", "around", "same", "raises, said"} - set(counts)
+    tally.expect(not absent, "every kind of difference was drawn", sorted(absent))
+    print(dict(counts))
+    tally.finish()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

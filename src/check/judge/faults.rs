@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::Inputs;
 use super::explain::ExplainedLoad;
 use super::integers;
-use super::predict::{quantised, same_bytes};
+use super::predict::{Prediction, quantised, same_bytes};
 use crate::check::load::{self, Judged, LoadReport, Stored};
 use crate::check::votes::{self, Vote};
 use crate::check::{quantization, size};
@@ -48,8 +48,7 @@ fn prefixes(load: &ExplainedLoad<'_>) -> impl Iterator<Item = Fault> {
 
 /// The fault of an index that states another size than the class has.
 fn total_size(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault> {
-    let leading = loads.iter().map(|load| &load.prediction).filter(|one| one.target.leads && inputs.is_plain());
-    let mut faults = leading.filter_map(|one| {
+    let mut faults = plain(inputs, loads).filter_map(|one| {
         let report = one.report.as_ref()?;
         size::fault(inputs.checkpoint, one.architecture, inputs.config, &one.expected, inputs.stored, report)
     });
@@ -58,9 +57,13 @@ fn total_size(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault>
 
 /// The fault of Git LFS pointers to more or fewer bytes than the class has.
 fn pointer_sizes(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault> {
-    let leading = loads.iter().map(|load| &load.prediction).filter(|one| one.target.leads && inputs.is_plain());
-    let mut faults = leading.filter_map(|one| size::pointer_fault(inputs.checkpoint, inputs.config, &one.expected));
-    faults.next()
+    plain(inputs, loads).find_map(|one| size::pointer_fault(inputs.checkpoint, inputs.config, &one.expected))
+}
+
+/// Predictions of the leading loaders; none when the weights are quantised.
+fn plain<'l>(inputs: &Inputs<'_>, loads: &'l [ExplainedLoad<'_>]) -> impl Iterator<Item = &'l Prediction<'l>> {
+    let is_plain = inputs.is_plain();
+    loads.iter().map(|load| &load.prediction).filter(move |one| one.target.leads && is_plain)
 }
 
 /// Faults of the tensors: for a leading loader all of them; for another one, that the checkpoint does not load there.
