@@ -1,4 +1,5 @@
 """A table of rules/ with one block for each version of a library. The tools that derive such a table call `keep` from `main`."""
+
 import json
 import sys
 

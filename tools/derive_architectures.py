@@ -7,6 +7,7 @@
 Each runs under one transformers version at a time (that of the Python it is started with) and writes below
 `DIR/<version>/`. Both resume: what is there already is not made again. See tools/derive/README.md.
 """
+
 import argparse
 import os
 import sys
@@ -87,7 +88,7 @@ def main():
     commands = parser.add_subparsers(required=True)
     for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_drop, add_table, add_accepts):
         add(commands)
-    for sub in set(commands.choices.values()):                # --cache may stand before or after the subcommand
+    for sub in set(commands.choices.values()):  # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.cache is None and args.run not in ("derive.table", "derive.drop"):

@@ -7,6 +7,7 @@
 A name counts if the function of the Auto class that looks it up finds a class; no file is opened, and a class whose packages
 are not installed counts too.
 """
+
 import json
 import sys
 from pathlib import Path

@@ -8,6 +8,7 @@ A name counts if the file of its module defines it or, outside the folders of mo
 package. Names of TensorFlow and Flax, of scripts, of documentation, and those that start with an underscore are left out, and
 so are names that no version has. The lists are complete when the last of the versions has written its own.
 """
+
 import ast
 import importlib
 import json
@@ -19,7 +20,20 @@ from pathlib import Path
 import transformers
 
 FILE = Path(__file__).resolve().parents[1] / "rules" / "modules.json"
-SKIPPED = ("tf", "flax", "convert", "modular", "onnx", "commands", "cli", "kernels", "testing", "keras", "sagemaker", "benchmark")
+SKIPPED = (
+    "tf",
+    "flax",
+    "convert",
+    "modular",
+    "onnx",
+    "commands",
+    "cli",
+    "kernels",
+    "testing",
+    "keras",
+    "sagemaker",
+    "benchmark",
+)
 
 
 def bound(body, imported):
@@ -36,7 +50,9 @@ def bound(body, imported):
         elif isinstance(node, ast.If):
             yield from bound(node.body + node.orelse, imported)
         elif isinstance(node, ast.Try):
-            yield from bound(node.body + node.orelse + node.finalbody + [line for h in node.handlers for line in h.body], imported)
+            yield from bound(
+                node.body + node.orelse + node.finalbody + [line for h in node.handlers for line in h.body], imported
+            )
 
 
 def modules(folder):
@@ -92,6 +108,7 @@ def without_unknown(known):
         return missing or name in sets[id(lists)].get(module, ())
 
     for lists in known.values():
+
         def had(module, names):
             return " ".join(name for name in names.split() if not all(lacks(other, module, name) for other in known.values()))
 
@@ -106,7 +123,10 @@ def main():
     known = json.loads(FILE.read_text()) if FILE.exists() else {}
     if sys.argv[1:] == ["--check"]:
         lists = known.get(version, {"modules": [], "names": {}})
-        candidates = {**{name: [] for name in lists["modules"]}, **{name: text.split() for name, text in lists["names"].items()}}
+        candidates = {
+            **{name: [] for name in lists["modules"]},
+            **{name: text.split() for name, text in lists["names"].items()},
+        }
     else:
         candidates = {}
         for folder in sys.argv[1:]:

@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Write the names that the transformers at hand accepts in config.json to rules/names.json. For maintainers.
 
-    python tools/loader_names.py            # replace the lists of this version
-    python tools/loader_names.py --check    # fail if the lists of this version differ
+python tools/loader_names.py            # replace the lists of this version
+python tools/loader_names.py --check    # fail if the lists of this version differ
 """
+
 import json
 import sys
 from pathlib import Path

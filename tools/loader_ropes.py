@@ -7,6 +7,7 @@
 Only versions before 5 have such keys: since then every class takes all of them in `rope_parameters`, and the older keys as
 well. A class has a key when its constructor has a parameter of that name; its value is the default.
 """
+
 import inspect
 import json
 import sys

@@ -6,6 +6,7 @@
 
 torch and transformers are imported once; each tool runs in a fork, because imports of one change what another sees.
 """
+
 import importlib
 import os
 import sys

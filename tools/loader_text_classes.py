@@ -7,6 +7,7 @@
 An entry has the class that AutoModelForCausalLM builds for the type of the language model alone, and the classes of the whole
 models that contain it.
 """
+
 import json
 import sys
 from pathlib import Path

@@ -8,6 +8,7 @@ Each class opens a small tokenizer.json of every kind of model. Since transforme
 takes the vocabulary and builds the rest itself; such classes have an entry. Older versions open tokenizer.json as it is, but
 for the classes under `replaces`, which have a post-processor of their own.
 """
+
 import inspect
 import json
 import sys
@@ -68,10 +69,24 @@ def document(kind, special, with_processor=True):
         "special_tokens": {name: {"id": name, "ids": [ids[name]], "tokens": [name]} for name in "ab"},
     }
     # Classes of transformers 4 read settings of these two.
-    normalizer = {"type": "BertNormalizer", "clean_text": False, "handle_chinese_chars": False, "strip_accents": None, "lowercase": False}
+    normalizer = {
+        "type": "BertNormalizer",
+        "clean_text": False,
+        "handle_chinese_chars": False,
+        "strip_accents": None,
+        "lowercase": False,
+    }
     pre_tokenizer = {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True}
     parts = {"truncation": None, "padding": None, "added_tokens": added}
-    return {"version": "1.0", **parts, "normalizer": normalizer, "pre_tokenizer": pre_tokenizer, "post_processor": post_processor if with_processor else None, "decoder": None, "model": model}
+    return {
+        "version": "1.0",
+        **parts,
+        "normalizer": normalizer,
+        "pre_tokenizer": pre_tokenizer,
+        "post_processor": post_processor if with_processor else None,
+        "decoder": None,
+        "model": model,
+    }
 
 
 def opened(cls, name, kind, special, named, with_processor=True):

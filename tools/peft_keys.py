@@ -89,8 +89,9 @@ def unknown(trees):
     texts = [ast.unparse(tree) for name, tree in trees.items() if name.endswith("/config.py")]
     if any("_check_and_remove_unused_kwargs" in text for text in texts):
         return "ignores"
-    base = next(text for name, text in zip((n for n in trees if n.endswith("/config.py")), texts)
-                if "class PeftConfigMixin" in text)
+    base = next(
+        text for name, text in zip((n for n in trees if n.endswith("/config.py")), texts) if "class PeftConfigMixin" in text
+    )
     return "ignores" if "if hasattr(config, key)" in base else "raises"
 
 
@@ -112,7 +113,7 @@ def table(cache):
         for key in sorted(seen[kind]):
             versions = [version for version, _ in seen[kind][key]]
             first, last = versions[0], versions[-1]
-            between = VERSIONS[VERSIONS.index(first):VERSIONS.index(last) + 1]
+            between = VERSIONS[VERSIONS.index(first) : VERSIONS.index(last) + 1]
             assert versions == between, f"{kind}.{key} is not in all of {between}"
             entry = keys[key] = {}
             if first != VERSIONS[0]:

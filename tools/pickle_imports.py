@@ -1,7 +1,7 @@
 """Writes rules/pickles/accepted.json5: what torch.load(weights_only=True) of the installed torch accepts in a pickle.
 
-    python tools/pickle_imports.py           writes the file
-    python tools/pickle_imports.py --check   fails when the file differs
+python tools/pickle_imports.py           writes the file
+python tools/pickle_imports.py --check   fails when the file differs
 """
 
 import ast

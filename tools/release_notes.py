@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Prints the section of CHANGELOG.md for a release, and fails if the tag is not the version in Cargo.toml.
 
-    tools/release_notes.py v0.1.0
+tools/release_notes.py v0.1.0
 """
 
 import re

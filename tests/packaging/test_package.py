@@ -47,9 +47,7 @@ class Package(unittest.TestCase):
         model = self.broken()
         (checkpoint,) = ckpt_doctor.check(model, loaders=["4.47"], ignore=["CFG021"], deep=True)["checkpoints"]
         self.assertEqual([load["loader"] for load in checkpoint["loads"]], ["4.47.0"])
-        self.assertEqual(
-            ckpt_doctor.check(model, select="CFG021", loaders="4.47")["checkpoints"][0]["verdict"], "error"
-        )
+        self.assertEqual(ckpt_doctor.check(model, select="CFG021", loaders="4.47")["checkpoints"][0]["verdict"], "error")
 
     def test_names_are_not_options(self):
         self.broken("--deep")

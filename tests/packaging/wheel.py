@@ -69,9 +69,7 @@ def inspect_sdist(sdist, version):
         found = {name.split("/", 1)[1] for name in archive.getnames()}
     tracked = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=PROJECT).split("\0")
     wanted = {
-        name
-        for name in tracked
-        if name.startswith(("src/", "rules/", "python/", "packaging/")) and (PROJECT / name).exists()
+        name for name in tracked if name.startswith(("src/", "rules/", "python/", "packaging/")) and (PROJECT / name).exists()
     } | {"Cargo.toml", "Cargo.lock", "pyproject.toml", "build.rs", "README.md", "LICENSE", "CHANGELOG.md", "PKG-INFO"}
     if found != wanted or sdist.name != f"ckpt_doctor-{version}.tar.gz":
         sys.exit(f"{sdist.name}: missing {sorted(wanted - found)}, unexpected {sorted(found - wanted)}")

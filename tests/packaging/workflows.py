@@ -42,16 +42,12 @@ def lint_all():
     if 'Rule "shellcheck" was disabled' in verbose:
         sys.exit(f"shellcheck did not run:\n{verbose}")
     lint(BIN / "zizmor", "--offline", "--no-progress", "--persona", "pedantic", ".github", "action.yml")
-    scripts = [
-        step["run"] for step in yaml.safe_load((PROJECT / "action.yml").read_text())["runs"]["steps"] if "run" in step
-    ]
+    scripts = [step["run"] for step in yaml.safe_load((PROJECT / "action.yml").read_text())["runs"]["steps"] if "run" in step]
     for script in scripts:
         lint(BIN / "shellcheck", "--shell=bash", "-", input=script)
     *_, job = yaml.safe_load_all((PROJECT / "templates/check.yml").read_text())
     lint(BIN / "shellcheck", "--shell=sh", "-", input="\n".join(next(iter(job.values()))["script"]))
-    print(
-        f"{len(WORKFLOWS)} workflows, {len(scripts)} steps of the action and the job of the template have no findings"
-    )
+    print(f"{len(WORKFLOWS)} workflows, {len(scripts)} steps of the action and the job of the template have no findings")
 
 
 def check_pins():
@@ -71,7 +67,9 @@ def check_pins():
 
 def check_notes():
     manifest = '[package]\nname = "x"\nversion = "1.2.0"\n'
-    changelog = "# Changelog\n\n## [Unreleased]\n\n- new\n\n## [1.2.0] - 2026-01-01\n\n### Added\n\n- one\n\n## [1.1.0]\n\n- old\n"
+    changelog = (
+        "# Changelog\n\n## [Unreleased]\n\n- new\n\n## [1.2.0] - 2026-01-01\n\n### Added\n\n- one\n\n## [1.1.0]\n\n- old\n"
+    )
     if notes("v1.2.0", manifest, changelog) != "### Added\n\n- one\n":
         sys.exit("the notes of a release are wrong")
     for wrong in [
@@ -122,9 +120,7 @@ def check_archive(program):
             names = packed.getnames()
         if not any(name.endswith("share/man/man1/ckpt-doctor.1") for name in names):
             sys.exit(f"the archive has no manual: {names}")
-        print(
-            f"{archive.name}: {archive.stat().st_size} bytes, {len(names)} entries, where cargo binstall looks for it"
-        )
+        print(f"{archive.name}: {archive.stat().st_size} bytes, {len(names)} entries, where cargo binstall looks for it")
 
 
 def main(program):

@@ -79,7 +79,9 @@ def worker(cases):
 
 def run(cases, folders):
     env = os.environ | {"PYTHONPATH": folders, "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run([sys.executable, __file__, str(cases), "--worker"], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, __file__, str(cases), "--worker"], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     if "\nFOUND " not in done.stdout:
         sys.exit(f"{folders}: {done.stderr}")
     return json.loads(done.stdout.rpartition("\nFOUND ")[2])

@@ -7,6 +7,7 @@ Draws directories with a tokenizer.json, a tokenizer class and a model type that
 AutoTokenizer, and compares: whether it raises, the type of its model, the added tokens that it lacks, and the tokens that it
 writes around text. Directories on the command line are compared too.
 """
+
 import argparse
 import json
 import random
@@ -25,9 +26,41 @@ OPENED = json.loads((ROOT / "rules" / "classes.json").read_text())[transformers.
 TYPES = {name: types for name, types in OPENED.items() if types}
 RULES = {"TOK022": "model", "TOK023": "dropped", "TOK024": "around"}
 FLAGS = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False}
-TOKENS = ["<s>", "</s>", "<unk>", "<pad>", "<mask>", "[CLS]", "[SEP]", "[UNK]", "[PAD]", "[MASK]", "<cls>", "<sep>", "<bos>", "<eos>",
-          "<|endoftext|>", "<|startoftext|>", "<|startoftranscript|>", "<|notimestamps|>", "en_XX", "eng_Latn", "__eng__", "__fra__",
-          "<ent>", "<ent2>", "<mask_2>", "<|padding|>", "<eop>", "<eod>", "[QUESTION]", "▁<PRE>", "▁<MID>", "▁<SUF>", "▁<EOT>"]
+TOKENS = [
+    "<s>",
+    "</s>",
+    "<unk>",
+    "<pad>",
+    "<mask>",
+    "[CLS]",
+    "[SEP]",
+    "[UNK]",
+    "[PAD]",
+    "[MASK]",
+    "<cls>",
+    "<sep>",
+    "<bos>",
+    "<eos>",
+    "<|endoftext|>",
+    "<|startoftext|>",
+    "<|startoftranscript|>",
+    "<|notimestamps|>",
+    "en_XX",
+    "eng_Latn",
+    "__eng__",
+    "__fra__",
+    "<ent>",
+    "<ent2>",
+    "<mask_2>",
+    "<|padding|>",
+    "<eop>",
+    "<eod>",
+    "[QUESTION]",
+    "▁<PRE>",
+    "▁<MID>",
+    "▁<SUF>",
+    "▁<EOT>",
+]
 LETTERS = [*"abcdefgh", "▁", "Ġ", "▁c", "Ġc", "c</w>", *(f"x{i}" for i in range(120))]
 
 
@@ -53,15 +86,24 @@ def template(rng):
 
 
 def simple_template(rng, ids):
-    special = [{"SpecialToken": {"id": t, "type_id": 0}} for t in rng.sample(["<s>", "</s>", "[CLS]", "[SEP]", "<|startoftranscript|>"], rng.randrange(4))]
+    special = [
+        {"SpecialToken": {"id": t, "type_id": 0}}
+        for t in rng.sample(["<s>", "</s>", "[CLS]", "[SEP]", "<|startoftranscript|>"], rng.randrange(4))
+    ]
     at = rng.randint(0, len(special))
     text = {"Sequence": {"id": "A", "type_id": 0}}
     return {
         "type": "TemplateProcessing",
         "single": [*special[:at], text, *special[at:]],
         "pair": [text, {"Sequence": {"id": "B", "type_id": 0}}],
-        "special_tokens": {p["SpecialToken"]["id"]: {"id": p["SpecialToken"]["id"], "ids": [ids[p["SpecialToken"]["id"]]],
-                                                      "tokens": [p["SpecialToken"]["id"]]} for p in special},
+        "special_tokens": {
+            p["SpecialToken"]["id"]: {
+                "id": p["SpecialToken"]["id"],
+                "ids": [ids[p["SpecialToken"]["id"]]],
+                "tokens": [p["SpecialToken"]["id"]],
+            }
+            for p in special
+        },
     }
 
 
@@ -72,12 +114,23 @@ def draw(directory, rng):
     tokens = [*TOKENS, *LETTERS]
     ids = {token: i for i, token in enumerate(tokens)}
     model = {"type": kind, "vocab": [[t, 0.0 if t in TOKENS else -1.0] for t in tokens] if kind == "Unigram" else ids}
-    model |= {"BPE": {"merges": []}, "Unigram": {"unk_id": 2}, "WordLevel": {"unk_token": "<unk>"},
-              "WordPiece": {"unk_token": "<unk>", "continuing_subword_prefix": "##", "max_input_chars_per_word": 100}}[kind]
+    model |= {
+        "BPE": {"merges": []},
+        "Unigram": {"unk_id": 2},
+        "WordLevel": {"unk_token": "<unk>"},
+        "WordPiece": {"unk_token": "<unk>", "continuing_subword_prefix": "##", "max_input_chars_per_word": 100},
+    }[kind]
     added = [{"id": ids[t], "content": t, **FLAGS, "special": True} for t in TOKENS]
     more = [f"<new{i}>" for i in range(rng.randrange(4))]
     added += [{"id": len(tokens) + i, "content": t, **FLAGS, "special": rng.random() < 0.5} for i, t in enumerate(more)]
-    parts = {"truncation": None, "padding": None, "added_tokens": added, "normalizer": None, "pre_tokenizer": None, "decoder": None}
+    parts = {
+        "truncation": None,
+        "padding": None,
+        "added_tokens": added,
+        "normalizer": None,
+        "pre_tokenizer": None,
+        "decoder": None,
+    }
     document = {"version": "1.0", **parts, "post_processor": template(rng), "model": model}
     (directory / "tokenizer.json").write_text(json.dumps(document))
 
@@ -98,7 +151,11 @@ def draw(directory, rng):
     if rng.random() < 0.3:
         (directory / "special_tokens_map.json").write_text(json.dumps({"cls_token": rng.choice(TOKENS[:14])}))
     own_types = next((t for n, t in TYPES.items() if n.removesuffix("Fast") == name), None)
-    model_type = rng.choice(own_types) if own_types and rng.random() < 0.6 else rng.choice(["llama", "t5", "bert", "gpt2", "granite", "llava", "qwen2"])
+    model_type = (
+        rng.choice(own_types)
+        if own_types and rng.random() < 0.6
+        else rng.choice(["llama", "t5", "bert", "gpt2", "granite", "llava", "qwen2"])
+    )
     (directory / "config.json").write_text(json.dumps({"model_type": model_type}))
 
 

@@ -9,22 +9,36 @@ from peer import WIDTH, Tally, doctor, read_tensors, workplace, write_shard
 NAMES = {"F16": "float16", "BF16": "bfloat16", "F32": "float32", "F64": "float64"}
 HIDDEN, ROWS = 64, 2048
 RECIPE = {
-    "recipe": "cast", "summary": "a checkpoint in another type",
+    "recipe": "cast",
+    "summary": "a checkpoint in another type",
     "donors": [{"role": "from", "what": "a Llama", "architectures": ["llama"]}],
     "options": [
         {"name": "dtype", "help": "type", "values": list(NAMES.values()), "default": "float32"},
         {"name": "scale", "help": "factor", "values": ["1", "8", "third"], "default": "1"},
     ],
     "documents": [{"name": "config.json", "from": "from", "edits": [{"dtype": {"to": "opt.dtype"}}]}],
-    "tensors": [{
-        "from": "from", "names": ".", "dtype": "opt.dtype",
-        "scale": "opt.scale == '8' ? 8.0 : opt.scale == 'third' ? 1.0 / 3.0 : 1.0",
-    }],
+    "tensors": [
+        {
+            "from": "from",
+            "names": ".",
+            "dtype": "opt.dtype",
+            "scale": "opt.scale == '8' ? 8.0 : opt.scale == 'third' ? 1.0 / 3.0 : 1.0",
+        }
+    ],
 }
 CONFIG = {
-    "architectures": ["LlamaForCausalLM"], "model_type": "llama", "hidden_size": HIDDEN, "intermediate_size": 80,
-    "num_hidden_layers": 0, "num_attention_heads": 4, "num_key_value_heads": 4, "vocab_size": ROWS,
-    "rms_norm_eps": 1e-6, "tie_word_embeddings": False, "bos_token_id": 1, "eos_token_id": 2,
+    "architectures": ["LlamaForCausalLM"],
+    "model_type": "llama",
+    "hidden_size": HIDDEN,
+    "intermediate_size": 80,
+    "num_hidden_layers": 0,
+    "num_attention_heads": 4,
+    "num_key_value_heads": 4,
+    "vocab_size": ROWS,
+    "rms_norm_eps": 1e-6,
+    "tie_word_embeddings": False,
+    "bos_token_id": 1,
+    "eos_token_id": 2,
     "transformers_version": "4.47.0",
 }
 
@@ -37,11 +51,14 @@ def save_donor(path, dtype):
     (path / "config.json").write_text(json.dumps({**CONFIG, "torch_dtype": NAMES[dtype]}))
     torch.manual_seed(3)
     usual = (torch.randn(ROWS, HIDDEN, dtype=torch.float64) * 2.0 ** torch.randint(-30, 18, (ROWS, 1))).to(torch_type(dtype))
-    write_shard(path / "model.safetensors", {
-        "model.embed_tokens.weight": (dtype, (ROWS, HIDDEN), os.urandom(ROWS * HIDDEN * WIDTH[dtype])),
-        "lm_head.weight": (dtype, (ROWS, HIDDEN), as_bytes(usual)),
-        "model.norm.weight": (dtype, (HIDDEN,), as_bytes(torch.ones(HIDDEN, dtype=torch_type(dtype)))),
-    })
+    write_shard(
+        path / "model.safetensors",
+        {
+            "model.embed_tokens.weight": (dtype, (ROWS, HIDDEN), os.urandom(ROWS * HIDDEN * WIDTH[dtype])),
+            "lm_head.weight": (dtype, (ROWS, HIDDEN), as_bytes(usual)),
+            "model.norm.weight": (dtype, (HIDDEN,), as_bytes(torch.ones(HIDDEN, dtype=torch_type(dtype)))),
+        },
+    )
 
 
 def torch_type(dtype):
@@ -96,8 +113,20 @@ def main():
                 for option, scale in (("1", 1), ("8", 8.0), ("third", 1 / 3)):
                     what, out = f"{dtype} to {to}, scale {option}", work / f"{dtype}-{to}-{option}"
                     code, stdout, stderr = doctor(
-                        "build-merged", "--recipe", work / "cast.json5", "--donor", f"from={work / dtype}", "--out", out,
-                        "--set", f"dtype={name}", "--set", f"scale={option}", "--output-format", "json")
+                        "build-merged",
+                        "--recipe",
+                        work / "cast.json5",
+                        "--donor",
+                        f"from={work / dtype}",
+                        "--out",
+                        out,
+                        "--set",
+                        f"dtype={name}",
+                        "--set",
+                        f"scale={option}",
+                        "--output-format",
+                        "json",
+                    )
                     if not tally.expect(out.exists(), f"{what}: exit {code}", (stdout + stderr)[-1500:]):
                         continue
                     changed = {c["name"]: c.get("losses") for c in json.loads(stdout)["merge"]["changed"]}
@@ -105,8 +134,14 @@ def main():
                     for tensor, (_, _, data) in before.items():
                         tally.equal(after[tensor][0], to, f"{what}: type of {tensor}")
                         source = as_tensor(dtype, data)
-                        lost = compare(tally, f"{what}: {tensor}", source, as_tensor(to, after[tensor][2]),
-                                       expected(source, to, scale), changed.get(tensor))
+                        lost = compare(
+                            tally,
+                            f"{what}: {tensor}",
+                            source,
+                            as_tensor(to, after[tensor][2]),
+                            expected(source, to, scale),
+                            changed.get(tensor),
+                        )
                         for kind in seen:
                             seen[kind] += lost[kind]
     tally.expect(all(seen.values()), f"the values lost {seen}: a kind was never tested")

@@ -52,7 +52,9 @@ class Cell:
     def line(self):
         """What opened.py needs to know."""
         guest = {"guest_dir": str(self.guest_dir), "stored": self.stored} if self.guest_dir else {}
-        return json.dumps(dict(name=self.name, what=self.what, host=self.host, out=str(self.out), host_dir=str(self.host_dir), **guest))
+        return json.dumps(
+            dict(name=self.name, what=self.what, host=self.host, out=str(self.out), host_dir=str(self.host_dir), **guest)
+        )
 
     @cached_property
     def tensors(self):
@@ -108,7 +110,9 @@ def reason(report, stderr):
     """Why the tool stopped, in one line."""
     if report:
         seams = report["merge"]["seams"] if report.get("merge") else []
-        errors = [f"{f['code']} {f['message']}" for c in report["checkpoints"] for f in c["findings"] if f["severity"] == "error"]
+        errors = [
+            f"{f['code']} {f['message']}" for c in report["checkpoints"] for f in c["findings"] if f["severity"] == "error"
+        ]
         found = [s.get("message") or json.dumps(s) for s in seams] + errors
         if found:
             return found[0]
@@ -182,18 +186,42 @@ class Part(Cell):
             self.inserted = doctor(*words, "--output-format", "concise")
 
     def line(self):
-        return json.dumps(dict(name=self.name, what=self.what, host=self.host, out=str(self.out), host_dir=str(self.host_dir), stored=self.stored))
+        return json.dumps(
+            dict(
+                name=self.name,
+                what=self.what,
+                host=self.host,
+                out=str(self.out),
+                host_dir=str(self.host_dir),
+                stored=self.stored,
+            )
+        )
 
     def compare(self, tally):
         """The part has only tensors of the donor; put back, every tensor and every document has the donor's bytes."""
         of_host = {(stored[1], stored[2]) for stored in read_tensors(self.host_dir).values()}
         for name, (_, shape, data) in self.tensors.items():
             tally.expect((shape, data) in of_host, f"{self.name}: {name} is not the donor's")
-        if not tally.expect(self.inserted[0] == 0, f"{self.name}: insert ends with {self.inserted[0]}", self.inserted[1][-800:] + self.inserted[2]):
+        if not tally.expect(
+            self.inserted[0] == 0,
+            f"{self.name}: insert ends with {self.inserted[0]}",
+            self.inserted[1][-800:] + self.inserted[2],
+        ):
             return
         tally.expect(read_tensors(self.back) == read_tensors(self.host_dir), f"{self.name}: other tensors when it is put back")
-        files = [{p.name: p.read_bytes() for p in path.iterdir() if p.is_file() and "safetensors" not in p.name and p.name not in GENERATED} for path in (self.host_dir, self.back)]
-        tally.equal(sorted(n for n in files[0].keys() | files[1].keys() if files[0].get(n) != files[1].get(n)), [], f"{self.name}: documents that differ when it is put back")
+        files = [
+            {
+                p.name: p.read_bytes()
+                for p in path.iterdir()
+                if p.is_file() and "safetensors" not in p.name and p.name not in GENERATED
+            }
+            for path in (self.host_dir, self.back)
+        ]
+        tally.equal(
+            sorted(n for n in files[0].keys() | files[1].keys() if files[0].get(n) != files[1].get(n)),
+            [],
+            f"{self.name}: documents that differ when it is put back",
+        )
 
 
 # Hosts that build one kind of language model, with the guests that are of this kind.

@@ -111,7 +111,9 @@ class Crash(Pressure):
                 some = self.sample(some, 120 if job.name == "build" else 80)
             some += self.sample(same, 400 if self.full else 30)
             ended = sum(self.each(job, some, self.fault))
-            self.report(f"{job.name}: {len(some)} injected faults ({ended} ended with an error, {len(some) - ended} without effect)")
+            self.report(
+                f"{job.name}: {len(some)} injected faults ({ended} ended with an error, {len(some) - ended} without effect)"
+            )
 
     def fault(self, job, call, what):
         job.reset()
@@ -164,7 +166,9 @@ class Crash(Pressure):
         """Closing a directory fails: without effect. It is closed to list or to sync it, in every phase of a run."""
         for job in self.jobs:
             calls = job.calls()[0]
-            ours = [c for c in calls if c.name == "close" and any(p.startswith(str(job.place)) for p in c.paths) and c.is_directory]
+            ours = [
+                c for c in calls if c.name == "close" and any(p.startswith(str(job.place)) for p in c.paths) and c.is_directory
+            ]
             cases = [(call, f"error={error}") for call in ours for error in CLOSES]
             some = cases if self.full else self.sample(cases, 24)
             ended = sum(self.each(job, some, self.fault))
@@ -180,7 +184,9 @@ class Crash(Pressure):
             cases = [(call, f"error={error}", on) for call in removing for error in ("EIO", "EROFS") for on in ("", "+")]
             some = cases if self.full else self.sample(cases, 20)
             left = sum(self.each(job, some, self.removal))
-            self.report(f"{job.name}: {len(some)} failures to remove, once or from then on ({left} left files, which the next run removed)")
+            self.report(
+                f"{job.name}: {len(some)} failures to remove, once or from then on ({left} left files, which the next run removed)"
+            )
 
     @staticmethod
     def removal(job, call, what, on):
@@ -265,7 +271,9 @@ class Crash(Pressure):
             job.promises(ignored, before)
             job.reset()
             self.nohup(job, changes[len(changes) // 2])
-            self.report(f"{job.name}: {len(chosen)} signals INT, TERM, HUP ({stopped} stopped the run, the others arrived too late)")
+            self.report(
+                f"{job.name}: {len(chosen)} signals INT, TERM, HUP ({stopped} stopped the run, the others arrived too late)"
+            )
 
     def interrupt(self, job, call, name):
         job.reset()
@@ -302,7 +310,9 @@ class Crash(Pressure):
             facts = durable(outcome.log, job.place)
             if not facts["names"] or facts["names"] != facts["synced"]:
                 raise Broken(f"{job.name}: {facts}")
-            self.report(f"{job.name}: {facts['files']} files were synced before they got {facts['names']} names, and the names afterwards")
+            self.report(
+                f"{job.name}: {facts['files']} files were synced before they got {facts['names']} names, and the names afterwards"
+            )
             job.reset()
 
 

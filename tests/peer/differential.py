@@ -38,7 +38,13 @@ CONFIGS = ROOT / "tests" / "data" / "hub-configs" / "configs.jsonl"
 SHARD = "model.safetensors"
 PARAMETERS = 2_000_000  # of a small model
 SHARES = {"false clean": ("bad", 0.01), "false error": ("sound", 0.005), "other lists": ("lists", 0.001)}
-NEVER = {"transformers_version", "architectures", "_name_or_path", "auto_map", "quantization_config"}  # no mutation changes them
+NEVER = {
+    "transformers_version",
+    "architectures",
+    "_name_or_path",
+    "auto_map",
+    "quantization_config",
+}  # no mutation changes them
 BATCH = 100  # directories that one run of `check` gets
 SECONDS, BYTES = 20, 6 << 30  # that one load may take; a mutant that takes more is not counted
 
@@ -88,7 +94,11 @@ def chosen_class(rng, config):
     from transformers.models.auto import modeling_auto
 
     named, _ = class_of(config)
-    autos = [value for name, value in sorted(vars(modeling_auto).items()) if name.startswith("AutoModel") and hasattr(value, "_model_mapping")]
+    autos = [
+        value
+        for name, value in sorted(vars(modeling_auto).items())
+        if name.startswith("AutoModel") and hasattr(value, "_model_mapping")
+    ]
     built = []
     for auto in autos:
         try:
@@ -118,7 +128,11 @@ def happened(folder, auto, base):
         return {"actual": "raises", "words": f"{type(error).__name__}: {error}"[:300], "lists": lists_of(folder, auto, error)}
     lists = as_lists(info)
     if lists["missing"] or lists["mismatched"]:
-        return {"actual": "wrong", "words": f"missing {lists['missing'][:3]}, mismatched {lists['mismatched'][:3]}", "lists": lists}
+        return {
+            "actual": "wrong",
+            "words": f"missing {lists['missing'][:3]}, mismatched {lists['mismatched'][:3]}",
+            "lists": lists,
+        }
     state = model.state_dict()
     for name, (dtype, shape, data) in promised.items():
         if name in state and name not in lists["unexpected"] and not is_equal(state[name], dtype, data):
@@ -153,8 +167,14 @@ def lists_of(folder, auto, error):
 
 def as_lists(info):
     # 4.57 reports names without shapes.
-    mismatched = [[m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])] for m in info.get("mismatched_keys", [])]
-    return {"missing": sorted(info["missing_keys"]), "unexpected": sorted(info["unexpected_keys"]), "mismatched": sorted(mismatched)}
+    mismatched = [
+        [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])] for m in info.get("mismatched_keys", [])
+    ]
+    return {
+        "missing": sorted(info["missing_keys"]),
+        "unexpected": sorted(info["unexpected_keys"]),
+        "mismatched": sorted(mismatched),
+    }
 
 
 # Mutations. Each changes the files of a folder, and returns what it did.
@@ -178,7 +198,11 @@ def mutate_config(rng, folder, others):
             path, (key, value) = (), rng.choice(found)
             return put(folder, config, path, key, None, value)
     if rng.random() < 0.3:
-        named = [p for p in places(config) if any(word in p[1] for word in ("dtype", "model_type", "act", "rope", "heads", "config", "tie_", "_id", "label"))]
+        named = [
+            p
+            for p in places(config)
+            if any(word in p[1] for word in ("dtype", "model_type", "act", "rope", "heads", "config", "tie_", "_id", "label"))
+        ]
         path, key, value = rng.choice(named) if named else (path, key, value)
     of_others = [v for other in others for _, k, v in places(other) if k == key and v != value]
     whole = isinstance(value, int) and not isinstance(value, bool)
@@ -208,7 +232,22 @@ def mutate_tensors(rng, folder):
     tensors = read_shard(folder / SHARD)
     name = rng.choice(sorted(tensors))
     dtype, shape, data = tensors[name]
-    how = rng.choice(["drop", "rename", "row less", "row more", "flatten", "transpose", "extra", "prefix", "halves", "integers", "bytes", "half"])
+    how = rng.choice(
+        [
+            "drop",
+            "rename",
+            "row less",
+            "row more",
+            "flatten",
+            "transpose",
+            "extra",
+            "prefix",
+            "halves",
+            "integers",
+            "bytes",
+            "half",
+        ]
+    )
     row = len(data) // shape[0] if shape and shape[0] else 0
     cast = {"integers": ("I64", torch.int64), "bytes": ("U8", torch.uint8), "half": ("F16", torch.float16)}
     if how == "drop" or (not row and how not in ("prefix", "halves")):
@@ -245,9 +284,25 @@ def mutate_index(rng, folder):
     halves = [dict(tensors[: len(tensors) // 2]), dict(tensors[len(tensors) // 2 :])]
     for file, half in zip(files, halves):
         write_shard(folder / file, half)
-    index = {"metadata": {"total_size": sum(len(t[2]) for _, t in tensors)}, "weight_map": {n: f for f, half in zip(files, halves) for n in half}}
+    index = {
+        "metadata": {"total_size": sum(len(t[2]) for _, t in tensors)},
+        "weight_map": {n: f for f, half in zip(files, halves) for n in half},
+    }
     weights, name = index["weight_map"], rng.choice([n for n, _ in tensors])
-    how = rng.choice(["as it is", "forgets one", "ghost", "other shard", "absent shard", "no metadata", "shard lost", "dropped from shard", "no map", "wrong size"])
+    how = rng.choice(
+        [
+            "as it is",
+            "forgets one",
+            "ghost",
+            "other shard",
+            "absent shard",
+            "no metadata",
+            "shard lost",
+            "dropped from shard",
+            "no map",
+            "wrong size",
+        ]
+    )
     if how == "forgets one":
         del weights[name]
     elif how == "ghost":
@@ -330,7 +385,14 @@ def worker(rows_file, work, seed, mutants, classes):
             signal.alarm(0)
             if any(word in outcome.get("words", "") for word in ("MemoryError", "allocate memory")):
                 outcome = {"actual": "too large"}
-            told = {"folder": str(folder), "class": json.loads((base / "config.json").read_text())["architectures"][0], "auto": auto.__name__, "what": what, "runs": runs, **outcome}
+            told = {
+                "folder": str(folder),
+                "class": json.loads((base / "config.json").read_text())["architectures"][0],
+                "auto": auto.__name__,
+                "what": what,
+                "runs": runs,
+                **outcome,
+            }
             file.write(json.dumps(told) + "\n")
             file.flush()
     (work / "told.partial").rename(work / "told.jsonl")
@@ -342,9 +404,19 @@ def worker(rows_file, work, seed, mutants, classes):
 def start_worker(script, folder, place, *arguments):
     """Runs `script --worker ROWS PLACE ARGUMENT...` under the version in `folder`; returns what it printed."""
     rows = place / "rows.jsonl"
-    rows.write_text("".join(json.dumps({**json.loads(line), "number": n}) + "\n" for n, line in enumerate(CONFIGS.read_text().splitlines())))
-    env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": "", "PYTHONHASHSEED": "0"}
-    done = subprocess.run([sys.executable, script, "--worker", rows, place, *arguments], capture_output=True, text=True, env=env)
+    rows.write_text(
+        "".join(json.dumps({**json.loads(line), "number": n}) + "\n" for n, line in enumerate(CONFIGS.read_text().splitlines()))
+    )
+    env = {
+        **os.environ,
+        "PYTHONPATH": folder,
+        "TRANSFORMERS_VERBOSITY": "critical",
+        "CUDA_VISIBLE_DEVICES": "",
+        "PYTHONHASHSEED": "0",
+    }
+    done = subprocess.run(
+        [sys.executable, script, "--worker", rows, place, *arguments], capture_output=True, text=True, env=env
+    )
     if done.returncode:
         sys.exit(f"the worker failed with {folder}:\n{done.stderr[-2000:]}")
     return done.stdout
@@ -426,8 +498,14 @@ def outcomes(told, entry, version, everything):
     if everything:
         for kind in set(found) & {"false clean", "false error", "other consequence", "other lists"}:
             config = json.loads(Path(told["folder"], "config.json").read_text())
-            detail = differences(report, told["lists"]) if kind == "other lists" else f"{verdict} ({(model.get('why') or '')[:140]}); the loader: {actual} ({told['words'][:180]})"
-            print(f"{kind} {version} {Path(told['folder']).name} {config.get('model_type')} {config.get('architectures')}: {told['what']}: {detail}")
+            detail = (
+                differences(report, told["lists"])
+                if kind == "other lists"
+                else f"{verdict} ({(model.get('why') or '')[:140]}); the loader: {actual} ({told['words'][:180]})"
+            )
+            print(
+                f"{kind} {version} {Path(told['folder']).name} {config.get('model_type')} {config.get('architectures')}: {told['what']}: {detail}"
+            )
     return found
 
 

@@ -65,7 +65,9 @@ class Server:
         """The payload of the answer, or the number of an error."""
         if code == INIT:
             minor = min(struct.unpack_from("<II", body)[1], 38)
-            return struct.pack("<IIIIHHIIHHI28x", 7, minor, 0, BIG_WRITES | MAX_PAGES, 16, 12, LARGEST, 1, LARGEST // 4096, 0, 0)
+            return struct.pack(
+                "<IIIIHHIIHHI28x", 7, minor, 0, BIG_WRITES | MAX_PAGES, 16, 12, LARGEST, 1, LARGEST // 4096, 0, 0
+            )
         if code == LOOKUP:
             if bytes(body).rstrip(b"\0") != b"disk":
                 return errno.ENOENT

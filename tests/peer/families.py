@@ -27,7 +27,13 @@ from peer import ROOT, Tally, workplace
 
 sys.path.insert(0, str(ROOT / "tools"))
 
-FAMILY = {"alias-alone": "aliases", "alias-beside": "aliases", "asked": "getattr keys", "derived": "dropped derived keys", "words": "dropped derived keys"}
+FAMILY = {
+    "alias-alone": "aliases",
+    "alias-beside": "aliases",
+    "asked": "getattr keys",
+    "derived": "dropped derived keys",
+    "words": "dropped derived keys",
+}
 SHARE = 0.99  # of the configs of each family that have to be right, or said to be unknown
 
 
@@ -44,7 +50,10 @@ def worker(out, seed, names, others):
 
     without_initialisation()
     trace.install()
-    theirs = {version: {row["class"]: row["rows"] for row in map(json.loads, Path(file).read_text().splitlines())} for version, file in others.items()}
+    theirs = {
+        version: {row["class"]: row["rows"] for row in map(json.loads, Path(file).read_text().splitlines())}
+        for version, file in others.items()
+    }
     with open(out, "w") as file:
         for name in names:
             try:
@@ -53,7 +62,9 @@ def worker(out, seed, names, others):
                     drawer = draw.Drawer(cls, cls.config_class, {"traced": {"absent": {}}}, seed)
                     rows = []
                     for version, there in theirs.items():
-                        saved = [r["config"] for r in there.get(name, ()) if r["kind"] in ("full", "thinned") and "error" not in r]
+                        saved = [
+                            r["config"] for r in there.get(name, ()) if r["kind"] in ("full", "thinned") and "error" not in r
+                        ]
                         rows += draw.files_of(drawer, cls.config_class.model_type, saved[:3] + saved[-1:], version)
                 else:
                     rows = draw.asked_now(cls, seed)
@@ -64,7 +75,19 @@ def worker(out, seed, names, others):
 
 
 def run(folder, out, seed, names, others=None):
-    command = [sys.executable, __file__, "--worker", str(out), "--seed", str(seed), "--names", ",".join(names), "--others", json.dumps(others or {}), folder]
+    command = [
+        sys.executable,
+        __file__,
+        "--worker",
+        str(out),
+        "--seed",
+        str(seed),
+        "--names",
+        ",".join(names),
+        "--others",
+        json.dumps(others or {}),
+        folder,
+    ]
     env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(command, capture_output=True, text=True, env=env)
     if done.returncode:

@@ -50,7 +50,7 @@ def damage_text(rng, folder):
         value["extra"] = float("-inf" if how == "infinity" else "nan")
         text = json.dumps(value)
     elif how == "twice":
-        text = text.rstrip().removesuffix("}").rstrip() + f', {json.dumps(key)}: {json.dumps(value.get(key))}}}'
+        text = text.rstrip().removesuffix("}").rstrip() + f", {json.dumps(key)}: {json.dumps(value.get(key))}}}"
     elif how == "quotes":
         text = text.replace('"', "'")
     elif how == "crlf":

@@ -28,7 +28,22 @@ def record(recorder, folder, names, seed, work):
     """Records of these classes, written by the version in that folder."""
     out = Path(work) / f"{re.sub('[^A-Za-z0-9]', '-', folder)}.jsonl.gz"
     only = f"^(?:{'|'.join(map(re.escape, names))})$"
-    command = [sys.executable, recorder, "--out", out, "--only", only, "--seed", str(seed), "--n", "1", "--n-other", "1", "--mutations", "5"]
+    command = [
+        sys.executable,
+        recorder,
+        "--out",
+        out,
+        "--only",
+        only,
+        "--seed",
+        str(seed),
+        "--n",
+        "1",
+        "--n-other",
+        "1",
+        "--mutations",
+        "5",
+    ]
     beside = {**os.environ, "PYTHONPATH": folder}
     done = subprocess.run([*map(str, command), "--tmp", str(work)], capture_output=True, text=True, timeout=900, env=beside)
     if done.returncode:

@@ -26,7 +26,12 @@ def tiny(work):
     path = work / "llama"
     model = tiny_sentencepiece(work, "words", 300, bos_id=1, eos_id=2, unk_id=0, pad_id=-1)
     config = LlamaConfig(
-        hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=4, num_key_value_heads=2, vocab_size=300,
+        hidden_size=32,
+        intermediate_size=64,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        num_key_value_heads=2,
+        vocab_size=300,
         max_position_embeddings=128,
     )
     LlamaForCausalLM(config).save_pretrained(path)

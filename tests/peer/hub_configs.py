@@ -114,7 +114,13 @@ def shrunk(config, scale):
     out = {}
     for key, value in config.items():
         whole = isinstance(value, int) and not isinstance(value, bool)
-        if isinstance(value, dict) and key not in ("id2label", "label2id", "quantization_config", "rope_scaling", "rope_parameters"):
+        if isinstance(value, dict) and key not in (
+            "id2label",
+            "label2id",
+            "quantization_config",
+            "rope_scaling",
+            "rope_parameters",
+        ):
             out[key] = shrunk(value, scale)
         elif whole and LAYERS.match(key) and value > 2:
             out[key] = 2
@@ -128,7 +134,13 @@ def shrunk(config, scale):
             out[key] = value if value in (514, 130) else 128
         elif whole and (HEADS.match(key) or KV_HEADS.match(key)) and value > 0:
             out[key] = max(value // scale, 1)
-        elif whole and (WIDTH.search(key) or INNER.match(key) or SMALL.match(key)) and "head_dim" not in key and value >= 64 and value % scale == 0:
+        elif (
+            whole
+            and (WIDTH.search(key) or INNER.match(key) or SMALL.match(key))
+            and "head_dim" not in key
+            and value >= 64
+            and value % scale == 0
+        ):
             out[key] = value // scale
         elif isinstance(value, list) and layers and len(value) == layers > 2:
             out[key] = value[:2]
@@ -165,8 +177,18 @@ def load(rows, out, work):
                     (folder / "config.json").write_text(json.dumps({**small, "architectures": [name]}))
                     _, info = cls.from_pretrained(folder, output_loading_info=True, ignore_mismatched_sizes=True)
                     # 4.57 reports names without shapes.
-                    mismatched = [[m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])] for m in info.get("mismatched_keys", [])]
-                    told.update(folder=str(folder), load={"missing": sorted(info["missing_keys"]), "unexpected": sorted(info["unexpected_keys"]), "mismatched": mismatched})
+                    mismatched = [
+                        [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])]
+                        for m in info.get("mismatched_keys", [])
+                    ]
+                    told.update(
+                        folder=str(folder),
+                        load={
+                            "missing": sorted(info["missing_keys"]),
+                            "unexpected": sorted(info["unexpected_keys"]),
+                            "mismatched": mismatched,
+                        },
+                    )
                     break
                 except Exception as e:  # it may only be that it was made too small
                     told["error"] = f"{type(e).__name__}: {e}"[:200]
@@ -182,14 +204,20 @@ def worker(folder, mode, rows, work):
     given, out = work / f"{mode}.in.jsonl", work / f"{mode}.out.jsonl"
     given.write_text("".join(json.dumps(r) + "\n" for r in rows))
     env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run([sys.executable, __file__, "--worker", mode, str(given), str(out), str(work)], capture_output=True, text=True, env=env)
+    done = subprocess.run(
+        [sys.executable, __file__, "--worker", mode, str(given), str(out), str(work)], capture_output=True, text=True, env=env
+    )
     if done.returncode:
         sys.exit(f"the worker failed with {folder}:\n{done.stderr[-2000:]}")
     return [json.loads(line) for line in out.read_text().splitlines()]
 
 
 def said(answer):
-    if answer.get("not_predicted") or "not known here" in answer.get("error", "") or "no architecture is known" in answer.get("error", ""):
+    if (
+        answer.get("not_predicted")
+        or "not known here" in answer.get("error", "")
+        or "no architecture is known" in answer.get("error", "")
+    ):
         return "not predicted"
     return "error" if "error" in answer else "built"
 
@@ -257,7 +285,11 @@ def main():
                     continue
                 counts[version, "loads compared"] += 1
                 row, report = rows[t["number"]], as_detailed(report, t["load"])
-                tally.expect(report == t["load"], f"{version} load of {row['id']}", "" if report == t["load"] else differences(report, t["load"]))
+                tally.expect(
+                    report == t["load"],
+                    f"{version} load of {row['id']}",
+                    "" if report == t["load"] else differences(report, t["load"]),
+                )
     for (version, what), n in sorted(counts.items()):
         print(f"{version}: {n} {what}")
     tally.finish()

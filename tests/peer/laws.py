@@ -84,7 +84,11 @@ def writes_inside(job, outcome, _):
             paths = paths[-1:]
         for path in paths:
             follows = "chmod" in event.call or "trunc" in event.call or "utime" in event.call
-            real = os.path.realpath(path) if follows else os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
+            real = (
+                os.path.realpath(path)
+                if follows
+                else os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
+            )
             if not inside(real, job.writes):
                 yield f"{event.call} {real!r}"
 
@@ -200,7 +204,16 @@ def switches_nothing_on(job, outcome, _):
                 pending.extend(value.values() if isinstance(value, dict) else value if isinstance(value, list) else ())
 
 
-LAWS = (ends_well, writes_inside, reads_inside, settings_from_here, starts_nothing, keeps_secrets, leaves_outside, switches_nothing_on)
+LAWS = (
+    ends_well,
+    writes_inside,
+    reads_inside,
+    settings_from_here,
+    starts_nothing,
+    keeps_secrets,
+    leaves_outside,
+    switches_nothing_on,
+)
 
 
 # Cases.
@@ -229,7 +242,11 @@ class Case:
                 self.reads = [self.place]
                 around = {SETTINGS: plants.planted_settings(site)}
             elif kind == "above":
-                around = {SETTINGS: plants.planted_settings(site), ".gitattributes": plants.Link(site.secret(".gitattributes")), ".git": {"lfs": {}}}
+                around = {
+                    SETTINGS: plants.planted_settings(site),
+                    ".gitattributes": plants.Link(site.secret(".gitattributes")),
+                    ".git": {"lfs": {}},
+                }
             elif kind == "link":
                 around = {"linked": plants.Link(below)}
                 given = place / "linked"
@@ -281,7 +298,9 @@ class Group:
             return ["undo"]
         options = ["check", "--output-format", rng.choice(FORMATS)]
         if self.kind == "check":
-            options += rng.choice([[], [], [], ["--deep"], ["--diff", "--unsafe-fixes"], ["--for", "all"], ["--statistics"], ["--verbose"]])
+            options += rng.choice(
+                [[], [], [], ["--deep"], ["--diff", "--unsafe-fixes"], ["--for", "all"], ["--statistics"], ["--verbose"]]
+            )
             if options[-1] == "--statistics":
                 options[2] = rng.choice(("full", "concise", "json"))
             return options

@@ -28,7 +28,11 @@ OPTIONS = {
     "layout": ("upstream", "wrapped"),
 }
 MODULES = (
-    "configuration_spatialvla", "modeling_spatialvla", "modeling_gemma2", "processing_spatialvla", "action_tokenizer",
+    "configuration_spatialvla",
+    "modeling_spatialvla",
+    "modeling_gemma2",
+    "processing_spatialvla",
+    "action_tokenizer",
 )
 
 
@@ -189,8 +193,9 @@ def judge(tally, what, out):
     """Checks and loads a written merge."""
     entries, code = check(out)
     verdict, findings = (next(iter(entries.values()))[key] for key in ("verdict", "findings"))
-    ok = tally.expect(code == 0 and verdict in ("clean", "info"), f"{what}: verdict {verdict}, exit {code}",
-                      json.dumps(findings)[:1500])
+    ok = tally.expect(
+        code == 0 and verdict in ("clean", "info"), f"{what}: verdict {verdict}, exit {code}", json.dumps(findings)[:1500]
+    )
     try:
         wrong = faults_on_loading(out)
     except Exception as error:  # a merged directory may break the loader in any way
@@ -235,8 +240,11 @@ def main():
             if to_blame:
                 ok = tally.equal(code, 2, f"{what}: exit code")
                 ok &= tally.expect(not out.exists(), f"{what}: refused, but something was written")
-                ok &= tally.expect(any(f"{name}=" in stdout + stderr for name in to_blame),
-                                   f"{what}: the refusal names no setting of {to_blame}", output)
+                ok &= tally.expect(
+                    any(f"{name}=" in stdout + stderr for name in to_blame),
+                    f"{what}: the refusal names no setting of {to_blame}",
+                    output,
+                )
                 result = "stops" if ok else "WRONG"
             else:
                 ok = tally.expect(code == 0, f"{what}: exit {code}", output) and judge(tally, what, out)

@@ -11,14 +11,30 @@ PROMPT = "pick the red cup"
 
 def save_paligemma(path, work, width):
     from transformers import (
-        AddedToken, GemmaTokenizerFast, PaliGemmaConfig, PaliGemmaForConditionalGeneration, PaliGemmaProcessor,
+        AddedToken,
+        GemmaTokenizerFast,
+        PaliGemmaConfig,
+        PaliGemmaForConditionalGeneration,
+        PaliGemmaProcessor,
         SiglipImageProcessor,
     )
     from transformers.models.paligemma.processing_paligemma import EXTRA_TOKENS
     import torch
 
-    model = tiny_sentencepiece(work, "gemma", 400, pad_id=0, eos_id=1, bos_id=2, unk_id=3, pad_piece="<pad>",
-                               eos_piece="<eos>", bos_piece="<bos>", unk_piece="<unk>", add_dummy_prefix=False)
+    model = tiny_sentencepiece(
+        work,
+        "gemma",
+        400,
+        pad_id=0,
+        eos_id=1,
+        bos_id=2,
+        unk_id=3,
+        pad_piece="<pad>",
+        eos_piece="<eos>",
+        bos_piece="<bos>",
+        unk_piece="<unk>",
+        add_dummy_prefix=False,
+    )
     tokenizer = GemmaTokenizerFast(vocab_file=model)
     tokenizer.add_tokens(EXTRA_TOKENS)
     tokenizer.add_special_tokens({"additional_special_tokens": [AddedToken("<image>", normalized=False, special=True)]})
@@ -26,14 +42,37 @@ def save_paligemma(path, work, width):
     images.image_seq_length = (IMAGE // PATCH) ** 2
     PaliGemmaProcessor(images, tokenizer).save_pretrained(path)
     torch.manual_seed(1)
-    PaliGemmaForConditionalGeneration(PaliGemmaConfig(
-        text_config=dict(model_type="gemma", hidden_size=width, intermediate_size=48, num_hidden_layers=2,
-                         num_attention_heads=2, num_key_value_heads=1, head_dim=16, vocab_size=len(tokenizer)),
-        vision_config=dict(model_type="siglip_vision_model", hidden_size=32, intermediate_size=48, num_hidden_layers=2,
-                           num_attention_heads=2, image_size=IMAGE, patch_size=PATCH, vision_use_head=False),
-        projection_dim=width, hidden_size=width, image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
-        vocab_size=len(tokenizer), bos_token_id=2, eos_token_id=1, pad_token_id=0,
-    )).to(torch.bfloat16).save_pretrained(path, max_shard_size="60KB")
+    PaliGemmaForConditionalGeneration(
+        PaliGemmaConfig(
+            text_config=dict(
+                model_type="gemma",
+                hidden_size=width,
+                intermediate_size=48,
+                num_hidden_layers=2,
+                num_attention_heads=2,
+                num_key_value_heads=1,
+                head_dim=16,
+                vocab_size=len(tokenizer),
+            ),
+            vision_config=dict(
+                model_type="siglip_vision_model",
+                hidden_size=32,
+                intermediate_size=48,
+                num_hidden_layers=2,
+                num_attention_heads=2,
+                image_size=IMAGE,
+                patch_size=PATCH,
+                vision_use_head=False,
+            ),
+            projection_dim=width,
+            hidden_size=width,
+            image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+            vocab_size=len(tokenizer),
+            bos_token_id=2,
+            eos_token_id=1,
+            pad_token_id=0,
+        )
+    ).to(torch.bfloat16).save_pretrained(path, max_shard_size="60KB")
 
 
 def save_llama(path, work, width, tied, dtype="bfloat16"):
@@ -44,11 +83,21 @@ def save_llama(path, work, width, tied, dtype="bfloat16"):
     tokenizer = LlamaTokenizerFast(vocab_file=model, pad_token="<unk>")
     tokenizer.save_pretrained(path)
     torch.manual_seed(2)
-    LlamaForCausalLM(LlamaConfig(
-        hidden_size=width, intermediate_size=80, num_hidden_layers=3, num_attention_heads=4, num_key_value_heads=2,
-        vocab_size=len(tokenizer), max_position_embeddings=512, tie_word_embeddings=tied, bos_token_id=1, eos_token_id=2,
-        pad_token_id=0,
-    )).to(getattr(torch, dtype)).save_pretrained(path, max_shard_size="80KB")
+    LlamaForCausalLM(
+        LlamaConfig(
+            hidden_size=width,
+            intermediate_size=80,
+            num_hidden_layers=3,
+            num_attention_heads=4,
+            num_key_value_heads=2,
+            vocab_size=len(tokenizer),
+            max_position_embeddings=512,
+            tie_word_embeddings=tied,
+            bos_token_id=1,
+            eos_token_id=2,
+            pad_token_id=0,
+        )
+    ).to(getattr(torch, dtype)).save_pretrained(path, max_shard_size="80KB")
 
 
 def compare_tensors(tally, what, vision, language, out, padded):
@@ -136,8 +185,9 @@ def image_rows(path):
 
     model, seen = PaliGemmaForConditionalGeneration.from_pretrained(path), []
     first = model.language_model.model.layers[0]
-    first.register_forward_pre_hook(lambda _, args, kwargs: seen.append((args or [kwargs["hidden_states"]])[0]),
-                                    with_kwargs=True)
+    first.register_forward_pre_hook(
+        lambda _, args, kwargs: seen.append((args or [kwargs["hidden_states"]])[0]), with_kwargs=True
+    )
     inputs = example(path, model.dtype)
     with torch.no_grad():
         model(**inputs)
@@ -181,8 +231,19 @@ def merge(vision, language, out, *settings, versions=()):
     if not any(setting.startswith("scale=") for setting in settings):
         settings = (*settings, "scale=keep")
     options = [word for setting in settings for word in ("--set", setting)]
-    return doctor("build-merged", "--recipe", "paligemma-llama", "--vision", vision, "--language", language,
-                  "--out", out, *options, *versions)
+    return doctor(
+        "build-merged",
+        "--recipe",
+        "paligemma-llama",
+        "--vision",
+        vision,
+        "--language",
+        language,
+        "--out",
+        out,
+        *options,
+        *versions,
+    )
 
 
 def main():

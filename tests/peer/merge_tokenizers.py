@@ -24,11 +24,20 @@ def save_language(folder, width):
     tokenizer = AutoTokenizer.from_pretrained(folder)
     torch.manual_seed(3)
     end = tokenizer.eos_token_id
-    LlamaForCausalLM(LlamaConfig(
-        hidden_size=width, intermediate_size=80, num_hidden_layers=2, num_attention_heads=4, num_key_value_heads=2,
-        vocab_size=len(tokenizer), max_position_embeddings=512, tie_word_embeddings=False,
-        bos_token_id=tokenizer.bos_token_id if tokenizer.bos_token_id is not None else end, eos_token_id=end,
-    )).to(torch.bfloat16).save_pretrained(folder)
+    LlamaForCausalLM(
+        LlamaConfig(
+            hidden_size=width,
+            intermediate_size=80,
+            num_hidden_layers=2,
+            num_attention_heads=4,
+            num_key_value_heads=2,
+            vocab_size=len(tokenizer),
+            max_position_embeddings=512,
+            tie_word_embeddings=False,
+            bos_token_id=tokenizer.bos_token_id if tokenizer.bos_token_id is not None else end,
+            eos_token_id=end,
+        )
+    ).to(torch.bfloat16).save_pretrained(folder)
 
 
 def ids_of(folder):
@@ -50,9 +59,20 @@ def main():
             save_language(work / kind, 64)
         for recipe, kind, form in itertools.product(visions, KINDS, ("plain", "baked")):
             what, out = f"{recipe} {kind} {form}", work / f"{recipe}-{kind}-{form}"
-            code, stdout, stderr = doctor("build-merged", "--recipe", recipe, "--vision", visions[recipe],
-                                          "--language", work / kind, "--out", out, "--set", f"tokenizer={form}",
-                                          *(("--set", "scale=keep") if recipe == "paligemma-llama" else ()))
+            code, stdout, stderr = doctor(
+                "build-merged",
+                "--recipe",
+                recipe,
+                "--vision",
+                visions[recipe],
+                "--language",
+                work / kind,
+                "--out",
+                out,
+                "--set",
+                f"tokenizer={form}",
+                *(("--set", "scale=keep") if recipe == "paligemma-llama" else ()),
+            )
             if not tally.expect(code == 0, f"{what}: exit {code}", (stdout + stderr)[-2000:]):
                 continue
             entry = next(iter(check(out)[0].values()))
@@ -64,8 +84,13 @@ def main():
                 wrong = [fault for fault in faults_on_loading(out) if not fault.startswith("kind of tokenizer")]
                 tally.equal(wrong, [], f"{what}: faults on loading")
             from transformers import AutoProcessor
+
             tokenizer = AutoProcessor.from_pretrained(out, trust_remote_code=True).tokenizer
-            tally.equal(tokenizer.get_vocab(), lengths.setdefault((recipe, kind), tokenizer.get_vocab()), f"{what}: ids of plain and baked")
+            tally.equal(
+                tokenizer.get_vocab(),
+                lengths.setdefault((recipe, kind), tokenizer.get_vocab()),
+                f"{what}: ids of plain and baked",
+            )
     tally.finish()
 
 

@@ -1,6 +1,5 @@
 """Mutated merges: donors, recipes, merge files, options and what already lies at the target."""
 
-import json
 import os
 
 import plants
@@ -52,31 +51,58 @@ def document(site, made):
 
 
 def template(site, made):
-    texts = ("spatialvla-llava3d/modeling_spatialvla.py", "../../../outside/secret.py", f"{site.root}/outside/secret.py", "nope.py", "")
+    texts = (
+        "spatialvla-llava3d/modeling_spatialvla.py",
+        "../../../outside/secret.py",
+        f"{site.root}/outside/secret.py",
+        "nope.py",
+        "",
+    )
     made["files"].append({"template": {"name": odd_path(site), "text": site.rng.choice(texts)}})
 
 
 def copied(site, made):
-    made["files"].append({"copy": {"from": site.rng.choice(["a", "a", "b"]), "names": [odd_path(site), "tokenizer_config.json"]}})
+    made["files"].append(
+        {"copy": {"from": site.rng.choice(["a", "a", "b"]), "names": [odd_path(site), "tokenizer_config.json"]}}
+    )
 
 
 def modules(site, made):
-    roots = ("modeling_x", "../outside/secret", f"{site.root}/outside/secret", "secret", "a.b", "", "..", "x\0", "modeling_x.py")
+    roots = (
+        "modeling_x",
+        "../outside/secret",
+        f"{site.root}/outside/secret",
+        "secret",
+        "a.b",
+        "",
+        "..",
+        "x\0",
+        "modeling_x.py",
+    )
     made["files"].append({"modules": {"from": ["a"], "roots": [site.rng.choice(roots)]}})
 
 
 def renamed(site, made):
-    made["tensors"][0] |= {"names": site.rng.choice([".*", "(.*)", "(", "lm_head", "^$"]), "as": site.rng.choice(["$1", "../$1", "x", "{a}", "{", ""])}
+    made["tensors"][0] |= {
+        "names": site.rng.choice([".*", "(.*)", "(", "lm_head", "^$"]),
+        "as": site.rng.choice(["$1", "../$1", "x", "{a}", "{", ""]),
+    }
 
 
 def edited(site, made):
-    edit = {"at": site.rng.choice(["", "/", "/x", "/text_config", "/a/b/c", "x", "/~2", "/0" * 2000, "/architectures/0"]), "to": site.rng.choice(EXPRESSIONS)}
+    edit = {
+        "at": site.rng.choice(["", "/", "/x", "/text_config", "/a/b/c", "x", "/~2", "/0" * 2000, "/architectures/0"]),
+        "to": site.rng.choice(EXPRESSIONS),
+    }
     made["documents"][0].setdefault("edits", []).append({"set": edit})
 
 
 def let(site, made):
     names = [f"x{n}" for n in range(site.rng.choice([1, 3, 40]))]
-    made["let"] = [{"name": name, "is": site.rng.choice([f"{names[n - 1]} + {names[n - 1]}" if n else "'aaaaaaaa'", *EXPRESSIONS])} for n, name in enumerate(names)]
+    made["let"] = [
+        {"name": name, "is": site.rng.choice([f"{names[n - 1]} + {names[n - 1]}" if n else "'aaaaaaaa'", *EXPRESSIONS])}
+        for n, name in enumerate(names)
+    ]
 
 
 def anything(site, made):
@@ -107,7 +133,12 @@ def job(Job, site, batch):
         donors = {"vision": dict(FIXTURES["spatialvla-tiny"]), "language": dict(FIXTURES["llava3d-tiny"])}
         recipe_file = None
     else:
-        with_code = {**LLAMA, "auto_map": {"AutoModel": "evil/repo--mod.X"}, "use_kernels": True, "text_config": {"auto_map": "x--y.Z", **LLAMA}}
+        with_code = {
+            **LLAMA,
+            "auto_map": {"AutoModel": "evil/repo--mod.X"},
+            "use_kernels": True,
+            "text_config": {"auto_map": "x--y.Z", **LLAMA},
+        }
         tree = dict(plants.BASES[rng.choice(["llama", "llama", "sharded"])])
         donors = {"a": tree | ({"config.json": as_json(with_code)} if rng.random() < 0.3 else {})}
         recipe_file = place / "recipe.json5"
@@ -154,8 +185,34 @@ def arguments(site, place, recipe_file, donors):
         words += [word for role in donors for word in ("--donor", f"{role}={place / role}")]
         words += [word for name, value in options.items() for word in ("--set", f"{name}={value}")]
         return words, out
-    into = "out" if rng.random() < 0.6 else rng.choice(["out", "./out", "sub/../out", "../m/out", str(place / "out"), "../up", "..", ".", "", "a", "vision/out", "recipe.json5", "out/x", 5, None])
-    made = {"donors": {role: rng.choice([role, f"./{role}", f"{role}/../{role}", str(place / role)]) for role in donors}, "out": into, "options": options}
+    into = (
+        "out"
+        if rng.random() < 0.6
+        else rng.choice(
+            [
+                "out",
+                "./out",
+                "sub/../out",
+                "../m/out",
+                str(place / "out"),
+                "../up",
+                "..",
+                ".",
+                "",
+                "a",
+                "vision/out",
+                "recipe.json5",
+                "out/x",
+                5,
+                None,
+            ]
+        )
+    )
+    made = {
+        "donors": {role: rng.choice([role, f"./{role}", f"{role}/../{role}", str(place / role)]) for role in donors},
+        "out": into,
+        "options": options,
+    }
     if recipe_file:
         made["recipe"] = rng.choice(["recipe.json5", "./recipe.json5", str(recipe_file), "../m/recipe.json5"])
     if rng.random() < 0.1:

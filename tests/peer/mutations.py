@@ -251,30 +251,84 @@ def unchanged(c, rng, prefix):
     pass
 
 
-ANY = [unchanged, drop, drop_embedding, drop_head, add, rename, rename_layer, reshape_grow, reshape_flat,
-       reshape_transpose, strip_prefix, add_prefix, stray_prefix, gamma_beta, gamma_elsewhere, old_buffers, shard_cut,
-       config_layers, config_fewer_layers, config_vocab, config_untied, config_tied]
-SHARDED = [index_other_shard, index_ghost, index_ghost_unknown, index_forgets, index_absent_shard, shard_lost,
-           no_metadata, stale_single_file]
+ANY = [
+    unchanged,
+    drop,
+    drop_embedding,
+    drop_head,
+    add,
+    rename,
+    rename_layer,
+    reshape_grow,
+    reshape_flat,
+    reshape_transpose,
+    strip_prefix,
+    add_prefix,
+    stray_prefix,
+    gamma_beta,
+    gamma_elsewhere,
+    old_buffers,
+    shard_cut,
+    config_layers,
+    config_fewer_layers,
+    config_vocab,
+    config_untied,
+    config_tied,
+]
+SHARDED = [
+    index_other_shard,
+    index_ghost,
+    index_ghost_unknown,
+    index_forgets,
+    index_absent_shard,
+    shard_lost,
+    no_metadata,
+    stale_single_file,
+]
 
 
 # Models: name -> a function that saves the model.
 
-VISION = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=28,
-              patch_size=14)
-TEXT = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, num_key_value_heads=2,
-            head_dim=8, vocab_size=96)
+VISION = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=28, patch_size=14)
+TEXT = dict(
+    hidden_size=32,
+    intermediate_size=48,
+    num_hidden_layers=2,
+    num_attention_heads=4,
+    num_key_value_heads=2,
+    head_dim=8,
+    vocab_size=96,
+)
 ZOE = dict(
-    use_pretrained_backbone=False, backbone=None, reassemble_factors=[4, 2, 1, 0.5], neck_hidden_sizes=[8, 8, 16, 16],
-    fusion_hidden_size=16, bottleneck_features=16, num_relative_features=8, bin_embedding_dim=16,
-    num_attractors=[8, 4, 2, 1], patch_transformer_hidden_size=16, patch_transformer_intermediate_size=32,
-    patch_transformer_num_attention_heads=2, num_patch_transformer_layers=4,
-    bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0, "name": "nyu"},
-                        {"n_bins": 8, "min_depth": 0.001, "max_depth": 80.0, "name": "kitti"}],
+    use_pretrained_backbone=False,
+    backbone=None,
+    reassemble_factors=[4, 2, 1, 0.5],
+    neck_hidden_sizes=[8, 8, 16, 16],
+    fusion_hidden_size=16,
+    bottleneck_features=16,
+    num_relative_features=8,
+    bin_embedding_dim=16,
+    num_attractors=[8, 4, 2, 1],
+    patch_transformer_hidden_size=16,
+    patch_transformer_intermediate_size=32,
+    patch_transformer_num_attention_heads=2,
+    num_patch_transformer_layers=4,
+    bin_configurations=[
+        {"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0, "name": "nyu"},
+        {"n_bins": 8, "min_depth": 0.001, "max_depth": 80.0, "name": "kitti"},
+    ],
     backbone_config=dict(
-        hidden_size=32, num_hidden_layers=4, num_attention_heads=2, intermediate_size=64,
-        image_size=64, patch_size=16, layer_scale_init_value=0.1, use_relative_position_bias=True,
-        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False),
+        hidden_size=32,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        intermediate_size=64,
+        image_size=64,
+        patch_size=16,
+        layer_scale_init_value=0.1,
+        use_relative_position_bias=True,
+        out_features=["stage1", "stage2", "stage3", "stage4"],
+        reshape_hidden_states=False,
+    ),
 )
 
 
@@ -283,7 +337,6 @@ def stock():
     import transformers as t
 
     vision = dict(VISION, model_type="siglip_vision_model", vision_use_head=False)
-    clip = dict(VISION, model_type="clip_vision_model", projection_dim=16)
     zoe = dict(ZOE, backbone_config=t.BeitConfig(**ZOE["backbone_config"]))
     yield "llama", t.LlamaForCausalLM, t.LlamaConfig(**TEXT), "20KB"
     yield "llama-tied", t.LlamaForCausalLM, t.LlamaConfig(**TEXT, tie_word_embeddings=True), "1GB"
@@ -291,15 +344,28 @@ def stock():
     yield "gemma2", t.Gemma2ForCausalLM, t.Gemma2Config(**TEXT), "20KB"
     yield "siglip", t.SiglipVisionModel, t.SiglipVisionConfig(**VISION), "20KB"
     yield "clip", t.CLIPVisionModel, t.CLIPVisionConfig(**VISION), "1GB"
-    yield "paligemma", t.PaliGemmaForConditionalGeneration, t.PaliGemmaConfig(
-        text_config=dict(TEXT, model_type="gemma"), vision_config=dict(vision), projection_dim=32,
-        image_token_index=95), "40KB"
-    yield "paligemma-llama", t.PaliGemmaForConditionalGeneration, t.PaliGemmaConfig(
-        text_config=dict(TEXT, model_type="llama"), vision_config=dict(vision), projection_dim=32,
-        image_token_index=95), "40KB"
-    yield "llava", t.LlavaForConditionalGeneration, t.LlavaConfig(
-        text_config=t.LlamaConfig(**TEXT), vision_config=t.CLIPVisionConfig(**VISION),
-        image_token_index=95), "40KB"
+    yield (
+        "paligemma",
+        t.PaliGemmaForConditionalGeneration,
+        t.PaliGemmaConfig(
+            text_config=dict(TEXT, model_type="gemma"), vision_config=dict(vision), projection_dim=32, image_token_index=95
+        ),
+        "40KB",
+    )
+    yield (
+        "paligemma-llama",
+        t.PaliGemmaForConditionalGeneration,
+        t.PaliGemmaConfig(
+            text_config=dict(TEXT, model_type="llama"), vision_config=dict(vision), projection_dim=32, image_token_index=95
+        ),
+        "40KB",
+    )
+    yield (
+        "llava",
+        t.LlavaForConditionalGeneration,
+        t.LlavaConfig(text_config=t.LlamaConfig(**TEXT), vision_config=t.CLIPVisionConfig(**VISION), image_token_index=95),
+        "40KB",
+    )
     yield "zoedepth", t.ZoeDepthForDepthEstimation, t.ZoeDepthConfig(**zoe), "60KB"
 
 
@@ -310,7 +376,8 @@ def loader_report(cls, directory):
     try:
         # SpatialVLA's own from_pretrained runs more code after loading, which may fail on a broken model.
         _, info = PreTrainedModel.from_pretrained.__func__(
-            cls, str(directory), output_loading_info=True, ignore_mismatched_sizes=True)
+            cls, str(directory), output_loading_info=True, ignore_mismatched_sizes=True
+        )
     except Exception as error:  # any exception counts as a failed load
         return f"{type(error).__name__}: {error}"
     return {

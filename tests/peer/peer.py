@@ -98,7 +98,21 @@ def errors(entry):
 # Checkpoints as plain data: {shard file: {tensor name: (dtype, shape, bytes)}} and an optional index.
 
 INDEX = "model.safetensors.index.json"
-WIDTH = {"C64": 8, "F64": 8, "I64": 8, "F32": 4, "I32": 4, "F16": 2, "BF16": 2, "I16": 2, "F8_E4M3": 1, "F8_E5M2": 1, "I8": 1, "U8": 1, "BOOL": 1}
+WIDTH = {
+    "C64": 8,
+    "F64": 8,
+    "I64": 8,
+    "F32": 4,
+    "I32": 4,
+    "F16": 2,
+    "BF16": 2,
+    "I16": 2,
+    "F8_E4M3": 1,
+    "F8_E5M2": 1,
+    "I8": 1,
+    "U8": 1,
+    "BOOL": 1,
+}
 
 
 def read_shard(path):
@@ -148,11 +162,7 @@ def read_index(directory):
 
 def read_tensors(directory):
     """All stored tensors of all files."""
-    return {
-        name: tensor
-        for path in sorted(Path(directory).glob("*.safetensors"))
-        for name, tensor in read_shard(path).items()
-    }
+    return {name: tensor for path in sorted(Path(directory).glob("*.safetensors")) for name, tensor in read_shard(path).items()}
 
 
 def tiny_sentencepiece(directory, name, vocab_size, **ids):

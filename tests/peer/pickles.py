@@ -52,7 +52,7 @@ def view(rng, tensor):
     if kind == "transpose" and tensor.dim() > 1:
         return tensor.transpose(rng.randrange(tensor.dim()), rng.randrange(tensor.dim()))
     if kind == "slice" and tensor.dim() and tensor.shape[0] > 1:
-        return tensor[rng.randrange(tensor.shape[0]):]
+        return tensor[rng.randrange(tensor.shape[0]) :]
     if kind == "step" and tensor.dim() and tensor.shape[-1] > 2:
         return tensor[..., ::2]
     if kind == "expand":
@@ -124,7 +124,7 @@ def expected(value):
         if tensor.is_contiguous():
             storage = torch.empty(0, dtype=torch.uint8).set_(tensor.untyped_storage()).numpy().tobytes()
             begin = tensor.storage_offset() * tensor.element_size()
-            data = storage[begin: begin + tensor.numel() * tensor.element_size()]
+            data = storage[begin : begin + tensor.numel() * tensor.element_size()]
             digest = hashlib.sha256(data).hexdigest()
         out[name] = [DTYPES[tensor.dtype], list(tensor.shape), digest]
     return out
@@ -158,7 +158,7 @@ def mutated(rng, data):
         elif kind < 0.7:
             data[place] ^= 1 << rng.randrange(8)
         elif kind < 0.8:
-            del data[place: place + rng.randint(1, 4)]
+            del data[place : place + rng.randint(1, 4)]
         elif kind < 0.9:
             data[place:place] = rng.randbytes(rng.randint(1, 3))
         else:
@@ -176,7 +176,11 @@ def compare(name, data, found, plain):
     if not found["whole"]:
         return [f"{name}: torch opens it, the reader says {found['faults']} {found['doubt']}"]
     want, have = expected(value), found["tensors"]
-    return [f"{name}: {key}: torch {want.get(key)}, reader {have.get(key)}" for key in {*want, *have} if want.get(key) != have.get(key)]
+    return [
+        f"{name}: {key}: torch {want.get(key)}, reader {have.get(key)}"
+        for key in {*want, *have}
+        if want.get(key) != have.get(key)
+    ]
 
 
 def compare_mutated(name, data, found):
@@ -193,7 +197,11 @@ def compare_mutated(name, data, found):
     except KeyError as error:
         return [f"{name}: called whole, with an unknown dtype {error}"]
     have = found["tensors"]
-    return [f"{name}: {key}: torch {want.get(key)}, reader {have.get(key)}" for key in {*want, *have} if want.get(key) != have.get(key)]
+    return [
+        f"{name}: {key}: torch {want.get(key)}, reader {have.get(key)}"
+        for key in {*want, *have}
+        if want.get(key) != have.get(key)
+    ]
 
 
 def main():
@@ -218,7 +226,7 @@ def main():
         plain_files = [data for _, data, plain in sound if plain]
         files = [(f"{n}.bin", mutated(rng, rng.choice(plain_files))) for n in range(args.mutations)]
         for start in range(0, len(files), 500):
-            part = files[start:start + 500]
+            part = files[start : start + 500]
             found = read(args.dump, folder, part)
             whole += sum(found[name]["whole"] for name, _ in part)
             for name, data in part:

@@ -22,8 +22,14 @@ WEIGHTS = "diffusion_pytorch_model.safetensors"
 def save(folder, pickled):
     """A pipeline of two models and a scheduler, with weights in one of the two formats."""
     unet = diffusers.UNet2DModel(
-        sample_size=8, in_channels=6, out_channels=3, layers_per_block=1, block_out_channels=(8, 8), norm_num_groups=4,
-        down_block_types=("DownBlock2D", "DownBlock2D"), up_block_types=("UpBlock2D", "UpBlock2D"),
+        sample_size=8,
+        in_channels=6,
+        out_channels=3,
+        layers_per_block=1,
+        block_out_channels=(8, 8),
+        norm_num_groups=4,
+        down_block_types=("DownBlock2D", "DownBlock2D"),
+        up_block_types=("UpBlock2D", "UpBlock2D"),
     )
     vqvae = diffusers.VQModel(block_out_channels=(8,), latent_channels=3, num_vq_embeddings=8, norm_num_groups=4, sample_size=8)
     pipeline = diffusers.LDMSuperResolutionPipeline(vqvae=vqvae, unet=unet, scheduler=diffusers.DDIMScheduler())
@@ -35,7 +41,9 @@ def damage(rng, folder):
     weights = sorted(folder.glob("*/diffusion_pytorch_model.*"))
     part = rng.choice(("unet", "vqvae", "scheduler"))
     done = []
-    for kind in rng.sample(("none", "weights", "variant", "both", "folder", "index", "null", "misspelt", "empty", "other"), rng.choice((1, 1, 2))):
+    for kind in rng.sample(
+        ("none", "weights", "variant", "both", "folder", "index", "null", "misspelt", "empty", "other"), rng.choice((1, 1, 2))
+    ):
         file = rng.choice([w for w in weights if w.exists()] or [None])
         if kind == "weights" and file:
             file.unlink()
@@ -88,7 +96,9 @@ def main():
             done = damage(rng, folder)
             found = sorted({f["code"] for c in check(folder)[0].values() for f in c["findings"]} & RULES)
             error = opens(folder)
-            if not (folder / "model_index.json").exists() and any(not any(folder.glob(f"{p}/*.json")) for p in ("unet", "scheduler")):
+            if not (folder / "model_index.json").exists() and any(
+                not any(folder.glob(f"{p}/*.json")) for p in ("unet", "scheduler")
+            ):
                 continue  # nothing shows that this was a pipeline
             raising += error is not None
             tally.equal(bool(found), error is not None, f"{number} ({', '.join(done)}): {error or 'opens'}; found {found}")

@@ -61,7 +61,9 @@ def outside(root):
         "secret.py": f"class {SECRET}:\n    pass\n".encode(),
         "secret.model": sentencepiece(["<unk>", "<s>", "</s>", SECRET]),
         # Names and shapes may be read through a link, tensors may not.
-        "secret.safetensors": shard({"lm_head.weight": [32, 8], "extra.weight": [4]})[:-16] + SECRET.encode() + b"\0" * (16 - len(SECRET)),
+        "secret.safetensors": shard({"lm_head.weight": [32, 8], "extra.weight": [4]})[:-16]
+        + SECRET.encode()
+        + b"\0" * (16 - len(SECRET)),
         "secret.attributes": f"*.safetensors filter=lfs {SECRET}\n".encode(),
         SETTINGS: as_json({"ignore": ["ARC", "CFG", "IDX", "SAF", "SEC", "AUT"], "per-path": {SECRET: {}}}),
     }
@@ -135,8 +137,12 @@ def remote():
     tree["modeling_x.py"] = b"from .configuration_x import XConfig\nclass XForCausalLM:\n    config_class = XConfig\n"
     tree["configuration_x.py"] = b"class XConfig:\n    model_type = 'x'\n"
     tree["processing_x.py"] = b"class XProcessor:\n    pass\n"
-    tree["preprocessor_config.json"] = as_json({"image_processor_type": "SiglipImageProcessor", "size": {"height": 8, "width": 8}})
-    tree["processor_config.json"] = as_json({"processor_class": "XProcessor", "auto_map": {"AutoProcessor": "processing_x.XProcessor"}})
+    tree["preprocessor_config.json"] = as_json(
+        {"image_processor_type": "SiglipImageProcessor", "size": {"height": 8, "width": 8}}
+    )
+    tree["processor_config.json"] = as_json(
+        {"processor_class": "XProcessor", "auto_map": {"AutoProcessor": "processing_x.XProcessor"}}
+    )
     return tree | {"config.json": as_json(config)}
 
 
@@ -274,8 +280,23 @@ def text(site, tree):
     name = rng.choice(names)
     data = bytearray(tree[name])
     at = rng.randrange(min(len(data), 400))
-    piece = rng.choice([b"\0", b"\xff", b"\xef\xbb\xbf", b"{", b"}", b'"', b"\\u0000", b"[" * 3000, b"{\"a\":" * 3000, b"NaN", b"1e999",
-                        b"<<<<<<< HEAD\n", b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"a" * 64 + b"\nsize 9\n"])
+    piece = rng.choice(
+        [
+            b"\0",
+            b"\xff",
+            b"\xef\xbb\xbf",
+            b"{",
+            b"}",
+            b'"',
+            b"\\u0000",
+            b"[" * 3000,
+            b'{"a":' * 3000,
+            b"NaN",
+            b"1e999",
+            b"<<<<<<< HEAD\n",
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"a" * 64 + b"\nsize 9\n",
+        ]
+    )
     kind = rng.randrange(5)
     if kind == 0:
         del data[at:]
@@ -338,8 +359,26 @@ def auto_map(site, tree):
         return
     if not isinstance(found, dict):
         return
-    reference = rng.choice(["evil/repo--mod.X", "../outside/secret.X", "..outside.secret.X", "secret.X", "a.b.c.X", "--x.Y", ".X", "X", "",
-                            "modeling_x.X", f"{site.secrets}/secret.X", "os.system", ["modeling_x.X", None], 7, None, {"a": "b.C"}])
+    reference = rng.choice(
+        [
+            "evil/repo--mod.X",
+            "../outside/secret.X",
+            "..outside.secret.X",
+            "secret.X",
+            "a.b.c.X",
+            "--x.Y",
+            ".X",
+            "X",
+            "",
+            "modeling_x.X",
+            f"{site.secrets}/secret.X",
+            "os.system",
+            ["modeling_x.X", None],
+            7,
+            None,
+            {"a": "b.C"},
+        ]
+    )
     found["auto_map"] = rng.choice([{"AutoModel": reference, "AutoConfig": reference}, reference, [reference]])
     if rng.random() < 0.3:
         found["text_config"] = {**LLAMA, "auto_map": found["auto_map"], "trust_remote_code": True, "use_kernels": True}
@@ -377,7 +416,9 @@ def attributes(site, tree):
     """Files of git, which decide whether LFS pointers are expected, and a pointer that makes them matter."""
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"a" * 64 + b"\nsize 9\n"
     tree[site.rng.choice(["model.safetensors", "tokenizer.model", "config.json"])] = pointer
-    tree[".git"] = site.rng.choice([{"lfs": {}}, b"gitdir: ../../outside\n", Link(str(site.secrets)), {"hooks": {"pre-push": b""}}])
+    tree[".git"] = site.rng.choice(
+        [{"lfs": {}}, b"gitdir: ../../outside\n", Link(str(site.secrets)), {"hooks": {"pre-push": b""}}]
+    )
     line = f"*.safetensors filter=lfs\n{'{' * 200} filter=lfs\n".encode()
     tree[".gitattributes"] = site.rng.choice([line, Link(site.secret(".gitattributes"))])
 
@@ -386,20 +427,52 @@ def journal(site, tree):
     """The remains of a repair that never was: a journal that names files outside, or folders that are links."""
     rng, secret = site.rng, site.secrets / "secret.txt"
     relative = os.path.relpath(secret, site.folder)
-    name = rng.choice([str(secret), relative, f"../{relative}", "config.json", "..", "", "new/../../x", str(site.secrets / "made.txt")])
-    old = rng.choice([None, {"len": 2, "mtime": [1, 1], "mode": 0o100644}, {"len": 2**63, "mtime": [-1, 2**40], "mode": 0o104777}])
+    name = rng.choice(
+        [str(secret), relative, f"../{relative}", "config.json", "..", "", "new/../../x", str(site.secrets / "made.txt")]
+    )
+    old = rng.choice(
+        [None, {"len": 2, "mtime": [1, 1], "mode": 0o100644}, {"len": 2**63, "mtime": [-1, 2**40], "mode": 0o104777}]
+    )
     files = [{"name": name, "old": old, "new": {"len": 2, "sha256": "0" * 64}}]
-    text = as_json({"version": 1, "kind": rng.choice(["undo", "repair"]), "number": rng.choice([0, 1, 1, 2**32 - 1]), "files": files})
+    text = as_json(
+        {"version": 1, "kind": rng.choice(["undo", "repair"]), "number": rng.choice([0, 1, 1, 2**32 - 1]), "files": files}
+    )
     inner = {"undo": {"1.json": text, "1": {"config.json": b"{}", "0": b"{}"}}, "new": {"config.json": b"{}", "0": b"{}"}}
     if rng.random() < 0.5:
         inner["journal.json"] = text
     away = Link(str(site.secrets))
-    inner |= rng.choice([{}, {"undo": away}, {"new": away}, {"lock": Link(str(secret))}, {"journal.json": Link(site.secret("a.json"))},
-                         {"new": {"config.json": Link(str(secret))}}, {".gitignore": Link(str(secret))}, {"journal.json.part": Link(str(secret))}])
+    inner |= rng.choice(
+        [
+            {},
+            {"undo": away},
+            {"new": away},
+            {"lock": Link(str(secret))},
+            {"journal.json": Link(site.secret("a.json"))},
+            {"new": {"config.json": Link(str(secret))}},
+            {".gitignore": Link(str(secret))},
+            {"journal.json.part": Link(str(secret))},
+        ]
+    )
     tree[".ckpt-doctor"] = rng.choice([inner, inner, inner, away, b"", Link(str(secret))])
 
 
-MUTATIONS = (value, value, structure, structure, text, text, index, link, link, link_by_folder, auto_map, odd_name, settings, attributes, journal)
+MUTATIONS = (
+    value,
+    value,
+    structure,
+    structure,
+    text,
+    text,
+    index,
+    link,
+    link,
+    link_by_folder,
+    auto_map,
+    odd_name,
+    settings,
+    attributes,
+    journal,
+)
 
 
 def mutated(site, tree, most=3):
@@ -414,7 +487,11 @@ def into_hub_cache(site, tree):
     """The tree as a snapshot of the hub cache: files are links to blobs, some of them to those of another model, or to files
     and links beside the blobs."""
     rng, blobs, snapshot = site.rng, {}, {}
-    other = {"e" * 64: Link(str(site.secrets / "secret.json")), "d" * 40: as_json({"bos_token_id": 1}), "secret.json": as_json({SECRET: 1})}
+    other = {
+        "e" * 64: Link(str(site.secrets / "secret.json")),
+        "d" * 40: as_json({"bos_token_id": 1}),
+        "secret.json": as_json({SECRET: 1}),
+    }
     for number, (name, entry) in enumerate(sorted(tree.items())):
         if not isinstance(entry, bytes):
             snapshot[name] = entry

@@ -104,7 +104,9 @@ def mounted(image, at):
 @contextlib.contextmanager
 def recorder(image, log, at):
     """Serves the image as the file `at`/disk."""
-    server = subprocess.Popen([sys.executable, str(Path(__file__).with_name("disk.py")), str(image), str(log), str(at)], stdout=subprocess.PIPE)
+    server = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("disk.py")), str(image), str(log), str(at)], stdout=subprocess.PIPE
+    )
     if server.stdout.readline() != b"ready\n":
         raise Broken("the recorder did not start")
     try:
@@ -247,7 +249,11 @@ def main():
     possible = [system for system in wanted if not reasons[system]]
     if possible and "POWER_NAMESPACE" not in os.environ:
         # Mounts end with the namespace.
-        os.execvpe("unshare", ["unshare", "--mount", "--propagation", "private", sys.executable, *sys.argv], {**os.environ, "POWER_NAMESPACE": "1"})
+        os.execvpe(
+            "unshare",
+            ["unshare", "--mount", "--propagation", "private", sys.executable, *sys.argv],
+            {**os.environ, "POWER_NAMESPACE": "1"},
+        )
     place = Path(tempfile.mkdtemp(prefix="power-")).resolve()
     passed = 0
     try:
@@ -260,7 +266,10 @@ def main():
                 seen = power.replay(system, recording)
                 counts = ", ".join(f"{n} {state}" for state, n in sorted(seen.items()))
                 blocks = sum(map(len, recording.epochs))
-                print(f"{recording.job.name} on {system}: {seen.total()} states of {len(recording.epochs) - 1} flushes and {blocks} blocks ({counts})", flush=True)
+                print(
+                    f"{recording.job.name} on {system}: {seen.total()} states of {len(recording.epochs) - 1} flushes and {blocks} blocks ({counts})",
+                    flush=True,
+                )
                 recording.base.unlink()
                 passed += 1
             print(f"{system}: {time.monotonic() - begun:.0f} s", flush=True)

@@ -172,7 +172,9 @@ class Pressure:
             cases = [(call, name, save) for call in changes for name in victims for save in SAVES.items()]
             cases = cases if self.full else self.sample(cases, 40)
             ended = sum(self.each(job, [(call, name, *save) for call, name, save in cases], self.save))
-            self.report(f"{job.name}: {len(cases)} files saved during the run, none was lost ({ended} runs ended with an error)")
+            self.report(
+                f"{job.name}: {len(cases)} files saved during the run, none was lost ({ended} runs ended with an error)"
+            )
 
     @staticmethod
     def save(job, call, name, how, save):

@@ -29,7 +29,7 @@ STRICTER_ON_DOCUMENTS = {
 }
 
 PIECES = [
-    *(c.encode() for c in '{}[],:"\\\'/'),
+    *(c.encode() for c in "{}[],:\"\\'/"),
     *(b"\0", b"\n", b"\xff", b"\xef\xbb\xbf", b"\\ud800", b"\\u0000", b"NaN", b"-Infinity", b"1e999", b"-", b"0", b"-1"),
     *(b"1.5", b"null", b"true", b"{}", b"[]", b'""', b"18446744073709551615", b"18446744073709551616", b"4294967296"),
     *(b"\\u0061", b"//", b"7" * 5000, b"[" * 130, b"]" * 130, b'"F4"', b'"dtype":"U8"', b'"a":0,', b" ", b"__metadata__"),

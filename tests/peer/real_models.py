@@ -60,7 +60,9 @@ def main():
     sizes = {s["directory"]: s["why"] for s in listed["indexes"]}
     tally, seen, rows = Tally(), set(), []
     for directory in sorted(p for p in Path(arguments[0]).iterdir() if p.is_dir()):
-        report = json.loads(doctor("check", directory, "--metadata-only", "--output-format", "json", "--exit-zero")[1])["checkpoints"][0]
+        report = json.loads(doctor("check", directory, "--metadata-only", "--output-format", "json", "--exit-zero")[1])[
+            "checkpoints"
+        ][0]
         for finding in report["findings"]:
             if finding["severity"] == "info":
                 continue

@@ -22,8 +22,13 @@ from peer import Tally, check, errors, workplace, write_holes
 # Classes that must be known, with an exact prediction for this version.
 FIRM_VERSION = "4.47.0"
 FIRM = {
-    "LlamaForCausalLM", "Gemma2ForCausalLM", "SiglipVisionModel", "CLIPVisionModel", "PaliGemmaForConditionalGeneration",
-    "LlavaForConditionalGeneration", "ZoeDepthForDepthEstimation",
+    "LlamaForCausalLM",
+    "Gemma2ForCausalLM",
+    "SiglipVisionModel",
+    "CLIPVisionModel",
+    "PaliGemmaForConditionalGeneration",
+    "LlavaForConditionalGeneration",
+    "ZoeDepthForDepthEstimation",
 }
 
 SHARE = 0.95  # minimum share of matching loads of known classes
@@ -121,7 +126,9 @@ class Shares:
     def summary(self):
         return {
             version: {
-                "classes": len(self.classes[version]), "loads": count, "agree": self.agreed[version],
+                "classes": len(self.classes[version]),
+                "loads": count,
+                "agree": self.agreed[version],
                 "differ": {name: sorted(kinds) for name, kinds in sorted(self.differ[version].items())},
             }
             for version, count in sorted(self.compared.items())

@@ -21,7 +21,11 @@ from pathlib import Path
 
 from peer import Tally, quiet, workplace
 
-MESSAGES = [{"role": "user", "content": "one two"}, {"role": "assistant", "content": "three"}, {"role": "user", "content": "four"}]
+MESSAGES = [
+    {"role": "user", "content": "one two"},
+    {"role": "assistant", "content": "three"},
+    {"role": "user", "content": "four"},
+]
 
 
 def attempt(open_it):
@@ -50,7 +54,9 @@ def open_tokenizer(path):
 
     tokenizer = AutoTokenizer.from_pretrained(path)
     text = " ".join(sorted(tokenizer.get_vocab())[:40]) + " Hello, world!"
-    special = {name: getattr(tokenizer, name, None) for name in ("bos_token_id", "eos_token_id", "pad_token_id", "unk_token_id")}
+    special = {
+        name: getattr(tokenizer, name, None) for name in ("bos_token_id", "eos_token_id", "pad_token_id", "unk_token_id")
+    }
     return len(tokenizer), tokenizer(text)["input_ids"], special
 
 
@@ -58,7 +64,9 @@ def render(path):
     from transformers import AutoTokenizer
 
     tokenizer = AutoTokenizer.from_pretrained(path)
-    return tokenizer.apply_chat_template(MESSAGES, tokenize=False, add_generation_prompt=True) if tokenizer.chat_template else None
+    return (
+        tokenizer.apply_chat_template(MESSAGES, tokenize=False, add_generation_prompt=True) if tokenizer.chat_template else None
+    )
 
 
 def open_processor(path):
@@ -146,7 +154,10 @@ def main():
         return worker(options.cases, options.only, options.say)
     tally = Tally()
     with workplace():
-        results = [json.loads(w.communicate()[0].rpartition("\nFOUND ")[2]) for w in [run(options.cases, f, options) for f in options.folders]]
+        results = [
+            json.loads(w.communicate()[0].rpartition("\nFOUND ")[2])
+            for w in [run(options.cases, f, options) for f in options.folders]
+        ]
     opened = {found.pop("version"): found for found in results}
     for facts in sorted(options.cases.glob("*/*/case.json")):
         name = str(facts.parent.relative_to(options.cases))

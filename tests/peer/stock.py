@@ -51,7 +51,9 @@ def llama(work, pad=None, more=()):
 def gemma(work, more=()):
     from transformers import GemmaTokenizerFast
 
-    pieces = dict(pad_id=0, eos_id=1, bos_id=2, unk_id=3, pad_piece="<pad>", eos_piece="<eos>", bos_piece="<bos>", unk_piece="<unk>")
+    pieces = dict(
+        pad_id=0, eos_id=1, bos_id=2, unk_id=3, pad_piece="<pad>", eos_piece="<eos>", bos_piece="<bos>", unk_piece="<unk>"
+    )
     model = tiny_sentencepiece(work, "gemma", 400, add_dummy_prefix=False, user_defined_symbols=["<mask>", *more], **pieces)
     return GemmaTokenizerFast(vocab_file=model)
 
@@ -63,11 +65,17 @@ def llama3(work):
     core = byte_level(380, ["<|begin_of_text|>", "<|end_of_text|>", "<|finetune_right_pad_id|>", "<|eot_id|>"])
     begin = core.token_to_id("<|begin_of_text|>")
     core.post_processor = processors.TemplateProcessing(
-        single="<|begin_of_text|> $A", pair="<|begin_of_text|> $A <|begin_of_text|> $B", special_tokens=[("<|begin_of_text|>", begin)]
+        single="<|begin_of_text|> $A",
+        pair="<|begin_of_text|> $A <|begin_of_text|> $B",
+        special_tokens=[("<|begin_of_text|>", begin)],
     )
     return PreTrainedTokenizerFast(
-        tokenizer_object=core, bos_token="<|begin_of_text|>", eos_token="<|end_of_text|>", model_max_length=512,
-        clean_up_tokenization_spaces=True, model_input_names=["input_ids", "attention_mask"],
+        tokenizer_object=core,
+        bos_token="<|begin_of_text|>",
+        eos_token="<|end_of_text|>",
+        model_max_length=512,
+        clean_up_tokenization_spaces=True,
+        model_input_names=["input_ids", "attention_mask"],
     )
 
 
@@ -78,7 +86,9 @@ def qwen2(work, more=()):
     vocabulary, merges = work / "vocab.json", work / "merges.txt"
     model = json.loads(core.to_str())["model"]
     vocabulary.write_text(json.dumps(model["vocab"]))
-    merges.write_text("#version: 0.2\n" + "".join(" ".join(m) + "\n" if isinstance(m, list) else m + "\n" for m in model["merges"]))
+    merges.write_text(
+        "#version: 0.2\n" + "".join(" ".join(m) + "\n" if isinstance(m, list) else m + "\n" for m in model["merges"])
+    )
     tokenizer = Qwen2TokenizerFast(vocab_file=str(vocabulary), merges_file=str(merges), bos_token=None)
     tokenizer.add_special_tokens({"additional_special_tokens": ["<|im_start|>", "<|im_end|>", *more]})
     return tokenizer
@@ -88,7 +98,13 @@ def smollm(work):
     from transformers import GPT2TokenizerFast
 
     core = byte_level(370, ["<|endoftext|>", "<|im_start|>", "<|im_end|>"])
-    return GPT2TokenizerFast(tokenizer_object=core, bos_token="<|im_start|>", eos_token="<|im_end|>", unk_token="<|endoftext|>", pad_token="<|im_end|>")
+    return GPT2TokenizerFast(
+        tokenizer_object=core,
+        bos_token="<|im_start|>",
+        eos_token="<|im_end|>",
+        unk_token="<|endoftext|>",
+        pad_token="<|im_end|>",
+    )
 
 
 def named(tokenizer, **tokens):
@@ -122,8 +138,15 @@ def text_config(kind, width, tokenizer):
     ids = {f"{end}_token_id": getattr(tokenizer, f"{end}_token_id") for end in ("bos", "eos", "pad")}
     rows = len(tokenizer) if kind not in ("qwen2", "qwen3", "phi3") else -(-len(tokenizer) // 32) * 32
     config = dict(
-        vocab_size=rows, hidden_size=width, intermediate_size=2 * width, num_hidden_layers=LAYERS, num_attention_heads=HEADS,
-        num_key_value_heads=KEYS, max_position_embeddings=512, rms_norm_eps=1e-5, **ids,
+        vocab_size=rows,
+        hidden_size=width,
+        intermediate_size=2 * width,
+        num_hidden_layers=LAYERS,
+        num_attention_heads=HEADS,
+        num_key_value_heads=KEYS,
+        max_position_embeddings=512,
+        rms_norm_eps=1e-5,
+        **ids,
     )
     if kind.startswith("gemma") or kind == "qwen3":
         config["head_dim"] = 16
@@ -145,7 +168,9 @@ def save_guest(kind, width, dtype, path, work):
 
     tokenizer = guest_tokenizer(kind, work)
     name = GUESTS[kind]
-    config = getattr(transformers, {"gemma3_text": "Gemma3TextConfig"}.get(kind, f"{name}Config"))(**text_config(kind, width, tokenizer))
+    config = getattr(transformers, {"gemma3_text": "Gemma3TextConfig"}.get(kind, f"{name}Config"))(
+        **text_config(kind, width, tokenizer)
+    )
     save_model(getattr(transformers, f"{name}ForCausalLM")(config), dtype, path)
     tokenizer.save_pretrained(path)
 
@@ -165,11 +190,30 @@ def save_model(model, dtype, path):
 
 
 def clip():
-    return dict(model_type="clip_vision_model", hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=SIDE, patch_size=PATCH, projection_dim=32)
+    return dict(
+        model_type="clip_vision_model",
+        hidden_size=32,
+        intermediate_size=48,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        image_size=SIDE,
+        patch_size=PATCH,
+        projection_dim=32,
+    )
 
 
 def siglip(side=SIDE, **more):
-    return dict(model_type="siglip_vision_model", hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=side, patch_size=PATCH, vision_use_head=False, **more)
+    return dict(
+        model_type="siglip_vision_model",
+        hidden_size=32,
+        intermediate_size=48,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        image_size=side,
+        patch_size=PATCH,
+        vision_use_head=False,
+        **more,
+    )
 
 
 def clip_images():
@@ -183,8 +227,16 @@ def llava(work):
 
     tokenizer = named(llama(work, pad="<unk>"), image_token="<image>")
     tokenizer.add_special_tokens({"pad_token": "<pad>"})
-    processor = LlavaProcessor(clip_images(), tokenizer, patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1)
-    config = dict(vision_config=clip(), image_token_index=tokenizer.convert_tokens_to_ids("<image>"), vision_feature_layer=-2, image_seq_length=TOKENS, pad_token_id=tokenizer.pad_token_id)
+    processor = LlavaProcessor(
+        clip_images(), tokenizer, patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1
+    )
+    config = dict(
+        vision_config=clip(),
+        image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+        vision_feature_layer=-2,
+        image_seq_length=TOKENS,
+        pad_token_id=tokenizer.pad_token_id,
+    )
     return "Llava", config, processor, "llama"
 
 
@@ -194,9 +246,18 @@ def llava_next(work):
     tokenizer = named(llama(work), image_token="<image>")
     tokenizer.add_special_tokens({"pad_token": "<pad>"})
     points = [[SIDE, 2 * SIDE], [2 * SIDE, SIDE], [2 * SIDE, 2 * SIDE]]
-    images = LlavaNextImageProcessor(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE}, image_grid_pinpoints=points)
-    processor = LlavaNextProcessor(images, tokenizer, patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1)
-    config = dict(vision_config=clip(), image_token_index=tokenizer.convert_tokens_to_ids("<image>"), image_grid_pinpoints=points, image_seq_length=TOKENS)
+    images = LlavaNextImageProcessor(
+        size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE}, image_grid_pinpoints=points
+    )
+    processor = LlavaNextProcessor(
+        images, tokenizer, patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1
+    )
+    config = dict(
+        vision_config=clip(),
+        image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+        image_grid_pinpoints=points,
+        image_seq_length=TOKENS,
+    )
     return "LlavaNext", config, processor, "mistral"
 
 
@@ -245,16 +306,34 @@ def splitting(kind):
         if kind == "idefics3":
             tokenizer.pad_token = "<|finetune_right_pad_id|>"
         rows = [f"<row_{i}_col_{j}>" for i in (1, 2) for j in (1, 2)]
-        tokenizer.add_special_tokens({"additional_special_tokens": ["<fake_token_around_image>", "<image>", "<end_of_utterance>", "<global-img>", *rows]})
-        images = getattr(transformers, f"{classes}ImageProcessor")(size={"longest_edge": 4 * SIDE}, max_image_size={"longest_edge": 2 * SIDE})
+        tokenizer.add_special_tokens(
+            {"additional_special_tokens": ["<fake_token_around_image>", "<image>", "<end_of_utterance>", "<global-img>", *rows]}
+        )
+        images = getattr(transformers, f"{classes}ImageProcessor")(
+            size={"longest_edge": 4 * SIDE}, max_image_size={"longest_edge": 2 * SIDE}
+        )
         parts = [images, tokenizer]
         if kind == "smolvlm":
             allow_without_num2words()
-            parts.append(transformers.SmolVLMVideoProcessor(size={"longest_edge": 4 * SIDE}, max_image_size={"longest_edge": 2 * SIDE}))
+            parts.append(
+                transformers.SmolVLMVideoProcessor(size={"longest_edge": 4 * SIDE}, max_image_size={"longest_edge": 2 * SIDE})
+            )
         processor = getattr(transformers, f"{classes}Processor")(*parts, image_seq_len=TOKENS)
-        vision = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=2 * SIDE, patch_size=PATCH)
+        vision = dict(
+            hidden_size=32,
+            intermediate_size=48,
+            num_hidden_layers=2,
+            num_attention_heads=4,
+            image_size=2 * SIDE,
+            patch_size=PATCH,
+        )
         vision["model_type"] = {"idefics3": "idefics3", "smolvlm": "smolvlm_vision"}[kind]
-        config = dict(vision_config=vision, image_token_id=tokenizer.convert_tokens_to_ids("<image>"), scale_factor=2, pad_token_id=tokenizer.pad_token_id)
+        config = dict(
+            vision_config=vision,
+            image_token_id=tokenizer.convert_tokens_to_ids("<image>"),
+            scale_factor=2,
+            pad_token_id=tokenizer.pad_token_id,
+        )
         return classes, config, processor, "llama"
 
     return make
@@ -281,9 +360,20 @@ def qwen_vl(kind):
         parts = [Qwen2VLImageProcessor(min_pixels=56 * 56, max_pixels=56 * 56), tokenizer]
         if kind == "qwen2_5_vl":
             parts.append(transformers.Qwen2VLVideoProcessor())
-        vision = dict(depth=2, num_heads=4, in_channels=3, patch_size=PATCH, spatial_merge_size=2, temporal_patch_size=2, model_type=kind)
-        vision |= dict(embed_dim=32, hidden_size=WIDTH, mlp_ratio=2) if kind == "qwen2_vl" else dict(hidden_size=32, intermediate_size=48, out_hidden_size=WIDTH, fullatt_block_indexes=[1], window_size=112)
-        ids = {key: tokenizer.convert_tokens_to_ids(token) for key, token in zip(("vision_start_token_id", "vision_end_token_id", "vision_token_id", "image_token_id", "video_token_id"), names)}
+        vision = dict(
+            depth=2, num_heads=4, in_channels=3, patch_size=PATCH, spatial_merge_size=2, temporal_patch_size=2, model_type=kind
+        )
+        vision |= (
+            dict(embed_dim=32, hidden_size=WIDTH, mlp_ratio=2)
+            if kind == "qwen2_vl"
+            else dict(hidden_size=32, intermediate_size=48, out_hidden_size=WIDTH, fullatt_block_indexes=[1], window_size=112)
+        )
+        ids = {
+            key: tokenizer.convert_tokens_to_ids(token)
+            for key, token in zip(
+                ("vision_start_token_id", "vision_end_token_id", "vision_token_id", "image_token_id", "video_token_id"), names
+            )
+        }
         config = dict(vision_config=vision, rope_scaling=dict(type="mrope", mrope_section=[2, 1, 1]), **ids)
         return classes, config, getattr(transformers, f"{classes}Processor")(*parts), "qwen2"
 
@@ -293,15 +383,27 @@ def qwen_vl(kind):
 def internvl(work):
     from transformers import GotOcr2ImageProcessor, InternVLProcessor, InternVLVideoProcessor
 
-    names = dict(start_image_token="<img>", end_image_token="</img>", context_image_token="<IMG_CONTEXT>", video_token="<video>")
+    names = dict(
+        start_image_token="<img>", end_image_token="</img>", context_image_token="<IMG_CONTEXT>", video_token="<video>"
+    )
     tokenizer = named(qwen2(work), **names)
     size = {"height": 2 * SIDE, "width": 2 * SIDE}
-    processor = InternVLProcessor(GotOcr2ImageProcessor(size=size, crop_to_patches=False), tokenizer, InternVLVideoProcessor(size=size), image_seq_length=TOKENS)
+    processor = InternVLProcessor(
+        GotOcr2ImageProcessor(size=size, crop_to_patches=False),
+        tokenizer,
+        InternVLVideoProcessor(size=size),
+        image_seq_length=TOKENS,
+    )
     vision = dict(
         model_type="internvl_vision", hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=[2 * SIDE] * 2,
         patch_size=[PATCH] * 2, norm_type="layer_norm", use_mean_pooling=True, use_absolute_position_embeddings=True,
     )  # fmt: skip
-    config = dict(vision_config=vision, image_token_id=tokenizer.convert_tokens_to_ids("<IMG_CONTEXT>"), image_seq_length=TOKENS, downsample_ratio=0.5)
+    config = dict(
+        vision_config=vision,
+        image_token_id=tokenizer.convert_tokens_to_ids("<IMG_CONTEXT>"),
+        image_seq_length=TOKENS,
+        downsample_ratio=0.5,
+    )
     return "InternVL", config, processor, "qwen2"
 
 
@@ -388,9 +490,13 @@ def save_openvla(dtype, path, work):
     (path / "config.json").write_text(json.dumps(config, indent=2))
     _, expected, _ = doctor("expect", path, "--for", "transformers==4.47.0", "--output-format", "json")
     stored = {"f32": "F32", "bf16": "BF16", "f16": "F16"}[dtype]
-    write_holes(path / "model.safetensors", {name: (stored, shape) for name, shape in json.loads(expected)[0]["tensors"].items()})
+    write_holes(
+        path / "model.safetensors", {name: (stored, shape) for name, shape in json.loads(expected)[0]["tensors"].items()}
+    )
     tokenizer.save_pretrained(path)
-    (path / "preprocessor_config.json").write_text(json.dumps({"image_processor_type": "PrismaticImageProcessor", "processor_class": "PrismaticProcessor"}))
+    (path / "preprocessor_config.json").write_text(
+        json.dumps({"image_processor_type": "PrismaticImageProcessor", "processor_class": "PrismaticProcessor"})
+    )
     for name, module in OPENVLA_MODULES.items():
         (path / name).write_text(module)
 
@@ -408,11 +514,20 @@ def save_tower(kind, dtype, path, work):
         model = transformers.SiglipVisionModel(transformers.SiglipVisionConfig(**siglip(2 * SIDE)))
         images = transformers.SiglipImageProcessor(size={"height": 2 * SIDE, "width": 2 * SIDE})
     elif kind == "siglip2":
-        vision = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, num_patches=TOKENS, patch_size=PATCH)
+        vision = dict(
+            hidden_size=32,
+            intermediate_size=48,
+            num_hidden_layers=2,
+            num_attention_heads=4,
+            num_patches=TOKENS,
+            patch_size=PATCH,
+        )
         model = transformers.Siglip2VisionModel(transformers.Siglip2VisionConfig(**vision))
         images = transformers.Siglip2ImageProcessor(patch_size=PATCH, max_num_patches=TOKENS)
     else:
-        vision = dict(hidden_size=32, mlp_ratio=2, num_hidden_layers=2, num_attention_heads=4, image_size=SIDE, patch_size=PATCH)
+        vision = dict(
+            hidden_size=32, mlp_ratio=2, num_hidden_layers=2, num_attention_heads=4, image_size=SIDE, patch_size=PATCH
+        )
         model = transformers.Dinov2Model(transformers.Dinov2Config(**vision))
         images = transformers.BitImageProcessor(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
     save_model(model, dtype, path)
@@ -429,7 +544,14 @@ def knows(kind):
     """Whether the version on PYTHONPATH has the class."""
     import transformers
 
-    kind = {"llama3": "llama", "openvla": "llama", "paligemma2": "paligemma", "siglip": "siglip_vision_model", "siglip2": "siglip2_vision_model", "clip": "clip_vision_model"}.get(kind, kind)
+    kind = {
+        "llama3": "llama",
+        "openvla": "llama",
+        "paligemma2": "paligemma",
+        "siglip": "siglip_vision_model",
+        "siglip2": "siglip2_vision_model",
+        "clip": "clip_vision_model",
+    }.get(kind, kind)
     return kind in transformers.CONFIG_MAPPING
 
 

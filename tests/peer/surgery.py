@@ -25,7 +25,7 @@ from pathlib import Path
 from cells import OPENVLA, Language, Part, Tower, all_cells
 from fresh import version_in
 from peer import Tally, workplace
-from stock import TOWERS, WIDTH, build, donor_name
+from stock import TOWERS, WIDTH, build
 
 HERE = Path(__file__).parent
 # Refusals that are right: regular expressions for the name of the cell and for the tool's reason, and the fact behind it.
@@ -35,11 +35,23 @@ REFUSED = [
     (r"gemma3 x (?!gemma3_text ).*", "builds its own", OWN),
     (r"openvla x (?!llama|mistral).*", "builds its own", OWN),
     (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
-    (r"(llava|llava_next) x gemma2 .*", "4.47 cannot generate", "the host was saved by 4.47, which cannot generate with this language model"),
-    (r".* sees with siglip2", "", "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP"),
+    (
+        r"(llava|llava_next) x gemma2 .*",
+        "4.47 cannot generate",
+        "the host was saved by 4.47, which cannot generate with this language model",
+    ),
+    (
+        r".* sees with siglip2",
+        "",
+        "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP",
+    ),
     (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
     (r"llava_next sees with siglip", "4.47 cannot see", "the host was saved by 4.47, which wants a class token of the tower"),
-    (r"llava_onevision sees with (clip|dinov2)", "builds its own", "the host counts the patches of a tower without class token"),
+    (
+        r"llava_onevision sees with (clip|dinov2)",
+        "builds its own",
+        "the host counts the patches of a tower without class token",
+    ),
     (r"idefics3 sees with .*", "", "the class of the host builds its own tower, whatever the config says"),
 ]
 
@@ -49,7 +61,13 @@ BY_CLASS = r"vision of qwen2(_5)?_vl"
 
 
 def start(folder, program, *arguments):
-    env = {**os.environ, "PYTHONPATH": str(folder), "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": "", "HF_HUB_OFFLINE": "1"}
+    env = {
+        **os.environ,
+        "PYTHONPATH": str(folder),
+        "TRANSFORMERS_VERBOSITY": "critical",
+        "CUDA_VISIBLE_DEVICES": "",
+        "HF_HUB_OFFLINE": "1",
+    }
     done = subprocess.run([sys.executable, program, *map(str, arguments)], capture_output=True, text=True, env=env)
     if done.returncode:
         sys.exit(f"the worker failed with {folder}:\n{done.stderr[-3000:]}")
@@ -164,9 +182,21 @@ report of the merge says that the result does not load there. A letter is the re
 each table. OpenVLA's merges are planned and checked, and not opened here, because its code needs the package timm.
 """
 TABLES = {
-    Language: "## Language models\n\n`ckpt-doctor build-merged --vision HOST --language GUEST --out OUT`, hosts in rows and guests in columns. A guest of another\nwidth needs `--set projector=pad` or `projector=reinit`; where versions scale image features differently, the merge asks for a\nversion (`--for 5.23`) or for `--set scale=`.\n",
-    Tower: "## Vision towers\n\n`ckpt-doctor build-merged --vision TOWER --language HOST --out OUT`, hosts in rows and towers in columns.\n",
-    Part: "## Parts\n\n`ckpt-doctor extract HOST --part PART --out OUT`: versions that open the part in its own class. `ckpt-doctor insert` of the\npart gives the files of the host again, byte for byte.\n",
+    Language: """## Language models
+
+`ckpt-doctor build-merged --vision HOST --language GUEST --out OUT`, hosts in rows and guests in columns. A guest of another
+width needs `--set projector=pad` or `projector=reinit`; where versions scale image features differently, the merge asks for a
+version (`--for 5.23`) or for `--set scale=`.
+""",
+    Tower: """## Vision towers
+
+`ckpt-doctor build-merged --vision TOWER --language HOST --out OUT`, hosts in rows and towers in columns.
+""",
+    Part: """## Parts
+
+`ckpt-doctor extract HOST --part PART --out OUT`: versions that open the part in its own class. `ckpt-doctor insert` of the
+part gives the files of the host again, byte for byte.
+""",
 }
 
 

@@ -20,8 +20,45 @@ from transformers.utils.chat_template_utils import _compile_jinja_template
 FOUND = 0.85
 
 PIECES = [
-    *("{%", "%}", "{{", "}}", "{%-", "-%}", "{#", "#}", "(", ")", "[", "]", "'", '"', ",", "|", ".", ":", "=", "==", "~", "-", "+"),
-    *(" if ", " else ", " endif ", " for ", " in ", " endfor ", " set ", " is ", " not ", " macro ", " endmacro ", "{% endif %}"),
+    *(
+        "{%",
+        "%}",
+        "{{",
+        "}}",
+        "{%-",
+        "-%}",
+        "{#",
+        "#}",
+        "(",
+        ")",
+        "[",
+        "]",
+        "'",
+        '"',
+        ",",
+        "|",
+        ".",
+        ":",
+        "=",
+        "==",
+        "~",
+        "-",
+        "+",
+    ),
+    *(
+        " if ",
+        " else ",
+        " endif ",
+        " for ",
+        " in ",
+        " endfor ",
+        " set ",
+        " is ",
+        " not ",
+        " macro ",
+        " endmacro ",
+        "{% endif %}",
+    ),
     *("{% else %}", "{% endfor %}", "{% break %}", "{% generation %}", "{% endgeneration %}", "\n", "\\", "0", "é", "**", "//"),
 ]
 
@@ -46,7 +83,10 @@ def mutate(rng, text):
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         edges = [m.start() for tag in re.finditer(r"\{[%{].*?[%}]\}", text, re.S) for m in re.finditer(r"\b|\W", tag.group())]
         starts = [tag.start() for tag in re.finditer(r"\{[%{].*?[%}]\}", text, re.S)]
-        at = min(len(text), rng.choice(starts or [0]) + rng.choice(edges or [0]) if rng.random() < 0.8 else rng.randrange(len(text) + 1))
+        at = min(
+            len(text),
+            rng.choice(starts or [0]) + rng.choice(edges or [0]) if rng.random() < 0.8 else rng.randrange(len(text) + 1),
+        )
         end = min(len(text), at + rng.choice((0, 1, 2, 3, 8)))
         kind = rng.randrange(3)
         if kind == 0:

@@ -54,8 +54,20 @@ def make(place):
     from transformers import GemmaTokenizerFast, LlamaTokenizerFast, PreTrainedTokenizerFast, Qwen2TokenizerFast
 
     llama = tiny_sentencepiece(place, "llama", 340, unk_id=0, bos_id=1, eos_id=2, pad_id=-1)
-    gemma = tiny_sentencepiece(place, "gemma", 400, pad_id=0, eos_id=1, bos_id=2, unk_id=3, pad_piece="<pad>",
-                               eos_piece="<eos>", bos_piece="<bos>", unk_piece="<unk>", add_dummy_prefix=False)
+    gemma = tiny_sentencepiece(
+        place,
+        "gemma",
+        400,
+        pad_id=0,
+        eos_id=1,
+        bos_id=2,
+        unk_id=3,
+        pad_piece="<pad>",
+        eos_piece="<eos>",
+        bos_piece="<bos>",
+        unk_piece="<unk>",
+        add_dummy_prefix=False,
+    )
     with_image = LlamaTokenizerFast(vocab_file=llama, pad_token="<unk>")
     with_image.add_tokens(["<image>"], special_tokens=True)
     of_gemma = GemmaTokenizerFast(vocab_file=gemma)
@@ -165,7 +177,9 @@ def main():
             kinds = ["raises" if "raises" in t else "absent" if t["id"] is None else "id" for t in told.values()]
             counts[version] = {kind: kinds.count(kind) for kind in ("id", "absent", "raises")}
     for version, count in counts.items():
-        print(f"transformers {version}: {count['id']} ids, {count['absent']} tokenizers without the token, {count['raises']} raise")
+        print(
+            f"transformers {version}: {count['id']} ids, {count['absent']} tokenizers without the token, {count['raises']} raise"
+        )
         tally.expect(count["id"] >= 20, f"{version}: only {count['id']} processors gave an id")
     return tally.finish()
 

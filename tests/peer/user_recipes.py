@@ -7,7 +7,6 @@ is compared with the donor tensor that the manifest names.
 
 import json
 import shutil
-import sys
 
 from peer import ROOT, Tally, doctor, quiet, read_tensors, workplace
 
@@ -27,7 +26,12 @@ RUNS = [
     ("extract-language.json5", {"from": "llava"}, (), "AutoModelForCausalLM"),
     ("extract-vision.json5", {"from": "llava"}, (), "CLIPVisionModel"),
     ("llava-llama/recipe.json5", {"vision": "llava", "language": "llama"}, (), "AutoModelForImageTextToText"),
-    ("llava-llama/recipe.json5", {"vision": "llava", "language": "llama-wide"}, ("projector=reinit",), "AutoModelForImageTextToText"),
+    (
+        "llava-llama/recipe.json5",
+        {"vision": "llava", "language": "llama-wide"},
+        ("projector=reinit",),
+        "AutoModelForImageTextToText",
+    ),
     ("llava-tower.json5", {"from": "llava", "tower": "siglip"}, (), "AutoModelForImageTextToText"),
     ("idefics3-llama.json5", {"vision": "idefics3", "language": "llama"}, ("connector=reinit",), "AutoModelForImageTextToText"),
     ("t5-halves.json5", {"encoder": "t5", "decoder": "t5-deep"}, (), "AutoModelForSeq2SeqLM"),

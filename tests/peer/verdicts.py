@@ -41,9 +41,30 @@ def save_bases(out):
     words = ["<unk>", "<s>", "</s>", "<pad>", "<image>"] + [f"w{n}" for n in range(59)]
     core = Tokenizer(models.BPE({word: n for n, word in enumerate(words)}, [], unk_token="<unk>", ignore_merges=True))
     core.pre_tokenizer = pre_tokenizers.Whitespace()
-    tokenizer = PreTrainedTokenizerFast(tokenizer_object=core, unk_token="<unk>", bos_token="<s>", eos_token="</s>", pad_token="<pad>")
-    text = dict(vocab_size=64, hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, num_key_value_heads=2, max_position_embeddings=64, pad_token_id=3, bos_token_id=1, eos_token_id=2)
-    vision = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=4, image_size=16, patch_size=8, projection_dim=16)
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_object=core, unk_token="<unk>", bos_token="<s>", eos_token="</s>", pad_token="<pad>"
+    )
+    text = dict(
+        vocab_size=64,
+        hidden_size=32,
+        intermediate_size=48,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        num_key_value_heads=2,
+        max_position_embeddings=64,
+        pad_token_id=3,
+        bos_token_id=1,
+        eos_token_id=2,
+    )
+    vision = dict(
+        hidden_size=32,
+        intermediate_size=48,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        image_size=16,
+        patch_size=8,
+        projection_dim=16,
+    )
 
     llama = transformers.LlamaForCausalLM(transformers.LlamaConfig(**text, tie_word_embeddings=False))
     llama.save_pretrained(out / "llama")
@@ -59,12 +80,26 @@ def save_bases(out):
     )
     transformers.LlavaForConditionalGeneration(config).save_pretrained(out / "llava")
     images = transformers.CLIPImageProcessor(size={"shortest_edge": 16}, crop_size={"height": 16, "width": 16})
-    processor = transformers.LlavaProcessor(images, tokenizer, patch_size=8, vision_feature_select_strategy="default", image_token="<image>", num_additional_image_tokens=1)
+    processor = transformers.LlavaProcessor(
+        images,
+        tokenizer,
+        patch_size=8,
+        vision_feature_select_strategy="default",
+        image_token="<image>",
+        num_additional_image_tokens=1,
+    )
     processor.save_pretrained(out / "llava")
 
     t5 = transformers.T5Config(vocab_size=64, d_model=32, d_kv=8, d_ff=48, num_layers=2, num_heads=4, decoder_start_token_id=0)
     transformers.T5ForConditionalGeneration(t5).save_pretrained(out / "t5")
-    bert = transformers.BertConfig(vocab_size=64, hidden_size=32, num_hidden_layers=2, num_attention_heads=4, intermediate_size=48, max_position_embeddings=64)
+    bert = transformers.BertConfig(
+        vocab_size=64,
+        hidden_size=32,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        intermediate_size=48,
+        max_position_embeddings=64,
+    )
     transformers.BertForSequenceClassification(bert).save_pretrained(out / "bert")
 
 
@@ -258,11 +293,17 @@ ROWS = {
     "config-is-a-pointer": ("llama", lambda d: d.write("config.json", POINTER)),
     "config-is-a-list": ("llama", lambda d: d.write("config.json", "[]")),
     "config-is-null": ("llama", lambda d: d.write("config.json", "null")),
-    "config-with-byte-order-mark": ("llama", lambda d: d.write("config.json", b"\xef\xbb\xbf" + (d.path / "config.json").read_bytes())),
+    "config-with-byte-order-mark": (
+        "llama",
+        lambda d: d.write("config.json", b"\xef\xbb\xbf" + (d.path / "config.json").read_bytes()),
+    ),
     "config-with-trailing-comma": ("llama", lambda d: d.text("config.json", "\n}", ",\n}")),
     "config-with-comment": ("llama", lambda d: d.text("config.json", "{", "{ // a comment\n")),
     "config-with-conflict": ("llama", lambda d: d.text("config.json", "{\n", "{\n<<<<<<< HEAD\n")),
-    "config-not-utf8": ("llama", lambda d: d.write("config.json", (d.path / "config.json").read_bytes().replace(b"llama", b"ll\xe4ma"))),
+    "config-not-utf8": (
+        "llama",
+        lambda d: d.write("config.json", (d.path / "config.json").read_bytes().replace(b"llama", b"ll\xe4ma")),
+    ),
     "model-type-missing": ("llama", lambda d: d.config(model_type=None)),
     "model-type-unknown": ("llama", lambda d: d.config(model_type="bora_moe")),
     "model-type-misspelt": ("llama", lambda d: d.config(model_type="Llama")),
@@ -283,11 +324,17 @@ ROWS = {
     "size-is-null": ("llama", lambda d: d.text("config.json", '"hidden_size": 32', '"hidden_size": null')),
     "heads-do-not-divide": ("llama", lambda d: d.config(num_attention_heads=5, head_dim=None)),
     "heads-are-zero": ("llama", lambda d: d.config(num_attention_heads=0, head_dim=None)),
-    "rope-type-unknown": ("llama", lambda d: d.config(rope_scaling={"rope_type": "spiral", "factor": 2.0}, rope_parameters=None)),
+    "rope-type-unknown": (
+        "llama",
+        lambda d: d.config(rope_scaling={"rope_type": "spiral", "factor": 2.0}, rope_parameters=None),
+    ),
     "rope-without-factor": ("llama", lambda d: d.config(rope_scaling={"rope_type": "linear"}, rope_parameters=None)),
     "rope-dynamic-without-factor": ("llama", lambda d: d.config(rope_scaling={"rope_type": "dynamic"}, rope_parameters=None)),
     "rope-yarn-without-factor": ("llama", lambda d: d.config(rope_scaling={"rope_type": "yarn"}, rope_parameters=None)),
-    "rope-type-unknown-in-old-key": ("llama", lambda d: d.config(rope_scaling={"type": "spiral", "factor": 2.0}, rope_parameters=None)),
+    "rope-type-unknown-in-old-key": (
+        "llama",
+        lambda d: d.config(rope_scaling={"type": "spiral", "factor": 2.0}, rope_parameters=None),
+    ),
     "dtype-with-module": ("llama", lambda d: d.config(torch_dtype="torch.float32", dtype=None)),
     "generation-is-null": ("llama", lambda d: d.write("generation_config.json", "null")),
     "flag-is-a-number": ("llama", lambda d: d.config(use_cache=1)),
@@ -313,7 +360,10 @@ ROWS = {
     "special-tokens-are-no-json": ("llama", lambda d: d.write("special_tokens_map.json", "{")),
     "tokenizer-config-is-a-list": ("llama", lambda d: d.write("tokenizer_config.json", "[]")),
     "tokenizer-json-is-a-list": ("llama", lambda d: d.write("tokenizer.json", "[]")),
-    "special-tokens-are-read": ("llama", lambda d: (d.edit("tokenizer_config.json", added_tokens_decoder=None), d.write("special_tokens_map.json", "{"))),
+    "special-tokens-are-read": (
+        "llama",
+        lambda d: (d.edit("tokenizer_config.json", added_tokens_decoder=None), d.write("special_tokens_map.json", "{")),
+    ),
     "generation-is-a-list": ("llama", lambda d: d.write("generation_config.json", "[]")),
     "generation-is-no-json": ("llama", lambda d: d.write("generation_config.json", "{")),
     "processor-is-no-json": ("llava", lambda d: d.write("preprocessor_config.json", "{")),
@@ -389,7 +439,14 @@ def is_equal(tensor, dtype, data):
     """Whether a loaded tensor has the stored values, in the dtype that it was loaded with."""
     import torch
 
-    kinds = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64, "U8": torch.uint8, "BOOL": torch.bool}
+    kinds = {
+        "F32": torch.float32,
+        "F16": torch.float16,
+        "BF16": torch.bfloat16,
+        "I64": torch.int64,
+        "U8": torch.uint8,
+        "BOOL": torch.bool,
+    }
     stored = torch.frombuffer(bytearray(data), dtype=kinds[dtype]).to(tensor.dtype) if data else torch.empty(0)
     return not tensor.is_meta and torch.equal(tensor.flatten(), stored)
 

@@ -7,6 +7,7 @@ that the architecture files know are left out.
 The first class of a config class is tried with every key. The others are tried with one replacement of each key, and with all of
 them where that one shows a difference.
 """
+
 import collections
 import contextlib
 import copy
@@ -36,7 +37,15 @@ NEWER = {"torch_dtype": "dtype", **({"rope_theta": ROPE, "partial_rotary_factor"
 PARAMETERS = 12_000_000
 SECONDS = 12
 WIDTHS = ("hidden_size", "d_model", "n_embd", "embed_dim", "dim", "encoder_embed_dim")
-NEVER = {"architectures", "model_type", "transformers_version", "_name_or_path", "quantization_config", "auto_map", "_attn_implementation_autoset"}
+NEVER = {
+    "architectures",
+    "model_type",
+    "transformers_version",
+    "_name_or_path",
+    "quantization_config",
+    "auto_map",
+    "_attn_implementation_autoset",
+}
 # The values that stand for each kind: a kind is refused when all of them are.
 KINDS = {
     "null": [None],
@@ -69,7 +78,7 @@ class Small:
 
     def __init__(self, cls, config, folder):
         self.cls, self.folder = cls, Path(folder)
-        with contextlib.suppress(Exception):                      # some classes cannot be built on `meta`
+        with contextlib.suppress(Exception):  # some classes cannot be built on `meta`
             with time_limit(SECONDS), torch.device("meta"):
                 count = sum(p.numel() for p in cls(cls.config_class.from_dict(copy.deepcopy(config))).parameters())
             if count > PARAMETERS:
@@ -112,7 +121,11 @@ class Small:
         value = at(self.config, pointer)
         if isinstance(value, {"list": list, "object": dict, "true": bool, "false": bool}.get(kind, ())) and pointer[-1] != ROPE:
             return None
-        if kind == "text" and (isinstance(value, str) or value is None and not names <= {"TypeError", "AttributeError", "StrictDataclassFieldValidationError"}):
+        if kind == "text" and (
+            isinstance(value, str)
+            or value is None
+            and not names <= {"TypeError", "AttributeError", "StrictDataclassFieldValidationError"}
+        ):
             return None
         return said[0].split(":", 1)[0]
 
@@ -165,7 +178,11 @@ def integers(small):
         return None
     stored, tensors = weights.read_bytes(), load_file(weights)
     # 4.47 copies the values where the first tensor of the class, an embedding, has another dtype than the model.
-    names = [name for name, tensor in tensors.items() if name.endswith("weight") and tensor.is_floating_point() and "embed" not in name]
+    names = [
+        name
+        for name, tensor in tensors.items()
+        if name.endswith("weight") and tensor.is_floating_point() and "embed" not in name
+    ]
     if not names:
         return None
     save_file({**tensors, names[-1]: tensors[names[-1]].to(torch.int64)}, weights, {"format": "pt"})
@@ -191,7 +208,12 @@ def special(small):
         if isinstance(vocabulary, int):
             put("padding", (*path, "pad_token_id"), vocabulary, "AssertionError: Padding_idx must be within num_embeddings")
         put("rope-type", (*path, ROPE), {"rope_type": "spiral", "factor": 2.0, "rope_theta": 10000.0}, "KeyError: 'spiral'")
-        put("rope-factor", (*path, ROPE), {"rope_type": "linear", "rope_theta": 10000.0}, "KeyError: \"Missing required keys in `")
+        put(
+            "rope-factor",
+            (*path, ROPE),
+            {"rope_type": "linear", "rope_theta": 10000.0},
+            'KeyError: "Missing required keys in `',
+        )
     return found
 
 
@@ -224,11 +246,16 @@ def values(small, every, known=None):
         first = {kind: raised for kind in FIRST if (raised := small.refuses(pointer, kind))}
         if first:
             # A whole number may be too small for others of the config.
-            kinds = [kind for kind in KINDS if kind not in FIRST and not (kind == "above-one" and isinstance(at(small.config, pointer), int) and "drop" not in pointer[-1])]
+            kinds = [
+                kind
+                for kind in KINDS
+                if kind not in FIRST
+                and not (kind == "above-one" and isinstance(at(small.config, pointer), int) and "drop" not in pointer[-1])
+            ]
             rest = {kind: raised for kind in kinds if (raised := small.refuses(pointer, kind))}
             every = {**first, **rest}
             if at(small.config, pointer) is None and {"zero", "negative", "fraction"} <= every.keys():
-                every.pop("text", None)                           # one of a few words may pass
+                every.pop("text", None)  # one of a few words may pass
             found.update({(pointer, kind): raised for kind, raised in every.items()})
         elif isinstance(at(small.config, pointer), float) and (raised := small.refuses(pointer, "above-one")):
             found[pointer, "above-one"] = raised
@@ -257,12 +284,16 @@ def family(args):
         path = draws / f"{name}.json.gz"
         if not path.exists():
             continue
-        rows = [row["config"] for row in json.loads(gzip.decompress(path.read_bytes())) if "error" not in row and row.get("kind") == "full"]
+        rows = [
+            row["config"]
+            for row in json.loads(gzip.decompress(path.read_bytes()))
+            if "error" not in row and row.get("kind") == "full"
+        ]
         models = []
         with contextlib.ExitStack() as stack:
             for row in rows:
                 folder = stack.enter_context(tempfile.TemporaryDirectory())
-                with contextlib.suppress(Exception, TooSlow):     # it may only be too large
+                with contextlib.suppress(Exception, TooSlow):  # it may only be too large
                     models.append(Small(catalogue.find_class(name), row, folder))
                 if len(models) == 4 or known is not None and models:
                     break
@@ -272,7 +303,11 @@ def family(args):
             found = values(models[0], every, known)
             if known is None:
                 for other in models[1:]:
-                    found = {(pointer, kind): raised for (pointer, kind), raised in found.items() if at(other.config, pointer[:-1]) is None or other.refuses(pointer, kind) == raised}
+                    found = {
+                        (pointer, kind): raised
+                        for (pointer, kind), raised in found.items()
+                        if at(other.config, pointer[:-1]) is None or other.refuses(pointer, kind) == raised
+                    }
             entry = collections.defaultdict(list)
             for kind, pointer in sorted(special(models[0])):
                 entry[kind].append(pointer)
@@ -280,7 +315,11 @@ def family(args):
                 entry["heads"].append([pointer, width, raised])
             if raised := integers(models[0]):
                 entry["integers"] = raised
-            kept = {(pointer, kind): raised for (pointer, kind), raised in found.items() if not (raised == "StrictDataclassFieldValidationError" and pointer[-1] in keys)}
+            kept = {
+                (pointer, kind): raised
+                for (pointer, kind), raised in found.items()
+                if not (raised == "StrictDataclassFieldValidationError" and pointer[-1] in keys)
+            }
             entry["values"] = table(kept)
             if known is None:
                 known, first = found, name
@@ -313,11 +352,14 @@ def table(found):
     rows = collections.defaultdict(list)
     for (pointer, raised), kinds in by_key.items():
         rows[raised, tuple(k for k in KINDS if k in kinds)].append(pointer)
-    return [{"raises": raised, "kinds": list(kinds), "keys": sorted(pointers)} for (raised, kinds), pointers in sorted(rows.items())]
+    return [
+        {"raises": raised, "kinds": list(kinds), "keys": sorted(pointers)} for (raised, kinds), pointers in sorted(rows.items())
+    ]
 
 
 def general(classes, sampled):
     """Takes the values out of all entries that nearly every class refuses; returns them."""
+
     def flat(entry):
         return {(row["raises"], kind, pointer) for row in entry["values"] for kind in row["kinds"] for pointer in row["keys"]}
 
@@ -371,7 +413,9 @@ def main(args):
     kept = json.loads(file.read_text()) if args.only and file.exists() else {}
     shared = general(classes, sampled)
     # A few families do not tell what every class refuses.
-    entries = {"*": {"values": shared}} | kept | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
+    entries = (
+        {"*": {"values": shared}} | kept | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
+    )
     entries |= {name: composed(entries, parts) for name, parts in CUSTOM.get(version, {}).items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in sorted(entries.items()))
     file.write_text(f"{{\n{lines}\n}}\n")

@@ -1,4 +1,5 @@
 """Building models without their weights, and reading off what they consist of."""
+
 import contextlib
 import signal
 
@@ -8,7 +9,7 @@ from transformers import PreTrainedModel, modeling_utils
 
 from .configs import flatten, subconfigs
 
-ALARM = 12                                                    # seconds one instantiation may take
+ALARM = 12  # seconds one instantiation may take
 
 
 class TooSlow(Exception):
@@ -19,6 +20,7 @@ class TooSlow(Exception):
 def time_limit(seconds):
     def ring(*_):
         raise TooSlow(f"took more than {seconds} s")
+
     signal.signal(signal.SIGALRM, ring)
     signal.alarm(seconds)
     try:
@@ -44,12 +46,13 @@ def without_initialisation():
     PreTrainedModel._initialize_weights = lambda *a, **k: None
     if transformers.__version__.startswith("4"):
         PreTrainedModel.init_weights = lambda self: self.tie_weights()
-    PreTrainedModel.can_generate = classmethod(lambda cls: False)      # no generation config is made
+    PreTrainedModel.can_generate = classmethod(lambda cls: False)  # no generation config is made
     torch.set_num_threads(1)
 
 
 class Built:
     """What one instantiation consists of."""
+
     __slots__ = ("flat", "tensors", "tied", "buffers", "persistent", "models", "modules", "facts", "instance", "config")
 
 
@@ -94,10 +97,12 @@ def nested_models(b, config):
     """[[prefix, class, model_type, where its config is]] of the models inside: "" the root's, "vision_config" a
     sub-config, None a config of its own (a changed copy, say)."""
     where = {id(config): ""}
+
     def walk(c, path):
         for k, v in subconfigs(c).items():
             where.setdefault(id(v), path + k)
             walk(v, path + k + ".")
+
     walk(config, "")
     by_value = {}
     for ident, path in where.items():
@@ -121,8 +126,17 @@ def nested_models(b, config):
 
 def essence(config):
     """A config's values that may matter, to recognise a copy of it."""
-    return repr(sorted((k, v) for k, v in flatten(config).items() if isinstance(v, (bool, int, list, str)) and "dtype" not in k and not k.startswith("_")
-                       and "attn_implementation" not in k and k not in ("transformers_version", "use_cache")))
+    return repr(
+        sorted(
+            (k, v)
+            for k, v in flatten(config).items()
+            if isinstance(v, (bool, int, list, str))
+            and "dtype" not in k
+            and not k.startswith("_")
+            and "attn_implementation" not in k
+            and k not in ("transformers_version", "use_cache")
+        )
+    )
 
 
 def alone(m, device):
@@ -133,7 +147,7 @@ def alone(m, device):
             other = type(m)(m.config)
     except TooSlow:
         raise
-    except Exception:                                         # it wants more than a config
+    except Exception:  # it wants more than a config
         return None
     b = read(other, m.config)
     return b.tensors, [frozenset(g) for g in b.tied]

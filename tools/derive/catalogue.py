@@ -1,4 +1,5 @@
 """Which classes there are: those of transformers' auto mappings, and those it exports besides, by their config class."""
+
 import collections
 import re
 
@@ -28,7 +29,9 @@ def mappings():
     out = {}
     for name, table in sorted(vars(modeling_auto).items()):
         if name.startswith("MODEL_") and name.endswith("MAPPING_NAMES") and isinstance(table, dict):
-            short = name.removesuffix("_MAPPING_NAMES").removeprefix("MODEL").removeprefix("_FOR_").strip("_").lower() or "model"
+            short = (
+                name.removesuffix("_MAPPING_NAMES").removeprefix("MODEL").removeprefix("_FOR_").strip("_").lower() or "model"
+            )
             out[short] = {mt: [n for n in (c if isinstance(c, (list, tuple)) else [c]) if n] for mt, c in table.items()}
     return out
 
@@ -37,7 +40,7 @@ def config_class(model_type):
     """The config class of a model type, or None where it cannot be imported."""
     try:
         return CONFIG_MAPPING[model_type]
-    except Exception:                                           # lazily imported: whatever the module raises
+    except Exception:  # lazily imported: whatever the module raises
         return None
 
 
@@ -46,7 +49,9 @@ def families():
 
     Classes of the mappings are only named here: each is imported when its turn comes."""
     by_type = collections.defaultdict(dict)
-    for short, table in sorted(mappings().items(), key=lambda kv: (kv[0] not in ("model", "backbone"), kv[0] == "backbone", kv[0])):
+    for short, table in sorted(
+        mappings().items(), key=lambda kv: (kv[0] not in ("model", "backbone"), kv[0] == "backbone", kv[0])
+    ):
         for mt, names in table.items():
             for n in names:
                 by_type[mt].setdefault(n, short)
@@ -74,7 +79,7 @@ def exported(mapped):
         try:
             cls = getattr(transformers, name)
             mt = cls.config_class.model_type
-        except Exception:                                     # it wants a library that is not there, or is no model
+        except Exception:  # it wants a library that is not there, or is no model
             continue
         if mt in CONFIG_MAPPING_NAMES and issubclass(cls, transformers.PreTrainedModel):
             yield mt, name

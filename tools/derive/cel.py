@@ -1,7 +1,10 @@
 """CEL expressions as text: which config keys they read, and how two of them become one."""
+
 import re
 
-TOKEN = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|\d+\.\d+(?:[eE][-+]?\d+)?|[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*|\d+|&&|\|\||[=!<>]=|\S""")
+TOKEN = re.compile(
+    r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|\d+\.\d+(?:[eE][-+]?\d+)?|[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*|\d+|&&|\|\||[=!<>]=|\S"""
+)
 WORD = re.compile(r"[A-Za-z_]")
 
 
@@ -15,7 +18,7 @@ def paths(text):
     for token, after in zip(all_tokens, all_tokens[1:] + [""]):
         if token.startswith("c."):
             path = token[2:]
-            if after == "(":                                  # a method of the value: c.depths.map(n, …)
+            if after == "(":  # a method of the value: c.depths.map(n, …)
                 path = path.rpartition(".")[0]
             if path:
                 found.append(path)
@@ -56,7 +59,7 @@ def split(text, operator):
         elif match[0] in ")]}":
             depth -= 1
         elif depth == 0 and match[0] == operator:
-            out.append(text[start:match.start()].strip())
+            out.append(text[start : match.start()].strip())
             start = match.end()
     return [*out, text[start:].strip()]
 

@@ -1,4 +1,5 @@
 """The smallest condition that is true in exactly the given rows; and expressions that fall into cases."""
+
 import itertools
 
 import numpy as np
@@ -8,11 +9,13 @@ from . import vectors
 
 class Work:
     """How many searches one class may still cost; counted, not timed, so that results do not depend on the machine."""
+
     left = 0
 
 
 class Literal:
     """A simple condition: its text, the text of its opposite, its truth in every row."""
+
     __slots__ = ("cost", "text", "opposite", "truth")
 
     def __init__(self, cost, text, opposite, truth):
@@ -33,8 +36,8 @@ def literals(columns):
         va, vb = np.array(a.values), np.array(b.values)
         base = a.cost + b.cost
         out.append(Literal(base, f"{a.text} == {b.text}", f"{a.text} != {b.text}", va == vb))
-        out.append(Literal(base + .3, f"{a.text} < {b.text}", f"{a.text} >= {b.text}", va < vb))
-        out.append(Literal(base + .3, f"{a.text} > {b.text}", f"{a.text} <= {b.text}", va > vb))
+        out.append(Literal(base + 0.3, f"{a.text} < {b.text}", f"{a.text} >= {b.text}", va < vb))
+        out.append(Literal(base + 0.3, f"{a.text} > {b.text}", f"{a.text} <= {b.text}", va > vb))
     seen, keep = set(), []
     for x in sorted(out, key=lambda x: x.cost):
         key = x.truth.tobytes()
@@ -49,7 +52,7 @@ def guarded_by(c, literals):
     config, there = c.there
     there = np.array(there, dtype=bool)
     for x in literals:
-        yield Literal(x.cost + .2, f"{config} != null && {x.text}", f"({config} == null || {x.opposite})", x.truth & there)
+        yield Literal(x.cost + 0.2, f"{config} != null && {x.text}", f"({config} == null || {x.opposite})", x.truth & there)
 
 
 def of_column(c):
@@ -60,8 +63,9 @@ def of_column(c):
     def when(cost, text, opposite, truth):
         truth = np.array(truth)
         if guard:
-            return Literal(c.cost + cost + .2, f"{guard}{text}", f"({c.text} == null || {opposite})", truth)
+            return Literal(c.cost + cost + 0.2, f"{guard}{text}", f"({c.text} == null || {opposite})", truth)
         return Literal(c.cost + cost, text, opposite, truth)
+
     if nulls.any():
         yield Literal(c.cost, f"{c.text} == null", f"{c.text} != null", nulls)
     some = [v for v in values if v is not None]
@@ -69,23 +73,27 @@ def of_column(c):
         return
     if any(isinstance(v, bool) for v in some):
         yield Literal(c.cost, f"{c.text} == true", f"{c.text} != true", np.array([v is True for v in values]))
-        yield Literal(c.cost + .3, f"{c.text} == false", f"{c.text} != false", np.array([v is False for v in values]))
+        yield Literal(c.cost + 0.3, f"{c.text} == false", f"{c.text} != false", np.array([v is False for v in values]))
     elif all(isinstance(v, str) for v in some):
         for w in sorted(set(some))[:12]:
-            yield Literal(c.cost + .1, f"{c.text} == {quoted(w)}", f"{c.text} != {quoted(w)}", np.array([v == w for v in values]))
+            yield Literal(
+                c.cost + 0.1, f"{c.text} == {quoted(w)}", f"{c.text} != {quoted(w)}", np.array([v == w for v in values])
+            )
     elif all(isinstance(v, (int, float)) for v in some):
         for b in (0, 1):
-            yield when(.2, f"{c.text} > {b}", f"{c.text} <= {b}", [v is not None and v > b for v in values])
+            yield when(0.2, f"{c.text} > {b}", f"{c.text} <= {b}", [v is not None and v > b for v in values])
         if all(isinstance(v, int) for v in some):
             distinct = sorted(set(some))
             if len(distinct) <= 8:
                 for x in distinct:
-                    yield when(.5, f"{c.text} == {x}", f"{c.text} != {x}", [v == x for v in values])
+                    yield when(0.5, f"{c.text} == {x}", f"{c.text} != {x}", [v == x for v in values])
     elif all(isinstance(v, list) for v in some):
         for n in sorted({len(v) for v in some} - {0})[-6:]:
-            yield when(.6, f"size({c.text}) >= {n}", f"size({c.text}) < {n}", [v is not None and len(v) >= n for v in values])
+            yield when(0.6, f"size({c.text}) >= {n}", f"size({c.text}) < {n}", [v is not None and len(v) >= n for v in values])
         for w in sorted({x for v in some for x in v if isinstance(x, str)})[:12]:
-            yield when(.4, f"{quoted(w)} in {c.text}", f"!({quoted(w)} in {c.text})", [v is not None and w in v for v in values])
+            yield when(
+                0.4, f"{quoted(w)} in {c.text}", f"!({quoted(w)} in {c.text})", [v is not None and w in v for v in values]
+            )
 
 
 def condition(truth, columns, extra=()):
@@ -94,7 +102,7 @@ def condition(truth, columns, extra=()):
     if truth.all():
         return "true"
     lits = literals(columns) + [x for x in extra if x.truth.any() and not x.truth.all()]
-    both = [(x.cost, x.text, x.truth) for x in lits] + [(x.cost + .15, x.opposite, ~x.truth) for x in lits]
+    both = [(x.cost, x.text, x.truth) for x in lits] + [(x.cost + 0.15, x.opposite, ~x.truth) for x in lits]
     both.sort(key=lambda x: x[0])
     for _, text, v in both:
         if (v == truth).all():
@@ -103,12 +111,14 @@ def condition(truth, columns, extra=()):
         return None
     both, truth = distinct_rows(both, truth)
     if both is None:
-        return None                                           # two rows alike in everything, and one is in
+        return None  # two rows alike in everything, and one is in
     # A conjunction is made of what holds wherever the target holds, a disjunction of what holds nowhere else.
     wide = [x for x in both if (x[2] | ~truth).all()]
     narrow = [x for x in both if (~x[2] | truth).all()]
     for n in (2, 3):
-        found = combine(wide[:150 if n == 2 else 50], n, ~truth, False, " && ") or combine(narrow[:150 if n == 2 else 50], n, truth, True, " || ")
+        found = combine(wide[: 150 if n == 2 else 50], n, ~truth, False, " && ") or combine(
+            narrow[: 150 if n == 2 else 50], n, truth, True, " || "
+        )
         if found:
             return found
     return of_both(wide, both, truth) or tree(truth, both[:200], 3)
@@ -132,7 +142,7 @@ def combine(choices, n, rows, inverted, sign):
     m = np.stack([(~v if inverted else v)[rows] for *_, v in choices]).astype(np.int32)
     costs = [c for c, *_ in choices]
     best = None
-    for start in (itertools.combinations(range(len(choices)), n - 2) if n > 2 else [()]):
+    for start in itertools.combinations(range(len(choices)), n - 2) if n > 2 else [()]:
         left = m if not start else m[:, m[start[0]] > 0]
         hits = np.argwhere(np.triu(left @ left.T == 0, 1))
         for a, b in hits[:400]:
@@ -230,5 +240,4 @@ def number(t, columns, extra=(), depth=2, thorough=True):
 def part(t, rows, columns, extra):
     """Targets, columns and literals at some of the rows."""
     at = np.flatnonzero(rows)
-    return (t[at], [c.at(at) for c in columns],
-            [Literal(x.cost, x.text, x.opposite, x.truth[at]) for x in extra])
+    return (t[at], [c.at(at) for c in columns], [Literal(x.cost, x.text, x.opposite, x.truth[at]) for x in extra])

@@ -3,6 +3,7 @@
 Each class is given configs with every key said, then with one left out, null, or said under another name. The values
 are followed (`trace.py`): what the class computes tells from which keys.
 """
+
 import json
 import random
 import re
@@ -12,8 +13,10 @@ from .configs import alternatives, copied, flatten, is_int, random_raw
 from .keys import LAYERS, NOISE
 from .output import failed, write_json
 
-BASES, ROWS = 6, 1400                                         # configs with all keys said; rows a class may take
-HELD = re.compile(r"^(model_type|transformers_version|architectures|id2label|label2id|torch_dtype|dtype|_.*|task_specific_params|quantization_config|return_dict)$")
+BASES, ROWS = 6, 1400  # configs with all keys said; rows a class may take
+HELD = re.compile(
+    r"^(model_type|transformers_version|architectures|id2label|label2id|torch_dtype|dtype|_.*|task_specific_params|quantization_config|return_dict)$"
+)
 
 
 def record(model_type, config_class, raws):
@@ -21,14 +24,26 @@ def record(model_type, config_class, raws):
     rng = random.Random(f"config/{model_type}")
     static = config_class()
     words = configs.compared_words(*sources.texts(config_class))
-    out = {"model_type": model_type, "config_class": config_class.__name__, "static": flatten(static), "sub": {}, "samples": [],
-           "attribute_map": dict(getattr(config_class, "attribute_map", None) or {}), "inside": getattr(config_class, "base_config_key", "") or None,
-           "popped": sources.popped(config_class), "reads": sources.config_reads(config_class), "bases": [], "rows": [], "literals": {}, "types": sources.field_types(config_class)}
+    out = {
+        "model_type": model_type,
+        "config_class": config_class.__name__,
+        "static": flatten(static),
+        "sub": {},
+        "samples": [],
+        "attribute_map": dict(getattr(config_class, "attribute_map", None) or {}),
+        "inside": getattr(config_class, "base_config_key", "") or None,
+        "popped": sources.popped(config_class),
+        "reads": sources.config_reads(config_class),
+        "bases": [],
+        "rows": [],
+        "literals": {},
+        "types": sources.field_types(config_class),
+    }
     for k, v in sorted(configs.subconfigs(static).items()):
         own = None
         try:
             own = flatten(type(v)())
-        except Exception:                                     # a config class that cannot be built from nothing
+        except Exception:  # a config class that cannot be built from nothing
             pass
         out["sub"][k] = {"model_type": getattr(v, "model_type", ""), "config_class": type(v).__name__, "own": own}
     for n in range(3 * len(raws) + 30):
@@ -36,9 +51,15 @@ def record(model_type, config_class, raws):
             if n < len(raws):
                 raw = copied(raws[n])
             else:
-                raw = thinned_raw(copied(raws[n % len(raws)]), rng, .35 if n % 2 else .7) if raws else {}
+                raw = thinned_raw(copied(raws[n % len(raws)]), rng, 0.35 if n % 2 else 0.7) if raws else {}
             config = config_class(**copied(raw))
-            out["samples"].append({"raw": raw, "flat": flatten(config), "types": {k: getattr(v, "model_type", "") for k, v in configs.subconfigs(config).items()}})
+            out["samples"].append(
+                {
+                    "raw": raw,
+                    "flat": flatten(config),
+                    "types": {k: getattr(v, "model_type", "") for k, v in configs.subconfigs(config).items()},
+                }
+            )
         except Exception:
             continue
     rows(out, config_class, raws, words, rng)
@@ -47,7 +68,7 @@ def record(model_type, config_class, raws):
 
 def rows(out, config_class, raws, words, rng):
     """`bases`: configs with all keys said; `rows`: one key of a base changed, and what came out otherwise."""
-    for at, raw in enumerate([{}, *raws[:2 * BASES]]):
+    for at, raw in enumerate([{}, *raws[: 2 * BASES]]):
         if len(out["bases"]) >= BASES:
             break
         try:
@@ -64,7 +85,7 @@ def rows(out, config_class, raws, words, rng):
     for number, base in enumerate(out["bases"]):
         for kind, key, without, given in changes(out, base["raw"], words, rng):
             one(out, config_class, number, kind, key, without, given)
-    for number, base in list(enumerate(out["bases"]))[-2:]:   # keys of the configs inside: what is copied from one to another
+    for number, base in list(enumerate(out["bases"]))[-2:]:  # keys of the configs inside: what is copied from one to another
         for sub, inner in sorted(base["raw"].items()):
             if isinstance(inner, dict) and sub in out["sub"]:
                 for k, v in sorted(inner.items()):
@@ -74,7 +95,7 @@ def rows(out, config_class, raws, words, rng):
     derived = computed_keys(out)
     for key, beginning in re.findall(r'c\.(\w+)\.startsWith\("([\w-]+)"\)', " ".join(out["literals"])):
         words[key] = list(dict.fromkeys([*words.get(key, ()), *(beginning + w for w in ("gelu", "silu", "relu"))]))
-    for number, base in enumerate(out["bases"]):              # what is computed, from other values of what it is computed from
+    for number, base in enumerate(out["bases"]):  # what is computed, from other values of what it is computed from
         for key in [k for k in out["reads"] if k not in derived]:
             now = base["raw"].get(key)
             values = alternatives(key, now, words)[:4] if key in base["raw"] else guesses(key, base["raw"], words)[:3]
@@ -121,9 +142,9 @@ def varied(full, words, rng):
     """The same with flags and words of its own changed at random."""
     out = dict(full)
     for k, v in full.items():
-        if isinstance(v, bool) and rng.random() < .3 and not NOISE.search(k):
+        if isinstance(v, bool) and rng.random() < 0.3 and not NOISE.search(k):
             out[k] = not v
-        elif isinstance(v, str) and words.get(k) and rng.random() < .5:
+        elif isinstance(v, str) and words.get(k) and rng.random() < 0.5:
             out[k] = rng.choice(words[k])
     return out
 
@@ -165,7 +186,12 @@ def guesses(key, full, words):
 
 
 def marked(raw, prefix="c."):
-    return {k: marked(v, f"{prefix}{k}.") if isinstance(v, dict) else trace.follow(list(v) if isinstance(v, list) else v, prefix + k) for k, v in raw.items()}
+    return {
+        k: marked(v, f"{prefix}{k}.")
+        if isinstance(v, dict)
+        else trace.follow(list(v) if isinstance(v, list) else v, prefix + k)
+        for k, v in raw.items()
+    }
 
 
 def outcome(out, config_class, raw):
@@ -177,7 +203,7 @@ def outcome(out, config_class, raw):
             config = None
     for text in record.literals:
         out["literals"].setdefault(re.sub(r"@\d+_(\d+)", r"@\1", text), True)
-    if config is None:                                        # some want plain values
+    if config is None:  # some want plain values
         config = config_class(**copied(raw))
     made = {}
     walk(config, "", made)
@@ -186,7 +212,12 @@ def outcome(out, config_class, raw):
 
 def walk(config, prefix, made):
     for k, v in vars(config).items():
-        if not isinstance(k, str) or k.startswith("_") and k not in ("_out_features", "_out_indices") or k == "transformers_version":
+        if (
+            not isinstance(k, str)
+            or k.startswith("_")
+            and k not in ("_out_features", "_out_indices")
+            or k == "transformers_version"
+        ):
             continue
         if k in ("id2label", "label2id"):
             continue
@@ -219,14 +250,14 @@ def base_raws(model_type, config_class, works, wanted, seed):
         if len(out) >= wanted or refused > 40 and not out:
             break
         rng = random.Random(f"{seed}/{model_type}/{n}")
-        keep = 1.0 if refused < 6 else (1.0, .7, .4, 0)[n % 4]
+        keep = 1.0 if refused < 6 else (1.0, 0.7, 0.4, 0)[n % 4]
         try:
             raw = random_raw(model_type, config_class, rng, keep)
             try:
                 works(raw)
             except MemoryError:
                 raise
-            except Exception:                                 # lists of as many entries as there were layers, perhaps
+            except Exception:  # lists of as many entries as there were layers, perhaps
                 raw = configs.with_lists_of_layers(raw, config_class(), rng)
                 works(raw)
             out.append(raw)
@@ -252,12 +283,15 @@ def thinned_raw(raw, rng, share):
     for k, v in sorted(raw.items()):
         if isinstance(v, dict) and "model_type" in v:
             r = rng.random()
-            if r < .6:
+            if r < 0.6:
                 out[k] = thinned_raw(v, rng, share)
-            elif r < .75:
+            elif r < 0.75:
                 out[k] = {"model_type": v["model_type"]}
-            elif r < .85:
+            elif r < 0.85:
                 out[k] = {x: y for x, y in thinned_raw(v, rng, share).items() if x != "model_type"}
-        elif k in ("model_type", "use_timm_backbone", "backbone", "use_pretrained_backbone", "vocabulary_map") or rng.random() > share:
+        elif (
+            k in ("model_type", "use_timm_backbone", "backbone", "use_pretrained_backbone", "vocabulary_map")
+            or rng.random() > share
+        ):
             out[k] = v
     return out

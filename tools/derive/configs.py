@@ -3,31 +3,88 @@
 A *raw* config is what a config class is given: a dict with only the keys that are set on purpose, so that everything
 the class computes from them stays computed. A *flat* config is what the class made of it: {"text_config.hidden_size": 64}.
 """
+
 import re
 
 import transformers
 from transformers.models.auto.configuration_auto import CONFIG_MAPPING
 
-from .keys import (EXPERTS, FIXED_FLAG, FLAG, HEAD_WIDTH, HEADS, INNER, KV_HEADS, LAYERS, NOISE, OPTIONAL, PER_TOKEN, POSITIONS, RATIO, SIZES, SMALL, VOCAB,
-                   WIDTH)
+from .keys import (
+    EXPERTS,
+    FIXED_FLAG,
+    FLAG,
+    HEAD_WIDTH,
+    HEADS,
+    INNER,
+    KV_HEADS,
+    LAYERS,
+    NOISE,
+    OPTIONAL,
+    PER_TOKEN,
+    POSITIONS,
+    RATIO,
+    SIZES,
+    SMALL,
+    VOCAB,
+    WIDTH,
+)
 
 CONFIG_BASE = getattr(transformers, "PretrainedConfig", None) or transformers.PreTrainedConfig
 
 # Which language and vision models a composition is tried with besides its own default.
-TEXTS = {"llava": ["llama", "mistral", "qwen2", "gemma", "phi3"], "llava_next": ["llama", "mistral", "qwen2"], "paligemma": ["gemma", "gemma2"],
-         "vipllava": ["llama", "mistral"], "llava_onevision": ["qwen2", "llama"], "idefics2": ["mistral", "llama"], "idefics3": ["llama", "mistral"],
-         "smolvlm": ["llama", "mistral"], "internvl": ["qwen2", "llama"], "mistral3": ["mistral", "llama"], "blip-2": ["opt", "t5"],
-         "instructblip": ["opt", "t5"], "video_llava": ["llama", "mistral"], "llava_next_video": ["llama", "mistral"], "instructblipvideo": ["opt", "t5"]}
-VISIONS = {"llava": ["clip_vision_model", "siglip_vision_model", "pixtral"], "llava_next": ["clip_vision_model", "siglip_vision_model"], "vipllava": ["clip_vision_model", "siglip_vision_model"],
-           "llava_onevision": ["siglip_vision_model", "clip_vision_model"], "mistral3": ["pixtral"], "paligemma": ["siglip_vision_model"]}
-PAIRS = {"encoder-decoder": (("encoder", ["bert", "roberta", "bert-generation"]), ("decoder", ["bert", "gpt2", "roberta", "bert-generation"])),
-         "speech-encoder-decoder": (("encoder", ["wav2vec2", "hubert"]), ("decoder", ["bert", "mbart", "gpt2"])),
-         "vision-encoder-decoder": (("encoder", ["vit", "deit", "donut-swin", "swin", "beit"]), ("decoder", ["gpt2", "bert", "trocr", "mbart", "roberta"])),
-         "vision-text-dual-encoder": (("vision_config", ["vit", "clip_vision_model", "deit"]), ("text_config", ["bert", "roberta"]))}
+TEXTS = {
+    "llava": ["llama", "mistral", "qwen2", "gemma", "phi3"],
+    "llava_next": ["llama", "mistral", "qwen2"],
+    "paligemma": ["gemma", "gemma2"],
+    "vipllava": ["llama", "mistral"],
+    "llava_onevision": ["qwen2", "llama"],
+    "idefics2": ["mistral", "llama"],
+    "idefics3": ["llama", "mistral"],
+    "smolvlm": ["llama", "mistral"],
+    "internvl": ["qwen2", "llama"],
+    "mistral3": ["mistral", "llama"],
+    "blip-2": ["opt", "t5"],
+    "instructblip": ["opt", "t5"],
+    "video_llava": ["llama", "mistral"],
+    "llava_next_video": ["llama", "mistral"],
+    "instructblipvideo": ["opt", "t5"],
+}
+VISIONS = {
+    "llava": ["clip_vision_model", "siglip_vision_model", "pixtral"],
+    "llava_next": ["clip_vision_model", "siglip_vision_model"],
+    "vipllava": ["clip_vision_model", "siglip_vision_model"],
+    "llava_onevision": ["siglip_vision_model", "clip_vision_model"],
+    "mistral3": ["pixtral"],
+    "paligemma": ["siglip_vision_model"],
+}
+PAIRS = {
+    "encoder-decoder": (
+        ("encoder", ["bert", "roberta", "bert-generation"]),
+        ("decoder", ["bert", "gpt2", "roberta", "bert-generation"]),
+    ),
+    "speech-encoder-decoder": (("encoder", ["wav2vec2", "hubert"]), ("decoder", ["bert", "mbart", "gpt2"])),
+    "vision-encoder-decoder": (
+        ("encoder", ["vit", "deit", "donut-swin", "swin", "beit"]),
+        ("decoder", ["gpt2", "bert", "trocr", "mbart", "roberta"]),
+    ),
+    "vision-text-dual-encoder": (("vision_config", ["vit", "clip_vision_model", "deit"]), ("text_config", ["bert", "roberta"])),
+}
 # What finds objects and depths is tried with, as its backbone.
-BACKBONES = {"dpt": ["dinov2", "beit", None], "depth_anything": ["dinov2"], "zoedepth": ["beit"], "upernet": ["swin", "convnext", "resnet"], "vitpose": ["vitpose_backbone"],
-             "mask2former": ["swin", "resnet"], "maskformer": ["swin", "resnet"], "oneformer": ["swin", "dinat"], "grounding-dino": ["swin"], "mm-grounding-dino": ["swin"],
-             "omdet-turbo": ["swin"], "vitmatte": ["vitdet"], "prompt_depth_anything": ["dinov2"]}
+BACKBONES = {
+    "dpt": ["dinov2", "beit", None],
+    "depth_anything": ["dinov2"],
+    "zoedepth": ["beit"],
+    "upernet": ["swin", "convnext", "resnet"],
+    "vitpose": ["vitpose_backbone"],
+    "mask2former": ["swin", "resnet"],
+    "maskformer": ["swin", "resnet"],
+    "oneformer": ["swin", "dinat"],
+    "grounding-dino": ["swin"],
+    "mm-grounding-dino": ["swin"],
+    "omdet-turbo": ["swin"],
+    "vitmatte": ["vitdet"],
+    "prompt_depth_anything": ["dinov2"],
+}
 
 
 def subconfigs(config):
@@ -47,15 +104,20 @@ def flatten(config, prefix="", out=None):
             continue
         elif isinstance(v, dict):
             if (len(v) < 80 or "model_type" in v) and not k.startswith("task_specific"):
-                out[prefix + k] = {}                            # that it is there
+                out[prefix + k] = {}  # that it is there
                 flatten(v, f"{prefix}{k}.", out)
         elif v is None or isinstance(v, (bool, int, float, str)):
             out[prefix + k] = v
         elif isinstance(v, (list, tuple)) and len(v) < 300:
             out[prefix + k] = plain(v)
-    if not isinstance(config, dict):                            # a key can be read under its other names too
+    if not isinstance(config, dict):  # a key can be read under its other names too
         mirror(config, prefix, out)
-    if not isinstance(config, dict) and not prefix and "num_labels" not in out and isinstance(getattr(config, "num_labels", None), int):
+    if (
+        not isinstance(config, dict)
+        and not prefix
+        and "num_labels" not in out
+        and isinstance(getattr(config, "num_labels", None), int)
+    ):
         out["num_labels"] = config.num_labels
     return out
 
@@ -110,6 +172,7 @@ def is_int(v):
 
 # ---- bases ---------------------------------------------------------------------------------------------------
 
+
 def skeleton(model_type, config_class, rng):
     """What must be given before a class can be built at all, with the parts chosen at random where there is a choice."""
     if model_type in PAIRS:
@@ -122,10 +185,10 @@ def skeleton(model_type, config_class, rng):
     raw = {}
     for key, table in (("text_config", TEXTS), ("vision_config", VISIONS)):
         known = [t for t in table.get(model_type, []) if t in CONFIG_MAPPING]
-        if known and rng.random() < .65:
+        if known and rng.random() < 0.65:
             raw[key] = {"model_type": rng.choice(known)}
     kinds = [k for k in BACKBONES.get(model_type, ()) if k in CONFIG_MAPPING or k is None]
-    if kinds and rng.random() < .6:
+    if kinds and rng.random() < 0.6:
         kind = rng.choice(kinds)
         raw.update(backbone(kind) if kind else {"is_hybrid": False, "backbone_config": None})
     d = config_class(**copied(raw)).to_dict()
@@ -133,8 +196,15 @@ def skeleton(model_type, config_class, rng):
         if "use_timm_backbone" in d:
             raw.update(use_timm_backbone=False, use_pretrained_backbone=False, backbone=None)
         return raw
-    if d.get("use_timm_backbone") or isinstance(d.get("backbone_config"), dict) and d["backbone_config"].get("model_type") == "timm_backbone":
-        raw["backbone_config"] = {"model_type": "resnet", "out_features": ["stage2", "stage3", "stage4"]}    # timm needs its own library
+    if (
+        d.get("use_timm_backbone")
+        or isinstance(d.get("backbone_config"), dict)
+        and d["backbone_config"].get("model_type") == "timm_backbone"
+    ):
+        raw["backbone_config"] = {
+            "model_type": "resnet",
+            "out_features": ["stage2", "stage3", "stage4"],
+        }  # timm needs its own library
         if "use_timm_backbone" in d:
             raw.update(use_timm_backbone=False, use_pretrained_backbone=False, backbone=None)
     return raw
@@ -142,10 +212,23 @@ def skeleton(model_type, config_class, rng):
 
 def backbone(kind):
     """A small backbone of this kind that gives out several maps."""
-    stages = {"dinov2": {"num_hidden_layers": 4, "out_features": ["stage1", "stage2", "stage3", "stage4"], "reshape_hidden_states": False},
-              "beit": {"num_hidden_layers": 4, "out_features": ["stage1", "stage2", "stage3", "stage4"], "reshape_hidden_states": False},
-              "vitdet": {"num_hidden_layers": 3, "out_features": ["stage3"]}, "vitpose_backbone": {"num_hidden_layers": 2, "out_indices": [2]}}
-    return {"backbone_config": {"model_type": kind, **stages.get(kind, {"out_features": ["stage1", "stage2", "stage3", "stage4"]})}}
+    stages = {
+        "dinov2": {
+            "num_hidden_layers": 4,
+            "out_features": ["stage1", "stage2", "stage3", "stage4"],
+            "reshape_hidden_states": False,
+        },
+        "beit": {
+            "num_hidden_layers": 4,
+            "out_features": ["stage1", "stage2", "stage3", "stage4"],
+            "reshape_hidden_states": False,
+        },
+        "vitdet": {"num_hidden_layers": 3, "out_features": ["stage3"]},
+        "vitpose_backbone": {"num_hidden_layers": 2, "out_indices": [2]},
+    }
+    return {
+        "backbone_config": {"model_type": kind, **stages.get(kind, {"out_features": ["stage1", "stage2", "stage3", "stage4"]})}
+    }
 
 
 def random_raw(model_type, config_class, rng, keep=1.0):
@@ -184,7 +267,7 @@ def vary(base, rng, keep, most_layers=4):
         v, must = d[k], False
         new = None
         if isinstance(v, bool):
-            if FLAG.search(k) and not FIXED_FLAG.search(k) and rng.random() < .28:
+            if FLAG.search(k) and not FIXED_FLAG.search(k) and rng.random() < 0.28:
                 new = not v
         elif k in ("num_labels",) or NOISE.search(k) and k != "pad_token_id":
             continue
@@ -192,14 +275,14 @@ def vary(base, rng, keep, most_layers=4):
             new = vary_list(k, v, rng)
             must = new is not None and "depth" in k
         elif LAYERS.match(k) and is_int(v) and v and "feat_extract" not in k:
-            new, must = (layers if rng.random() < .6 else rng.randint(1, most_layers)), v > 4
+            new, must = (layers if rng.random() < 0.6 else rng.randint(1, most_layers)), v > 4
         elif KV_HEADS.match(k):
-            new = kv if is_int(v) or rng.random() < .5 else None
+            new = kv if is_int(v) or rng.random() < 0.5 else None
         elif HEADS.match(k) and is_int(v):
             new = heads
         elif HEAD_WIDTH.match(k):
-            if is_int(v) or rng.random() < .4:
-                new = rng.choice([8, 16, 24, 32]) if rng.random() < .6 else head_width
+            if is_int(v) or rng.random() < 0.4:
+                new = rng.choice([8, 16, 24, 32]) if rng.random() < 0.6 else head_width
         elif not is_int(v):
             continue
         elif WIDTH.match(k):
@@ -235,7 +318,7 @@ def vary(base, rng, keep, most_layers=4):
             new = rng.choice([2, 4])
         elif k == "num_buckets" and v > 64:
             new = 64
-        if new is not None and new != v and (must or rng.random() < .93 * keep):
+        if new is not None and new != v and (must or rng.random() < 0.93 * keep):
             over[k] = new
     return over
 
@@ -246,7 +329,12 @@ def vary_list(k, v, rng):
         return None
     if "depths" in k or k in ("num_blocks", "layers"):
         return [rng.randint(1, 2) for _ in v]
-    if SIZES.search(k) and min(v) >= 8 and all(x % 8 == 0 for x in v) and not re.search("kernel|stride|patch|window|image|crop|pool", k):
+    if (
+        SIZES.search(k)
+        and min(v) >= 8
+        and all(x % 8 == 0 for x in v)
+        and not re.search("kernel|stride|patch|window|image|crop|pool", k)
+    ):
         f = 8 if all(x % 64 == 0 for x in v) else 4 if all(x % 32 == 0 for x in v) else 1
         return [x // f for x in v]
     return None
@@ -275,7 +363,7 @@ def settle(model_type, over, base, rng):
     elif model_type == "hubert" or model_type.startswith(("wav2vec2", "wavlm", "unispeech", "data2vec-audio", "sew")):
         over.pop("conv_dim", None)
     settle_stages(model_type, over, base, rng)
-    if model_type in ("deberta", "deberta-v2") and rng.random() < .6:     # words of a list, which do nothing without the flag
+    if model_type in ("deberta", "deberta-v2") and rng.random() < 0.6:  # words of a list, which do nothing without the flag
         over.update(relative_attention=True, pos_att_type=rng.choice([["c2p"], ["p2c"], ["p2c", "c2p"], "p2c|c2p"]))
     text = over.get("text_config")
     width = text.get("hidden_size") if isinstance(text, dict) else None
@@ -307,7 +395,11 @@ def with_lists_of_layers(raw, base, rng):
 
 def settle_mllama(text, rng):
     n = rng.randint(2, 5)
-    text.update(num_hidden_layers=n, cross_attention_layers=sorted(rng.sample(range(n), rng.randint(1, 2))), pad_token_id=rng.randint(0, 3))
+    text.update(
+        num_hidden_layers=n,
+        cross_attention_layers=sorted(rng.sample(range(n), rng.randint(1, 2))),
+        pad_token_id=rng.randint(0, 3),
+    )
     if transformers.__version__.startswith("4"):
         text["rope_scaling"] = {"rope_type": "default"}
 
@@ -317,7 +409,13 @@ def settle_stages(model_type, over, base, rng):
     out = getattr(base, "out_indices", None) or getattr(base, "_out_indices", None)
     names = getattr(base, "stage_names", None)
     n = over.get("num_hidden_layers")
-    if model_type in ("beit", "data2vec-vision") or not out or not names or not is_int(n) or len(names) != getattr(base, "num_hidden_layers", 0) + 1:
+    if (
+        model_type in ("beit", "data2vec-vision")
+        or not out
+        or not names
+        or not is_int(n)
+        or len(names) != getattr(base, "num_hidden_layers", 0) + 1
+    ):
         return
     n = over["num_hidden_layers"] = max(n, len(out))
     pick = sorted(rng.sample(range(1, n + 1), len(out)))
@@ -326,10 +424,17 @@ def settle_stages(model_type, over, base, rng):
 
 # ---- perturbations -------------------------------------------------------------------------------------------
 
+
 def candidates(flat, words):
     """Keys of a flat config that are worth changing."""
-    return [k for k in sorted(flat) if not NOISE.search(k.split(".")[-1]) and alternatives(k, flat[k], words)
-            and not FIXED_FLAG.search(k.split(".")[-1]) and ".rope_" not in "." + k]
+    return [
+        k
+        for k in sorted(flat)
+        if not NOISE.search(k.split(".")[-1])
+        and alternatives(k, flat[k], words)
+        and not FIXED_FLAG.search(k.split(".")[-1])
+        and ".rope_" not in "." + k
+    ]
 
 
 def alternatives(key, v, words):
@@ -341,9 +446,13 @@ def alternatives(key, v, words):
     if is_int(v):
         if leaf == "num_labels":
             return [v + 1, v + 3, 1]
-        return [v * 2, v + 1, v * 3, 0 if not (WIDTH.match(leaf) or HEADS.match(leaf)) else v + 2, v + 8, v // 2, 1] if v > 0 else [1, 2, 8, 3, 0]
+        return (
+            [v * 2, v + 1, v * 3, 0 if not (WIDTH.match(leaf) or HEADS.match(leaf)) else v + 2, v + 8, v // 2, 1]
+            if v > 0
+            else [1, 2, 8, 3, 0]
+        )
     if isinstance(v, float):
-        return [v * 2, v / 2, v + .5] if RATIO.search(leaf) else []
+        return [v * 2, v / 2, v + 0.5] if RATIO.search(leaf) else []
     if isinstance(v, str):
         return said[:6]
     if v is None:
@@ -363,7 +472,16 @@ def list_alternatives(leaf, v, said):
     if all(is_int(x) for x in v):
         bumped = [[x + (j == q) for j, x in enumerate(v)] for q in range(min(4, len(v)))]
         doubled = [[x * (2 if j == q else 1) for j, x in enumerate(v)] for q in range(min(4, len(v)))]
-        return [[x * 2 for x in v], *doubled, [x + 1 + j for j, x in enumerate(v)], [v[0]] * len(v), v[:-1], v + [v[-1]], *bumped, v[::-1]]
+        return [
+            [x * 2 for x in v],
+            *doubled,
+            [x + 1 + j for j, x in enumerate(v)],
+            [v[0]] * len(v),
+            v[:-1],
+            v + [v[-1]],
+            *bumped,
+            v[::-1],
+        ]
     if all(isinstance(x, str) for x in v):
         out = []
         values = sorted(set(v) | set(said))[:6]
@@ -375,7 +493,9 @@ def list_alternatives(leaf, v, said):
             out += [v[-1:], v[:1], v[::2]]
         return [x for x in out if x != v] + ([v[1:], v[:-1]] if len(v) > 1 else [])
     if all(isinstance(x, (list, tuple)) for x in v) and all(is_int(y) for x in v for y in x):
-        return [[[y * 2 for y in x] for x in v], [[y + 1 for y in x] for x in v], v[:-1]] + [[[y * (2 if j == q else 1) for y in x] for j, x in enumerate(v)] for q in range(min(3, len(v)))]
+        return [[[y * 2 for y in x] for x in v], [[y + 1 for y in x] for x in v], v[:-1]] + [
+            [[y * (2 if j == q else 1) for y in x] for j, x in enumerate(v)] for q in range(min(3, len(v)))
+        ]
     if all(isinstance(x, bool) for x in v):
         return [[not x for x in v], [not v[0], *v[1:]], [*v[:-1], not v[-1]], [j % 2 == 0 for j in range(len(v))]]
     return [v[:-1]] if len(v) > 1 else []
@@ -431,9 +551,10 @@ def valued(text, flat):
     if text.startswith('"'):
         return text.strip('"')
     from . import evaluate
+
     try:
         return evaluate.value(text, flat)
-    except Exception:                                         # it asks for what this config does not have
+    except Exception:  # it asks for what this config does not have
         return None
 
 
@@ -457,7 +578,7 @@ def compared_words(*sources):
             add_words(out, m[2], m[1])
         for m in re.finditer(r"(\w+)\s*:\s*(?:list\[)?Literal\[((?:\s*[\"'][\w.\-]+[\"']\s*,?)+)", source):
             add_words(out, m[1], m[2])
-    for k in list(out):                                         # a list of layer types, compared one by one
+    for k in list(out):  # a list of layer types, compared one by one
         out.setdefault(k + "s", out[k])
         if k in ("layer_type", "attention_type"):
             out.setdefault("layer_types", out[k])

@@ -1,4 +1,5 @@
 """Reads off transformers 5 what it renames and merges at load, and which names its classes leave unreported."""
+
 import inspect
 import json
 
@@ -53,9 +54,12 @@ def instances(args, version, identifiers, patterns):
                 if transform.scope_prefix is not None:
                     told["scope"] = transform.scope_prefix
                 rows.append(told)
-            told = {"conversions": rows, "ignore_missing": listed(model, "_keys_to_ignore_on_load_missing"),
-                    "ignore_unexpected": listed(model, "_keys_to_ignore_on_load_unexpected")}
-        except Exception as e:                                # whatever a model raises
+            told = {
+                "conversions": rows,
+                "ignore_missing": listed(model, "_keys_to_ignore_on_load_missing"),
+                "ignore_unexpected": listed(model, "_keys_to_ignore_on_load_unexpected"),
+            }
+        except Exception as e:  # whatever a model raises
             told = {"error": f"{type(e).__name__}: {e}"[:200]}
         target.write_text(json.dumps({"config": config, **told}, sort_keys=True) + "\n")
 
@@ -75,12 +79,17 @@ def main(args):
     patterns = {}
     for name in sorted(all_models(transformers)):
         cls = name[1]
-        told = {"ignore_missing": listed(cls, "_keys_to_ignore_on_load_missing"), "ignore_unexpected": listed(cls, "_keys_to_ignore_on_load_unexpected")}
+        told = {
+            "ignore_missing": listed(cls, "_keys_to_ignore_on_load_missing"),
+            "ignore_unexpected": listed(cls, "_keys_to_ignore_on_load_unexpected"),
+        }
         if any(told.values()):
             patterns[name[0]] = {k: v for k, v in told.items() if v}
     out = args.cache / version / "conversions.json"
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"identifiers": identifiers, "same_as": same_as, "patterns": patterns}, indent=1, sort_keys=True) + "\n")
+    out.write_text(
+        json.dumps({"identifiers": identifiers, "same_as": same_as, "patterns": patterns}, indent=1, sort_keys=True) + "\n"
+    )
     if args.instances:
         instances(args, version, identifiers, patterns)
     print(f"{out}: {len(identifiers)} identifiers, {len(same_as)} the same as another, {len(patterns)} classes with patterns")
@@ -96,6 +105,7 @@ def all_models(transformers):
     import pkgutil
 
     import transformers.models as models
+
     for family in pkgutil.iter_modules(models.__path__):
         for module in pkgutil.iter_modules([f"{models.__path__[0]}/{family.name}"]):
             if not module.name.startswith("modeling_") or "_tf_" in module.name or "_flax_" in module.name:

@@ -1,11 +1,12 @@
 """A class that is right but for one corner of its configs ships with that corner named, and nothing is predicted there."""
+
 import itertools
 import re
 
 from .conditions import quoted
 from .keys import NOISE
 
-MOST = 3                                                     # corners of one class
+MOST = 3  # corners of one class
 WHOLE = re.compile(r"(^|\.)(hidden_size|d_model|n_embd|embed_dim|emb_dim|dim)$")
 HEADS = re.compile(r"(^|\.)(num_attention_heads|n_heads?|num_heads)$")
 
@@ -14,7 +15,11 @@ def found(v, name, records, outcomes, named, enough):
     """{"when", "why"} of a condition that configs it was wrong about fulfil, and that leaves enough; or None.
 
     Of all conditions it is the one that covers the most wrong configs, then the one that loses the fewest right ones."""
-    rows = [(r["flat"], o) for r, o in zip(records, outcomes) if "flat" in r and o != "not predicted" and not o.startswith(("raises", "builds"))]
+    rows = [
+        (r["flat"], o)
+        for r, o in zip(records, outcomes)
+        if "flat" in r and o != "not predicted" and not o.startswith(("raises", "builds"))
+    ]
     wrong = [flat for flat, o in rows if o != "exact"]
     right = [flat for flat, o in rows if o == "exact"]
     if not wrong or len(named) >= MOST or len(wrong) > len(right):
@@ -34,7 +39,11 @@ def found(v, name, records, outcomes, named, enough):
 
 def candidates(flat, default):
     """(condition, what it is about, its truth in a config) that a config fulfils."""
-    keys = [k for k in sorted(flat) if not NOISE.search(k.split(".")[-1]) and k.split(".")[-1] not in ("num_labels", "model_type") and not k.startswith("_")]
+    keys = [
+        k
+        for k in sorted(flat)
+        if not NOISE.search(k.split(".")[-1]) and k.split(".")[-1] not in ("num_labels", "model_type") and not k.startswith("_")
+    ]
     for key in keys:
         for text, holds in asked(key, flat[key], default.get(key)):
             yield text, key, holds

@@ -1,5 +1,6 @@
 """What a config class fills in: static values, values computed from others, and what compositions build or overwrite
 in the configs inside them. `config/<model_type>.json`, and what one class needs of it."""
+
 import collections
 import functools
 import json
@@ -41,6 +42,7 @@ def at(raw, path):
 
 # ---- one config class ----------------------------------------------------------------------------------------
 
+
 @functools.lru_cache(maxsize=None)
 def of_config(root, model_type):
     """The derived knowledge about one model_type's config, made on first use and kept on disk."""
@@ -64,11 +66,29 @@ def derive(root, document):
     rows = all_rows(document)
     own_keys = [k for k in static if not k.startswith(inner)] if inner else list(static)
     for r in rows:
-        own_keys += [k for k in r.made if k not in static and not (inner and k.startswith(inner)) and k not in own_keys and k in r.raw]
-    keys = [k for k in own_keys if k not in subs and k != "num_labels" and (not NOISE.search(k.split(".")[-1]) or k in document["reads"])]
-    result = {"model_type": document["model_type"], "config_class": document["config_class"], "inside": document["inside"],
-              "defaults": {k: static[k] for k in keys if k in static}, "computed": [["num_labels", (LABELS_5 if root.name.startswith("5") else LABELS).format(n=static.get("num_labels", 2)), "always"]], "failed": [], "aliases": {},
-              "configs": {}, "varied": sorted({r.key for r in rows if r.key}), "reads": document["reads"], "declared": sorted(static)}
+        own_keys += [
+            k for k in r.made if k not in static and not (inner and k.startswith(inner)) and k not in own_keys and k in r.raw
+        ]
+    keys = [
+        k
+        for k in own_keys
+        if k not in subs and k != "num_labels" and (not NOISE.search(k.split(".")[-1]) or k in document["reads"])
+    ]
+    result = {
+        "model_type": document["model_type"],
+        "config_class": document["config_class"],
+        "inside": document["inside"],
+        "defaults": {k: static[k] for k in keys if k in static},
+        "computed": [
+            ["num_labels", (LABELS_5 if root.name.startswith("5") else LABELS).format(n=static.get("num_labels", 2)), "always"]
+        ],
+        "failed": [],
+        "aliases": {},
+        "configs": {},
+        "varied": sorted({r.key for r in rows if r.key}),
+        "reads": document["reads"],
+        "declared": sorted(static),
+    }
     result["aliases"] = aliases(document, rows)
     known = Known(document, own_keys)
     for k in sorted(keys):
@@ -87,7 +107,7 @@ def derive(root, document):
             continue
         result["computed"].append([k, text, mode])
         if mode != "always":
-            result["defaults"][k] = None                      # a static default would keep the rule from being used
+            result["defaults"][k] = None  # a static default would keep the rule from being used
     for k in document["popped"]:
         if k not in result["defaults"] and not k.startswith("_"):
             result["defaults"][k] = None
@@ -115,13 +135,13 @@ class Unexplained(Exception):
 
 class Row:
     """One config that a class was given, and what it made of it."""
+
     __slots__ = ("raw", "made", "kind", "key", "flat")
 
     def __init__(self, raw, made, kind, key):
         self.raw, self.made, self.kind, self.key = raw, made, kind, key
         self.flat = {}
         spread(raw, "", self.flat)
-
 
     def filled(self, key, value):
         """The same with the static default of a key that is not said."""
@@ -168,7 +188,9 @@ class Known:
     def columns(self, rows, more=()):
         """Keys the class reads of itself, then those that expressions name."""
         names = dict.fromkeys([*self.reads, *more])
-        return [Column(f"c.{x}", [r.flat.get(x) for r in rows], 1 + .03 * n) for n, x in enumerate(names) if differs(rows, x)][:24]
+        return [Column(f"c.{x}", [r.flat.get(x) for r in rows], 1 + 0.03 * n) for n, x in enumerate(names) if differs(rows, x)][
+            :24
+        ]
 
     def asked(self, rows):
         out = []
@@ -198,7 +220,9 @@ def aliases(document, rows):
         if not all(key in r.made and r.made[key][0] == r.raw[alias] for r in alone):
             continue
         if all(wins):
-            seen = any(v[1] and re.search(rf"c\.{alias}\b", v[1]) for r in beside + alone for k, v in r.made.items() if k != key)
+            seen = any(
+                v[1] and re.search(rf"c\.{alias}\b", v[1]) for r in beside + alone for k, v in r.made.items() if k != key
+            )
             out[alias] = [key, "early" if seen else "late"]
     return out
 
@@ -283,9 +307,15 @@ def simple(v):
 def decide(truth, rows, known, options):
     names = [x for t in options for x in KEY.findall(t)]
     found = conditions.condition(truth, known.columns(rows, names), known.asked(rows))
-    if found is None:                                         # a key inside, or one the class does not read by name
-        flats = sorted({x for r in rows for x in r.flat if not NOISE.search(x.split(".")[-1])} | {k for k in known.keys if "tie" in k})
-        columns = [Column(f"c.{x}", [r.flat.get(x) for r in rows], 1.5) for x in flats if differs(rows, x) and any(isinstance(r.flat.get(x), (bool, str)) or r.flat.get(x) is None for r in rows)]
+    if found is None:  # a key inside, or one the class does not read by name
+        flats = sorted(
+            {x for r in rows for x in r.flat if not NOISE.search(x.split(".")[-1])} | {k for k in known.keys if "tie" in k}
+        )
+        columns = [
+            Column(f"c.{x}", [r.flat.get(x) for r in rows], 1.5)
+            for x in flats
+            if differs(rows, x) and any(isinstance(r.flat.get(x), (bool, str)) or r.flat.get(x) is None for r in rows)
+        ]
         found = conditions.condition(truth, columns[:40])
     return found
 
@@ -317,20 +347,26 @@ def by_cases(k, rows, targets, known, options, depth):
 def gives(text, row, target):
     try:
         return same(evaluate.value(text, row.flat), target)
-    except Exception:                                         # it asks for what this config does not have
+    except Exception:  # it asks for what this config does not have
         return False
 
 
 def searched(targets, rows, known):
     """A number that no followed value explains."""
-    names = [x for x in known.keys if "." not in x and not NOISE.search(x) and any(is_number(r.get(x)) for r in rows) and varies(rows, x)]
+    names = [
+        x
+        for x in known.keys
+        if "." not in x and not NOISE.search(x) and any(is_number(r.get(x)) for r in rows) and varies(rows, x)
+    ]
     alike = [x for x in names if all(r.get(x) == t for r, t in zip(rows, targets))]
     if alike:
         return f"c.{min(alike, key=lambda x: (not LIKELY.search(x), len(x)))}"
     if not all(isinstance(t, int) for t in targets):
         return None
     names.sort(key=lambda x: not LIKELY.search(x))
-    found = conditions.number(targets, [Column(f"c.{x}", [r.get(x) for r in rows], 1 + .03 * n) for n, x in enumerate(names[:8])], (), 0)
+    found = conditions.number(
+        targets, [Column(f"c.{x}", [r.get(x) for r in rows], 1 + 0.03 * n) for n, x in enumerate(names[:8])], (), 0
+    )
     return found and found[1]
 
 
@@ -344,9 +380,18 @@ def varies(rows, x):
 
 def list_rule(targets, rows, known):
     """A list computed from counts: `range(n).map(i, …)`, with its length and, element by element, its values."""
-    names = [x for x in known.keys if "." not in x and not NOISE.search(x) and varies(rows, x) and any(is_number(r.get(x)) for r in rows)]
+    names = [
+        x
+        for x in known.keys
+        if "." not in x and not NOISE.search(x) and varies(rows, x) and any(is_number(r.get(x)) for r in rows)
+    ]
     names = sorted(names, key=lambda x: not re.search("layers|depth|interval|period|pattern|freq|every|window", x))
-    length = conditions.number([len(t) for t in targets], [Column(f"c.{x}", [r.get(x) for r in rows], 1 + .03 * n) for n, x in enumerate(names[:8])], (), 0)
+    length = conditions.number(
+        [len(t) for t in targets],
+        [Column(f"c.{x}", [r.get(x) for r in rows], 1 + 0.03 * n) for n, x in enumerate(names[:8])],
+        (),
+        0,
+    )
     if length is None:
         return None
     flat = [(r, i, x) for r, t in zip(rows, targets) for i, x in enumerate(t)]
@@ -371,7 +416,7 @@ def element_test(truth, flat, names, known):
     extra = [conditions.Literal(1, "i == 0", "i > 0", i == 0)]
     for m in (2, 3, 4, 5, 6, 8):
         for r in range(m):
-            extra.append(conditions.Literal(1.5 + .1 * m, f"i % {m} == {r}", f"i % {m} != {r}", i % m == r))
+            extra.append(conditions.Literal(1.5 + 0.1 * m, f"i % {m} == {r}", f"i % {m} != {r}", i % m == r))
     for x in names:
         values = [r.get(x) for r, *_ in flat]
         if not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
@@ -391,7 +436,7 @@ def element_test(truth, flat, names, known):
         text = re.sub(r"@\d+", "i", text)
         try:
             said = np.array([bool(evaluate.value(text, r, (n,))) for r, n, _ in flat])
-        except Exception:                                     # it asks for what some config does not have
+        except Exception:  # it asks for what some config does not have
             continue
         extra.append(conditions.Literal(1, text, f"!({text})", said))
     columns = [Column(f"c.{x}", [r.get(x) for r, *_ in flat], 1.5) for x in names]
@@ -411,13 +456,19 @@ def ordered(rules):
 
 # ---- configs inside configs ----------------------------------------------------------------------------------
 
+
 def of_sub(root, document, key, sub, rows, known):
     """{"type", "absent", "set", "instead"}, and "defaults" for a config that has no file of its own."""
     prefix = key + "."
-    static = {k[len(prefix):]: v for k, v in document["static"].items() if k.startswith(prefix)}
+    static = {k[len(prefix) :]: v for k, v in document["static"].items() if k.startswith(prefix)}
     own = sub["own"] or {}
-    mt = sub["model_type"] if sub["model_type"] != document["model_type"] else None       # some carry the name of the outer one
-    out = {"type": mt or None, "absent": {}, "set": {}, "kinds": sorted({s["types"].get(key) or "" for s in document["samples"]} - {""})}
+    mt = sub["model_type"] if sub["model_type"] != document["model_type"] else None  # some carry the name of the outer one
+    out = {
+        "type": mt or None,
+        "absent": {},
+        "set": {},
+        "kinds": sorted({s["types"].get(key) or "" for s in document["samples"]} - {""}),
+    }
     if f"{key}_dict" in document["popped"]:
         out["instead"] = f"{key}_dict"
     samples = document["samples"]
@@ -452,10 +503,12 @@ def copied(k, samples, prefix, top):
 def written_over(key, prefix, rows, known):
     """Keys of the inner config that do not keep the value they were given, with what they become."""
     out, kept = {}, [r for r in rows if isinstance(r.raw.get(key), dict)]
-    for k in sorted({n[len(prefix):] for r in kept for n in r.made if n.startswith(prefix)}):
+    for k in sorted({n[len(prefix) :] for r in kept for n in r.made if n.startswith(prefix)}):
         if NOISE.search(k.split(".")[-1]) or "." in k or k == "model_type":
             continue
-        mine = [r for r in kept if prefix + k in r.made and r.raw[key].get(k) is not None and not isinstance(r.raw[key][k], dict)]
+        mine = [
+            r for r in kept if prefix + k in r.made and r.raw[key].get(k) is not None and not isinstance(r.raw[key][k], dict)
+        ]
         if not any(r.made[prefix + k][0] != r.raw[key][k] for r in mine):
             continue
         # What the inner class does to its own keys is told by its own record.

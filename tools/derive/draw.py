@@ -4,6 +4,7 @@ A record is a config.json as it may lie on a hub, and the class's tensors with i
 under other names alone and beside, keys that only the source asks for, words, nulls, what is computed left out, a
 number of labels; and, with `--others`, files as another version wrote them.
 """
+
 import json
 import os
 import random
@@ -22,7 +23,17 @@ from .configs import alternatives, copied, flatten  # noqa: E402
 from .keys import NOISE  # noqa: E402
 from .output import write_json  # noqa: E402
 
-PLAN = [("full", 9), ("thinned", 4), ("alias-alone", 1), ("alias-beside", 1), ("asked", 2), ("words", 2), ("derived", 2), ("null", 1), ("labels", 1)]
+PLAN = [
+    ("full", 9),
+    ("thinned", 4),
+    ("alias-alone", 1),
+    ("alias-beside", 1),
+    ("asked", 2),
+    ("words", 2),
+    ("derived", 2),
+    ("null", 1),
+    ("labels", 1),
+]
 SECONDS = 60
 TOKENS = re.compile(r"(_token_id|_token_index|_token_ids?)$|^(torch_)?dtype$|^transformers_version$")
 
@@ -48,7 +59,15 @@ class Drawer:
             raise
         except Exception as e:
             return {"config": given, "kind": kind, "error": f"{type(e).__name__}: {e}"[:300]}
-        return {"config": given, "kind": kind, "flat": flat, "state_dict": b.tensors, "tied": b.tied, "buffers": b.buffers, "base_model_prefix": b.instance.base_model_prefix}
+        return {
+            "config": given,
+            "kind": kind,
+            "flat": flat,
+            "state_dict": b.tensors,
+            "tied": b.tied,
+            "buffers": b.buffers,
+            "base_model_prefix": b.instance.base_model_prefix,
+        }
 
     def saved(self, raw):
         text = self.config_class(**copied(raw)).to_json_string()
@@ -63,7 +82,11 @@ class Drawer:
             return thinned(saved, rng)
         out = copied(saved)
         if kind in ("alias-alone", "alias-beside"):
-            options = [(a, k) for a, k in sorted(self.map.items()) if isinstance(saved.get(k), (int, float, bool, str)) and not TOKENS.search(k) and not NOISE.search(k)]
+            options = [
+                (a, k)
+                for a, k in sorted(self.map.items())
+                if isinstance(saved.get(k), (int, float, bool, str)) and not TOKENS.search(k) and not NOISE.search(k)
+            ]
             if not options:
                 return None
             for alias, key in rng.sample(options, min(len(options), 2)):
@@ -92,12 +115,19 @@ class Drawer:
             for key in gone:
                 del out[key]
             for key in [k for k in self.about["sources"] if k in out and k not in gone]:
-                if rng.random() < .4:
+                if rng.random() < 0.4:
                     out[key] = other(key, out[key], self.words, rng)
             return out if gone else None
         if kind == "null":
-            options = [k for k, v in sorted(saved.items()) if v is not None and not isinstance(v, (dict, list)) and not TOKENS.search(k) and k not in ("model_type", "architectures")
-                       and not NOISE.search(k)]
+            options = [
+                k
+                for k, v in sorted(saved.items())
+                if v is not None
+                and not isinstance(v, (dict, list))
+                and not TOKENS.search(k)
+                and k not in ("model_type", "architectures")
+                and not NOISE.search(k)
+            ]
             for key in rng.sample(options, min(len(options), 2)):
                 out[key] = None
             return out
@@ -163,13 +193,21 @@ def other(key, value, words, rng):
 
 def thinned(config, rng):
     """A config with some of its keys left out, as older files and files written by hand are."""
-    share = rng.uniform(.15, .6)
+    share = rng.uniform(0.15, 0.6)
     out = {}
     for k, v in sorted(config.items()):
-        if k in ("model_type", "use_timm_backbone", "backbone", "use_pretrained_backbone", "out_features", "vocabulary_map", "architectures"):
+        if k in (
+            "model_type",
+            "use_timm_backbone",
+            "backbone",
+            "use_pretrained_backbone",
+            "out_features",
+            "vocabulary_map",
+            "architectures",
+        ):
             out[k] = v
         elif isinstance(v, dict) and "model_type" in v:
-            if rng.random() > .1:
+            if rng.random() > 0.1:
                 out[k] = thinned(v, rng)
         elif rng.random() > share:
             out[k] = v
@@ -186,20 +224,24 @@ def derived_of(root, model_type):
 
 def raws_for(cls, config_class, model_type, seed, count):
     """Small random configs that the class can be built from, with numbers of labels where it has some."""
+
     def works(raw):
         built(cls, config_class(**copied(raw)), lambda: config_class(**copied(raw)))
+
     name = cls.__name__
     rng = random.Random(f"labels/{seed}/{name}")
     raws = config_sample.base_raws(model_type, config_class, works, count, f"{seed}/{name}")
     if re.search("Classification|MultipleChoice|Segmentation|Detection", name):
-        raws = [{**copied(r), "num_labels": rng.randint(1, 7)} if rng.random() < .7 else r for r in raws]
+        raws = [{**copied(r), "num_labels": rng.randint(1, 7)} if rng.random() < 0.7 else r for r in raws]
     return raws
 
 
 def class_of(name, about):
     """A model class and the config class it was sampled with."""
     cls = catalogue.find_class(name)
-    return cls, next(c for c in (cls.config_class, catalogue.config_class(about["model_type"])) if c and c.__name__ == about["config_class"])
+    return cls, next(
+        c for c in (cls.config_class, catalogue.config_class(about["model_type"])) if c and c.__name__ == about["config_class"]
+    )
 
 
 def draw(root, name, seed):
@@ -226,7 +268,11 @@ def asked_now(cls, seed, count=6):
         absent.update(record.absent)
     told = config_sample.record(config_class.model_type, config_class, raws[:2])
     computed = config_sample.computed_keys(told)
-    about = {"traced": {"absent": absent}, "derived": sorted(computed), "sources": [k for k in told["reads"] if k not in computed and not NOISE.search(k)]}
+    about = {
+        "traced": {"absent": absent},
+        "derived": sorted(computed),
+        "sources": [k for k in told["reads"] if k not in computed and not NOISE.search(k)],
+    }
     return Drawer(cls, config_class, about, seed).all(raws)
 
 
@@ -283,12 +329,16 @@ def main(args):
     folder = "others" if args.others else "unseen"
     sampled = sorted(p.name.removesuffix(".json.gz") for p in (root / "samples").glob("*.json.gz"))
     while True:
-        todo = [n for n in sampled if (not args.only or re.search(args.only, n)) and not (root / folder / str(args.seed) / f"{n}.json.gz").exists()]
+        todo = [
+            n
+            for n in sampled
+            if (not args.only or re.search(args.only, n)) and not (root / folder / str(args.seed) / f"{n}.json.gz").exists()
+        ]
         if not todo:
             return 0
         pid = os.fork()
         if pid == 0:
             work(root, todo[:150], args)
         _, status = os.waitpid(pid, 0)
-        if status:                                            # killed, or out of memory: the class at hand is to blame
+        if status:  # killed, or out of memory: the class at hand is to blame
             write_json(root / folder / str(args.seed) / f"{(root / 'current').read_text()}.json.gz", [])

@@ -1,5 +1,6 @@
 """Takes classes that were found wrong out of the shipped files, with those that have them as a part, or names a corner of
 them, until the next verification, which reads the configs that `tests/peer/families.py --save` kept."""
+
 import json
 import re
 
@@ -14,7 +15,7 @@ def entries(text):
     whole = json.loads(re.search(r"^  loaders: (\[.*\]),", text, re.M)[1])
     for found in ENTRY.finditer(text, text.index("  classes: [")):
         name = re.search(r'class: "(\w+)"', found[0])
-        own = re.search(r'^      loaders: (\[.*\]),', found[0], re.M)
+        own = re.search(r"^      loaders: (\[.*\]),", found[0], re.M)
         if name:
             yield found[0], name[1], json.loads(own[1]) if own else whole
 
@@ -26,7 +27,9 @@ def without(text, version, name):
             continue
         rest = [v for v in versions if v != version]
         left = re.sub(r"^      loaders: .*\n", "", entry, flags=re.M)
-        left = re.sub(r"^(      class: .*\n)", lambda m: m[1] + f"      loaders: {json.dumps(rest)},\n", left, count=1, flags=re.M)
+        left = re.sub(
+            r"^(      class: .*\n)", lambda m: m[1] + f"      loaders: {json.dumps(rest)},\n", left, count=1, flags=re.M
+        )
         text = text.replace(entry, left if rest else "", 1)
     at = text.find(f'    "{version}": {{')
     end = text.find("\n    },", at)
@@ -40,7 +43,9 @@ def with_corner(text, version, name, when):
         if cls == name and version in versions and corner not in entry:
             left = entry.replace("not_predicted_when: [", f"not_predicted_when: [{corner}, ", 1)
             if left == entry:
-                left = re.sub(r"^      tensors:", lambda m: f"      not_predicted_when: [{corner}],\n{m[0]}", entry, count=1, flags=re.M)
+                left = re.sub(
+                    r"^      tensors:", lambda m: f"      not_predicted_when: [{corner}],\n{m[0]}", entry, count=1, flags=re.M
+                )
             text = text.replace(entry, left, 1)
     return text
 
@@ -57,7 +62,11 @@ def main(args):
             if args.when:
                 texts[path] = with_corner(text, version, name, args.when)
                 continue
-            parts = [cls for entry, cls, versions in entries(text) if version in versions and cls != name and f'part: {{ class: "{name}"' in entry]
+            parts = [
+                cls
+                for entry, cls, versions in entries(text)
+                if version in versions and cls != name and f'part: {{ class: "{name}"' in entry
+            ]
             todo += [(version, cls, PART) for cls in parts]
             texts[path] = without(text, version, name)
         if args.when:
@@ -68,4 +77,11 @@ def main(args):
         print(f"{version}: {name}: {why}")
     for path, text in texts.items():
         path.write_text(text)
-    NOT_SHIPPED.write_text(json.dumps({v: {kind: dict(sorted(names.items())) for kind, names in groups.items()} for v, groups in told.items()}, indent=1, ensure_ascii=False) + "\n")
+    NOT_SHIPPED.write_text(
+        json.dumps(
+            {v: {kind: dict(sorted(names.items())) for kind, names in groups.items()} for v, groups in told.items()},
+            indent=1,
+            ensure_ascii=False,
+        )
+        + "\n"
+    )

@@ -1,4 +1,5 @@
 """The part of CEL that fitted expressions are written in, to check them without the Rust side."""
+
 import functools
 import math
 import re
@@ -37,12 +38,34 @@ def within(text):
     return re.sub(r"c(?:\.\w+)+\[([ijkl]) - 1\] ([!=])= null", lambda m: f"{m[1]} == 0" if m[2] == "=" else f"{m[1]} > 0", text)
 
 
-FUNCTIONS = {"size": lambda x: len(x) if x is not None else 0, "sum": sum, "pow": pow, "isqrt": math.isqrt, "floor": lambda x: math.floor(x + 1e-12),
-             "double": float, "min": min, "max": max, "range": lambda n: list(range(n)), "split": split, "ceil": lambda x: math.ceil(x - 1e-12)}
+FUNCTIONS = {
+    "size": lambda x: len(x) if x is not None else 0,
+    "sum": sum,
+    "pow": pow,
+    "isqrt": math.isqrt,
+    "floor": lambda x: math.floor(x + 1e-12),
+    "double": float,
+    "min": min,
+    "max": max,
+    "range": lambda n: list(range(n)),
+    "split": split,
+    "ceil": lambda x: math.ceil(x - 1e-12),
+}
 METHODS = {"startsWith": str.startswith, "endsWith": str.endswith, "contains": lambda s, part: part in s}
-OPERATORS = {"==": lambda a, b: a == b and isinstance(a, bool) == isinstance(b, bool), "!=": lambda a, b: not (a == b and isinstance(a, bool) == isinstance(b, bool)),
-             "<": lambda a, b: a < b, ">": lambda a, b: a > b, "<=": lambda a, b: a <= b, ">=": lambda a, b: a >= b, "in": lambda a, b: a in b,
-             "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "/": divide, "%": lambda a, b: a % b}
+OPERATORS = {
+    "==": lambda a, b: a == b and isinstance(a, bool) == isinstance(b, bool),
+    "!=": lambda a, b: not (a == b and isinstance(a, bool) == isinstance(b, bool)),
+    "<": lambda a, b: a < b,
+    ">": lambda a, b: a > b,
+    "<=": lambda a, b: a <= b,
+    ">=": lambda a, b: a >= b,
+    "in": lambda a, b: a in b,
+    "+": lambda a, b: a + b,
+    "-": lambda a, b: a - b,
+    "*": lambda a, b: a * b,
+    "/": divide,
+    "%": lambda a, b: a % b,
+}
 LEVELS = [("||",), ("&&",), ("==", "!=", "<", ">", "<=", ">=", "in"), ("+", "-"), ("*", "/", "%")]
 
 

@@ -1,4 +1,5 @@
 """What was fitted, by transformers version and config class, and what of it an architecture file says."""
+
 import functools
 import gzip
 import json
@@ -21,7 +22,9 @@ RELATIVE = re.compile(r"(c(?:\.\w+)*\.position_embedding_type) != 'absolute'")
 def tidied(value):
     """The same with tidy expressions, 'words' in single quotes so that they need no escapes inside a string."""
     if isinstance(value, str):
-        return RELATIVE.sub(r"(\1 == 'relative_key' || \1 == 'relative_key_query')", tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value))))
+        return RELATIVE.sub(
+            r"(\1 == 'relative_key' || \1 == 'relative_key_query')", tidy(within(re.sub(r'"([\w. +-]*)"', r"'\1'", value)))
+        )
     if isinstance(value, list):
         return [tidied(v) for v in value]
     if isinstance(value, dict):
@@ -40,9 +43,10 @@ FLAT = {"qwen2_vl": "text_config", "qwen2_5_vl": "text_config"}
 @dataclass
 class Fit:
     """One class under one version, as `fit` wrote it."""
+
     raw: dict
-    order: list                                              # names of a state dict, for the place of its parts
-    auto: dict = field(default_factory=dict)                 # mapping -> {model_type: class}
+    order: list  # names of a state dict, for the place of its parts
+    auto: dict = field(default_factory=dict)  # mapping -> {model_type: class}
 
     @property
     def name(self):
@@ -79,8 +83,10 @@ class Fit:
     @cached_property
     def items(self):
         """Its tensors in the order of the state dict, parts and buffers at their place."""
-        out = [Item(name, repeats(e), e.get("when"), list(e["shape"]), e.get("tied_to"), e.get("tied_when"))
-               for name, e in self.raw["tensors"]]
+        out = [
+            Item(name, repeats(e), e.get("when"), list(e["shape"]), e.get("tied_to"), e.get("tied_when"))
+            for name, e in self.raw["tensors"]
+        ]
         for item in reversed(self.parts):
             out.insert(self.place(item.name, out), item)
         for name, e in self.raw.get("buffers", []):
@@ -97,10 +103,10 @@ class Fit:
         starts = [at for at, name in enumerate(self.order) if name.startswith(prefix)]
         if not starts:
             return 0
-        before = {head(n) for n in self.order[:starts[0]]} - {prefix}
+        before = {head(n) for n in self.order[: starts[0]]} - {prefix}
         at = 0
         for index, item in enumerate(items):
-            if head(item.name) in before or any(n.startswith(item.name.split("{")[0]) for n in self.order[:starts[0]]):
+            if head(item.name) in before or any(n.startswith(item.name.split("{")[0]) for n in self.order[: starts[0]]):
                 at = index + 1
         return at
 
@@ -110,7 +116,7 @@ LAYERS = re.compile(r"^c\.(\w+\.)*(num_hidden_layers|n_layers?|num_layers|encode
 
 def clamped(tensors):
     """No tensor lies in a layer that there is none of: `first_k_dense_replace` may be more than `num_hidden_layers`."""
-    whole = {}                                               # what all layers of a list have, by what their names start with
+    whole = {}  # what all layers of a list have, by what their names start with
     for name, entry in tensors:
         repeat = entry.get("repeat", [])
         if len(repeat) == 1 and not entry.get("when") and LAYERS.match(repeat[0][1]):
@@ -118,8 +124,14 @@ def clamped(tensors):
     out = []
     for name, entry in tensors:
         repeat, count = entry.get("repeat", []), whole.get(name.split("{")[0])
-        if count and repeat and name.split("{")[1].startswith(f"{repeat[0][0]}}}") and repeat[0][1].startswith("c.") and repeat[0][1] != count \
-                and re.fullmatch(r"c\.[\w.]+", repeat[0][1]):
+        if (
+            count
+            and repeat
+            and name.split("{")[1].startswith(f"{repeat[0][0]}}}")
+            and repeat[0][1].startswith("c.")
+            and repeat[0][1] != count
+            and re.fullmatch(r"c\.[\w.]+", repeat[0][1])
+        ):
             entry = {**entry, "repeat": [[repeat[0][0], f"min({repeat[0][1]}, {count})"], *repeat[1:]]}
         out.append([name, entry])
     return out
@@ -140,6 +152,7 @@ def head(name):
 
 def neighbour(name, items):
     """After the last item that shares the most modules with it."""
+
     def shared(other):
         count = 0
         for a, b in zip(name.split(".")[:-1], other.split(".")):
@@ -147,6 +160,7 @@ def neighbour(name, items):
                 break
             count += 1
         return count
+
     best = max((shared(i.name) for i in items), default=0)
     return max((at + 1 for at, i in enumerate(items) if shared(i.name) == best), default=0) if best else len(items)
 
@@ -154,12 +168,13 @@ def neighbour(name, items):
 @dataclass(eq=False)
 class Version:
     """Everything one version of the cache says."""
+
     version: str
     folder: Path
-    fits: dict = field(default_factory=dict)                 # class -> Fit
-    reasons: dict = field(default_factory=dict)              # class -> why it is not shipped
-    configs: dict = field(default_factory=dict)              # model_type -> {"defaults", "computed", …}
-    auto: dict = field(default_factory=dict)                 # mapping -> {model_type: class}
+    fits: dict = field(default_factory=dict)  # class -> Fit
+    reasons: dict = field(default_factory=dict)  # class -> why it is not shipped
+    configs: dict = field(default_factory=dict)  # model_type -> {"defaults", "computed", …}
+    auto: dict = field(default_factory=dict)  # mapping -> {model_type: class}
 
     @classmethod
     def read(cls, cache, version):
@@ -178,7 +193,9 @@ class Version:
             raw["tensors"] = clamped(raw["tensors"])
             if raw.get("unexplained"):
                 what = raw["unexplained"][0]
-                out.reasons[raw["class"]] = "not explained: " + " ".join(str(w) for w in (what if isinstance(what, list) else [what]))[:100]
+                out.reasons[raw["class"]] = (
+                    "not explained: " + " ".join(str(w) for w in (what if isinstance(what, list) else [what]))[:100]
+                )
             else:
                 out.fits[raw["class"]] = Fit(raw, raw["order"], out.auto)
                 out.reasons.pop(raw["class"], None)
@@ -228,7 +245,7 @@ class Version:
         for key, spec in out.items():
             if FLAT.get(model_type) == key and self.version.startswith("5"):
                 spec["flat"] = True
-            if spec.get("type") == model_type:                # a config inside that bears the name of the one around it
+            if spec.get("type") == model_type:  # a config inside that bears the name of the one around it
                 spec["defaults"] = self.inside(model_type, key)
         return out
 
@@ -280,14 +297,20 @@ class Version:
         varied = set(config["varied"]).union(*(f.raw["varied"] for f in family)) | self.varied_inside[model_type]
         left = reads - varied - used - set(self.aliases(model_type)) - set(config["configs"]) - self.of_others(model_type)
         static = config["defaults"]
-        return {k: static.get(k) for k in sorted(left) if "." not in k and not NOISE.search(k) and not NO_KEY.search(k) and simple(static.get(k))}
+        return {
+            k: static.get(k)
+            for k in sorted(left)
+            if "." not in k and not NOISE.search(k) and not NO_KEY.search(k) and simple(static.get(k))
+        }
 
 
 # What is read of a config that is no key of it, or that every config has and no class builds by.
-NO_KEY = re.compile(r"^(_|to_|get_|from_|update|save|is_composition|name_or_path|num_labels|architectures|quantization_config|sub_configs|layer_types_|use_return_dict|attribute_map"
-                    r"|keys_to|auto_map|output_attentions|use_bfloat16|tie_encoder_decoder$|is_encoder_decoder$|base_config|per_layer_config|is_heterogeneous|text_config|vision_config"
-                    r"|(\w+_)?act(ivation)?(_fn|_func|_function)?$|forced_|max_length$|min_length$|num_beam|length_penalty|no_repeat|do_sample|num_return|decoder_start|max_new"
-                    r"|generation|head_mask|items|keys|values|copy|pop|get)")
+NO_KEY = re.compile(
+    r"^(_|to_|get_|from_|update|save|is_composition|name_or_path|num_labels|architectures|quantization_config|sub_configs|layer_types_|use_return_dict|attribute_map"
+    r"|keys_to|auto_map|output_attentions|use_bfloat16|tie_encoder_decoder$|is_encoder_decoder$|base_config|per_layer_config|is_heterogeneous|text_config|vision_config"
+    r"|(\w+_)?act(ivation)?(_fn|_func|_function)?$|forced_|max_length$|min_length$|num_beam|length_penalty|no_repeat|do_sample|num_return|decoder_start|max_new"
+    r"|generation|head_mask|items|keys|values|copy|pop|get)"
+)
 
 
 def simple(v):
@@ -296,7 +319,9 @@ def simple(v):
 
 def expressions(items):
     for item in items:
-        yield from (text for text in (item.when, item.tied_when, *(item.shape or ()), *(count for _, count in item.repeat)) if text)
+        yield from (
+            text for text in (item.when, item.tied_when, *(item.shape or ()), *(count for _, count in item.repeat)) if text
+        )
 
 
 def used_keys(version, classes, corners=None, kept=()):
@@ -341,7 +366,7 @@ def used_keys(version, classes, corners=None, kept=()):
                 read(model_type, item.part["config"])
                 used[model_type].add(item.part["config"].split(".")[0])
             read_values(model_type, item.part.get("set"))
-        for p in fit.raw["parts"]:                            # a part of the same config reads this class's keys
+        for p in fit.raw["parts"]:  # a part of the same config reads this class's keys
             if not p.get("config"):
                 for other in p["classes"].values():
                     if other in version.fits and version.model_type(other) != model_type:

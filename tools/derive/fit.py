@@ -1,4 +1,5 @@
 """From samples to templates: `fit/<Class>.json`, a template per tensor with expressions that explain every sample."""
+
 import collections
 import importlib.metadata
 import json
@@ -16,10 +17,10 @@ from .lists import of_list
 from .names import LETTERS, gapless, groups, lettered, some_names, split
 from .vectors import Column
 
-MANY = 160                                                    # rows an expression is searched on; it must hold on all
-SEARCHES, ONE_SEARCH = 300, 40                                # for one class, for one expression
-ENOUGH = 6                                                    # unexplained templates after which a class is given up
-ACCIDENTAL = 8                                                # numbers from here on may as well be widths of the samples
+MANY = 160  # rows an expression is searched on; it must hold on all
+SEARCHES, ONE_SEARCH = 300, 40  # for one class, for one expression
+ENOUGH = 6  # unexplained templates after which a class is given up
+ACCIDENTAL = 8  # numbers from here on may as well be widths of the samples
 STEP = re.compile(r"step|interval|every|freq|pattern|period|stride|first|dense|offset|start|end|last|moe|layer|num_")
 
 
@@ -28,6 +29,7 @@ class Unexplained(Exception):
 
 
 # ---- what a class's expressions may use ----------------------------------------------------------------------
+
 
 class Fitter:
     """Fits everything about one class, remembering what has been fitted: many tensors share their dimensions."""
@@ -69,11 +71,17 @@ class Fitter:
                 if k != s.key:
                     implied[k] += 1
         keys = [k for k, _ in sorted(direct.items(), key=lambda kv: (-kv[1], kv[0]))][:9]
-        keys += [k for k, _ in sorted(implied.items(), key=lambda kv: (-kv[1], kv[0])) if k not in keys and not NOISE.search(k.split(".")[-1])][:max(3, 8 - len(keys))]
+        keys += [
+            k
+            for k, _ in sorted(implied.items(), key=lambda kv: (-kv[1], kv[0]))
+            if k not in keys and not NOISE.search(k.split(".")[-1])
+        ][: max(3, 8 - len(keys))]
         if keys:
             return keys
         live = [self.by_number[n] for n in values]
-        varied = [k for k in live[0].flat if len({repr(s.flat.get(k)) for s in live}) > 1 and not NOISE.search(k.split(".")[-1])]
+        varied = [
+            k for k in live[0].flat if len({repr(s.flat.get(k)) for s in live}) > 1 and not NOISE.search(k.split(".")[-1])
+        ]
         return sorted(varied, key=lambda k: not LAYERS.match(k.split(".")[-1]))[:14]
 
     def columns(self, rows, keys, indexed=0):
@@ -82,7 +90,7 @@ class Fitter:
         flats = [self.by_number[n].flat for n, _ in rows]
         for rank, k in enumerate(keys):
             values = [f.get(k) for f in flats]
-            cost = 1 + .04 * rank
+            cost = 1 + 0.04 * rank
             out.append(Column(f"c.{k}", values, cost, there=self.there(k, flats)))
             if any(isinstance(v, list) for v in values):
                 out.extend(of_list(f"c.{k}", values, rows, indexed, cost))
@@ -93,7 +101,13 @@ class Fitter:
     def all_lists(self):
         """Keys that hold lists in every sample."""
         first = self.samples[0].flat
-        return [k for k, v in first.items() if isinstance(v, list) and not NOISE.search(k.split(".")[-1]) and all(isinstance(s.flat.get(k), list) for s in self.samples)]
+        return [
+            k
+            for k, v in first.items()
+            if isinstance(v, list)
+            and not NOISE.search(k.split(".")[-1])
+            and all(isinstance(s.flat.get(k), list) for s in self.samples)
+        ]
 
     # -- numbers
 
@@ -108,19 +122,24 @@ class Fitter:
             extra = self.index_literals(some, columns, keys, indexed) if indexed else ()
             found = conditions.number(wanted, columns, extra, 0 if self.heads_of(keys) else depth)
             if found is None and (more := self.heads_of(keys)):
-                found = conditions.number(wanted, self.columns(some, keys[:4] + more, indexed), extra, 0) or conditions.number(wanted, columns, extra, depth)
+                found = conditions.number(wanted, self.columns(some, keys[:4] + more, indexed), extra, 0) or conditions.number(
+                    wanted, columns, extra, depth
+                )
             if found is None:
                 lists = [k for k in self.all_lists() if k not in keys]
                 if lists:
-                    found = conditions.number(wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, min(depth, 1 + (indexed > 0)))
+                    found = conditions.number(
+                        wanted, self.columns(some, keys[:5] + lists[:8], indexed), extra, min(depth, 1 + (indexed > 0))
+                    )
             return found and found[1]
+
         def plainly(some, wanted):
             found = conditions.number(wanted, self.columns(some, keys, indexed), (), 0)
             return found[1] if found and found[0] < (4.5 if depth is not None else 2.6) else None
 
         def tried():
             text = self.one_told(rows, targets, told)
-            if depth is None:                                 # only what is simple
+            if depth is None:  # only what is simple
                 return text or self.hold(what, keys, rows, targets, plainly)
             if text is None and told:
                 try:
@@ -128,6 +147,7 @@ class Fitter:
                 except Unexplained:
                     text = self.followed(rows, targets, values, indexed, told)
             return text or self.hold(what, keys, rows, targets, solve)
+
         return self.remembered(f"number {depth} {indexed}", (tuple(rows), tuple(targets), tuple(told)), tried)
 
     def can_say(self, text, rows):
@@ -138,7 +158,7 @@ class Fitter:
     def value(self, text, row):
         try:
             return evaluate.value(text, self.by_number[row[0]].flat, row[1])
-        except Exception:                                     # it asks for what this config does not have
+        except Exception:  # it asks for what this config does not have
             return None
 
     def one_told(self, rows, targets, told):
@@ -185,7 +205,11 @@ class Fitter:
         """Numbers of heads beside widths: a width they do not divide is rounded down, which few samples show."""
         flat = self.samples[0].flat
         beside = {k.rpartition(".")[0] for k in keys if WIDTH.match(k.split(".")[-1])}
-        return [k for k, v in flat.items() if k not in keys[:4] and isinstance(v, int) and HEADS.match(k.split(".")[-1]) and k.rpartition(".")[0] in beside][:3]
+        return [
+            k
+            for k, v in flat.items()
+            if k not in keys[:4] and isinstance(v, int) and HEADS.match(k.split(".")[-1]) and k.rpartition(".")[0] in beside
+        ][:3]
 
     def truth(self, what, rows, targets, values, indexed=0):
         keys = self.influence(values)
@@ -194,14 +218,16 @@ class Fitter:
             said = self.compared(some, indexed)
             if said:
                 i = np.array([ix[-1] if ix else 0 for _, ix in some])
-                first = [Literal(1.02, f"{LETTERS[indexed - 1]} == 0", f"{LETTERS[indexed - 1]} > 0", i == 0)] if indexed else []
+                first = (
+                    [Literal(1.02, f"{LETTERS[indexed - 1]} == 0", f"{LETTERS[indexed - 1]} > 0", i == 0)] if indexed else []
+                )
                 found = conditions.condition(wanted, self.flags(some, keys), said + first)
                 if found is not None:
                     return found
             columns = self.columns(some, keys, indexed)
             extra = [*(self.index_literals(some, columns, keys, indexed) if indexed else ()), *said]
             found = conditions.condition(wanted, columns, extra)
-            if found is None:                                 # a flag that no single change showed
+            if found is None:  # a flag that no single change showed
                 more = [k for k in self.traced.get("reads", ()) if k not in keys and k in self.samples[0].flat]
                 found = conditions.condition(wanted, self.flags(some, [*keys, *more])[:24], extra)
             if found is None and indexed:
@@ -209,6 +235,7 @@ class Fitter:
                 columns = self.columns(some, more, indexed)
                 found = conditions.condition(wanted, columns, self.index_literals(some, columns, more, indexed))
             return found
+
         return self.remembered("truth", (tuple(rows), tuple(targets)), lambda: self.hold(what, keys, rows, targets, solve))
 
     def flags(self, rows, keys):
@@ -218,7 +245,7 @@ class Fitter:
         for rank, k in enumerate(keys):
             values = [f.get(k) for f in flats]
             if any(v is None or isinstance(v, (bool, str)) for v in values) and not any(isinstance(v, list) for v in values):
-                out.append(Column(f"c.{k}", values, 1 + .04 * rank, there=self.there(k, flats)))
+                out.append(Column(f"c.{k}", values, 1 + 0.04 * rank, there=self.there(k, flats)))
         return out
 
     @staticmethod
@@ -242,14 +269,21 @@ class Fitter:
                     said = " && ".join([*(f"c.{p} != null" for p in parents), said])
                     truth = [self.value(said, r) for r in rows]
                 if all(isinstance(t, bool) for t in truth) and len(set(truth)) == 2:
-                    out.append(Literal(1.05 + .004 * len(said), said, f"!({said})" if not said.startswith("!") else said[1:], np.array(truth)))
+                    out.append(
+                        Literal(
+                            1.05 + 0.004 * len(said),
+                            said,
+                            f"!({said})" if not said.startswith("!") else said[1:],
+                            np.array(truth),
+                        )
+                    )
         return out
 
     def told_dims(self, pattern, k):
         """What the class said dimension `k` of the tensors of a template is made of, over the template's indices."""
         out = []
         # The bias of a layer whose weight was replaced by another is padded to it.
-        names = [pattern] + ([pattern[:-len("bias")] + "weight"] if pattern.endswith(".bias") else [])
+        names = [pattern] + ([pattern[: -len("bias")] + "weight"] if pattern.endswith(".bias") else [])
         for skeleton, per in self.traced["dims"].items():
             places = next((found for name in names if (found := aligned(skeleton, name)) is not None), None)
             if places is None:
@@ -271,10 +305,12 @@ class Fitter:
 
     def told_counts(self, indexed):
         """How far the class said its loops run; and the lengths of lists it may go through together."""
-        out = [s for text in self.traced["counts"] for s in spelled_out(text, indexed, self.several, self.traced.get("sites", {}))][:40]
+        out = [
+            s for text in self.traced["counts"] for s in spelled_out(text, indexed, self.several, self.traced.get("sites", {}))
+        ][:40]
         lists = [k for k in self.all_lists() if k in self.traced.get("reads", ())][:6]
         out += [f"size(c.{k})" for k in lists]
-        return out + [f"min(size(c.{a}), size(c.{b}))" for n, a in enumerate(lists) for b in lists[n + 1:]]
+        return out + [f"min(size(c.{a}), size(c.{b}))" for n, a in enumerate(lists) for b in lists[n + 1 :]]
 
     def hold(self, what, keys, rows, targets, solve):
         """What `solve` finds on some of the rows and holds on all: rows it is wrong on are added until it does."""
@@ -283,7 +319,9 @@ class Fitter:
                 return text
         chosen = range(len(rows))
         if len(rows) > MANY:
-            chosen = sorted({*range(0, len(rows), len(rows) // MANY + 1), *list({t: n for n, t in enumerate(targets)}.values())[:40]})
+            chosen = sorted(
+                {*range(0, len(rows), len(rows) // MANY + 1), *list({t: n for n, t in enumerate(targets)}.values())[:40]}
+            )
         for _ in range(8):
             whole, conditions.Work.left = conditions.Work.left, min(conditions.Work.left, ONE_SEARCH)
             granted = conditions.Work.left
@@ -296,7 +334,7 @@ class Fitter:
             wrong = [n for n, (r, t) in enumerate(zip(rows, targets)) if not self.says(text, r, t)]
             if not wrong:
                 return text
-            chosen = sorted({*chosen, *wrong[::len(wrong) // 40 + 1]})
+            chosen = sorted({*chosen, *wrong[:: len(wrong) // 40 + 1]})
         raise Unexplained(f"{what}: {len(set(targets))} values over {len(rows)} rows by {keys[:6]}")
 
     def says(self, text, row, target):
@@ -314,16 +352,31 @@ class Fitter:
 
         def add(cost, text, opposite, truth):
             out.append(Literal(cost, text, opposite, np.array(truth, dtype=bool)))
+
         for m in (2, 3, 4):
             for r in range(m):
-                add(1.6 + .2 * m, f"{letter} % {m} == {r}", f"{letter} % {m} != {r}", i % m == r)
+                add(1.6 + 0.2 * m, f"{letter} % {m} == {r}", f"{letter} % {m} != {r}", i % m == r)
         ints = [c for c in columns if c.kind() == "int" and c.text not in LETTERS]
-        ints += [c for c in self.columns(rows, [k for k, v in self.samples[0].flat.items() if isinstance(v, int) and not isinstance(v, bool) and k not in keys
-                                                and STEP.search(k) and not NOISE.search(k.split(".")[-1])][:10]) if c.kind() == "int"]
+        ints += [
+            c
+            for c in self.columns(
+                rows,
+                [
+                    k
+                    for k, v in self.samples[0].flat.items()
+                    if isinstance(v, int)
+                    and not isinstance(v, bool)
+                    and k not in keys
+                    and STEP.search(k)
+                    and not NOISE.search(k.split(".")[-1])
+                ][:10],
+            )
+            if c.kind() == "int"
+        ]
         for c in ints:
             v = np.array(c.values)
-            add(c.cost + .5, f"{letter} >= {c.text}", f"{letter} < {c.text}", i >= v)
-            add(c.cost + .8, f"{letter} == {c.text} - 1", f"{letter} != {c.text} - 1", i == v - 1)
+            add(c.cost + 0.5, f"{letter} >= {c.text}", f"{letter} < {c.text}", i >= v)
+            add(c.cost + 0.8, f"{letter} == {c.text} - 1", f"{letter} != {c.text} - 1", i == v - 1)
             add(c.cost + 1.2, f"{letter} == {c.text}", f"{letter} != {c.text}", i == v)
             add(c.cost + 1.4, f"{letter} >= {c.text} - 1", f"{letter} < {c.text} - 1", i >= v - 1)
             add(c.cost + 1.5, f"{letter} > {c.text}", f"{letter} <= {c.text}", i > v)
@@ -332,29 +385,53 @@ class Fitter:
             add(c.cost + 1.7, f"{letter} > {c.text} / 2", f"{letter} <= {c.text} / 2", i > half)
             if (v >= 0).all() and not v.all() and v.max() < 64:
                 safe = np.maximum(v, 1)
-                add(c.cost + .9, f"{c.text} > 0 && {letter} % {c.text} == 0", f"!({c.text} > 0 && {letter} % {c.text} == 0)", (v > 0) & (i % safe == 0))
-                add(c.cost + 1, f"{c.text} > 0 && ({letter} + 1) % {c.text} == 0", f"!({c.text} > 0 && ({letter} + 1) % {c.text} == 0)", (v > 0) & ((i + 1) % safe == 0))
+                add(
+                    c.cost + 0.9,
+                    f"{c.text} > 0 && {letter} % {c.text} == 0",
+                    f"!({c.text} > 0 && {letter} % {c.text} == 0)",
+                    (v > 0) & (i % safe == 0),
+                )
+                add(
+                    c.cost + 1,
+                    f"{c.text} > 0 && ({letter} + 1) % {c.text} == 0",
+                    f"!({c.text} > 0 && ({letter} + 1) % {c.text} == 0)",
+                    (v > 0) & ((i + 1) % safe == 0),
+                )
             if (v > 0).all() and v.max() < 64:
-                add(c.cost + .7, f"{letter} % {c.text} == 0", f"{letter} % {c.text} != 0", i % v == 0)
-                add(c.cost + .8, f"({letter} + 1) % {c.text} == 0", f"({letter} + 1) % {c.text} != 0", (i + 1) % v == 0)
+                add(c.cost + 0.7, f"{letter} % {c.text} == 0", f"{letter} % {c.text} != 0", i % v == 0)
+                add(c.cost + 0.8, f"({letter} + 1) % {c.text} == 0", f"({letter} + 1) % {c.text} != 0", (i + 1) % v == 0)
                 add(c.cost + 1.1, f"{letter} % {c.text} == 1", f"{letter} % {c.text} != 1", i % v == 1)
                 for d in ints:
                     w = np.array(d.values)
                     if d is not c and re.search("offset|start|first|index|begin", d.text):
-                        add(c.cost + d.cost + .8, f"{letter} % {c.text} == {d.text}", f"{letter} % {c.text} != {d.text}", i % v == w)
-                        add(c.cost + d.cost + 1, f"({letter} - {d.text}) % {c.text} == 0", f"({letter} - {d.text}) % {c.text} != 0", (i - w) % v == 0)
+                        add(
+                            c.cost + d.cost + 0.8,
+                            f"{letter} % {c.text} == {d.text}",
+                            f"{letter} % {c.text} != {d.text}",
+                            i % v == w,
+                        )
+                        add(
+                            c.cost + d.cost + 1,
+                            f"({letter} - {d.text}) % {c.text} == 0",
+                            f"({letter} - {d.text}) % {c.text} != 0",
+                            (i - w) % v == 0,
+                        )
             for d in ints:
                 if d is not c and LAYERS.match(c.text.split(".")[-1]):
                     w = np.array(d.values)
-                    add(c.cost + d.cost + .9, f"{letter} >= {c.text} - {d.text}", f"{letter} < {c.text} - {d.text}", i >= v - w)
+                    add(
+                        c.cost + d.cost + 0.9, f"{letter} >= {c.text} - {d.text}", f"{letter} < {c.text} - {d.text}", i >= v - w
+                    )
         for k in dict.fromkeys([*keys, *self.all_lists()[:12]]):
             values = [self.by_number[n].flat.get(k) for n, _ in rows]
             if not any(isinstance(v, list) for v in values):
                 continue
             guard = f"c.{k} != null && " if any(v is None for v in values) else ""
             lists = [v if isinstance(v, list) else [] for v in values]
+
             def both(cost, text, truth):
                 add(cost, guard + text, f"!({guard}{text})", truth)
+
             if all(isinstance(x, int) and not isinstance(x, bool) for v in lists for x in v):
                 both(1.5, f"{letter} in c.{k}", [n in v for n, v in zip(i.tolist(), lists)])
                 full = all(n < len(v) for n, v in zip(i.tolist(), lists))
@@ -368,10 +445,14 @@ class Fitter:
                 if inside:
                     both(1.4, f"c.{k}[{letter}] == {quoted(w)}", [x == w for x in at])
                 elif all(lists):
-                    both(2, f"c.{k}[{letter} % size(c.{k})] == {quoted(w)}", [v[n % len(v)] == w for n, v in zip(i.tolist(), lists)])
+                    both(
+                        2,
+                        f"c.{k}[{letter} % size(c.{k})] == {quoted(w)}",
+                        [v[n % len(v)] == w for n, v in zip(i.tolist(), lists)],
+                    )
             if inside and any(isinstance(x, bool) for x in at):
                 both(1.4, f"c.{k}[{letter}] == true", [x is True for x in at])
-        for c in columns:                                     # that index against a count: the last layer
+        for c in columns:  # that index against a count: the last layer
             if c.kind() == "int" and c.text.startswith("size("):
                 add(2, f"{letter} == {c.text} - 1", f"{letter} != {c.text} - 1", i == np.array(c.values) - 1)
         return out
@@ -402,7 +483,7 @@ class Fitter:
         repeat = []
         for p in range(places):
             sets = {(n, ix): {full[p] for full in per.get(n, ()) if full[:p] == ix} for n, ix in rows}
-            here = "{}".join(prefixes[:p + 1])
+            here = "{}".join(prefixes[: p + 1])
             count, when = self.index_range(pattern, here, p, rows, sets)
             repeat.append([LETTERS[p], count])
             if when:
@@ -450,7 +531,7 @@ class Fitter:
         if whole:
             try:
                 return self.count(here, p, rows, sizes, values, None), None
-            except Unexplained:                               # perhaps a condition on the index ends it early
+            except Unexplained:  # perhaps a condition on the index ends it early
                 pass
         for count in self.bounds(here, p, rows, sizes):
             flat_rows, truth = [], []
@@ -486,10 +567,23 @@ class Fitter:
         """Counts an index with holes may run to: those of its neighbours, those of layers."""
         out = list(self.counts.get(here, {}))
         if not out:
-            out = [c for h, cs in self.counts.items() if h.rpartition("{}")[0] == here.rpartition("{}")[0] and h.count("{}") == here.count("{}") for c in cs][:3]
-        out += [t for t in self.told_counts(p) if all(isinstance(self.value(t, r), int) and self.value(t, r) >= sizes[r] for r in rows)][:4]
+            out = [
+                c
+                for h, cs in self.counts.items()
+                if h.rpartition("{}")[0] == here.rpartition("{}")[0] and h.count("{}") == here.count("{}")
+                for c in cs
+            ][:3]
+        out += [
+            t
+            for t in self.told_counts(p)
+            if all(isinstance(self.value(t, r), int) and self.value(t, r) >= sizes[r] for r in rows)
+        ][:4]
         flat = self.by_number[rows[0][0]].flat
-        out += [f"c.{k}" for k, v in flat.items() if isinstance(v, int) and not isinstance(v, bool) and LAYERS.match(k.split(".")[-1])]
+        out += [
+            f"c.{k}"
+            for k, v in flat.items()
+            if isinstance(v, int) and not isinstance(v, bool) and LAYERS.match(k.split(".")[-1])
+        ]
         out += [f"size(c.{k})" for k in self.all_lists()]
         return list(dict.fromkeys(out))[:9]
 
@@ -560,7 +654,15 @@ def generalised(text, values):
         value, options = int(site[0]), []
         token = f"@{site[0]}_{site[1]}"
         for letter, v in values.items():
-            options += [letter] if v == value else [f"({letter} + {value - v})"] if 0 < value - v < 3 else [f"({letter} - {v - value})"] if 0 < v - value < 3 else []
+            options += (
+                [letter]
+                if v == value
+                else [f"({letter} + {value - v})"]
+                if 0 < value - v < 3
+                else [f"({letter} - {v - value})"]
+                if 0 < v - value < 3
+                else []
+            )
         options.append(str(value))
         texts = [t.replace(token, o) for t in texts for o in options][:12]
     out = []
@@ -569,7 +671,12 @@ def generalised(text, values):
         variants = [t]
         for letter, v in values.items():
             if subscripts and all(abs(n - v) <= 2 for n in subscripts):
-                step = SUBSCRIPT.sub(lambda m, letter=letter, v=v: f"[{letter}]" if int(m[1]) == v else f"[{letter} {'+' if int(m[1]) > v else '-'} {abs(int(m[1]) - v)}]", t)
+                step = SUBSCRIPT.sub(
+                    lambda m, letter=letter, v=v: (
+                        f"[{letter}]" if int(m[1]) == v else f"[{letter} {'+' if int(m[1]) > v else '-'} {abs(int(m[1]) - v)}]"
+                    ),
+                    t,
+                )
                 variants.insert(0, step)
         out += [x for x in variants if x not in out]
     return out
@@ -588,11 +695,21 @@ def spelled_out(text, indexed, several, values):
     if subscripts and indexed and subscripts[-1] - subscripts[0] <= 2 and SUBSCRIPT.sub("[#]", text) in several:
         for base in {subscripts[0], subscripts[-1]}:
             for letter in letters:
-                texts.append(SUBSCRIPT.sub(lambda m: f"[{letter}]" if int(m[1]) == base else f"[{letter} {'+' if int(m[1]) > base else '-'} {abs(int(m[1]) - base)}]", text))
+                texts.append(
+                    SUBSCRIPT.sub(
+                        lambda m: (
+                            f"[{letter}]"
+                            if int(m[1]) == base
+                            else f"[{letter} {'+' if int(m[1]) > base else '-'} {abs(int(m[1]) - base)}]"
+                        ),
+                        text,
+                    )
+                )
     return texts
 
 
 # ---- all templates of a class --------------------------------------------------------------------------------
+
 
 def fit_names(fitter, samples, names_of, order, shapes=True):
     """[[template, entry]] in state-dict order, and what was not explained."""
@@ -604,7 +721,7 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
     while queue:
         pattern = queue.pop(0)
         per = todo[pattern]
-        if len(bad) >= ENOUGH:                                # it cannot be shipped; what fails is what takes time
+        if len(bad) >= ENOUGH:  # it cannot be shipped; what fails is what takes time
             bad.append([lettered(pattern), "not tried", ""])
             continue
         try:
@@ -620,7 +737,7 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
             if not smaller:
                 bad.append([lettered(pattern), *str(e).partition(": ")[::2]])
                 continue
-            for q, sub in smaller.items():                    # each number by itself
+            for q, sub in smaller.items():  # each number by itself
                 todo[q], first[q] = sub, first[pattern]
                 queue.append(q)
     done.sort(key=lambda d: (d[0], d[1]))
@@ -630,7 +747,7 @@ def fit_names(fitter, samples, names_of, order, shapes=True):
 def collapsed(done, samples, names_of):
     """Layers that were told one by one, because all samples that have these tensors have as many, as layers of a list whose
     length is known from others: only where that holds for every sample."""
-    counts = {}                                              # what names of layers start with -> how many there are
+    counts = {}  # what names of layers start with -> how many there are
     for _, name, entry, _ in done:
         if len(entry.get("repeat", ())) == 1 and name.count("{") == 1:
             counts.setdefault(name.split("{")[0], entry["repeat"][0][1])
@@ -658,10 +775,10 @@ def collapsed(done, samples, names_of):
 def fits_all(sample, names_of, prefix, rest, count, when):
     try:
         wanted = evaluate.value(count, sample.flat) if not when or evaluate.value(when, sample.flat) else 0
-    except Exception:                                         # it asks for what this config does not have
+    except Exception:  # it asks for what this config does not have
         return False
     names = names_of(sample)
-    have = [n for n in names if n.startswith(prefix) and n.endswith(rest) and n[len(prefix):-len(rest)].isdigit()]
+    have = [n for n in names if n.startswith(prefix) and n.endswith(rest) and n[len(prefix) : -len(rest)].isdigit()]
     return len(have) == wanted and all(f"{prefix}{k}{rest}" in names for k in range(wanted))
 
 
@@ -673,7 +790,12 @@ def strided(fitter, pattern, per, shapes):
     numbers = {n: sorted(ix[0] for ix in d) for n, d in per.items()}
     if any(len(v) < 2 for v in numbers.values()) or all(v == list(range(len(v))) for v in numbers.values()):
         return None
-    cuts = [[slice(None)], [slice(None, -1), slice(-1, None)], [slice(0, 1), slice(1, None)], [slice(0, 1), slice(1, -1), slice(-1, None)]]
+    cuts = [
+        [slice(None)],
+        [slice(None, -1), slice(-1, None)],
+        [slice(0, 1), slice(1, None)],
+        [slice(0, 1), slice(1, -1), slice(-1, None)],
+    ]
     for cut in cuts:
         try:
             out = [strided_part(fitter, pattern, {n: v[piece] for n, v in numbers.items()}, per, shapes) for piece in cut]
@@ -701,7 +823,7 @@ def in_runs(numbers):
 
 def strided_part(fitter, pattern, numbers, per, shapes):
     runs = in_runs(numbers)
-    if runs is not None:                                      # a loop in a loop
+    if runs is not None:  # a loop in a loop
         inner = {n: {(a, b): per[n][v,] for a, r in enumerate(rs) for b, v in enumerate(r)} for n, rs in runs.items()}
         rows = [(n, (a, b)) for n, rs in sorted(runs.items()) for a, r in enumerate(rs) for b in range(len(r))]
         targets = tuple(v for _, rs in sorted(runs.items()) for r in rs for v in r)
@@ -717,7 +839,9 @@ def strided_part(fitter, pattern, numbers, per, shapes):
     targets = tuple(v for n, vs in sorted(numbers.items()) for v in vs)
     if single:
         text = fitter.number("number", [(n, ()) for n, _ in rows], targets, values, 0, 1)
-        entry = fitter.template_over(pattern.replace("{}", "0"), {n: {(): d[0,]} for n, d in inner.items()}, shapes, [(n, ()) for n in sorted(inner)])
+        entry = fitter.template_over(
+            pattern.replace("{}", "0"), {n: {(): d[0,]} for n, d in inner.items()}, shapes, [(n, ()) for n in sorted(inner)]
+        )
     else:
         text = fitter.number("number", rows, targets, values, 1, 1)
         entry = fitter.template_over(pattern, inner, shapes, [(n, ()) for n in sorted(inner)])
@@ -737,6 +861,7 @@ def fit_class(root, name, known):
 
     def own_tensors(s):
         return {n: v for n, v in s.tensors.items() if not n.startswith(inside)} if inside else s.tensors
+
     done, bad = fit_names(fitter, samples, own_tensors, data.order)
     templates = []
     persistent = {n for s in samples for n in s.persistent}
@@ -745,21 +870,44 @@ def fit_class(root, name, known):
             entry["persistent_buffer"] = True
         templates.append([pattern, entry])
     bad += parts.fit_ties(fitter, samples, done, inside, about)
-    buffers, bad_buffers = fit_names(fitter, samples, lambda s: {n: () for n in s.buffers if not n.startswith(inside)} if inside else {n: () for n in s.buffers}, data.order, False)
-    result = {"class": name, "model_type": about["model_type"], "version": about["version"], "config_class": about["config_class"], "module": about["module"],
-              "samples": len(samples), "order": list(sorted(max(samples, key=lambda s: len(s.tensors)).tensors, key=lambda n: data.order.get(n, 1 << 30))),
-              "base_model_prefix": about["base_model_prefix"], "has_base": about["has_base"],
-              "ignore_missing": about["ignore_missing"], "ignore_unexpected": about["ignore_unexpected"],
-              "models": [[p.rstrip("."), c, mt] for p, c, mt, _ in max(samples, key=lambda s: len(s.tensors)).models],
-              "parts": found.entries(fitter, samples, bad), "tensors": templates, "buffers": [[p, e] for _, p, e, _ in buffers],
-              "unexplained": bad, "unexplained_buffers": bad_buffers,
-              "varied": about.get("varied", []), "source_reads": about.get("source_reads", []), "absent": (about.get("traced") or {}).get("absent", {}),
-              "key_mapping": about.get("key_mapping", []),
-              "refuses": refusals.found([s.flat for s in data.samples], about.get("raised", []), (about.get("traced") or {}).get("literals", []))}
+    buffers, bad_buffers = fit_names(
+        fitter,
+        samples,
+        lambda s: {n: () for n in s.buffers if not n.startswith(inside)} if inside else {n: () for n in s.buffers},
+        data.order,
+        False,
+    )
+    result = {
+        "class": name,
+        "model_type": about["model_type"],
+        "version": about["version"],
+        "config_class": about["config_class"],
+        "module": about["module"],
+        "samples": len(samples),
+        "order": list(sorted(max(samples, key=lambda s: len(s.tensors)).tensors, key=lambda n: data.order.get(n, 1 << 30))),
+        "base_model_prefix": about["base_model_prefix"],
+        "has_base": about["has_base"],
+        "ignore_missing": about["ignore_missing"],
+        "ignore_unexpected": about["ignore_unexpected"],
+        "models": [[p.rstrip("."), c, mt] for p, c, mt, _ in max(samples, key=lambda s: len(s.tensors)).models],
+        "parts": found.entries(fitter, samples, bad),
+        "tensors": templates,
+        "buffers": [[p, e] for _, p, e, _ in buffers],
+        "unexplained": bad,
+        "unexplained_buffers": bad_buffers,
+        "varied": about.get("varied", []),
+        "source_reads": about.get("source_reads", []),
+        "absent": (about.get("traced") or {}).get("absent", {}),
+        "key_mapping": about.get("key_mapping", []),
+        "refuses": refusals.found(
+            [s.flat for s in data.samples], about.get("raised", []), (about.get("traced") or {}).get("literals", [])
+        ),
+    }
     return result
 
 
 # ---- the command ---------------------------------------------------------------------------------------------
+
 
 def main(args):
     fit_version(args.cache / (args.version or importlib.metadata.version("transformers")), args)
@@ -786,7 +934,9 @@ def fit_version(root, args):
             fitted += 1
             Path(str(target) + ".part").write_text(json.dumps(result, indent=1) + "\n")
             Path(str(target) + ".part").replace(target)
-            line = f"{name}: {len(result['tensors'])} templates, {len(result['unexplained'])} unexplained, {time.time() - t:.1f} s"
+            line = (
+                f"{name}: {len(result['tensors'])} templates, {len(result['unexplained'])} unexplained, {time.time() - t:.1f} s"
+            )
         except Exception as e:
             causes[type(e).__name__] += 1
             with open(root / "failed.jsonl", "a") as f:
@@ -796,6 +946,6 @@ def fit_version(root, args):
                 raise
         if args.only:
             print(line, flush=True)
-            for b in (result["unexplained"][:4] if args.only else ()):
+            for b in result["unexplained"][:4] if args.only else ():
                 print("   ", b)
     print(f"{root.name}: {fitted} fitted in {time.time() - started:.0f} s {dict(causes)}", file=sys.stderr)

@@ -2,6 +2,7 @@
 
 A class of a file in rules/architectures that a version's fits do not ship goes into the tool's file with the names (`let`)
 that it uses, and is held against the same unseen configs as any other."""
+
 import ast
 import re
 from pathlib import Path
@@ -12,8 +13,11 @@ from .mended import MENDED, REFUSED
 # {version: classes} whose entries a hand has corrected: they come before what the tool found.
 KEPT = Path(__file__).resolve().parent / "kept.json"
 
-TOKEN = re.compile(r"""\s+|//[^\n]*|/\*.*?\*/|(?P<string>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')|(?P<number>[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"""
-                   r"""|(?P<word>[A-Za-z_$][\w$]*)|(?P<mark>[{}\[\]:,])""", re.DOTALL)
+TOKEN = re.compile(
+    r"""\s+|//[^\n]*|/\*.*?\*/|(?P<string>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')|(?P<number>[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"""
+    r"""|(?P<word>[A-Za-z_$][\w$]*)|(?P<mark>[{}\[\]:,])""",
+    re.DOTALL,
+)
 WORDS = {"true": True, "false": False, "null": None}
 
 
@@ -22,7 +26,7 @@ def parse(text):
     tokens = [(m.lastgroup, m.group()) for m in TOKEN.finditer(text) if m.lastgroup]
     value, at = parsed(tokens, 0)
     if at != len(tokens):
-        raise ValueError(f"more than one value: {tokens[at:at + 3]}")
+        raise ValueError(f"more than one value: {tokens[at : at + 3]}")
     return value
 
 
@@ -134,7 +138,13 @@ def read(folder):
         document = parse(text)
         for entry in document["classes"]:
             if entry["class"] not in REFUSED:
-                kept = Kept(path.stem, entry, document.get("let", {}), document.get("computed", {}), entry.get("loaders", document["loaders"]))
+                kept = Kept(
+                    path.stem,
+                    entry,
+                    document.get("let", {}),
+                    document.get("computed", {}),
+                    entry.get("loaders", document["loaders"]),
+                )
                 out.setdefault(kept.name, []).append(kept)
     return out
 

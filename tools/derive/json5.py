@@ -1,4 +1,5 @@
 """Writes JSON5 the way the files beside it are written by hand: unquoted keys, lines that are full but not long."""
+
 import json
 import re
 
@@ -39,7 +40,11 @@ def dump(value, indent=0, before=0):
     else:
         opening, closing = "[", "]"
         entries = [dump(v, indent + 2, indent + 2) for v in value]
-    if isinstance(value, dict) and not isinstance(value, Filled) or any(isinstance(v, dict) for v in value if not isinstance(value, dict)):
+    if (
+        isinstance(value, dict)
+        and not isinstance(value, Filled)
+        or any(isinstance(v, dict) for v in value if not isinstance(value, dict))
+    ):
         lines = [pad + e + "," for e in entries]
     else:
         lines = fill(entries, pad)
@@ -48,7 +53,9 @@ def dump(value, indent=0, before=0):
 
 def must_break(value):
     """Members of `tensors`, and whatever holds them, stand one to a line."""
-    return isinstance(value, dict) and ("tensors" in value or any(isinstance(v, dict) and "tensors" in v for v in value.values()) or isinstance(value, Lines))
+    return isinstance(value, dict) and (
+        "tensors" in value or any(isinstance(v, dict) and "tensors" in v for v in value.values()) or isinstance(value, Lines)
+    )
 
 
 class Lines(dict):

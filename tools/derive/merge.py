@@ -1,9 +1,11 @@
 """One list of tensors for two transformers versions, or more: what is equal is said once, what differs says so in place."""
+
 import difflib
 from dataclasses import replace
 
 from .cel import also, bracketed
 from .tree import Item
+
 
 class Apart(Exception):
     """The versions differ in a way that one entry cannot say."""

@@ -1,4 +1,5 @@
 """Tensor names with numbers in them: which numbers are indices, and templates of names."""
+
 import functools
 import re
 
@@ -22,7 +23,7 @@ def skeleton(name):
 def put(pattern, position, text):
     """`pattern` with its placeholder number `position` replaced."""
     pieces = pattern.split("{}")
-    return "{}".join(pieces[:position + 1]) + text + "{}".join(pieces[position + 1:])
+    return "{}".join(pieces[: position + 1]) + text + "{}".join(pieces[position + 1 :])
 
 
 def groups(samples, names_of):
@@ -56,14 +57,14 @@ def spell_out(pattern, per, position, out):
     for n in sorted({ix[position] for d in per.values() for ix in d}):
         sub = {}
         for s, d in per.items():
-            some = {ix[:position] + ix[position + 1:]: v for ix, v in d.items() if ix[position] == n}
+            some = {ix[:position] + ix[position + 1 :]: v for ix, v in d.items() if ix[position] == n}
             if some:
                 sub[s] = some
         settle(put(pattern, position, str(n)), sub, position, out)
 
 
 def lettered(pattern):
-    for letter in LETTERS[:pattern.count("{}")]:
+    for letter in LETTERS[: pattern.count("{}")]:
         pattern = pattern.replace("{}", "{" + letter + "}", 1)
     return pattern
 
@@ -88,7 +89,7 @@ def split(pattern, per):
         if len(numbers) <= 8:
             out = {}
             for n in sorted(numbers):
-                sub = {s: {ix[:p] + ix[p + 1:]: v for ix, v in d.items() if ix[p] == n} for s, d in per.items()}
+                sub = {s: {ix[:p] + ix[p + 1 :]: v for ix, v in d.items() if ix[p] == n} for s, d in per.items()}
                 out[put(pattern, p, str(n))] = {s: d for s, d in sub.items() if d}
             return out
     return None

@@ -1,18 +1,45 @@
 """Names (`let`) for what the expressions of a file say often, so that shapes can be read."""
+
 import re
 from collections import Counter
 
 from .cel import paths, replace_path, variables
 from .tree import conditions, identifier, rewritten
 
-OFTEN = 3                                                    # uses from which a well-known width gets its short name
-LONG, LONG_OFTEN = 30, 3                                     # characters, and uses, from which anything else gets one
-WIDTHS = {"hidden_size": "h", "intermediate_size": "ff", "d_model": "d", "embed_dim": "e", "n_embd": "e", "dim": "d", "hidden_dim": "h", "d_ff": "ff", "ffn_dim": "ff",
-          "encoder_ffn_dim": "encoder_ff", "decoder_ffn_dim": "decoder_ff", "moe_intermediate_size": "expert_ff", "embedding_size": "e", "vision_hidden_size": "vision_h"}
-PRODUCTS = {"c.num_attention_heads * c.head_dim": "q", "c.head_dim * c.num_attention_heads": "q",
-            "c.num_attention_heads * head_dim": "q", "c.num_key_value_heads * head_dim": "kv",
-            "c.num_key_value_heads * c.head_dim": "kv", "c.head_dim * c.num_key_value_heads": "kv"}
-SUBS = {"text_config": "text_", "vision_config": "vision_", "audio_config": "audio_", "encoder": "encoder_", "decoder": "decoder_", "backbone_config": "backbone_"}
+OFTEN = 3  # uses from which a well-known width gets its short name
+LONG, LONG_OFTEN = 30, 3  # characters, and uses, from which anything else gets one
+WIDTHS = {
+    "hidden_size": "h",
+    "intermediate_size": "ff",
+    "d_model": "d",
+    "embed_dim": "e",
+    "n_embd": "e",
+    "dim": "d",
+    "hidden_dim": "h",
+    "d_ff": "ff",
+    "ffn_dim": "ff",
+    "encoder_ffn_dim": "encoder_ff",
+    "decoder_ffn_dim": "decoder_ff",
+    "moe_intermediate_size": "expert_ff",
+    "embedding_size": "e",
+    "vision_hidden_size": "vision_h",
+}
+PRODUCTS = {
+    "c.num_attention_heads * c.head_dim": "q",
+    "c.head_dim * c.num_attention_heads": "q",
+    "c.num_attention_heads * head_dim": "q",
+    "c.num_key_value_heads * head_dim": "kv",
+    "c.num_key_value_heads * c.head_dim": "kv",
+    "c.head_dim * c.num_key_value_heads": "kv",
+}
+SUBS = {
+    "text_config": "text_",
+    "vision_config": "vision_",
+    "audio_config": "audio_",
+    "encoder": "encoder_",
+    "decoder": "decoder_",
+    "backbone_config": "backbone_",
+}
 
 
 def short(path):
@@ -42,7 +69,13 @@ def name_all(classes):
             naming.rewrite(lambda t, path=path, name=name: replace_path(t, path, name))
     texts = naming.counted()
     for place, kind, text in naming.said():
-        if len(text) >= LONG and not re.fullmatch(r"c[\w.]+", text) and texts[text] >= LONG_OFTEN and text not in naming.lets.values() and not variables(text) & indices:
+        if (
+            len(text) >= LONG
+            and not re.fullmatch(r"c[\w.]+", text)
+            and texts[text] >= LONG_OFTEN
+            and text not in naming.lets.values()
+            and not variables(text) & indices
+        ):
             name = stem(place, kind)
             while not naming.free(name) or name in widths:
                 name += "_too" if not name[-1].isdigit() else "0"

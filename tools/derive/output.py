@@ -1,4 +1,5 @@
 """Writing results so that a run that is killed leaves none half-written."""
+
 import gzip
 import json
 

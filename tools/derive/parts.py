@@ -1,4 +1,5 @@
 """Models inside models: which can be referred to instead of repeated; and which tensors share their storage."""
+
 import functools
 import importlib.metadata
 import importlib.util
@@ -6,11 +7,18 @@ import json
 import re
 from pathlib import Path
 
-from . import conditions
 
-AUTO = {"AutoModel": "model", "AutoModelForCausalLM": "causal_lm", "AutoModelForSeq2SeqLM": "seq_to_seq_causal_lm", "AutoBackbone": "backbone",
-        "load_backbone": "backbone", "AutoModelForImageTextToText": "image_text_to_text", "AutoModelForTextEncoding": "text_encoding",
-        "AutoModelForMaskedLM": "masked_lm", "AutoModelForKeypointDetection": "keypoint_detection"}
+AUTO = {
+    "AutoModel": "model",
+    "AutoModelForCausalLM": "causal_lm",
+    "AutoModelForSeq2SeqLM": "seq_to_seq_causal_lm",
+    "AutoBackbone": "backbone",
+    "load_backbone": "backbone",
+    "AutoModelForImageTextToText": "image_text_to_text",
+    "AutoModelForTextEncoding": "text_encoding",
+    "AutoModelForMaskedLM": "masked_lm",
+    "AutoModelForKeypointDetection": "keypoint_detection",
+}
 
 
 class Parts:
@@ -22,8 +30,14 @@ class Parts:
     def entries(self, fitter, samples, bad):
         out = []
         for prefix, p in self.prefixes.items():
-            entry = {"prefix": prefix, "config": p["config"] or None, "classes": dict(sorted(p["classes"].items())), "auto": p["auto"], "when": None,
-                     "without": p["without"]}
+            entry = {
+                "prefix": prefix,
+                "config": p["config"] or None,
+                "classes": dict(sorted(p["classes"].items())),
+                "auto": p["auto"],
+                "when": None,
+                "without": p["without"],
+            }
             present = {s.number: has(s, prefix) for s in samples}
             if not all(present.values()):
                 rows = [(s.number, ()) for s in samples]
@@ -42,7 +56,7 @@ def has(s, prefix):
 def find(samples, name, known, root):
     """Parts that hold by themselves: the same class, built alone from the same config, gives the same tensors, except
     for some it has and the composition leaves out."""
-    seen = {}                                                 # (prefix, path) -> {model_type: [(class, lacks, differs, sample)]}
+    seen = {}  # (prefix, path) -> {model_type: [(class, lacks, differs, sample)]}
     for s in samples:
         for prefix, (cls, path, lacks, differs) in (s.parts or {}).items():
             mt = s.flat.get(path + ".model_type") if path else s.flat.get("model_type", "")
@@ -51,8 +65,12 @@ def find(samples, name, known, root):
     for (prefix, path), kinds in sorted(seen.items(), key=lambda kv: len(kv[0][0])):
         if any(prefix.startswith(p) for p in out.prefixes):
             continue
-        good = {mt: rows for mt, rows in kinds.items() if all(not r[2] and r[0] in known and r[0] != name for r in rows) and len({r[0] for r in rows}) == 1}
-        if good and path:                                     # a copy with small changes is not recognised; the class still tells
+        good = {
+            mt: rows
+            for mt, rows in kinds.items()
+            if all(not r[2] and r[0] in known and r[0] != name for r in rows) and len({r[0] for r in rows}) == 1
+        }
+        if good and path:  # a copy with small changes is not recognised; the class still tells
             for s in samples:
                 mt = s.flat.get(path + ".model_type")
                 for p, cls, inner, where in s.models:
@@ -62,18 +80,27 @@ def find(samples, name, known, root):
         if not good or without is None:
             continue
         bad = {s.number for mt, rows in kinds.items() if mt not in good for *_, s in rows}
-        bad |= {s.number for s in samples if has(s, prefix) and (s.flat.get(path + ".model_type") if path else s.flat.get("model_type", "")) not in good}
-        if len(bad) > .7 * len(samples):
+        bad |= {
+            s.number
+            for s in samples
+            if has(s, prefix) and (s.flat.get(path + ".model_type") if path else s.flat.get("model_type", "")) not in good
+        }
+        if len(bad) > 0.7 * len(samples):
             continue
         out.unusable |= bad
         classes = {mt: rows[0][0] for mt, rows in good.items()}
-        out.prefixes[prefix] = {"config": path, "classes": classes, "without": without, "auto": auto_mapping(root, samples, name, prefix, classes) if path else None}
+        out.prefixes[prefix] = {
+            "config": path,
+            "classes": classes,
+            "without": without,
+            "auto": auto_mapping(root, samples, name, prefix, classes) if path else None,
+        }
     return out
 
 
 def left_out(prefix, rows):
     """The shortest prefixes of what the composition leaves out, or None where they would take along something it has."""
-    inside = {n[len(prefix):] for *_, s in rows for n in s.tensors if n.startswith(prefix)}
+    inside = {n[len(prefix) :] for *_, s in rows for n in s.tensors if n.startswith(prefix)}
     ends = {"*." + n.split(".")[-1] for _, lacks, _, _ in rows for n in lacks}
     if len(ends) == 1 and not any(n.endswith(end[1:]) for n in inside for end in ends):
         return sorted(ends)
@@ -93,6 +120,7 @@ def left_out(prefix, rows):
 
 # ---- which auto class chooses --------------------------------------------------------------------------------
 
+
 @functools.lru_cache(maxsize=None)
 def auto_table(root):
     return json.loads((root / "auto.json").read_text())
@@ -108,7 +136,7 @@ def source(root, module):
     return path.read_text() if path.exists() else ""
 
 
-MODULES = {}                                                  # class -> module, filled by the fitter
+MODULES = {}  # class -> module, filled by the fitter
 
 
 def auto_mapping(root, samples, name, prefix, classes):
@@ -124,6 +152,7 @@ def auto_mapping(root, samples, name, prefix, classes):
 
 
 # ---- ties ----------------------------------------------------------------------------------------------------
+
 
 def fit_ties(fitter, samples, done, inside, about):
     """Give templates that share their storage with another their `tied_to` and `tied_when`; returns what failed."""
@@ -172,7 +201,7 @@ def chosen_target(fitter, tied):
     truth = tuple(tied[r] == targets[0] for r in rows)
     try:
         when = fitter.truth("tie", rows, truth, {n: tied[n, ()] for n, _ in rows})
-    except Exception:                                         # no condition tells which
+    except Exception:  # no condition tells which
         return None
     return "{" + when.replace('"', "'") + f" ? '{targets[0]}' : '{targets[1]}'" + "}"
 
@@ -190,7 +219,11 @@ def tie_targets(s, inside, about):
     for group in s.tied:
         dropped = {n for n in group if any(re.search(k, n) for k in keys)}
         kept = [n for n in group if n not in dropped] or group
-        kept = [n for n in kept if inside and n.startswith(inside)] or ([n for n in group if n.startswith(inside)] if inside else []) or kept
+        kept = (
+            [n for n in kept if inside and n.startswith(inside)]
+            or ([n for n in group if n.startswith(inside)] if inside else [])
+            or kept
+        )
         out.update((n, kept[0]) for n in group if n != kept[0])
     return out
 

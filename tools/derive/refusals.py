@@ -1,20 +1,23 @@
 """With which configs a class raises: what it compared just before, where that tells every time."""
+
 import collections
 import re
 
 from . import evaluate
 
-FIELD = re.compile(r"^StrictDataclassFieldValidationError")   # the types of fields: told by themselves
+FIELD = re.compile(r"^StrictDataclassFieldValidationError")  # the types of fields: told by themselves
 CLASS = re.compile(r"^StrictDataclassClassValidationError: .*?:\s+(\w+(?:Error|Exception)): ", re.DOTALL)
-NO_CAUSE = re.compile(r"^(TypeError|AttributeError|KeyError|IndexError|ImportError|ModuleNotFoundError|OSError|NotImplementedError|TooSlow|MemoryError)")
-ENOUGH = 3                                                    # times that it must have raised
+NO_CAUSE = re.compile(
+    r"^(TypeError|AttributeError|KeyError|IndexError|ImportError|ModuleNotFoundError|OSError|NotImplementedError|TooSlow|MemoryError)"
+)
+ENOUGH = 3  # times that it must have raised
 
 
 def beginning(error):
     """The exception up to the first thing in it that depends on the config."""
     error = CLASS.sub(lambda m: f"{m[1]}: ", " ".join(error.split()))
     cut = re.search(r"\(?got|[`'\"(\[]?[-+]?\d|\bNone\b|\bTrue\b|\bFalse\b", error)
-    return error[:cut.start()].rstrip(" (:`'\"") if cut else error
+    return error[: cut.start()].rstrip(" (:`'\"") if cut else error
 
 
 def found(fine, raised, literals):
@@ -41,5 +44,5 @@ def found(fine, raised, literals):
 def holds(text, flat):
     try:
         return evaluate.value(text, flat) is True
-    except Exception:                                         # it asks for what this config does not have
+    except Exception:  # it asks for what this config does not have
         return False

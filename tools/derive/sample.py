@@ -4,15 +4,14 @@ For every class: some random bases; one base with every key changed once (the sc
 keys that had an effect; bases on which every optional tensor exists; mixtures of everything that had an effect, keys
 made equal on purpose, and what the class compared made to come out otherwise. All of it is followed (`trace.py`).
 """
+
 import copy
 import gc
-import gzip
 import json
 import os
 import random
 import re
 import resource
-import sys
 import time
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -22,7 +21,7 @@ os.environ["CUDA_VISIBLE_DEVICES"] = ""
 from . import catalogue, config_sample, configs, evaluate, sources, trace  # noqa: E402
 from .build import TooSlow, alone, build, facts, nested_models, without_initialisation  # noqa: E402
 from .catalogue import VERSION  # noqa: E402
-from .configs import alternatives, candidates, changed, copied, flatten, is_int, random_raw  # noqa: E402
+from .configs import alternatives, candidates, changed, copied, flatten, is_int  # noqa: E402
 from .keys import FLAG, NOISE, OPTIONAL  # noqa: E402
 from .names import skeleton  # noqa: E402
 from .output import failed, write_json  # noqa: E402
@@ -31,7 +30,7 @@ MEMORY = 5 << 30
 BASES, MIXED, EQUAL, FLIPS = 6, 24, 6, 40
 # A budget in modules built, not in seconds, so that the same version gives the same samples. A module costs about 100 µs.
 FIRST_BUDGET, OTHER_BUDGET, LEAST = 9000, 5000, 40
-CLASS_SECONDS = 60                                            # a stop for what the budget does not see
+CLASS_SECONDS = 60  # a stop for what the budget does not see
 
 
 class Traced:
@@ -39,8 +38,8 @@ class Traced:
 
     def __init__(self):
         self.dims, self.literals, self.counts, self.reads, self.absent, self.opaque = {}, {}, {}, set(), {}, False
-        self.sites = {}                                       # place in the source -> values its loop index had
-        self.names = {}                                       # path of a config inside -> {key: its other names}
+        self.sites = {}  # place in the source -> values its loop index had
+        self.names = {}  # path of a config inside -> {key: its other names}
 
     def add(self, record, model):
         self.reads |= record.reads.keys()
@@ -71,9 +70,19 @@ class Traced:
                     rows.append([list(indices), text])
 
     def packed(self):
-        dims = {p: {k: [r for rows in list(kinds.values())[:12] for r in rows] for k, kinds in per.items()} for p, per in self.dims.items()}
-        return {"dims": dims, "literals": list(self.literals), "counts": list(self.counts), "reads": sorted(self.reads), "absent": self.absent,
-                "names": self.names, "sites": self.sites}
+        dims = {
+            p: {k: [r for rows in list(kinds.values())[:12] for r in rows] for k, kinds in per.items()}
+            for p, per in self.dims.items()
+        }
+        return {
+            "dims": dims,
+            "literals": list(self.literals),
+            "counts": list(self.counts),
+            "reads": sorted(self.reads),
+            "absent": self.absent,
+            "names": self.names,
+            "sites": self.sites,
+        }
 
 
 SITE = re.compile(r"@(\d+)_(\d+)")
@@ -119,15 +128,25 @@ class Sampler:
         self.varied.add(key)
         self.spent += b.modules
         self.count += 1
-        s = {"raw": raw, "parent": parent, "key": key, "flat": b.flat, "tensors": b.tensors, "tied": b.tied, "buffers": b.buffers,
-             "persistent": b.persistent, "models": self.models(b, config), "reads": reads}
+        s = {
+            "raw": raw,
+            "parent": parent,
+            "key": key,
+            "flat": b.flat,
+            "tensors": b.tensors,
+            "tied": b.tied,
+            "buffers": b.buffers,
+            "persistent": b.persistent,
+            "models": self.models(b, config),
+            "reads": reads,
+        }
         if self.facts is None:
             self.facts = facts(b, self.cls)
         if parent is None or {(m[0], m[1]) for m in s["models"]} - set(self.parts):
             self.note_parts(b, s)
         self.seen[mark] = len(self.samples)
         self.samples.append(s)
-        for k in [*(reads or ()), *self.traced.absent]:       # where it was read first
+        for k in [*(reads or ()), *self.traced.absent]:  # where it was read first
             self.first.setdefault(k, len(self.samples) - 1)
         return len(self.samples) - 1
 
@@ -155,7 +174,9 @@ class Sampler:
         if reads is None:
             return False
         changed_keys = [k for k in flat.keys() | s["flat"].keys() if repr(flat.get(k)) != repr(s["flat"].get(k))]
-        return not any(k in reads or any(k.startswith(r + ".") for r in reads) or k not in s["flat"] or k not in flat for k in changed_keys)
+        return not any(
+            k in reads or any(k.startswith(r + ".") for r in reads) or k not in s["flat"] or k not in flat for k in changed_keys
+        )
 
     def models(self, b, config):
         """`nested_models`, worked out again only for models not seen before: comparing configs is slow."""
@@ -175,11 +196,11 @@ class Sampler:
             if by_itself is None:
                 continue
             tensors, tied = by_itself
-            inside = {n[len(prefix):]: shape for n, shape in b.tensors.items() if n.startswith(prefix)}
+            inside = {n[len(prefix) :]: shape for n, shape in b.tensors.items() if n.startswith(prefix)}
             lacks = sorted(set(tensors) - set(inside))
             differs = sorted(n for n in inside if tensors.get(n) != inside[n])
             # Tensors that it shares by itself and not here: then it is no part either.
-            here = {frozenset(n[len(prefix):] for n in g if n.startswith(prefix)) for g in b.tied}
+            here = {frozenset(n[len(prefix) :] for n in g if n.startswith(prefix)) for g in b.tied}
             differs += [n for g in tied for n in g if not any(g <= h for h in here) and g <= set(inside)]
             s["parts"][prefix] = [name, path, lacks, differs]
             if not differs and tensors:
@@ -197,14 +218,20 @@ class Sampler:
         known = tuple(x for x, v in p.get("parts", {}).items() if not v[3] and v[0] in self.known) or None
         if known is None or s["tied"] != p["tied"] or s["buffers"] != p["buffers"] and not known:
             return 2
+
         def outside(t):
             return {n: v for n, v in t["tensors"].items() if not n.startswith(known)}
+
         return 2 if outside(s) != outside(p) else 1
 
     def alike(self, k, flat, keys):
         """Values that other keys have: some tensors are there only where two are the same."""
         v, beside = flat.get(k), k.rpartition(".")[0]
-        others = [flat.get(o) for o in keys if o != k and o.rpartition(".")[0] == beside and not re.search("vocab|layers|heads", o + k)]
+        others = [
+            flat.get(o)
+            for o in keys
+            if o != k and o.rpartition(".")[0] == beside and not re.search("vocab|layers|heads", o + k)
+        ]
         pool = [x for o in others for x in (o if isinstance(o, list) else [o]) if is_int(x) and x > 1]
         if not pool:
             return []
@@ -219,7 +246,7 @@ class Sampler:
     def run(self):
         bases = [i for i in (self.make(r) for r in self.raws) if i is not None]
         if not bases:
-            self.device, self.seen = "cpu", {}                  # some need values while they are built
+            self.device, self.seen = "cpu", {}  # some need values while they are built
             bases = [i for i in (self.make(r) for r in self.raws[:6]) if i is not None]
             if not bases:
                 raise RuntimeError(max(self.errors, key=self.errors.get, default="no config to start from"))
@@ -234,7 +261,7 @@ class Sampler:
         for depth, base in enumerate(order):
             self.deepen(base, strong, 3 if depth < 1 else 1)
         self.joint(order[:2])
-        for base in order[:2]:                                # neither does anything without the other
+        for base in order[:2]:  # neither does anything without the other
             raw = self.samples[base]["raw"]
             if {"is_decoder", "add_cross_attention"} <= set(self.samples[base]["flat"]):
                 self.make(changed(changed(raw, "is_decoder", True), "add_cross_attention", True), base, "add_cross_attention")
@@ -251,7 +278,7 @@ class Sampler:
                 continue
             if not self.left():
                 break
-            for v in self.alternatives(k, flat.get(k))[:3 if flat.get(k) is None else 2]:
+            for v in self.alternatives(k, flat.get(k))[: 3 if flat.get(k) is None else 2]:
                 i = self.change(base, raw, k, v)
                 if i is not None:
                     e = self.effect(i)
@@ -261,14 +288,20 @@ class Sampler:
 
     def candidates(self, flat):
         """Keys worth changing: those of the config, and those that the source asks for though the config has none."""
-        return candidates(flat, self.words) + [k for k in sorted(self.traced.absent) if k not in flat and not NOISE.search(k.split(".")[-1])]
+        return candidates(flat, self.words) + [
+            k for k in sorted(self.traced.absent) if k not in flat and not NOISE.search(k.split(".")[-1])
+        ]
 
     def alternatives(self, k, v):
         if v is None and k in self.traced.absent:
             default, _ = self.traced.absent[k]
             if default is not None:
                 return alternatives(k, default, self.words)
-            if FLAG.search(k.split(".")[-1]) and not OPTIONAL.search(k.split(".")[-1]) or re.search(r"(^|\.)(use|is|has|tie|add|with)_|_use_", k):
+            if (
+                FLAG.search(k.split(".")[-1])
+                and not OPTIONAL.search(k.split(".")[-1])
+                or re.search(r"(^|\.)(use|is|has|tie|add|with)_|_use_", k)
+            ):
                 return [False, True]
         return alternatives(k, v, self.words)
 
@@ -325,9 +358,22 @@ class Sampler:
 
     def equalise(self, bases, keys):
         """Widths made equal: some projections exist only where two keys differ."""
-        wide = [k for k in keys if all(is_int(self.samples[b]["flat"].get(k)) for b in bases) and re.search("size|dim|d_model|n_embd|width|channels|heads|experts|layers", k)]
-        pairs = [(a, b) for a in wide for b in wide if a != b and a.rpartition(".")[0] == b.rpartition(".")[0]
-                 and ("layers" in a) == ("layers" in b) and ("heads" in a) == ("heads" in b) and "vocab" not in a + b]
+        wide = [
+            k
+            for k in keys
+            if all(is_int(self.samples[b]["flat"].get(k)) for b in bases)
+            and re.search("size|dim|d_model|n_embd|width|channels|heads|experts|layers", k)
+        ]
+        pairs = [
+            (a, b)
+            for a in wide
+            for b in wide
+            if a != b
+            and a.rpartition(".")[0] == b.rpartition(".")[0]
+            and ("layers" in a) == ("layers" in b)
+            and ("heads" in a) == ("heads" in b)
+            and "vocab" not in a + b
+        ]
         self.rng.shuffle(pairs)
         pairs.sort(key=lambda p: not re.search("embed|proj|hidden_size|dim", p[0]))
         done = 0
@@ -362,7 +408,12 @@ class Sampler:
     def late(self):
         """Keys that are read only where something else has another value: changed there."""
         for k, at in sorted(self.first.items()):
-            if k in self.varied or NOISE.search(k.split(".")[-1]) or configs.FIXED_FLAG.search(k.split(".")[-1]) or not self.left():
+            if (
+                k in self.varied
+                or NOISE.search(k.split(".")[-1])
+                or configs.FIXED_FLAG.search(k.split(".")[-1])
+                or not self.left()
+            ):
                 continue
             s = self.samples[at]
             for v in self.alternatives(k, s["flat"].get(k))[:2]:
@@ -403,7 +454,11 @@ class Sampler:
             flat = self.samples[base]["flat"]
             flags = [k for k in keys if not is_int(flat.get(k))]
             quiet = [k for k in sorted(self.traced.reads) if isinstance(flat.get(k), bool) and k not in keys]
-            chosen = [k for k in flags if self.rng.random() < .5] + [k for k in quiet if self.rng.random() < .2] + self.rng.sample(keys, min(len(keys), self.rng.randint(1, 3)))
+            chosen = (
+                [k for k in flags if self.rng.random() < 0.5]
+                + [k for k in quiet if self.rng.random() < 0.2]
+                + self.rng.sample(keys, min(len(keys), self.rng.randint(1, 3)))
+            )
             for k in dict.fromkeys(chosen):
                 options = self.alternatives(k, flat.get(k))[:5] if k in flat or k in self.traced.absent else []
                 if done % 2:
@@ -419,7 +474,7 @@ class Sampler:
 def truth(text, flat):
     try:
         return bool(evaluate.value(text, flat))
-    except Exception:                                         # it asks for what this config does not have
+    except Exception:  # it asks for what this config does not have
         return None
 
 
@@ -438,6 +493,7 @@ def templates(tensors):
 
 # ---- a file per class ----------------------------------------------------------------------------------------
 
+
 def packed(sampler, extra):
     """The samples with every repeated thing written once: names by number, children as differences from their parents."""
     names, number = [], {}
@@ -447,12 +503,23 @@ def packed(sampler, extra):
             number[n] = len(names)
             names.append(n)
         return number[n]
+
     rows = []
     for s in sampler.samples:
-        p = sampler.samples[s["parent"]] if s["parent"] is not None else {"flat": {}, "tensors": {}, "tied": None, "buffers": None, "persistent": None, "models": None}
-        row = {"raw": s["raw"], "parent": s["parent"], "key": s["key"],
-               "flat": {k: v for k, v in s["flat"].items() if k not in p["flat"] or repr(p["flat"][k]) != repr(v)}, "flat_gone": [k for k in p["flat"] if k not in s["flat"]],
-               "t": [[at(n), *v] for n, v in s["tensors"].items() if p["tensors"].get(n) != v], "t_gone": [at(n) for n in p["tensors"] if n not in s["tensors"]]}
+        p = (
+            sampler.samples[s["parent"]]
+            if s["parent"] is not None
+            else {"flat": {}, "tensors": {}, "tied": None, "buffers": None, "persistent": None, "models": None}
+        )
+        row = {
+            "raw": s["raw"],
+            "parent": s["parent"],
+            "key": s["key"],
+            "flat": {k: v for k, v in s["flat"].items() if k not in p["flat"] or repr(p["flat"][k]) != repr(v)},
+            "flat_gone": [k for k in p["flat"] if k not in s["flat"]],
+            "t": [[at(n), *v] for n, v in s["tensors"].items() if p["tensors"].get(n) != v],
+            "t_gone": [at(n) for n in p["tensors"] if n not in s["tensors"]],
+        }
         if s["tied"] != p["tied"]:
             row["tied"] = [[at(n) for n in g] for g in s["tied"]]
         for k in ("buffers", "persistent"):
@@ -464,13 +531,27 @@ def packed(sampler, extra):
             row["parts"] = s["parts"]
         rows.append(row)
     largest = max(sampler.samples, key=lambda s: len(s["tensors"]))
-    extra = {**extra, "traced": sampler.traced.packed(), "varied": sorted(k for k in sampler.varied if k),
-             "source_reads": sources.model_reads(sampler.cls), "raised": sampler.raised}
-    return {"class": sampler.cls.__name__, **extra, **sampler.facts, "device": sampler.device, "samples": rows, "names": names,
-            "order": [at(n) for n in largest["tensors"]], "errors": dict(sorted(sampler.errors.items(), key=lambda kv: -kv[1])[:8])}
+    extra = {
+        **extra,
+        "traced": sampler.traced.packed(),
+        "varied": sorted(k for k in sampler.varied if k),
+        "source_reads": sources.model_reads(sampler.cls),
+        "raised": sampler.raised,
+    }
+    return {
+        "class": sampler.cls.__name__,
+        **extra,
+        **sampler.facts,
+        "device": sampler.device,
+        "samples": rows,
+        "names": names,
+        "order": [at(n) for n in largest["tensors"]],
+        "errors": dict(sorted(sampler.errors.items(), key=lambda kv: -kv[1])[:8]),
+    }
 
 
 # ---- the run -------------------------------------------------------------------------------------------------
+
 
 def sample_family(root, model_type, names, again, log):
     """All classes of one model type: they share their bases."""
@@ -497,7 +578,10 @@ def sample_family(root, model_type, names, again, log):
             words = configs.compared_words(*sources.texts(cls, cc))
             s = Sampler(cls, cc, mt, raws, words, known, OTHER_BUDGET if known else FIRST_BUDGET)
             s.run()
-            write_json(root / "samples" / f"{name}.json.gz", packed(s, {"model_type": mt, "config_class": cc.__name__, "version": VERSION}))
+            write_json(
+                root / "samples" / f"{name}.json.gz",
+                packed(s, {"model_type": mt, "config_class": cc.__name__, "version": VERSION}),
+            )
             known.add(name)
             print(f"{name}: {len(s.samples)} samples, {s.spent} modules, {time.time() - started:.1f} s", file=log, flush=True)
         except MemoryError:
@@ -508,14 +592,16 @@ def sample_family(root, model_type, names, again, log):
 
 def family_raws(model_type, config_class, cls, count, seed):
     """Configs that this class can be built from."""
+
     def works(raw):
         try:
             build(cls, config_class(**copied(raw)))
         except (MemoryError, TooSlow):
             raise
         except Exception as e:
-            if "meta" not in str(e):                          # "cannot copy out of meta tensor": tried again on the CPU
+            if "meta" not in str(e):  # "cannot copy out of meta tensor": tried again on the CPU
                 raise
+
     return config_sample.base_raws(model_type, config_class, works, count, seed)
 
 
@@ -524,7 +610,7 @@ def labelled(name, raws):
     if not re.search("Classification|MultipleChoice|Segmentation|Detection", name):
         return raws
     rng = random.Random(f"labels/{name}")
-    return [{**copied(r), "num_labels": rng.randint(1, 7)} if rng.random() < .8 else r for r in raws]
+    return [{**copied(r), "num_labels": rng.randint(1, 7)} if rng.random() < 0.8 else r for r in raws]
 
 
 def has_failed(root):
@@ -540,7 +626,7 @@ def work(root, todo, args):
     without_initialisation()
     trace.install()
     with open(root / "sample.log", "a") as log:
-        for model_type, names in todo[:args.restart_every]:
+        for model_type, names in todo[: args.restart_every]:
             try:
                 sample_family(root, model_type, names, args.again, log)
             except MemoryError:
@@ -556,8 +642,11 @@ def main(args):
     root = args.cache / VERSION
     root.mkdir(parents=True, exist_ok=True)
     write_json(root / "auto.json", {m: {mt: c[0] for mt, c in t.items() if c} for m, t in catalogue.mappings().items()})
-    families = [(mt, names) for mt, names in catalogue.families()
-                if not args.only or re.search(args.only, mt) or any(re.search(args.only, n) for n in names)]
+    families = [
+        (mt, names)
+        for mt, names in catalogue.families()
+        if not args.only or re.search(args.only, mt) or any(re.search(args.only, n) for n in names)
+    ]
     if args.again:
         args.restart_every = len(families)
     while True:
@@ -572,7 +661,7 @@ def main(args):
         if pid == 0:
             work(root, todo, args)
         _, status = os.waitpid(pid, 0)
-        if status:                                            # killed, or out of memory: the class at hand is to blame
+        if status:  # killed, or out of memory: the class at hand is to blame
             failed(root, (root / "current").read_text(), f"the process ended with status {status}")
         if args.again:
             return 0

@@ -1,4 +1,5 @@
 """What a verified run leaves in the repository: the architecture files, and a list of what is not among them and why."""
+
 import json
 import re
 from pathlib import Path
@@ -17,7 +18,10 @@ KINDS = [
     ("its tensors are not explained by its config", r"^not explained"),
     ("too few or no unseen configs", r"unseen configs"),
     ("described by hand in a file of its own", r"^by hand"),
-    ("needs a package that is not installed", r"requires? (the )?.{0,60}(librar|backend|package|install)|No module named|not found in your environment|pip install|ImportError|ModuleNotFound"),
+    (
+        "needs a package that is not installed",
+        r"requires? (the )?.{0,60}(librar|backend|package|install)|No module named|not found in your environment|pip install|ImportError|ModuleNotFound",
+    ),
     ("takes too long or too much to build", r"TooSlow|took more|MemoryError|[Tt]imed out|timeout"),
     ("cannot be built from a small random config", r""),
 ]
@@ -42,12 +46,14 @@ def write(writer, out=None):
             v.reasons.pop(kept.name, None)
         for name, reason in sorted(v.reasons.items()):
             if name in mended.get(v.version, ()):
-                continue                                      # what the tool made of it was not right; the file is
+                continue  # what the tool made of it was not right; the file is
             if name not in ships or reason == "by hand":
                 groups.setdefault(kind(reason), {})[name] = short(reason)
         rows[v.version] = groups
     kept = {v.version: [k.name for k in writer.kept_classes(v)] for v in writer.versions}
-    (folder / KEPT.name if out else KEPT).write_text(json.dumps({v: names for v, names in kept.items() if names}, indent=1) + "\n")
+    (folder / KEPT.name if out else KEPT).write_text(
+        json.dumps({v: names for v, names in kept.items() if names}, indent=1) + "\n"
+    )
     target = (folder / NOT_SHIPPED.name) if out else NOT_SHIPPED
     target.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
     sizes = [p.stat().st_size for p in folder.glob("*.json5")]

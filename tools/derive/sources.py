@@ -1,4 +1,5 @@
 """What the source of a class says by itself: which words keys are compared with, which keys are read, which are popped."""
+
 import ast
 import functools
 import inspect
@@ -22,7 +23,9 @@ def texts(*classes):
 
 def bases(cls, stop):
     """A class and what it inherits from, short of the library's own base classes."""
-    return [c for c in cls.__mro__ if c.__module__.startswith(("transformers.models", "transformers_modules")) and c is not stop]
+    return [
+        c for c in cls.__mro__ if c.__module__.startswith(("transformers.models", "transformers_modules")) and c is not stop
+    ]
 
 
 def popped(config_class):
@@ -33,7 +36,11 @@ def popped(config_class):
             text = inspect.getsource(c)
         except (OSError, TypeError):
             continue
-        for key in re.findall(r"\bkwargs\.(?:pop|get|setdefault)\(\s*[\"'](\w+)[\"']", text) + re.findall(r"[\"'](\w+)[\"'] (?:not )?in kwargs", text) + re.findall(r"\bkwargs\[[\"'](\w+)[\"']\]", text):
+        for key in (
+            re.findall(r"\bkwargs\.(?:pop|get|setdefault)\(\s*[\"'](\w+)[\"']", text)
+            + re.findall(r"[\"'](\w+)[\"'] (?:not )?in kwargs", text)
+            + re.findall(r"\bkwargs\[[\"'](\w+)[\"']\]", text)
+        ):
             if key not in found:
                 found.append(key)
     return found
@@ -42,7 +49,10 @@ def popped(config_class):
 def constructed(tree):
     """The functions of a module that may run while a model is built: constructors and what stands outside of `forward`."""
     for node in ast.walk(tree):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not re.match(r"forward|generate|prepare_inputs|_reorder|get_(image|video|audio)_features|loss|_init_weights|_update|compute", node.name):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not re.match(
+            r"forward|generate|prepare_inputs|_reorder|get_(image|video|audio)_features|loss|_init_weights|_update|compute",
+            node.name,
+        ):
             yield node
 
 
@@ -58,7 +68,12 @@ class Reads(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Call(self, node):
-        if isinstance(node.func, ast.Name) and node.func.id in ("getattr", "hasattr") and len(node.args) > 1 and is_config(node.args[0]):
+        if (
+            isinstance(node.func, ast.Name)
+            and node.func.id in ("getattr", "hasattr")
+            and len(node.args) > 1
+            and is_config(node.args[0])
+        ):
             if isinstance(node.args[1], ast.Constant) and isinstance(node.args[1].value, str):
                 self.keys.add(node.args[1].value)
         self.generic_visit(node)
@@ -112,7 +127,7 @@ def told_type(hint):
         inner = told_type(args[0])
         return "list" if inner is None else f"list[{inner}]" if "[" not in inner else "list"
     if origin is tuple:
-        return ""                                             # JSON has none
+        return ""  # JSON has none
     if origin is dict:
         return "object"
     if origin is typing.Literal and all(isinstance(a, str) for a in args):

@@ -1,11 +1,26 @@
 """Reading back what `sample` wrote."""
+
 import gzip
 import json
 
 
 class Sample:
     """One config and what the class consists of under it."""
-    __slots__ = ("number", "raw", "flat", "tensors", "tied", "buffers", "persistent", "models", "parts", "parent", "key", "changed")
+
+    __slots__ = (
+        "number",
+        "raw",
+        "flat",
+        "tensors",
+        "tied",
+        "buffers",
+        "persistent",
+        "models",
+        "parts",
+        "parent",
+        "key",
+        "changed",
+    )
 
 
 class Samples:

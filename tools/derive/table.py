@@ -1,4 +1,5 @@
 """docs/architectures.md: which classes are known, per version, and why the others are not. From the repository alone."""
+
 import json
 import re
 import sys
@@ -42,12 +43,16 @@ def page():
     versions = sorted(shipped, key=lambda v: [int(n) for n in v.split(".")])
     unbuildable = {KINDS[-1][0], KINDS[-2][0], KINDS[-3][0]}
     lines = [
-        "# Known architectures", "",
+        "# Known architectures",
+        "",
         "Which model classes of transformers the files in [`rules/architectures`](../rules/architectures) describe. A class is *exact* when the tensors that",
         "`ckpt-doctor expect` predicts were those of the class (names, shapes, ties, buffers) on every one of its configs that were never used to derive it,",
-        "some of them with keys left out. Only exact classes are shipped. How it is done: [`tools/derive`](../tools/derive/README.md).", "",
-        "This page is written by `python tools/derive_architectures.py table`; do not edit it.", "",
-        "| | " + " | ".join(f"transformers {v}" for v in versions) + " |", "|---|" + "---:|" * len(versions),
+        "some of them with keys left out. Only exact classes are shipped. How it is done: [`tools/derive`](../tools/derive/README.md).",
+        "",
+        "This page is written by `python tools/derive_architectures.py table`; do not edit it.",
+        "",
+        "| | " + " | ".join(f"transformers {v}" for v in versions) + " |",
+        "|---|" + "---:|" * len(versions),
     ]
 
     def row(title, cell):
@@ -66,15 +71,26 @@ def page():
     told = json.loads(LOADS.read_text())
     row("classes whose loads were compared", lambda v: told[v]["classes"] if v in told else "")
     row("loads: of a saved file, and of changed copies", lambda v: told[v]["loads"] if v in told else "")
-    row("**of them the report is the loader's**", lambda v: f"**{told[v]['agree']} ({told[v]['agree'] / told[v]['loads']:.2%})**" if v in told else "")
-    lines += ["", f"Beside them, written by hand: {', '.join(f'`{s}`' for s in by_hand)}.", "", "## Families people meet", "",
-              "| family | " + " | ".join(versions) + " |", "|---|" + "---|" * len(versions)]
+    row(
+        "**of them the report is the loader's**",
+        lambda v: f"**{told[v]['agree']} ({told[v]['agree'] / told[v]['loads']:.2%})**" if v in told else "",
+    )
+    lines += [
+        "",
+        f"Beside them, written by hand: {', '.join(f'`{s}`' for s in by_hand)}.",
+        "",
+        "## Families people meet",
+        "",
+        "| family | " + " | ".join(versions) + " |",
+        "|---|" + "---|" * len(versions),
+    ]
     for family in " ".join(FAMILIES.split()).split("; "):
         stems = family.split()
 
         def cell(v, stems=stems):
             names = sorted(n for n, (stem, _) in shipped[v].items() if stem in stems)
             return f"{len(names)} exact" if names else "–"
+
         row(", ".join(stems), cell)
     lines += ["", "## Shipped", ""]
     for v in versions:

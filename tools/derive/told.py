@@ -3,7 +3,14 @@
 A width that several keys move at once, or a rule with more cases than a search visits, costs a class all its budget."""
 
 # Tried for every class: what heads and embeddings are often as wide as, when many other keys change with it.
-ANY = ("c.vocab_size", "c.num_labels", "c.xvector_output_dim", "c.num_hidden_layers + 1", "c.src_vocab_size", "c.tgt_vocab_size")
+ANY = (
+    "c.vocab_size",
+    "c.num_labels",
+    "c.xvector_output_dim",
+    "c.num_hidden_layers + 1",
+    "c.src_vocab_size",
+    "c.tgt_vocab_size",
+)
 SAM = (  # SamVisionLayer: no window in the layers named, and in none when window_size is 0
     "i in c.{0}global_attn_indexes || c.{0}window_size == 0 ? 2 * (c.{0}image_size / c.{0}patch_size) - 1 : 2 * c.{0}window_size - 1",
 )

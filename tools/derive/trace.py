@@ -3,6 +3,7 @@
 A class that is built with them tells its own formulas: what each dimension is made of, how far its loops run, what it
 compares. These are candidates, not facts: each has to explain every sample before it is used (`fit.py`).
 """
+
 import builtins
 import re
 import sys
@@ -11,8 +12,8 @@ import torch
 import transformers
 
 BASE = getattr(transformers, "PretrainedConfig", None) or transformers.PreTrainedConfig
-LONGEST = 240                                                 # characters from which an expression is no longer followed
-LONG_LOOP = 512                                               # rounds from which a loop's index is a plain number
+LONGEST = 240  # characters from which an expression is no longer followed
+LONG_LOOP = 512  # rounds from which a loop's index is a plain number
 SIMPLE = re.compile(r"[\w.@]+(\[[^\[\]]*\])*|[a-z]+\([^()]*\)")
 VARIABLE = re.compile(r"c\.[\w.]+(\[[^\[\]]*\])?")
 
@@ -25,7 +26,7 @@ class Record:
 
 
 class State:
-    record = None                                             # where to; None while nothing is followed
+    record = None  # where to; None while nothing is followed
     sites = {}
     injected = set()
     modules = 0
@@ -94,6 +95,7 @@ def binary(name, sign, neutral=None):
         if neutral is not None and x == str(neutral) and sign in "+*":
             return a
         return made(Int, value, f"{wrapped(x) if sign in '*/%' else x} {sign} {wrapped(y)}")
+
     return left, right
 
 
@@ -121,6 +123,7 @@ def compare(sign):
         if value is not NotImplemented and x is not None and y is not None and isinstance(b, (int, float)):
             literal(f"{x} {sign} {y}")
         return value
+
     return asked
 
 
@@ -178,6 +181,7 @@ class Int(int):
 
 class Float(float):
     """A number with the expression it comes from."""
+
     ratio = None
 
     def __new__(cls, value, e):
@@ -378,6 +382,7 @@ def follow(value, e):
 
 # ---- what takes the place of builtins in modeling and configuration modules ---------------------------------------
 
+
 class Whole(type):
     def __instancecheck__(cls, x):
         return isinstance(x, int)
@@ -418,7 +423,10 @@ def rounds(iterable, start, at):
     if isinstance(iterable, List):
         State.record and State.record.counts.setdefault(f"size({iterable.e})", True)
         for n in range(list.__len__(iterable)):
-            yield Int(n + start, f"@{n + start}_{at}"), follow(list.__getitem__(iterable, n), f"{iterable.e}[@{n}_{at}]" if not start else f"{iterable.e}[{n}]")
+            yield (
+                Int(n + start, f"@{n + start}_{at}"),
+                follow(list.__getitem__(iterable, n), f"{iterable.e}[@{n}_{at}]" if not start else f"{iterable.e}[{n}]"),
+            )
     else:
         for n, x in enumerate(iterable, start):
             yield (Int(n, f"@{n}_{at}") if n < LONG_LOOP else n), x
@@ -439,6 +447,7 @@ def extreme(name):
             value = plain(int(args[0]), int(args[1]))
             return made(Int, value, f"{name}({x}, {y})") if x is not None and y is not None else value
         return plain(*args, **kwargs)
+
     return f
 
 
@@ -473,9 +482,20 @@ def note_absent(config, name, default):
         State.record.absent.setdefault(path + name, [plain if e is None or type(default) in (int, float) else None, e])
 
 
-STANDINS = {"int": int_, "range": range_, "enumerate": enumerate_, "len": len_, "max": extreme("max"), "min": extreme("min"), "sum": sum_,
-            "getattr": getattr_, "hasattr": hasattr_}
-FOLLOWED = re.compile(r"transformers\.(models\.|modeling_layers|pytorch_utils|backbone_utils|utils\.backbone_utils|modeling_rope)|transformers_modules")
+STANDINS = {
+    "int": int_,
+    "range": range_,
+    "enumerate": enumerate_,
+    "len": len_,
+    "max": extreme("max"),
+    "min": extreme("min"),
+    "sum": sum_,
+    "getattr": getattr_,
+    "hasattr": hasattr_,
+}
+FOLLOWED = re.compile(
+    r"transformers\.(models\.|modeling_layers|pytorch_utils|backbone_utils|utils\.backbone_utils|modeling_rope)|transformers_modules"
+)
 
 
 def inject():
@@ -506,6 +526,7 @@ def passing_on(plain):
         if getattr(data, "_dims", None) is not None:
             out._dims = data._dims
         return out
+
     return new
 
 
@@ -517,6 +538,7 @@ def keeping(plain):
             if any(isinstance(d, Int) for d in dims):
                 out._dims = [said(d) for d in dims]
         return out
+
     return f
 
 
@@ -536,6 +558,7 @@ def patch_configs():
             if key in own or key == "num_labels" or "_" + key in own:
                 record.reads[path + key] = record.reads.get(path + key, 0) + 1
         return value
+
     BASE.__getattribute__ = read
     for name in ("to_dict", "to_diff_dict"):
         setattr(BASE, name, whole(getattr(BASE, name)))
@@ -543,10 +566,12 @@ def patch_configs():
 
 def whole(plain):
     """A method that reads every key."""
+
     def f(self, *args, **kwargs):
         if State.record is not None and "_trace" in vars(self):
             State.record.opaque = True
         return plain(self, *args, **kwargs)
+
     return f
 
 

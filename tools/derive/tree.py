@@ -1,18 +1,20 @@
 """From a flat list of tensors to the nested `tensors` of an architecture file: layers once, weight beside bias."""
+
 import os
 from dataclasses import dataclass, field, replace
 
 from . import json5
 from .cel import also, split, variables
 
-GROUP_LET = 36                                               # characters from which a condition said often gets a name
+GROUP_LET = 36  # characters from which a condition said often gets a name
 
 
 @dataclass
 class Item:
     """One line of a state dict as a template, or a part, or a buffer that is not in the state dict."""
+
     name: str
-    repeat: list = field(default_factory=list)               # [(index, count)], outermost first
+    repeat: list = field(default_factory=list)  # [(index, count)], outermost first
     when: str | None = None
     shape: list | None = None
     tied_to: str | None = None
@@ -90,7 +92,7 @@ def model_group(left, models):
             if any(i.repeat and "{" in prefix for i in taken):
                 return None
             when = common_condition(taken)
-            inner = [(p[len(prefix):], c, t) for p, c, t in models[at + 1:] if p.startswith(prefix)]
+            inner = [(p[len(prefix) :], c, t) for p, c, t in models[at + 1 :] if p.startswith(prefix)]
             member = {"when": when} if when else {}
             member["model"] = name
             if model_type:
@@ -111,7 +113,7 @@ def repeat_group(left, out):
         return None
     prefix = first.name.split(brace + ".")[0] + brace + "."
     taken = [i for i in left if i.name.startswith(prefix) and i.repeat[:1] == [(index, count)]]
-    if prefix in out:                                        # the same list with another length came before
+    if prefix in out:  # the same list with another length came before
         prefix = os.path.commonprefix([i.name for i in taken]).rpartition(".")[0] + "."
         if prefix in out or brace not in prefix:
             return None
@@ -146,8 +148,8 @@ def condition_group(left, out):
             return None
         indices = {index for index, _ in first.repeat}
         if prefix not in out and not any("{" + i + "}" in prefix or uses(first.when, i) for i in indices):
-            if len(run) == 2 and {i.name[len(prefix):] for i in run} == {"weight", "bias"}:
-                return None                                   # becomes one member anyway
+            if len(run) == 2 and {i.name[len(prefix) :] for i in run} == {"weight", "bias"}:
+                return None  # becomes one member anyway
             inner = [without(i, prefix, drop_when=True) for i in run]
             return prefix, {"when": first.when, "tensors": members(inner, [])}, run
         run = run[:-1]
@@ -159,7 +161,7 @@ def uses(expression, name):
 
 
 def without(item, prefix, drop_when=False):
-    return replace(item, name=item.name[len(prefix):], when=None if drop_when else item.when)
+    return replace(item, name=item.name[len(prefix) :], when=None if drop_when else item.when)
 
 
 def common_condition(items):
@@ -230,9 +232,16 @@ def weights(tensors):
 
 
 def pair(weight, bias):
-    return (weight is not None and "shape" in weight and "shape" in bias and weight["shape"] and bias["shape"] == weight["shape"][:1]
-            and weight.get("repeat") == bias.get("repeat") and "tied_to" not in bias
-            and (weight.get("when") in (None, bias.get("when"))))
+    return (
+        weight is not None
+        and "shape" in weight
+        and "shape" in bias
+        and weight["shape"]
+        and bias["shape"] == weight["shape"][:1]
+        and weight.get("repeat") == bias.get("repeat")
+        and "tied_to" not in bias
+        and (weight.get("when") in (None, bias.get("when")))
+    )
 
 
 def layout(tensors):

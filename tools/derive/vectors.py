@@ -3,6 +3,7 @@
 Two columns have the same `shape` when one is a multiple of the other plus a constant. Looking a column up by its shape
 finds factor and constant at once; subtracting every known column first finds sums of two. No search over coefficients.
 """
+
 import itertools
 import re
 from fractions import Fraction
@@ -16,6 +17,7 @@ LIMIT = 1 << 40
 
 class Column:
     """A value per row, with the expression that names it and what it costs to read."""
+
     __slots__ = ("text", "values", "cost", "known", "there")
 
     def __init__(self, text, values, cost=1.0, known=None, there=None):
@@ -26,7 +28,13 @@ class Column:
         """The same column in some of the rows."""
         kind = self.kind()
         there = self.there and (self.there[0], [self.there[1][i] for i in rows])
-        return Column(self.text, [self.values[i] for i in rows], self.cost, None if kind in ("mixed", "number") else kind, there and (None if all(there[1]) else there))
+        return Column(
+            self.text,
+            [self.values[i] for i in rows],
+            self.cost,
+            None if kind in ("mixed", "number") else kind,
+            there and (None if all(there[1]) else there),
+        )
 
     def kind(self):
         if self.known is None:
@@ -34,8 +42,22 @@ class Column:
         return self.known
 
     def find_kind(self):
-        kinds = {"object" if isinstance(v, dict) else "null" if v is None else "bool" if isinstance(v, bool) else "int" if isinstance(v, int) else "float" if isinstance(v, float)
-                 else "str" if isinstance(v, str) else "list" for v in self.values}
+        kinds = {
+            "object"
+            if isinstance(v, dict)
+            else "null"
+            if v is None
+            else "bool"
+            if isinstance(v, bool)
+            else "int"
+            if isinstance(v, int)
+            else "float"
+            if isinstance(v, float)
+            else "str"
+            if isinstance(v, str)
+            else "list"
+            for v in self.values
+        }
         return next(iter(kinds)) if len(kinds) == 1 else "number" if kinds == {"int", "float"} else "mixed"
 
 
@@ -92,7 +114,7 @@ class Atoms:
                 self.list.append((cost, text, v))
 
     def generate(self, floats):
-        ks = self.ints[:7 if self.plain else 9]
+        ks = self.ints[: 7 if self.plain else 9]
         for n, v, c in self.ints:
             yield c, n, v
             yield c + 2.2, f"{n} * {n}", v * v
@@ -100,7 +122,7 @@ class Atoms:
             for p, q in ((1, 2), (1, 4), (1, 8), (1, 16), (1, 3), (2, 3), (3, 2), (3, 4), (8, 3), (4, 3), (5, 2)):
                 floor = v * p // q
                 if (floor * q != v * p).any():
-                    yield c + 1.6 + .1 * (p > 1), (f"{n} / {q}" if p == 1 else f"{n} * {p} / {q}"), floor
+                    yield c + 1.6 + 0.1 * (p > 1), (f"{n} / {q}" if p == 1 else f"{n} * {p} / {q}"), floor
             for m in (8, 16, 32, 64, 128):
                 up = (v + m - 1) // m * m
                 if (up != v).any():
@@ -115,8 +137,16 @@ class Atoms:
                 for m, y, mc in ks:
                     if m != n and (y > 0).all():
                         yield c + fc + mc + 2, f"floor(double({n}) * double({f})) / {m}", product // y
-                        yield c + fc + mc + 2.2, f"({n} / {m}) * floor(double({m}) * double({f}))", v // y * np.floor(y * w + 1e-12).astype(np.int64)
-                        yield c + fc + mc + 2.4, f"floor(double({n} * {m}) * double({f}))", np.floor(v * y * w + 1e-12).astype(np.int64)
+                        yield (
+                            c + fc + mc + 2.2,
+                            f"({n} / {m}) * floor(double({m}) * double({f}))",
+                            v // y * np.floor(y * w + 1e-12).astype(np.int64),
+                        )
+                        yield (
+                            c + fc + mc + 2.4,
+                            f"floor(double({n} * {m}) * double({f}))",
+                            np.floor(v * y * w + 1e-12).astype(np.int64),
+                        )
         yield from self.pairs(ks)
         if not self.plain:
             yield from self.triples(ks[:8])
@@ -124,16 +154,22 @@ class Atoms:
     def pairs(self, ks):
         every = self.ints[:14]
         for (n, v, c), (m, w, d) in itertools.combinations(every, 2):
-            yield c + d + .2, f"{n} * {m}", v * w
-            yield c + d + 3.6, f"({n} * {m} * 2 / 3 + 7) / 8 * 8", (v * w * 2 // 3 + 7) // 8 * 8        # gated units of about the same size
+            yield c + d + 0.2, f"{n} * {m}", v * w
+            yield (
+                c + d + 3.6,
+                f"({n} * {m} * 2 / 3 + 7) / 8 * 8",
+                (v * w * 2 // 3 + 7) // 8 * 8,
+            )  # gated units of about the same size
             yield c + d + 2, f"max({n}, {m})", np.maximum(v, w)
             yield c + d + 2, f"min({n}, {m})", np.minimum(v, w)
         fixed = self.fixed[:6]
-        for (n, v, c), (m, w, d) in itertools.chain(itertools.permutations(ks, 2), itertools.product(ks, fixed), itertools.product(fixed, ks)):
+        for (n, v, c), (m, w, d) in itertools.chain(
+            itertools.permutations(ks, 2), itertools.product(ks, fixed), itertools.product(fixed, ks)
+        ):
             if (w <= 0).any():
                 continue
             q = v // w
-            yield c + d + .5, f"{n} / {m}", q
+            yield c + d + 0.5, f"{n} / {m}", q
             yield c + d + 1.6, f"({n} / {m}) * ({n} / {m})", q * q
             yield c + d + 2.6, f"(2 * ({n} / {m}) - 1) * (2 * ({n} / {m}) - 1)", (2 * q - 1) ** 2
             yield c + d + 1.4, f"{n} / {m} * {m}", q * w
@@ -145,12 +181,12 @@ class Atoms:
 
     def triples(self, ks):
         for (n, v, c), (m, w, d), (o, x, e) in itertools.combinations(ks, 3):
-            yield c + d + e + .4, f"{n} * {m} * {o}", v * w * x
+            yield c + d + e + 0.4, f"{n} * {m} * {o}", v * w * x
         for (n, v, c), (m, w, d) in itertools.combinations(ks, 2):
             for o, x, e in ks:
                 if o in (n, m) or (x <= 0).any():
                     continue
-                yield c + d + e + .8, f"{n} * {m} / {o}", v * w // x
+                yield c + d + e + 0.8, f"{n} * {m} / {o}", v * w // x
                 yield c + d + e + 1.5, f"({n} / {o}) * ({m} / {o})", (v // x) * (w // x)
                 yield c + d + e + 1.2, f"{n} * ({m} / {o})", v * (w // x)
                 yield c + d + e + 1.2, f"{m} * ({n} / {o})", w * (v // x)
@@ -170,16 +206,16 @@ def scaled(a, b, text):
         return None
     p, q = a.numerator, a.denominator
     body = text if p == 1 else f"-{wrap(text)}" if p == -1 else f"{p} * {product(text)}"
-    cost = (p != 1) * .5 + (p < 0) * .6 + (abs(p) > 8) * .6 + (b != 0) * (.9 if abs(b) <= 4 else 1.6)
+    cost = (p != 1) * 0.5 + (p < 0) * 0.6 + (abs(p) > 8) * 0.6 + (b != 0) * (0.9 if abs(b) <= 4 else 1.6)
     if q == 1:
         return cost, plus(body, int(b))
-    cost += .9
+    cost += 0.9
     top = b * q
     if top.denominator != 1:
         return None
     if b.denominator == 1:
         return cost, plus(f"{wrap(body) if ' + ' in body or ' - ' in body else body} / {q}", int(b))
-    return cost + .4, f"({plus(body, int(top))}) / {q}"
+    return cost + 0.4, f"({plus(body, int(top))}) / {q}"
 
 
 def product(text):
@@ -219,7 +255,7 @@ def two_terms(t, atoms, most, coefficients=(1, -1, 2, 3, 4)):
             other = one_term(r, atoms, shape)
             if other is None:
                 continue
-            total = cost + other[0] + .5 + .5 * (k != 1) + .6 * (k < 0)
+            total = cost + other[0] + 0.5 + 0.5 * (k != 1) + 0.6 * (k < 0)
             if best is None or total < best[0]:
                 mine = text if abs(k) == 1 else f"{abs(k)} * {product(text)}"
                 if k < 0:
@@ -240,7 +276,10 @@ def three_terms(t, atoms):
             two = two_terms(rest, atoms, 3.3, (1, 2)) if (rest != rest[0]).any() else None
             if two and (best is None or two[0] + cost < best[0]):
                 mine = text if abs(k) == 1 else f"{abs(k)} * {product(text)}"
-                best = (two[0] + cost + .5, f"{two[1]} - {wrap(mine) if ' - ' in mine or ' + ' in mine else mine}" if k < 0 else f"{mine} + {two[1]}")
+                best = (
+                    two[0] + cost + 0.5,
+                    f"{two[1]} - {wrap(mine) if ' - ' in mine or ' + ' in mine else mine}" if k < 0 else f"{mine} + {two[1]}",
+                )
         if best:
             return best
     return best
@@ -272,7 +311,7 @@ def fit(t, columns, thorough=True):
     matrix = np.array([c.values for c in usable] + [t.tolist()], dtype=float).T
     _, keep = np.unique(matrix, axis=0, return_index=True)
     if len(usable) and len(np.unique(matrix[:, :-1], axis=0)) < len(keep):
-        return None                                           # the same columns, different targets: nothing can explain it
+        return None  # the same columns, different targets: nothing can explain it
     keep.sort()
     t = t[keep]
     usable = [c.at(keep) for c in usable]
@@ -285,17 +324,17 @@ def fit(t, columns, thorough=True):
     if best:
         return best
     quotients = [(f"({text})", v, cost) for cost, text, v in atoms.list if QUOTIENT.fullmatch(text)]
-    for n, v, c in atoms.ints + quotients[:12]:               # a common factor: (heads + 2 * groups) * head_dim
+    for n, v, c in atoms.ints + quotients[:12]:  # a common factor: (heads + 2 * groups) * head_dim
         if (v > 0).all() and (t % v == 0).all():
             rest = t // v
             if (rest == rest[0]).all():
                 continue
             inner = one_term(rest, atoms) or two_terms(rest, atoms, 3.5)
             if inner and (best is None or inner[0] + c < best[0]):
-                best = (inner[0] + c + .5, f"{wrap(inner[1])} * {n}")
+                best = (inner[0] + c + 0.5, f"{wrap(inner[1])} * {n}")
     if best or not thorough:
         return best
-    for (n, v, c) in atoms.ints:                              # a quotient of a sum: (image - kernel) / stride + 1
+    for n, v, c in atoms.ints:  # a quotient of a sum: (image - kernel) / stride + 1
         for b in (0, 1):
             if (v <= 0).any():
                 continue
@@ -303,12 +342,10 @@ def fit(t, columns, thorough=True):
                 for const in (-1, 1, 2, -2):
                     if ((w + const) // v + b == t).all():
                         return cost + c + 2, plus(f"({plus(text, const)}) / {n}", b)
-    for b in (0, 1, 2):                                       # a square of a sum, with class tokens
+    for b in (0, 1, 2):  # a square of a sum, with class tokens
         r = np.round(np.sqrt(np.maximum(t - b, 0).astype(float))).astype(np.int64)
         if (r * r == t - b).all() and (r != r[0]).any():
             inner = one_term(r, atoms)
             if inner:
                 return inner[0] * 2, plus(f"{wrap(inner[1])} * {wrap(inner[1])}", b)
     return three_terms(t, atoms)
-
-

@@ -1,4 +1,5 @@
 """Asks the program itself what it expects of unseen configs, and ships the classes it is right about every time."""
+
 import hashlib
 import json
 import os
@@ -13,8 +14,8 @@ from .family import load
 from .mended import MENDED
 from .write import Writer, mended_classes, put, read_conversions, read_versions
 
-CHUNK = 80                                                   # classes asked about at a time: their records are large
-ENOUGH = 12                                                  # configs a class must have been right about
+CHUNK = 80  # classes asked about at a time: their records are large
+ENOUGH = 12  # configs a class must have been right about
 
 
 class Program:
@@ -29,8 +30,20 @@ class Program:
             file.writelines(json.dumps({"class": name, "config": config}) + "\n" for name, config in asked)
             file.flush()
             done = subprocess.run(
-                [self.binary, "expect", *(["--rules", rules] if rules else []), "--for", f"transformers=={version}", "--output-format", "jsonl", f"@{file.name}"],
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, check=False,
+                [
+                    self.binary,
+                    "expect",
+                    *(["--rules", rules] if rules else []),
+                    "--for",
+                    f"transformers=={version}",
+                    "--output-format",
+                    "jsonl",
+                    f"@{file.name}",
+                ],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                check=False,
             )
         lines = done.stdout.splitlines()
         if len(lines) != len(asked):
@@ -39,11 +52,13 @@ class Program:
 
 
 # The program says that it does not know the model a config chooses for a part: no wrong answer, and no right one.
-UNKNOWN_PART = re.compile(r"it is not known here: |\) is not known here|is not known here$|which it has as a part, is not known")
+UNKNOWN_PART = re.compile(
+    r"it is not known here: |\) is not known here|is not known here$|which it has as a part, is not known"
+)
 
 
 def judged(record, answer):
-    """"exact", "not predicted", "raises" (as the class does), "builds" (which the class does not), or how it is wrong."""
+    """ "exact", "not predicted", "raises" (as the class does), "builds" (which the class does not), or how it is wrong."""
     unsure = bool(answer.get("not_predicted")) or UNKNOWN_PART.search(answer.get("error", ""))
     if "error" in record:
         return "not predicted" if unsure else "raises" if "error" in answer else "builds"
@@ -91,9 +106,9 @@ def records(folder, name, seeds):
 class Verifier:
     def __init__(self, writer, program, seeds):
         self.writer, self.program, self.seeds = writer, program, seeds
-        self.told = {}                                       # (version, class) -> (mark of the files, what came of each record)
-        self.kinds = {}                                      # (version, class) -> kinds of its records
-        self.instead = set()                                 # (version, class) for which the files' own entry was tried
+        self.told = {}  # (version, class) -> (mark of the files, what came of each record)
+        self.kinds = {}  # (version, class) -> kinds of its records
+        self.instead = set()  # (version, class) for which the files' own entry was tried
 
     def outcomes(self, only=None):
         """{version: {class: [what came of each record]}} for what the writer ships now. Asked again only of what changed."""
@@ -107,14 +122,18 @@ class Verifier:
                 told = out[v.version] = {}
                 todo = []
                 for n in sorted(self.writer.ships[v.version] | {k.name for k in self.writer.kept_classes(v)}):
-                    mark = "".join(marks.get(stem, "-") for stem in sorted(self.stems(v, n))) if n in self.writer.ships[v.version] else everything
+                    mark = (
+                        "".join(marks.get(stem, "-") for stem in sorted(self.stems(v, n)))
+                        if n in self.writer.ships[v.version]
+                        else everything
+                    )
                     kept = self.told.get((v.version, n))
                     if kept and kept[0] == mark:
                         told[n] = kept[1]
                     elif only is None or n in only:
                         todo.append((n, mark))
                 for at in range(0, len(todo), CHUNK):
-                    self.ask(v, todo[at:at + CHUNK], folder, told)
+                    self.ask(v, todo[at : at + CHUNK], folder, told)
         return out
 
     def ask(self, v, names, folder, told):
@@ -144,7 +163,7 @@ class Verifier:
 
     def run(self, report=print):
         self.writer.start()
-        for v in self.writer.versions:                       # what a hand corrected comes before what the tool found
+        for v in self.writer.versions:  # what a hand corrected comes before what the tool found
             first = [n for n in json.loads(graft.KEPT.read_text()).get(v.version, ()) if n in self.writer.grafts[v.version]]
             self.instead.update((v.version, n) for n in first if n in self.writer.ships[v.version])
             self.writer.ships[v.version] -= set(first)
@@ -171,7 +190,7 @@ class Verifier:
                     wrong += 1
                     again = True
                     grafts = writer.grafts[version]
-                    if name not in writer.ships[version]:     # kept from the files, and not right either
+                    if name not in writer.ships[version]:  # kept from the files, and not right either
                         del grafts[name]
                         if (version, name) in self.instead:
                             writer.ships[version].add(name)
@@ -182,14 +201,19 @@ class Verifier:
                         self.instead.add((version, name))
                         writer.ships[version].discard(name)
                         continue
-                    corner = how and corners.found(v, name, records(v.folder, name, self.seeds), found, writer.corners[version].get(name, []), ENOUGH)
+                    corner = how and corners.found(
+                        v, name, records(v.folder, name, self.seeds), found, writer.corners[version].get(name, []), ENOUGH
+                    )
                     if corner:
                         writer.corners[version].setdefault(name, []).append(corner)
                         continue
                     writer.ships[version].discard(name)
                     writer.corners[version].pop(name, None)
-                    v.reasons[name] = (f"not exact: {len(how)} of {len(found)} unseen configs: {how[0]}" if how
-                                       else f"only {found.count('exact')} unseen configs have parts that are known")
+                    v.reasons[name] = (
+                        f"not exact: {len(how)} of {len(found)} unseen configs: {how[0]}"
+                        if how
+                        else f"only {found.count('exact')} unseen configs have parts that are known"
+                    )
                 report(f"{version}: {len(told) - wrong} of {len(told)} exact")
             if not again:
                 return
@@ -208,7 +232,9 @@ class Verifier:
                 if any(f not in FINE for v in writer.versions for f in told[v.version].get(name, ())):
                     del writer.prefer[name]
             self.told = before
-            report(f"one expression for all versions, that of the {'newest' if side == 'new' else 'oldest'}: {len(trial & writer.prefer.keys())} of {len(trial)} classes")
+            report(
+                f"one expression for all versions, that of the {'newest' if side == 'new' else 'oldest'}: {len(trial & writer.prefer.keys())} of {len(trial)} classes"
+            )
 
     def conversions(self, report):
         """Compares conversions and ignore patterns with what the library said of a model of the first unseen config."""
@@ -218,7 +244,9 @@ class Verifier:
             return
         with tempfile.TemporaryDirectory() as folder:
             place(self.writer.files(), Path(folder) / "architectures")
-            answers = self.program.expect(folder, v.version, [(n, load(v.folder / "instances" / f"{n}.json")["config"]) for n in names])
+            answers = self.program.expect(
+                folder, v.version, [(n, load(v.folder / "instances" / f"{n}.json")["config"]) for n in names]
+            )
         wrong = {}
         for name, answer in zip(names, answers):
             told = load(v.folder / "instances" / f"{name}.json")
@@ -245,7 +273,7 @@ def place(files, folder):
             shutil.copy(path, folder)
 
 
-LEGACY = 5                                                   # rows that apply to every model, at the end
+LEGACY = 5  # rows that apply to every model, at the end
 
 
 def comparable(row):
@@ -258,10 +286,20 @@ def main(args):
     writer.mended = mended_classes(ship.RULES)
     kept = graft.read(ship.RULES)
     for v in versions:
-        writer.grafts[v.version] = {n: k for n, k in graft.of_version(kept, v.version).items() if records(v.folder, n, args.seeds.split(","))}
+        writer.grafts[v.version] = {
+            n: k for n, k in graft.of_version(kept, v.version).items() if records(v.folder, n, args.seeds.split(","))
+        }
     verifier = Verifier(writer, Program(args.binary or os.environ.get("CKPT_DOCTOR", "ckpt-doctor")), args.seeds.split(","))
     verifier.run()
     verifier.conversions(print)
     ship.write(writer, args.out)
-    (args.cache / "verified.json").write_text(json.dumps(
-        {f"{version} {name}": list(zip(verifier.kinds[version, name], found)) for (version, name), (_, found) in sorted(verifier.told.items())}, indent=0) + "\n")
+    (args.cache / "verified.json").write_text(
+        json.dumps(
+            {
+                f"{version} {name}": list(zip(verifier.kinds[version, name], found))
+                for (version, name), (_, found) in sorted(verifier.told.items())
+            },
+            indent=0,
+        )
+        + "\n"
+    )

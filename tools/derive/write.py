@@ -1,4 +1,5 @@
 """From fitted classes to the files of rules/architectures."""
+
 import re
 from pathlib import Path
 
@@ -22,15 +23,15 @@ class Writer:
     """Writes what `ships` says: {version: classes}; `prefer`: {class: "old" or "new"} where one version's expressions hold for all."""
 
     def __init__(self, versions, conversions):
-        self.versions = versions                             # oldest first
+        self.versions = versions  # oldest first
         self.conversions = conversions
         self.prefer = {}
         self.ships = {}
-        self.verified = {}                                   # version -> {class: configs}
-        self.mended = {}                                     # version -> classes of files that are not written
+        self.verified = {}  # version -> {class: configs}
+        self.mended = {}  # version -> classes of files that are not written
         self.apart = {}
-        self.corners = {v.version: {} for v in versions}     # class -> [{"when", "why"}]
-        self.grafts = {v.version: {} for v in versions}      # class -> Kept, used where `ships` has none
+        self.corners = {v.version: {} for v in versions}  # class -> [{"when", "why"}]
+        self.grafts = {v.version: {} for v in versions}  # class -> Kept, used where `ships` has none
 
     def start(self):
         self.ships = {v.version: set(v.fits) - set(REFUSED) for v in self.versions}
@@ -52,7 +53,9 @@ class Writer:
                         v.reasons[name] = f"a part is not shipped: {lacking}"
                         again = True
                 grafts = self.grafts[v.version]
-                for name in [n for n, kept in grafts.items() if not set(kept.parts()) <= there or not known(v, kept.model_type)]:
+                for name in [
+                    n for n, kept in grafts.items() if not set(kept.parts()) <= there or not known(v, kept.model_type)
+                ]:
                     del grafts[name]
                     again = True
 
@@ -62,13 +65,19 @@ class Writer:
 
     def kept_classes(self, v, model_type=None):
         """Classes that stand in the files as they did before, for want of an explanation."""
-        return [k for n, k in sorted(self.grafts[v.version].items()) if n not in self.ships[v.version] and model_type in (None, k.model_type)]
+        return [
+            k
+            for n, k in sorted(self.grafts[v.version].items())
+            if n not in self.ships[v.version] and model_type in (None, k.model_type)
+        ]
 
     def files(self):
         """{stem: text} of all families."""
         used = [used_keys(v, self.ships[v.version], self.corners[v.version], self.kept_classes(v)) for v in self.versions]
         # A version that knows a config class knows all its keys: entries may be shared between versions.
-        self.used = {v.version: {t: set().union(*(u.get(t, ()) for u in used)) for t in mine} for v, mine in zip(self.versions, used)}
+        self.used = {
+            v.version: {t: set().union(*(u.get(t, ()) for u in used)) for t in mine} for v, mine in zip(self.versions, used)
+        }
         model_types = {t for used in self.used.values() for t in used}
         model_types |= {v.model_type(n) for v in self.versions for n in self.ships[v.version]}
         model_types |= {k.model_type for v in self.versions for k in self.kept_classes(v)}
@@ -82,27 +91,40 @@ class Writer:
         return {t: json5.document(self.file(t)) for t in sorted(model_types) if t and any(known(v, t) for v in self.versions)}
 
     def file(self, model_type):
-        present = [v for v in self.versions if self.used[v.version].get(model_type) or self.family(v, model_type) or self.kept_classes(v, model_type)]
+        present = [
+            v
+            for v in self.versions
+            if self.used[v.version].get(model_type) or self.family(v, model_type) or self.kept_classes(v, model_type)
+        ]
         common, by_loader = self.config_class(model_type, present)
         entries = self.classes(model_type, present)
         lets, trees = name_all([e["tensors"] for e in entries])
         for entry, tensors in zip(entries, trees):
             entry["tensors"] = layout(tensors)
         entries += self.kept_entries(model_type, present)
-        derived = {v.version: self.provenance(v, model_type) for v in present if self.family(v, model_type) or self.kept_classes(v, model_type)}
+        derived = {
+            v.version: self.provenance(v, model_type)
+            for v in present
+            if self.family(v, model_type) or self.kept_classes(v, model_type)
+        }
         names = sorted({e["class"] for e in entries})
         modules = sorted({f.raw["module"].split(".")[-2] for v in present for f in self.family(v, model_type)}) or [model_type]
         config_class = next((f.raw.get("config_class") for v in reversed(present) for f in self.family(v, model_type)), None)
         out = {
             "architecture": model_type,
-            "summary": f"{config_class or model_type}: {counted(len(names))}" if names else f"{model_type}: what the config of a part fills in",
+            "summary": f"{config_class or model_type}: {counted(len(names))}"
+            if names
+            else f"{model_type}: what the config of a part fills in",
             "model_types": [model_type],
             "sources": [f"transformers {listed([v.version for v in present])}, models/{' and models/'.join(modules)}"],
             "loaders": [v.version for v in present],
             "derived": json5.Lines(derived),
             **common,
         }
-        computed = [*common.get("computed", {}).values(), *(t for told in by_loader.values() for t in told.get("computed", {}).values())]
+        computed = [
+            *common.get("computed", {}).values(),
+            *(t for told in by_loader.values() for t in told.get("computed", {}).values()),
+        ]
         require = divisors([t if isinstance(t, str) else "" for t in computed])
         if require:
             out["require"] = [{"that": f"c.{key} > 0", "message": f"{key} is {{c.{key}}}"} for key in require]
@@ -125,7 +147,9 @@ class Writer:
         family = self.family(v, model_type)
         verified = self.verified.get(v.version, {})
         names = sorted([f.name for f in family] + [k.name for k in self.kept_classes(v, model_type)])
-        return json5.Filled(samples=sum(f.raw["samples"] for f in family), verified=json5.Filled({n: verified.get(n, 0) for n in names}))
+        return json5.Filled(
+            samples=sum(f.raw["samples"] for f in family), verified=json5.Filled({n: verified.get(n, 0) for n in names})
+        )
 
     # ---- the config class ------------------------------------------------------------------------------------
 
@@ -161,7 +185,11 @@ class Writer:
         for field in FILLED:
             if field in shown:
                 shown[field] = json5.Filled(dict(sorted(shown[field].items())))
-        return shown, {version: json5.Lines({k: json5.Filled(told[k]) if k in FILLED else told[k] for k in FIELDS if k in told}) for version, told in by_loader.items() if told}
+        return shown, {
+            version: json5.Lines({k: json5.Filled(told[k]) if k in FILLED else told[k] for k in FIELDS if k in told})
+            for version, told in by_loader.items()
+            if told
+        }
 
     def config_side(self, v, model_type):
         used = self.used[v.version].get(model_type, set())
@@ -171,18 +199,35 @@ class Writer:
             name = first(table.get(model_type))
             if name in there:
                 auto[mapping.lower()] = name
-        for kept in self.kept_classes(v, model_type):         # what a file computes for such a class
-            computed.update({k: (text, "filled") for k, text in kept.computed.items() if k in used and k not in computed and isinstance(text, str)})
+        for kept in self.kept_classes(v, model_type):  # what a file computes for such a class
+            computed.update(
+                {
+                    k: (text, "filled")
+                    for k, text in kept.computed.items()
+                    if k in used and k not in computed and isinstance(text, str)
+                }
+            )
         return {
             "auto": auto,
             "inside": inside if isinstance(inside := v.configs.get(model_type, {}).get("inside"), str) else None,
-            "aliases": {a: key if when == "late" else {"early": key} for a, (key, when) in v.aliases(model_type).items() if key in used},
-            "defaults": {k: static.get(k) for k in sorted(used) if k not in configs and k != "model_type" and (k in static or known(v, model_type))
-                         and k not in v.aliases(model_type) and computed.get(k, ("", ""))[1] != "unless_given"},
+            "aliases": {
+                a: key if when == "late" else {"early": key} for a, (key, when) in v.aliases(model_type).items() if key in used
+            },
+            "defaults": {
+                k: static.get(k)
+                for k in sorted(used)
+                if k not in configs
+                and k != "model_type"
+                and (k in static or known(v, model_type))
+                and k not in v.aliases(model_type)
+                and computed.get(k, ("", ""))[1] != "unless_given"
+            },
             "computed": {k: text if mode == "filled" else {mode: text} for k, (text, mode) in computed.items() if k in used},
             "unvaried": v.unvaried(model_type, used),
             "types": by_type(v.configs.get(model_type, {}).get("types") or {}),
-            "refuses": [r for r in v.configs.get(model_type, {}).get("refuses", ()) if set(tops(r["when"])) <= used] if REFUSALS else [],
+            "refuses": [r for r in v.configs.get(model_type, {}).get("refuses", ()) if set(tops(r["when"])) <= used]
+            if REFUSALS
+            else [],
             "configs": {k: self.sub_config(v, model_type, k, spec) for k, spec in sorted(configs.items()) if k in used},
         }
 
@@ -198,7 +243,8 @@ class Writer:
             sub = spec["absent"].get("model_type", spec.get("type"))
             static = v.static(sub) if sub else {}
             out["absent"] = {
-                k: value for k, value in spec["absent"].items()
+                k: value
+                for k, value in spec["absent"].items()
                 if k == "model_type" or (used is None or k in used) and not (k in static and static[k] == value)
             }
         if spec.get("set"):
@@ -234,7 +280,7 @@ class Writer:
 
     def entries(self, name, have):
         """[(versions, entry)]: as few entries as say everything, each for versions that follow each other."""
-        for at in range(len(have), 0, -1):                    # the oldest ones together, then the rest
+        for at in range(len(have), 0, -1):  # the oldest ones together, then the rest
             entry = self.shared_entry(name, have[:at])
             if entry is None:
                 continue
@@ -243,11 +289,14 @@ class Writer:
             if at == 1 and len(have) == 3 and (later := self.shared_entry(name, have[1:])) is not None:
                 return [(have[:1], entry), (have[1:], later)]
             return [(have[:at], entry), *(self.entries(name, have[at:]) if at < len(have) else ())]
-        raise AssertionError(name)                            # one version by itself can always be written
+        raise AssertionError(name)  # one version by itself can always be written
 
     def shared_entry(self, name, have):
         newest, last = have[-1]
-        heads = [(self.head(v, fit), self.ignored(v, fit), self.refusals(v, fit), self.corners[v.version].get(name)) for v, fit in have]
+        heads = [
+            (self.head(v, fit), self.ignored(v, fit), self.refusals(v, fit), self.corners[v.version].get(name))
+            for v, fit in have
+        ]
         if any(h != heads[0] for h in heads):
             self.apart[name] = "other prefix, patterns or corners"
             return None
@@ -290,7 +339,7 @@ class Writer:
         out = {}
         for key in ("ignore_missing", "ignore_unexpected"):
             told = list(fit.raw.get(key) or [])
-            if v.version.startswith("5"):                     # the loader asks the models inside too; parts bring their own
+            if v.version.startswith("5"):  # the loader asks the models inside too; parts bring their own
                 for _, name, _ in self.written_out(fit):
                     told += [p for p in self.conversions.get("patterns", {}).get(name, {}).get(key, []) if p not in told]
             out[key] = effective(told)
@@ -362,7 +411,9 @@ class Writer:
             if other and (home == model_type and other in wanted or home not in (None, model_type)):
                 out[identifier] = other
             else:
-                out[identifier] = [{k: row[k] for k in ("kind", "from", "to", "ops", *sorted(row)) if k in row} for row in table[identifier]]
+                out[identifier] = [
+                    {k: row[k] for k in ("kind", "from", "to", "ops", *sorted(row)) if k in row} for row in table[identifier]
+                ]
         return out
 
 
@@ -384,7 +435,7 @@ def missing_part(fit, ships):
     """A class that the fit needs and that is not there; of a choice by model type one is enough."""
     for p in fit.raw["parts"]:
         names = set(p["classes"].values())
-        fit.parts                                             # decides on `auto`
+        fit.parts  # decides on `auto`
         if not p.get("auto") and not names & ships:
             return ", ".join(sorted(names))
     return None
@@ -392,9 +443,17 @@ def missing_part(fit, ships):
 
 def order_of(fits):
     """Classes in an order to be read in: what others are made of first."""
+
     def depth(name, seen=()):
-        inner = [c for p in fits[name].raw["parts"] if not p.get("config") for c in p["classes"].values() if c in fits and c not in seen and c != name]
+        inner = [
+            c
+            for p in fits[name].raw["parts"]
+            if not p.get("config")
+            for c in p["classes"].values()
+            if c in fits and c not in seen and c != name
+        ]
         return 1 + max((depth(c, (*seen, name)) for c in inner), default=0)
+
     return sorted(fits, key=lambda n: (depth(n), n))
 
 
@@ -458,7 +517,9 @@ def put(files, folder):
 
 
 def read_versions(cache):
-    names = sorted((p.name for p in Path(cache).iterdir() if (p / "fit").is_dir()), key=lambda n: [int(x) for x in n.split(".")])
+    names = sorted(
+        (p.name for p in Path(cache).iterdir() if (p / "fit").is_dir()), key=lambda n: [int(x) for x in n.split(".")]
+    )
     return [Version.read(cache, n) for n in names]
 
 
