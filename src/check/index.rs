@@ -46,8 +46,8 @@ pub(super) fn readable(shard: &Shard) -> bool {
 /// Whether every shard exists and its header was read, so that a tensor that was not read is missing.
 #[must_use]
 pub fn all_read(checkpoint: &Checkpoint) -> bool {
-    let named = checkpoint.index.iter().flat_map(|index| index.weight_map.values());
-    checkpoint.shards.values().all(readable) && named.into_iter().all(|name| checkpoint.shards.contains_key(name))
+    let mut named = checkpoint.index.iter().flat_map(|index| &index.files);
+    checkpoint.shards.values().all(readable) && named.all(|name| checkpoint.shards.contains_key(name))
 }
 
 /// Whether nothing suggests that a tensor was lost: every shard that the index or the shards' own names count is present
@@ -366,7 +366,7 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
 pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
     match &checkpoint.index {
         _ if single(checkpoint).is_some() => single(checkpoint) == Some(name),
-        Some(index) => index.weight_map.values().any(|file| file == name),
+        Some(index) => index.files.contains(name),
         None => numbered(name).is_some(),
     }
 }

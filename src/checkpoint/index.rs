@@ -1,6 +1,6 @@
 //! The index of a sharded checkpoint: a map from tensors to shards.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
@@ -22,6 +22,8 @@ pub struct Index {
     pub document: String,
     /// Tensor name to file name, without entries whose file name is not a plain one.
     pub weight_map: BTreeMap<String, String>,
+    /// The files that `weight_map` names.
+    pub files: BTreeSet<String>,
     /// `metadata.total_size` as written.
     pub total_size: Option<Value>,
     /// Whether the document has a `metadata` object.
@@ -93,6 +95,9 @@ impl Index {
             let place = || self.place(&pointer::join("/weight_map", tensor)).in_tensor(tensor.clone());
             match file.as_str() {
                 Some(file) if is_plain_file_name(file) => {
+                    if !self.files.contains(file) {
+                        self.files.insert(file.to_owned());
+                    }
                     self.weight_map.insert(tensor.clone(), file.to_owned());
                 }
                 Some(file) => {

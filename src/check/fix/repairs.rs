@@ -47,8 +47,7 @@ fn rebuild_index(checkpoint: &Checkpoint) -> Option<Edit> {
             // case counts under the name of its file.
             let there =
                 |name: &str| if checkpoint.has_file(name) { Some(name.to_owned()) } else { twin(checkpoint, name) };
-            let named: BTreeSet<&str> = index.weight_map.values().map(String::as_str).collect();
-            let shards: Option<BTreeSet<String>> = named.into_iter().map(there).collect();
+            let shards: Option<BTreeSet<String>> = index.files.iter().map(|name| there(name)).collect();
             (index.document.clone(), shards?.into_iter().collect())
         }
         None => family(checkpoint)?,

@@ -3,7 +3,9 @@
 //! The patterns are the library's own, the names are a stranger's: backtracking is bounded, and a search that
 //! reaches the bound counts as no match.
 
-use fancy_regex::{Captures, Regex, RegexBuilder};
+use std::ops::Range;
+
+use fancy_regex::RegexBuilder;
 
 /// Steps of backtracking for one name; the longest pattern of transformers 5.23.0 takes some hundred.
 const BACKTRACKS: usize = 10_000;
@@ -14,47 +16,94 @@ const LONGEST: usize = 512;
 
 /// A compiled pattern.
 #[derive(Debug, Clone)]
-pub(super) struct Pattern(Regex);
+pub(super) enum Pattern {
+    /// Without a lookaround: several times faster.
+    Regular(regex::Regex),
+    Backtracking(fancy_regex::Regex),
+}
+
+/// The groups of a match; the first is the whole.
+pub(super) struct Groups<'n>(Vec<Option<Range<usize>>>, &'n str);
+
+impl<'n> Groups<'n> {
+    /// Where the group matched; `None` when it took no part.
+    pub(super) fn range(&self, n: usize) -> Option<Range<usize>> {
+        self.0.get(n)?.clone()
+    }
+
+    /// The text of the group; empty when it took no part.
+    pub(super) fn text(&self, n: usize) -> &'n str {
+        self.range(n).and_then(|range| self.1.get(range)).unwrap_or_default()
+    }
+}
 
 impl Pattern {
-    /// Python's syntax is fancy-regex's in all that these patterns use.
+    /// Python's syntax is that of both crates in all that these patterns use.
     pub(super) fn new(text: &str) -> Option<Self> {
-        RegexBuilder::new(text).backtrack_limit(BACKTRACKS).build().ok().map(Self)
+        // The only lookaround of most patterns has another spelling in the crate without lookarounds.
+        let regular = regex::Regex::new(&text.replace(r"(?!\w)", r"\b{end-half}")).map(Self::Regular);
+        let backtracking = || RegexBuilder::new(text).backtrack_limit(BACKTRACKS).build().map(Self::Backtracking);
+        regular.or_else(|_| backtracking()).ok()
     }
 
     pub(super) fn found_in(&self, name: &str) -> bool {
-        name.len() <= LONGEST && self.0.is_match(name).unwrap_or(false)
+        name.len() <= LONGEST
+            && match self {
+                Self::Regular(regex) => regex.is_match(name),
+                Self::Backtracking(regex) => regex.is_match(name).unwrap_or(false),
+            }
     }
 
-    pub(super) fn captures<'n>(&self, name: &'n str) -> Option<Captures<'n, str>> {
-        if name.len() <= LONGEST { self.0.captures(name).ok().flatten() } else { None }
+    pub(super) fn captures<'n>(&self, name: &'n str) -> Option<Groups<'n>> {
+        self.captures_from(name, 0)
+    }
+
+    /// The first match that starts at byte `start` or after.
+    fn captures_from<'n>(&self, name: &'n str, start: usize) -> Option<Groups<'n>> {
+        if name.len() > LONGEST {
+            return None;
+        }
+        let groups = match self {
+            Self::Regular(regex) => {
+                let captures = regex.captures_at(name, start)?;
+                captures.iter().map(|group| group.map(|found| found.range())).collect()
+            }
+            Self::Backtracking(regex) => {
+                let captures = regex.captures_from_pos(name, start).ok()??;
+                captures.iter().map(|group| group.map(|found| found.range())).collect()
+            }
+        };
+        Some(Groups(groups, name))
     }
 
     /// As Python's `re.sub`: every match replaced, `\1` standing for a group; `None` where nothing matches.
     pub(super) fn replace_all(&self, name: &str, to: &str) -> Option<String> {
-        if name.len() > LONGEST {
-            return None;
-        }
         let mut out = String::new();
-        let mut end = 0;
-        for captures in self.0.captures_iter(name) {
-            let Ok(captures) = captures else { break };
-            let whole = captures.get(0)?;
-            out.push_str(name.get(end..whole.start())?);
-            let group = |n: usize| captures.get(n).map_or("", |m| m.as_str());
-            out.push_str(&(1..10).fold(to.to_owned(), |text, n| text.replace(&format!(r"\{n}"), group(n))));
-            end = whole.end();
-        }
-        if end == 0 && out.is_empty() && !self.found_in(name) {
-            return None;
+        // End of the last match, and the place where the next may start.
+        let (mut end, mut next) = (0, 0);
+        let mut found = false;
+        while let Some(groups) = name.get(next..).and_then(|_| self.captures_from(name, next)) {
+            let whole = groups.range(0)?;
+            found = true;
+            out.push_str(name.get(end..whole.start)?);
+            out.push_str(&(1..10).fold(to.to_owned(), |text, n| text.replace(&format!(r"\{n}"), groups.text(n))));
+            end = whole.end;
+            // After an empty match the search goes on at the next character.
+            next = if whole.is_empty() { name.ceil_char_boundary(end.saturating_add(1)) } else { end };
+            if whole.is_empty() && end >= name.len() {
+                break;
+            }
         }
         out.push_str(name.get(end..)?);
-        Some(out)
+        found.then_some(out)
     }
 
     /// Number of the group of this name.
     pub(super) fn group(&self, name: &str) -> Option<usize> {
-        self.0.capture_names().position(|group| group == Some(name))
+        match self {
+            Self::Regular(regex) => regex.capture_names().position(|group| group == Some(name)),
+            Self::Backtracking(regex) => regex.capture_names().position(|group| group == Some(name)),
+        }
     }
 }
 

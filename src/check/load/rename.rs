@@ -20,6 +20,8 @@ enum Target {
 pub(super) struct Transform<'c> {
     row: &'c Conversion,
     pattern: Pattern,
+    /// Number of the group of each branch, by the branch.
+    groups: Vec<(usize, usize)>,
     target: Target,
     /// What a name has to start with, the longer first; none for a transform of the whole model.
     prefixes: Option<[String; 2]>,
@@ -44,7 +46,9 @@ impl<'c> Transform<'c> {
             let scope = dotted(scope);
             [format!("{}{scope}", dotted(base_model_prefix)), scope]
         });
-        Some(Self { row, pattern: Pattern::new(&branches.join("|"))?, target, prefixes })
+        let pattern = Pattern::new(&branches.join("|"))?;
+        let groups = (0..row.from.len()).filter_map(|i| Some((i, pattern.group(&format!("g{i}"))?))).collect();
+        Some(Self { row, pattern, groups, target, prefixes })
     }
 
     pub(super) const fn row(&self) -> &'c Conversion {
@@ -62,11 +66,8 @@ impl<'c> Transform<'c> {
             Some(prefixes) => prefixes.iter().find_map(|p| Some((p.as_str(), name.strip_prefix(p.as_str())?)))?,
         };
         let captures = self.pattern.captures(inner)?;
-        let group = |i: usize| self.pattern.group(&format!("g{i}"));
-        let (branch, at) = (0..self.row.from.len())
-            .filter_map(|i| Some((i, group(i)?)))
-            .find(|(_, at)| captures.get(*at).is_some())?;
-        let inside = |n: usize| captures.get(at.saturating_add(n)).map_or("", |m| m.as_str());
+        let (branch, at) = *self.groups.iter().find(|(_, at)| captures.range(*at).is_some())?;
+        let inside = |n: usize| captures.text(at.saturating_add(n));
         let replacement = match &mut self.target {
             Target::First => self.row.to.first()?.replace(r"\1", inside(1)),
             Target::Offset(offset) => {
@@ -81,7 +82,7 @@ impl<'c> Transform<'c> {
                 (1..10).fold(self.row.to.get(branch)?.clone(), |text, n| text.replace(&format!(r"\{n}"), inside(n)))
             }
         };
-        let matched = captures.get(0)?.as_str();
+        let matched = captures.text(0);
         // As the loader does: the first place where the matched text stands, which need not be where it matched.
         let renamed = inner.replacen(matched, &replacement, 1);
         Some((format!("{prefix}{renamed}"), self.row.from.get(branch)?))

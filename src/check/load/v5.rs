@@ -248,6 +248,11 @@ fn natural(a: &str, b: &str) -> Ordering {
             a_text.cmp(b_text).then_with(|| number(a_digits).cmp(&number(b_digits)))
         })
     };
+    // Parts before the first difference compare equal.
+    let same = a.bytes().zip(b.bytes()).take_while(|(a, b)| a == b).count();
+    let start =
+        a.as_bytes().get(..same).and_then(|same| memchr::memrchr(b'.', same)).map_or(0, |dot| dot.saturating_add(1));
+    let (a, b) = (a.get(start..).unwrap_or_default(), b.get(start..).unwrap_or_default());
     let differing = parts(a).zip(parts(b)).map(|(a, b)| compare(&a, &b)).find(|o| o.is_ne());
     differing.unwrap_or_else(|| parts(a).count().cmp(&parts(b).count()))
 }

@@ -14,7 +14,7 @@ pub(in crate::check::fix) fn rename(checkpoint: &Checkpoint, prefixes: Vec<(Stri
         return None;
     }
     let index = checkpoint.index.as_ref().filter(|index| !index.weight_map.is_empty());
-    let indexed: Option<BTreeSet<&str>> = index.map(|index| index.weight_map.values().map(String::as_str).collect());
+    let indexed = index.map(|index| &index.files);
     let mut after = BTreeSet::new();
     let (mut before, mut moved) = (BTreeSet::new(), BTreeSet::new());
     for (shard, tensor) in checkpoint.tensors() {
