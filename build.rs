@@ -1,5 +1,5 @@
-//! Writes the index of the embedded architecture files, and rebuilds the program when a file in `rules/` changes: the
-//! program embeds this directory.
+//! Writes the index of the embedded architecture files and the other data files as JSON, and rebuilds the program when a
+//! file in `rules/` changes: the program embeds this directory.
 
 #![allow(
     clippy::print_stdout,
@@ -8,7 +8,7 @@
 )]
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::{env, fs, io};
 
 mod library {
@@ -41,5 +41,25 @@ fn main() -> io::Result<()> {
         format!("{key}\t{}\n", stems.join("\t"))
     };
     let text: String = index.iter().map(line).collect();
-    fs::write(Path::new(&env::var_os("OUT_DIR").unwrap_or_default()).join("architectures.index"), text)
+    let out = PathBuf::from(env::var_os("OUT_DIR").unwrap_or_default());
+    fs::write(out.join("architectures.index"), text)?;
+    let mut files = BTreeMap::new();
+    convert(Path::new("rules"), &mut files)?;
+    let lines: String = files.into_iter().map(|(path, json)| format!("{path}\t{json}\n")).collect();
+    fs::write(out.join("data.txt"), lines)
+}
+
+/// Reads the JSON5 files below a folder as JSON, by their paths; not those of architectures.
+fn convert(folder: &Path, files: &mut BTreeMap<String, String>) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        if path.is_dir() && !path.ends_with("architectures") {
+            convert(&path, files)?;
+        } else if path.extension().is_some_and(|extension| extension == "json5") {
+            let wrong = |error| io::Error::other(format!("{}: {error}", path.display()));
+            let value: serde_json::Value = json5::from_str(&fs::read_to_string(&path)?).map_err(wrong)?;
+            files.insert(path.to_string_lossy().replace('\\', "/"), value.to_string());
+        }
+    }
+    Ok(())
 }

@@ -157,18 +157,22 @@ fn settings() -> Vec<(PathBuf, Value)> {
 
 #[test]
 fn schemas_are_fresh() {
-    let write = std::env::var_os("CKPT_DOCTOR_WRITE").is_some();
     let inputs = inputs().into_iter().map(|input| (input.name, input.schema));
     for (name, schema) in inputs.chain(outputs()) {
-        let file = project().join(format!("schemas/{name}.schema.json"));
         let text = format!("{}\n", serde_json::to_string_pretty(&schema).unwrap());
-        if write {
-            fs::create_dir_all(file.parent().unwrap()).unwrap();
-            fs::write(&file, &text).unwrap();
-        }
-        let stale = "is stale: run `CKPT_DOCTOR_WRITE=1 cargo test --lib schemas`, and commit it";
-        assert!(fs::read_to_string(&file).unwrap_or_default() == text, "{} {stale}", file.display());
+        assert_fresh(&format!("schemas/{name}.schema.json"), &text);
     }
+}
+
+/// Fails when the generated file of this path has another text; writes it when `CKPT_DOCTOR_WRITE` is set.
+pub fn assert_fresh(path: &str, text: &str) {
+    let file = project().join(path);
+    if std::env::var_os("CKPT_DOCTOR_WRITE").is_some() {
+        fs::create_dir_all(file.parent().unwrap()).unwrap();
+        fs::write(&file, text).unwrap();
+    }
+    let stale = "is stale: run `CKPT_DOCTOR_WRITE=1 cargo test --lib`, and commit it";
+    assert!(fs::read_to_string(&file).unwrap_or_default() == text, "{path} {stale}");
 }
 
 #[test]

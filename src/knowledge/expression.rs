@@ -6,6 +6,7 @@
 mod compiled;
 mod functions;
 mod limits;
+mod parsed;
 mod program;
 mod references;
 mod scope;

@@ -1,5 +1,7 @@
 //! The data files in `rules/`: embedded in the program, parsed as JSON5.
 
+use std::cmp::Ordering;
+
 use include_dir::{Dir, include_dir};
 use serde::de::DeserializeOwned;
 
@@ -7,6 +9,10 @@ use super::expression::{compile_eagerly, compile_lazily};
 use crate::checkpoint::line_column;
 
 static RULES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules");
+
+/// Data files as JSON, which is read ten times as fast as JSON5: lines for [`line_of`] that the build script writes. Without
+/// architectures, of which a run reads a few.
+const CONVERTED: &str = include_str!(concat!(env!("OUT_DIR"), "/data.txt"));
 
 /// A malformed data file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -70,7 +76,27 @@ pub fn parse<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError
 /// # Errors
 /// As [`parse`], except for invalid expressions.
 pub fn parse_embedded<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
-    compile_lazily(|| read(path, text))
+    let converted = |json| serde_json::from_str(json).map_err(|error| DataError::new(path, error.to_string()));
+    compile_lazily(|| line_of(CONVERTED, path).map_or_else(|| read(path, text), converted))
+}
+
+/// The value in the line of `key`, by bisection: lines of a key, a tab and a value, sorted by their keys.
+pub(super) fn line_of<'t>(lines: &'t str, key: &str) -> Option<&'t str> {
+    let (mut start, mut end) = (0, lines.len());
+    while start < end {
+        let middle = start.midpoint(end);
+        // The line around the middle; as bytes, because the middle may lie within a character.
+        let before = lines.as_bytes().get(start..middle)?;
+        let from = memchr::memrchr(b'\n', before).map_or(Some(start), |at| start.checked_add(at)?.checked_add(1))?;
+        let line = lines.get(from..end)?.split('\n').next()?;
+        let (found, value) = line.split_once('\t')?;
+        match found.cmp(key) {
+            Ordering::Equal => return Some(value),
+            Ordering::Less => start = from.checked_add(line.len())?.checked_add(1)?,
+            Ordering::Greater => end = from,
+        }
+    }
+    None
 }
 
 fn read<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
@@ -151,15 +177,24 @@ pub fn nearest<'w>(word: &str, known: impl IntoIterator<Item = &'w str>) -> Opti
     best.filter(|(likeness, _)| *likeness > NEAR).map(|(_, word)| word)
 }
 
-/// The files directly in `rules/<folder>`, by their names.
-pub fn files(folder: &str) -> impl Iterator<Item = (&'static str, &'static str)> {
-    let files = RULES.get_dir(folder).into_iter().flat_map(Dir::files);
+/// The folder of this path below `rules/`; `include_dir` would compare the path with that of every file.
+fn folder(path: &str) -> Option<&'static Dir<'static>> {
+    let mut here = &RULES;
+    for (end, _) in path.match_indices('/').chain([(path.len(), "")]) {
+        here = here.dirs().find(|dir| dir.path().to_str() == path.get(..end))?;
+    }
+    Some(here)
+}
+
+/// The files directly in a folder of `rules/`, by their names.
+pub fn files(path: &str) -> impl Iterator<Item = (&'static str, &'static str)> {
+    let files = folder(path).into_iter().flat_map(Dir::files);
     files.filter_map(|file| Some((file.path().file_name()?.to_str()?, file.contents_utf8()?)))
 }
 
-/// The `.json5` files below `rules/<folder>`, in path order.
+/// The `.json5` files below a folder of `rules/`, in path order.
 #[must_use]
-pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {
+pub fn embedded(path: &str) -> Vec<(String, &'static str)> {
     fn walk(dir: &'static Dir<'static>, out: &mut Vec<(String, &'static str)>) {
         for file in dir.files() {
             let path = file.path().to_string_lossy();
@@ -174,27 +209,27 @@ pub fn embedded(folder: &str) -> Vec<(String, &'static str)> {
         }
     }
     let mut out = Vec::new();
-    if let Some(dir) = RULES.get_dir(folder) {
+    if let Some(dir) = folder(path) {
         walk(dir, &mut out);
     }
     out.sort_by(|a, b| a.0.cmp(&b.0));
     out
 }
 
-/// Stem and bytes of each `.json5` file in `rules/<folder>`, not in its subfolders.
-pub(super) fn embedded_bytes(folder: &str) -> impl Iterator<Item = (&'static str, &'static [u8])> {
-    let files = RULES.get_dir(folder).into_iter().flat_map(Dir::files);
+/// Stem and bytes of each `.json5` file in a folder of `rules/`, not in its subfolders.
+pub(super) fn embedded_bytes(path: &str) -> impl Iterator<Item = (&'static str, &'static [u8])> {
+    let files = folder(path).into_iter().flat_map(Dir::files);
     files.filter_map(|file| Some((file.path().to_str()?.rsplit('/').next()?.strip_suffix(".json5")?, file.contents())))
 }
 
-/// Paths below `rules/<folder>` of all embedded files in it and in its subfolders.
+/// Paths below a folder of `rules/` of all files in it and in its subfolders.
 #[must_use]
-pub fn paths(folder: &str) -> Vec<&'static str> {
-    let mut pending: Vec<&Dir<'static>> = RULES.get_dir(folder).into_iter().collect();
+pub fn paths(path: &str) -> Vec<&'static str> {
+    let mut pending: Vec<&Dir<'static>> = folder(path).into_iter().collect();
     let mut out = Vec::new();
     while let Some(dir) = pending.pop() {
         let paths = dir.files().filter_map(|file| file.path().to_str());
-        out.extend(paths.filter_map(|path| path.strip_prefix(folder)?.strip_prefix('/')));
+        out.extend(paths.filter_map(|file| file.strip_prefix(path)?.strip_prefix('/')));
         pending.extend(dir.dirs());
     }
     out.sort_unstable();
@@ -204,7 +239,8 @@ pub fn paths(folder: &str) -> Vec<&'static str> {
 /// The text of one embedded file, such as a template of a recipe.
 #[must_use]
 pub fn text(path: &str) -> Option<&'static str> {
-    RULES.get_file(path)?.contents_utf8()
+    let dir = path.rsplit_once('/').map_or(Some(&RULES), |(dir, _)| folder(dir))?;
+    dir.files().find(|file| file.path().to_str() == Some(path))?.contents_utf8()
 }
 
 #[cfg(test)]
@@ -230,6 +266,30 @@ mod tests {
         assert!(refused("{}").contains("missing key `summary`"), "{}", refused("{}"));
         let about = DataError::about("a.json5", "{\n x: ['IDX']}", "IDX", "no");
         assert_eq!(about.to_string(), "a.json5:2:6: no");
+    }
+
+    #[test]
+    fn every_line_is_found_and_no_other() {
+        let lines = "a\t1\nb + 1\t2\nb + é\t3\n";
+        for (key, value) in [("a", Some("1")), ("b + 1", Some("2")), ("b + é", Some("3")), ("b", None), ("c", None)] {
+            assert_eq!(line_of(lines, key), value, "{key}");
+        }
+        assert_eq!(line_of("", "a"), None);
+    }
+
+    #[test]
+    fn converted_files_have_the_values_of_their_json5() {
+        let mut files = 0;
+        for line in CONVERTED.lines() {
+            let (path, json) = line.split_once('\t').unwrap();
+            let text = text(path.strip_prefix("rules/").unwrap()).unwrap();
+            let [json, value] = [serde_json::from_str(json).ok(), json5::from_str(text).ok()];
+            let value: Option<serde_json::Value> = value;
+            assert!(json.is_some() && json == value, "{path}");
+            assert_eq!(line_of(CONVERTED, path), line.split_once('\t').map(|(_, json)| json));
+            files += 1;
+        }
+        assert!(files > 100);
     }
 
     /// Strings and comments between the brackets do not hide the nesting.

@@ -231,8 +231,9 @@ fn the_page_of_data_files_is_fresh() {
          | `statistics.json5` | where policies of robots keep their statistics |\n\
          | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
-         | `examples.json` | an example of each rule, generated from its fixtures |\n\n\
-         All files are JSON5. The keys below come from the JSON Schemas in [`schemas/`](../schemas). *Expression* means an \
+         | `examples.json` | an example of each rule, generated from its fixtures |\n\
+         | `expressions.txt` | the expressions of all these files, parsed; written by `CKPT_DOCTOR_WRITE=1 cargo test --lib` |\n\n\
+         Files that people write are JSON5. The keys below come from the JSON Schemas in [`schemas/`](../schemas). *Expression* means an \
          expression in [CEL](https://cel.dev), and *template* a text with expressions in braces, in which `{{{{` and `}}}}` \
          are literal braces. Keys marked * are required.\n"
     );

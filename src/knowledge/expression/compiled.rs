@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 use std::cell::RefCell;
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::fmt;
 use std::sync::{Arc, OnceLock};
 
@@ -109,6 +109,8 @@ impl Expression {
         let expression = if at_once {
             Self::parse(source)?
         } else {
+            #[cfg(test)]
+            super::parsed::tests::record(source);
             Self(Arc::new(Inner { source: source.into(), counted: false, program: OnceLock::new() }))
         };
         READING.with_borrow_mut(|r| Some(r.seen.as_mut()?.insert(source.into(), expression.clone())));
@@ -126,10 +128,10 @@ impl Expression {
         &self.0.source
     }
 
-    /// Variables in the expression, sorted, including those bound by its macros.
+    /// Variables of the expression, without those that its loops bind.
     #[must_use]
-    pub fn variables(&self) -> Vec<String> {
-        self.program().map_or_else(|_| Vec::new(), Program::variables)
+    pub fn variables(&self) -> BTreeSet<String> {
+        self.references().paths.into_iter().filter_map(|path| path.into_iter().next()).collect()
     }
 
     /// Evaluates to a JSON value; objects have sorted keys.

@@ -6,6 +6,7 @@ use cel::common::value::Val;
 use cel::{Context, ExecutionError, Value as Cel};
 
 use super::limits;
+use super::parsed;
 use super::scope::ENV;
 use super::steps;
 
@@ -17,9 +18,9 @@ pub(super) enum Program {
     /// A variable, and the keys to follow from it.
     Path { variable: String, keys: Vec<CelString<'static>> },
     /// Any other expression of a built-in file.
-    General(cel::Program),
+    General(Box<IdedExpr>),
     /// Any other expression of a user's file: as parsed, and with counted loops.
-    Counted(cel::Program, Box<IdedExpr>),
+    Counted { parsed: Box<IdedExpr>, counted: Box<IdedExpr> },
 }
 
 /// Words that are not variables.
@@ -31,21 +32,28 @@ impl Program {
         if counted {
             limits::check(source)?;
         }
-        if let Some(simple) = Self::constant(source).or_else(|| Self::path(source)) {
+        if let Some(simple) = Self::simple(source) {
             return Ok(simple);
         }
-        let compiled = |program: cel::Program| {
-            if counted {
-                let counted = steps::count(program.expression());
-                Self::Counted(program, Box::new(counted))
-            } else {
-                Self::General(program)
-            }
-        };
-        ENV.compile(source).map(compiled).map_err(|errors| {
+        if let Some(expression) = parsed::find(source).filter(|_| !counted) {
+            return Ok(Self::General(Box::new(expression)));
+        }
+        let program = ENV.compile(source).map_err(|errors| {
             let errors = errors.errors.iter().map(|e| format!("column {}: {}", e.pos.1, e.msg));
             errors.collect::<Vec<_>>().join("; ")
+        })?;
+        let parsed = Box::new(program.expression().clone());
+        Ok(if counted {
+            let counted = Box::new(steps::count(&parsed));
+            Self::Counted { parsed, counted }
+        } else {
+            Self::General(parsed)
         })
+    }
+
+    /// A constant or a path, which needs no parser.
+    pub fn simple(source: &str) -> Option<Self> {
+        Self::constant(source).or_else(|| Self::path(source))
     }
 
     fn constant(source: &str) -> Option<Self> {
@@ -80,28 +88,14 @@ impl Program {
                 let root = context.get_variable(variable).ok_or_else(undeclared)?;
                 follow(root.as_ref(), keys)
             }
-            Self::General(program) => program.execute(context),
-            Self::Counted(_, expression) => {
-                let value = steps::bounded(|| Cel::resolve(expression, context))?;
+            Self::General(expression) => Cel::resolve(expression, context),
+            Self::Counted { counted, .. } => {
+                let value = steps::bounded(|| Cel::resolve(counted, context))?;
                 if steps::size(&value) > limits::VALUE {
                     let message = "the value is too large".to_owned();
                     return Err(ExecutionError::FunctionError { function: "value".to_owned(), message });
                 }
                 Ok(value)
-            }
-        }
-    }
-
-    /// Variables in the expression, sorted.
-    pub fn variables(&self) -> Vec<String> {
-        match self {
-            Self::Constant(_) => Vec::new(),
-            Self::Path { variable, .. } => vec![variable.clone()],
-            Self::General(program) | Self::Counted(program, _) => {
-                let references = program.references();
-                let mut names: Vec<String> = references.variables().into_iter().map(str::to_owned).collect();
-                names.sort();
-                names
             }
         }
     }

@@ -36,7 +36,7 @@ impl Expression {
                 let keys = keys.iter().map(|key| key.inner().to_owned());
                 references.paths.push([variable.clone()].into_iter().chain(keys).collect());
             }
-            Ok(Program::General(program) | Program::Counted(program, _)) => references.read(program.expression()),
+            Ok(Program::General(parsed) | Program::Counted { parsed, .. }) => references.read(parsed),
             Ok(Program::Constant(_)) | Err(_) => {}
         }
         references

@@ -97,7 +97,7 @@ fn children_see_their_parents() {
     assert_eq!(expression.eval(&grandchild), Ok(json!(45)));
     assert_eq!(expression.eval(&child), Ok(json!(44)));
     assert!(expression.eval(&root).is_err());
-    assert_eq!(expression.variables(), ["i", "n"]);
+    assert_eq!(expression.variables().iter().map(String::as_str).collect::<Vec<_>>(), ["i", "n"]);
 }
 
 #[test]
