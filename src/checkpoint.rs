@@ -36,7 +36,6 @@ mod sniff;
 pub mod text;
 pub mod tokenizer;
 
-pub use contents::Contents;
 pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
@@ -93,8 +92,8 @@ pub struct Checkpoint {
     pub base: Option<adapter::AdapterBase>,
     /// Files below its folders.
     pub nested: Nested,
-    /// Digests of the tensors' bytes; `None` unless [`Checkpoint::read_contents`] ran.
-    pub contents: Option<Contents>,
+    /// Whether [`Checkpoint::read_contents`] read the bytes of the tensors, so that others may be read to compare them.
+    pub deep: bool,
     /// Faults of the directory itself; [`Checkpoint::all_faults`] adds those of the files.
     pub faults: Vec<Fault>,
 }
@@ -279,6 +278,12 @@ impl Checkpoint {
     pub fn sample(&self, name: &str) -> Option<Vec<u8>> {
         let (shard, tensor) = self.tensor(name)?;
         contents::sample(&self.root, shard, tensor)
+    }
+
+    /// Whether two tensors have the same bytes; `None` when they cannot be read.
+    #[must_use]
+    pub fn same_bytes(&self, one: &str, other: &str) -> Option<bool> {
+        contents::same_bytes(&self.root, self.tensor(one)?, self.tensor(other)?)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

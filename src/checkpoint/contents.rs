@@ -1,12 +1,14 @@
-//! Digests and faults from the bytes of the tensors; read only for `check --deep`.
+//! Faults from the bytes of the tensors, and their comparison; read only for `check --deep`.
 //!
-//! Every byte of every shard passes once through one buffer, independent of the size of the weights; holes of sparse files,
-//! which are zeros, are not read. Reads are positioned instead of memory-mapped: a file that shrinks during the read gives a
+//! Every byte of every shard passes once through the buffer of a thread, independent of the size of the weights; holes of
+//! sparse files, which are zeros, are not read. Reads are positioned instead of memory-mapped: a file that shrinks during the read gives a
 //! fault instead of a signal.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::FileExt as _;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::thread;
 
 use super::open::{Opened, open_regular};
 use super::shard::tail::zero_tail;
@@ -24,41 +26,72 @@ use pieces::{Hash, Piece, each_piece};
 /// Bytes read at a time: a multiple of every element width, so that no element is split between two reads.
 const CHUNK: usize = 1 << 20;
 
-/// Maximum number of zeros in holes that are hashed of one checkpoint: a few seconds of work. A tensor with more has no
-/// digest.
+/// Maximum number of zeros in holes that are hashed of one checkpoint: a few seconds of work. A file or a tensor with more
+/// has no digest.
 const HASHED_ZEROS: u64 = 1 << 30;
 
-/// SHA-256 digests of the tensors, by shard and tensor name.
-#[derive(Debug, Clone, Default)]
-pub struct Contents {
-    digests: BTreeMap<String, BTreeMap<String, [u8; 32]>>,
-}
-
-impl Contents {
-    /// Reads the bytes of every tensor of `shards`, and adds the faults that only the bytes reveal.
-    pub(super) fn read(root: &Path, entries: &BTreeMap<String, Entry>, shards: &mut BTreeMap<String, Shard>) -> Self {
-        let mut contents = Self::default();
-        let mut zeros_left = HASHED_ZEROS;
-        for shard in shards.values_mut() {
-            let mut reader =
-                ContentsReader { shard, digests: BTreeMap::new(), faults: Vec::new(), zeros_left: &mut zeros_left };
+/// Reads the bytes of every tensor of `shards`, and adds the faults that only the bytes reveal. Each thread takes one shard
+/// after the other; the faults of a shard do not depend on the number of threads.
+pub(super) fn read(root: &Path, entries: &BTreeMap<String, Entry>, shards: &mut BTreeMap<String, Shard>) {
+    let hashed = shards.keys().filter(|name| entries.get(*name).and_then(stated_digest).is_some()).count();
+    let zeros = HASHED_ZEROS.checked_div(as_u64(hashed)).unwrap_or(0);
+    let threads = thread::available_parallelism().map_or(1, usize::from).min(shards.len());
+    let queue = Mutex::new(shards.values_mut());
+    let work = || {
+        let mut buffer = vec![0_u8; CHUNK];
+        let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+        while let Some(shard) = next() {
+            let mut reader = ContentsReader { shard, faults: Vec::new(), zeros_left: zeros, buffer: &mut buffer };
             reader.run(root, entries.get(&shard.name));
-            let ContentsReader { digests, faults, .. } = reader;
-            contents.digests.insert(shard.name.clone(), digests);
+            let faults = reader.faults;
             if faults.iter().any(|f| f.kind == FaultKind::ZeroTail) {
                 // The header reader may already have reported a part of the zeros, from holes in the file.
                 shard.faults.retain(|f| f.kind != FaultKind::ZeroTail);
             }
             shard.faults.extend(faults);
         }
-        contents
-    }
+    };
+    thread::scope(|scope| {
+        for _ in 1..threads {
+            // Without another thread, this one does all of the work.
+            let _started = thread::Builder::new().spawn_scoped(scope, work);
+        }
+        work();
+    });
+}
 
-    /// SHA-256 of a tensor's bytes; `None` when they could not be read.
-    #[must_use]
-    pub fn digest(&self, shard: &str, tensor: &str) -> Option<&[u8; 32]> {
-        self.digests.get(shard)?.get(tensor)
-    }
+/// Whether two tensors of the same length have the same bytes; `None` when they cannot be read. Holes are zeros.
+pub(super) fn same_bytes(root: &Path, one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<bool> {
+    let start = |(shard, tensor): (&Shard, &Tensor)| {
+        let opened = open_regular(&root.join(&shard.name), u64::MAX).ok()?;
+        let is_whole = opened.identity.size == shard.file_len && !shard.unread && shard.is_contiguous(&tensor.name);
+        let start = shard.data_start.checked_add(tensor.begin)?;
+        (is_whole && start.checked_add(tensor.len())? <= shard.file_len).then_some((opened, start))
+    };
+    let ((one_file, one_start), (other_file, other_start)) = (start(one)?, start(other)?);
+    let [mut buffer, mut there] = [(); 2].map(|()| vec![0_u8; CHUNK]);
+    let mut equal = one.1.len() == other.1.len();
+    let mut readable = true;
+    let mut at = other_start;
+    let whole = each_piece(&one_file, one_start, one.1.len(), &mut buffer, |piece| {
+        if equal && readable {
+            match &piece {
+                Piece::Data(bytes) => {
+                    let there = there.get_mut(..bytes.len()).unwrap_or_default();
+                    readable = other_file.file.read_exact_at(there, at).is_ok();
+                    equal = *bytes == there;
+                }
+                Piece::Hole(len) => {
+                    let zeros = each_piece(&other_file, at, *len, &mut there, |piece| {
+                        equal &= !matches!(piece, Piece::Data(bytes) if bytes.iter().any(|byte| *byte != 0));
+                    });
+                    readable = zeros.is_ok();
+                }
+            }
+        }
+        at = at.saturating_add(piece.len());
+    });
+    (whole.is_ok() && readable).then_some(equal)
 }
 
 /// Bytes of each of the blocks of a [`sample`].
@@ -110,10 +143,10 @@ pub(super) fn numbers(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec
 /// State of reading one shard.
 struct ContentsReader<'s> {
     shard: &'s Shard,
-    digests: BTreeMap<String, [u8; 32]>,
     faults: Vec<Fault>,
     /// Zeros in holes that may still be hashed.
-    zeros_left: &'s mut u64,
+    zeros_left: u64,
+    buffer: &'s mut [u8],
 }
 
 impl ContentsReader<'_> {
@@ -140,7 +173,6 @@ impl ContentsReader<'_> {
     }
 
     fn tensors(&mut self, opened: &Opened, entry: Option<&Entry>) -> std::io::Result<()> {
-        let mut buffer = vec![0_u8; CHUNK];
         let region = self.shard.file_len.saturating_sub(self.shard.data_start);
         let mut tensors: Vec<&Tensor> = self.shard.tensors.iter().filter(|t| t.begin <= t.end).collect();
         tensors.sort_by_key(|t| (t.begin, t.end, t.name.as_str()));
@@ -149,12 +181,12 @@ impl ContentsReader<'_> {
             entry.and_then(stated_digest).filter(|_| self.shard.faults.iter().all(|f| f.kind == FaultKind::ZeroTail));
         // Storages of a pickle are in any order, with other bytes between them, so its hash takes a pass of its own.
         let (mut whole, stated) = if self.shard.is_pickle() {
-            self.pickle_hash(opened, stated, &mut buffer)?;
+            self.pickle_hash(opened, stated)?;
             (Hash::none(), None)
         } else {
             (stated.as_ref().map_or_else(Hash::none, |_| Hash::new()), stated)
         };
-        each_piece(opened, 0, self.shard.data_start, &mut buffer, |piece| whole.add(&piece, self.zeros_left))?;
+        each_piece(opened, 0, self.shard.data_start, self.buffer, |piece| whole.add(&piece, &mut self.zeros_left))?;
         // End of the last nonzero byte, counted from the start of the data.
         let mut last_value = 0_u64;
         let mut read = 0_u64;
@@ -166,9 +198,7 @@ impl ContentsReader<'_> {
                 continue;
             }
             // Those of a pickle that share a storage whole are read once.
-            if let Some(same) = shared.filter(|same: &&Tensor| (same.begin, same.end) == (tensor.begin, tensor.end)) {
-                let digest = self.digests.get(&same.name).copied();
-                self.digests.extend(digest.map(|digest| (tensor.name.clone(), digest)));
+            if shared.is_some_and(|same: &Tensor| (same.begin, same.end) == (tensor.begin, tensor.end)) {
                 continue;
             }
             shared = Some(*tensor).filter(|_| self.shard.is_pickle());
@@ -177,13 +207,11 @@ impl ContentsReader<'_> {
                 self.unread("its tensors overlap");
                 return Ok(());
             }
-            let mut digest = Hash::new();
             let mut numbers = NonFiniteCounter::new(tensor.dtype);
             let mut at = tensor.begin;
             let start = self.shard.data_start.saturating_add(tensor.begin);
-            each_piece(opened, start, tensor.len(), &mut buffer, |piece| {
-                digest.add(&piece, self.zeros_left);
-                whole.add(&piece, self.zeros_left);
+            each_piece(opened, start, tensor.len(), self.buffer, |piece| {
+                whole.add(&piece, &mut self.zeros_left);
                 match &piece {
                     Piece::Data(bytes) => numbers.add(bytes),
                     Piece::Hole(len) => numbers.skip(*len),
@@ -195,7 +223,6 @@ impl ContentsReader<'_> {
                 }
                 at = at.saturating_add(piece.len());
             })?;
-            self.digests.extend(digest.finish().map(|digest| (tensor.name.clone(), digest)));
             self.faults.extend(numbers.fault(self.shard, tensor));
         }
         if last_value < region && !self.shard.is_pickle() {
@@ -216,10 +243,10 @@ impl ContentsReader<'_> {
 
 impl ContentsReader<'_> {
     /// Compares the hash of a pickle with the one that its name states.
-    fn pickle_hash(&mut self, opened: &Opened, stated: Option<String>, buffer: &mut [u8]) -> std::io::Result<()> {
+    fn pickle_hash(&mut self, opened: &Opened, stated: Option<String>) -> std::io::Result<()> {
         let Some(stated) = stated else { return Ok(()) };
         let mut whole = Hash::new();
-        each_piece(opened, 0, self.shard.file_len, buffer, |piece| whole.add(&piece, self.zeros_left))?;
+        each_piece(opened, 0, self.shard.file_len, self.buffer, |piece| whole.add(&piece, &mut self.zeros_left))?;
         match whole.finish().map(|found| hex(&found)) {
             Some(found) if found != stated => {
                 let fault = Fault::new(FaultKind::ContentHashDiffers).at(self.shard.place());

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use super::adapter::AdapterBase;
 use super::budget::{Budget, text_cost};
 use super::card::{CARD, CARD_CAP, ModelCard};
-use super::contents::Contents;
+use super::contents;
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
@@ -85,10 +85,11 @@ impl Checkpoint {
         git::mark_pointers(self, trusts);
     }
 
-    /// Reads the bytes of every tensor: fills in [`Checkpoint::contents`], and adds to the shards the faults that only
-    /// the bytes reveal. Never fails: a read error becomes a fault.
+    /// Reads the bytes of every tensor, and adds to the shards the faults that only the bytes reveal. Never fails: a read
+    /// error becomes a fault.
     pub fn read_contents(&mut self) {
-        self.contents = Some(Contents::read(&self.root, &self.entries, &mut self.shards));
+        self.deep = true;
+        contents::read(&self.root, &self.entries, &mut self.shards);
     }
 }
 

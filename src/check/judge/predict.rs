@@ -78,17 +78,14 @@ pub(super) fn finished(checkpoint: &Checkpoint, target: &Target, mut report: Loa
     report
 }
 
-/// Whether two tensors have the same type, shape and bytes; `None` when their bytes were not read and samples of them are
+/// Whether two tensors have the same type, shape and bytes; `None` when their bytes are not read and samples of them are
 /// equal.
 pub(super) fn same_bytes(checkpoint: &Checkpoint, one: &str, other: &str) -> Option<bool> {
-    let Some(contents) = checkpoint.contents.as_ref() else {
+    if !checkpoint.deep {
         return (checkpoint.sample(one)? != checkpoint.sample(other)?).then_some(false);
-    };
-    let held = |name: &str| {
-        let (shard, tensor) = checkpoint.tensor(name)?;
-        Some((tensor.dtype, &tensor.shape, contents.digest(&shard.name, name)?))
-    };
-    Some(held(one)? == held(other)?)
+    }
+    let held = |name: &str| checkpoint.tensor(name).map(|(_, tensor)| (tensor.dtype, &tensor.shape));
+    if held(one)? == held(other)? { checkpoint.same_bytes(one, other) } else { Some(false) }
 }
 
 /// The report for readers: with the quantised modules that do not fit, and a missing shard, which rules of other families

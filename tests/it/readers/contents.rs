@@ -88,3 +88,59 @@ fn a_hole_at_the_end_is_detected_without_reading() {
     let detail = &checkpoint.shards[NAME].faults[0].detail;
     assert_eq!((detail["tensors"].as_u64(), detail["bytes"].as_u64()), (Some(1), Some(1_097_152)));
 }
+
+/// Every shard has its own faults, whichever thread reads it.
+#[test]
+fn shards_are_read_by_several_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    for number in 1..=20 {
+        let mut data = [1; 64];
+        if number % 3 == 0 {
+            data[number..number + 2].copy_from_slice(&[0xc0, 0x7f]);
+        }
+        write(&dir.path().join(format!("model-{number:05}-of-00020.safetensors")), &data);
+    }
+    let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
+    checkpoint.read_contents();
+    let faulty = checkpoint.shards.values().filter(|shard| !shard.faults.is_empty());
+    let numbers: Vec<&str> = faulty.map(|shard| &shard.name["model-".len()..][..5]).collect();
+    assert_eq!(numbers, ["00006", "00012", "00018"], "an odd place is within two elements");
+}
+
+#[test]
+fn bytes_of_tensors_are_compared_with_holes_as_zeros() {
+    const LEN: u64 = 3 << 20;
+    let dir = tempfile::tempdir().unwrap();
+    let names = ["sparse", "zeros", "value", "same"];
+    let entries: Vec<String> = (0_u64..)
+        .zip(names)
+        .map(|(i, name)| {
+            format!(r#""{name}":{{"dtype":"U8","shape":[{LEN}],"data_offsets":[{},{}]}}"#, i * LEN, (i + 1) * LEN)
+        })
+        .collect();
+    let header = format!(r#"{{"__metadata__":{{"format":"pt"}},{}}}"#, entries.join(","));
+    let file = fs::File::create(dir.path().join(NAME)).unwrap();
+    let start = 8 + u64::try_from(header.len()).unwrap();
+    let put = |bytes: &[u8], at: u64| std::os::unix::fs::FileExt::write_all_at(&file, bytes, at).unwrap();
+    put(&(start - 8).to_le_bytes(), 0);
+    put(header.as_bytes(), 8);
+    file.set_len(start + 4 * LEN).unwrap();
+    put(&vec![0; usize::try_from(LEN).unwrap()], start + LEN);
+    for tensor in [2, 3] {
+        put(&[7], start + tensor * LEN + (2 << 20) + 5);
+    }
+    let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
+    checkpoint.read_contents();
+    for (one, other, same) in [
+        ("sparse", "zeros", true),
+        ("zeros", "sparse", true),
+        ("sparse", "value", false),
+        ("value", "sparse", false),
+        ("zeros", "value", false),
+        ("value", "same", true),
+    ] {
+        assert_eq!(checkpoint.same_bytes(one, other), Some(same), "{one} {other}");
+    }
+    file.set_len(start + 3 * LEN).unwrap();
+    assert_eq!(checkpoint.same_bytes("sparse", "zeros"), None, "the file became shorter");
+}
