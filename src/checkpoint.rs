@@ -28,6 +28,7 @@ pub mod module;
 mod nested;
 pub mod open;
 pub mod pickle;
+pub(crate) mod platform;
 pub(crate) mod pointer;
 mod read;
 mod scan;

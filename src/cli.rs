@@ -17,9 +17,12 @@ mod paths;
 mod recipes;
 mod rules;
 mod settings;
+#[cfg_attr(windows, path = "cli/signals_windows.rs")]
 mod signals;
 mod skipped;
 mod stack;
+#[cfg_attr(windows, path = "cli/system_windows.rs")]
+mod system;
 mod undo;
 mod verify;
 
@@ -30,7 +33,7 @@ use std::process::ExitCode;
 use clap::Parser;
 
 use crate::merge::PipelineError;
-use crate::surgery::{ApplyError, RepairError};
+use crate::surgery::{ApplyError, CAN_WRITE, RepairError};
 
 /// Whether a signal ended the run.
 fn interrupted(error: &anyhow::Error) -> bool {
@@ -51,6 +54,19 @@ fn file_as_option(args: impl Iterator<Item = OsString>, exists: impl Fn(&Path) -
     options.find(|arg| exists(Path::new(arg)))
 }
 
+/// The name of a command that writes a checkpoint, for the refusal where none can be written.
+const fn writer(command: &args::Command) -> Option<&'static str> {
+    use args::Command;
+    match command {
+        Command::Check(args) if args.fix.writes() => Some("check --fix"),
+        Command::BuildMerged(args) if !args.help && !args.print_recipe => Some("build-merged"),
+        Command::Extract(_) => Some("extract"),
+        Command::Insert(_) => Some("insert"),
+        Command::Undo(_) => Some("undo"),
+        _ => None,
+    }
+}
+
 /// Runs the program.
 #[must_use]
 pub fn main() -> ExitCode {
@@ -64,6 +80,10 @@ fn run() -> ExitCode {
         return ExitCode::from(exit::FAILED);
     }
     let args::Cli { command, rules } = args::Cli::try_parse().unwrap_or_else(|error| hints::explained(error).exit());
+    if let Some(name) = writer(&command).filter(|_| !CAN_WRITE) {
+        output::note(&format!("error: {name} writes checkpoints, which needs Linux or macOS; on Windows use WSL"));
+        return ExitCode::from(exit::FAILED);
+    }
     let result = match command {
         args::Command::Check(args) => check::run(&args, rules.as_deref()),
         args::Command::Undo(args) => undo::run(&args),
@@ -100,7 +120,26 @@ mod tests {
     use std::ffi::OsString;
     use std::path::Path;
 
-    use super::file_as_option;
+    use clap::Parser as _;
+
+    use super::{args, file_as_option, writer};
+
+    #[test]
+    fn commands_that_write_checkpoints_are_known() {
+        let name = |args: &str| {
+            let args = ["ckpt-doctor"].into_iter().chain(args.split(' '));
+            writer(&args::Cli::try_parse_from(args).expect("arguments").command)
+        };
+        assert_eq!(name("check --fix a"), Some("check --fix"));
+        assert_eq!(name("check --fix-only a"), Some("check --fix"));
+        assert_eq!(name("undo a"), Some("undo"));
+        assert_eq!(name("build-merged --vision a --language b --out c"), Some("build-merged"));
+        assert_eq!(name("extract a --part language --out c"), Some("extract"));
+        assert_eq!(name("insert a --part language --from b --out c"), Some("insert"));
+        for reader in ["check a", "check --fix --diff a", "build-merged --recipe insert --help", "verify a", "init"] {
+            assert_eq!(name(reader), None, "{reader}");
+        }
+    }
 
     #[test]
     fn names_of_files_are_no_options() {

@@ -29,7 +29,7 @@
 // these to build one checkpoint from several. `api` and `cli` run them for a user. No module imports from a later one.
 
 #![cfg_attr(
-    not(feature = "cli"),
+    not(all(feature = "cli", unix)),
     allow(dead_code, unused_imports, reason = "only the program fixes, undoes, inspects and reads settings files")
 )]
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use super::{Error, knowledge};
 use crate::check::check_for;
 use crate::checkpoint::Checkpoint;
+use crate::checkpoint::platform::shown;
 use crate::report::model::CheckpointReport;
 
 /// Checks checkpoint directories with the rules of this crate.
@@ -54,7 +55,7 @@ impl Checker {
         }
         let checkpoint = Arc::new(checkpoint);
         let outcome = check_for(&checkpoint, knowledge, &self.versions);
-        Ok(CheckpointReport::new(path.display().to_string(), None, &checkpoint, &outcome))
+        Ok(CheckpointReport::new(shown(path), None, &checkpoint, &outcome))
     }
 }
 

@@ -5,7 +5,6 @@
 //! fault instead of a signal.
 
 use std::collections::BTreeMap;
-use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::thread;
@@ -78,7 +77,7 @@ pub(super) fn same_bytes(root: &Path, one: (&Shard, &Tensor), other: (&Shard, &T
             match &piece {
                 Piece::Data(bytes) => {
                     let there = there.get_mut(..bytes.len()).unwrap_or_default();
-                    readable = other_file.file.read_exact_at(there, at).is_ok();
+                    readable = other_file.read_exact_at(there, at).is_ok();
                     equal = *bytes == there;
                 }
                 Piece::Hole(len) => {
@@ -113,7 +112,7 @@ pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<
     let mut bytes = Vec::new();
     for at in [0, last / 2, last] {
         let mut block = vec![0; usize::try_from(length).ok()?];
-        opened.file.read_exact_at(&mut block, start.checked_add(at)?).ok()?;
+        opened.read_exact_at(&mut block, start.checked_add(at)?).ok()?;
         bytes.append(&mut block);
     }
     Some(bytes)
@@ -130,7 +129,7 @@ pub(super) fn numbers(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec
         return None;
     }
     let mut bytes = vec![0; usize::try_from(tensor.len()).ok()?];
-    opened.file.read_exact_at(&mut bytes, shard.data_start.checked_add(tensor.begin)?).ok()?;
+    opened.read_exact_at(&mut bytes, shard.data_start.checked_add(tensor.begin)?).ok()?;
     Some(match tensor.dtype {
         Dtype::F64 => bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect(),
         Dtype::F32 => bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b).into()).collect(),

@@ -2,9 +2,9 @@
 
 use std::fmt;
 use std::fs::Metadata;
-use std::os::unix::fs::FileTypeExt as _;
 
 use super::lfs::LfsPointer;
+use super::platform::special_kind;
 
 /// Kind of a directory entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -33,12 +33,8 @@ impl EntryKind {
             Self::Regular
         } else if kind.is_dir() {
             Self::Directory
-        } else if kind.is_fifo() {
-            Self::Fifo
-        } else if kind.is_socket() {
-            Self::Socket
         } else {
-            Self::Device
+            special_kind(kind)
         }
     }
 

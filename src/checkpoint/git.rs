@@ -11,6 +11,7 @@ use globset::GlobSet;
 
 use super::glob::glob;
 use super::open::read_capped;
+use super::platform::canonicalize;
 use super::{Checkpoint, Fault, FaultKind};
 
 /// Maximum number of bytes read of a `.gitattributes`.
@@ -52,7 +53,7 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint, trusts: &dyn Fn(&Path) 
 
 /// The given files that git-lfs handles according to the `.gitattributes` of the work tree around `root`.
 fn kept(root: &Path, mut files: BTreeSet<String>, trusts: &dyn Fn(&Path) -> bool) -> BTreeSet<String> {
-    let Ok(root) = root.canonicalize() else { return BTreeSet::new() };
+    let Ok(root) = canonicalize(root) else { return BTreeSet::new() };
     let Some(top) = root.ancestors().skip(1).find(|dir| dir.join(".git").symlink_metadata().is_ok()) else {
         return BTreeSet::new();
     };

@@ -3,14 +3,13 @@
 //! A plain `open` would block for ever on a FIFO named like a config, and a sparse "config" of six gigabytes would fill
 //! the memory. [`open_regular`] refuses both.
 
-use std::fs::{File, Metadata, OpenOptions};
+use std::fs::{File, Metadata};
 use std::io::Read as _;
-use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::OFlags;
 use thiserror::Error;
 
+use super::platform::{self, is_windows_file_name};
 use super::{EntryKind, Fault, FaultKind, Place};
 
 /// Maximum number of bytes read of a JSON document.
@@ -37,12 +36,7 @@ impl Identity {
     /// Reads the identity from a file's metadata.
     #[must_use]
     pub fn from_metadata(metadata: &Metadata) -> Self {
-        Self {
-            dev: metadata.dev(),
-            ino: metadata.ino(),
-            size: metadata.len(),
-            mtime: (metadata.mtime(), metadata.mtime_nsec()),
-        }
+        platform::identity(metadata)
     }
 }
 
@@ -146,7 +140,7 @@ impl OpenError {
     /// The error for a failed system call on `path`.
     pub(crate) fn from_io(path: &Path, source: std::io::Error) -> Self {
         let path = path.to_owned();
-        if source.raw_os_error() == Some(rustix::io::Errno::LOOP.raw_os_error()) {
+        if platform::is_loop(&source) {
             return Self::SymlinkLoop { path };
         }
         if source.kind() == std::io::ErrorKind::NotFound {
@@ -167,7 +161,7 @@ impl OpenError {
 /// # Errors
 /// When the file is missing, is not regular, or has more than `cap` bytes.
 pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
-    open_at(path, path, cap, OFlags::empty())
+    open_at(path, path, cap, true)
 }
 
 /// Opens a file of the checkpoint in `root`, as [`open_regular`] does. A symbolic link is followed if its target lies in
@@ -181,7 +175,7 @@ pub fn open_own(root: &Path, name: &str, cap: u64) -> Result<Opened, OpenError> 
     let path = root.join(name);
     let real = real_target(root, &path)?;
     // A link that somebody puts there now is not followed.
-    open_at(real.as_deref().unwrap_or(&path), &path, cap, OFlags::NOFOLLOW)
+    open_at(real.as_deref().unwrap_or(&path), &path, cap, false)
 }
 
 /// Reads a whole file of the checkpoint in `root`, see [`open_own`].
@@ -223,17 +217,18 @@ fn is_blob(root: &Path, real: &Path) -> bool {
     is_hash && (root.starts_with(repository) || folder.starts_with("models--"))
 }
 
-/// Opens `path`, which errors call `shown`.
-fn open_at(path: &Path, shown: &Path, cap: u64, more: OFlags) -> Result<Opened, OpenError> {
+/// Opens `path`, which errors call `shown`; a link is refused unless `follow`.
+fn open_at(path: &Path, shown: &Path, cap: u64, follow: bool) -> Result<Opened, OpenError> {
     let io = |source| OpenError::from_io(shown, source);
     let regular = |metadata: &Metadata| match EntryKind::from_metadata(metadata) {
         EntryKind::Regular => Ok(()),
         kind => Err(OpenError::NotRegular { path: shown.to_owned(), kind }),
     };
+    if cfg!(windows) && !path.file_name().is_some_and(|name| is_windows_file_name(&name.to_string_lossy())) {
+        return Err(OpenError::NotFound { path: shown.to_owned() });
+    }
     regular(&std::fs::metadata(path).map_err(io)?)?;
-    let flags = OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY | more;
-    let flags = i32::try_from(flags.bits()).unwrap_or(0);
-    let file = OpenOptions::new().read(true).custom_flags(flags).open(path).map_err(io)?;
+    let file = platform::open(path, follow).map_err(io)?;
     let metadata = file.metadata().map_err(io)?;
     regular(&metadata)?;
     let identity = Identity::from_metadata(&metadata);
@@ -252,6 +247,14 @@ pub fn read_capped(path: &Path, cap: u64) -> Result<Vec<u8>, OpenError> {
 }
 
 impl Opened {
+    /// Fills the buffer with the bytes from `at` on. Called by the readers of shards and pickles, in any order.
+    ///
+    /// # Errors
+    /// When the file ends before, or reading fails.
+    pub(crate) fn read_exact_at(&self, buffer: &mut [u8], at: u64) -> std::io::Result<()> {
+        platform::read_exact_at(&self.file, buffer, at)
+    }
+
     /// Reads the whole file, up to the cap it was opened with.
     ///
     /// # Errors

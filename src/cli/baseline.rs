@@ -8,6 +8,7 @@ use anyhow::{Context, bail};
 use super::output;
 use super::settings::Resolved;
 use crate::checkpoint::open::{JSON_CAP, read_capped};
+use crate::checkpoint::platform::shown;
 use crate::report::baseline::Baseline;
 use crate::report::model::CheckpointReport;
 
@@ -22,7 +23,7 @@ pub fn apply_baseline(reports: &mut [CheckpointReport], by: &Resolved, write: bo
         }
         return Ok(());
     };
-    let name = file.display().to_string();
+    let name = shown(file);
     let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let selected: BTreeSet<&str> = codes(by).collect();
     let older = read(file, &name, write)?;

@@ -12,6 +12,7 @@ use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::Checkpoint;
+use crate::checkpoint::platform::shown;
 use crate::knowledge::settings::Surroundings;
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
@@ -41,7 +42,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     }
     let mut looked = Vec::new();
     for dir in dirs {
-        let path = dir.display().to_string();
+        let path = shown(&dir);
         let checked = match run.look(dir) {
             Ok(checked) => {
                 run.refuse_unusable(&checked)?;
@@ -74,8 +75,8 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let searched: Vec<PathBuf> = args.paths.iter().filter(is_checked).cloned().collect();
     report_unused_suppressions(&mut looked, by, &searched);
     let reports = looked.iter().map(|l| {
-        let mut report = CheckpointReport::new(l.dir.display().to_string(), None, &l.checkpoint, &l.outcome);
-        report.settings = by.file.as_ref().map(|file| file.display().to_string());
+        let mut report = CheckpointReport::new(shown(&l.dir), None, &l.checkpoint, &l.outcome);
+        report.settings = by.file.as_ref().map(|file| shown(file));
         report.overrides = Overrides::of(&by.knowledge);
         (report.fixed, report.withdrawn) = l.repaired.clone();
         report.fixing = Some(Fixing { unsafe_fixes: args.fix.unsafe_fixes, made: args.fix.writes() });

@@ -13,6 +13,7 @@ use super::args::{ExpectArgs, ExpectFormat};
 use super::exit::{CLEAN, FINDINGS};
 use super::{library, output};
 use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped, read_own};
+use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Document, escape};
 use crate::knowledge::{Expected, Library, Loader};
 
@@ -71,7 +72,7 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 fn one(path: &Path) -> anyhow::Result<Input> {
     let text = if path.is_dir() { read_own(path, "config.json", JSON_CAP) } else { read_capped(path, JSON_CAP) };
     let record = parse(&text?).map(|config| Record { config, class: None });
-    Ok(Input { source: path.display().to_string(), record })
+    Ok(Input { source: shown(path), record })
 }
 
 /// Reads the configs of a JSONL file one at a time, because such a file may be larger than memory.
@@ -80,8 +81,8 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Input) -> anyhow::Result<()>) 
     for number in 1_usize.. {
         let mut line = Vec::new();
         let read = lines.by_ref().take(JSON_CAP).read_until(b'\n', &mut line);
-        let source = format!("{}:{number}", path.display());
-        match read.with_context(|| path.display().to_string())? {
+        let source = format!("{}:{number}", shown(path));
+        match read.with_context(|| shown(path))? {
             0 => break,
             _ if !line.ends_with(b"\n") && u64::try_from(line.len()).is_ok_and(|n| n >= JSON_CAP) => {
                 bail!("{source}: the line is longer than {JSON_CAP} bytes")

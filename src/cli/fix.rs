@@ -9,12 +9,12 @@ use anyhow::bail;
 use super::args::FixArgs;
 use super::output;
 use crate::check::Outcome;
+use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, escape};
 use crate::report::model::{Fixed, Withdrawn};
 use crate::report::{diff, fixes};
-use crate::surgery::journal::{self, Recovered, Recovery};
 use crate::surgery::repair::{Repair, plan};
-use crate::surgery::{ApplyError, Leftover, RepairError, overlay};
+use crate::surgery::{ApplyError, Leftover, Recovered, Recovery, RepairError, journal, overlay};
 
 /// Checks a checkpoint with the selected rules.
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
@@ -140,7 +140,7 @@ pub fn show(
     check: CheckFn<'_>,
 ) -> anyhow::Result<usize> {
     let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, check);
-    output::print(&diff::render(&dir.display().to_string(), &repair))?;
+    output::print(&diff::render(&shown(dir), &repair))?;
     output::note(&fixes::would(repair.fixed.len(), repair.changes.len()));
     Ok(repair.changes.len())
 }

@@ -8,6 +8,7 @@ use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
 use crate::check::inspect::inspect;
+use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
 use crate::report::inspect as report;
@@ -37,10 +38,10 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         Checkpoint::open(dir).with_context(|| dir.display().to_string())?
     };
     let inspection = inspect(&checkpoint, &library::with(rules)?);
-    let shown = path.display().to_string();
+    let name = shown(path);
     output::print(&match args.output_format {
-        InspectFormat::Full => report::full(&shown, &inspection, output::style(args.color)),
-        InspectFormat::Json => report::json(&shown, &inspection),
+        InspectFormat::Full => report::full(&name, &inspection, output::style(args.color)),
+        InspectFormat::Json => report::json(&name, &inspection),
     })?;
     Ok(CLEAN)
 }

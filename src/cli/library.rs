@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 
 use crate::checkpoint::list::list;
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
+use crate::checkpoint::platform::shown;
 use crate::knowledge::rule::RuleSet;
 use crate::knowledge::{Knowledge, Library};
 use crate::merge::{processor_of, read_recipe};
@@ -87,7 +88,7 @@ fn texts(rules: Option<&Path>, folder: &str) -> anyhow::Result<Vec<(String, Stri
         if bytes > MAX_BYTES {
             bail!("the files in {folder} of --rules have more than {MAX_BYTES} bytes");
         }
-        let name = file.display().to_string();
+        let name = shown(&file);
         Ok((name.clone(), text.with_context(|| format!("{name}: not UTF-8"))?))
     };
     files.into_iter().map(read).collect()

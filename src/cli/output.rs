@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Context;
 
 use super::args::{Color, ReportArgs};
+use super::system;
 use crate::report::{Format, Report, Style, render, statistics};
 
 /// Prints a line to standard error. A failure (full disk, closed pipe) is ignored; `eprintln` would panic.
@@ -37,9 +38,9 @@ pub fn style(color: Color) -> Style {
         Color::Always => true,
         Color::Never => false,
         // https://no-color.org
-        Color::Auto => terminal && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()),
+        Color::Auto => terminal && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()) && system::shows_color(),
     };
-    Style { color, width: terminal.then(columns).flatten(), ..Style::default() }
+    Style { color, width: terminal.then(system::columns).flatten(), ..Style::default() }
 }
 
 /// Prints to standard output.
@@ -66,12 +67,6 @@ pub fn safe(line: &str) -> String {
 /// Writes a new file; fails if it exists.
 pub fn create(file: &Path, text: &str) -> std::io::Result<()> {
     fs::OpenOptions::new().write(true).create_new(true).open(file)?.write_all(text.as_bytes())
-}
-
-/// Width of the terminal in columns.
-fn columns() -> Option<usize> {
-    let size = rustix::termios::tcgetwinsize(std::io::stdout()).ok()?;
-    (size.ws_col > 0).then_some(usize::from(size.ws_col))
 }
 
 /// Progress on a terminal, on one line.

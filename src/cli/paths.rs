@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use super::output;
+use crate::checkpoint::platform::shown;
 use crate::checkpoint::{ForeignFiles, Found, find_checkpoints};
 use crate::knowledge::directories::Directories;
 use crate::knowledge::source::DataError;
@@ -32,14 +33,14 @@ pub fn targets(paths: &[PathBuf], quiet: bool) -> Result<Targets, DataError> {
         let found = find_checkpoints(path, &|names| kinds.recognise(names));
         for (folder, error) in &found.unlisted {
             let reason = format!("cannot be listed: {error}");
-            targets.unchecked.push(UncheckedPath { path: folder.display().to_string(), reason });
+            targets.unchecked.push(UncheckedPath { path: shown(folder), reason });
         }
         if let Some(reason) = nothing(path, &found) {
             // pre-commit passes all files of a commit; those outside of checkpoints are no reason to fail.
             if path.is_file() && found.foreign.is_empty() {
                 outside.push(path);
             } else if found.unlisted.is_empty() || !found.foreign.is_empty() {
-                targets.unchecked.push(UncheckedPath { path: path.display().to_string(), reason });
+                targets.unchecked.push(UncheckedPath { path: shown(path), reason });
             }
             continue;
         }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
 use crate::check::Severity;
+use crate::checkpoint::platform::{here, shown};
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::expanded;
 use crate::knowledge::selection::Choice;
@@ -91,9 +92,8 @@ pub fn resolve(typed: &Typed, surroundings: &Surroundings) -> anyhow::Result<Res
 
 /// The path from the working directory, if it is below it.
 fn shortened(path: &Path) -> String {
-    let here = std::env::current_dir().ok();
-    let below = here.and_then(|here| path.strip_prefix(here).ok().map(Path::to_owned));
-    below.as_deref().unwrap_or(path).display().to_string()
+    let below = here().and_then(|here| path.strip_prefix(here).ok().map(Path::to_owned));
+    shown(below.as_deref().unwrap_or(path))
 }
 
 impl Typed {

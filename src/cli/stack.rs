@@ -1,6 +1,6 @@
 //! Room on the stack, whatever `ulimit -s` allows.
 
-use rustix::process::{Resource, getrlimit};
+use super::system;
 
 /// Stack that the deepest data needs, several times over: documents, modules and expressions are limited in depth.
 const ENOUGH: u64 = 2 << 20;
@@ -10,8 +10,7 @@ const RESERVED: usize = 16 << 20;
 /// Runs `work` on the main thread, or on a thread of its own where the stack of the main thread is small. Called by
 /// [`super::main`] with the whole program.
 pub(super) fn with_room<T: Send>(work: impl Fn() -> T + Send + Sync) -> T {
-    let limit = getrlimit(Resource::Stack).current;
-    if limit.is_none_or(|limit| limit >= ENOUGH) {
+    if system::stack().is_none_or(|limit| limit >= ENOUGH) {
         return work();
     }
     std::thread::scope(|scope| {

@@ -12,6 +12,7 @@ use super::ordered::ordered;
 use super::rule::Severity;
 use super::source::{self, DataError};
 use crate::checkpoint::open::{MODULE_CAP, read_capped};
+use crate::checkpoint::platform::shown;
 pub use chain::Chain;
 pub use find::{FILE, Surroundings, absolute};
 pub use policy::{Policy, Suppression};
@@ -120,7 +121,7 @@ impl SettingsSource {
     }
 
     pub(super) fn read(path: &Path) -> Result<Self, DataError> {
-        let name = path.display().to_string();
+        let name = shown(path);
         let bytes = read_capped(path, MODULE_CAP).map_err(|e| DataError::new(&name, e.to_string()))?;
         let text = String::from_utf8(bytes).map_err(|_| DataError::new(&name, "not UTF-8"))?;
         Self::parse(&name, absolute(path).parent().unwrap_or(path), &text)

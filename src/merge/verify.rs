@@ -10,6 +10,7 @@ use super::manifest;
 use super::run::count;
 use crate::checkpoint::contents::digests::Digester;
 use crate::checkpoint::open::OpenError;
+use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Dtype, EntryKind, Shard, Tensor};
 use crate::knowledge::source::hint;
 use crate::report::verification::{DifferenceKind, Verification, VerifiedPart};
@@ -66,7 +67,7 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
         parts.push(run.donor_files(role, &donor)?);
         parts.push(run.recomputed(role, &donor)?);
     }
-    Ok(Verification::new(dir.display().to_string(), recorded.recipe(), recorded.schema, parts, run.unverified))
+    Ok(Verification::new(shown(dir), recorded.recipe(), recorded.schema, parts, run.unverified))
 }
 
 struct Run<'v> {

@@ -1,17 +1,18 @@
 //! Donors: read-only access, and detection of changes.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs;
 use std::io::{self, Read};
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use super::error::{ApplyError, io_at};
+use super::retry::retry;
 use super::stop::interrupted;
-use super::system::{names, retry};
 use crate::checkpoint::hex;
+use crate::checkpoint::list::list;
 use crate::checkpoint::open::{Identity, OpenError, Opened, TOKENIZER_CAP, open_regular, read_own};
 
 /// The identities of a directory's files at the start of a run.
@@ -31,7 +32,8 @@ impl DonorSnapshot {
     pub fn record(dir: &Path) -> Result<Self, ApplyError> {
         interrupted()?;
         let mut files = BTreeMap::new();
-        for name in names(dir).map_err(io_at(dir, "listing"))? {
+        let names: io::Result<Vec<OsString>> = list(dir).and_then(|entries| entries.map(|e| Ok(e?.name)).collect());
+        for name in names.map_err(io_at(dir, "listing"))? {
             let path = dir.join(&name);
             let hidden = name.as_encoded_bytes().starts_with(b".");
             // Links are followed, because readers follow them. Rules report broken links.
@@ -85,7 +87,7 @@ impl DonorFile {
     }
 
     pub(super) fn read_at(&self, buf: &mut [u8], at: u64) -> io::Result<()> {
-        self.opened.file.read_exact_at(buf, at)
+        self.opened.read_exact_at(buf, at)
     }
 
     /// Converts a read error: an unexpected end means that the donor was truncated during the run.

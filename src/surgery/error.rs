@@ -76,6 +76,9 @@ pub enum ApplyError {
         /// The change.
         reason: String,
     },
+    /// This system cannot write checkpoints.
+    #[error("writing checkpoints needs Linux or macOS; on Windows use WSL")]
+    NeedsUnix,
     /// A signal such as SIGINT from Ctrl-C.
     #[error("interrupted; nothing was written")]
     Interrupted,

@@ -2,6 +2,7 @@
 
 mod formats;
 mod samples;
+#[cfg(unix)]
 mod schemas;
 
 use ckpt_doctor::check::Location;

@@ -395,13 +395,14 @@ pub fn on_every_case<T: Send>(
     on_cases(knowledge, |_| true, look)
 }
 
-/// As [`on_every_case`], for the wanted case names.
+/// As [`on_every_case`], for the wanted case names. The directories stay below `CKPT_DOCTOR_CASES`, if it is set.
 pub fn on_cases<T: Send>(
     knowledge: &Knowledge,
     wanted: impl Fn(&str) -> bool,
     look: impl Fn(&BTreeMap<&'static str, PathBuf>, &Case, &Path) -> T + Sync,
 ) -> Vec<(Case, T)> {
     let temporary = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
+    let kept = std::env::var_os("CKPT_DOCTOR_CASES").map(PathBuf::from);
     let bases = base::make_all(&temporary.path().join("bases"), BASES, knowledge);
     let cases: Vec<Case> = cases().into_iter().filter(|case| wanted(&case.name)).collect();
     let pending = Mutex::new(cases.into_iter().enumerate());
@@ -410,10 +411,12 @@ pub fn on_cases<T: Send>(
     let work = || {
         while let Some((number, case)) = next() {
             let base = bases.get(case.base.as_str()).unwrap_or_else(|| panic!("{}: no base {}", case.name, case.base));
-            let room = temporary.path().join(number.to_string());
+            let room = kept.as_ref().map_or_else(|| temporary.path().join(number.to_string()), |d| d.join(&case.name));
             let made = change::make(&case.name, base, &case.changes, &room);
             let seen = look(&bases, &case, &made);
-            fs::remove_dir_all(&room).expect("removing a fixture");
+            if kept.is_none() {
+                fs::remove_dir_all(&room).expect("removing a fixture");
+            }
             done.lock().expect("no panic").insert(number, (case, seen));
         }
     };

@@ -1,14 +1,12 @@
 //! The bytes of a file in pieces, without the holes of a sparse file.
 
 use std::io::{Error, ErrorKind, Result};
-use std::os::unix::fs::FileExt as _;
 
-use rustix::fs::SeekFrom;
-use rustix::io::Errno;
 use sha2::{Digest as _, Sha256};
 
 use super::numbers::as_u64;
 use crate::checkpoint::open::Opened;
+use crate::checkpoint::platform::{next_data, next_hole};
 
 /// Pieces start and end at a multiple of this many bytes from the start of the range, so that no element is split.
 const ALIGNMENT: u64 = 16;
@@ -46,10 +44,10 @@ pub(super) fn each_piece(
     let aligned = |at: u64| start.saturating_add(at.saturating_sub(start) & !(ALIGNMENT - 1));
     let mut at = start;
     while at < end {
-        let data = match rustix::fs::seek(&opened.file, SeekFrom::Data(at)) {
-            Ok(data) => aligned(data).min(end),
+        let data = match next_data(&opened.file, at) {
+            Ok(Some(data)) => aligned(data).min(end),
             // There is no data behind this place.
-            Err(Errno::NXIO) => end,
+            Ok(None) => end,
             // The file system does not tell holes.
             Err(_) => at,
         };
@@ -61,7 +59,7 @@ pub(super) fn each_piece(
             at = data;
             continue;
         }
-        let hole = rustix::fs::seek(&opened.file, SeekFrom::Hole(at)).unwrap_or(end);
+        let hole = next_hole(&opened.file, at).unwrap_or(end);
         // A piece reaches into the hole up to the end of its last element.
         let stop = aligned(hole.saturating_add(ALIGNMENT)).min(end);
         at = read(opened, at..stop, buffer, &mut each)?;
@@ -81,7 +79,7 @@ fn read(
         let left = range.end.saturating_sub(at);
         let size = usize::try_from(left).unwrap_or(usize::MAX).min(buffer.len());
         let Some(piece) = buffer.get_mut(..size).filter(|piece| !piece.is_empty()) else { break };
-        opened.file.read_exact_at(piece, at)?;
+        opened.read_exact_at(piece, at)?;
         each(Piece::Data(piece));
         at = at.saturating_add(as_u64(size));
     }
@@ -133,16 +131,21 @@ fn add_zeros(hash: &mut Sha256, len: u64) {
 #[cfg(test)]
 #[allow(clippy::disallowed_methods, reason = "makes the files it reads")]
 mod tests {
+    #[cfg(unix)]
+    use std::os::unix::fs::FileExt as _;
+
     use super::*;
     use crate::checkpoint::open::open_regular;
 
     /// Numbers from a seed.
+    #[cfg(unix)]
     fn next(state: &mut u64, below: u64) -> u64 {
         *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (*state >> 33).checked_rem(below).unwrap_or(0)
     }
 
     #[test]
+    #[cfg(unix)]
     fn pieces_are_the_bytes_of_a_sparse_file() {
         const LEN: u64 = 1 << 20;
         let dir = tempfile::tempdir().unwrap();

@@ -1,7 +1,5 @@
 //! Bytes of a file, read by position.
 
-use std::os::unix::fs::FileExt as _;
-
 use super::Problem;
 use crate::checkpoint::open::Opened;
 
@@ -48,7 +46,7 @@ impl Source for Opened {
     }
 
     fn fill(&self, at: u64, buffer: &mut [u8]) -> std::io::Result<()> {
-        self.file.read_exact_at(buffer, at)
+        self.read_exact_at(buffer, at)
     }
 }
 

@@ -1,15 +1,12 @@
 //! Reads the header of a shard from disk.
 
-use std::os::unix::fs::FileExt as _;
 use std::path::Path;
-
-use rustix::fs::SeekFrom;
-use rustix::io::Errno;
 
 use super::tail::zero_tail;
 use super::{MAX_HEADER, Shard, Tensor};
 use crate::checkpoint::budget::Budget;
 use crate::checkpoint::open::{Opened, open_regular};
+use crate::checkpoint::platform::{next_data, next_hole};
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::{Fault, FaultKind, Place};
 
@@ -74,17 +71,15 @@ fn unwritten_tail(shard: &Shard, opened: &Opened) -> Option<Fault> {
     if shard.unread || !shard.faults.is_empty() {
         return None;
     }
-    // `seek` moves the offset of the file, which no reader uses: all reads are positioned.
     let mut at = shard.data_start;
     for _ in 0..STRETCHES {
-        let hole = rustix::fs::seek(&opened.file, SeekFrom::Hole(at)).ok()?;
-        // Every file has an implicit hole at its end.
+        let hole = next_hole(&opened.file, at).ok()?;
         if hole >= shard.file_len {
             return None;
         }
-        match rustix::fs::seek(&opened.file, SeekFrom::Data(hole)) {
-            Ok(data) if data > hole => at = data,
-            Err(Errno::NXIO) => {
+        match next_data(&opened.file, hole) {
+            Ok(Some(data)) if data > hole => at = data,
+            Ok(None) => {
                 let tensors: Vec<&Tensor> = shard.tensors.iter().collect();
                 return zero_tail(shard, &tensors, written(opened, shard.data_start, hole)?);
             }
@@ -100,7 +95,7 @@ fn written(opened: &Opened, data_start: u64, hole: u64) -> Option<u64> {
     let end = hole.saturating_sub(data_start);
     let mut block = vec![0; usize::try_from(end.min(BLOCK)).ok()?];
     let begin = hole.saturating_sub(end.min(BLOCK));
-    opened.file.read_exact_at(&mut block, begin).ok()?;
+    opened.read_exact_at(&mut block, begin).ok()?;
     let last = block.iter().rposition(|byte| *byte != 0).map_or(0, |at| at.saturating_add(1));
     Some(begin.saturating_sub(data_start).saturating_add(u64::try_from(last).ok()?))
 }
@@ -108,7 +103,7 @@ fn written(opened: &Opened, data_start: u64, hole: u64) -> Option<u64> {
 fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
     let size = opened.identity.size;
     let mut head = vec![0; usize::try_from(size.min(SAMPLE)).unwrap_or(0)];
-    opened.file.read_exact_at(&mut head, 0)?;
+    opened.read_exact_at(&mut head, 0)?;
     let Some(stated) = head.first_chunk().map(|b| u64::from_le_bytes(*b)) else { return Ok(head) };
     let end = stated.saturating_add(8);
     if stated > MAX_HEADER || end > size {
@@ -117,7 +112,7 @@ fn read_head(opened: &Opened) -> std::io::Result<Vec<u8>> {
     let read = head.len();
     head.resize(usize::try_from(end).unwrap_or(0).max(read), 0);
     if let Some(rest) = head.get_mut(read..) {
-        opened.file.read_exact_at(rest, u64::try_from(read).unwrap_or(u64::MAX))?;
+        opened.read_exact_at(rest, u64::try_from(read).unwrap_or(u64::MAX))?;
     }
     Ok(head)
 }
@@ -127,7 +122,7 @@ fn name_trailing_bytes(shard: &mut Shard, opened: &Opened) {
     for fault in shard.faults.iter_mut().filter(|f| f.kind == FaultKind::TrailingBytes) {
         let Some(count) = fault.detail.get("count").and_then(serde_json::Value::as_u64) else { continue };
         let mut bytes = vec![0; usize::try_from(count.min(512)).unwrap_or(0)];
-        if opened.file.read_exact_at(&mut bytes, opened.identity.size.saturating_sub(count)).is_err() {
+        if opened.read_exact_at(&mut bytes, opened.identity.size.saturating_sub(count)).is_err() {
             continue;
         }
         let what = looks_like(&bytes).or_else(|| bytes.iter().all(|b| *b == 0).then_some("NUL bytes"));

@@ -1,10 +1,10 @@
 //! Finds the settings file of a run, and decides which files around a checkpoint may say how it is judged.
 
 use std::collections::BTreeMap;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::{Component, Path, PathBuf};
 
 use crate::checkpoint::is_checkpoint;
+use crate::checkpoint::platform::{canonicalize, here, is_own};
 
 /// Name of a settings file.
 pub const FILE: &str = "ckpt-doctor.json5";
@@ -58,8 +58,8 @@ impl Surroundings {
     /// The surroundings of a run on these directories; files among them are passed over.
     #[must_use]
     pub fn new<'p>(checked: impl IntoIterator<Item = &'p Path>) -> Self {
-        let checked = checked.into_iter().filter_map(|path| path.canonicalize().ok()).filter(|path| path.is_dir());
-        Self { here: std::env::current_dir().ok(), checked: checked.collect() }
+        let checked = checked.into_iter().filter_map(|path| canonicalize(path).ok()).filter(|path| path.is_dir());
+        Self { here: here(), checked: checked.collect() }
     }
 
     /// Why `name` in the folder `dir`, a path without links, has no say; `None` when it may decide.
@@ -74,9 +74,7 @@ impl Surroundings {
         if !self.here.as_ref().is_some_and(|here| here.starts_with(dir)) {
             return Some(Distrust::Elsewhere);
         }
-        let user = rustix::process::geteuid().as_raw();
-        let owned = |path: &Path| path.symlink_metadata().is_ok_and(|metadata| metadata.uid() == user);
-        (!owned(dir) || !owned(&dir.join(name))).then_some(Distrust::OtherOwner)
+        (!is_own(dir) || !is_own(&dir.join(name))).then_some(Distrust::OtherOwner)
     }
 
     /// The settings file of the run: the nearest from the working directory upward that may decide. Those that may not,
@@ -115,5 +113,5 @@ pub fn absolute(path: &Path) -> PathBuf {
     // Only the file system resolves `..` after a symbolic link.
     let plain = || std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let back = path.components().any(|part| part == Component::ParentDir);
-    if back { path.canonicalize().unwrap_or_else(|_| plain()) } else { plain() }
+    if back { canonicalize(path).unwrap_or_else(|_| plain()) } else { plain() }
 }

@@ -8,9 +8,8 @@ use std::sync::Arc;
 
 use ckpt_doctor::check::check;
 use ckpt_doctor::checkpoint::Checkpoint;
-use ckpt_doctor::surgery::journal::{self, Recovered};
 use ckpt_doctor::surgery::repair::{Repair, plan};
-use ckpt_doctor::surgery::{RepairError, overlay};
+use ckpt_doctor::surgery::{Recovered, RepairError, journal, overlay};
 use tempfile::TempDir;
 
 use super::seen;

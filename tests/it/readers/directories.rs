@@ -16,14 +16,7 @@ use serde_json::json;
 use tempfile::TempDir;
 
 use super::shards::file;
-use super::{Case, hold};
-
-/// A checkpoint with one file.
-pub fn open_with(name: &str, bytes: &[u8]) -> Checkpoint {
-    let dir = TempDir::new().unwrap();
-    fs::write(dir.path().join(name), bytes).unwrap();
-    Checkpoint::open(dir.path()).unwrap()
-}
+use super::{Case, hold, open_with};
 
 fn fifo(path: &Path) {
     let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;

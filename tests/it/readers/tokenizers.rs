@@ -7,8 +7,7 @@ use std::sync::LazyLock;
 use ckpt_doctor::checkpoint::{Document, FaultKind, Tokenizer, Vocabulary};
 use serde_json::json;
 
-use super::directories::open_with;
-use super::{Case, hold};
+use super::{Case, hold, open_with};
 
 /// A sentencepiece model with these pieces.
 pub fn sentencepiece(pieces: &[&str]) -> Vec<u8> {

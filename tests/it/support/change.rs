@@ -4,13 +4,33 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use ckpt_doctor::knowledge::{Expression, Scope};
-use rustix::fs::{CWD, FileType, Mode, mknodat};
 use serde::Deserialize;
 use serde_json::Value;
 
 use super::base;
 use super::pickle::StateDict;
 use super::weights::{Shard, Tensor, Weights, join, split};
+
+/// FIFOs and links.
+#[cfg(unix)]
+mod special {
+    pub use std::os::unix::fs::symlink;
+
+    pub fn fifo(path: &std::path::Path) -> std::io::Result<()> {
+        use rustix::fs::{CWD, FileType, Mode, mknodat};
+        Ok(mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?)
+    }
+}
+
+/// Windows has no FIFOs.
+#[cfg(windows)]
+mod special {
+    pub use std::os::windows::fs::symlink_file as symlink;
+
+    pub fn fifo(_: &std::path::Path) -> std::io::Result<()> {
+        Err(std::io::ErrorKind::Unsupported.into())
+    }
+}
 
 /// One change. Changes of tensors keep shards and index consistent; changes of headers and bytes do not.
 #[derive(Debug, Clone, Deserialize)]
@@ -198,11 +218,11 @@ fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
         Change::Encode { file, to } => rewrite(&at(file), |old| encode(&String::from_utf8(old).expect("text"), to)),
         Change::Fifo(file) => {
             let _ = fs::remove_file(at(file));
-            Ok(mknodat(CWD, at(file), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?)
+            special::fifo(&at(file))
         }
         Change::Link { file, to } => {
             let _ = fs::remove_file(at(file));
-            std::os::unix::fs::symlink(to, at(file))
+            special::symlink(to, at(file))
         }
         Change::Folder(name) => fs::create_dir(at(name)),
         Change::Directory(_) => Ok(()),

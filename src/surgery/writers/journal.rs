@@ -14,6 +14,6 @@ mod replay;
 mod undo;
 mod write;
 
-pub use recover::{Recovered, Recovery, recover};
+pub use recover::recover;
 pub use undo::undo;
 pub use write::write;

@@ -4,24 +4,11 @@ use std::path::Path;
 
 use super::folder::Folder;
 use super::record::{Journal, JournaledFile};
-use super::recover::{Recovered, recover_in};
+use super::recover::recover_in;
 use super::replay::Replay;
 use crate::surgery::error::RepairError;
-use crate::surgery::leftover::Leftover;
+use crate::surgery::outcome::{Recovered, Undone};
 use crate::surgery::stop::interrupted;
-
-/// Result of an undo.
-#[derive(Debug)]
-pub struct Undone {
-    /// Files that were restored.
-    pub restored: Vec<String>,
-    /// Files that the repair had added and that were removed.
-    pub removed: Vec<String>,
-    /// Number of earlier repairs that can still be undone.
-    pub left: usize,
-    /// Files that could not be removed.
-    pub leftover: Option<Leftover>,
-}
 
 /// Undoes the latest repair of a checkpoint. An interrupted repair is finished or rolled back first.
 ///

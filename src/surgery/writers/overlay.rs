@@ -3,27 +3,18 @@
 use std::fs;
 use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsupported};
 use std::os::unix::fs::symlink;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::changes::{check_unchanged, explain_error, write_content};
-use super::donor::DonorSnapshot;
-use super::error::{ApplyError, RepairError, io_at};
-use super::leftover::Leftover;
-use super::repair::Repair;
 use super::staging::Staging;
-use super::stop::interrupted;
 use super::system::{check_space, retry};
-use super::target::{Target, claim_target};
+use super::target::claim_target;
 use crate::checkpoint::open::real_target;
-
-/// A repaired copy that was written.
-#[derive(Debug)]
-pub struct RepairedCopy {
-    /// The staging directory of an ended run, if one was removed.
-    pub cleared: Option<PathBuf>,
-    /// The staging directory, if it could not be removed.
-    pub leftover: Option<Leftover>,
-}
+use crate::surgery::donor::DonorSnapshot;
+use crate::surgery::error::{ApplyError, RepairError, io_at};
+use crate::surgery::outcome::{RepairedCopy, Target};
+use crate::surgery::repair::Repair;
+use crate::surgery::stop::interrupted;
 
 /// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's or, on
 /// another file system, symbolic links. Hidden files are not copied.

@@ -11,9 +11,9 @@ use std::path::Path;
 use rustix::fs::OFlags;
 use rustix::io::Errno;
 
-use super::error::{ApplyError, io_at};
 use super::system::{custom, retry};
 use crate::checkpoint::open::read_capped;
+use crate::surgery::error::{ApplyError, io_at};
 
 /// Result of locking.
 pub(super) enum Lock {

@@ -9,7 +9,7 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::io::{Errno, retry_on_intr};
 
 use crate::checkpoint::open::Identity;
-use crate::surgery::system::retry;
+use crate::surgery::writers::system::retry;
 
 /// Result of taking a file from its place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

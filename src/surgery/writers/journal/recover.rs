@@ -6,24 +6,7 @@ use super::folder::{Folder, Remains};
 use super::replay::Replay;
 use crate::surgery::error::RepairError;
 use crate::surgery::leftover::Leftover;
-
-/// Outcome of the recovery.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Recovered {
-    /// The repair was completed.
-    Finished,
-    /// The checkpoint is in its state before the repair.
-    RolledBack,
-}
-
-/// Result of [`recover`].
-#[derive(Debug, Default)]
-pub struct Recovery {
-    /// What happened to an interrupted repair or undo; `None` when there was none.
-    pub outcome: Option<Recovered>,
-    /// Files that could not be removed.
-    pub leftover: Option<Leftover>,
-}
+use crate::surgery::outcome::{Recovered, Recovery};
 
 /// Finishes or rolls back an interrupted repair, and removes what an ended run has left.
 ///

@@ -11,11 +11,11 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::error::{ApplyError, io_at};
-use super::leftover::Leftover;
 use super::lock::{self, Lock, LockFile};
 pub(super) use super::system::sync_dir;
 use super::system::{names, remove_dir, remove_file, remove_folder, retry};
+use crate::surgery::error::{ApplyError, io_at};
+use crate::surgery::leftover::Leftover;
 
 const MARKER: &str = "ckpt-doctor-owner";
 const CONTENT: &str = "content";

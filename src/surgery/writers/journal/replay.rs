@@ -15,7 +15,7 @@ use crate::checkpoint::hex;
 use crate::checkpoint::open::{Identity, open_regular};
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
-use crate::surgery::system::{look, remove_folder, retry, sync_dir};
+use crate::surgery::writers::system::{look, remove_folder, retry, sync_dir};
 
 /// What the staging folder holds under the name of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

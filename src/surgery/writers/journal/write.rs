@@ -7,13 +7,13 @@ use std::path::Path;
 use super::folder::{Folder, VERSION};
 use super::record::{Journal, JournaledFile, NewFile, OldFile};
 use super::replay::Replay;
-use crate::surgery::changes::{check_unchanged, explain_error, write_content};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
 use crate::surgery::repair::Repair;
 use crate::surgery::stop::interrupted;
-use crate::surgery::system::{check_space, look, retry, sync_dir};
+use crate::surgery::writers::changes::{check_unchanged, explain_error, write_content};
+use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
 
 /// Replaces the changed files of a repair, all of them or none.
 ///

@@ -10,8 +10,8 @@ use crate::checkpoint::open::{JSON_CAP, OpenError, read_own};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::leftover::Leftover;
-use crate::surgery::lock::{self, Lock, LockFile};
-use crate::surgery::system::{self, create, look, retry, sync_dir, with_figures};
+use crate::surgery::writers::lock::{self, Lock, LockFile};
+use crate::surgery::writers::system::{self, create, look, retry, sync_dir, with_figures};
 
 /// Excludes the folder from version control, as caches of other tools do.
 const IGNORE: (&str, &str) = (".gitignore", "# created by ckpt-doctor for undoing repairs\n*\n");

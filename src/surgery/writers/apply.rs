@@ -7,17 +7,17 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::donor::{DonorFile, DonorSnapshot};
-use super::error::{ApplyError, io_at};
-use super::leftover::Leftover;
-use super::plan::{Plan, PlannedFile, PlannedShard, PlannedTensor, TensorRef, TensorTransform};
 use super::staging::Staging;
-use super::stop::interrupted;
-use super::stream::{Streamed, block, stream};
 use super::system::{check_space, copy_in_kernel, create, with_figures};
 use super::verify::accepted_by_safetensors;
-use super::written::{ShardDigests, WrittenShard};
 use crate::checkpoint::open::open_regular;
+use crate::surgery::donor::{DonorFile, DonorSnapshot};
+use crate::surgery::error::{ApplyError, io_at};
+use crate::surgery::leftover::Leftover;
+use crate::surgery::plan::{Plan, PlannedFile, PlannedShard, PlannedTensor, TensorRef, TensorTransform};
+use crate::surgery::stop::interrupted;
+use crate::surgery::stream::{Streamed, block, stream};
+use crate::surgery::written::{ShardDigests, WrittenShard};
 
 /// Writes `plan` as the directory `out` (a path from [`super::claim_target`]); `progress` receives the bytes written.
 /// Returns the staging directory if it could not be removed afterwards.

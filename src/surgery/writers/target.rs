@@ -5,19 +5,11 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::error::{ApplyError, io_at};
 use super::staging::{clear_remains, staging_path};
 use super::system::{is_mount_point, look};
 use crate::checkpoint::list::list;
-
-/// An output directory that is free.
-#[derive(Debug)]
-pub struct Target {
-    /// The path, with the links of its parent resolved.
-    pub path: PathBuf,
-    /// The staging directory of an ended run, if one was removed.
-    pub cleared: Option<PathBuf>,
-}
+use crate::surgery::error::{ApplyError, io_at};
+use crate::surgery::outcome::Target;
 
 /// Checks that `out` can become a new directory: missing or empty, and not overlapping a donor.
 ///

@@ -11,19 +11,9 @@ use rustix::fs::{AtFlags, OFlags, unlinkat};
 use rustix::io::{Errno, retry_on_intr};
 use rustix::process::{Resource, getrlimit};
 
-use super::error::{ApplyError, io_at};
 use crate::checkpoint::list::{list, list_real};
-
-/// Repeats a call that a signal interrupted. The standard library repeats reads, writes, opens and syncs of files, but
-/// not other calls, which some network file systems interrupt as well.
-pub(super) fn retry<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T> {
-    loop {
-        match call() {
-            Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
-            other => return other,
-        }
-    }
-}
+use crate::surgery::error::{ApplyError, io_at};
+pub(super) use crate::surgery::retry::retry;
 
 /// `flags` for the standard library.
 pub(super) fn custom(flags: OFlags) -> i32 {

@@ -6,11 +6,11 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::apply::write_shard;
-use super::error::{ApplyError, RepairError, io_at};
-use super::repair::{Change, Content, Repair};
 use super::system::{create, look, with_figures};
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
 use crate::checkpoint::{FaultKind, Shard};
+use crate::surgery::error::{ApplyError, RepairError, io_at};
+use crate::surgery::repair::{Change, Content, Repair};
 
 /// Fails when a file no longer matches the checkpoint for which the repair was planned.
 pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> Result<(), RepairError> {

@@ -1,0 +1,79 @@
+//! In place of `writers.rs` where there is no Unix: every function fails with [`ApplyError::NeedsUnix`].
+//!
+//! A Unix has the locks, the links and the renames of whole directories that let the next run finish a killed one.
+
+use std::path::Path;
+
+use super::donor::DonorSnapshot;
+use super::error::{ApplyError, RepairError};
+use super::leftover::Leftover;
+use super::outcome::{RepairedCopy, Target};
+use super::plan::{Plan, PlannedFile};
+use super::repair::Repair;
+use super::written::WrittenShard;
+
+/// Whether this system can write checkpoints. The command line refuses commands that write them where it cannot.
+pub const CAN_WRITE: bool = false;
+
+/// # Errors
+/// Always.
+pub fn apply(
+    _: &Plan,
+    _: &[DonorSnapshot],
+    _: &Path,
+    _: &[u64],
+    _: &mut dyn FnMut(&[WrittenShard]) -> Vec<PlannedFile>,
+    _: &mut dyn FnMut(u64),
+) -> Result<Option<Leftover>, ApplyError> {
+    Err(ApplyError::NeedsUnix)
+}
+
+/// # Errors
+/// Always.
+pub fn check_target(_: &Path, _: &[&Path]) -> Result<Target, ApplyError> {
+    Err(ApplyError::NeedsUnix)
+}
+
+/// # Errors
+/// Always.
+pub fn claim_target(_: &Path, _: &[&Path]) -> Result<Target, ApplyError> {
+    Err(ApplyError::NeedsUnix)
+}
+
+/// # Errors
+/// Always.
+pub fn free_space(_: &Path) -> Result<Option<u64>, ApplyError> {
+    Err(ApplyError::NeedsUnix)
+}
+
+/// # Errors
+/// Always.
+pub fn overlay(_: &Repair, _: &Path, _: &mut dyn FnMut(u64)) -> Result<RepairedCopy, RepairError> {
+    Err(ApplyError::NeedsUnix.into())
+}
+
+/// Repairs in place.
+pub mod journal {
+    use std::path::Path;
+
+    use super::{ApplyError, Leftover, Repair, RepairError};
+    use crate::surgery::outcome::{Recovery, Undone};
+
+    /// # Errors
+    /// Always.
+    pub fn recover(_: &Path) -> Result<Recovery, RepairError> {
+        Err(ApplyError::NeedsUnix.into())
+    }
+
+    /// # Errors
+    /// Always.
+    pub fn undo(_: &Path) -> Result<Undone, RepairError> {
+        Err(ApplyError::NeedsUnix.into())
+    }
+
+    /// # Errors
+    /// Always.
+    pub fn write(_: &Repair, _: &mut dyn FnMut(u64)) -> Result<Option<Leftover>, RepairError> {
+        Err(ApplyError::NeedsUnix.into())
+    }
+}
