@@ -45,7 +45,10 @@ fn main() -> io::Result<()> {
     fs::write(out.join("architectures.index"), text)?;
     let mut files = BTreeMap::new();
     convert(Path::new("rules"), &mut files)?;
-    let lines: String = files.into_iter().map(|(path, json)| format!("{path}\t{json}\n")).collect();
+    let mut lines = String::new();
+    for (path, json) in files {
+        lines.extend([&path, "\t", &json, "\n"]);
+    }
     fs::write(out.join("data.txt"), lines)
 }
 

@@ -4,9 +4,10 @@
 
 use std::{env, fs, io};
 
-use ckpt_doctor::checkpoint::{Checkpoint, hex};
+use ckpt_doctor::checkpoint::{Checkpoint, Tensor, hex};
 use ckpt_doctor::knowledge::pickles::Pickles;
 use serde_json::{Map, Value, json};
+use sha2::{Digest as _, Sha256};
 
 fn main() -> io::Result<()> {
     let accepted = Pickles::embedded().map_err(io::Error::other)?;
@@ -16,9 +17,14 @@ fn main() -> io::Result<()> {
         let mut checkpoint = Checkpoint::open(entry.path()).map_err(io::Error::other)?;
         checkpoint.read_contents();
         let Some(shard) = checkpoint.shards.get("pytorch_model.bin") else { continue };
-        let digest = |name: &str| checkpoint.contents.as_ref()?.digest(&shard.name, name).map(|digest| hex(digest));
+        let file = fs::read(entry.path().join("pytorch_model.bin"))?;
+        let digest = |tensor: &Tensor| {
+            let at = |offset: u64| usize::try_from(shard.data_start.checked_add(offset)?).ok();
+            let bytes = file.get(at(tensor.begin)?..at(tensor.end)?).filter(|_| shard.is_contiguous(&tensor.name))?;
+            Some(hex(&Sha256::digest(bytes)))
+        };
         let tensors: Map<String, Value> =
-            shard.tensors.iter().map(|t| (t.name.clone(), json!([t.dtype.name(), t.shape, digest(&t.name)]))).collect();
+            shard.tensors.iter().map(|t| (t.name.clone(), json!([t.dtype.name(), t.shape, digest(t)]))).collect();
         let pickle = shard.pickle.clone().unwrap_or_default();
         // NaN in random bytes is no fault of the container.
         let faults: Vec<&str> =

@@ -98,7 +98,7 @@ impl Shard {
 
     /// Whether the bytes of a tensor are one run in the file, in the order of its elements.
     #[must_use]
-    pub(crate) fn is_contiguous(&self, tensor: &str) -> bool {
+    pub fn is_contiguous(&self, tensor: &str) -> bool {
         self.pickle.as_ref().is_none_or(|pickle| !pickle.strided.contains(tensor))
     }
 

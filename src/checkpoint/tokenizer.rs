@@ -365,7 +365,7 @@ fn special_tokens<'v>(files: &[&str], get: &impl Fn(&str, &str) -> Option<&'v Va
         let Some(value) = files.iter().find_map(|f| get(f, &pointer)) else { continue };
         match value {
             Value::Array(list) => {
-                tokens.extend(list.iter().filter_map(content).map(|t| (name.to_owned(), t.to_owned())))
+                tokens.extend(list.iter().filter_map(content).map(|t| (name.to_owned(), t.to_owned())));
             }
             other => tokens.extend(content(other).map(|t| (name.to_owned(), t.to_owned()))),
         }
