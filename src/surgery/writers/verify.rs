@@ -17,7 +17,6 @@ use safetensors::tensor::Metadata;
 /// systems, a limit on memory), the crate gets the header alone.
 ///
 /// # Errors
-/// When the file cannot be read, or when the crate refuses it.
 /// When the file cannot be read, or the crate refuses it.
 #[expect(
     unsafe_code,
