@@ -1,4 +1,4 @@
-//! The data files in `rules/`: embedded in the program, parsed as JSON5.
+//! The data files in `rules/`, which are embedded in the program, and those of users: both are JSON5.
 
 use std::cmp::Ordering;
 
@@ -10,7 +10,7 @@ use crate::checkpoint::line_column;
 
 static RULES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules");
 
-/// Data files as JSON, which is read ten times as fast as JSON5: lines for [`line_of`] that the build script writes. Without
+/// The built-in JSON5 files as JSON, which is faster to parse: lines for [`line_of`] that the build script writes. Without
 /// architectures, of which a run reads a few.
 const CONVERTED: &str = include_str!(concat!(env!("OUT_DIR"), "/data.txt"));
 
@@ -71,7 +71,8 @@ pub fn parse<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError
     compile_eagerly(|| read(path, text))
 }
 
-/// Parses a built-in file; its expressions are compiled at their first evaluation.
+/// Parses a built-in file, its JSON if it was converted, otherwise `text`; its expressions are compiled at their first
+/// evaluation.
 ///
 /// # Errors
 /// As [`parse`], except for invalid expressions.

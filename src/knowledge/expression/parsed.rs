@@ -1,5 +1,5 @@
-//! Expressions of the built-in files as CEL parses them, from `rules/expressions.txt`: CEL's parser takes longer for a
-//! hundred expressions than the rest of a check.
+//! Expressions of the built-in files as CEL parses them, from `rules/expressions.txt`, so that a check need not start CEL's
+//! parser, which is slow.
 //!
 //! Each line has the text of an expression and its tree, both as JSON; the lines are sorted. A text without a line is
 //! parsed as usual. A test writes the file, and compares it with what CEL's parser makes of each text.
