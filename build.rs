@@ -1,5 +1,5 @@
-//! Writes the index of the embedded architecture files and the other data files as JSON, and rebuilds the program when a
-//! file in `rules/` changes: the program embeds this directory.
+//! Writes the index of the embedded architecture files, the other data files as JSON and the conditions of the rules, and
+//! rebuilds the program when a file in `rules/` changes: the program embeds this directory.
 
 #![allow(
     clippy::print_stdout,
@@ -10,6 +10,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::{env, fs, io};
+
+use serde_json::{Map, Value};
 
 mod library {
     pub mod scan {
@@ -46,22 +48,30 @@ fn main() -> io::Result<()> {
     let mut files = BTreeMap::new();
     convert(Path::new("rules"), &mut files)?;
     let mut lines = String::new();
-    for (path, json) in files {
-        lines.extend([&path, "\t", &json, "\n"]);
+    let mut rules = BTreeMap::new();
+    for (path, value) in files {
+        lines.extend([&path, "\t", &value.to_string(), "\n"]);
+        if path.starts_with("rules/checks/") {
+            let head = ["code", "name", "applies", "when", "check"];
+            let head = head.into_iter().filter_map(|key| Some((key.to_owned(), value.get(key)?.clone())));
+            let head: Map<String, Value> = head.chain([("path".to_owned(), path.into())]).collect();
+            rules.insert(value["code"].as_str().unwrap_or_default().to_owned(), Value::Object(head));
+        }
     }
+    fs::write(out.join("rules.json"), Value::Array(rules.into_values().collect()).to_string())?;
     fs::write(out.join("data.txt"), lines)
 }
 
 /// Reads the JSON5 files below a folder as JSON, by their paths; not those of architectures.
-fn convert(folder: &Path, files: &mut BTreeMap<String, String>) -> io::Result<()> {
+fn convert(folder: &Path, files: &mut BTreeMap<String, Value>) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {
         let path = entry?.path();
         if path.is_dir() && !path.ends_with("architectures") {
             convert(&path, files)?;
         } else if path.extension().is_some_and(|extension| extension == "json5") {
             let wrong = |error| io::Error::other(format!("{}: {error}", path.display()));
-            let value: serde_json::Value = json5::from_str(&fs::read_to_string(&path)?).map_err(wrong)?;
-            files.insert(path.to_string_lossy().replace('\\', "/"), value.to_string());
+            let value: Value = json5::from_str(&fs::read_to_string(&path)?).map_err(wrong)?;
+            files.insert(path.to_string_lossy().replace('\\', "/"), value);
         }
     }
     Ok(())

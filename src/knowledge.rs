@@ -32,6 +32,8 @@ pub mod text_classes;
 pub mod tokenizer_parts;
 pub mod tokenizers;
 
+use std::sync::LazyLock;
+
 pub use architecture::{Architecture, Conversion, Doubt, Expected, ExpectedTensor, Refusal};
 pub use evidence::Evidence;
 pub use expression::{EvalError, Expression, Scope, Template};
@@ -60,48 +62,61 @@ use text_classes::TextTypes;
 use tokenizer_parts::TokenizerPart;
 use tokenizers::TokenizerClasses;
 
+/// Built-in data, parsed when it is first used: a check of one model needs a few of the tables.
+pub type Table<T> = LazyLock<T>;
+
+/// The table that a function parses.
+macro_rules! table {
+    ($embedded:expr) => {
+        // A test reads every built-in file.
+        LazyLock::new(|| $embedded().unwrap_or_else(|error| panic!("{error}")))
+    };
+}
+
 /// Data used by a check or a merge. The caller loads it once and passes it down.
+///
+/// Using a table panics when its built-in file is malformed; [`Knowledge::read_all`] is how a test finds that.
 pub struct Knowledge {
     /// Rules.
     pub rules: RuleSet,
     /// Architectures.
     pub library: Library,
     /// Processors.
-    pub processors: Vec<Processor>,
+    pub processors: Table<Vec<Processor>>,
     /// Parts of models.
-    pub parts: Vec<ModelParts>,
+    pub parts: Table<Vec<ModelParts>>,
     /// Recipes; a merge selects one by its donors.
-    pub recipes: Vec<Recipe>,
+    pub recipes: Table<Vec<Recipe>>,
     /// Quantisation schemes.
-    pub schemes: Vec<Scheme>,
+    pub schemes: Table<Vec<Scheme>>,
     /// Names that transformers accepts in config.json.
-    pub names: LoaderNames,
+    pub names: Table<LoaderNames>,
     /// Tokenizer and processor classes that transformers opens by name.
-    pub classes: ClassNames,
+    pub classes: Table<ClassNames>,
     /// Keys of adapter configs by version of PEFT.
-    pub peft: PeftKeys,
+    pub peft: Table<PeftKeys>,
     /// Other programs that load checkpoints.
-    pub programs: Programs,
+    pub programs: Table<Programs>,
     /// Values of config.json that classes refuse.
     pub refusals: Refusals,
     /// Keys of rotary embeddings that classes read.
-    pub ropes: RopeKeys,
+    pub ropes: Table<RopeKeys>,
     /// What torch accepts in pickles, and imports that harm.
-    pub pickles: Pickles,
+    pub pickles: Table<Pickles>,
     /// Names of token embeddings.
-    pub token_embedding: TokenEmbedding,
+    pub token_embedding: Table<TokenEmbedding>,
     /// Kinds of directories that are no checkpoints of transformers.
-    pub directories: Directories,
+    pub directories: Table<Directories>,
     /// Where policies keep their statistics.
-    pub statistics: StatisticsPlaces,
+    pub statistics: Table<StatisticsPlaces>,
     /// Parts of tokenizer.json.
-    pub tokenizer_parts: Vec<TokenizerPart>,
+    pub tokenizer_parts: Table<Vec<TokenizerPart>>,
     /// Tokenizer classes that do not open tokenizer.json as it is.
-    pub tokenizers: TokenizerClasses,
+    pub tokenizers: Table<TokenizerClasses>,
     /// Model types of language models inside other models.
-    pub text_types: TextTypes,
+    pub text_types: Table<TextTypes>,
     /// Factors of classes on embeddings and image features.
-    pub scales: Scales,
+    pub scales: Table<Scales>,
     /// Severities and suppressions of a settings file for single findings.
     pub policy: Policy,
 }
@@ -113,41 +128,64 @@ impl Knowledge {
         self.processors.iter().find(|processor| processor.architectures.iter().any(|name| name == architecture))
     }
 
+    /// Parses all tables, for tests.
+    ///
+    /// # Panics
+    /// When a built-in file is malformed.
+    pub fn read_all(&self) {
+        self.rules.read_all();
+        LazyLock::force(&self.processors);
+        LazyLock::force(&self.parts);
+        LazyLock::force(&self.recipes);
+        LazyLock::force(&self.schemes);
+        LazyLock::force(&self.names);
+        LazyLock::force(&self.classes);
+        LazyLock::force(&self.peft);
+        LazyLock::force(&self.programs);
+        LazyLock::force(&self.ropes);
+        LazyLock::force(&self.pickles);
+        LazyLock::force(&self.token_embedding);
+        LazyLock::force(&self.directories);
+        LazyLock::force(&self.statistics);
+        LazyLock::force(&self.tokenizer_parts);
+        LazyLock::force(&self.tokenizers);
+        LazyLock::force(&self.text_types);
+        LazyLock::force(&self.scales);
+    }
+
     /// The built-in data files.
     ///
     /// # Errors
-    /// [`DataError`] for a malformed file; the tests parse every built-in file.
+    /// [`DataError`] for a malformed rule; the tests parse every built-in file.
     pub fn embedded() -> Result<Self, DataError> {
-        Self::with(RuleSet::embedded()?, Library::embedded())
+        Ok(Self::with(RuleSet::embedded()?, Library::embedded()))
     }
 
     /// The built-in data files, with these rules and architectures.
-    ///
-    /// # Errors
-    /// As [`Self::embedded`].
-    pub fn with(rules: RuleSet, library: Library) -> Result<Self, DataError> {
-        Ok(Self {
+    #[must_use]
+    pub fn with(rules: RuleSet, library: Library) -> Self {
+        Self {
             rules,
             library,
-            processors: Processor::embedded()?,
-            parts: ModelParts::embedded()?,
-            recipes: Recipe::embedded()?,
-            schemes: Scheme::embedded()?,
-            names: LoaderNames::embedded()?,
-            classes: ClassNames::embedded()?,
-            peft: PeftKeys::embedded()?,
-            programs: Programs::embedded()?,
+            processors: table!(Processor::embedded),
+            parts: table!(ModelParts::embedded),
+            recipes: table!(Recipe::embedded),
+            schemes: table!(Scheme::embedded),
+            names: table!(LoaderNames::embedded),
+            classes: table!(ClassNames::embedded),
+            peft: table!(PeftKeys::embedded),
+            programs: table!(Programs::embedded),
             refusals: Refusals::embedded(),
-            ropes: RopeKeys::embedded()?,
-            pickles: Pickles::embedded()?,
-            token_embedding: TokenEmbedding::embedded()?,
-            directories: Directories::embedded()?,
-            statistics: StatisticsPlaces::embedded()?,
-            tokenizer_parts: TokenizerPart::embedded()?,
-            tokenizers: TokenizerClasses::embedded()?,
-            text_types: TextTypes::embedded()?,
-            scales: Scales::embedded()?,
+            ropes: table!(RopeKeys::embedded),
+            pickles: table!(Pickles::embedded),
+            token_embedding: table!(TokenEmbedding::embedded),
+            directories: table!(Directories::embedded),
+            statistics: table!(StatisticsPlaces::embedded),
+            tokenizer_parts: table!(TokenizerPart::embedded),
+            tokenizers: table!(TokenizerClasses::embedded),
+            text_types: table!(TextTypes::embedded),
+            scales: table!(Scales::embedded),
             policy: Policy::default(),
-        })
+        }
     }
 }

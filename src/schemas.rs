@@ -20,7 +20,7 @@ use crate::knowledge::parts::ModelParts;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::quantization::Scheme;
 use crate::knowledge::recipe::{MergeFile, Recipe};
-use crate::knowledge::rule::Rule;
+use crate::knowledge::rule::RuleFile;
 use crate::knowledge::settings::Settings;
 use crate::knowledge::source::{self, DataError};
 use crate::knowledge::statistics::Pattern;
@@ -66,7 +66,7 @@ struct Input {
 
 fn inputs() -> Vec<Input> {
     vec![
-        input::<Rule>("rule", "A rule of ckpt-doctor", values("rules/checks")),
+        input::<RuleFile>("rule", "A rule of ckpt-doctor", values("rules/checks")),
         input::<Blueprint>("architecture", "An architecture of ckpt-doctor", values("rules/architectures")),
         input::<Recipe>("recipe", "A recipe of ckpt-doctor", values("rules/recipes")),
         input::<ModelParts>("parts", "The parts of a model of ckpt-doctor", values("rules/parts")),

@@ -54,7 +54,7 @@ static SMALL: LazyLock<Knowledge> = LazyLock::new(|| {
     library
         .add("llama.json5", &llama.replace("num_hidden_layers: 32", "num_hidden_layers: 1"))
         .expect("an architecture");
-    Knowledge::with(RuleSet::embedded().expect("built-in files"), library).expect("built-in files")
+    Knowledge::with(RuleSet::embedded().expect("built-in files"), library)
 });
 
 /// The length of a shard with this header, and the header after its length field.

@@ -34,7 +34,8 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         dirs.retain(|dir| args.paths.contains(dir));
     }
     let surroundings = Surroundings::new(args.paths.iter().chain(&dirs).map(PathBuf::as_path));
-    let by = &resolve(&Typed::check(args, rules), &surroundings)?;
+    // Never freed: the process ends with the run.
+    let by: &Resolved = Box::leak(Box::new(resolve(&Typed::check(args, rules), &surroundings)?));
     let run = CheckRun { args, by, surroundings: &surroundings };
     args.fix.refuse(dirs.len())?;
     if args.fix.writes() {

@@ -36,7 +36,7 @@ pub fn rules(rules: Option<&Path>) -> anyhow::Result<RuleSet> {
 /// These rules with the built-in architectures, processors and recipes, and those in `rules`, which override built-in ones
 /// of the same name.
 pub fn knowledge(set: RuleSet, rules: Option<&Path>) -> anyhow::Result<Knowledge> {
-    let mut knowledge = Knowledge::with(set, with(rules)?)?;
+    let mut knowledge = Knowledge::with(set, with(rules)?);
     for (name, text) in texts(rules, "processors")? {
         let processor = processor_of(&name, &text, &knowledge)?;
         knowledge.processors.retain(|other| other.processor != processor.processor);
@@ -46,8 +46,8 @@ pub fn knowledge(set: RuleSet, rules: Option<&Path>) -> anyhow::Result<Knowledge
         let recipe = read_recipe(&file, &knowledge)?;
         knowledge.recipes.retain(|other| other.recipe != recipe.recipe);
         knowledge.recipes.push(recipe);
+        knowledge.recipes.sort_by(|a, b| a.recipe.cmp(&b.recipe));
     }
-    knowledge.recipes.sort_by(|a, b| a.recipe.cmp(&b.recipe));
     Ok(knowledge)
 }
 

@@ -1,5 +1,8 @@
 //! Rules, one JSON5 file each: the condition to check, the reason, the message, the fixes.
 
+use std::ops::Deref;
+use std::sync::OnceLock;
+
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -11,7 +14,7 @@ pub use catalogue::{Catalogue, example};
 pub use effect::{Consequence, Effect, Harm, LoaderRange, Object};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
-use super::expression::{Expression, Template};
+use super::expression::{Expression, Template, compile_lazily};
 use super::source::{self, DataError};
 use crate::checkpoint::FaultKind;
 
@@ -40,11 +43,11 @@ impl Severity {
     }
 }
 
-/// A rule, as read from its file in `rules/checks/`.
+/// The file of a rule in `rules/checks/`.
 #[derive(Debug, Clone, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[cfg_attr(test, derive(schemars::JsonSchema), schemars(rename = "Rule"))]
 #[serde(deny_unknown_fields)]
-pub struct Rule {
+pub struct RuleFile {
     /// Family and number: `IDX003`.
     pub code: String,
     /// The fault in kebab case: `shard-missing`.
@@ -89,16 +92,84 @@ pub struct Rule {
     /// Links to the sources of the facts.
     #[serde(default)]
     pub references: Vec<String>,
+    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
+    #[serde(default, rename = "$schema")]
+    #[allow(dead_code, reason = "for editors")]
+    pub schema: Option<String>,
+}
+
+/// A rule: what tells whether it has findings, and its file, which the other fields are read from through `Deref`.
+///
+/// A run evaluates all of the built-in rules and reports findings of a few, so the file of a built-in rule is parsed when one
+/// of the other fields is first read.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Rule {
+    /// As [`RuleFile::code`].
+    pub code: String,
+    /// As [`RuleFile::name`].
+    pub name: String,
+    /// As [`RuleFile::applies`].
+    #[serde(default)]
+    pub applies: Vec<String>,
+    /// As [`RuleFile::when`].
+    #[serde(default)]
+    pub when: Option<Expression>,
+    /// As [`RuleFile::check`].
+    pub check: Check,
     /// Path of the file, for a rule from `--rules`.
     #[serde(skip)]
     pub origin: Option<String>,
     /// Severity that settings give every finding.
     #[serde(skip)]
     pub regraded: Option<Severity>,
-    /// Path or URL of this file's JSON Schema, for editors; the program ignores it.
-    #[serde(default, rename = "$schema")]
-    #[allow(dead_code, reason = "for editors")]
-    pub schema: Option<String>,
+    /// Path of the built-in file; empty for a rule from `--rules`.
+    #[serde(default)]
+    path: String,
+    #[serde(skip)]
+    file: OnceLock<Box<RuleFile>>,
+}
+
+impl RuleFile {
+    /// What the types of its fields leave open: the form of the code, that it has a severity, and its fixes.
+    fn check_text(&self) -> Result<(), String> {
+        if !is_code(&self.code) {
+            let code = &self.code;
+            return Err(format!("`{code}` is not a code: use capitals for the family, then digits, as in IDX005"));
+        }
+        if self.severity.is_none() && self.effects.is_empty() && self.harm.is_none() {
+            return Err(format!("{} needs a `severity`, `effects` or a `harm`", self.code));
+        }
+        self.fixes.iter().try_for_each(Fix::check)
+    }
+}
+
+impl Deref for Rule {
+    type Target = RuleFile;
+
+    /// # Panics
+    /// When a built-in file does not parse; a test reads them all.
+    fn deref(&self) -> &RuleFile {
+        self.file.get_or_init(|| {
+            let text = self.path.strip_prefix("rules/").and_then(source::text).unwrap_or_default();
+            source::parse_embedded(&self.path, text).unwrap_or_else(|error| panic!("{error}"))
+        })
+    }
+}
+
+impl From<RuleFile> for Rule {
+    fn from(file: RuleFile) -> Self {
+        Self {
+            code: file.code.clone(),
+            name: file.name.clone(),
+            applies: file.applies.clone(),
+            when: file.when.clone(),
+            check: file.check.clone(),
+            origin: None,
+            regraded: None,
+            path: String::new(),
+            file: OnceLock::from(Box::new(file)),
+        }
+    }
 }
 
 impl Rule {
@@ -215,6 +286,9 @@ pub struct At {
     pub tensor: Option<Template>,
 }
 
+/// The fields of [`Rule`] of every built-in rule, sorted by code, as JSON; the build script writes them.
+const HEADS: &str = include_str!(concat!(env!("OUT_DIR"), "/rules.json"));
+
 /// The rules of a run, by code.
 #[derive(Debug, Clone, Default)]
 pub struct RuleSet {
@@ -232,52 +306,44 @@ impl RuleSet {
     /// # Errors
     /// [`DataError`] when a built-in file is malformed; a test parses all of them.
     pub fn embedded() -> Result<Self, DataError> {
-        let parse = |(path, text): (String, &str)| Ok((source::parse_embedded(&path, text)?, path));
-        Self { catalogue: Catalogue::embedded()?, ..Self::default() }
-            .with(source::embedded("checks").into_iter().map(parse))
+        let rules = compile_lazily(|| serde_json::from_str(HEADS));
+        let rules = rules.map_err(|error| DataError::new("rules/checks", error.to_string()))?;
+        Ok(Self { rules, unselected: Vec::new(), catalogue: Catalogue::embedded()? })
     }
 
     /// Adds rules parsed from pairs of path and text.
     ///
     /// # Errors
     /// [`DataError`] for a malformed rule, a duplicate code or name, or an unknown kind of fault.
-    pub fn and_files<'a>(self, files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
-        self.with(files.into_iter().map(|(path, text)| {
-            let rule: Rule = source::parse(&path, text)?;
-            Ok((Rule { origin: Some(path.clone()), ..rule }, path))
-        }))
+    pub fn and_files<'a>(mut self, files: impl IntoIterator<Item = (String, &'a str)>) -> Result<Self, DataError> {
+        for (path, text) in files {
+            let file: RuleFile = source::parse(&path, text)?;
+            let wrong = |reason: String| Err(DataError::new(&path, reason));
+            if let Err(reason) = file.check_text() {
+                return wrong(reason);
+            }
+            if let Some(twin) = self.rules.iter().find(|r| r.code == file.code || r.name == file.name) {
+                return wrong(format!("{} {} is already used by {} {}", file.code, file.name, twin.code, twin.name));
+            }
+            self.rules.push(Rule { origin: Some(path), ..Rule::from(file) });
+        }
+        self.rules.sort_by(|a, b| a.code.cmp(&b.code));
+        Ok(self)
+    }
+
+    /// Parses the files of all rules, for tests.
+    ///
+    /// # Panics
+    /// When a built-in file is malformed.
+    pub fn read_all(&self) {
+        for rule in self.all() {
+            let _file: &RuleFile = rule;
+        }
     }
 
     /// All rules, selected or not.
     pub fn all(&self) -> impl Iterator<Item = &Rule> {
         self.rules.iter().chain(&self.unselected)
-    }
-
-    fn with(mut self, files: impl Iterator<Item = Result<(Rule, String), DataError>>) -> Result<Self, DataError> {
-        for file in files {
-            let (rule, path) = file?;
-            let wrong = |reason: String| Err(DataError::new(&path, reason));
-            if !is_code(&rule.code) {
-                return wrong(format!(
-                    "`{}` is not a code: use capitals for the family, then digits, as in IDX005",
-                    rule.code
-                ));
-            }
-            if rule.severity.is_none() && rule.effects.is_empty() && rule.harm.is_none() {
-                return wrong(format!("{} needs a `severity`, `effects` or a `harm`", rule.code));
-            }
-            for fix in &rule.fixes {
-                if let Err(reason) = fix.check() {
-                    return wrong(reason);
-                }
-            }
-            if let Some(twin) = self.rules.iter().find(|r| r.code == rule.code || r.name == rule.name) {
-                return wrong(format!("{} {} is already used by {} {}", rule.code, rule.name, twin.code, twin.name));
-            }
-            self.rules.push(rule);
-        }
-        self.rules.sort_by(|a, b| a.code.cmp(&b.code));
-        Ok(self)
     }
 }
 
@@ -315,6 +381,21 @@ mod tests {
     }
 
     #[test]
+    fn built_in_files_are_those_of_their_heads() {
+        let set = RuleSet::embedded().unwrap();
+        assert_eq!(set.rules.len(), source::embedded("checks").len());
+        let mut words = std::collections::BTreeSet::new();
+        for rule in &set.rules {
+            let file: &RuleFile = rule;
+            assert_eq!((&rule.code, &rule.name, &rule.applies), (&file.code, &file.name, &file.applies));
+            assert_eq!(format!("{:?} {:?}", rule.when, rule.check), format!("{:?} {:?}", file.when, file.check));
+            assert_eq!(file.check_text(), Ok(()), "{}", rule.path);
+            assert!(words.insert(&rule.code) && words.insert(&rule.name), "{} is used twice", rule.code);
+        }
+        assert!(set.rules.is_sorted_by(|a, b| a.code < b.code));
+    }
+
+    #[test]
     fn severity_follows_from_effects() {
         use Severity::{Error, Info, Warning};
         let effect = "effects: [{ on: 'model', raises: 'KeyError' }]";
@@ -329,7 +410,7 @@ mod tests {
             let rule = rule(&keys).unwrap();
             let found = [(true, true), (false, true), (false, false)].map(|(l, any)| rule.severity_given(l, any));
             assert_eq!(found, [leading, other, none], "{keys}");
-            let regraded = Rule { regraded: Some(Info), ..rule };
+            let regraded = Rule { regraded: Some(Info), ..rule.clone() };
             assert_eq!(regraded.severity_given(true, true), Info, "{keys}");
         }
         assert_eq!(rule(effect).unwrap().highest_severity(), Error);

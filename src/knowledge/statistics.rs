@@ -1,12 +1,9 @@
 //! Where policies of robots keep their statistics: `rules/statistics.json5`.
 
-use std::borrow::Cow;
-
-use globset::GlobSet;
-use serde::{Deserialize, Deserializer};
+use fast_glob::glob_match;
+use serde::Deserialize;
 
 use super::source::{self, DataError};
-use crate::checkpoint::glob::glob;
 
 /// `rules/statistics.json5`.
 #[derive(Debug, Clone, Deserialize)]
@@ -37,22 +34,16 @@ pub struct StatisticsDocument {
     references: Vec<String>,
 }
 
-/// A pattern for file names, in which `*` does not match `/`.
-#[derive(Debug, Clone)]
-pub struct Pattern(GlobSet);
+/// A pattern for file names, in which `*` does not match `/`. Most are used once or not at all, so none is compiled.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(transparent)]
+pub struct Pattern(String);
 
 impl Pattern {
     /// Whether the pattern matches a name.
     #[must_use]
     pub fn is_match(&self, name: &str) -> bool {
-        self.0.is_match(name)
-    }
-}
-
-impl<'de> Deserialize<'de> for Pattern {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let text = Cow::<str>::deserialize(deserializer)?;
-        glob(&text).map(Self).map_err(|reason| serde::de::Error::custom(format!("not a pattern: {reason}")))
+        glob_match(&self.0, name)
     }
 }
 

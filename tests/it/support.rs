@@ -168,7 +168,7 @@ pub fn texts(folder: &str) -> Vec<(String, String)> {
 
 /// All knowledge of a checker.
 pub fn knowledge() -> Knowledge {
-    Knowledge::with(rules(), Library::embedded()).unwrap_or_else(|e| panic!("{e}"))
+    Knowledge::with(rules(), Library::embedded())
 }
 
 /// Reads a directory; a git work tree around it is trusted.

@@ -163,7 +163,7 @@ pub(super) mod tests {
     /// The texts of all expressions in built-in files.
     fn texts() -> BTreeSet<String> {
         SEEN.take();
-        Knowledge::embedded().expect("the built-in files");
+        Knowledge::embedded().expect("the built-in files").read_all();
         for (path, text) in source::embedded("architectures") {
             source::parse_embedded::<Blueprint>(&path, text).expect("a built-in file");
         }

@@ -25,7 +25,7 @@ fn part_of(model: &ModelParts, name: &str) -> Option<String> {
 fn parts_stand_where_the_architectures_build_them() {
     let knowledge = Knowledge::embedded().unwrap();
     let mut changed: BTreeMap<&str, usize> = BTreeMap::new();
-    for model in &knowledge.parts {
+    for model in knowledge.parts.iter() {
         for (architecture, loader) in model.architectures.iter().flat_map(|a| Loader::ALL.map(|loader| (a, loader))) {
             let config = json!({ "model_type": architecture });
             let Some(class) = knowledge.library.find(&config, [], loader) else { continue };
