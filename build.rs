@@ -1,5 +1,5 @@
-//! Writes the index of the embedded architecture files, the other data files as JSON and the conditions of the rules, and
-//! rebuilds the program when a file in `rules/` changes: the program embeds this directory.
+//! Writes what the program embeds: the data files of `rules/` as JSON, the index of the architecture files, and the
+//! conditions of the rules.
 
 #![allow(
     clippy::print_stdout,
@@ -45,33 +45,38 @@ fn main() -> io::Result<()> {
     let text: String = index.iter().map(line).collect();
     let out = PathBuf::from(env::var_os("OUT_DIR").unwrap_or_default());
     fs::write(out.join("architectures.index"), text)?;
-    let mut files = BTreeMap::new();
-    convert(Path::new("rules"), &mut files)?;
-    let mut lines = String::new();
-    let mut rules = BTreeMap::new();
-    for (path, value) in files {
-        lines.extend([&path, "\t", &value.to_string(), "\n"]);
-        if path.starts_with("rules/checks/") {
-            let head = ["code", "name", "applies", "when", "check"];
-            let head = head.into_iter().filter_map(|key| Some((key.to_owned(), value.get(key)?.clone())));
-            let head: Map<String, Value> = head.chain([("path".to_owned(), path.into())]).collect();
-            rules.insert(value["code"].as_str().unwrap_or_default().to_owned(), Value::Object(head));
-        }
+    let mut heads = BTreeMap::new();
+    let data = out.join("rules");
+    if data.exists() {
+        fs::remove_dir_all(&data)?;
     }
-    fs::write(out.join("rules.json"), Value::Array(rules.into_values().collect()).to_string())?;
-    fs::write(out.join("data.txt"), lines)
+    convert(Path::new("rules"), &data, &mut heads)?;
+    fs::write(out.join("rules.json"), Value::Array(heads.into_values().collect()).to_string())
 }
 
-/// Reads the JSON5 files below a folder as JSON, by their paths; not those of architectures.
-fn convert(folder: &Path, files: &mut BTreeMap<String, Value>) -> io::Result<()> {
+/// Copies a folder of data files, with JSON5 files as JSON, which is faster to parse; those of recipes stay as they are,
+/// since the manifest of a merge has their digests. `heads` gets the conditions of the rules by their codes.
+fn convert(folder: &Path, to: &Path, heads: &mut BTreeMap<String, Value>) -> io::Result<()> {
+    fs::create_dir_all(to)?;
     for entry in fs::read_dir(folder)? {
         let path = entry?.path();
-        if path.is_dir() && !path.ends_with("architectures") {
-            convert(&path, files)?;
-        } else if path.extension().is_some_and(|extension| extension == "json5") {
+        let copy = to.join(path.file_name().unwrap_or_default());
+        if path.is_dir() {
+            convert(&path, &copy, heads)?;
+        } else if path.extension().is_some_and(|extension| extension == "json5") && !folder.starts_with("rules/recipes")
+        {
             let wrong = |error| io::Error::other(format!("{}: {error}", path.display()));
             let value: Value = json5::from_str(&fs::read_to_string(&path)?).map_err(wrong)?;
-            files.insert(path.to_string_lossy().replace('\\', "/"), value);
+            fs::write(copy, value.to_string())?;
+            if path.starts_with("rules/checks") {
+                let head = ["code", "name", "applies", "when", "check"];
+                let head = head.into_iter().filter_map(|key| Some((key.to_owned(), value.get(key)?.clone())));
+                let path = path.to_string_lossy().replace('\\', "/");
+                let head: Map<String, Value> = head.chain([("path".to_owned(), path.into())]).collect();
+                heads.insert(value["code"].as_str().unwrap_or_default().to_owned(), Value::Object(head));
+            }
+        } else if path.extension().is_none_or(|extension| extension != "md") {
+            fs::copy(&path, copy)?;
         }
     }
     Ok(())

@@ -13,6 +13,7 @@ mod init;
 mod inspect;
 mod library;
 mod output;
+mod parallel;
 mod paths;
 mod recipes;
 mod rules;

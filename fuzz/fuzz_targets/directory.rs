@@ -52,7 +52,7 @@ static SMALL: LazyLock<Knowledge> = LazyLock::new(|| {
     let llama = source::text("architectures/llama.json5").expect("a built-in file");
     let mut library = Library::default();
     library
-        .add("llama.json5", &llama.replace("num_hidden_layers: 32", "num_hidden_layers: 1"))
+        .add("llama.json5", &llama.replace(r#""num_hidden_layers":32"#, r#""num_hidden_layers":1"#))
         .expect("an architecture");
     Knowledge::with(RuleSet::embedded().expect("built-in files"), library)
 });

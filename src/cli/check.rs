@@ -7,6 +7,7 @@ use anyhow::bail;
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
+use super::parallel::in_order;
 use super::paths::{self, Targets};
 use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
@@ -41,10 +42,14 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     if args.fix.writes() {
         signals::install()?;
     }
+    // `--deep` uses all cores for one checkpoint, and what is written to one may be read from another.
+    let alone = args.deep || args.fix.writes();
+    let look = |dir: PathBuf| (shown(&dir), run.look(dir));
+    let looks: Box<dyn Iterator<Item = (String, anyhow::Result<Checked>)>> =
+        if alone { Box::new(dirs.into_iter().map(look)) } else { Box::new(in_order(dirs, look).into_iter()) };
     let mut looked = Vec::new();
-    for dir in dirs {
-        let path = shown(&dir);
-        let checked = match run.look(dir) {
+    for (path, look) in looks {
+        let checked = match look {
             Ok(checked) => {
                 run.refuse_unusable(&checked)?;
                 run.repaired(checked)

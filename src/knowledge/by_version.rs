@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::de::DeserializeOwned;
+use serde::Deserialize;
 
 use super::loader::version_numbers;
 use super::source::{self, DataError};
@@ -13,15 +13,15 @@ pub(super) struct ByVersion<T> {
     entries: BTreeMap<Vec<u64>, T>,
 }
 
-impl<T: DeserializeOwned> ByVersion<T> {
+impl<T: Deserialize<'static>> ByVersion<T> {
     /// The built-in file of this name.
     ///
     /// # Errors
     /// [`DataError`] when it is malformed.
     pub(super) fn embedded(file: &str) -> Result<Self, DataError> {
-        let entries: BTreeMap<String, T> = serde_json::from_str(source::text(file).unwrap_or_default())
+        let entries: BTreeMap<&str, T> = serde_json::from_str(source::text(file).unwrap_or_default())
             .map_err(|error| DataError::new(&format!("rules/{file}"), error.to_string()))?;
-        Ok(Self { entries: entries.into_iter().map(|(version, entry)| (version_numbers(&version), entry)).collect() })
+        Ok(Self { entries: entries.into_iter().map(|(version, entry)| (version_numbers(version), entry)).collect() })
     }
 }
 

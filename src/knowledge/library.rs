@@ -26,9 +26,9 @@ pub struct Library {
 }
 
 struct File {
-    stem: String,
+    stem: Cow<'static, str>,
     text: Cow<'static, [u8]>,
-    parsed: OnceLock<Blueprint>,
+    parsed: OnceLock<Box<Blueprint>>,
 }
 
 impl Library {
@@ -36,11 +36,12 @@ impl Library {
     #[must_use]
     pub fn embedded() -> Self {
         // A page of a text is read from disk when it is first used.
-        let file = |(stem, text): (&str, &'static [u8])| {
-            let stem = stem.to_owned();
-            File { stem, text: Cow::Borrowed(text), parsed: OnceLock::new() }
+        let file = |(stem, text): (&'static str, &'static [u8])| File {
+            stem: Cow::Borrowed(stem),
+            text: Cow::Borrowed(text),
+            parsed: OnceLock::new(),
         };
-        let mut files: Vec<File> = source::embedded_bytes("architectures").map(file).collect();
+        let mut files: Vec<File> = source::embedded_bytes("architectures", ".json5").map(file).collect();
         files.sort_by(|a, b| a.stem.cmp(&b.stem));
         Self { files, added: 0 }
     }
@@ -56,14 +57,15 @@ impl Library {
             self.files.remove(at);
             self.added = self.added.saturating_sub(usize::from(at < self.added));
         }
-        self.files.insert(0, File { stem, text: Cow::Owned(text.into()), parsed: OnceLock::from(blueprint) });
+        let (stem, text) = (Cow::Owned(stem), Cow::Owned(text.into()));
+        self.files.insert(0, File { stem, text, parsed: OnceLock::from(Box::new(blueprint)) });
         self.added = self.added.saturating_add(1);
         Ok(())
     }
 
     /// Names of all architectures.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.files.iter().map(|file| file.stem.as_str())
+        self.files.iter().map(|file| file.stem.as_ref())
     }
 
     /// The class of this name, as `loader` builds it.
@@ -172,7 +174,7 @@ impl Library {
 
     /// Stem and text of every file, unparsed.
     pub(super) fn texts(&self) -> impl Iterator<Item = (&str, &[u8])> {
-        self.files.iter().map(|file| (file.stem.as_str(), file.text.as_ref()))
+        self.files.iter().map(|file| (file.stem.as_ref(), file.text.as_ref()))
     }
 
     /// Text of the file of this stem.
@@ -218,7 +220,7 @@ impl Library {
     fn candidates<'l>(&'l self, stems: impl Iterator<Item = &'static str> + 'l) -> impl Iterator<Item = &'l Blueprint> {
         let (added, embedded) = self.files.split_at_checked(self.added).unwrap_or_default();
         let of_stem = |stem: &str| {
-            let at = embedded.binary_search_by(|file| file.stem.as_str().cmp(stem)).ok()?;
+            let at = embedded.binary_search_by(|file| file.stem.as_ref().cmp(stem)).ok()?;
             embedded.get(at)
         };
         added.iter().chain(stems.filter_map(of_stem)).map(File::blueprint)
@@ -273,7 +275,7 @@ impl File {
     fn blueprint(&self) -> &Blueprint {
         self.parsed.get_or_init(|| {
             let path = format!("rules/architectures/{}.json5", self.stem);
-            source::parse_embedded(&path, self.text()).unwrap_or_else(|e| panic!("{e}"))
+            Box::new(source::parse_embedded(&path, self.text()).unwrap_or_else(|e| panic!("{e}")))
         })
     }
 }
@@ -287,7 +289,7 @@ mod tests {
     #[test]
     fn only_the_file_at_hand_is_parsed() {
         let library = Library::embedded();
-        let parsed = || library.files.iter().filter(|f| f.parsed.get().is_some()).map(|f| f.stem.as_str());
+        let parsed = || library.files.iter().filter(|f| f.parsed.get().is_some()).map(|f| f.stem.as_ref());
         assert_eq!(parsed().count(), 0);
         let config = json!({ "architectures": ["LlamaForCausalLM"], "model_type": "llama" });
         for loader in Loader::ALL {

@@ -7,16 +7,19 @@ use serde::Deserialize;
 use super::by_version::ByVersion;
 use super::source::DataError;
 
+/// Names in the order of their bytes, as the file has them.
+type Sorted = Vec<&'static str>;
+
 /// The names of one version.
 #[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, bound(deserialize = "'de: 'static"))]
 struct Lists {
-    activations: BTreeSet<String>,
-    dtypes: BTreeSet<String>,
-    model_types: BTreeSet<String>,
-    processors: BTreeSet<String>,
-    quantization: BTreeSet<String>,
-    rope_types: BTreeSet<String>,
+    activations: Sorted,
+    dtypes: Sorted,
+    model_types: Sorted,
+    processors: Sorted,
+    quantization: Sorted,
+    rope_types: Sorted,
 }
 
 /// A list of names.
@@ -37,7 +40,11 @@ pub enum NameKind {
 }
 
 impl Lists {
-    const fn of(&self, kind: NameKind) -> &BTreeSet<String> {
+    fn contains(&self, kind: NameKind, name: &str) -> bool {
+        self.of(kind).binary_search(&name).is_ok()
+    }
+
+    const fn of(&self, kind: NameKind) -> &Sorted {
         match kind {
             NameKind::Activation => &self.activations,
             NameKind::Dtype => &self.dtypes,
@@ -69,22 +76,22 @@ impl LoaderNames {
     #[must_use]
     pub fn lacks(&self, version: &str, kind: NameKind, name: &str) -> bool {
         let (newer, older) = self.versions.around(version);
-        let lacks = |lists: &Lists| !lists.of(kind).contains(name);
+        let lacks = |lists: &Lists| !lists.contains(kind, name);
         newer.is_some_and(lacks) && older.is_none_or(lacks)
     }
 
     /// Whether any known version knows the name.
     #[must_use]
     pub fn contains(&self, kind: NameKind, name: &str) -> bool {
-        self.versions.values().any(|lists| lists.of(kind).contains(name))
+        self.versions.values().any(|lists| lists.contains(kind, name))
     }
 
     /// The model type that transformers 4 takes from a directory's name when config.json has none: the longest one in it.
     #[must_use]
     pub fn model_type_in(&self, version: &str, directory: &str) -> Option<&str> {
         let (Some(lists), _) = self.versions.around(version) else { return None };
-        let found = lists.model_types.iter().filter(|name| directory.contains(name.as_str()));
-        found.max_by_key(|name| name.len()).map(String::as_str)
+        let found = lists.model_types.iter().filter(|name| directory.contains(**name));
+        found.max_by_key(|name| name.len()).copied()
     }
 
     /// The known name that `name` is a misspelling of: another separator or case, or a letter.
@@ -95,7 +102,7 @@ impl LoaderNames {
             return None;
         }
         let plain = |name: &str| name.to_ascii_lowercase().replace(['-', '.', ' '], "_");
-        let all: BTreeSet<&str> = self.versions.values().flat_map(|lists| lists.of(kind)).map(String::as_str).collect();
+        let all: BTreeSet<&str> = self.versions.values().flat_map(|lists| lists.of(kind)).copied().collect();
         let likeness = |other: &str| strsim::damerau_levenshtein(&plain(other), &plain(name));
         let best = all.into_iter().map(|other| (likeness(other), other)).min()?;
         // Names of versions such as qwen2 and qwen3 differ in one letter.
@@ -108,6 +115,16 @@ impl LoaderNames {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_file_is_sorted() {
+        for lists in LoaderNames::embedded().unwrap().versions.values() {
+            let Lists { activations, dtypes, model_types, processors, quantization, rope_types } = lists;
+            for names in [activations, dtypes, model_types, processors, quantization, rope_types] {
+                assert!(names.is_sorted() && !names.is_empty(), "{names:?}");
+            }
+        }
+    }
 
     #[test]
     fn a_name_is_lacking_only_where_both_neighbours_lack_it() {

@@ -367,7 +367,7 @@ impl Recipe {
     /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         let parse = |(path, text): (String, &'static str)| {
-            let recipe: Self = source::parse_embedded(&path, text)?;
+            let recipe: Self = source::parse_lazily(&path, text)?;
             let origin = Origin { path, text: Cow::Borrowed(text), ..Origin::default() };
             Ok(Self { origin, ..recipe })
         };

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use memchr::memmem;
 use serde::Deserialize;
 use serde_json::Value;
 
@@ -147,15 +146,14 @@ pub const EVERY_CLASS: &str = "*";
 /// one line, and only the lines that a check needs are parsed.
 #[derive(Debug, Clone, Default)]
 pub struct Refusals {
-    versions: BTreeMap<&'static str, &'static str>,
+    versions: BTreeMap<&'static str, &'static [u8]>,
 }
 
 impl Refusals {
     /// The built-in files.
     #[must_use]
     pub fn embedded() -> Self {
-        let files = source::files("refused");
-        Self { versions: files.filter_map(|(name, text)| Some((name.strip_suffix(".json")?, text))).collect() }
+        Self { versions: source::embedded_bytes("refused", ".json").collect() }
     }
 
     /// What the model class refuses under this version. Where it was not tried there, what both the next older and the
@@ -181,11 +179,10 @@ impl Refusals {
     }
 
     fn line(&self, version: &str, class: &str) -> Option<ClassRefusals> {
-        let text = self.versions.get(version)?;
-        let start = format!("\n{}: ", Value::from(class));
-        let at = memmem::find(text.as_bytes(), start.as_bytes())?.checked_add(start.len())?;
-        let line = text.get(at..)?.lines().next()?;
-        serde_json::from_str(line.strip_suffix(',').unwrap_or(line)).ok()
+        // The first line and the last one are the braces of the file.
+        let lines = self.versions.get(version)?.strip_prefix(b"{\n")?.strip_suffix(b"\n}\n")?;
+        let entry = source::bisect(lines, class, |line| line.strip_prefix('"')?.split_once("\": "))?;
+        serde_json::from_str(entry.strip_suffix(',').unwrap_or(entry)).ok()
     }
 }
 
@@ -223,7 +220,7 @@ mod tests {
         let refusals = Refusals::embedded();
         assert!(refusals.versions.len() >= 3);
         for (version, text) in &refusals.versions {
-            let document: Value = serde_json::from_str(text).unwrap();
+            let document: Value = serde_json::from_slice(text).unwrap();
             for (class, entry) in document.as_object().unwrap() {
                 let expected: ClassRefusals = serde_json::from_value(entry.clone()).unwrap();
                 assert_eq!(refusals.line(version, class), Some(expected), "{version} {class}");

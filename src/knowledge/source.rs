@@ -8,11 +8,8 @@ use serde::de::DeserializeOwned;
 use super::expression::{compile_eagerly, compile_lazily};
 use crate::checkpoint::line_column;
 
-static RULES: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/rules");
-
-/// The built-in JSON5 files as JSON, which is faster to parse: lines for [`line_of`] that the build script writes. Without
-/// architectures, of which a run reads a few.
-const CONVERTED: &str = include_str!(concat!(env!("OUT_DIR"), "/data.txt"));
+/// The files of `rules/`, all but recipes as JSON: the build script writes them.
+static RULES: Dir<'static> = include_dir!("$OUT_DIR/rules");
 
 /// A malformed data file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -71,29 +68,45 @@ pub fn parse<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError
     compile_eagerly(|| read(path, text))
 }
 
-/// Parses a built-in file, its JSON if it was converted, otherwise `text`; its expressions are compiled at their first
-/// evaluation.
+/// As [`parse`], for a built-in recipe: its expressions are compiled at their first evaluation.
 ///
 /// # Errors
 /// As [`parse`], except for invalid expressions.
+pub fn parse_lazily<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
+    compile_lazily(|| read(path, text))
+}
+
+/// Parses any other built-in file, which is JSON; its expressions are compiled at their first evaluation.
+///
+/// # Errors
+/// [`DataError`] with the parser's line and column.
 pub fn parse_embedded<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, DataError> {
-    let converted = |json| serde_json::from_str(json).map_err(|error| DataError::new(path, error.to_string()));
-    compile_lazily(|| line_of(CONVERTED, path).map_or_else(|| read(path, text), converted))
+    compile_lazily(|| serde_json::from_str(text)).map_err(|error| DataError::new(path, error.to_string()))
 }
 
 /// The value in the line of `key`, by bisection: lines of a key, a tab and a value, sorted by their keys.
 pub(super) fn line_of<'t>(lines: &'t str, key: &str) -> Option<&'t str> {
+    bisect(lines.as_bytes(), key, |line| line.split_once('\t'))
+}
+
+/// The value in the line of `key` in sorted lines, which `split` separates into their keys and values. Reads the lines that
+/// it compares, and of a built-in file only their pages.
+pub(super) fn bisect<'t>(
+    lines: &'t [u8],
+    key: &str,
+    split: impl Fn(&'t str) -> Option<(&'t str, &'t str)>,
+) -> Option<&'t str> {
     let (mut start, mut end) = (0, lines.len());
     while start < end {
         let middle = start.midpoint(end);
-        // The line around the middle; as bytes, because the middle may lie within a character.
-        let before = lines.as_bytes().get(start..middle)?;
+        let before = lines.get(start..middle)?;
         let from = memchr::memrchr(b'\n', before).map_or(Some(start), |at| start.checked_add(at)?.checked_add(1))?;
-        let line = lines.get(from..end)?.split('\n').next()?;
-        let (found, value) = line.split_once('\t')?;
+        let to = memchr::memchr(b'\n', lines.get(middle..end)?).map_or(Some(end), |at| middle.checked_add(at))?;
+        let line = std::str::from_utf8(lines.get(from..to)?).ok()?;
+        let (found, value) = split(line)?;
         match found.cmp(key) {
             Ordering::Equal => return Some(value),
-            Ordering::Less => start = from.checked_add(line.len())?.checked_add(1)?,
+            Ordering::Less => start = to.checked_add(1)?,
             Ordering::Greater => end = from,
         }
     }
@@ -187,12 +200,6 @@ fn folder(path: &str) -> Option<&'static Dir<'static>> {
     Some(here)
 }
 
-/// The files directly in a folder of `rules/`, by their names.
-pub fn files(path: &str) -> impl Iterator<Item = (&'static str, &'static str)> {
-    let files = folder(path).into_iter().flat_map(Dir::files);
-    files.filter_map(|file| Some((file.path().file_name()?.to_str()?, file.contents_utf8()?)))
-}
-
 /// The `.json5` files below a folder of `rules/`, in path order.
 #[must_use]
 pub fn embedded(path: &str) -> Vec<(String, &'static str)> {
@@ -217,10 +224,12 @@ pub fn embedded(path: &str) -> Vec<(String, &'static str)> {
     out
 }
 
-/// Stem and bytes of each `.json5` file in a folder of `rules/`, not in its subfolders.
-pub(super) fn embedded_bytes(path: &str) -> impl Iterator<Item = (&'static str, &'static [u8])> {
+/// Stem and bytes of each file in a folder of `rules/` that has this extension with its dot, not in its subfolders.
+pub(super) fn embedded_bytes(path: &str, extension: &str) -> impl Iterator<Item = (&'static str, &'static [u8])> {
     let files = folder(path).into_iter().flat_map(Dir::files);
-    files.filter_map(|file| Some((file.path().to_str()?.rsplit('/').next()?.strip_suffix(".json5")?, file.contents())))
+    files.filter_map(move |file| {
+        Some((file.path().to_str()?.rsplit('/').next()?.strip_suffix(extension)?, file.contents()))
+    })
 }
 
 /// Paths below a folder of `rules/` of all files in it and in its subfolders.
@@ -276,21 +285,6 @@ mod tests {
             assert_eq!(line_of(lines, key), value, "{key}");
         }
         assert_eq!(line_of("", "a"), None);
-    }
-
-    #[test]
-    fn converted_files_have_the_values_of_their_json5() {
-        let mut files = 0;
-        for line in CONVERTED.lines() {
-            let (path, json) = line.split_once('\t').unwrap();
-            let text = text(path.strip_prefix("rules/").unwrap()).unwrap();
-            let [json, value] = [serde_json::from_str(json).ok(), json5::from_str(text).ok()];
-            let value: Option<serde_json::Value> = value;
-            assert!(json.is_some() && json == value, "{path}");
-            assert_eq!(line_of(CONVERTED, path), line.split_once('\t').map(|(_, json)| json));
-            files += 1;
-        }
-        assert!(files > 100);
     }
 
     /// Strings and comments between the brackets do not hide the nesting.

@@ -107,10 +107,87 @@ impl Pattern {
     }
 }
 
+/// A text that every match of a regular expression contains: its longest run of characters that stand for themselves. `None`
+/// without one, or for an expression with alternatives, classes, or groups that are optional or look around.
+pub(super) fn contained(text: &str) -> Option<String> {
+    let longer = |one: String, other: String| if other.len() > one.len() { other } else { one };
+    let (mut longest, mut run) = (String::new(), String::new());
+    let mut depth = 0_usize;
+    let mut rest = text.chars().peekable();
+    while let Some(c) = rest.next() {
+        let literal = match c {
+            '|' | '[' => return None,
+            '\\' => rest.next().filter(|escaped| escaped.is_ascii_punctuation()),
+            '.' | '^' | '$' | '+' => None,
+            '*' | '?' | '{' => {
+                // The character before need not be there.
+                run.pop();
+                if c == '{' {
+                    rest.by_ref().find(|c| *c == '}');
+                }
+                None
+            }
+            '(' => {
+                depth = depth.checked_add(1)?;
+                if rest.peek() == Some(&'?') {
+                    return None;
+                }
+                None
+            }
+            ')' => {
+                depth = depth.checked_sub(1)?;
+                if rest.peek().is_some_and(|c| matches!(c, '*' | '?' | '{')) {
+                    return None;
+                }
+                None
+            }
+            other => Some(other),
+        };
+        match literal {
+            Some(c) => run.push(c),
+            None => longest = longer(longest, std::mem::take(&mut run)),
+        }
+    }
+    longest = longer(longest, run);
+    (!longest.is_empty()).then_some(longest)
+}
+
 /// Drops the names that one of the patterns is found in.
 pub(super) fn ignore(names: &mut Vec<String>, patterns: &[String]) {
     let patterns: Vec<Pattern> = patterns.iter().filter_map(|text| Pattern::new(text)).collect();
     if !patterns.is_empty() {
         names.retain(|name| !patterns.iter().any(|p| p.found_in(name)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_match_contains_the_text() {
+        for (pattern, names, text) in [
+            (r"\.attn\.(q|k)", &[".attn.q"][..], None),
+            (r"^model\.", &["model.x"], Some("model.")),
+            (r"LayerNorm.gamma", &["LayerNorm.gamma", "LayerNorm_gamma"], Some("LayerNorm")),
+            (r"abc*", &["ab", "abcc"], Some("ab")),
+            (r"abc+d", &["abccd"], Some("abc")),
+            (r"abc?de", &["abde", "abcde"], Some("ab")),
+            (r"ab{0,2}cde", &["acde", "abbcde"], Some("cde")),
+            (r"layers\.(\d+)\.mlp", &["layers.10.mlp"], Some("layers.")),
+            (r"a(bcd)?", &["a", "abcd"], None),
+            (r"a(bcd)ef", &["abcdef"], Some("bcd")),
+            (r"[ab]cdef", &["acdef"], None),
+            (r"(?:a)bc", &["abc"], None),
+            (r"\w+", &["a"], None),
+        ] {
+            let found = contained(pattern);
+            assert_eq!(found.as_deref(), text, "{pattern}");
+            let compiled = Pattern::new(pattern).expect("a pattern");
+            for name in names {
+                assert!(compiled.found_in(name), "{pattern} {name}");
+                assert!(found.as_ref().is_none_or(|text| name.contains(text)), "{pattern} {name}");
+            }
+        }
     }
 }

@@ -1,6 +1,8 @@
 //! Renamings of transformers 5: one `WeightTransform` of its `core_model_loading.py`, applied to one name.
 
-use super::pattern::Pattern;
+use std::cell::OnceCell;
+
+use super::pattern::{Pattern, contained};
 use crate::knowledge::Conversion;
 
 /// What a transform replaces the matched text with.
@@ -16,24 +18,40 @@ enum Target {
     Offset(u64),
 }
 
-/// A transform, ready to be asked.
-pub(super) struct Transform<'c> {
-    row: &'c Conversion,
+/// The source patterns of a row.
+struct Branches {
     pattern: Pattern,
     /// Number of the group of each branch, by the branch.
     groups: Vec<(usize, usize)>,
+}
+
+impl Branches {
+    fn new(row: &Conversion) -> Option<Self> {
+        let mut branches: Vec<(usize, &String)> = row.from.iter().enumerate().collect();
+        // A name is matched by the first branch that fits, so the longest stands first.
+        branches.sort_by_key(|(_, text)| std::cmp::Reverse(text.chars().count()));
+        let branches: Vec<String> = branches.into_iter().map(|(i, text)| branch(i, text)).collect();
+        let pattern = Pattern::new(&branches.join("|"))?;
+        let groups = (0..row.from.len()).filter_map(|i| Some((i, pattern.group(&format!("g{i}"))?))).collect();
+        Some(Self { pattern, groups })
+    }
+}
+
+/// A transform, ready to be asked.
+pub(super) struct Transform<'c> {
+    row: &'c Conversion,
+    /// For each branch a text that every match contains: most models have no name with any of them, and compiling a pattern
+    /// takes as long as a hundred searches. `None` where a branch has no such text.
+    contained: Option<Vec<String>>,
+    /// `None` when the pattern does not compile.
+    branches: OnceCell<Option<Branches>>,
     target: Target,
     /// What a name has to start with, the longer first; none for a transform of the whole model.
     prefixes: Option<[String; 2]>,
 }
 
 impl<'c> Transform<'c> {
-    /// `None` for a row whose pattern does not compile.
-    pub(super) fn new(row: &'c Conversion, base_model_prefix: &str) -> Option<Self> {
-        let mut branches: Vec<(usize, &String)> = row.from.iter().enumerate().collect();
-        // A name is matched by the first branch that fits, so the longest stands first.
-        branches.sort_by_key(|(_, text)| std::cmp::Reverse(text.chars().count()));
-        let branches: Vec<String> = branches.into_iter().map(|(i, text)| branch(i, text)).collect();
+    pub(super) fn new(row: &'c Conversion, base_model_prefix: &str) -> Self {
         let target = match row.kind.as_str() {
             "GroupWeightRename" => Target::Own { active: false },
             "Inkling2IndexOffsetWeightRename" => {
@@ -46,9 +64,8 @@ impl<'c> Transform<'c> {
             let scope = dotted(scope);
             [format!("{}{scope}", dotted(base_model_prefix)), scope]
         });
-        let pattern = Pattern::new(&branches.join("|"))?;
-        let groups = (0..row.from.len()).filter_map(|i| Some((i, pattern.group(&format!("g{i}"))?))).collect();
-        Some(Self { row, pattern, groups, target, prefixes })
+        let contained = row.from.iter().map(|text| contained(&glob(text))).collect();
+        Self { row, contained, branches: OnceCell::new(), target, prefixes }
     }
 
     pub(super) const fn row(&self) -> &'c Conversion {
@@ -65,8 +82,12 @@ impl<'c> Transform<'c> {
             None => ("", name),
             Some(prefixes) => prefixes.iter().find_map(|p| Some((p.as_str(), name.strip_prefix(p.as_str())?)))?,
         };
-        let captures = self.pattern.captures(inner)?;
-        let (branch, at) = *self.groups.iter().find(|(_, at)| captures.range(*at).is_some())?;
+        if self.contained.as_ref().is_some_and(|texts| !texts.iter().any(|text| inner.contains(text))) {
+            return None;
+        }
+        let branches = self.branches.get_or_init(|| Branches::new(self.row)).as_ref()?;
+        let captures = branches.pattern.captures(inner)?;
+        let (branch, at) = *branches.groups.iter().find(|(_, at)| captures.range(*at).is_some())?;
         let inside = |n: usize| captures.text(at.saturating_add(n));
         let replacement = match &mut self.target {
             Target::First => self.row.to.first()?.replace(r"\1", inside(1)),
@@ -89,9 +110,14 @@ impl<'c> Transform<'c> {
     }
 }
 
-/// A source pattern as one branch of the transform's pattern: `*.` is a glob, and a name ends where the pattern does.
+/// A source pattern as a regular expression: `*.` is a glob.
+fn glob(text: &str) -> String {
+    text.replace("*.", r".*\.")
+}
+
+/// A source pattern as one branch of the transform's pattern: a name ends where the pattern does.
 fn branch(i: usize, text: &str) -> String {
-    let glob = text.replace("*.", r".*\.");
+    let glob = glob(text);
     let ends_a_name = glob.ends_with(|c: char| c.is_ascii_alphanumeric());
     format!("(?P<g{i}>{glob}{})", if ends_a_name { r"(?!\w)" } else { "" })
 }

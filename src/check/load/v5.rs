@@ -98,7 +98,7 @@ struct Loading<'e> {
 
 impl<'e> Loading<'e> {
     fn new(expected: &'e Expected) -> Self {
-        let transforms = expected.conversions.iter().filter_map(|row| Transform::new(row, &expected.base_model_prefix));
+        let transforms = expected.conversions.iter().map(|row| Transform::new(row, &expected.base_model_prefix));
         let (converters, renamings): (Vec<_>, Vec<_>) = transforms.partition(Transform::is_converter);
         let patterns =
             converters.iter().enumerate().flat_map(|(i, c)| c.row().from.iter().map(move |p| (p.as_str(), i)));
