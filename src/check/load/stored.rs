@@ -1,6 +1,7 @@
 //! What the loader finds in a checkpoint: keys, and the tensors behind them.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::OnceLock;
 
 use crate::checkpoint::{Checkpoint, PICKLE_NAME, Shard};
 use crate::knowledge::Evidence;
@@ -29,6 +30,8 @@ pub struct Stored {
     absent: BTreeSet<String>,
     /// Whether a file that the loader opens was read without a fault: without a tensor in it, everything is missing.
     was_read: bool,
+    /// What [`Stored::evidence`] made.
+    evidence: OnceLock<Evidence>,
 }
 
 impl Stored {
@@ -57,7 +60,7 @@ impl Stored {
                 let Self { shapes, was_read, .. } = Self::together(opened);
                 let keys: BTreeSet<String> = index.keys().cloned().collect();
                 let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();
-                Self { keys, shapes, absent, was_read }
+                Self { keys, shapes, absent, was_read, ..Self::default() }
             }
         }
     }
@@ -74,13 +77,13 @@ impl Stored {
     /// Names and shapes of one file.
     #[must_use]
     pub fn from_shapes(shapes: BTreeMap<String, Vec<u64>>) -> Self {
-        Self { keys: shapes.keys().cloned().collect(), shapes, absent: BTreeSet::new(), was_read: false }
+        Self { keys: shapes.keys().cloned().collect(), shapes, ..Self::default() }
     }
 
     /// The same with some tensors taken out and others put in; of those the shape may be unknown.
     #[must_use]
     pub fn replacing(&self, taken: &BTreeSet<String>, added: BTreeMap<String, Option<Vec<u64>>>) -> Self {
-        let mut replaced = self.clone();
+        let mut replaced = Self { evidence: OnceLock::new(), ..self.clone() };
         replaced.keys.retain(|name| !taken.contains(name));
         replaced.absent.retain(|name| !taken.contains(name));
         replaced.shapes.retain(|name, _| !taken.contains(name));
@@ -104,6 +107,7 @@ impl Stored {
             shapes: self.shapes.iter().map(|(name, shape)| (renamed(name), shape.clone())).collect(),
             absent: self.absent.iter().map(renamed).collect(),
             was_read: self.was_read,
+            ..Self::default()
         }
     }
 
@@ -128,7 +132,9 @@ impl Stored {
     /// The stored tensors, for what an architecture reads off them.
     #[must_use]
     pub fn evidence(&self) -> Evidence {
-        self.keys.iter().chain(self.shapes.keys()).map(|name| (name.clone(), self.shapes.get(name).cloned())).collect()
+        let shapes = self.shapes.iter().map(|(name, shape)| (name.clone(), Some(shape.clone())));
+        let others = self.keys.iter().filter(|key| !self.shapes.contains_key(*key)).map(|key| (key.clone(), None));
+        self.evidence.get_or_init(|| shapes.chain(others).collect()).clone()
     }
 
     /// Names in the files the loader opens; those of the index stand in for files that are not there.

@@ -3,7 +3,6 @@
 //! Each key of the files is renamed, and may go with others into a converter; what comes out is compared with the
 //! model. All lists are in the model's names.
 
-use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use indexmap::IndexMap;
@@ -118,7 +117,7 @@ impl<'e> Loading<'e> {
     fn of(expected: &'e Expected, stored: &Stored) -> Self {
         let mut loading = Self::new(expected);
         let mut names: Vec<&str> = stored.file_names().collect();
-        names.sort_by(|a, b| natural(a, b));
+        names.sort_by_cached_key(|name| natural(name));
         for name in names {
             loading.collect(name, stored.shape(name).map_or(Shape::Unknown, |dims| Shape::Known(dims.to_vec())));
         }
@@ -238,40 +237,34 @@ impl<'e> Loading<'e> {
     }
 }
 
-/// The loader's order of names: part by part between dots, numbers by value and before words, and the number at the
-/// end of a word by value.
-fn natural(a: &str, b: &str) -> Ordering {
-    let compare = |(a_word, a): &(bool, &str), (b_word, b): &(bool, &str)| {
-        a_word.cmp(b_word).then_with(|| {
-            let (a_text, a_digits) = trailing_digits(a);
-            let (b_text, b_digits) = trailing_digits(b);
-            a_text.cmp(b_text).then_with(|| number(a_digits).cmp(&number(b_digits)))
-        })
-    };
-    // Parts before the first difference compare equal.
-    let same = a.bytes().zip(b.bytes()).take_while(|(a, b)| a == b).count();
-    let start =
-        a.as_bytes().get(..same).and_then(|same| memchr::memrchr(b'.', same)).map_or(0, |dot| dot.saturating_add(1));
-    let (a, b) = (a.get(start..).unwrap_or_default(), b.get(start..).unwrap_or_default());
-    let differing = parts(a).zip(parts(b)).map(|(a, b)| compare(&a, &b)).find(|o| o.is_ne());
-    differing.unwrap_or_else(|| parts(a).count().cmp(&parts(b).count()))
-}
-
-/// The parts of a name, each with whether it is a word.
-fn parts(name: &str) -> impl Iterator<Item = (bool, &str)> {
-    let is_number = |part: &str| !part.is_empty() && part.bytes().all(|b| b.is_ascii_digit());
-    name.split('.').map(move |part| (!is_number(part), part))
+/// A key whose bytes sort names as the loader does: part by part between dots, numbers by value and before words, and the
+/// number at the end of a word by value.
+fn natural(name: &str) -> Vec<u8> {
+    let mut key = Vec::with_capacity(name.len().saturating_mul(2));
+    for part in name.split('.') {
+        let (text, digits) = trailing_digits(part);
+        // A number is digits alone.
+        key.push(u8::from(!text.is_empty() || digits.is_empty()));
+        // A text ends before all that goes on.
+        for byte in text.bytes() {
+            key.push(byte);
+            if byte == 0 {
+                key.push(1);
+            }
+        }
+        key.extend([0, 0]);
+        // A number of more digits is larger; a part without one is before all.
+        key.push(u8::from(!digits.is_empty()));
+        let digits = digits.trim_start_matches('0');
+        key.extend(u32::try_from(digits.len()).unwrap_or(u32::MAX).to_be_bytes());
+        key.extend(digits.bytes());
+    }
+    key
 }
 
 fn trailing_digits(part: &str) -> (&str, &str) {
     let text = part.trim_end_matches(|c: char| c.is_ascii_digit());
     part.split_at(text.len())
-}
-
-/// A number of any length as something that compares by value; none is before all.
-fn number(digits: &str) -> Option<(usize, &str)> {
-    let value = digits.trim_start_matches('0');
-    (!digits.is_empty()).then_some((value.len(), value))
 }
 
 #[cfg(test)]
@@ -281,7 +274,14 @@ mod tests {
     #[test]
     fn names_sort_as_the_loader_sorts_them() {
         let mut names = ["b.10.w", "b.9.w", "b.x.w", "b.shard_11", "b.shard_2", "b.shard_", "b.9", "a.1"];
-        names.sort_by(|a, b| natural(a, b));
+        names.sort_by_cached_key(|name| natural(name));
         assert_eq!(names, ["a.1", "b.9", "b.9.w", "b.10.w", "b.shard_", "b.shard_2", "b.shard_11", "b.x.w"]);
+        let mut others =
+            ["a..b", "a.", "a", "a.b\0c", "a.b\0", "a.b", "a.b0", "a.b00001", "a.b1x", "a.001", "a.1b", "a.2"];
+        others.sort_by_cached_key(|name| natural(name));
+        assert_eq!(
+            others,
+            ["a", "a.001", "a.2", "a.", "a..b", "a.1b", "a.b", "a.b0", "a.b00001", "a.b\0", "a.b\0c", "a.b1x"]
+        );
     }
 }
