@@ -309,27 +309,29 @@ def same_bytes(one, other):
 
 
 def rounds(count, programs, before=lambda: None, after=lambda name: None):
-    """Runs each program once in every round, and returns its times in seconds and the largest memory in KiB."""
-    times = {name: [] for name in programs}
-    memory = dict.fromkeys(programs, 0)
-    for turn in range(count):
+    """Runs each program once in every round. Returns its times in seconds, and its peak memory in KiB in a round of its own,
+    which also warms the page cache: GNU time starts the program from a small process, of which the figure has no part."""
+    times, memory = {name: [] for name in programs}, {}
+    for turn in range(-1, count):
         order = list(programs.items())
         random.Random(turn).shuffle(order)
         for name, command in order:
+            command = ["sh", "-c", command] if isinstance(command, str) else [str(word) for word in command]
+            if turn < 0:
+                command = ["/usr/bin/time", "-o", "/dev/stderr", "-f", "peak %M", *command]
             before()
             begun = time.perf_counter()
-            process = subprocess.Popen(
-                command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, shell=isinstance(command, str)
-            )
-            _, status, usage = os.wait4(process.pid, 0)
-            times[name].append(time.perf_counter() - begun)
-            process.returncode = os.waitstatus_to_exitcode(status)
-            if process.returncode not in (0, 1):
-                sys.exit(f"{command}: exit {process.returncode}")
-            memory[name] = max(memory[name], usage.ru_maxrss)
+            done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+            took = time.perf_counter() - begun
+            if done.returncode not in (0, 1):
+                sys.exit(f"{command}: exit {done.returncode}\n{done.stderr[-2000:]}")
+            if turn < 0:
+                memory[name] = int(done.stderr.split()[-1])
+            else:
+                times[name].append(took)
             after(name)
-        line = ", ".join(f"{name} {times[name][-1]:.3f}" for name in programs)
-        print(f"  round {turn + 1}: {line}", flush=True)
+        if turn >= 0:
+            print(f"  round {turn + 1}: " + ", ".join(f"{name} {times[name][-1]:.3f}" for name in programs), flush=True)
     return {"times": times, "memory": memory}
 
 
@@ -357,7 +359,6 @@ def measure_check(args):
     }
     if args.real:
         programs[f"{len(list(args.real.iterdir()))} real directories"] = [TOOL, "check", args.real]
-    rounds(1, programs)  # warms the page cache
     return rounds(args.rounds * 3, programs)
 
 
@@ -385,7 +386,6 @@ def measure_deep(args):
     if args.python:
         programs["sum of mapped words"] = [args.python, "-c", READ, str(cores()), *files]
         programs["start of numpy"] = [args.python, "-c", "import numpy, threading"]
-    rounds(1, programs)
     return {"bytes": sum(file.stat().st_size for file in files)} | rounds(args.rounds, programs)
 
 
@@ -406,7 +406,6 @@ def measure_hash(args):
         "openssl": f"printf '%s\\n' {listed} | xargs -P {cores()} -n 1 openssl dgst -sha256",
         "sha256sum": f"printf '%s\\n' {listed} | xargs -P {cores()} -n 1 sha256sum",
     }
-    rounds(1, programs)
     return {"bytes": sum(file.stat().st_size for file in files)} | rounds(args.rounds, programs)
 
 
@@ -602,7 +601,7 @@ def measure(args):
 def machine(work):
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-    system = run("stat", "-f", "-c", "%T", work).stdout.strip()
+    system = run("findmnt", "-n", "-o", "FSTYPE", "--target", work).stdout.strip()
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") >> 30
     return f"{cores()} cores ({model}), {memory} GiB, Linux {platform.release()}, {system}"
 

@@ -105,6 +105,8 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
             skipped::print(&l.dir, &l.outcome, &by.knowledge.rules);
         }
     }
+    // Not freed, like the rules.
+    std::mem::forget(looked);
     Ok(code)
 }
 

@@ -85,8 +85,8 @@ pub fn parse_embedded<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, 
 }
 
 /// The value in the line of `key`, by bisection: lines of a key, a tab and a value, sorted by their keys.
-pub(super) fn line_of<'t>(lines: &'t str, key: &str) -> Option<&'t str> {
-    bisect(lines.as_bytes(), key, |line| line.split_once('\t'))
+pub(super) fn line_of<'t>(lines: &'t [u8], key: &str) -> Option<&'t str> {
+    bisect(lines, key, |line| line.split_once('\t'))
 }
 
 /// The value in the line of `key` in sorted lines, which `split` separates into their keys and values. Reads the lines that
@@ -249,8 +249,13 @@ pub fn paths(path: &str) -> Vec<&'static str> {
 /// The text of one embedded file, such as a template of a recipe.
 #[must_use]
 pub fn text(path: &str) -> Option<&'static str> {
+    std::str::from_utf8(bytes(path)?).ok()
+}
+
+/// The bytes of one embedded file, of which a large one is not read whole to look something up.
+pub(super) fn bytes(path: &str) -> Option<&'static [u8]> {
     let dir = path.rsplit_once('/').map_or(Some(&RULES), |(dir, _)| folder(dir))?;
-    dir.files().find(|file| file.path().to_str() == Some(path))?.contents_utf8()
+    Some(dir.files().find(|file| file.path().to_str() == Some(path))?.contents())
 }
 
 #[cfg(test)]
@@ -282,9 +287,9 @@ mod tests {
     fn every_line_is_found_and_no_other() {
         let lines = "a\t1\nb + 1\t2\nb + é\t3\n";
         for (key, value) in [("a", Some("1")), ("b + 1", Some("2")), ("b + é", Some("3")), ("b", None), ("c", None)] {
-            assert_eq!(line_of(lines, key), value, "{key}");
+            assert_eq!(line_of(lines.as_bytes(), key), value, "{key}");
         }
-        assert_eq!(line_of("", "a"), None);
+        assert_eq!(line_of(b"", "a"), None);
     }
 
     /// Strings and comments between the brackets do not hide the nesting.

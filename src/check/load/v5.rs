@@ -240,24 +240,31 @@ impl<'e> Loading<'e> {
 /// A key whose bytes sort names as the loader does: part by part between dots, numbers by value and before words, and the
 /// number at the end of a word by value.
 fn natural(name: &str) -> Vec<u8> {
-    let mut key = Vec::with_capacity(name.len().saturating_mul(2));
+    // Most parts are words, which take two bytes more than they and their dot have.
+    let mut key = Vec::with_capacity(name.len().saturating_add(24));
     for part in name.split('.') {
         let (text, digits) = trailing_digits(part);
         // A number is digits alone.
         key.push(u8::from(!text.is_empty() || digits.is_empty()));
-        // A text ends before all that goes on.
         for byte in text.bytes() {
-            key.push(byte);
-            if byte == 0 {
-                key.push(1);
+            match byte {
+                0 | 1 => key.extend([1, byte]),
+                _ => key.push(byte),
             }
         }
-        key.extend([0, 0]);
-        // A number of more digits is larger; a part without one is before all.
-        key.push(u8::from(!digits.is_empty()));
-        let digits = digits.trim_start_matches('0');
-        key.extend(u32::try_from(digits.len()).unwrap_or(u32::MAX).to_be_bytes());
-        key.extend(digits.bytes());
+        // A text ends before all that goes on.
+        key.push(0);
+        // A part without a number is before all, and a number of more digits is larger.
+        let value = digits.trim_start_matches('0');
+        match u8::try_from(value.len()) {
+            _ if digits.is_empty() => key.push(0),
+            Ok(length @ 0..200) => key.push(length.saturating_add(1)),
+            _ => {
+                key.push(u8::MAX);
+                key.extend(u32::try_from(value.len()).unwrap_or(u32::MAX).to_be_bytes());
+            }
+        }
+        key.extend(value.bytes());
     }
     key
 }

@@ -15,7 +15,7 @@ use serde_json::Value;
 use crate::knowledge::source;
 
 /// The lines of the file, for [`source::line_of`].
-static LINES: LazyLock<&str> = LazyLock::new(|| source::text("expressions.txt").unwrap_or_default());
+static LINES: LazyLock<&[u8]> = LazyLock::new(|| source::bytes("expressions.txt").unwrap_or_default());
 
 /// The tree of an expression, if the file has one.
 pub(super) fn find(expression: &str) -> Option<IdedExpr> {
