@@ -666,9 +666,40 @@ def plot(name, title, unit, points):
     (FOLDER / name).write_text("\n".join([*out, "</svg>"]) + "\n")
 
 
+ABOUT = {
+    "introduction": """# Performance
+
+`tools/performance.py` writes this page. It generates checkpoints, runs ckpt-doctor and other programs in turn in the same
+rounds, and compares the bytes of every merge with those of the donors. The times are those of whole processes, with their
+start. A ratio is the median of the ratios of each round, so that what disturbs the machine disturbs both sides. The raw times
+are in [figures.json](performance/figures.json).
+
+```sh
+cargo build --release
+tools/performance.py measure --work DIR --python PYTHON
+tools/performance.py page
+```
+
+`DIR` needs room for four times the size of a merge. `PYTHON` has torch, numpy and safetensors.""",
+    "check": """`check` reads the headers of shards and the documents, and nothing of the tensors. The time of a small model is that of the
+start of the program and of the rules: about 2 ms are the kernel's, which maps the program and starts the process. The time of
+a large one is proportional to the number of its tensors. Several directories are checked on all cores.""",
+    "growth": """Qwen3-MoE models of 512 experts with 1 to 58 layers. Time and memory are linear in the number of tensors.""",
+    "deep": """The bound is the rate at which memory is read: numpy sums the words of the mapped files with a thread for each core, and
+`start of numpy` is what it takes before it reads.""",
+    "hash": """SHA-256 is sequential, so one file is hashed by one core. openssl and sha256sum run once for each file, on all cores at a time.""",
+    "merge": """The `insert` recipe with a LLaVA and a Llama of random bytes. Every program leaves its result on the disk (`fsync`). `cp` copies
+files of the size of the result. The Python script copies byte ranges of the donors and hashes nothing; the torch script loads
+every tensor and saves them with `safetensors.torch.save_file`.""",
+    "cold": """The page cache is dropped before every run.""",
+    "reflink": """File systems in a loop device. The result shares the blocks of the donors: the header of a shard is padded, so that its data
+starts where the donor's does within a block.""",
+}
+
+
 def page(_):
     figures = json.loads(FIGURES.read_text())
-    text = [(FOLDER / "introduction.md").read_text().rstrip()]
+    text = [ABOUT["introduction"]]
     for part, title in {
         "check": "## Checking",
         "growth": "## Growth with the number of tensors",
@@ -681,10 +712,7 @@ def page(_):
         if part not in figures:
             continue
         measured = figures[part]
-        text += ["", title, ""]
-        about = FOLDER / f"{part}.md"
-        if about.exists():
-            text += [about.read_text().rstrip(), ""]
+        text += ["", title, "", ABOUT[part], ""]
         if part == "growth":
             points = [(p["tensors"], statistics.median(p["seconds"])) for p in measured["points"]]
             plot("growth-time.svg", "ckpt-doctor check, by number of tensors", "seconds", points)
