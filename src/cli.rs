@@ -14,6 +14,7 @@ mod inspect;
 mod library;
 mod output;
 mod paths;
+mod progress;
 mod recipes;
 mod rules;
 mod settings;

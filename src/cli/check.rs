@@ -8,11 +8,12 @@ use anyhow::bail;
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::paths::{self, Targets};
+use super::progress::Meter;
 use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
-use crate::checkpoint::Checkpoint;
 use crate::checkpoint::platform::shown;
+use crate::checkpoint::{Checkpoint, ReadOptions};
 use crate::knowledge::settings::Surroundings;
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
@@ -118,8 +119,14 @@ impl CheckRun<'_> {
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
         let mut checkpoint = Checkpoint::open(dir)?;
         checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
-        if self.args.deep {
-            checkpoint.read_contents();
+        if self.args.deep || self.args.stats {
+            let meter = Meter::new("reading");
+            let options = ReadOptions { stats: self.args.stats, ..ReadOptions::default() };
+            checkpoint.read_contents(options, &|read| meter.add(read.file, read.bytes, read.total));
+        }
+        if self.args.hash {
+            let meter = Meter::new("hashing");
+            checkpoint.check_hashes(&|read| meter.add(read.file, read.bytes, read.total));
         }
         Ok(Arc::new(checkpoint))
     }

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Checkpoint, Fault, FaultKind};
+use ckpt_doctor::checkpoint::{Checkpoint, Fault, FaultKind, ReadOptions};
 
 use super::{Case, hold};
 
@@ -23,7 +23,8 @@ fn faults(before: impl Fn(&Path), after: impl Fn(&Path)) -> Vec<Fault> {
     before(dir.path());
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     after(dir.path());
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
+    checkpoint.check_hashes(&|_| {});
     checkpoint.shards.remove(NAME).unwrap().faults
 }
 
@@ -41,8 +42,9 @@ fn cases() -> Vec<Case> {
     };
     let cached = |dir: &Path| {
         let blob = "4d7a".repeat(16);
-        write(&dir.join(&blob), &[1; 64]);
-        std::os::unix::fs::symlink(blob, dir.join(NAME)).unwrap();
+        fs::create_dir(dir.join("blobs")).unwrap();
+        write(&dir.join("blobs").join(&blob), &[1; 64]);
+        std::os::unix::fs::symlink(format!("blobs/{blob}"), dir.join(NAME)).unwrap();
     };
     vec![
         Case::new("ordinary numbers", &[], with(|_| ())),
@@ -83,7 +85,7 @@ fn a_hole_at_the_end_is_detected_without_reading() {
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     let kinds = |c: &Checkpoint| c.shards[NAME].faults.iter().map(|f| f.kind).collect::<Vec<_>>();
     assert_eq!(kinds(&checkpoint), if tells { vec![FaultKind::ZeroTail] } else { vec![] });
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
     assert_eq!(kinds(&checkpoint), [FaultKind::ZeroTail]);
     let detail = &checkpoint.shards[NAME].faults[0].detail;
     assert_eq!((detail["tensors"].as_u64(), detail["bytes"].as_u64()), (Some(1), Some(1_097_152)));
@@ -101,7 +103,7 @@ fn shards_are_read_by_several_threads() {
         write(&dir.path().join(format!("model-{number:05}-of-00020.safetensors")), &data);
     }
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
     let faulty = checkpoint.shards.values().filter(|shard| !shard.faults.is_empty());
     let numbers: Vec<&str> = faulty.map(|shard| &shard.name["model-".len()..][..5]).collect();
     // The two bytes of a NaN at an odd place belong to two elements.
@@ -131,7 +133,7 @@ fn bytes_of_tensors_are_compared_with_holes_as_zeros() {
         put(&[7], start + tensor * LEN + (2 << 20) + 5);
     }
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
     for (one, other, same) in [
         ("sparse", "zeros", true),
         ("zeros", "sparse", true),
