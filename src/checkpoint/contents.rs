@@ -22,7 +22,7 @@ mod tally;
 use pieces::{Piece, each_piece};
 pub(super) use read::read;
 pub use read::{Progress, ReadOptions, TensorContents, TensorStats};
-use tally::BLOCK;
+use tally::{BLOCK, as_u64};
 
 /// Bytes of a buffer: whole blocks, so that no element is split between two reads.
 const CHUNK: usize = 40 * BLOCK;
@@ -48,9 +48,16 @@ pub(super) fn same_bytes(root: &Path, one: (&Shard, &Tensor), other: (&Shard, &T
         if equal && readable {
             match &piece {
                 Piece::Data(bytes) => {
-                    let there = there.get_mut(..bytes.len()).unwrap_or_default();
-                    readable = other_file.read_exact_at(there, at).is_ok();
-                    equal = *bytes == there;
+                    let mut at = at;
+                    for here in bytes.chunks(there.len()) {
+                        let there = there.get_mut(..here.len()).unwrap_or_default();
+                        readable &= other_file.read_exact_at(there, at).is_ok();
+                        equal &= here == there;
+                        at = at.saturating_add(as_u64(here.len()));
+                        if !(equal && readable) {
+                            break;
+                        }
+                    }
                 }
                 Piece::Hole(len) => {
                     let zeros = each_piece(&other_file, at, *len, &mut there, |piece| {

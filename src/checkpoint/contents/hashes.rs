@@ -250,3 +250,48 @@ fn pointer_hash(sha256: &str, size: u64) -> String {
     let text = format!("version https://git-lfs.github.com/spec/v1\noid sha256:{sha256}\nsize {size}\n");
     hex(&Sha1::digest(format!("blob {}\0{text}", text.len())))
 }
+
+#[cfg(test)]
+#[allow(clippy::disallowed_methods, reason = "makes the files it reads")]
+mod tests {
+    use std::fs;
+    use std::process::Command;
+
+    use super::*;
+
+    const NAME: &str = "model.safetensors";
+
+    /// A work tree as `git lfs` leaves it: the index has the pointer, the tree the content. A shell script stands for git-lfs.
+    #[test]
+    fn weights_of_a_work_tree_are_those_of_the_pointer() {
+        let dir = tempfile::tempdir().unwrap();
+        let git = |arguments: &[&str]| {
+            Command::new("git").current_dir(dir.path()).args(arguments).status().is_ok_and(|status| status.success())
+        };
+        if !git(&["init", "-q"]) {
+            return;
+        }
+        let clean = "cat > .git/t; printf 'version https://git-lfs.github.com/spec/v1\\noid sha256:%s\\nsize %s\\n' \
+                     $(sha256sum < .git/t | cut -c1-64) $(wc -c < .git/t)";
+        assert!(git(&["config", "filter.lfs.clean", clean]));
+        let file = dir.path().join(NAME);
+        fs::write(dir.path().join(".gitattributes"), "*.safetensors filter=lfs\n").unwrap();
+        fs::write(&file, [7; 1000]).unwrap();
+        assert!(git(&["add", "."]));
+        let kinds = || {
+            let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
+            checkpoint.shards.entry(NAME.to_owned()).or_default();
+            check(&checkpoint, &|_| {}).into_iter().map(|fault| fault.kind).collect::<Vec<_>>()
+        };
+        assert_eq!(kinds(), []);
+        let time = fs::metadata(&file).unwrap().modified().unwrap();
+        fs::write(&file, [8; 1000]).unwrap();
+        assert_eq!(kinds(), [FaultKind::ContentEdited]);
+        fs::File::options().write(true).open(&file).unwrap().set_modified(time).unwrap();
+        assert_eq!(kinds(), [FaultKind::ContentHashDiffers]);
+        // Small weights outside of Git LFS.
+        fs::write(dir.path().join(".gitattributes"), "").unwrap();
+        assert!(git(&["add", "."]));
+        assert_eq!(kinds(), []);
+    }
+}
