@@ -4,7 +4,7 @@
 
 use std::{env, fs, io};
 
-use ckpt_doctor::checkpoint::{Checkpoint, Tensor, hex};
+use ckpt_doctor::checkpoint::{Checkpoint, ReadOptions, Tensor, hex};
 use ckpt_doctor::knowledge::pickles::Pickles;
 use serde_json::{Map, Value, json};
 use sha2::{Digest as _, Sha256};
@@ -15,7 +15,7 @@ fn main() -> io::Result<()> {
     for entry in fs::read_dir(root)? {
         let entry = entry?;
         let mut checkpoint = Checkpoint::open(entry.path()).map_err(io::Error::other)?;
-        checkpoint.read_contents();
+        checkpoint.read_contents(ReadOptions::default(), &|_| {});
         let Some(shard) = checkpoint.shards.get("pytorch_model.bin") else { continue };
         let file = fs::read(entry.path().join("pytorch_model.bin"))?;
         let digest = |tensor: &Tensor| {

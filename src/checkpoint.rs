@@ -37,6 +37,7 @@ mod sniff;
 pub mod text;
 pub mod tokenizer;
 
+pub use contents::{Progress, ReadOptions, TensorContents, TensorStats};
 pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
 pub use document::Document;
 pub use document::edit::{Splice, spliced};
@@ -95,6 +96,8 @@ pub struct Checkpoint {
     pub nested: Nested,
     /// Whether [`Checkpoint::read_contents`] read the bytes of the tensors, so that others may be read to compare them.
     pub deep: bool,
+    /// What the tensors contain, if their bytes were read.
+    pub contents: Arc<[TensorContents]>,
     /// Faults of the directory itself; [`Checkpoint::all_faults`] adds those of the files.
     pub faults: Vec<Fault>,
 }
@@ -154,7 +157,7 @@ impl Checkpoint {
     #[must_use]
     pub fn replaced(&self, parts: Parts) -> Self {
         let Parts { documents, shards, modules, mut vocabularies, entries } = parts;
-        let mut next = self.clone();
+        let mut next = Self { contents: Arc::default(), ..self.clone() };
         next.entries.extend(entries);
         let mut entry = |name: &str, size: Option<u64>| {
             let entry = next.entries.entry(name.to_owned()).or_default();

@@ -15,6 +15,7 @@ mod library;
 mod output;
 mod parallel;
 mod paths;
+mod progress;
 mod recipes;
 mod rules;
 mod settings;

@@ -61,6 +61,8 @@ def check(
     *paths: Union[str, "os.PathLike[str]"],
     loaders: Iterable[str] = (),
     deep: bool = False,
+    stats: bool = False,
+    hash: bool = False,
     metadata_only: bool = False,
     select: Iterable[str] = (),
     ignore: Iterable[str] = (),
@@ -83,7 +85,14 @@ def check(
         if isinstance(values, str):
             values = [values]
         command += [f"{option}={value}" for value in values]
-    for option, wanted in (("--deep", deep), ("--metadata-only", metadata_only), ("--isolated", isolated)):
+    flags = {
+        "--deep": deep,
+        "--stats": stats,
+        "--hash": hash,
+        "--metadata-only": metadata_only,
+        "--isolated": isolated,
+    }
+    for option, wanted in flags.items():
         command += [option] * wanted
     for option, file in (("--baseline", baseline), ("--config", config)):
         command += [f"{option}={os.fspath(file)}"] if file is not None else []

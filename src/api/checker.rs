@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use super::{Error, knowledge};
 use crate::check::check_for;
-use crate::checkpoint::Checkpoint;
 use crate::checkpoint::platform::shown;
+use crate::checkpoint::{Checkpoint, Progress, ReadOptions};
 use crate::report::model::CheckpointReport;
 
 /// Checks checkpoint directories with the rules of this crate.
@@ -14,6 +14,8 @@ use crate::report::model::CheckpointReport;
 pub struct Checker {
     versions: Vec<String>,
     deep: bool,
+    stats: bool,
+    hash: bool,
 }
 
 impl Checker {
@@ -35,10 +37,25 @@ impl Checker {
         Ok(self)
     }
 
-    /// Whether to read all tensor data as well: finds NaN, infinities and shards of zeros.
+    /// Whether to read all tensor data as well: finds NaN, infinities and shards of zeros, and counts them in
+    /// [`CheckpointReport::contents`].
     #[must_use]
     pub const fn deep(mut self, deep: bool) -> Self {
         self.deep = deep;
+        self
+    }
+
+    /// Whether to add up the numbers of each tensor as well; implies [`Self::deep`].
+    #[must_use]
+    pub const fn stats(mut self, stats: bool) -> Self {
+        self.stats = stats;
+        self
+    }
+
+    /// Whether to hash the files of which the Hub cache, a download of huggingface_hub or git recorded the hash.
+    #[must_use]
+    pub const fn hash(mut self, hash: bool) -> Self {
+        self.hash = hash;
         self
     }
 
@@ -47,11 +64,27 @@ impl Checker {
     /// # Errors
     /// [`Error::Open`] when the directory cannot be read. Bad content is a finding of the report.
     pub fn check(&self, path: impl AsRef<Path>) -> Result<CheckpointReport, Error> {
+        self.check_with(path, &|_| {})
+    }
+
+    /// As [`Self::check`]; `progress` is called while tensor data is read, and again while files are hashed, by several
+    /// threads and after each read. It must be fast.
+    ///
+    /// # Errors
+    /// As [`Self::check`].
+    pub fn check_with(
+        &self,
+        path: impl AsRef<Path>,
+        progress: &(dyn Fn(Progress<'_>) + Sync),
+    ) -> Result<CheckpointReport, Error> {
         let path = path.as_ref();
         let knowledge = knowledge()?;
         let mut checkpoint = Checkpoint::open(path)?;
-        if self.deep {
-            checkpoint.read_contents();
+        if self.deep || self.stats {
+            checkpoint.read_contents(ReadOptions { stats: self.stats, ..ReadOptions::default() }, progress);
+        }
+        if self.hash {
+            checkpoint.check_hashes(progress);
         }
         let checkpoint = Arc::new(checkpoint);
         let outcome = check_for(&checkpoint, knowledge, &self.versions);

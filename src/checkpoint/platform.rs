@@ -4,10 +4,14 @@
 use std::path::Path;
 
 #[cfg(unix)]
+mod mapped;
+#[cfg(unix)]
 mod unix;
 #[cfg(windows)]
 mod windows;
 
+#[cfg(unix)]
+pub(crate) use mapped::with_window;
 #[cfg(unix)]
 pub(crate) use unix::*;
 #[cfg(windows)]

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use super::adapter::AdapterBase;
 use super::budget::{Budget, text_cost};
 use super::card::{CARD, CARD_CAP, ModelCard};
-use super::contents;
+use super::contents::{self, Progress, ReadOptions};
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
@@ -86,10 +86,19 @@ impl Checkpoint {
     }
 
     /// Reads the bytes of every tensor, and adds to the shards the faults that only the bytes reveal. Never fails: a read
-    /// error becomes a fault.
-    pub fn read_contents(&mut self) {
+    /// error becomes a fault. `progress` is called by several threads, after each read.
+    pub fn read_contents(&mut self, options: ReadOptions, progress: &(dyn Fn(Progress<'_>) + Sync)) {
         self.deep = true;
-        contents::read(&self.root, &self.entries, &mut self.shards);
+        self.contents = contents::read(&self.root, &mut self.shards, options, progress).into();
+    }
+
+    /// Hashes the files whose hash a download or git recorded, and adds a fault for each that differs. Never fails, as
+    /// [`Self::read_contents`], whose `progress` it has.
+    pub fn check_hashes(&mut self, progress: &(dyn Fn(Progress<'_>) + Sync)) {
+        for fault in contents::hashes::check(self, progress) {
+            let shard = fault.places.first().and_then(|place| self.shards.get_mut(place.file.as_deref()?));
+            shard.map_or(&mut self.faults, |shard| &mut shard.faults).push(fault);
+        }
     }
 }
 

@@ -242,10 +242,16 @@ pub struct CheckArgs {
     /// known of each major version]
     #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_program)]
     pub versions: Vec<String>,
-    /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub
-    /// checksums
+    /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros and tied weights that differ
     #[arg(long)]
     pub deep: bool,
+    /// As --deep, and show smallest and largest value, mean, root mean square, zeros and denormals of each tensor (formats
+    /// full and json)
+    #[arg(long)]
+    pub stats: bool,
+    /// Also hash the files whose hash the Hub cache, a local download or git recorded, to find changed ones
+    #[arg(long)]
+    pub hash: bool,
     /// Accept checkpoints without weights, such as copies of the documents alone; their load is not predicted
     #[arg(long)]
     pub metadata_only: bool,

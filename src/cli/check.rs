@@ -9,11 +9,12 @@ use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::parallel::in_order;
 use super::paths::{self, Targets};
+use super::progress::Meter;
 use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
-use crate::checkpoint::Checkpoint;
 use crate::checkpoint::platform::shown;
+use crate::checkpoint::{Checkpoint, ReadOptions};
 use crate::knowledge::settings::Surroundings;
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
@@ -42,8 +43,8 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     if args.fix.writes() {
         signals::install()?;
     }
-    // `--deep` uses all cores for one checkpoint, and what is written to one may be read from another.
-    let alone = args.deep || args.fix.writes();
+    // Reading contents uses all cores for one checkpoint, and what is written to one may be read from another.
+    let alone = args.deep || args.stats || args.hash || args.fix.writes();
     let look = |dir: PathBuf| (shown(&dir), run.look(dir));
     let looks: Box<dyn Iterator<Item = (String, anyhow::Result<Checked>)>> =
         if alone { Box::new(dirs.into_iter().map(look)) } else { Box::new(in_order(dirs, look).into_iter()) };
@@ -126,8 +127,14 @@ impl CheckRun<'_> {
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
         let mut checkpoint = Checkpoint::open(dir)?;
         checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
-        if self.args.deep {
-            checkpoint.read_contents();
+        if self.args.deep || self.args.stats {
+            let meter = Meter::new("reading");
+            let options = ReadOptions { stats: self.args.stats, ..ReadOptions::default() };
+            checkpoint.read_contents(options, &|read| meter.add(read.file, read.bytes, read.total));
+        }
+        if self.args.hash {
+            let meter = Meter::new("hashing");
+            checkpoint.check_hashes(&|read| meter.add(read.file, read.bytes, read.total));
         }
         Ok(Arc::new(checkpoint))
     }

@@ -45,6 +45,7 @@ impl CheckpointReport {
             findings: by_severity(&outcome.findings),
             suppressed: outcome.suppressed.clone(),
             loads: outcome.verdicts.clone(),
+            contents: checkpoint.contents.to_vec(),
             fixed: Vec::new(),
             withdrawn: Vec::new(),
             fixing: None,

@@ -12,6 +12,7 @@ pub use super::merge::{
 use crate::check::finding::Suppressed;
 use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
+use crate::checkpoint::TensorContents;
 use crate::knowledge::Knowledge;
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
@@ -140,6 +141,10 @@ pub struct CheckpointReport {
     pub suppressed: Vec<Suppressed>,
     /// Will it load? One entry for each version of transformers of the run, those that the checkpoint must load with first.
     pub loads: Vec<PredictedLoad>,
+    /// What each tensor contains, with `--deep`: by file, then in the order of the bytes. Tensors that could not be read are
+    /// missing, and so are those that share the bytes of another.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub contents: Vec<TensorContents>,
     /// Findings whose fixes were applied; `findings` has the remaining ones.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub fixed: Vec<Fixed>,

@@ -1,5 +1,6 @@
 //! The report for a terminal: source excerpts and tables, with a line for the verdict at the end.
 
+mod contents;
 pub(super) mod finding;
 pub(super) mod load;
 mod merge;
@@ -38,6 +39,7 @@ pub fn render(report: &Report, style: Style) -> String {
             for (load, loaders) in agreeing(&checkpoint.loads) {
                 load::render(&mut out, load, &loaders, style);
             }
+            contents::render(&mut out, &checkpoint.contents, style);
         }
         out.push('\n');
         above = Some(checkpoint);

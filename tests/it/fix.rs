@@ -12,7 +12,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ckpt_doctor::check::{Finding, Outcome, Safety, Severity, check};
-use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::checkpoint::{Checkpoint, ReadOptions};
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::surgery::RepairError;
 use ckpt_doctor::surgery::repair::{Repair, plan};
@@ -34,7 +34,7 @@ fn seen(dir: &Path) -> BTreeMap<String, (u32, i64, i64, Vec<u8>)> {
 fn planned(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Outcome, Repair) {
     let mut checkpoint = Checkpoint::open(dir).expect("a directory");
     if deep {
-        checkpoint.read_contents();
+        checkpoint.read_contents(ReadOptions::default(), &|_| {});
     }
     let checkpoint = Arc::new(checkpoint);
     let outcome = check(&checkpoint, knowledge);

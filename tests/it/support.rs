@@ -20,7 +20,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::{Outcome, Safety, check, check_for, unused_suppressions};
-use ckpt_doctor::checkpoint::{Checkpoint, FaultKind};
+use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, ReadOptions};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, SettingsSource};
@@ -59,7 +59,7 @@ pub struct Case {
     /// Changes, in order.
     #[serde(default)]
     changes: Vec<Change>,
-    /// Whether to read the tensors' bytes, as `check --deep` does; always for sound cases.
+    /// Whether to read the bytes of tensors and files, as `check --deep --hash` does; always for sound cases.
     #[serde(default)]
     pub deep: bool,
     /// Values of `--for`.
@@ -247,7 +247,8 @@ pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
 fn open(dir: &Path, deep: bool, loaders: &[String], knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let mut checkpoint = read(dir);
     if deep {
-        checkpoint.read_contents();
+        checkpoint.read_contents(ReadOptions::default(), &|_| {});
+        checkpoint.check_hashes(&|_| {});
     }
     let checkpoint = Arc::new(checkpoint);
     let outcome = check_for(&checkpoint, knowledge, loaders);

@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
+use sha2::Sha256;
+
 use super::pieces::{Hash, each_piece};
 use super::{CHUNK, HASHED_ZEROS};
-use crate::checkpoint::hex;
 use crate::checkpoint::open::{OpenError, open_own};
 
 /// SHA-256 digests of a file of a checkpoint, in hexadecimal; `None` for what has more zeros in holes than are hashed.
@@ -37,7 +38,7 @@ impl Digester {
         let bytes = opened.identity.size;
         let io = |source| OpenError::from_io(&root.join(name), source);
         let Self { buffer, zeros_left } = self;
-        let mut whole = Hash::new();
+        let mut whole = Hash::<Sha256>::new();
         let mut digests = Vec::new();
         let mut at = 0_u64;
         for (start, len) in ranges {
@@ -48,16 +49,16 @@ impl Digester {
             };
             each_piece(&opened, at, start.saturating_sub(at), buffer, |piece| whole.add(&piece, zeros_left))
                 .map_err(io)?;
-            let mut range = Hash::new();
+            let mut range = Hash::<Sha256>::new();
             each_piece(&opened, *start, *len, buffer, |piece| {
                 range.add(&piece, zeros_left);
                 whole.add(&piece, zeros_left);
             })
             .map_err(io)?;
-            digests.push(range.finish().map(|digest| hex(&digest)));
+            digests.push(range.finish());
             at = end;
         }
         each_piece(&opened, at, bytes.saturating_sub(at), buffer, |piece| whole.add(&piece, zeros_left)).map_err(io)?;
-        Ok(FileDigests { bytes, sha256: whole.finish().map(|digest| hex(&digest)), ranges: digests })
+        Ok(FileDigests { bytes, sha256: whole.finish(), ranges: digests })
     }
 }

@@ -2,14 +2,22 @@
 
 use std::io::{Error, ErrorKind, Result};
 
-use sha2::{Digest as _, Sha256};
+use sha2::Digest;
 
-use super::numbers::as_u64;
+use super::tally::{BLOCK, as_u64};
+use crate::checkpoint::hex;
 use crate::checkpoint::open::Opened;
-use crate::checkpoint::platform::{next_data, next_hole};
+use crate::checkpoint::platform::{next_data, next_hole, with_window};
 
-/// Pieces start and end at a multiple of this many bytes from the start of the range, so that no element is split.
-const ALIGNMENT: u64 = 16;
+/// Pieces start and end at a multiple of this many bytes from the start of the range, so that no element is split, and sums
+/// do not depend on the holes.
+const ALIGNMENT: u64 = BLOCK as u64;
+
+/// Bytes that are mapped at a time: few enough to keep the memory that counts as used small.
+pub(super) const WINDOW: usize = 1024 * BLOCK;
+
+/// Fewer bytes than this are read into the buffer, which is faster.
+const LEAST: usize = 256 << 10;
 
 /// A part of a range of bytes.
 pub(super) enum Piece<'b> {
@@ -28,8 +36,8 @@ impl Piece<'_> {
     }
 }
 
-/// Calls `each` with the `len` bytes from `start` on, one piece of at most the length of `buffer` at a time. Called for the
-/// header and for each tensor of a shard.
+/// Calls `each` with the `len` bytes from `start` on, one piece of at most [`WINDOW`] bytes at a time: mapped, or
+/// read into `buffer` where they are few or cannot be mapped. Called for each part of a tensor, and for files that are hashed.
 ///
 /// # Errors
 /// When reading fails, or the file has become shorter.
@@ -41,7 +49,7 @@ pub(super) fn each_piece(
     mut each: impl FnMut(Piece<'_>),
 ) -> Result<()> {
     let end = start.saturating_add(len);
-    let aligned = |at: u64| start.saturating_add(at.saturating_sub(start) & !(ALIGNMENT - 1));
+    let aligned = |at: u64| at.saturating_sub(at.saturating_sub(start) % ALIGNMENT);
     let mut at = start;
     while at < end {
         let data = match next_data(&opened.file, at) {
@@ -60,7 +68,7 @@ pub(super) fn each_piece(
             continue;
         }
         let hole = next_hole(&opened.file, at).unwrap_or(end);
-        // A piece reaches into the hole up to the end of its last element.
+        // A piece reaches into the hole, or starts in one before it, by less than a block.
         let stop = aligned(hole.saturating_add(ALIGNMENT)).min(end);
         at = read(opened, at..stop, buffer, &mut each)?;
     }
@@ -77,6 +85,14 @@ fn read(
     let mut at = range.start;
     while at < range.end {
         let left = range.end.saturating_sub(at);
+        let window = usize::try_from(left).unwrap_or(usize::MAX).min(WINDOW);
+        if window >= LEAST
+            && let Some(read) = with_window(&opened.file, at, window, |bytes| each(Piece::Data(bytes)))
+        {
+            read?;
+            at = at.saturating_add(as_u64(window));
+            continue;
+        }
         let size = usize::try_from(left).unwrap_or(usize::MAX).min(buffer.len());
         let Some(piece) = buffer.get_mut(..size).filter(|piece| !piece.is_empty()) else { break };
         opened.read_exact_at(piece, at)?;
@@ -86,16 +102,17 @@ fn read(
     Ok(range.end)
 }
 
-/// A SHA-256 in progress; none once the bytes have more holes than are hashed.
-pub(super) struct Hash(Option<Sha256>);
+/// A hash in progress; none once the bytes have more holes than are hashed.
+pub(super) struct Hash<D>(Option<D>);
 
-impl Hash {
+impl<D: Digest> Hash<D> {
     pub(super) fn new() -> Self {
-        Self(Some(Sha256::new()))
+        Self(Some(D::new()))
     }
 
-    pub(super) const fn none() -> Self {
-        Self(None)
+    /// A hash of bytes that start with these.
+    pub(super) fn starting(bytes: &[u8]) -> Self {
+        Self(Some(D::new_with_prefix(bytes)))
     }
 
     /// Adds a piece; zeros of a hole are taken from `zeros_left`.
@@ -113,12 +130,18 @@ impl Hash {
         }
     }
 
-    pub(super) fn finish(self) -> Option<[u8; 32]> {
-        self.0.map(|hash| hash.finalize().into())
+    /// Whether nothing was left out.
+    pub(super) const fn is_whole(&self) -> bool {
+        self.0.is_some()
+    }
+
+    /// The hash in hexadecimal; `None` when something was left out.
+    pub(super) fn finish(self) -> Option<String> {
+        self.0.map(|hash| hex(&hash.finalize()))
     }
 }
 
-fn add_zeros(hash: &mut Sha256, len: u64) {
+fn add_zeros(hash: &mut impl Digest, len: u64) {
     const ZEROS: [u8; 4096] = [0; 4096];
     let mut left = len;
     while left > 0 {
@@ -147,7 +170,7 @@ mod tests {
     #[test]
     #[cfg(unix)]
     fn pieces_are_the_bytes_of_a_sparse_file() {
-        const LEN: u64 = 1 << 20;
+        const LEN: u64 = 2 << 20;
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("sparse");
         let mut state = 1;
@@ -156,8 +179,8 @@ mod tests {
             let file = std::fs::File::create(&path).unwrap();
             file.set_len(LEN).unwrap();
             for _ in 0..next(&mut state, 12) {
-                let at = next(&mut state, LEN - 9000);
-                let bytes = vec![7; usize::try_from(next(&mut state, 9000)).unwrap()];
+                let at = next(&mut state, LEN - 90_000);
+                let bytes = vec![7; usize::try_from(next(&mut state, 90_000)).unwrap()];
                 file.write_all_at(&bytes, at).unwrap();
             }
             let whole = std::fs::read(&path).unwrap();
@@ -166,7 +189,7 @@ mod tests {
                 let start = next(&mut state, LEN);
                 let len = next(&mut state, LEN - start + 1);
                 let (mut found, mut lengths) = (Vec::new(), Vec::new());
-                each_piece(&opened, start, len, &mut [0; 8192], |piece| {
+                each_piece(&opened, start, len, &mut vec![0; 3 * BLOCK], |piece| {
                     lengths.push(piece.len());
                     holes += usize::from(matches!(piece, Piece::Hole(_)));
                     match piece {

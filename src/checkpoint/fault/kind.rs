@@ -58,6 +58,7 @@ fault_kinds! {
         ByteOrderMark = "byte-order-mark",
         CheckpointTooLarge = "checkpoint-too-large",
         CommentInJson = "comment-in-json",
+        ContentEdited = "content-edited",
         ContentHashDiffers = "content-hash-differs",
         ContentsUnread = "contents-unread",
         DanglingSymlink = "dangling-symlink",

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Checkpoint, Fault, FaultKind};
+use ckpt_doctor::checkpoint::{Checkpoint, Fault, FaultKind, ReadOptions};
 
 use super::{Case, hold};
 
@@ -23,7 +23,8 @@ fn faults(before: impl Fn(&Path), after: impl Fn(&Path)) -> Vec<Fault> {
     before(dir.path());
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     after(dir.path());
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
+    checkpoint.check_hashes(&|_| {});
     checkpoint.shards.remove(NAME).unwrap().faults
 }
 
@@ -41,8 +42,16 @@ fn cases() -> Vec<Case> {
     };
     let cached = |dir: &Path| {
         let blob = "4d7a".repeat(16);
-        write(&dir.join(&blob), &[1; 64]);
-        std::os::unix::fs::symlink(blob, dir.join(NAME)).unwrap();
+        fs::create_dir(dir.join("blobs")).unwrap();
+        write(&dir.join("blobs").join(&blob), &[1; 64]);
+        std::os::unix::fs::symlink(format!("blobs/{blob}"), dir.join(NAME)).unwrap();
+    };
+    let recorded = |dir: &Path| {
+        let records = dir.join(".cache/huggingface/download");
+        fs::create_dir_all(&records).unwrap();
+        write(&dir.join(NAME), &[1; 64]);
+        let record = format!("commit\n{}\n1700000000.5\n", "4d7a".repeat(16));
+        fs::write(records.join(format!("{NAME}.metadata")), record).unwrap();
     };
     vec![
         Case::new("ordinary numbers", &[], with(|_| ())),
@@ -59,6 +68,7 @@ fn cases() -> Vec<Case> {
             &[FaultKind::ContentHashDiffers],
             faults(cached, |_| ()),
         ),
+        Case::new("content that was written after its download", &[FaultKind::ContentEdited], faults(recorded, |_| ())),
     ]
 }
 
@@ -83,7 +93,7 @@ fn a_hole_at_the_end_is_detected_without_reading() {
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
     let kinds = |c: &Checkpoint| c.shards[NAME].faults.iter().map(|f| f.kind).collect::<Vec<_>>();
     assert_eq!(kinds(&checkpoint), if tells { vec![FaultKind::ZeroTail] } else { vec![] });
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
     assert_eq!(kinds(&checkpoint), [FaultKind::ZeroTail]);
     let detail = &checkpoint.shards[NAME].faults[0].detail;
     assert_eq!((detail["tensors"].as_u64(), detail["bytes"].as_u64()), (Some(1), Some(1_097_152)));
@@ -101,7 +111,7 @@ fn shards_are_read_by_several_threads() {
         write(&dir.path().join(format!("model-{number:05}-of-00020.safetensors")), &data);
     }
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
     let faulty = checkpoint.shards.values().filter(|shard| !shard.faults.is_empty());
     let numbers: Vec<&str> = faulty.map(|shard| &shard.name["model-".len()..][..5]).collect();
     // The two bytes of a NaN at an odd place belong to two elements.
@@ -131,7 +141,7 @@ fn bytes_of_tensors_are_compared_with_holes_as_zeros() {
         put(&[7], start + tensor * LEN + (2 << 20) + 5);
     }
     let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
-    checkpoint.read_contents();
+    checkpoint.read_contents(ReadOptions::default(), &|_| {});
     for (one, other, same) in [
         ("sparse", "zeros", true),
         ("zeros", "sparse", true),
@@ -144,4 +154,39 @@ fn bytes_of_tensors_are_compared_with_holes_as_zeros() {
     }
     file.set_len(start + 3 * LEN).unwrap();
     assert_eq!(checkpoint.same_bytes("sparse", "zeros"), None, "the file became shorter");
+}
+
+/// Random bytes in several shards: what is found does not depend on the number of threads.
+#[test]
+fn threads_do_not_change_what_is_found() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut draw = crate::support::Draw::new(7);
+    for (number, dtype) in ["BF16", "F32", "F8_E4M3", "F4"].into_iter().enumerate() {
+        let bytes: Vec<u8> = (0..3 << 20).map(|_| u8::try_from(draw.below(256)).unwrap()).collect();
+        let bits = ckpt_doctor::checkpoint::Dtype::from_name(dtype).unwrap().bits();
+        let elements = u64::try_from(bytes.len()).unwrap() * 8 / bits;
+        let header =
+            format!(r#"{{"w":{{"dtype":"{dtype}","shape":[{elements}],"data_offsets":[0,{}]}}}}"#, bytes.len());
+        let length = u64::try_from(header.len()).unwrap().to_le_bytes();
+        let name = format!("model-{:05}-of-00004.safetensors", number + 1);
+        fs::write(dir.path().join(name), [&length[..], header.as_bytes(), &bytes].concat()).unwrap();
+    }
+    let read = |threads: usize| {
+        let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
+        let options = ReadOptions { stats: true, threads: threads.try_into().ok() };
+        let read = std::sync::atomic::AtomicU64::new(0);
+        checkpoint.read_contents(options, &|progress| {
+            assert_eq!(progress.total, 4 * 3 << 20);
+            read.fetch_add(progress.bytes, std::sync::atomic::Ordering::Relaxed);
+        });
+        assert_eq!(read.into_inner(), 4 * 3 << 20);
+        let faults: Vec<Fault> = checkpoint.shards.values().flat_map(|shard| shard.faults.clone()).collect();
+        (checkpoint.contents, faults)
+    };
+    let (one, faults) = read(1);
+    assert_eq!(one.len(), 4);
+    assert!(one.iter().all(|tensor| tensor.stats.is_some() && !tensor.constant));
+    for threads in [2, 3, 16] {
+        assert!((&*one, &faults) == (&*read(threads).0, &read(threads).1), "{threads} threads");
+    }
 }

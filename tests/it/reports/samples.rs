@@ -33,6 +33,7 @@ pub fn checkpoint(path: &str, findings: Vec<Finding>, sources: &[(&str, &str)]) 
         suppressed: vec![],
         loads: vec![],
         sources: sources.iter().map(|(file, text)| ((*file).to_owned(), Arc::from(*text))).collect(),
+        contents: Vec::new(),
         fixed: Vec::new(),
         withdrawn: Vec::new(),
         fixing: None,

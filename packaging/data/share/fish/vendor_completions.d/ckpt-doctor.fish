@@ -70,7 +70,9 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l min-se
 warning\t'Warnings and errors'
 error\t'Errors only'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l deep -d 'Also read the bytes of every tensor, to find NaN, infinity, trailing zeros, tied weights that differ and wrong hub checksums'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l deep -d 'Also read the bytes of every tensor, to find NaN, infinity, trailing zeros and tied weights that differ'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l stats -d 'As --deep, and show smallest and largest value, mean, root mean square, zeros and denormals of each tensor (formats full and json)'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l hash -d 'Also hash the files whose hash the Hub cache, a local download or git recorded, to find changed ones'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l metadata-only -d 'Accept checkpoints without weights, such as copies of the documents alone; their load is not predicted'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l isolated -d 'Use no settings file'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l write-baseline -d 'Write the current findings to the baseline instead of comparing with it'

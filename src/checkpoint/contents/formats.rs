@@ -1,0 +1,270 @@
+//! The bit patterns of each element type: which are NaN, infinite, zero or denormal, and which number each one is.
+
+#![allow(
+    clippy::cast_precision_loss,
+    clippy::inline_always,
+    clippy::verbose_bit_mask,
+    reason = "a function that is not inlined is compiled for the oldest processors, masks are compared in vectors, and sums of large integers are not exact"
+)]
+
+use std::ops::{BitOr, BitXor};
+
+/// A little-endian word of `N` bytes: the bits of one element.
+pub(super) trait Word<const N: usize>:
+    Copy + Eq + BitOr<Output = Self> + BitXor<Output = Self> + Into<u64>
+{
+    /// The word of zeros.
+    const ZERO: Self;
+    /// Elements that a counter of this type can count.
+    const RUN: usize;
+
+    fn read(bytes: [u8; N]) -> Self;
+
+    /// Adds 1 if the condition holds. The sum must not exceed [`Self::RUN`].
+    fn plus(self, condition: bool) -> Self;
+}
+
+macro_rules! words {
+    ($($word:ident, $width:literal, $run:literal;)*) => { $(
+        impl Word<$width> for $word {
+            const ZERO: Self = 0;
+            const RUN: usize = $run;
+
+            #[inline(always)]
+            fn read(bytes: [u8; $width]) -> Self {
+                Self::from_le_bytes(bytes)
+            }
+
+            #[inline(always)]
+            fn plus(self, condition: bool) -> Self {
+                self.wrapping_add(Self::from(condition))
+            }
+        }
+    )* };
+}
+
+words! {
+    u8, 1, 192;
+    u16, 2, 6144;
+    u32, 4, 3072;
+    u64, 8, 1536;
+}
+
+/// A number that an element can be: `f32`, or `f64` for those that `f32` cannot represent.
+pub(super) trait Number: Copy + PartialOrd + Into<f64> {
+    const HIGHEST: Self;
+    const LOWEST: Self;
+}
+
+impl Number for f32 {
+    const HIGHEST: Self = Self::INFINITY;
+    const LOWEST: Self = Self::NEG_INFINITY;
+}
+
+impl Number for f64 {
+    const HIGHEST: Self = Self::INFINITY;
+    const LOWEST: Self = Self::NEG_INFINITY;
+}
+
+/// An element type whose elements have `N` bytes.
+pub(super) trait Format<const N: usize> {
+    type Word: Word<N>;
+    type Number: Number;
+
+    /// Whether the element is NaN or infinite.
+    #[inline(always)]
+    fn special(_: Self::Word) -> bool {
+        false
+    }
+
+    /// Whether a special element is infinite.
+    #[inline(always)]
+    fn infinite(_: Self::Word) -> bool {
+        false
+    }
+
+    #[inline(always)]
+    fn zero(word: Self::Word) -> bool {
+        word == Self::Word::ZERO
+    }
+
+    /// Whether the element is nonzero and below the smallest normal number.
+    #[inline(always)]
+    fn denormal(_: Self::Word) -> bool {
+        false
+    }
+
+    /// The number, of an element that is not special.
+    fn number(word: Self::Word) -> Self::Number;
+}
+
+/// Formats of IEEE 754 layout: all exponent bits are set in NaN, whose fraction is nonzero, and in infinity.
+macro_rules! ieee {
+    ($($format:ident, $word:ident, $width:literal, $number:ident, $magnitude:literal, $exponent:literal, $convert:expr;)*) => { $(
+        pub(super) struct $format;
+
+        impl Format<$width> for $format {
+            type Word = $word;
+            type Number = $number;
+
+            #[inline(always)]
+            fn special(word: $word) -> bool {
+                word & $exponent == $exponent
+            }
+
+            #[inline(always)]
+            fn infinite(word: $word) -> bool {
+                word & $magnitude == $exponent
+            }
+
+            #[inline(always)]
+            fn zero(word: $word) -> bool {
+                word & $magnitude == 0
+            }
+
+            #[inline(always)]
+            fn denormal(word: $word) -> bool {
+                let smallest: $word = $exponent & (!$exponent + 1);
+                (word & $magnitude).wrapping_sub(1) < smallest.wrapping_sub(1)
+            }
+
+            #[inline(always)]
+            fn number(word: $word) -> $number {
+                $convert(word)
+            }
+        }
+    )* };
+}
+
+ieee! {
+    F64, u64, 8, f64, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, f64::from_bits;
+    F32, u32, 4, f32, 0x7fff_ffff, 0x7f80_0000, f32::from_bits;
+    Bf16, u16, 2, f32, 0x7fff, 0x7f80, |word: u16| f32::from_bits(u32::from(word) << 16);
+    F16, u16, 2, f32, 0x7fff, 0x7c00, |word: u16| widened::<5, 10, 15>(word.into());
+    F8E5M2, u8, 1, f32, 0x7f, 0x7c, |word: u8| widened::<5, 2, 15>(word.into());
+}
+
+/// The number of a code with a sign, an exponent and a fraction, of these many bits. Exact, and without denormal operands,
+/// which some processors multiply slowly.
+#[inline(always)]
+fn widened<const EXPONENT: u32, const FRACTION: u32, const BIAS: u32>(code: u32) -> f32 {
+    let size = const { EXPONENT.wrapping_add(FRACTION) };
+    let shift = const { 23_u32.wrapping_sub(FRACTION) };
+    // The exponent of the smallest normal number, in f32.
+    let least = const { 128_u32.wrapping_sub(BIAS) << 23 };
+    let magnitude = code & const { (1_u32 << (EXPONENT.wrapping_add(FRACTION))).wrapping_sub(1) };
+    let bits = (magnitude << shift).wrapping_add(least);
+    let normal = f32::from_bits(bits.wrapping_sub(const { 1 << 23 }));
+    let denormal = f32::from_bits(bits) - f32::from_bits(least);
+    let number = if magnitude < const { 1 << FRACTION } { denormal } else { normal };
+    f32::from_bits(number.to_bits() | ((code >> size) & 1) << 31)
+}
+
+/// Formats of at most eight bits without infinity: at most one magnitude, or one pattern, is NaN.
+macro_rules! small {
+    ($($format:ident, $exponent:literal, $fraction:literal, $bias:literal, $special:expr, $zero:expr;)*) => { $(
+        pub(super) struct $format;
+
+        impl Format<1> for $format {
+            type Word = u8;
+            type Number = f32;
+
+            #[inline(always)]
+            fn special(word: u8) -> bool {
+                $special(word)
+            }
+
+            #[inline(always)]
+            fn zero(word: u8) -> bool {
+                $zero(word)
+            }
+
+            #[inline(always)]
+            fn denormal(word: u8) -> bool {
+                let magnitude = word & (0xff_u8 >> (8 - ($exponent + $fraction)));
+                magnitude.wrapping_sub(1) < (1_u8 << $fraction).wrapping_sub(1)
+            }
+
+            #[inline(always)]
+            fn number(word: u8) -> f32 {
+                widened::<$exponent, $fraction, $bias>(word.into())
+            }
+        }
+    )* };
+}
+
+// Sources: OCP 8-bit floating point specification; OCP microscaling formats; ml_dtypes for the FNUZ variants, whose only NaN
+// has the bits of minus zero.
+small! {
+    F8E4M3, 4, 3, 7, |word: u8| word & 0x7f == 0x7f, |word: u8| word & 0x7f == 0;
+    F8E4M3Fnuz, 4, 3, 8, |word: u8| word == 0x80, |word: u8| word == 0;
+    F8E5M2Fnuz, 5, 2, 16, |word: u8| word == 0x80, |word: u8| word == 0;
+    F6E2M3, 2, 3, 1, |_| false, |word: u8| word & 0x1f == 0;
+    F6E3M2, 3, 2, 3, |_| false, |word: u8| word & 0x1f == 0;
+    F4, 2, 1, 1, |_| false, |word: u8| word & 7 == 0;
+}
+
+/// Powers of two from 2^-127 on: no sign, no zero, no denormals.
+pub(super) struct F8E8M0;
+
+impl Format<1> for F8E8M0 {
+    type Word = u8;
+    type Number = f64;
+
+    #[inline(always)]
+    fn special(word: u8) -> bool {
+        word == 0xff
+    }
+
+    #[inline(always)]
+    fn zero(_: u8) -> bool {
+        false
+    }
+
+    #[inline(always)]
+    fn number(word: u8) -> f64 {
+        f64::from_bits(u64::from(word).wrapping_add(1023 - 127) << 52)
+    }
+}
+
+/// Integers and truth values.
+macro_rules! integers {
+    ($($format:ident, $word:ident, $width:literal, $number:ident, $convert:expr;)*) => { $(
+        pub(super) struct $format;
+
+        impl Format<$width> for $format {
+            type Word = $word;
+            type Number = $number;
+
+            #[inline(always)]
+            fn number(word: $word) -> $number {
+                $convert(word)
+            }
+        }
+    )* };
+}
+
+integers! {
+    U8, u8, 1, f32, f32::from;
+    I8, u8, 1, f32, |word: u8| f32::from(word.cast_signed());
+    U16, u16, 2, f32, f32::from;
+    I16, u16, 2, f32, |word: u16| f32::from(word.cast_signed());
+    U32, u32, 4, f64, f64::from;
+    I32, u32, 4, f64, |word: u32| f64::from(word.cast_signed());
+    U64, u64, 8, f64, |word: u64| word as f64;
+    I64, u64, 8, f64, |word: u64| word.cast_signed() as f64;
+}
+
+/// Takes elements of four bits apart, low half first.
+pub(super) fn unpack4(bytes: &[u8], codes: &mut Vec<u8>) {
+    codes.clear();
+    codes.extend(bytes.iter().flat_map(|byte| [byte & 0xf, byte >> 4]));
+}
+
+/// Takes elements of six bits apart, from the lowest bit on: four in three bytes.
+pub(super) fn unpack6(bytes: &[u8], codes: &mut Vec<u8>) {
+    codes.clear();
+    codes.extend(bytes.as_chunks().0.iter().flat_map(|[one, two, three]: &[u8; 3]| {
+        [one & 0x3f, one >> 6 | (two & 0xf) << 2, two >> 4 | (three & 3) << 4, three >> 2]
+    }));
+}

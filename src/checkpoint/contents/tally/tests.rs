@@ -1,0 +1,119 @@
+//! Tests of the counts and sums.
+#![allow(clippy::arithmetic_side_effects, clippy::float_cmp, reason = "expected values are exact")]
+
+use super::*;
+
+/// Bytes of elements with every pattern, and more of them than a block holds.
+fn bytes(seed: u64) -> Vec<u8> {
+    let mut state = seed;
+    let mut next = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33).to_le_bytes()
+    };
+    (0..3 * BLOCK + 96).map(|_| next()[0]).collect()
+}
+
+fn tally(dtype: Dtype, bytes: &[u8]) -> Tally {
+    let mut tally = Tally::new(dtype, true);
+    tally.add(bytes);
+    tally
+}
+
+/// The number of a code, from the definition of the format: sign, exponent with this bias, fraction.
+fn defined(code: u32, exponent: u32, fraction: u32, bias: i32) -> f64 {
+    let field = |at: u32, bits: u32| (code >> at) & ((1 << bits) - 1);
+    let sign = if field(exponent + fraction, 1) == 1 { -1.0 } else { 1.0 };
+    let (power, part) = (field(fraction, exponent), f64::from(field(0, fraction)) / f64::from(1_u32 << fraction));
+    let power_of = |n: i32| f64::from(n).exp2();
+    let power = i32::try_from(power).unwrap();
+    sign * if power == 0 { part * power_of(1 - bias) } else { (1.0 + part) * power_of(power - bias) }
+}
+
+#[test]
+fn codes_are_the_numbers_of_their_definitions() {
+    for code in 0..=0xff_u8 {
+        let at = u32::from(code);
+        let same = |number: f32, exponent, fraction, bias| {
+            assert_eq!(f64::from(number), defined(at, exponent, fraction, bias), "{code:#x} {exponent} {fraction}");
+        };
+        same(F8E4M3::number(code), 4, 3, 7);
+        same(F8E5M2::number(code), 5, 2, 15);
+        same(F8E4M3Fnuz::number(code), 4, 3, 8);
+        same(F8E5M2Fnuz::number(code), 5, 2, 16);
+        assert_eq!(F8E8M0::number(code), (f64::from(code) - 127.0).exp2());
+    }
+    for code in 0..0x40_u8 {
+        assert_eq!(f64::from(F6E2M3::number(code)), defined(code.into(), 2, 3, 1));
+        assert_eq!(f64::from(F6E3M2::number(code)), defined(code.into(), 3, 2, 3));
+        assert_eq!(f64::from(F4::number(code & 0xf)), defined((code & 0xf).into(), 2, 1, 1));
+    }
+    for code in (0..=0xffff_u16).filter(|code| !F16::special(*code)) {
+        assert_eq!(F16::number(code).to_bits(), half::f16::from_bits(code).to_f32().to_bits());
+    }
+}
+
+/// The numbers of a tensor of 32-bit floats, counted one after the other.
+#[test]
+fn a_tensor_is_counted_as_a_loop_counts_it() {
+    let bytes = bytes(1);
+    let found = tally(Dtype::F32, &bytes);
+    let numbers: Vec<f32> = bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+    let count = |is: fn(&f32) -> bool| as_u64(numbers.iter().filter(|n| is(n)).count());
+    assert!(count(|n| n.is_nan()) > 0);
+    assert_eq!((found.nan, found.infinite), (count(|n| n.is_nan()), count(|n| n.is_infinite())));
+    assert_eq!((found.elements, found.zeros), (as_u64(numbers.len()), count(|n| *n == 0.0)));
+    assert_eq!(found.first, numbers.iter().position(|n| !n.is_finite()).map(as_u64));
+    let finite: Vec<f64> = numbers.iter().filter(|n| n.is_finite()).map(|n| f64::from(*n)).collect();
+    let sums = found.sums.unwrap();
+    let near = |one: f64, other: f64| assert!((one - other).abs() <= 1e-9 * other.abs(), "{one} {other}");
+    near(sums.squares, finite.iter().map(|n| n * n).sum());
+    assert_eq!(sums.min, finite.iter().copied().fold(f64::INFINITY, f64::min));
+    assert_eq!(sums.max, finite.iter().copied().fold(f64::NEG_INFINITY, f64::max));
+    assert_eq!(sums.denormals, count(|n| n.is_subnormal()));
+    assert!(found.varies);
+}
+
+/// Parts between blocks, in order, have the same bits as the whole; so have holes and the zeros that they stand for.
+#[test]
+fn parts_are_the_whole() {
+    for dtype in Dtype::ALL {
+        let mut bytes = bytes(2);
+        bytes[BLOCK..2 * BLOCK].fill(0);
+        let whole = tally(dtype, &bytes);
+        let mut hole = Tally::new(dtype, true);
+        hole.skip(as_u64(BLOCK));
+        let mut parts = Tally::new(dtype, true);
+        for (n, block) in bytes.chunks(BLOCK).enumerate() {
+            parts.then(&if n == 1 { hole } else { tally(dtype, block) });
+        }
+        assert_eq!(parts, whole, "{dtype}");
+        let zeros =
+            [tally(dtype, &vec![0; BLOCK]), hole].map(|t| (t.zeros, t.is_constant(), t.last_value(), t.elements));
+        assert_eq!(zeros[0], zeros[1], "{dtype}");
+    }
+}
+
+#[test]
+fn each_type_has_its_own_patterns() {
+    let counts = |dtype, bytes: &[u8]| {
+        let tally = tally(dtype, bytes);
+        (tally.nan, tally.infinite, tally.zeros, tally.sums.unwrap().denormals, tally.first)
+    };
+    let floats = [1.0, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 0.0, -0.0, 1e-40].map(f32::to_le_bytes).concat();
+    assert_eq!(counts(Dtype::F32, &floats), (1, 2, 2, 1, Some(1)));
+    let floats = [1.0, f64::NAN, f64::INFINITY, -0.0, 5e-324].map(f64::to_le_bytes).concat();
+    assert_eq!(counts(Dtype::F64, &floats), (1, 1, 1, 1, Some(1)));
+    let words = |words: &[u16]| words.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<_>>();
+    assert_eq!(counts(Dtype::F16, &words(&[0x7bff, 0x7e00, 0x7c00, 0xfc00, 0x8000, 0x83ff])), (1, 2, 1, 1, Some(1)));
+    assert_eq!(counts(Dtype::BF16, &words(&[0x7f7f, 0xffc0, 0x7f80, 0xff80, 0x8000, 0x7f])), (1, 2, 1, 1, Some(1)));
+    assert_eq!(counts(Dtype::F8_E5M2, &[0x7b, 0x7f, 0x7c, 0xfc, 0x80, 0x83]), (1, 2, 1, 1, Some(1)));
+    assert_eq!(counts(Dtype::F8_E4M3, &[0x7e, 0x7f, 0xff, 0xfe, 0x80, 0x87]), (2, 0, 1, 1, Some(1)));
+    assert_eq!(counts(Dtype::F8_E4M3FNUZ, &[0x7f, 0x80, 0xff, 0, 0x87]), (1, 0, 1, 1, Some(1)));
+    assert_eq!(counts(Dtype::F8_E5M2FNUZ, &[0x7f, 0x80, 0xff, 0, 0x83]), (1, 0, 1, 1, Some(1)));
+    assert_eq!(counts(Dtype::F8_E8M0, &[0xfe, 0xff, 1, 0]), (1, 0, 0, 0, Some(1)));
+    assert_eq!(counts(Dtype::F4, &[0x10, 0x89]), (0, 0, 2, 2, None));
+    // 0x20 (-0), 0x1f, 0, 1.
+    assert_eq!(counts(Dtype::F6_E2M3, &[0xe0, 0x07, 0x04]), (0, 0, 2, 1, None));
+    assert_eq!(counts(Dtype::U8, &[0xff, 0, 1]), (0, 0, 1, 0, None));
+    assert_eq!(counts(Dtype::C64, &floats[..8]).4, None);
+}

@@ -1,0 +1,69 @@
+//! Progress of a long operation, on a terminal.
+
+use std::borrow::Cow;
+use std::io::IsTerminal as _;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use super::output::safe;
+
+/// An operation shows nothing before it has taken this long.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Lines drawn in a second.
+const RATE: u8 = 10;
+
+/// What is shown of an operation that reads or writes bytes: share, rate, time left and the current file. Any thread adds to it.
+///
+/// Nothing is written unless standard error is a terminal, and the line is removed at the end. An operation makes one, calls
+/// [`Self::add`] with the bytes since the last call, and drops it.
+pub struct Meter {
+    /// What the operation does, in one word: `reading`.
+    verb: &'static str,
+    begun: Instant,
+    /// Whether anything is shown.
+    is_shown: bool,
+    /// The line, from the first moment on at which it is shown, and the bytes so far.
+    line: Mutex<(Option<ProgressBar>, u64)>,
+}
+
+impl Meter {
+    /// A meter of an operation that begins now.
+    pub fn new(verb: &'static str) -> Self {
+        Self { verb, begun: Instant::now(), is_shown: std::io::stderr().is_terminal(), line: Mutex::default() }
+    }
+
+    /// Adds `bytes` that were read or written of `file`, of `total` in all files.
+    pub fn add(&self, file: &str, bytes: u64, total: u64) {
+        if !self.is_shown {
+            return;
+        }
+        let mut line = self.line.lock().unwrap_or_else(PoisonError::into_inner);
+        let (bar, done) = &mut *line;
+        *done = done.saturating_add(bytes);
+        if bar.is_none() && self.begun.elapsed() < PATIENCE {
+            return;
+        }
+        let bar = bar.get_or_insert_with(|| self.bar(total));
+        bar.set_message(Cow::Owned(safe(file)));
+        bar.set_position(*done);
+    }
+
+    fn bar(&self, total: u64) -> ProgressBar {
+        let template = "{prefix} {percent:>3} % of {total_bytes}, {bytes_per_sec}, {eta} left: {wide_msg}";
+        let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+        let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(RATE));
+        bar.with_style(style).with_prefix(self.verb).with_elapsed(self.begun.elapsed())
+    }
+}
+
+impl Drop for Meter {
+    fn drop(&mut self) {
+        let (bar, _) = self.line.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if let Some(bar) = bar {
+            bar.finish_and_clear();
+        }
+    }
+}
