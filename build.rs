@@ -73,7 +73,8 @@ fn convert(folder: &Path, to: &Path, heads: &mut BTreeMap<String, Value>) -> io:
                 let head = head.into_iter().filter_map(|key| Some((key.to_owned(), value.get(key)?.clone())));
                 let path = path.to_string_lossy().replace('\\', "/");
                 let head: Map<String, Value> = head.chain([("path".to_owned(), path.into())]).collect();
-                heads.insert(value["code"].as_str().unwrap_or_default().to_owned(), Value::Object(head));
+                let code = value.get("code").and_then(Value::as_str).unwrap_or_default().to_owned();
+                heads.insert(code, Value::Object(head));
             }
         } else if path.extension().is_none_or(|extension| extension != "md") {
             fs::copy(&path, copy)?;
