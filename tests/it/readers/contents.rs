@@ -176,10 +176,10 @@ fn threads_do_not_change_what_is_found() {
         let options = ReadOptions { stats: true, threads: threads.try_into().ok() };
         let read = std::sync::atomic::AtomicU64::new(0);
         checkpoint.read_contents(options, &|progress| {
-            assert_eq!(progress.total, 4 * 3 << 20);
+            assert_eq!(progress.total, (4 * 3) << 20);
             read.fetch_add(progress.bytes, std::sync::atomic::Ordering::Relaxed);
         });
-        assert_eq!(read.into_inner(), 4 * 3 << 20);
+        assert_eq!(read.into_inner(), (4 * 3) << 20);
         let faults: Vec<Fault> = checkpoint.shards.values().flat_map(|shard| shard.faults.clone()).collect();
         (checkpoint.contents, faults)
     };
