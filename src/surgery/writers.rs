@@ -2,9 +2,11 @@
 
 mod apply;
 mod changes;
+mod jobs;
 pub mod journal;
 mod lock;
 mod overlay;
+mod shards;
 mod staging;
 mod system;
 mod target;

@@ -291,8 +291,8 @@ fn a_dry_run_shows_the_config_and_writes_the_plan() {
     let read = |path: &Path| -> Value { serde_json::from_slice(&fs::read(path).unwrap()).unwrap() };
     let (plan, mut manifest) = (read(&plan), read(&work.path().join("out/merge-manifest.json")));
     for tensor in manifest["tensors"].as_array_mut().unwrap() {
-        tensor.as_object_mut().unwrap().remove("sha256");
-        tensor["source"].as_object_mut().unwrap().remove("sha256");
+        tensor.as_object_mut().unwrap().remove("digest");
+        tensor["source"].as_object_mut().unwrap().remove("digest");
     }
     assert_eq!(plan["tensors"], manifest["tensors"]);
     let refused = tiny(&work.path().join("b"), &["--plan", "x.json"]);

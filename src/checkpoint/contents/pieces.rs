@@ -2,9 +2,9 @@
 
 use std::io::{Error, ErrorKind, Result};
 
-use sha2::{Digest as _, Sha256};
-
 use super::numbers::as_u64;
+use crate::checkpoint::HashAlgorithm;
+use crate::checkpoint::digest::Hasher;
 use crate::checkpoint::open::Opened;
 use crate::checkpoint::platform::{next_data, next_hole};
 
@@ -67,6 +67,21 @@ pub(super) fn each_piece(
     Ok(())
 }
 
+/// Number of the `len` bytes from `start` on that are in holes: at least as many as [`each_piece`] gives as holes. 0 where the
+/// file system does not tell holes.
+#[cfg(feature = "cli")]
+pub(super) fn holes(opened: &Opened, start: u64, len: u64) -> u64 {
+    let end = start.saturating_add(len);
+    let (mut at, mut zeros) = (start, 0_u64);
+    while at < end {
+        let Ok(data) = next_data(&opened.file, at) else { break };
+        let data = data.map_or(end, |data| data.min(end));
+        zeros = zeros.saturating_add(data.saturating_sub(at));
+        at = next_hole(&opened.file, data).unwrap_or(end);
+    }
+    zeros
+}
+
 /// Reads a range of the file, and returns its end.
 fn read(
     opened: &Opened,
@@ -86,12 +101,17 @@ fn read(
     Ok(range.end)
 }
 
-/// A SHA-256 in progress; none once the bytes have more holes than are hashed.
-pub(super) struct Hash(Option<Sha256>);
+/// A digest in progress; none once the bytes have more holes than are hashed.
+pub(super) struct Hash(Option<Hasher>);
 
 impl Hash {
+    /// A SHA-256.
     pub(super) fn new() -> Self {
-        Self(Some(Sha256::new()))
+        Self::by(HashAlgorithm::Sha256)
+    }
+
+    pub(super) fn by(algorithm: HashAlgorithm) -> Self {
+        Self(Some(Hasher::new(algorithm)))
     }
 
     pub(super) const fn none() -> Self {
@@ -114,11 +134,11 @@ impl Hash {
     }
 
     pub(super) fn finish(self) -> Option<[u8; 32]> {
-        self.0.map(|hash| hash.finalize().into())
+        self.0.and_then(Hasher::finish)
     }
 }
 
-fn add_zeros(hash: &mut Sha256, len: u64) {
+fn add_zeros(hash: &mut Hasher, len: u64) {
     const ZEROS: [u8; 4096] = [0; 4096];
     let mut left = len;
     while left > 0 {

@@ -164,12 +164,18 @@ pub(super) fn is_mount_point(_: &Path) -> bool {
     false
 }
 
-/// Copies up to `len` bytes inside the kernel, from offset `at` of `from` to the current offset of `to`; file systems
+/// Copies up to `len` bytes inside the kernel, from offset `from_at` of `from` to offset `to_at` of `to`; file systems
 /// with shared blocks copy no data. `None` when the kernel or these file systems do not support it.
 #[cfg(target_os = "linux")]
-pub(super) fn copy_in_kernel(from: &File, mut at: u64, to: &File, len: u64) -> io::Result<Option<u64>> {
+pub(super) fn copy_in_kernel(
+    from: &File,
+    mut from_at: u64,
+    to: &File,
+    mut to_at: u64,
+    len: u64,
+) -> io::Result<Option<u64>> {
     let len = usize::try_from(len).unwrap_or(usize::MAX);
-    match retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut at), to, None, len)) {
+    match retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut from_at), to, Some(&mut to_at), len)) {
         // Some file systems return 0 for unsupported; at the end of the file a plain read reports the end.
         Ok(0) | Err(Errno::NOSYS | Errno::XDEV | Errno::INVAL | Errno::OPNOTSUPP | Errno::PERM | Errno::BADF) => {
             Ok(None)
@@ -180,6 +186,27 @@ pub(super) fn copy_in_kernel(from: &File, mut at: u64, to: &File, len: u64) -> i
 }
 
 #[cfg(not(target_os = "linux"))]
-pub(super) fn copy_in_kernel(_: &File, _: u64, _: &File, _: u64) -> io::Result<Option<u64>> {
+pub(super) fn copy_in_kernel(_: &File, _: u64, _: &File, _: u64, _: u64) -> io::Result<Option<u64>> {
     Ok(None)
+}
+
+/// Reserves `len` bytes for a new file, which gets this size; does nothing where the file system cannot do it.
+///
+/// # Errors
+/// When the space is not free, or the file would be too large.
+#[cfg(target_os = "linux")]
+pub(super) fn reserve(file: &File, len: u64) -> io::Result<()> {
+    if len == 0 {
+        return Ok(());
+    }
+    let flags = rustix::fs::FallocateFlags::empty();
+    match retry_on_intr(|| rustix::fs::fallocate(file, flags, 0, len)) {
+        Err(Errno::NOSYS | Errno::OPNOTSUPP | Errno::INVAL | Errno::NODEV | Errno::PERM) => Ok(()),
+        other => Ok(other?),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn reserve(_: &File, _: u64) -> io::Result<()> {
+    Ok(())
 }
