@@ -1,24 +1,10 @@
 //! The work of writing a shard, cut into pieces that threads do in any order.
 
-use std::path::Path;
-
+use crate::surgery::align::Run;
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorTransform};
 
 /// Maximum number of bytes of a job that copies; also the bytes copied between two checks for a signal.
 pub(super) const SLICE: u64 = 64 * 1024 * 1024;
-
-/// A range of a donor's file that goes unchanged into a shard: one tensor or adjacent ones, or a part of them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Run<'p> {
-    /// The donor's file.
-    pub(super) path: &'p Path,
-    /// Its first byte there.
-    pub(super) from: u64,
-    /// Its first byte in the shard.
-    pub(super) at: u64,
-    /// Number of bytes.
-    pub(super) len: u64,
-}
 
 /// A piece of work. Jobs of one shard write to disjoint ranges of it, which are together the whole file.
 #[derive(Debug, Clone, Copy)]
@@ -53,11 +39,8 @@ pub(super) fn jobs(shard: &PlannedShard, header: u64, hashed: bool) -> Vec<Job<'
             jobs.push(Job::Tensor { index, tensor, at });
         } else {
             let run = Run { path: &from.path, from: from.offset, at, len };
-            match &mut open {
-                Some(open) if open.path == run.path && open.from.saturating_add(open.len) == run.from => {
-                    open.len = open.len.saturating_add(len);
-                }
-                _ => cut(open.replace(run), &mut jobs),
+            if !open.as_mut().is_some_and(|open| open.extend(run)) {
+                cut(open.replace(run), &mut jobs);
             }
         }
         at = at.saturating_add(len);
@@ -70,11 +53,9 @@ pub(super) fn jobs(shard: &PlannedShard, header: u64, hashed: bool) -> Vec<Job<'
 fn cut<'p>(run: Option<Run<'p>>, jobs: &mut Vec<Job<'p>>) {
     let Some(mut rest) = run else { return };
     while rest.len > 0 {
-        let len = rest.len.min(SLICE.saturating_sub(rest.at % SLICE));
-        jobs.push(Job::Copy(Run { len, ..rest }));
-        rest.from = rest.from.saturating_add(len);
-        rest.at = rest.at.saturating_add(len);
-        rest.len = rest.len.saturating_sub(len);
+        let (slice, others) = rest.split(SLICE.saturating_sub(rest.at % SLICE));
+        jobs.push(Job::Copy(slice));
+        rest = others;
     }
 }
 
@@ -104,7 +85,12 @@ mod tests {
     }
 
     fn shard(tensors: Vec<PlannedTensor>) -> PlannedShard {
-        PlannedShard { name: FileName::constant("model.safetensors"), tensors, metadata: BTreeMap::new() }
+        PlannedShard {
+            name: FileName::constant("model.safetensors"),
+            tensors,
+            metadata: BTreeMap::new(),
+            residue: None,
+        }
     }
 
     /// File, offset there, offset in the shard and length of each copy. Every byte of the data belongs to exactly one job.

@@ -13,12 +13,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use sha2::{Digest as _, Sha256};
 
-use super::jobs::{Job, Run, jobs};
-use super::system::{copy_in_kernel, create, reserve};
+use super::jobs::{Job, jobs};
+use super::system::{copy_in_kernel, create, read_ahead, reserve, shares_blocks, write_back};
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::digest::Hasher;
 use crate::checkpoint::open::open_regular;
 use crate::checkpoint::{HashAlgorithm, hex, parallel};
+use crate::surgery::align::{BLOCK, Run};
 use crate::surgery::donor::DonorFile;
 use crate::surgery::error::{ApplyError, io_at};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorTransform};
@@ -139,7 +140,7 @@ impl Writers<'_> {
         interrupted()?;
         let Some(shard) = self.shards.get(shard) else { return Ok(None) };
         let Some(file) = self.open(shard)? else { return Ok(None) };
-        let out = Out { path: shard.path, file: &file, progress: self.progress };
+        let out = Out { path: shard.path, file: &file, shares: shares_blocks(&file), progress: self.progress };
         let tensor = match job {
             Job::Header => {
                 out.write(&shard.header, 0)?;
@@ -183,10 +184,20 @@ impl Writers<'_> {
     }
 }
 
+/// Bytes between two requests to write back and to read ahead.
+const STREAMED: u64 = 8 << 20;
+
+/// Whether the `len` bytes from `at` on reach the end of a window of [`STREAMED`] bytes.
+fn ends_window(at: u64, len: u64) -> bool {
+    at / STREAMED != at.saturating_add(len) / STREAMED
+}
+
 /// The file that a job writes to.
 struct Out<'o> {
     path: &'o Path,
     file: &'o File,
+    /// Whether copies inside the kernel share blocks.
+    shares: bool,
     progress: &'o (dyn Fn(u64) + Sync),
 }
 
@@ -198,30 +209,81 @@ impl Out<'_> {
     }
 
     /// Copies bytes, inside the kernel if supported, otherwise through the buffer.
+    ///
+    /// The kernel shares whole blocks with the donor if the file system can do it and both offsets agree; a call for more than
+    /// whole blocks would copy all of them.
     fn copy(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
-        let Run { mut from, mut at, len: mut left, .. } = run;
-        let mut kernel_copies = true;
-        while left > 0 {
+        let [head, whole, tail] = run.blocks();
+        self.copy_bytes(donor, head, buffer)?;
+        let rest = self.copy_in_kernel(donor, whole)?;
+        self.copy_bytes(donor, rest, buffer)?;
+        // Offsets that do not agree: the kernel copies without sharing.
+        let rest = if tail.len < BLOCK { tail } else { self.copy_in_kernel(donor, tail)? };
+        self.copy_bytes(donor, rest, buffer)
+    }
+
+    /// Copies inside the kernel, and returns the range that it did not copy because it is not supported.
+    fn copy_in_kernel<'r>(&self, donor: &DonorFile, run: Run<'r>) -> Result<Run<'r>, ApplyError> {
+        let mut rest = run;
+        while rest.len > 0 {
             interrupted()?;
-            let in_kernel = if kernel_copies {
-                copy_in_kernel(donor.file(), from, self.file, at, left)
-                    .map_err(io_at(self.path, "copying from a donor"))?
-            } else {
-                None
-            };
-            let copied = if let Some(n) = in_kernel {
-                (self.progress)(n);
-                n
-            } else {
-                kernel_copies = false;
-                let block = block(buffer, left);
-                donor.read_at(block, from).map_err(|e| donor.read_error(e))?;
-                self.write(block, at)?;
-                block.len() as u64
-            };
-            from = from.saturating_add(copied);
-            at = at.saturating_add(copied);
-            left = left.saturating_sub(copied);
+            let next = if self.shares { rest } else { rest.split(STREAMED.saturating_sub(rest.at % STREAMED)).0 };
+            if !self.shares {
+                let later = rest.split(next.len).1.split(STREAMED).0;
+                read_ahead(donor.file(), later.from, later.len);
+            }
+            let copied = copy_in_kernel(donor.file(), next.from, self.file, next.at, next.len);
+            let Some(copied) = copied.map_err(io_at(self.path, "copying from a donor"))? else { break };
+            if !self.shares {
+                write_back(self.file, next.at, copied);
+            }
+            (self.progress)(copied);
+            rest = rest.split(copied).1;
+        }
+        Ok(rest)
+    }
+
+    /// Copies through the buffer.
+    fn copy_bytes(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
+        let mut rest = run;
+        while rest.len > 0 {
+            interrupted()?;
+            let block = block(buffer, rest.len);
+            donor.read_at(block, rest.from).map_err(|e| donor.read_error(e))?;
+            self.write(block, rest.at)?;
+            rest = rest.split(block.len() as u64).1;
+        }
+        Ok(())
+    }
+
+    /// Copies a tensor, and hashes it. What the file system can share is only read.
+    fn copy_hashed(
+        &self,
+        donor: &DonorFile,
+        run: Run<'_>,
+        place: &mut Place<'_>,
+        buffer: &mut Vec<u8>,
+    ) -> Result<(), ApplyError> {
+        let [head, whole, tail] = run.blocks();
+        let rest = if self.shares { self.copy_in_kernel(donor, whole)? } else { whole };
+        let (shared, rest) = whole.split(whole.len.saturating_sub(rest.len));
+        for (mut part, is_shared) in [(head, false), (shared, true), (rest, false), (tail, false)] {
+            while part.len > 0 {
+                interrupted()?;
+                if ends_window(part.from, buffer.len() as u64) {
+                    let (_, later) = part.split(STREAMED);
+                    read_ahead(donor.file(), later.from, later.len.min(STREAMED));
+                }
+                // Hashed and written while it is in the cache of the processor.
+                let block = block(buffer, part.len);
+                donor.read_at(block, part.from).map_err(|e| donor.read_error(e))?;
+                if is_shared {
+                    place.pass(block);
+                } else {
+                    place.write_all(block).map_err(io_at(self.path, "writing"))?;
+                }
+                part = part.split(block.len() as u64).1;
+            }
         }
         Ok(())
     }
@@ -237,15 +299,9 @@ impl Out<'_> {
     ) -> Result<WrittenTensor, ApplyError> {
         let mut place = Place { out: self, at, left: tensor.len(), hasher: Hasher::new(hash) };
         let streamed = if tensor.transform() == TensorTransform::Copy {
-            let mut from = tensor.source.from.offset;
-            while place.left > 0 {
-                interrupted()?;
-                // Hashed and written while it is in the cache of the processor.
-                let block = block(buffer, place.left);
-                donor.read_at(block, from).map_err(|e| donor.read_error(e))?;
-                place.write_all(block).map_err(io_at(self.path, "writing"))?;
-                from = from.saturating_add(block.len() as u64);
-            }
+            let from = &tensor.source.from;
+            let run = Run { path: &from.path, from: from.offset, at, len: tensor.len() };
+            self.copy_hashed(donor, run, &mut place, buffer)?;
             Streamed::default()
         } else {
             stream(donor, tensor, hash, self.path, &mut place)?
@@ -269,16 +325,27 @@ struct Place<'p> {
     hasher: Hasher,
 }
 
+impl Place<'_> {
+    /// Adds the next bytes, which the file already has.
+    fn pass(&mut self, bytes: &[u8]) {
+        self.hasher.update(bytes);
+        self.at = self.at.saturating_add(bytes.len() as u64);
+        self.left = self.left.saturating_sub(bytes.len() as u64);
+    }
+}
+
 impl Write for Place<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let len = bytes.len() as u64;
-        let left = self.left.checked_sub(len);
-        let left = left.ok_or_else(|| io::Error::other("a transform gave more bytes than its tensor has"))?;
-        self.hasher.update(bytes);
+        if len > self.left {
+            return Err(io::Error::other("a transform gave more bytes than its tensor has"));
+        }
         self.out.file.write_all_at(bytes, self.at)?;
         (self.out.progress)(len);
-        self.at = self.at.saturating_add(len);
-        self.left = left;
+        if ends_window(self.at, len) {
+            write_back(self.out.file, (self.at / STREAMED).saturating_mul(STREAMED), STREAMED);
+        }
+        self.pass(bytes);
         Ok(bytes.len())
     }
 
@@ -321,6 +388,7 @@ mod tests {
             name: FileName::shard(shard + 1, 3),
             tensors: (0..40).map(|index| tensor(shard, index)).collect(),
             metadata: BTreeMap::new(),
+            residue: None,
         };
         (0..3).map(shard).collect()
     }

@@ -4,9 +4,13 @@
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
+#[cfg(target_os = "linux")]
+use std::num::NonZeroU64;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
+#[cfg(target_os = "linux")]
+use rustix::fs::Advice;
 use rustix::fs::{AtFlags, OFlags, unlinkat};
 use rustix::io::{Errno, retry_on_intr};
 use rustix::process::{Resource, getrlimit};
@@ -209,4 +213,48 @@ pub(super) fn reserve(file: &File, len: u64) -> io::Result<()> {
 #[cfg(not(target_os = "linux"))]
 pub(super) fn reserve(_: &File, _: u64) -> io::Result<()> {
     Ok(())
+}
+
+/// Starts to write a range of a file to the disk, and does not wait for it: later syncs then have less to do. Pages of the range
+/// that are already on the disk leave the page cache.
+#[cfg(target_os = "linux")]
+pub(super) fn write_back(file: &File, at: u64, len: u64) {
+    if let Some(len) = NonZeroU64::new(len) {
+        // Advice: without support, the kernel writes when it sees fit.
+        let _ = rustix::fs::fadvise(file, at, Some(len), Advice::DontNeed);
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn write_back(_: &File, _: u64, _: u64) {}
+
+/// Starts to read a range of a file that is needed soon.
+#[cfg(target_os = "linux")]
+pub(super) fn read_ahead(file: &File, at: u64, len: u64) {
+    // A call reads at most as much as the disk takes at once.
+    const STEP: u64 = 1 << 20;
+    let end = at.saturating_add(len);
+    let mut at = at;
+    while at < end {
+        let _ = rustix::fs::fadvise(file, at, NonZeroU64::new(end.saturating_sub(at).min(STEP)), Advice::WillNeed);
+        at = at.saturating_add(STEP);
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn read_ahead(_: &File, _: u64, _: u64) {}
+
+/// Whether copies inside the kernel share blocks on the file system of a file: XFS and btrfs.
+#[cfg(target_os = "linux")]
+pub(super) fn shares_blocks(file: &File) -> bool {
+    // Source: linux/magic.h.
+    const XFS: u64 = 0x5846_5342;
+    const BTRFS: u64 = 0x9123_683E;
+    rustix::fs::fstatfs(file)
+        .is_ok_and(|stats| u64::try_from(stats.f_type).is_ok_and(|kind| [XFS, BTRFS].contains(&kind)))
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn shares_blocks(_: &File) -> bool {
+    false
 }
