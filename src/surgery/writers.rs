@@ -5,6 +5,7 @@ mod changes;
 mod jobs;
 pub mod journal;
 mod lock;
+mod out;
 mod overlay;
 mod shards;
 mod staging;

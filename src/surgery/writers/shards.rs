@@ -5,8 +5,7 @@
 //! that ends its last job syncs and verifies it, while the others go on with the next shard.
 
 use std::fs::File;
-use std::io::{self, Write};
-use std::os::unix::fs::FileExt as _;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -14,17 +13,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use sha2::{Digest as _, Sha256};
 
 use super::jobs::{Job, jobs};
-use super::system::{copy_in_kernel, create, read_ahead, reserve, shares_blocks, write_back};
+use super::out::Out;
+use super::system::{create, reserve, shares_blocks};
 use super::verify::accepted_by_safetensors;
-use crate::checkpoint::digest::Hasher;
 use crate::checkpoint::open::open_regular;
 use crate::checkpoint::{HashAlgorithm, hex, parallel};
-use crate::surgery::align::{BLOCK, Run};
 use crate::surgery::donor::DonorFile;
 use crate::surgery::error::{ApplyError, io_at};
-use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorTransform};
+use crate::surgery::plan::PlannedShard;
 use crate::surgery::stop::interrupted;
-use crate::surgery::stream::{Streamed, block, stream};
 use crate::surgery::written::{Writing, WrittenShard, WrittenTensor};
 
 /// Writes new files with these paths, and syncs them. Called with all shards of a merge, and with each one of a repair.
@@ -184,176 +181,6 @@ impl Writers<'_> {
     }
 }
 
-/// Bytes between two requests to write back and to read ahead.
-const STREAMED: u64 = 8 << 20;
-
-/// Whether the `len` bytes from `at` on reach the end of a window of [`STREAMED`] bytes.
-fn ends_window(at: u64, len: u64) -> bool {
-    at / STREAMED != at.saturating_add(len) / STREAMED
-}
-
-/// The file that a job writes to.
-struct Out<'o> {
-    path: &'o Path,
-    file: &'o File,
-    /// Whether copies inside the kernel share blocks.
-    shares: bool,
-    progress: &'o (dyn Fn(u64) + Sync),
-}
-
-impl Out<'_> {
-    fn write(&self, bytes: &[u8], at: u64) -> Result<(), ApplyError> {
-        self.file.write_all_at(bytes, at).map_err(io_at(self.path, "writing"))?;
-        (self.progress)(bytes.len() as u64);
-        Ok(())
-    }
-
-    /// Copies bytes, inside the kernel if supported, otherwise through the buffer.
-    ///
-    /// The kernel shares whole blocks with the donor if the file system can do it and both offsets agree; a call for more than
-    /// whole blocks would copy all of them.
-    fn copy(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
-        let [head, whole, tail] = run.blocks();
-        self.copy_bytes(donor, head, buffer)?;
-        let rest = self.copy_in_kernel(donor, whole)?;
-        self.copy_bytes(donor, rest, buffer)?;
-        // Offsets that do not agree: the kernel copies without sharing.
-        let rest = if tail.len < BLOCK { tail } else { self.copy_in_kernel(donor, tail)? };
-        self.copy_bytes(donor, rest, buffer)
-    }
-
-    /// Copies inside the kernel, and returns the range that it did not copy because it is not supported.
-    fn copy_in_kernel<'r>(&self, donor: &DonorFile, run: Run<'r>) -> Result<Run<'r>, ApplyError> {
-        let mut rest = run;
-        while rest.len > 0 {
-            interrupted()?;
-            let next = if self.shares { rest } else { rest.split(STREAMED.saturating_sub(rest.at % STREAMED)).0 };
-            if !self.shares {
-                let later = rest.split(next.len).1.split(STREAMED).0;
-                read_ahead(donor.file(), later.from, later.len);
-            }
-            let copied = copy_in_kernel(donor.file(), next.from, self.file, next.at, next.len);
-            let Some(copied) = copied.map_err(io_at(self.path, "copying from a donor"))? else { break };
-            if !self.shares {
-                write_back(self.file, next.at, copied);
-            }
-            (self.progress)(copied);
-            rest = rest.split(copied).1;
-        }
-        Ok(rest)
-    }
-
-    /// Copies through the buffer.
-    fn copy_bytes(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
-        let mut rest = run;
-        while rest.len > 0 {
-            interrupted()?;
-            let block = block(buffer, rest.len);
-            donor.read_at(block, rest.from).map_err(|e| donor.read_error(e))?;
-            self.write(block, rest.at)?;
-            rest = rest.split(block.len() as u64).1;
-        }
-        Ok(())
-    }
-
-    /// Copies a tensor, and hashes it. What the file system can share is only read.
-    fn copy_hashed(
-        &self,
-        donor: &DonorFile,
-        run: Run<'_>,
-        place: &mut Place<'_>,
-        buffer: &mut Vec<u8>,
-    ) -> Result<(), ApplyError> {
-        let [head, whole, tail] = run.blocks();
-        let rest = if self.shares { self.copy_in_kernel(donor, whole)? } else { whole };
-        let (shared, rest) = whole.split(whole.len.saturating_sub(rest.len));
-        for (mut part, is_shared) in [(head, false), (shared, true), (rest, false), (tail, false)] {
-            while part.len > 0 {
-                interrupted()?;
-                if ends_window(part.from, buffer.len() as u64) {
-                    let (_, later) = part.split(STREAMED);
-                    read_ahead(donor.file(), later.from, later.len.min(STREAMED));
-                }
-                // Hashed and written while it is in the cache of the processor.
-                let block = block(buffer, part.len);
-                donor.read_at(block, part.from).map_err(|e| donor.read_error(e))?;
-                if is_shared {
-                    place.pass(block);
-                } else {
-                    place.write_all(block).map_err(io_at(self.path, "writing"))?;
-                }
-                part = part.split(block.len() as u64).1;
-            }
-        }
-        Ok(())
-    }
-
-    /// Makes a tensor at an offset of the file, and its digest.
-    fn tensor(
-        &self,
-        donor: &DonorFile,
-        tensor: &PlannedTensor,
-        at: u64,
-        hash: HashAlgorithm,
-        buffer: &mut Vec<u8>,
-    ) -> Result<WrittenTensor, ApplyError> {
-        let mut place = Place { out: self, at, left: tensor.len(), hasher: Hasher::new(hash) };
-        let streamed = if tensor.transform() == TensorTransform::Copy {
-            let from = &tensor.source.from;
-            let run = Run { path: &from.path, from: from.offset, at, len: tensor.len() };
-            self.copy_hashed(donor, run, &mut place, buffer)?;
-            Streamed::default()
-        } else {
-            stream(donor, tensor, hash, self.path, &mut place)?
-        };
-        if place.left > 0 {
-            let error = io::Error::other(format!("{} is {} bytes too short", tensor.name, place.left));
-            return Err(io_at(self.path, "writing")(error));
-        }
-        let Streamed { losses, source_digest } = streamed;
-        Ok(WrittenTensor { digest: place.hasher.finish_hex(), losses, source_digest })
-    }
-}
-
-/// The range of a file that belongs to one tensor, written from its start to its end.
-struct Place<'p> {
-    out: &'p Out<'p>,
-    /// Offset of the next byte in the file.
-    at: u64,
-    /// Number of bytes up to the end of the tensor.
-    left: u64,
-    hasher: Hasher,
-}
-
-impl Place<'_> {
-    /// Adds the next bytes, which the file already has.
-    fn pass(&mut self, bytes: &[u8]) {
-        self.hasher.update(bytes);
-        self.at = self.at.saturating_add(bytes.len() as u64);
-        self.left = self.left.saturating_sub(bytes.len() as u64);
-    }
-}
-
-impl Write for Place<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let len = bytes.len() as u64;
-        if len > self.left {
-            return Err(io::Error::other("a transform gave more bytes than its tensor has"));
-        }
-        self.out.file.write_all_at(bytes, self.at)?;
-        (self.out.progress)(len);
-        if ends_window(self.at, len) {
-            write_back(self.out.file, (self.at / STREAMED).saturating_mul(STREAMED), STREAMED);
-        }
-        self.pass(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
 #[cfg(test)]
 #[allow(clippy::disallowed_methods, clippy::arithmetic_side_effects, reason = "makes the files it reads")]
 mod tests {
@@ -362,7 +189,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::{TensorRef, TensorSource};
+    use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform};
 
     /// Shards with tensors of every transform, from one donor's file.
     fn plans(donor: &Path) -> Vec<PlannedShard> {
