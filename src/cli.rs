@@ -13,7 +13,6 @@ mod init;
 mod inspect;
 mod library;
 mod output;
-mod parallel;
 mod paths;
 mod progress;
 mod recipes;

@@ -71,7 +71,9 @@ pub use check::finding::{Accepted, Suppressed};
 pub use check::load::{LoadReport, Mismatch, Silent, SilentReason};
 pub use check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad};
 pub use check::{Edit, Finding, FixHint, Location, Safety, Severity};
-pub use checkpoint::{Dtype, Fault, FaultKind, Place, Progress, Shard, Tensor, TensorContents, TensorStats};
+pub use checkpoint::{
+    Dtype, Fault, FaultKind, HashAlgorithm, Place, Progress, Shard, Tensor, TensorContents, TensorStats,
+};
 pub use report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, Fixed, MergeReport, MergeStage, MergedFile, Report, Role, Seam,
     ShapedName, StageOutcome, Summary, ToolInfo, UncheckedPath, Verdict, Withdrawn,

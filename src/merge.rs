@@ -35,6 +35,7 @@ mod validate;
 mod verify;
 
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 pub use error::PipelineError;
 pub use file::ResolvedMergeFile;
@@ -52,7 +53,7 @@ use run::count;
 use crate::checkpoint::{Checkpoint, FileName};
 use crate::knowledge::Knowledge;
 use crate::report::model::{MergeStage, Role};
-use crate::surgery::written::WrittenShard;
+use crate::surgery::written::{Writing, WrittenShard};
 use crate::surgery::{Target, apply, check_target, claim_target};
 
 /// File name of the report in the merged directory.
@@ -61,7 +62,7 @@ pub(crate) const REPORT: FileName = FileName::constant("merge-report.md");
 /// File name of the model card in the merged directory.
 pub(crate) const CARD: FileName = FileName::constant("README.md");
 
-/// Runs a merge; `progress` receives the bytes written so far and their total.
+/// Runs a merge; `progress` receives the bytes written so far and their total, from several threads.
 ///
 /// A donor with errors, a seam mismatch and a planned checkpoint with errors are not failures of the run:
 /// [`MergeReport::stage`](crate::report::model::MergeReport::stage) names the stage at which it stopped.
@@ -71,7 +72,7 @@ pub(crate) const CARD: FileName = FileName::constant("README.md");
 pub fn run(
     request: &MergeRequest,
     knowledge: &Knowledge,
-    progress: &mut dyn FnMut(u64, u64),
+    progress: &(dyn Fn(u64, u64) + Sync),
 ) -> Result<MergeRun, PipelineError> {
     let mut run = MergeRun::new(request);
     let dirs: Vec<&Path> = request.donors.values().map(AsRef::as_ref).collect();
@@ -119,15 +120,15 @@ pub fn run(
         return Ok(run.end(MergeStage::DryRun));
     }
 
-    let digests = manifest::donor_digests(&donors, &draft.plan, request.hash)?;
+    let digests = manifest::donor_digests(&donors, &draft.plan, request.hash_donors)?;
     let total = draft.plan.len();
-    let mut done = 0_u64;
-    let recorded = Recorded { recipe, donors: &donors, digests: &digests, plan: &draft.plan };
+    let done = AtomicU64::new(0);
+    let recorded = Recorded { recipe, donors: &donors, digests: &digests, plan: &draft.plan, hash: request.hash };
     let sizes = record::sizes(&run, &recorded);
     let mut record = |written: &[WrittenShard]| record::files(&mut run, &recorded, written);
-    let leftover = apply(&draft.plan, &snapshots, &out, &sizes, &mut record, &mut |bytes| {
-        done = done.saturating_add(bytes);
-        progress(done, total);
+    let leftover = apply(&draft.plan, &snapshots, &out, &sizes, &mut record, Writing::new(request.hash), &|bytes| {
+        let before = done.fetch_add(bytes, Ordering::Relaxed);
+        progress(before.saturating_add(bytes), total);
     })?;
     run.note_files(cleared.as_deref(), leftover.as_ref());
 

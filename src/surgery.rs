@@ -1,5 +1,6 @@
 //! Plans and writes changes of checkpoints; the only stage that writes them.
 
+pub mod align;
 #[cfg(feature = "cli")]
 pub mod compare;
 pub mod convert;

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::{Error, knowledge};
+use crate::checkpoint::HashAlgorithm;
 use crate::merge::{MergeRequest, ResolvedMergeFile, run};
 use crate::report::Report;
 
@@ -22,7 +23,8 @@ use crate::report::Report;
 pub struct Merge {
     parts: ResolvedMergeFile,
     versions: Vec<String>,
-    hash: bool,
+    hash: HashAlgorithm,
+    hash_donors: bool,
 }
 
 impl Merge {
@@ -81,10 +83,17 @@ impl Merge {
         Ok(self)
     }
 
+    /// Sets the algorithm of the digests of tensors in the manifest of the result; BLAKE3 by default.
+    #[must_use]
+    pub const fn hash(mut self, algorithm: HashAlgorithm) -> Self {
+        self.hash = algorithm;
+        self
+    }
+
     /// Whether the manifest of the result has a hash of every byte of the donors, not only of documents and headers.
     #[must_use]
-    pub const fn hash(mut self, hash: bool) -> Self {
-        self.hash = hash;
+    pub const fn hash_donors(mut self, hash: bool) -> Self {
+        self.hash_donors = hash;
         self
     }
 
@@ -115,8 +124,8 @@ impl Merge {
         let knowledge = knowledge()?;
         let recipe = self.parts.find_recipe(knowledge)?;
         let ResolvedMergeFile { donors, options, out, .. } = self.parts.clone();
-        let request =
-            MergeRequest { recipe, donors, options, out, versions: self.versions.clone(), dry_run, hash: self.hash };
-        Ok(run(&request, knowledge, &mut |_, _| {})?.report())
+        let (versions, hash, hash_donors) = (self.versions.clone(), self.hash, self.hash_donors);
+        let request = MergeRequest { recipe, donors, options, versions, out, dry_run, hash, hash_donors };
+        Ok(run(&request, knowledge, &|_, _| {})?.report())
     }
 }

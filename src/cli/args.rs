@@ -7,6 +7,7 @@ use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
 use crate::check::Severity;
+use crate::checkpoint::HashAlgorithm;
 use crate::knowledge::loader::{parse_program, parse_requirement, parse_requirement_or_all};
 use crate::report::Format;
 
@@ -374,9 +375,12 @@ pub struct BuildMergedArgs {
     /// With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON
     #[arg(long, value_name = "FILE", requires = "dry_run")]
     pub plan: Option<PathBuf>,
+    /// Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result
+    #[arg(long, value_name = "ALGORITHM", default_value = "blake3")]
+    pub hash: HashName,
     /// Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers
     #[arg(long)]
-    pub hash: bool,
+    pub hash_donors: bool,
     /// Report formats and the exit code.
     #[command(flatten)]
     pub report: ReportArgs,
@@ -490,7 +494,8 @@ impl PartWriteArgs {
             versions: Vec::new(),
             dry_run: self.dry_run,
             plan: None,
-            hash: false,
+            hash: HashName::Blake3,
+            hash_donors: false,
             report: self.report,
         }
     }
@@ -514,6 +519,28 @@ impl SeverityName {
             Self::Info => Severity::Info,
             Self::Warning => Severity::Warning,
             Self::Error => Severity::Error,
+        }
+    }
+}
+
+/// Algorithm of digests as an argument.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum HashName {
+    /// No digests; the donors are needed to verify the result
+    None,
+    /// BLAKE3
+    Blake3,
+    /// SHA-256
+    Sha256,
+}
+
+impl HashName {
+    /// The algorithm of this name.
+    pub const fn algorithm(self) -> HashAlgorithm {
+        match self {
+            Self::None => HashAlgorithm::None,
+            Self::Blake3 => HashAlgorithm::Blake3,
+            Self::Sha256 => HashAlgorithm::Sha256,
         }
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::{Context, bail};
 
@@ -30,15 +31,14 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let request = request(args, &knowledge)?;
     signals::install()?;
     let terminal = std::io::stderr().is_terminal();
-    let mut last = 0;
-    let mut progress = |done: u64, total: u64| {
+    let last = AtomicU64::new(0);
+    let progress = |done: u64, total: u64| {
         let percent = done.saturating_mul(100).checked_div(total).unwrap_or(100);
-        if terminal && percent > last {
-            last = percent;
+        if terminal && percent > last.fetch_max(percent, Ordering::Relaxed) {
             output::progress(percent);
         }
     };
-    let run = merge::run(&request, &knowledge, &mut progress)?;
+    let run = merge::run(&request, &knowledge, &progress)?;
     run.notices.iter().for_each(|notice| output::note(&output::safe(notice)));
     let stage = run.record.stage;
     if let (Some(file), Some(plan)) = (&args.plan, &run.plan) {
@@ -110,5 +110,7 @@ fn request(args: &BuildMergedArgs, knowledge: &Knowledge) -> anyhow::Result<Merg
     options.extend(typed);
     let out = out.context("no output directory given; pass --out DIR")?;
     let versions = expanded(args.versions.clone());
-    Ok(MergeRequest { recipe, donors, options, versions, out, dry_run: args.dry_run, hash: args.hash })
+    let hash = args.hash.algorithm();
+    let (dry_run, hash_donors) = (args.dry_run, args.hash_donors);
+    Ok(MergeRequest { recipe, donors, options, versions, out, dry_run, hash, hash_donors })
 }

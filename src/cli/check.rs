@@ -7,14 +7,13 @@ use anyhow::bail;
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
-use super::parallel::in_order;
 use super::paths::{self, Targets};
 use super::progress::Meter;
 use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::platform::shown;
-use crate::checkpoint::{Checkpoint, ReadOptions};
+use crate::checkpoint::{Checkpoint, ReadOptions, parallel};
 use crate::knowledge::settings::Surroundings;
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
@@ -45,9 +44,12 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     }
     // Reading contents uses all cores for one checkpoint, and what is written to one may be read from another.
     let alone = args.deep || args.stats || args.hash || args.fix.writes();
-    let look = |dir: PathBuf| (shown(&dir), run.look(dir));
-    let looks: Box<dyn Iterator<Item = (String, anyhow::Result<Checked>)>> =
-        if alone { Box::new(dirs.into_iter().map(look)) } else { Box::new(in_order(dirs, look).into_iter()) };
+    let look = |dir: &PathBuf| (shown(dir), run.look(dir.clone()));
+    let looks: Box<dyn Iterator<Item = (String, anyhow::Result<Checked>)>> = if alone {
+        Box::new(dirs.iter().map(look))
+    } else {
+        Box::new(parallel::map(parallel::threads(), &dirs, || (), |(), dir| look(dir)).into_iter())
+    };
     let mut looked = Vec::new();
     for (path, look) in looks {
         let checked = match look {

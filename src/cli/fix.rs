@@ -3,6 +3,7 @@
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::bail;
 
@@ -100,18 +101,17 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         return Ok(None);
     }
     let total = repair.changes.iter().fold(0_u64, |n, change| n.saturating_add(change.new.len()));
-    let (mut done, mut last) = (0_u64, 0);
+    let (done, last) = (AtomicU64::new(0), AtomicU64::new(0));
     let terminal = std::io::stderr().is_terminal();
-    let mut progress = |bytes: u64| {
-        done = done.saturating_add(bytes);
+    let progress = |bytes: u64| {
+        let done = done.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes);
         let percent = done.saturating_mul(100).checked_div(total).unwrap_or(100);
-        if terminal && percent > last {
-            last = percent;
+        if terminal && percent > last.fetch_max(percent, Ordering::Relaxed) {
             output::progress(percent);
         }
     };
     if let Some(out) = &args.output {
-        let copy = overlay(repair, out, &mut progress).map_err(|error| name_interrupted(error, out))?;
+        let copy = overlay(repair, out, &progress).map_err(|error| name_interrupted(error, out))?;
         if let Some(cleared) = &copy.cleared {
             let cleared = output::safe(&cleared.display().to_string());
             output::note(&format!("{cleared}, which an ended run had left, was removed"));
@@ -119,7 +119,7 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         warn(copy.leftover.as_ref());
         return Ok(Some(out.clone()));
     }
-    warn(journal::write(repair, &mut progress).map_err(|error| name_interrupted(error, dir))?.as_ref());
+    warn(journal::write(repair, &progress).map_err(|error| name_interrupted(error, dir))?.as_ref());
     Ok(Some(dir.to_owned()))
 }
 

@@ -11,7 +11,7 @@ use super::hub::HubOrigin;
 use super::record::Recorded;
 use super::run::MergeRun;
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
-use crate::checkpoint::{Checkpoint, FileName, Shard, hex};
+use crate::checkpoint::{Checkpoint, FileName, HashAlgorithm, hex, parallel};
 use crate::knowledge::recipe::Recipe;
 use crate::knowledge::source;
 use crate::report::model::{ToolInfo, Training};
@@ -30,7 +30,7 @@ pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct Manifest {
-    /// Version of this contract: 2.
+    /// Version of this contract: 3.
     pub schema: u32,
     /// The program that made the merge.
     pub tool: ToolInfo,
@@ -42,8 +42,12 @@ pub(crate) struct Manifest {
     pub donors: BTreeMap<String, DonorDigests>,
     /// Tensors to train, and to freeze meanwhile.
     pub training: Training,
-    /// Every file of the result except this one, by file name.
+    /// Every file of the result except the shards and this one, by file name.
     pub files: BTreeMap<String, FileDigest>,
+    /// The shards of the result, by file name.
+    pub shards: BTreeMap<String, ShardDigest>,
+    /// Algorithm of the digests of tensors, here and in their sources.
+    pub hash: HashAlgorithm,
     /// Every tensor of the result, in the order of the shards.
     pub tensors: Vec<TensorOrigin>,
 }
@@ -84,6 +88,16 @@ pub(crate) struct DonorDigests {
     pub shards: BTreeMap<String, DonorShard>,
 }
 
+/// A shard of the result. Its header and its tensors are all of its bytes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct ShardDigest {
+    /// Its size.
+    pub bytes: u64,
+    /// SHA-256 of its header, including the length before it and the spaces after it.
+    pub header_sha256: String,
+}
+
 /// A shard of a donor.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
@@ -92,7 +106,7 @@ pub(crate) struct DonorShard {
     pub bytes: u64,
     /// SHA-256 of its header.
     pub header_sha256: String,
-    /// SHA-256 of the whole file; only with `--hash`.
+    /// SHA-256 of the whole file; only with `--hash-donors`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
 }
@@ -109,8 +123,9 @@ pub(crate) struct TensorOrigin {
     pub dtype: String,
     /// Shape in the result.
     pub shape: Vec<u64>,
-    /// SHA-256 of its bytes.
-    pub sha256: String,
+    /// Digest of its bytes; missing with the algorithm `none`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub digest: Option<String>,
     /// How it was made.
     pub transform: TensorTransform,
     /// Factor on all values.
@@ -135,26 +150,27 @@ pub(crate) struct DonorTensor {
     /// The rows that were used, if not all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub slice: Option<RowSlice>,
-    /// SHA-256 of this part; missing if they were copied, so that the digest is the one of the result, or not read.
+    /// Digest of this part; missing if it was copied, so that the digest is the one of the result, or not read, and with the
+    /// algorithm `none`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub sha256: Option<String>,
+    pub digest: Option<String>,
 }
 
 impl DonorTensor {
     /// The record of a source.
-    pub(super) fn new(from: &TensorRef, sha256: Option<String>) -> Self {
+    pub(super) fn new(from: &TensorRef, digest: Option<String>) -> Self {
         Self {
             donor: from.donor.clone(),
             name: from.name.clone(),
             dtype: from.dtype.name().to_owned(),
             shape: from.shape.clone(),
             slice: from.slice,
-            sha256,
+            digest,
         }
     }
 }
 
-/// The donors by content. With `all_bytes`, whole shards are hashed, otherwise only their headers.
+/// The donors by content. With `all_bytes`, whole shards are hashed, several at a time, otherwise only their headers.
 ///
 /// # Errors
 /// When a donor's file cannot be read, or a signal arrived.
@@ -165,10 +181,28 @@ pub(super) fn donor_digests(
 ) -> Result<BTreeMap<String, DonorDigests>, ApplyError> {
     let digests = |donor: &Donor| {
         let hub = HubOrigin::find(&donor.checkpoint);
+        let shards = donor.checkpoint.shards.iter().map(|(name, shard)| {
+            let digest = DonorShard { bytes: shard.file_len, header_sha256: shard.header_sha256.clone(), sha256: None };
+            (name.clone(), digest)
+        });
         let files = small_files(&donor.checkpoint, plan)?;
-        Ok((donor.role.clone(), DonorDigests { hub, files, shards: shards(&donor.checkpoint, all_bytes)? }))
+        Ok((donor.role.clone(), DonorDigests { hub, files, shards: shards.collect() }))
     };
-    donors.iter().map(digests).collect()
+    let mut digests: BTreeMap<String, DonorDigests> = donors.iter().map(digests).collect::<Result<_, _>>()?;
+    if all_bytes {
+        let shards = |donor: &Donor| {
+            let names = donor.checkpoint.shards.keys().cloned();
+            names.map(|name| (donor.role.clone(), donor.checkpoint.root.join(&name), name)).collect::<Vec<_>>()
+        };
+        let shards: Vec<_> = donors.iter().flat_map(shards).collect();
+        let hashes = parallel::map(parallel::threads(), &shards, || (), |(), (_, path, _)| sha256(path));
+        for ((role, _, name), hash) in shards.iter().zip(hashes) {
+            if let Some(shard) = digests.get_mut(role).and_then(|donor| donor.shards.get_mut(name)) {
+                shard.sha256 = Some(hash?);
+            }
+        }
+    }
+    Ok(digests)
 }
 
 /// The manifest of a merge whose shards are written; `described` are the other files of its record.
@@ -179,7 +213,9 @@ pub(super) fn manifest(
     described: &[&PlannedFile],
 ) -> Manifest {
     let others = merge.plan.files.iter().chain(described.iter().copied());
-    let shards = written.iter().map(|s| (s.name.to_string(), FileDigest { bytes: s.bytes, sha256: s.sha256.clone() }));
+    let shards = written
+        .iter()
+        .map(|s| (s.name.to_string(), ShardDigest { bytes: s.bytes, header_sha256: s.header_sha256.clone() }));
     let others = others.map(|f| (f.name.to_string(), FileDigest { bytes: f.bytes.len() as u64, sha256: f.sha256() }));
     let digests = written.iter().flat_map(|shard| &shard.tensors);
     let tensors = merge.plan.tensors().zip(digests).map(|((shard, t), written)| {
@@ -189,20 +225,22 @@ pub(super) fn manifest(
             shard: shard.name.to_string(),
             dtype: t.dtype.name().to_owned(),
             shape: t.shape.clone(),
-            sha256: written.sha256.clone(),
+            digest: written.digest.clone(),
             transform: t.transform(),
             scale: t.source.scale,
-            source: DonorTensor::new(from, written.source_sha256.clone()),
+            source: DonorTensor::new(from, written.source_digest.clone()),
         }
     });
     Manifest {
-        schema: 2,
+        schema: 3,
         tool: ToolInfo::this(),
         recipe: recipe_digest(merge.recipe),
         options: run.record.options.clone(),
         donors: merge.digests.clone(),
         training: run.record.training.clone().unwrap_or_default(),
-        files: shards.chain(others).collect(),
+        files: others.collect(),
+        shards: shards.collect(),
+        hash: merge.hash,
         tensors: tensors.collect(),
     }
 }
@@ -231,13 +269,4 @@ fn small_files(checkpoint: &Checkpoint, plan: &Plan) -> Result<BTreeMap<String, 
         }
     }
     Ok(files)
-}
-
-fn shards(checkpoint: &Checkpoint, all_bytes: bool) -> Result<BTreeMap<String, DonorShard>, ApplyError> {
-    let digest = |(name, shard): (&String, &Shard)| {
-        let sha256 = all_bytes.then(|| sha256(&checkpoint.root.join(name))).transpose()?;
-        let header_sha256 = shard.header_sha256.clone();
-        Ok((name.clone(), DonorShard { bytes: shard.file_len, header_sha256, sha256 }))
-    };
-    checkpoint.shards.iter().map(digest).collect()
 }

@@ -6,6 +6,7 @@ use super::context::Donor;
 use super::manifest::{self, DonorDigests};
 use super::run::{MergeRun, count};
 use super::{CARD, REPORT, card};
+use crate::checkpoint::HashAlgorithm;
 use crate::knowledge::recipe::Recipe;
 use crate::report::markdown;
 use crate::report::model::MergedFile;
@@ -18,6 +19,8 @@ pub(super) struct Recorded<'m> {
     pub(super) donors: &'m [Donor],
     pub(super) digests: &'m BTreeMap<String, DonorDigests>,
     pub(super) plan: &'m Plan,
+    /// Algorithm of the digests of the tensors.
+    pub(super) hash: HashAlgorithm,
 }
 
 /// Notes the stage `write`, and returns the files, of which the manifest has the digests of all others.
@@ -45,6 +48,6 @@ pub(super) fn files(run: &mut MergeRun, merge: &Recorded<'_>, written: &[Written
 
 /// Sizes in bytes that [`files`] will have; the figures of a lossy cast may make the report a few bytes longer.
 pub(super) fn sizes(run: &MergeRun, merge: &Recorded<'_>) -> Vec<u64> {
-    let files = files(&mut run.clone(), merge, &WrittenShard::expected(merge.plan));
+    let files = files(&mut run.clone(), merge, &WrittenShard::expected(merge.plan, merge.hash));
     files.iter().map(|file| file.bytes.len() as u64).collect()
 }

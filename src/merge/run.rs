@@ -10,7 +10,7 @@ use super::parts::DonorParts;
 use super::training::training;
 use super::usage::Usage;
 use crate::check::{Finding, Outcome, Severity, check_for};
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, HashAlgorithm};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::Report;
@@ -35,8 +35,10 @@ pub struct MergeRequest {
     pub out: PathBuf,
     /// Whether to stop before writing.
     pub dry_run: bool,
+    /// Algorithm of the digests of the tensors in the manifest.
+    pub hash: HashAlgorithm,
     /// Whether to hash all bytes of the donors for the manifest, not only documents and headers.
-    pub hash: bool,
+    pub hash_donors: bool,
 }
 
 /// A checkpoint that the merge has checked.

@@ -5,13 +5,13 @@ mod recorded;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use self::recorded::{Recorded, RecordedFile, RecordedTensor};
+use self::recorded::{Recorded, RecordedFile, RecordedShard, RecordedTensor};
 use super::manifest;
 use super::run::count;
-use crate::checkpoint::contents::digests::Digester;
-use crate::checkpoint::open::OpenError;
+use crate::checkpoint::contents::digests::{HashJob, hash};
+use crate::checkpoint::open::{OpenError, open_own};
 use crate::checkpoint::platform::shown;
-use crate::checkpoint::{Checkpoint, Dtype, EntryKind, Shard, Tensor};
+use crate::checkpoint::{Checkpoint, Dtype, EntryKind, HashAlgorithm, Shard, Tensor, parallel};
 use crate::knowledge::source::hint;
 use crate::report::verification::{DifferenceKind, Verification, VerifiedPart};
 use crate::surgery::ApplyError;
@@ -61,7 +61,7 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
     if recorded.schema >= 2 {
         parts.push(run.files()?);
     }
-    parts.push(run.tensors());
+    parts.push(run.tensors()?);
     for (role, dir) in donors {
         let donor = Checkpoint::open(dir)?;
         parts.push(run.donor_files(role, &donor)?);
@@ -75,9 +75,6 @@ struct Run<'v> {
     recorded: &'v Recorded,
     /// The tensors of the result by shard and name.
     present: BTreeMap<(&'v str, &'v str), (&'v Shard, &'v Tensor)>,
-    /// SHA-256 of tensors of the result by shard and name.
-    digests: BTreeMap<(&'v str, &'v str), String>,
-    digester: Digester,
     /// What could not be verified, one sentence each.
     unverified: Vec<String>,
 }
@@ -89,25 +86,26 @@ impl<'v> Run<'v> {
         let mut unverified = Vec::new();
         if recorded.schema < 2 {
             unverified.push("a manifest of version 1 has no digests of the files and tensors of the result".to_owned());
+        } else if recorded.hash() == HashAlgorithm::None {
+            unverified.push("the manifest has no digests of tensors: the merge ran with --hash none".to_owned());
         }
         if result.is_partial() {
             unverified.push("the checkpoint is too large to be read whole".to_owned());
         }
-        Self { result, recorded, present, digests: BTreeMap::new(), digester: Digester::new(), unverified }
+        Self { result, recorded, present, unverified }
     }
 
-    /// The files of the result against the digests of the manifest.
+    /// The files of the result against the digests of the manifest, and its shards against those of their headers.
     fn files(&mut self) -> Result<VerifiedPart, VerifyError> {
         let mut part = VerifiedPart::new("files");
         let (result, recorded) = (self.result, self.recorded);
-        for (name, file) in &recorded.files {
-            let shard = result.shards.get(name);
-            self.file(&result.root, name, file, shard, &mut part)?;
-        }
+        self.compare_files(&result.root, &recorded.files, &mut part)?;
+        let own = |name: &str| open_own(&result.root, name, u64::MAX).map(drop);
+        compare_headers(result, &recorded.shards, own, &mut part);
         for (name, entry) in &result.entries {
-            let is_known = recorded.files.contains_key(name) || **name == *manifest::NAME;
+            let is_recorded = recorded.files.contains_key(name) || recorded.shards.contains_key(name);
             // Hidden files belong to other tools, such as git.
-            if !is_known && !name.starts_with('.') {
+            if !is_recorded && **name != *manifest::NAME && !name.starts_with('.') {
                 let detail = (entry.kind != EntryKind::Regular).then(|| format!("a {}", entry.kind));
                 part.differ(name, DifferenceKind::Extra, detail);
             }
@@ -115,51 +113,46 @@ impl<'v> Run<'v> {
         Ok(part)
     }
 
-    /// One file against its digest; the digests of its tensors are kept if it is a shard of the result.
-    fn file(
+    /// Files of one checkpoint against their digests.
+    fn compare_files(
         &mut self,
         root: &Path,
-        name: &str,
-        recorded: &RecordedFile,
-        shard: Option<&'v Shard>,
+        files: &BTreeMap<String, RecordedFile>,
         part: &mut VerifiedPart,
     ) -> Result<(), VerifyError> {
-        let mut tensors: Vec<&Tensor> = shard.iter().flat_map(|s| &s.tensors).filter(|t| t.begin <= t.end).collect();
-        tensors.sort_by_key(|tensor| (tensor.begin, tensor.end));
-        let start = shard.map_or(0, |shard| shard.data_start);
-        let ranges: Vec<(u64, u64)> = tensors.iter().map(|t| (start.saturating_add(t.begin), t.len())).collect();
-        let found = match self.digester.file(root, name, &ranges) {
-            Ok(found) => found,
-            Err(OpenError::NotFound { .. }) => {
-                part.differ(name, DifferenceKind::Missing, None);
-                return Ok(());
+        let jobs: Vec<HashJob<'_>> =
+            files.keys().map(|name| HashJob { root, name, range: None, algorithm: HashAlgorithm::Sha256 }).collect();
+        for ((name, recorded), found) in files.iter().zip(hash(&jobs)) {
+            let found = match found {
+                Ok(found) => found,
+                Err(OpenError::NotFound { .. }) => {
+                    part.differ(name, DifferenceKind::Missing, None);
+                    continue;
+                }
+                Err(error @ OpenError::Io { .. }) => return Err(error.into()),
+                Err(error) => {
+                    part.differ(name, DifferenceKind::Differs, Some(error.to_string()));
+                    continue;
+                }
+            };
+            match (recorded.bytes, found.digest) {
+                (Some(bytes), _) if bytes != found.file_len => {
+                    let detail = format!("has {} bytes, {bytes} are recorded", found.file_len);
+                    part.differ(name, DifferenceKind::Differs, Some(detail));
+                }
+                (_, Some(digest)) if digest == recorded.sha256 => part.equal = part.equal.saturating_add(1),
+                (_, Some(_)) => part.differ(name, DifferenceKind::Differs, Some("has another SHA-256".to_owned())),
+                (_, None) => self.unverified.push(format!("{name} has holes, with more zeros than are hashed")),
             }
-            Err(error @ OpenError::Io { .. }) => return Err(error.into()),
-            Err(error) => {
-                part.differ(name, DifferenceKind::Differs, Some(error.to_string()));
-                return Ok(());
-            }
-        };
-        for (tensor, digest) in tensors.into_iter().zip(found.ranges) {
-            let key = shard.map_or("", |shard| shard.name.as_str());
-            self.digests.extend(digest.map(|digest| ((key, tensor.name.as_str()), digest)));
-        }
-        match (recorded.bytes, found.sha256) {
-            (Some(bytes), _) if bytes != found.bytes => {
-                let detail = format!("has {} bytes, {bytes} are recorded", found.bytes);
-                part.differ(name, DifferenceKind::Differs, Some(detail));
-            }
-            (_, Some(digest)) if digest == recorded.sha256 => part.equal = part.equal.saturating_add(1),
-            (_, Some(_)) => part.differ(name, DifferenceKind::Differs, Some("has another SHA-256".to_owned())),
-            (_, None) => self.unverified.push(format!("{name} has holes, with more zeros than are hashed")),
         }
         Ok(())
     }
 
     /// The tensors of the result against the manifest.
-    fn tensors(&mut self) -> VerifiedPart {
+    fn tensors(&mut self) -> Result<VerifiedPart, VerifyError> {
         let mut part = VerifiedPart::new("tensors");
         let mut unhashed = 0_usize;
+        let digests = self.digests()?;
         for tensor in &self.recorded.tensors {
             let key = (tensor.shard.as_str(), tensor.name.as_str());
             let Some((_, found)) = self.present.get(&key) else {
@@ -171,11 +164,11 @@ impl<'v> Run<'v> {
                 part.differ(&tensor.name, DifferenceKind::Differs, Some(detail));
                 continue;
             }
-            match (&tensor.sha256, self.digests.get(&key)) {
+            match (&tensor.digest, digests.get(&key)) {
                 (Some(recorded), Some(found)) if recorded == found => part.equal = part.equal.saturating_add(1),
                 (Some(_), Some(_)) => {
-                    let detail = Some(format!("has another SHA-256 in {}", tensor.shard));
-                    part.differ(&tensor.name, DifferenceKind::Differs, detail);
+                    let detail = format!("has another {} in {}", self.recorded.hash().title(), tensor.shard);
+                    part.differ(&tensor.name, DifferenceKind::Differs, Some(detail));
                 }
                 _ => unhashed = unhashed.saturating_add(1),
             }
@@ -189,29 +182,56 @@ impl<'v> Run<'v> {
         for (shard, name) in self.present.keys().filter(|key| !recorded.contains(*key)) {
             part.differ(name, DifferenceKind::Extra, Some(format!("in {shard}")));
         }
-        part
+        Ok(part)
+    }
+
+    /// The digests of the recorded tensors that the result has, by shard and name. One that overlaps another one has none:
+    /// tensors that overlap could name the same bytes any number of times.
+    fn digests(&self) -> Result<BTreeMap<(&'v str, &'v str), String>, VerifyError> {
+        let algorithm = self.recorded.hash();
+        let hashed = self.recorded.tensors.iter().filter(|tensor| tensor.digest.is_some());
+        let wanted: BTreeSet<(&str, &str)> = hashed.map(|t| (t.shard.as_str(), t.name.as_str())).collect();
+        let (mut keys, mut jobs) = (Vec::new(), Vec::new());
+        for shard in self.result.shards.values() {
+            let mut tensors: Vec<&Tensor> = shard.tensors.iter().filter(|t| t.begin <= t.end).collect();
+            tensors.sort_by_key(|tensor| (tensor.begin, tensor.end));
+            let mut end = 0_u64;
+            for tensor in tensors {
+                let key = (shard.name.as_str(), tensor.name.as_str());
+                if tensor.begin >= end && wanted.contains(&key) {
+                    end = tensor.end;
+                    keys.push(key);
+                    let range = Some((shard.data_start.saturating_add(tensor.begin), tensor.len()));
+                    jobs.push(HashJob { root: &self.result.root, name: key.0, range, algorithm });
+                }
+            }
+        }
+        let mut digests = BTreeMap::new();
+        for (key, found) in keys.into_iter().zip(hash(&jobs)) {
+            match found {
+                Ok(found) => digests.extend(found.digest.map(|digest| (key, digest))),
+                Err(error @ OpenError::Io { .. }) => return Err(error.into()),
+                // Reported with the files, or as unverified.
+                Err(_) => {}
+            }
+        }
+        Ok(digests)
     }
 
     /// The files of a donor against the manifest.
     fn donor_files(&mut self, role: &str, donor: &Checkpoint) -> Result<VerifiedPart, VerifyError> {
         let mut part = VerifiedPart::new(&format!("files of donor {role}"));
         let Some(recorded) = self.recorded.donors.get(role) else { return Ok(part) };
-        for (name, file) in &recorded.files {
-            self.file(&donor.root, name, file, None, &mut part)?;
-        }
-        for (name, shard) in &recorded.shards {
-            match (donor.shards.get(name), &shard.sha256) {
-                (None, _) => part.differ(name, DifferenceKind::Missing, None),
-                (Some(found), _) if found.file_len != shard.bytes || found.header_sha256 != shard.header_sha256 => {
-                    part.differ(name, DifferenceKind::Differs, Some("has another size or header".to_owned()));
-                }
-                (Some(_), None) => part.equal = part.equal.saturating_add(1),
-                (Some(_), Some(sha256)) => {
-                    let file = RecordedFile { bytes: Some(shard.bytes), sha256: sha256.clone() };
-                    self.file(&donor.root, name, &file, None, &mut part)?;
-                }
-            }
-        }
+        self.compare_files(&donor.root, &recorded.files, &mut part)?;
+        let (hashed, others): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            recorded.shards.clone().into_iter().partition(|(name, shard)| {
+                shard.sha256.is_some() && donor.shards.get(name).is_some_and(|found| has_header(found, shard))
+            });
+        compare_headers(donor, &others, |_| Ok(()), &mut part);
+        let whole = hashed
+            .into_iter()
+            .filter_map(|(name, shard)| Some((name, RecordedFile { bytes: Some(shard.bytes), sha256: shard.sha256? })));
+        self.compare_files(&donor.root, &whole.collect(), &mut part)?;
         Ok(part)
     }
 
@@ -220,6 +240,7 @@ impl<'v> Run<'v> {
         let mut part = VerifiedPart::new(&format!("tensors recomputed from donor {role}"));
         let there: BTreeMap<&str, (&Shard, &Tensor)> =
             donor.tensors().map(|(s, t)| (t.name.as_str(), (s, t))).collect();
+        let mut work = Vec::new();
         for tensor in self.recorded.tensors.iter().filter(|tensor| tensor.source.donor == role) {
             let present = self.present.get(&(tensor.shard.as_str(), tensor.name.as_str()));
             // Reported with the tensors of the result.
@@ -228,18 +249,30 @@ impl<'v> Run<'v> {
             };
             let from = there.get(tensor.source.name.as_str());
             let planned = from.and_then(|(shard, from)| planned(tensor, found, role, &donor.root, shard, from));
-            let Some(planned) = planned.filter(|planned| shard.is_whole() && planned.is_possible()) else {
+            let planned = planned.filter(|planned| shard.is_whole() && planned.is_possible());
+            let at = shard.data_start.saturating_add(found.begin);
+            work.push((tensor, planned, self.result.root.join(&shard.name), at));
+        }
+        let hash = self.recorded.hash();
+        let compared = parallel::map(
+            parallel::threads(),
+            &work,
+            || (),
+            |(), (_, planned, result, at)| {
+                planned.as_ref().map(|planned| compare(planned, result, *at, hash)).transpose()
+            },
+        );
+        for ((tensor, planned, ..), compared) in work.iter().zip(compared) {
+            let (Some(planned), Some(compared)) = (planned, compared?) else {
                 let detail = format!("the donor has no {} that it could be made from", tensor.source.name);
                 part.differ(&tensor.name, DifferenceKind::Missing, Some(detail));
                 continue;
             };
-            let at = shard.data_start.saturating_add(found.begin);
-            let compared = compare(&planned, &self.result.root.join(&shard.name), at)?;
             // The digest of a copy is that of its source.
-            let copied = tensor.sha256.as_ref().filter(|_| tensor.transform == TensorTransform::Copy);
-            let source = tensor.source.sha256.as_ref().or(copied);
+            let copied = tensor.digest.as_ref().filter(|_| tensor.transform == TensorTransform::Copy);
+            let source = tensor.source.digest.as_ref().or(copied);
             let is_other_donor =
-                source.is_some_and(|s| compared.source_sha256.as_ref().is_some_and(|found| s != found));
+                source.is_some_and(|s| compared.source_digest.as_ref().is_some_and(|found| s != found));
             match compared.difference {
                 None => part.equal = part.equal.saturating_add(1),
                 Some(place) => {
@@ -250,6 +283,30 @@ impl<'v> Run<'v> {
             }
         }
         Ok(part)
+    }
+}
+
+/// Whether a shard has the recorded size and header.
+fn has_header(found: &Shard, recorded: &RecordedShard) -> bool {
+    found.file_len == recorded.bytes && found.header_sha256 == recorded.header_sha256
+}
+
+/// The shards of a checkpoint against recorded sizes and headers; `refused` says why one must not be read.
+fn compare_headers(
+    checkpoint: &Checkpoint,
+    shards: &BTreeMap<String, RecordedShard>,
+    refused: impl Fn(&str) -> Result<(), OpenError>,
+    part: &mut VerifiedPart,
+) {
+    for (name, recorded) in shards {
+        match (checkpoint.shards.get(name), refused(name)) {
+            (None, _) | (_, Err(OpenError::NotFound { .. })) => part.differ(name, DifferenceKind::Missing, None),
+            (_, Err(error)) => part.differ(name, DifferenceKind::Differs, Some(error.to_string())),
+            (Some(found), Ok(())) if has_header(found, recorded) => part.equal = part.equal.saturating_add(1),
+            (Some(_), Ok(())) => {
+                part.differ(name, DifferenceKind::Differs, Some("has another size or header".to_owned()));
+            }
+        }
     }
 }
 

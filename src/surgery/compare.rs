@@ -7,27 +7,29 @@ use super::donor::DonorFile;
 use super::error::ApplyError;
 use super::plan::PlannedTensor;
 use super::stream::{block, stream};
+use crate::checkpoint::HashAlgorithm;
 
 /// A recomputed tensor, compared with the one in a result.
 #[derive(Debug)]
 pub struct Compared {
     /// Offset of the first byte that differs, from the start of the tensor; `None` when all are equal.
     pub difference: Option<u64>,
-    /// SHA-256 of the donor's part; `None` if none of its bytes were read.
-    pub source_sha256: Option<String>,
+    /// Digest of the donor's part; `None` if none of its bytes were read, or without an algorithm.
+    pub source_digest: Option<String>,
 }
 
-/// Recomputes `tensor` from its donor, and compares it with the bytes from `at` on in the file `result`.
+/// Recomputes `tensor` from its donor, and compares it with the bytes from `at` on in the file `result`; `hash` is the
+/// algorithm of the donor's digest.
 ///
 /// # Errors
 /// [`ApplyError`] when a file cannot be opened or read.
-pub fn compare(tensor: &PlannedTensor, result: &Path, at: u64) -> Result<Compared, ApplyError> {
+pub fn compare(tensor: &PlannedTensor, result: &Path, at: u64, hash: HashAlgorithm) -> Result<Compared, ApplyError> {
     let donor = DonorFile::open(&tensor.source.from.path)?;
     let mut out =
         Comparison { file: DonorFile::open(result)?, start: at, len: 0, difference: None, buffer: Vec::new() };
-    let streamed = stream(&donor, tensor, result, &mut out)?;
+    let streamed = stream(&donor, tensor, hash, result, &mut out)?;
     let difference = out.difference.or_else(|| (out.len != tensor.len()).then_some(out.len));
-    Ok(Compared { difference, source_sha256: streamed.source_sha256 })
+    Ok(Compared { difference, source_digest: streamed.source_digest })
 }
 
 /// Compares what is written to it with a range of a file.

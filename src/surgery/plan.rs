@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::align::{self, BLOCK};
 use super::values::can_compute;
 use crate::checkpoint::{Dtype, FileName, Shard, Tensor, byte_len};
 
@@ -41,6 +42,9 @@ pub struct PlannedShard {
     pub tensors: Vec<PlannedTensor>,
     /// `__metadata__`; transformers refuses a shard without `format` in it.
     pub metadata: BTreeMap<String, String>,
+    /// What the offset of the data leaves when it is divided by [`BLOCK`], a multiple of eight; see [`align::residue`]. `None`
+    /// if it does not matter.
+    pub residue: Option<u64>,
 }
 
 /// The metadata that `save_pretrained` writes.
@@ -243,7 +247,8 @@ impl PlannedShard {
         (self.header().len() as u64).saturating_add(self.data_len())
     }
 
-    /// The header: length prefix and JSON, padded with spaces so that the data starts on a multiple of eight.
+    /// The header: length prefix and JSON, padded with spaces so that the data starts on a multiple of eight, and leaves the
+    /// planned residue.
     ///
     /// Keys are `__metadata__`, then the tensors in file order: equal plans give equal bytes.
     #[must_use]
@@ -270,9 +275,12 @@ impl PlannedShard {
             at = end;
         }
         json.push('}');
-        while !json.len().is_multiple_of(8) {
-            json.push(' ');
-        }
+        // The length prefix has eight bytes too.
+        let end = (json.len() as u64).saturating_add(8).next_multiple_of(8);
+        let end = self.residue.map_or(end, |residue| {
+            end.saturating_add(residue.saturating_add(BLOCK).saturating_sub(end % BLOCK) % BLOCK)
+        });
+        json.extend((json.len() as u64..end.saturating_sub(8)).map(|_| ' '));
         let mut bytes = (json.len() as u64).to_le_bytes().to_vec();
         bytes.extend_from_slice(json.as_bytes());
         bytes
@@ -326,8 +334,8 @@ impl Plan {
 /// Distributes tensors over shards of at most `limit` bytes each, in order, and names the shards.
 ///
 /// A tensor starts a new shard when it would exceed the limit of the current one; a single shard is named
-/// `model.safetensors`. Within a shard, wider types come first, then names in order, as the safetensors crate writes
-/// them. Source: `split_state_dict_into_shards_factory` in `huggingface_hub`.
+/// `model.safetensors`. Within a shard, wider types come first, as the safetensors crate writes them; tensors of one type
+/// have the order of the donors' files, so that copies are long. Source: `split_state_dict_into_shards_factory` in `huggingface_hub`.
 #[must_use]
 pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard> {
     let mut groups: Vec<Vec<PlannedTensor>> = Vec::new();
@@ -350,8 +358,9 @@ pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard>
         .into_iter()
         .enumerate()
         .map(|(i, mut tensors)| {
-            tensors.sort_by(|a, b| b.dtype.cmp(&a.dtype).then_with(|| a.name.cmp(&b.name)));
-            PlannedShard { name: FileName::shard(i.saturating_add(1), count), tensors, metadata: format_pt() }
+            tensors.sort_by(align::file_order);
+            let residue = align::residue(&tensors);
+            PlannedShard { name: FileName::shard(i.saturating_add(1), count), tensors, metadata: format_pt(), residue }
         })
         .collect()
 }

@@ -3,15 +3,14 @@
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use sha2::{Digest as _, Sha256};
-
 use super::convert::CastLosses;
 use super::donor::DonorFile;
 use super::error::{ApplyError, io_at};
 use super::plan::{PlannedTensor, TensorRef};
 use super::stop::interrupted;
 use super::transform;
-use crate::checkpoint::hex;
+use crate::checkpoint::HashAlgorithm;
+use crate::checkpoint::digest::Hasher;
 
 /// Bytes held in memory between the donor and the writer.
 const BLOCK: usize = 256 * 1024;
@@ -21,13 +20,13 @@ const BLOCK: usize = 256 * 1024;
 pub(super) struct Streamed {
     /// Values of the donor that scaling and casting could not keep.
     pub(super) losses: CastLosses,
-    /// SHA-256 of the donor's tensor; `None` if none of its bytes were read.
-    pub(super) source_sha256: Option<String>,
+    /// Digest of the donor's tensor; `None` if none of its bytes were read, or without an algorithm.
+    pub(super) source_digest: Option<String>,
 }
 
 /// Writes the bytes of a planned tensor into `out`: a file of the result, or the comparison of a verification.
 ///
-/// `donor` is the open file of the tensor's source; `path` names `out` in errors of writing.
+/// `donor` is the open file of the tensor's source, which is hashed by `hash`; `path` names `out` in errors of writing.
 ///
 /// # Errors
 /// [`ApplyError::Changed`] when the donor is shorter than the source, [`ApplyError::Io`] for other errors of reading and
@@ -35,12 +34,14 @@ pub(super) struct Streamed {
 pub(super) fn stream(
     donor: &DonorFile,
     tensor: &PlannedTensor,
+    hash: HashAlgorithm,
     path: &Path,
     out: &mut dyn Write,
 ) -> Result<Streamed, ApplyError> {
     let from = &tensor.source.from;
     let mut failed_read = None;
-    let mut digest = SourceDigest::default();
+    let mut digest =
+        SourceDigest { hash: (hash != HashAlgorithm::None).then(|| Hasher::new(hash)), len: 0, is_read: false };
     let result = {
         let mut writer = BufWriter::with_capacity(BLOCK, out);
         let mut read = |at: u64, buf: &mut [u8]| {
@@ -63,13 +64,13 @@ pub(super) fn stream(
         return Err(donor.read_error(e));
     }
     let losses = result.map_err(io_at(path, "writing"))?;
-    Ok(Streamed { losses, source_sha256: digest.finish(donor, from)? })
+    Ok(Streamed { losses, source_digest: digest.finish(donor, from)? })
 }
 
 /// The digest of a donor's tensor that a transform reads, usually once and in order.
-#[derive(Default)]
 struct SourceDigest {
-    hash: Sha256,
+    /// `None` without an algorithm.
+    hash: Option<Hasher>,
     /// Number of bytes in `hash`, from the start of the tensor.
     len: u64,
     is_read: bool,
@@ -79,15 +80,15 @@ impl SourceDigest {
     /// Adds bytes read at an offset in the tensor, unless they are already included.
     fn add(&mut self, at: u64, bytes: &[u8]) {
         self.is_read = true;
-        if at == self.len {
-            self.hash.update(bytes);
+        if let Some(hash) = self.hash.as_mut().filter(|_| at == self.len) {
+            hash.update(bytes);
             self.len = self.len.saturating_add(bytes.len() as u64);
         }
     }
 
     /// The digest, after the bytes that the transform left out are read.
     fn finish(mut self, donor: &DonorFile, from: &TensorRef) -> Result<Option<String>, ApplyError> {
-        if !self.is_read {
+        if !self.is_read || self.hash.is_none() {
             return Ok(None);
         }
         let mut buffer = Vec::new();
@@ -97,7 +98,7 @@ impl SourceDigest {
             donor.read_at(block, from.offset.saturating_add(self.len)).map_err(|e| donor.read_error(e))?;
             self.add(self.len, block);
         }
-        Ok(Some(hex(&self.hash.finalize())))
+        Ok(self.hash.and_then(Hasher::finish_hex))
     }
 }
 

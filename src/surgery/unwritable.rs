@@ -10,7 +10,7 @@ use super::leftover::Leftover;
 use super::outcome::{RepairedCopy, Target};
 use super::plan::{Plan, PlannedFile};
 use super::repair::Repair;
-use super::written::WrittenShard;
+use super::written::{Writing, WrittenShard};
 
 /// Whether this system can write checkpoints. The command line refuses commands that write them where it cannot.
 pub const CAN_WRITE: bool = false;
@@ -23,7 +23,8 @@ pub fn apply(
     _: &Path,
     _: &[u64],
     _: &mut dyn FnMut(&[WrittenShard]) -> Vec<PlannedFile>,
-    _: &mut dyn FnMut(u64),
+    _: Writing,
+    _: &(dyn Fn(u64) + Sync),
 ) -> Result<Option<Leftover>, ApplyError> {
     Err(ApplyError::NeedsUnix)
 }
@@ -48,7 +49,7 @@ pub fn free_space(_: &Path) -> Result<Option<u64>, ApplyError> {
 
 /// # Errors
 /// Always.
-pub fn overlay(_: &Repair, _: &Path, _: &mut dyn FnMut(u64)) -> Result<RepairedCopy, RepairError> {
+pub fn overlay(_: &Repair, _: &Path, _: &(dyn Fn(u64) + Sync)) -> Result<RepairedCopy, RepairError> {
     Err(ApplyError::NeedsUnix.into())
 }
 
@@ -73,7 +74,7 @@ pub mod journal {
 
     /// # Errors
     /// Always.
-    pub fn write(_: &Repair, _: &mut dyn FnMut(u64)) -> Result<Option<Leftover>, RepairError> {
+    pub fn write(_: &Repair, _: &(dyn Fn(u64) + Sync)) -> Result<Option<Leftover>, RepairError> {
         Err(ApplyError::NeedsUnix.into())
     }
 }

@@ -2,9 +2,12 @@
 
 mod apply;
 mod changes;
+mod jobs;
 pub mod journal;
 mod lock;
+mod out;
 mod overlay;
+mod shards;
 mod staging;
 mod system;
 mod target;

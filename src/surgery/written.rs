@@ -1,11 +1,27 @@
-//! Digests of written shards and tensors, computed while they are written.
+//! What the writers report of the shards and tensors that they wrote.
 
 use sha2::{Digest as _, Sha256};
 
 use super::convert::CastLosses;
 use super::plan::{Plan, PlannedFile, PlannedTensor, TensorTransform};
-use super::stream::Streamed;
-use crate::checkpoint::{FileName, hex};
+use crate::checkpoint::{FileName, HashAlgorithm, hex, parallel};
+
+/// How [`super::apply()`] writes a plan. The bytes of the shards do not depend on it.
+#[derive(Debug, Clone, Copy)]
+pub struct Writing {
+    /// Algorithm of the digests of the tensors.
+    pub hash: HashAlgorithm,
+    /// Number of threads that write shards.
+    pub threads: usize,
+}
+
+impl Writing {
+    /// Digests by this algorithm, on all processors.
+    #[must_use]
+    pub fn new(hash: HashAlgorithm) -> Self {
+        Self { hash, threads: parallel::threads() }
+    }
+}
 
 /// A shard that [`super::apply()`] wrote.
 #[derive(Debug, Clone)]
@@ -14,21 +30,22 @@ pub struct WrittenShard {
     pub name: FileName,
     /// Its size in bytes.
     pub bytes: u64,
-    /// SHA-256 of the whole file in hexadecimal.
-    pub sha256: String,
+    /// SHA-256 of its header, length included, in hexadecimal. Together with the digests of the tensors, it covers every
+    /// byte of the file.
+    pub header_sha256: String,
     /// Its tensors, in the order of [`super::plan::PlannedShard::tensors`].
     pub tensors: Vec<WrittenTensor>,
 }
 
-/// Facts about one tensor that are known only after it was written.
-#[derive(Debug, Clone)]
+/// Facts about one tensor that are known only after it was written; the default is that of a byte copy without a digest.
+#[derive(Debug, Clone, Default)]
 pub struct WrittenTensor {
-    /// SHA-256 of its bytes in hexadecimal.
-    pub sha256: String,
+    /// Digest of its bytes in hexadecimal; `None` with [`HashAlgorithm::None`].
+    pub digest: Option<String>,
     /// Values of the donor that scaling and casting could not keep.
     pub losses: CastLosses,
-    /// SHA-256 of the donor's tensor, if it was read and is not equal by the transform.
-    pub source_sha256: Option<String>,
+    /// Digest of the donor's tensor, if it was read and is not equal by the transform.
+    pub source_digest: Option<String>,
 }
 
 impl WrittenShard {
@@ -36,53 +53,22 @@ impl WrittenShard {
     ///
     /// A merge makes its manifest from them to know its size before it writes.
     #[must_use]
-    pub fn expected(plan: &Plan) -> Vec<Self> {
+    pub fn expected(plan: &Plan, hash: HashAlgorithm) -> Vec<Self> {
         let zeros = || "0".repeat(64);
+        let digest = || (hash != HashAlgorithm::None).then(zeros);
         let tensor = |tensor: &PlannedTensor| {
             let is_read = tensor.transform() != TensorTransform::Copy && tensor.source.fit != TensorTransform::Reinit;
-            WrittenTensor { sha256: zeros(), losses: CastLosses::default(), source_sha256: is_read.then(zeros) }
+            let source_digest = digest().filter(|_| is_read);
+            WrittenTensor { digest: digest(), losses: CastLosses::default(), source_digest }
         };
         let shards = plan.shards.iter();
         let expected = shards.map(|shard| Self {
             name: shard.name.clone(),
             bytes: shard.file_len(),
-            sha256: zeros(),
+            header_sha256: zeros(),
             tensors: shard.tensors.iter().map(tensor).collect(),
         });
         expected.collect()
-    }
-}
-
-/// Digests of the shard that is being written.
-#[derive(Default)]
-pub(super) struct ShardDigests {
-    file: Sha256,
-    tensor: Sha256,
-    tensors: Vec<WrittenTensor>,
-}
-
-impl ShardDigests {
-    /// Adds bytes of the header.
-    pub(super) fn header(&mut self, bytes: &[u8]) {
-        self.file.update(bytes);
-    }
-
-    /// Adds bytes of the current tensor.
-    pub(super) fn update(&mut self, bytes: &[u8]) {
-        self.file.update(bytes);
-        self.tensor.update(bytes);
-    }
-
-    /// Ends the current tensor.
-    pub(super) fn end_tensor(&mut self, streamed: Streamed) {
-        let Streamed { losses, source_sha256 } = streamed;
-        let sha256 = hex(&self.tensor.finalize_reset());
-        self.tensors.push(WrittenTensor { sha256, losses, source_sha256 });
-    }
-
-    /// The record of the shard.
-    pub(super) fn finish(self, name: &FileName, bytes: u64) -> WrittenShard {
-        WrittenShard { name: name.clone(), bytes, sha256: hex(&self.file.finalize()), tensors: self.tensors }
     }
 }
 

@@ -72,7 +72,7 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
         };
     }
     let fixed = codes(repair.fixed.iter().map(|f| &f.code));
-    match ckpt_doctor::surgery::journal::write(&repair, &mut |_| {}) {
+    match ckpt_doctor::surgery::journal::write(&repair, &|_| {}) {
         // FIFOs and links in a fixture are not repaired.
         Err(RepairError::Linked { .. }) => return Ok(Some(format!("{fixed} (linked)"))),
         other => assert!(other.map_err(|e| format!("writing: {e}"))?.is_none(), "every temporary file is removed"),

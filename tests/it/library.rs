@@ -38,7 +38,8 @@ fn a_header_is_read_with_its_faults() {
 fn a_merge_is_planned_then_run() {
     let place = tempfile::tempdir().expect("a directory");
     let out = place.path().join("merged");
-    let merge = Merge::from_file(project().join("fixtures/merge.json5")).expect("a merge file").output(&out).hash(true);
+    let merge =
+        Merge::from_file(project().join("fixtures/merge.json5")).expect("a merge file").output(&out).hash_donors(true);
     let stage = |report: &ckpt_doctor::Report| report.merge.as_ref().and_then(|m| m.stage);
     assert_eq!(stage(&merge.plan().expect("a plan")), Some(MergeStage::DryRun));
     assert!(!out.exists());

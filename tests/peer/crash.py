@@ -42,7 +42,8 @@ MESSAGES = {
 HARMLESS = ("EINTR", "EXDEV", "EINVAL", "EOPNOTSUPP", "ENODEV", "ENOMEM", "ENOLCK")
 ROOM = ("ENOSPC", "EDQUOT", "EIO")
 FAULTS = {
-    **dict.fromkeys(("write", "pwrite64", "sendfile", "ftruncate", "fallocate"), (*ROOM, "EFBIG", "EINTR")),
+    **dict.fromkeys(("write", "pwrite64", "sendfile", "ftruncate"), (*ROOM, "EFBIG", "EINTR")),
+    "fallocate": (*ROOM, "EFBIG", "EINTR", "EOPNOTSUPP"),
     "copy_file_range": (*ROOM, "EFBIG", "EINTR", "EXDEV", "EINVAL", "EOPNOTSUPP"),
     **dict.fromkeys(("fsync", "fdatasync", "close", "mkdir", "link", "linkat", "symlink", "symlinkat"), (*ROOM, "EINTR")),
     **dict.fromkeys(("rename", "renameat"), (*ROOM, "EROFS", "EINTR")),
@@ -53,7 +54,7 @@ FAULTS = {
     "openat": ("EIO", "EMFILE", "EINTR"),
     "creating": (*ROOM, "EMFILE", "EINTR"),
 }  # fmt: skip
-WRITES = ("write", "pwrite64", "copy_file_range", "sendfile", "creating", "mkdir", "fsync", "fdatasync", "rename")
+WRITES = ("write", "pwrite64", "fallocate", "copy_file_range", "sendfile", "creating", "mkdir", "fsync", "fdatasync", "rename")
 REMOVES = ("unlink", "unlinkat", "rmdir")
 CLOSES = ("EDQUOT", "ENOMEM", "EROFS", "EIO")
 
@@ -326,7 +327,7 @@ def main():
     parser.add_argument("--job", action="append", choices=[job.name for job in JOBS], help="only these kinds of run")
     parser.add_argument("part", nargs="*", metavar="PART", help=", ".join(PARTS))
     args = parser.parse_args()
-    for tool in ("strace", "prlimit", "unshare"):
+    for tool in ("strace", "prlimit", "taskset", "unshare"):
         if not shutil.which(tool):
             sys.exit(f"{tool} is missing: install strace and util-linux")
     place = Path(tempfile.mkdtemp(prefix="crash-")).resolve()

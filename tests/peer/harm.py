@@ -193,7 +193,7 @@ class Job:
     def strace(self, *options, argv=None, **more):
         """Runs under strace; the options select the log."""
         log = self.place / "strace.log"
-        command = ["strace", "-f", "-qq", "-o", str(log), *options, "--", *(argv or self.argv())]
+        command = [*one_thread(), "strace", "-f", "-qq", "-o", str(log), *options, "--", *(argv or self.argv())]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **more)
         self.command = " ".join(command)
         outcome = Outcome(done.returncode, done.stdout, log.read_text(errors="replace"))
@@ -289,6 +289,11 @@ def describe(now, complete):
     return f"missing {missing[:5]}, extra {extra[:5]}, different {other[:5]}"
 
 
+def one_thread():
+    """The start of a command that may use one processor: the program then writes with one thread, whose calls strace counts."""
+    return ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0)))]
+
+
 def stopped_at(job, call, argv=None):
     """Starts a run that stops at a call, and waits for the stop. Returns the process of strace and the id of the run.
 
@@ -296,7 +301,7 @@ def stopped_at(job, call, argv=None):
     """
     log = job.place / "stop.log"
     log.unlink(missing_ok=True)
-    command = ["strace", "-f", "-qq", "-o", str(log), "-e", f"trace={call.name}",
+    command = [*one_thread(), "strace", "-f", "-qq", "-o", str(log), "-e", f"trace={call.name}",
                "-e", f"inject={call.name}:signal=STOP:when={call.nth}", "--", *(argv or job.argv())]  # fmt: skip
     job.command = " ".join(command)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -99,9 +100,13 @@ class Pressure:
     def short_writes(self, job):
         """A limit in the middle of a write makes it short. It is lifted while the program is stopped, and the write continues."""
         calls, first, last = job.calls()
-        ends, cut = {}, []
+        ends, cut, reserved = {}, [], set()
         for call in calls[first : last + 1]:
-            if call.name in ("write", "copy_file_range") and not call.printed:
+            if call.name == "fallocate":
+                # The limit counts here; what is written into the reserved space is within it.
+                ends[call.paths[-1]] = int(re.search(r", (\d+)\) ", call.text)[1])
+                reserved.add(call.paths[-1])
+            elif call.name in ("write", "copy_file_range") and not call.printed and call.paths[-1] not in reserved:
                 path = call.paths[-1]
                 begin = ends.get(path, 0)
                 ends[path] = begin + call.result

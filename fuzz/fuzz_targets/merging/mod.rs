@@ -66,7 +66,7 @@ fn names(folder: &Path) -> BTreeSet<String> {
 pub fn hold(request: &MergeRequest) {
     let above = PLACE.parent().expect("a folder above");
     let before = (names(above), names(&PLACE));
-    let run = run(request, &KNOWLEDGE, &mut |_, _| {});
+    let run = run(request, &KNOWLEDGE, &|_, _| {});
     let written = run.as_ref().is_ok_and(|run| run.record.stage == Some(MergeStage::Written));
     if let Ok(run) = &run {
         drop((run.report().to_json(), run.report().to_markdown()));

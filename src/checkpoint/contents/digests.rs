@@ -1,64 +1,73 @@
-//! The digest of a file and of ranges in it, in one pass.
+//! Digests of files and of ranges in them, on several threads.
 
 use std::path::Path;
 
-use sha2::Sha256;
-
-use super::pieces::{Hash, each_piece};
+use super::pieces::{Hash, each_piece, holes};
 use super::{CHUNK, HASHED_ZEROS};
+use crate::checkpoint::digest::Hasher;
 use crate::checkpoint::open::{OpenError, open_own};
+use crate::checkpoint::{HashAlgorithm, parallel};
 
-/// SHA-256 digests of a file of a checkpoint, in hexadecimal; `None` for what has more zeros in holes than are hashed.
-pub(crate) struct FileDigests {
-    /// Its size.
-    pub(crate) bytes: u64,
-    /// Digest of the whole file.
-    pub(crate) sha256: Option<String>,
-    /// Digests of the ranges; `None` also for a range that overlaps the one before it or ends behind the file.
-    pub(crate) ranges: Vec<Option<String>>,
+/// A file of a checkpoint, or a range of it, to be hashed.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct HashJob<'h> {
+    /// Directory of the checkpoint.
+    pub(crate) root: &'h Path,
+    /// File name.
+    pub(crate) name: &'h str,
+    /// First byte and number of bytes; the whole file if `None`.
+    pub(crate) range: Option<(u64, u64)>,
+    /// How to hash it.
+    pub(crate) algorithm: HashAlgorithm,
 }
 
-/// Hashes files of one checkpoint, with one limit on the zeros of holes.
-pub(crate) struct Digester {
-    buffer: Vec<u8>,
-    zeros_left: u64,
+/// A file, or a range of it, that was hashed.
+#[derive(Debug)]
+pub(crate) struct Hashed {
+    /// Size of the whole file.
+    pub(crate) file_len: u64,
+    /// Digest in hexadecimal; `None` for a range that ends behind the file, and when the holes of the jobs up to this one
+    /// have more zeros than are hashed.
+    pub(crate) digest: Option<String>,
 }
 
-impl Digester {
-    pub(crate) fn new() -> Self {
-        Self { buffer: vec![0; CHUNK], zeros_left: HASHED_ZEROS }
+/// Hashes files and ranges of one checkpoint; the results are in the order of the jobs, and do not depend on the number of
+/// threads.
+///
+/// # Errors
+/// For each job as [`open_own`], and when reading fails.
+pub(crate) fn hash(jobs: &[HashJob<'_>]) -> Vec<Result<Hashed, OpenError>> {
+    // The zeros of holes are shared out in the order of the jobs, so that the threads do not compete for them.
+    let mut left = HASHED_ZEROS;
+    let allowed = jobs.iter().map(|job| {
+        let zeros = Some(job.zeros()).filter(|zeros| *zeros <= left).unwrap_or(0);
+        left = left.saturating_sub(zeros);
+        (*job, zeros)
+    });
+    let jobs: Vec<(HashJob<'_>, u64)> = allowed.collect();
+    parallel::map(parallel::threads(), &jobs, || vec![0; CHUNK], |buffer, (job, zeros)| job.run(buffer, *zeros))
+}
+
+impl HashJob<'_> {
+    /// The range in a file of `file_len` bytes; `None` when it ends behind it.
+    fn range(self, file_len: u64) -> Option<(u64, u64)> {
+        let (start, len) = self.range.unwrap_or((0, file_len));
+        start.checked_add(len).filter(|end| *end <= file_len).map(|_| (start, len))
     }
 
-    /// Hashes the file `name` of the checkpoint in `root`, and ranges of it (start and length, in order of their starts).
-    ///
-    /// # Errors
-    /// As [`open_own`], and when reading fails.
-    pub(crate) fn file(&mut self, root: &Path, name: &str, ranges: &[(u64, u64)]) -> Result<FileDigests, OpenError> {
-        let opened = open_own(root, name, u64::MAX)?;
-        let bytes = opened.identity.size;
-        let io = |source| OpenError::from_io(&root.join(name), source);
-        let Self { buffer, zeros_left } = self;
-        let mut whole = Hash::<Sha256>::new();
-        let mut digests = Vec::new();
-        let mut at = 0_u64;
-        for (start, len) in ranges {
-            let end = start.checked_add(*len).filter(|end| *end <= bytes && *start >= at);
-            let Some(end) = end else {
-                digests.push(None);
-                continue;
-            };
-            each_piece(&opened, at, start.saturating_sub(at), buffer, |piece| whole.add(&piece, zeros_left))
-                .map_err(io)?;
-            let mut range = Hash::<Sha256>::new();
-            each_piece(&opened, *start, *len, buffer, |piece| {
-                range.add(&piece, zeros_left);
-                whole.add(&piece, zeros_left);
-            })
-            .map_err(io)?;
-            digests.push(range.finish());
-            at = end;
-        }
-        each_piece(&opened, at, bytes.saturating_sub(at), buffer, |piece| whole.add(&piece, zeros_left)).map_err(io)?;
-        Ok(FileDigests { bytes, sha256: whole.finish(), ranges: digests })
+    /// Number of its bytes in holes; 0 for a file that cannot be opened.
+    fn zeros(self) -> u64 {
+        let Ok(opened) = open_own(self.root, self.name, u64::MAX) else { return 0 };
+        self.range(opened.identity.size).map_or(0, |(start, len)| holes(&opened, start, len))
+    }
+
+    fn run(self, buffer: &mut [u8], mut zeros: u64) -> Result<Hashed, OpenError> {
+        let opened = open_own(self.root, self.name, u64::MAX)?;
+        let file_len = opened.identity.size;
+        let Some((start, len)) = self.range(file_len) else { return Ok(Hashed { file_len, digest: None }) };
+        let mut hash = Hash::of(Hasher::new(self.algorithm));
+        each_piece(&opened, start, len, buffer, |piece| hash.add(&piece, &mut zeros))
+            .map_err(|source| OpenError::from_io(&self.root.join(self.name), source))?;
+        Ok(Hashed { file_len, digest: hash.finish() })
     }
 }

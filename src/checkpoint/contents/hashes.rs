@@ -224,9 +224,9 @@ impl Hashes {
         read: &dyn Fn(u64),
     ) -> std::io::Result<Option<Self>> {
         let size = opened.identity.size;
-        let mut sha256: Option<Hash<Sha256>> = (!matches!(record, Record::Git(_))).then(Hash::new);
+        let mut sha256: Option<Hash<Sha256>> = (!matches!(record, Record::Git(_))).then(|| Hash::of(Sha256::new()));
         let is_git = matches!(record, Record::Git(_)) || matches!(record, Record::GitOrPointer(_)) && size <= PLAIN_CAP;
-        let mut git: Option<Hash<Sha1>> = is_git.then(|| Hash::starting(format!("blob {size}\0").as_bytes()));
+        let mut git: Option<Hash<Sha1>> = is_git.then(|| Hash::of(Sha1::new_with_prefix(format!("blob {size}\0"))));
         each_piece(opened, 0, size, buffer, |piece| {
             // Both take the same zeros.
             let mut left = zeros;

@@ -5,6 +5,7 @@ use std::io::{Error, ErrorKind, Result};
 use sha2::Digest;
 
 use super::tally::{BLOCK, as_u64};
+use crate::checkpoint::digest::Hasher;
 use crate::checkpoint::hex;
 use crate::checkpoint::open::Opened;
 use crate::checkpoint::platform::{next_data, next_hole, with_window};
@@ -75,6 +76,21 @@ pub(super) fn each_piece(
     Ok(())
 }
 
+/// Number of the `len` bytes from `start` on that are in holes: at least as many as [`each_piece`] gives as holes. 0 where the
+/// file system does not tell holes.
+#[cfg(feature = "cli")]
+pub(super) fn holes(opened: &Opened, start: u64, len: u64) -> u64 {
+    let end = start.saturating_add(len);
+    let (mut at, mut zeros) = (start, 0_u64);
+    while at < end {
+        let Ok(data) = next_data(&opened.file, at) else { break };
+        let data = data.map_or(end, |data| data.min(end));
+        zeros = zeros.saturating_add(data.saturating_sub(at));
+        at = next_hole(&opened.file, data).unwrap_or(end);
+    }
+    zeros
+}
+
 /// Reads a range of the file, and returns its end.
 fn read(
     opened: &Opened,
@@ -102,24 +118,48 @@ fn read(
     Ok(range.end)
 }
 
-/// A hash in progress; none once the bytes have more holes than are hashed.
-pub(super) struct Hash<D>(Option<D>);
+/// A hash function in progress.
+pub(super) trait Absorb {
+    fn absorb(&mut self, bytes: &[u8]);
 
-impl<D: Digest> Hash<D> {
-    pub(super) fn new() -> Self {
-        Self(Some(D::new()))
+    /// The digest in hexadecimal; `None` for no hash function.
+    fn into_hex(self) -> Option<String>;
+}
+
+impl<D: Digest> Absorb for D {
+    fn absorb(&mut self, bytes: &[u8]) {
+        self.update(bytes);
     }
 
-    /// A hash of bytes that start with these.
-    pub(super) fn starting(bytes: &[u8]) -> Self {
-        Self(Some(D::new_with_prefix(bytes)))
+    fn into_hex(self) -> Option<String> {
+        Some(hex(&self.finalize()))
+    }
+}
+
+impl Absorb for Hasher {
+    fn absorb(&mut self, bytes: &[u8]) {
+        self.update(bytes);
+    }
+
+    fn into_hex(self) -> Option<String> {
+        self.finish().map(|digest| hex(&digest))
+    }
+}
+
+/// A hash in progress; none once the bytes have more holes than are hashed.
+pub(super) struct Hash<H>(Option<H>);
+
+impl<H: Absorb> Hash<H> {
+    /// The hash of what `start` has already absorbed, and of what is added.
+    pub(super) const fn of(start: H) -> Self {
+        Self(Some(start))
     }
 
     /// Adds a piece; zeros of a hole are taken from `zeros_left`.
     pub(super) fn add(&mut self, piece: &Piece<'_>, zeros_left: &mut u64) {
         let Self(Some(hash)) = self else { return };
         match piece {
-            Piece::Data(bytes) => hash.update(bytes),
+            Piece::Data(bytes) => hash.absorb(bytes),
             Piece::Hole(len) => match zeros_left.checked_sub(*len) {
                 Some(left) => {
                     *zeros_left = left;
@@ -135,18 +175,18 @@ impl<D: Digest> Hash<D> {
         self.0.is_some()
     }
 
-    /// The hash in hexadecimal; `None` when something was left out.
+    /// The digest in hexadecimal; `None` when something was left out.
     pub(super) fn finish(self) -> Option<String> {
-        self.0.map(|hash| hex(&hash.finalize()))
+        self.0.and_then(H::into_hex)
     }
 }
 
-fn add_zeros(hash: &mut impl Digest, len: u64) {
+fn add_zeros(hash: &mut impl Absorb, len: u64) {
     const ZEROS: [u8; 4096] = [0; 4096];
     let mut left = len;
     while left > 0 {
         let size = left.min(as_u64(ZEROS.len()));
-        hash.update(ZEROS.get(..usize::try_from(size).unwrap_or(0)).unwrap_or_default());
+        hash.absorb(ZEROS.get(..usize::try_from(size).unwrap_or(0)).unwrap_or_default());
         left = left.saturating_sub(size);
     }
 }

@@ -1,4 +1,4 @@
-//! Reads `merge-manifest.json` of versions 1 and 2. It is untrusted, like every file of a checkpoint.
+//! Reads `merge-manifest.json` of versions 1 to 3. It is untrusted, like every file of a checkpoint.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -7,21 +7,27 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::VerifyError;
-use crate::checkpoint::is_plain_file_name;
 use crate::checkpoint::open::{JSON_CAP, read_own};
+use crate::checkpoint::{HashAlgorithm, is_plain_file_name};
 use crate::merge::manifest;
 use crate::surgery::plan::{RowSlice, TensorTransform};
 
-/// A recorded merge. Keys of one version only are optional.
+/// A recorded merge. Keys that not all versions have are optional.
 #[derive(Debug, Deserialize)]
 pub(super) struct Recorded {
     pub(super) schema: u32,
-    /// An object in version 2, a name in version 1.
+    /// An object since version 2, a name in version 1.
     recipe: Value,
     #[serde(default)]
     pub(super) donors: BTreeMap<String, RecordedDonor>,
+    /// Since version 2: the files of the result. Version 2 has the shards here too.
     #[serde(default)]
     pub(super) files: BTreeMap<String, RecordedFile>,
+    /// Since version 3: the shards of the result.
+    #[serde(default)]
+    pub(super) shards: BTreeMap<String, RecordedShard>,
+    /// Since version 3: the algorithm of the digests of tensors. It was SHA-256 before.
+    hash: Option<HashAlgorithm>,
     pub(super) tensors: Vec<RecordedTensor>,
 }
 
@@ -44,11 +50,12 @@ pub(super) struct RecordedFile {
     pub(super) sha256: String,
 }
 
-/// A recorded shard of a donor.
-#[derive(Debug, Deserialize)]
+/// A recorded shard of a donor, or of the result.
+#[derive(Debug, Clone, Deserialize)]
 pub(super) struct RecordedShard {
     pub(super) bytes: u64,
     pub(super) header_sha256: String,
+    /// Of donors only, with `--hash-donors`.
     pub(super) sha256: Option<String>,
 }
 
@@ -59,7 +66,9 @@ pub(super) struct RecordedTensor {
     pub(super) shard: String,
     pub(super) dtype: String,
     pub(super) shape: Vec<u64>,
-    pub(super) sha256: Option<String>,
+    /// Version 2 calls it `sha256`, version 1 has none.
+    #[serde(alias = "sha256")]
+    pub(super) digest: Option<String>,
     pub(super) transform: TensorTransform,
     pub(super) scale: Option<f64>,
     pub(super) source: RecordedSource,
@@ -73,7 +82,8 @@ pub(super) struct RecordedSource {
     pub(super) dtype: Option<String>,
     pub(super) shape: Vec<u64>,
     pub(super) slice: Option<RowSlice>,
-    pub(super) sha256: Option<String>,
+    #[serde(alias = "sha256")]
+    pub(super) digest: Option<String>,
 }
 
 impl Recorded {
@@ -92,16 +102,19 @@ impl Recorded {
         let damaged = |reason: String| wrong(format!("{reason}; the manifest is damaged"));
         let value: Value = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
         let schema = value.get("schema").and_then(Value::as_u64);
-        if !matches!(schema, Some(1 | 2)) {
+        if !matches!(schema, Some(1..=3)) {
             let schema = value.get("schema").map_or_else(|| "missing".to_owned(), Value::to_string);
             return Err(wrong(format!(
-                "its schema is {schema}, and this version of ckpt-doctor reads 1 and 2; use a newer version"
+                "its schema is {schema}, and this version of ckpt-doctor reads 1 to 3; use a newer version"
             )));
         }
         let mut recorded: Self = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
         for donor in recorded.donors.values_mut() {
             let documents = std::mem::take(&mut donor.documents).into_iter();
             donor.files.extend(documents.map(|(name, sha256)| (name, RecordedFile { bytes: None, sha256 })));
+        }
+        if recorded.schema >= 3 && recorded.hash.is_none() {
+            return Err(damaged("it has no \"hash\"".to_owned()));
         }
         recorded.check().map_err(damaged)?;
         Ok(recorded)
@@ -111,7 +124,7 @@ impl Recorded {
     fn check(&self) -> Result<(), String> {
         let of_donors = self.donors.values().flat_map(|donor| donor.files.keys().chain(donor.shards.keys()));
         let of_tensors = self.tensors.iter().map(|tensor| &tensor.shard);
-        let mut names = self.files.keys().chain(of_donors).chain(of_tensors);
+        let mut names = self.files.keys().chain(self.shards.keys()).chain(of_donors).chain(of_tensors);
         if let Some(name) = names.find(|name| !is_plain_file_name(name)) {
             return Err(format!("{name:?} is not the name of a file"));
         }
@@ -120,6 +133,11 @@ impl Recorded {
             Some(tensor) => Err(format!("{:?} is recorded twice", tensor.name)),
             None => Ok(()),
         }
+    }
+
+    /// Algorithm of the digests of tensors.
+    pub(super) fn hash(&self) -> HashAlgorithm {
+        self.hash.unwrap_or(HashAlgorithm::Sha256)
     }
 
     /// Name of the recipe.

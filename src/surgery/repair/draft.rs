@@ -8,6 +8,7 @@ use serde_json::{Map, Value, json};
 use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
+use crate::surgery::align;
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
 /// Result of applying the edits of one fix.
@@ -302,7 +303,9 @@ impl RepairDraft {
             }),
         });
         let metadata = shard.metadata.clone().unwrap_or_default();
-        Some(PlannedShard { name: FileName::parse(file).ok()?, tensors: tensors.collect(), metadata })
+        let tensors: Vec<PlannedTensor> = tensors.collect();
+        let residue = align::residue(&tensors);
+        Some(PlannedShard { name: FileName::parse(file).ok()?, tensors, metadata, residue })
     }
 
     fn header(&mut self, file: &str) -> Option<()> {

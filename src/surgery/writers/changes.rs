@@ -5,12 +5,13 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::apply::write_shard;
+use super::shards::write_shards;
 use super::system::{create, look, with_figures};
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
-use crate::checkpoint::{FaultKind, Shard};
+use crate::checkpoint::{FaultKind, HashAlgorithm, Shard};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::repair::{Change, Content, Repair};
+use crate::surgery::written::Writing;
 
 /// Fails when a file no longer matches the checkpoint for which the repair was planned.
 pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> Result<(), RepairError> {
@@ -53,9 +54,15 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
 }
 
 /// Writes a new file and syncs it.
-pub(super) fn write_content(path: &Path, content: &Content, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
+pub(super) fn write_content(
+    path: &Path,
+    content: &Content,
+    progress: &(dyn Fn(u64) + Sync),
+) -> Result<(), RepairError> {
     match content {
-        Content::Shard(shard) => write_shard(path, shard, progress)?,
+        Content::Shard(shard) => {
+            write_shards(&[(path.to_owned(), shard)], Writing::new(HashAlgorithm::None), progress)?;
+        }
         Content::Text(text) => {
             let mut file = create(path)?;
             file.write_all(text.as_bytes()).map_err(io_at(path, "writing"))?;

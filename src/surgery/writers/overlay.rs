@@ -19,11 +19,11 @@ use crate::surgery::stop::interrupted;
 /// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's or, on
 /// another file system, symbolic links. Hidden files are not copied.
 ///
-/// `progress` receives the bytes written.
+/// `progress` receives the bytes written, from several threads.
 ///
 /// # Errors
 /// A [`RepairError`]; then the directory was not created.
-pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Result<RepairedCopy, RepairError> {
+pub fn overlay(repair: &Repair, out: &Path, progress: &(dyn Fn(u64) + Sync)) -> Result<RepairedCopy, RepairError> {
     let original = &repair.original;
     let Target { path: out, cleared } = claim_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
@@ -43,7 +43,7 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &mut dyn FnMut(u64)) -> Re
     }
 }
 
-fn fill(repair: &Repair, dir: &Path, progress: &mut dyn FnMut(u64)) -> Result<(), RepairError> {
+fn fill(repair: &Repair, dir: &Path, progress: &(dyn Fn(u64) + Sync)) -> Result<(), RepairError> {
     for change in &repair.changes {
         interrupted()?;
         check_unchanged(repair, change, &repair.original.root.join(&change.name))?;

@@ -4,9 +4,13 @@
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
+#[cfg(target_os = "linux")]
+use std::num::NonZeroU64;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
+#[cfg(target_os = "linux")]
+use rustix::fs::Advice;
 use rustix::fs::{AtFlags, OFlags, unlinkat};
 use rustix::io::{Errno, retry_on_intr};
 use rustix::process::{Resource, getrlimit};
@@ -164,12 +168,18 @@ pub(super) fn is_mount_point(_: &Path) -> bool {
     false
 }
 
-/// Copies up to `len` bytes inside the kernel, from offset `at` of `from` to the current offset of `to`; file systems
+/// Copies up to `len` bytes inside the kernel, from offset `from_at` of `from` to offset `to_at` of `to`; file systems
 /// with shared blocks copy no data. `None` when the kernel or these file systems do not support it.
 #[cfg(target_os = "linux")]
-pub(super) fn copy_in_kernel(from: &File, mut at: u64, to: &File, len: u64) -> io::Result<Option<u64>> {
+pub(super) fn copy_in_kernel(
+    from: &File,
+    mut from_at: u64,
+    to: &File,
+    mut to_at: u64,
+    len: u64,
+) -> io::Result<Option<u64>> {
     let len = usize::try_from(len).unwrap_or(usize::MAX);
-    match retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut at), to, None, len)) {
+    match retry_on_intr(|| rustix::fs::copy_file_range(from, Some(&mut from_at), to, Some(&mut to_at), len)) {
         // Some file systems return 0 for unsupported; at the end of the file a plain read reports the end.
         Ok(0) | Err(Errno::NOSYS | Errno::XDEV | Errno::INVAL | Errno::OPNOTSUPP | Errno::PERM | Errno::BADF) => {
             Ok(None)
@@ -180,6 +190,71 @@ pub(super) fn copy_in_kernel(from: &File, mut at: u64, to: &File, len: u64) -> i
 }
 
 #[cfg(not(target_os = "linux"))]
-pub(super) fn copy_in_kernel(_: &File, _: u64, _: &File, _: u64) -> io::Result<Option<u64>> {
+pub(super) fn copy_in_kernel(_: &File, _: u64, _: &File, _: u64, _: u64) -> io::Result<Option<u64>> {
     Ok(None)
+}
+
+/// Reserves `len` bytes for a new file, which gets this size; does nothing where the file system cannot do it.
+///
+/// # Errors
+/// When the space is not free, or the file would be too large.
+#[cfg(target_os = "linux")]
+pub(super) fn reserve(file: &File, len: u64) -> io::Result<()> {
+    if len == 0 {
+        return Ok(());
+    }
+    let flags = rustix::fs::FallocateFlags::empty();
+    match retry_on_intr(|| rustix::fs::fallocate(file, flags, 0, len)) {
+        Err(Errno::NOSYS | Errno::OPNOTSUPP | Errno::INVAL | Errno::NODEV | Errno::PERM) => Ok(()),
+        other => Ok(other?),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn reserve(_: &File, _: u64) -> io::Result<()> {
+    Ok(())
+}
+
+/// Starts to write a range of a file to the disk, and does not wait for it: later syncs then have less to do. Pages of the range
+/// that are already on the disk leave the page cache.
+#[cfg(target_os = "linux")]
+pub(super) fn write_back(file: &File, at: u64, len: u64) {
+    if let Some(len) = NonZeroU64::new(len) {
+        // Advice: without support, the kernel writes when it sees fit.
+        let _ = rustix::fs::fadvise(file, at, Some(len), Advice::DontNeed);
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn write_back(_: &File, _: u64, _: u64) {}
+
+/// Starts to read a range of a file that is needed soon.
+#[cfg(target_os = "linux")]
+pub(super) fn read_ahead(file: &File, at: u64, len: u64) {
+    // A call reads at most as much as the disk takes at once.
+    const STEP: u64 = 1 << 20;
+    let end = at.saturating_add(len);
+    let mut at = at;
+    while at < end {
+        let _ = rustix::fs::fadvise(file, at, NonZeroU64::new(end.saturating_sub(at).min(STEP)), Advice::WillNeed);
+        at = at.saturating_add(STEP);
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn read_ahead(_: &File, _: u64, _: u64) {}
+
+/// Whether copies inside the kernel share blocks on the file system of a file: XFS and btrfs.
+#[cfg(target_os = "linux")]
+pub(super) fn shares_blocks(file: &File) -> bool {
+    // Source: linux/magic.h.
+    const XFS: u64 = 0x5846_5342;
+    const BTRFS: u64 = 0x9123_683E;
+    rustix::fs::fstatfs(file)
+        .is_ok_and(|stats| u64::try_from(stats.f_type).is_ok_and(|kind| [XFS, BTRFS].contains(&kind)))
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn shares_blocks(_: &File) -> bool {
+    false
 }

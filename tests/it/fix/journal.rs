@@ -45,7 +45,7 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
     let (_room, dir) = broken();
     let before = contents(&dir);
     let repair = repair(&dir);
-    journal::write(&repair, &mut |_| {}).expect("written");
+    journal::write(&repair, &|_| {}).expect("written");
     let after = contents(&dir);
     assert_ne!(before, after);
     let folder = dir.join(".ckpt-doctor");
@@ -120,7 +120,7 @@ fn an_interrupted_undo_is_finished() {
     let (kept, config, index) = (folder.join("undo/1"), "config.json", "model.safetensors.index.json");
     for step in 0..=4 {
         for exchanged in [false, true] {
-            journal::write(&repair(&dir), &mut |_| {}).expect("written");
+            journal::write(&repair(&dir), &|_| {}).expect("written");
             let after = contents(&dir);
             // 0: the journal is current again. 1: the original restored. 2: the added file removed. 3: the originals
             // removed. 4: the journal removed.
@@ -164,7 +164,7 @@ fn an_interrupted_undo_is_finished() {
 #[test]
 fn a_file_saved_during_an_interrupted_repair_is_returned() {
     let (_room, dir) = broken();
-    journal::write(&repair(&dir), &mut |_| {}).expect("written");
+    journal::write(&repair(&dir), &|_| {}).expect("written");
     let folder = dir.join(".ckpt-doctor");
     fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
     fs::create_dir(folder.join("new")).expect("a folder");
@@ -201,7 +201,7 @@ fn an_empty_folder_is_removed_by_the_next_run() {
 #[test]
 fn files_changed_after_a_repair_are_not_restored() {
     let (_room, dir) = broken();
-    journal::write(&repair(&dir), &mut |_| {}).expect("written");
+    journal::write(&repair(&dir), &|_| {}).expect("written");
     fs::write(dir.join("config.json"), "{}").expect("a file");
     let now = contents(&dir);
     let error = journal::undo(&dir).expect_err("refused");
@@ -216,7 +216,7 @@ fn a_file_that_changes_during_planning_stops_the_repair() {
     let repair = repair(&dir);
     fs::write(dir.join("config.json"), "{}").expect("a file");
     let now = contents(&dir);
-    assert!(matches!(journal::write(&repair, &mut |_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
+    assert!(matches!(journal::write(&repair, &|_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
     assert_eq!(contents(&dir), now);
     assert!(!dir.join(".ckpt-doctor").exists());
 }
@@ -226,7 +226,7 @@ fn mode_is_kept_and_the_last_repair_is_undone_first() {
     let (_room, dir) = broken();
     fs::set_permissions(dir.join("config.json"), PermissionsExt::from_mode(0o640)).expect("a mode");
     let before = seen(&dir);
-    journal::write(&repair(&dir), &mut |_| {}).expect("written");
+    journal::write(&repair(&dir), &|_| {}).expect("written");
     assert_eq!(fs::metadata(dir.join("config.json")).expect("a file").mode() & 0o7777, 0o640);
     assert_eq!(fs::read_to_string(dir.join(".ckpt-doctor/.gitignore")).expect("a file").lines().last(), Some("*"));
     let between = contents(&dir);
@@ -235,7 +235,7 @@ fn mode_is_kept_and_the_last_repair_is_undone_first() {
     let knowledge = support::knowledge();
     let checkpoint = Arc::new(Checkpoint::open(&dir).expect("a directory"));
     let second = plan(&checkpoint, check(&checkpoint, &knowledge), false, &|c| check(c, &knowledge));
-    journal::write(&second, &mut |_| {}).expect("written");
+    journal::write(&second, &|_| {}).expect("written");
     assert_eq!(contents(&dir), between);
     assert_eq!(journal::undo(&dir).expect("undone").left, 1);
     fs::write(dir.join("config.json"), &text).expect("a file");
@@ -254,11 +254,11 @@ fn links_are_never_written_through() {
     symlink(&blob, dir.join("config.json")).expect("a link");
     let bytes = fs::read(&blob).expect("a file");
     let repair = repair(&dir);
-    let error = journal::write(&repair, &mut |_| {}).expect_err("refused");
+    let error = journal::write(&repair, &|_| {}).expect_err("refused");
     assert!(error.to_string().contains("--fix --output DIR"), "{error}");
     assert!(!dir.join(".ckpt-doctor").exists());
     let out = room.path().join("repaired");
-    overlay(&repair, &out, &mut |_| {}).expect("a copy");
+    overlay(&repair, &out, &|_| {}).expect("a copy");
     assert_eq!(fs::read(&blob).expect("a file"), bytes);
     assert!(fs::symlink_metadata(out.join("config.json")).expect("a file").is_file());
 }
@@ -269,7 +269,7 @@ fn a_copy_leaves_the_original_alone() {
     let before = seen(&dir);
     let repair = repair(&dir);
     let out = room.path().join("repaired");
-    overlay(&repair, &out, &mut |_| {}).expect("a copy");
+    overlay(&repair, &out, &|_| {}).expect("a copy");
     assert_eq!(seen(&dir), before);
     let found = check(&Arc::new(Checkpoint::open(&out).expect("open")), &support::knowledge()).findings;
     assert_eq!(found, repair.outcome.findings);
@@ -277,6 +277,6 @@ fn a_copy_leaves_the_original_alone() {
     let inode = |dir: &Path| fs::metadata(dir.join(shard)).expect("a shard").ino();
     assert_eq!(inode(&out), inode(&dir), "an unchanged shard is a link");
     for target in [dir.clone(), dir.join("inside")] {
-        assert!(overlay(&repair, &target, &mut |_| {}).is_err(), "{}", target.display());
+        assert!(overlay(&repair, &target, &|_| {}).is_err(), "{}", target.display());
     }
 }

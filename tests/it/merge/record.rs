@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
 use super::{content, copy, donor, merge, text, tiny};
 
-fn digest(bytes: &[u8]) -> String {
+pub fn digest(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().fold(String::new(), |text, byte| text + &format!("{byte:02x}"))
 }
 
@@ -31,36 +31,54 @@ pub fn flip(dir: &Path, tensor: &str) {
     panic!("{tensor} is missing");
 }
 
+/// Digests of tensors by the algorithm of the manifest, of headers and other files by SHA-256.
 #[test]
 fn the_manifest_has_the_digest_of_every_tensor_and_file() {
     let work = TempDir::new().unwrap();
-    let out = work.path().join("out");
-    let run = tiny(&out, &["--set", "shard-size=300KB", "--set", "projector=reinit"]);
-    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
-    let (manifest, files) = (manifest(&out), content(&out));
-    let tensors: BTreeMap<String, String> = files
-        .iter()
-        .filter(|(name, _)| name.ends_with(".safetensors"))
-        .flat_map(|(_, bytes)| {
-            let parsed = safetensors::SafeTensors::deserialize(bytes).unwrap();
-            parsed.tensors().into_iter().map(|(name, t)| (name, digest(t.data()))).collect::<Vec<_>>()
-        })
-        .collect();
-    let recorded = manifest["tensors"].as_array().unwrap().iter();
-    let recorded: BTreeMap<String, String> =
-        recorded.map(|t| (t["name"].as_str().unwrap().to_owned(), t["sha256"].as_str().unwrap().to_owned())).collect();
-    assert_eq!(recorded, tensors);
-    let own = |name: &str| name == "merge-manifest.json";
-    let expected: BTreeMap<String, (u64, String)> = files
-        .iter()
-        .filter(|(name, _)| !own(name))
-        .map(|(name, bytes)| (name.clone(), (bytes.len() as u64, digest(bytes))))
-        .collect();
-    let recorded = manifest["files"].as_object().unwrap().iter();
-    let recorded: BTreeMap<String, (u64, String)> = recorded
-        .map(|(name, f)| (name.clone(), (f["bytes"].as_u64().unwrap(), f["sha256"].as_str().unwrap().to_owned())))
-        .collect();
-    assert_eq!(recorded, expected);
+    let mut shards = None;
+    for algorithm in ["blake3", "sha256", "none"] {
+        let out = work.path().join(algorithm);
+        let given = ["--set", "shard-size=300KB", "--set", "projector=reinit", "--hash", algorithm];
+        // BLAKE3 is the default.
+        let run = tiny(&out, if algorithm == "blake3" { &given[..4] } else { &given });
+        assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+        let (manifest, files) = (manifest(&out), content(&out));
+        assert_eq!((&manifest["schema"], &manifest["hash"]), (&json!(3), &json!(algorithm)));
+        let by_algorithm = |bytes: &[u8]| match algorithm {
+            "blake3" => Some(blake3::hash(bytes).to_string()),
+            "sha256" => Some(digest(bytes)),
+            _ => None,
+        };
+        let (weights, others): (BTreeMap<_, _>, BTreeMap<_, _>) = files
+            .iter()
+            .map(|(name, bytes)| (name.clone(), bytes))
+            .partition(|(name, _)| name.ends_with(".safetensors"));
+        let tensors: BTreeMap<String, Option<String>> = weights
+            .values()
+            .flat_map(|bytes| {
+                let parsed = safetensors::SafeTensors::deserialize(bytes).unwrap();
+                parsed.tensors().into_iter().map(|(name, t)| (name, by_algorithm(t.data()))).collect::<Vec<_>>()
+            })
+            .collect();
+        let recorded = manifest["tensors"].as_array().unwrap().iter();
+        let recorded: BTreeMap<String, Option<String>> = recorded
+            .map(|t| (t["name"].as_str().unwrap().to_owned(), t["digest"].as_str().map(str::to_owned)))
+            .collect();
+        assert_eq!(recorded, tensors);
+        let header = |bytes: &[u8]| 8 + usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
+        let expected = |key: &str, name: &str, bytes: &[u8], hashed: &[u8]| {
+            (name.to_owned(), json!({ "bytes": bytes.len(), key: digest(hashed) }))
+        };
+        let headers = weights.iter().map(|(name, b)| expected("header_sha256", name, b, &b[..header(b)]));
+        assert_eq!(manifest["shards"], Value::Object(headers.collect()));
+        let own = |name: &str| name == "merge-manifest.json";
+        let documents = others.iter().filter(|(name, _)| !own(name)).map(|(name, b)| expected("sha256", name, b, b));
+        assert_eq!(manifest["files"], Value::Object(documents.collect()));
+        // The algorithm changes nothing but the manifest.
+        let now: BTreeMap<_, _> =
+            files.iter().filter(|(name, _)| !own(name)).map(|(n, b)| (n.clone(), b.clone())).collect();
+        assert!(shards.replace(now.clone()).is_none_or(|before| before == now));
+    }
 }
 
 /// Donors that differ in one byte of a weight, with equal headers and documents.
@@ -74,7 +92,7 @@ fn donors_with_other_weights_give_another_manifest() {
     assert_eq!(tiny(&a, &[]).status.code(), Some(0));
     assert_eq!(merge(&donor("spatialvla-tiny"), &other, &b, &[]).status.code(), Some(0));
     let differ = |key: &str| manifest(&a)[key] != manifest(&b)[key];
-    assert!(differ("tensors") && differ("files"));
+    assert!(differ("tensors") && !differ("shards"));
 }
 
 /// Donors in a cache of the Hub, with model cards.

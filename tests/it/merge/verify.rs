@@ -7,7 +7,7 @@ use std::process::Output;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::record::flip;
+use super::record::{digest, flip};
 use super::{copy, doctor, donor, merge, text, tiny};
 
 /// Donors in the order of the merge, all options that change bytes, and a result.
@@ -56,7 +56,13 @@ fn donors() -> [String; 4] {
 
 #[test]
 fn a_result_is_equal_to_its_manifest_and_its_donors() {
-    for options in [&[][..], &["--set", "projector=reinit", "--set", "tokenizer=baked"], &["--hash"]] {
+    let options: [&[&str]; 4] = [
+        &[],
+        &["--set", "projector=reinit", "--set", "tokenizer=baked"],
+        &["--hash-donors"],
+        &["--hash", "sha256", "--set", "dtype=float16"],
+    ];
+    for options in options {
         let room = Room::new(options);
         let donors = donors();
         let given: Vec<&str> = donors.iter().map(String::as_str).collect();
@@ -108,10 +114,76 @@ fn every_file_is_compared() {
         fs::write(entry.path(), changed).unwrap();
         let run = room.verify(&[]);
         assert_eq!(run.status.code(), Some(1), "{name}: {}", text(&run));
-        assert!(text(&run).contains(&format!("differs  {name}")), "{name}: {}", text(&run));
+        // The last byte of a shard is one of a tensor.
+        let named = if name.ends_with(".safetensors") { format!("in {name}") } else { format!("differs  {name}") };
+        assert!(text(&run).contains(&named), "{name}: {}", text(&run));
         fs::write(entry.path(), bytes).unwrap();
     }
     assert_eq!(room.verify(&[]).status.code(), Some(0));
+}
+
+/// The header of a shard has a digest of its own: spaces in it belong to no tensor.
+#[test]
+fn a_changed_header_is_found() {
+    let room = Room::new(&[]);
+    let shard = room.out.join("model-00001-of-00006.safetensors");
+    let mut bytes = fs::read(&shard).unwrap();
+    let place = bytes.windows(4).position(|part| part == b"\"pt\"").unwrap();
+    bytes[place + 1] = b'q';
+    fs::write(&shard, bytes).unwrap();
+    let (code, shown) = room.shown(&[]);
+    assert_eq!(code, Some(1), "{shown}");
+    assert!(shown.contains("differs  model-00001-of-00006.safetensors: has another size or header"), "{shown}");
+}
+
+/// Without digests of tensors, the donors are needed, and the report says what remains unverified.
+#[test]
+fn a_manifest_without_digests_of_tensors_is_read() {
+    let room = Room::new(&["--hash", "none"]);
+    let given = donors();
+    let given: Vec<&str> = given.iter().map(String::as_str).collect();
+    let (code, shown) = room.shown(&given);
+    assert_eq!(code, Some(2), "{shown}");
+    snapshot!("verify-without-digests", shown);
+    flip(&room.out, "multi_modal_projector.linear.weight");
+    assert_eq!(room.verify(&[]).status.code(), Some(2));
+    assert_eq!(room.verify(&given).status.code(), Some(1));
+}
+
+/// Version 2 had SHA-256 digests of the tensors and of whole shards.
+#[test]
+fn a_manifest_of_version_2_is_read() {
+    let room = Room::new(&["--hash", "sha256"]);
+    let shards: Vec<(String, Value)> = super::content(&room.out)
+        .into_iter()
+        .filter(|(name, _)| name.ends_with(".safetensors"))
+        .map(|(name, bytes)| (name, json!({ "bytes": bytes.len(), "sha256": digest(&bytes) })))
+        .collect();
+    room.manifest(|manifest| {
+        manifest["schema"] = json!(2);
+        for key in ["hash", "shards"] {
+            manifest.as_object_mut().unwrap().remove(key);
+        }
+        manifest["files"].as_object_mut().unwrap().extend(shards.clone());
+        for tensor in manifest["tensors"].as_array_mut().unwrap() {
+            for place in ["", "/source"] {
+                let object = tensor.pointer_mut(place).unwrap().as_object_mut().unwrap();
+                let digest = object.remove("digest");
+                object.extend(digest.map(|digest| ("sha256".to_owned(), digest)));
+            }
+        }
+    });
+    let given = donors();
+    let given: Vec<&str> = given.iter().map(String::as_str).collect();
+    let (code, shown) = room.shown(&given);
+    assert_eq!(code, Some(0), "{shown}");
+    assert!(shown.contains("manifest version 2"), "{shown}");
+    flip(&room.out, "multi_modal_projector.linear.weight");
+    let (code, shown) = room.shown(&[]);
+    assert_eq!(code, Some(1), "{shown}");
+    for line in ["differs  multi_modal_projector.linear.weight: has another SHA-256", "differs  model-"] {
+        assert!(shown.contains(line), "{line}: {shown}");
+    }
 }
 
 /// Version 1 had no digests of the result: without donors, little can be verified.
@@ -121,12 +193,12 @@ fn a_manifest_of_version_1_is_read() {
     room.manifest(|manifest| {
         manifest["schema"] = json!(1);
         manifest["recipe"] = manifest["recipe"]["name"].clone();
-        for key in ["files", "training"] {
+        for key in ["files", "shards", "hash", "training"] {
             manifest.as_object_mut().unwrap().remove(key);
         }
         for tensor in manifest["tensors"].as_array_mut().unwrap() {
-            tensor.as_object_mut().unwrap().remove("sha256");
-            for key in ["sha256", "dtype"] {
+            tensor.as_object_mut().unwrap().remove("digest");
+            for key in ["digest", "dtype"] {
                 tensor["source"].as_object_mut().unwrap().remove(key);
             }
         }
@@ -160,8 +232,14 @@ fn a_manifest_that_cannot_be_used_is_refused() {
     };
     let set =
         |pointer: &str, value: Value| room.manifest(|manifest| *manifest.pointer_mut(pointer).unwrap() = value.clone());
-    set("/schema", json!(3));
+    set("/schema", json!(4));
     refused("newer", &[]);
+    set("/hash", json!("md5"));
+    refused("algorithm", &[]);
+    room.manifest(|manifest| drop(manifest.as_object_mut().unwrap().remove("hash")));
+    refused("no algorithm", &[]);
+    room.manifest(|manifest| manifest["shards"]["../x"] = json!({ "bytes": 1, "header_sha256": "" }));
+    refused("shard", &[]);
     set("/tensors/0/shard", json!("../../etc/passwd"));
     refused("path", &[]);
     room.manifest(|manifest| manifest["files"]["/etc/passwd"] = json!({ "bytes": 1, "sha256": "" }));
@@ -187,6 +265,9 @@ fn a_hostile_manifest_is_bounded() {
     let room = Room::new(&[]);
     let original = fs::read(room.out.join("merge-manifest.json")).unwrap();
     let huge = json!([u64::MAX, u64::MAX]);
+    // A tensor with more rows than its source.
+    let value: Value = serde_json::from_slice(&original).unwrap();
+    let grown = value["tensors"].as_array().unwrap().iter().position(|t| t["transform"] == "grow-rows").unwrap();
     let given = donors();
     let given: Vec<&str> = given.iter().map(String::as_str).collect();
     let changes: [(&str, Value); 8] = [
@@ -200,6 +281,7 @@ fn a_hostile_manifest_is_bounded() {
         ("/tensors/0/scale", json!(0.0)),
     ];
     for (pointer, value) in changes {
+        let pointer = pointer.replacen('0', &grown.to_string(), 1);
         room.manifest(|manifest| {
             let (parent, key) = pointer.rsplit_once('/').unwrap();
             manifest.pointer_mut(parent).unwrap()[key] = value.clone();

@@ -90,11 +90,17 @@ fn reports_and_manifests_of_merges_follow_their_schemas() {
     let manifest = jsonschema::draft202012::new(&schema("manifest")).unwrap();
     let verification = jsonschema::draft202012::new(&schema("verification")).unwrap();
     let room = TempDir::new().unwrap();
-    for (name, more) in [("plain", [].as_slice()), ("hashed", &["--hash"]), ("seam", &["--set", "projector=keep"])] {
+    let cases: [(&str, &[&str]); 4] = [
+        ("plain", &[]),
+        ("hashed", &["--hash-donors", "--hash", "sha256"]),
+        ("bare", &["--hash", "none"]),
+        ("seam", &["--set", "projector=keep"]),
+    ];
+    for (name, more) in cases {
         let out = room.path().join(name);
         let out = out.to_str().unwrap();
         let args = ["merge", "fixtures/merge.json5", "--out", out, "--output-format", "json"];
-        holds(&report, &printed(project(), &[&args, more].concat()));
+        holds(&report, &printed(project(), &[&args[..], more].concat()));
         match fs::read_to_string(Path::new(out).join("merge-manifest.json")) {
             Ok(text) => {
                 holds(&manifest, &serde_json::from_str(&text).unwrap());

@@ -74,7 +74,7 @@ fn round_trip(code: &str, left: &[String], dir: &Path, knowledge: &Knowledge) ->
         return Err(format!("{code} is silent{}", shown(&broken.findings)));
     }
     let repair = plan(&checkpoint, broken, true, &|c| check(c, knowledge));
-    journal::write(&repair, &mut |_| {}).map_err(|e| format!("writing: {e}"))?;
+    journal::write(&repair, &|_| {}).map_err(|e| format!("writing: {e}"))?;
     let (_, repaired) = looked(dir, knowledge);
     let loud =
         |f: &Finding| f.severity > Severity::Info && !(f.severity == Severity::Warning && left.contains(&f.code));

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ckpt_doctor::HashAlgorithm;
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::knowledge::Loader;
 use ckpt_doctor::merge::{self, MergeRequest};
@@ -152,9 +153,10 @@ fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {
         versions: Vec::new(),
         out: out.to_owned(),
         dry_run: false,
-        hash: false,
+        hash: HashAlgorithm::default(),
+        hash_donors: false,
     };
-    let run = merge::run(&request, knowledge, &mut |_, _| {}).unwrap_or_else(|e| panic!("{e}"));
+    let run = merge::run(&request, knowledge, &|_, _| {}).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(
         run.record.stage,
         Some(MergeStage::Written),

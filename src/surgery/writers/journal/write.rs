@@ -17,12 +17,13 @@ use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
 
 /// Replaces the changed files of a repair, all of them or none.
 ///
-/// `progress` receives the bytes written. Call [`super::recover`] before the checkpoint is opened. Returns the files that
+/// `progress` receives the bytes written, from several threads.
+/// Call [`super::recover`] before the checkpoint is opened. Returns the files that
 /// could not be removed afterwards.
 ///
 /// # Errors
 /// A [`RepairError`]; then the checkpoint is unchanged, except with [`RepairError::Unfinished`].
-pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<Option<Leftover>, RepairError> {
+pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<Leftover>, RepairError> {
     let root = &repair.original.root;
     for change in &repair.changes {
         let path = root.join(&change.name);
@@ -48,7 +49,7 @@ pub fn write(repair: &Repair, progress: &mut dyn FnMut(u64)) -> Result<Option<Le
 }
 
 /// Stages the new files.
-fn stage(repair: &Repair, folder: &Folder, progress: &mut dyn FnMut(u64)) -> Result<Journal, RepairError> {
+fn stage(repair: &Repair, folder: &Folder, progress: &(dyn Fn(u64) + Sync)) -> Result<Journal, RepairError> {
     let root = &repair.original.root;
     let donor = DonorSnapshot::record(root)?;
     if folder.pending()?.is_some() {

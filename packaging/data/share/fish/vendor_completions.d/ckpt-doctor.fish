@@ -98,6 +98,9 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l set -d 'Set an option of the recipe; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, or all; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
+blake3\t'BLAKE3'
+sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
 concise\t''
 json\t''
@@ -118,7 +121,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l print-recipe -d 'Print the text of the recipe, and do nothing else'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -s h -l help -d 'Print help; with --recipe, print the donors and options of the recipe'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l dry-run -d 'Plan and check the merge, and write nothing'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l hash -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l hash-donors -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l recipe -d 'Name of a recipe (see `ckpt-doctor recipes`), or a JSON5 file' -r
@@ -129,6 +132,9 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l out -d
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l set -d 'Set an option of the recipe; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, or all; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
+blake3\t'BLAKE3'
+sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
 concise\t''
 json\t''
@@ -149,7 +155,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l rules 
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l print-recipe -d 'Print the text of the recipe, and do nothing else'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -s h -l help -d 'Print help; with --recipe, print the donors and options of the recipe'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l dry-run -d 'Plan and check the merge, and write nothing'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l hash -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l hash-donors -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l part -d 'Name of the part, such as language or vision, or the JSON pointer of its config' -r

@@ -1,0 +1,233 @@
+//! The range of a new file that one job writes: copies, hashed copies and tensors that are made.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::os::unix::fs::FileExt as _;
+use std::path::Path;
+
+use super::system::{copy_in_kernel, read_ahead, write_back};
+use crate::checkpoint::HashAlgorithm;
+use crate::checkpoint::digest::Hasher;
+use crate::surgery::align::{BLOCK, Run};
+use crate::surgery::donor::DonorFile;
+use crate::surgery::error::{ApplyError, io_at};
+use crate::surgery::plan::{PlannedTensor, TensorTransform};
+use crate::surgery::stop::interrupted;
+use crate::surgery::stream::{Streamed, block, stream};
+use crate::surgery::written::WrittenTensor;
+
+/// Bytes between two requests to write back and to read ahead.
+const STREAMED: u64 = 8 << 20;
+
+/// Whether the `len` bytes from `at` on reach the end of a window of [`STREAMED`] bytes.
+fn ends_window(at: u64, len: u64) -> bool {
+    at / STREAMED != at.saturating_add(len) / STREAMED
+}
+
+/// The file that a job writes to.
+pub(super) struct Out<'o> {
+    pub(super) path: &'o Path,
+    pub(super) file: &'o File,
+    /// Whether copies inside the kernel share blocks.
+    pub(super) shares: bool,
+    pub(super) progress: &'o (dyn Fn(u64) + Sync),
+}
+
+impl Out<'_> {
+    pub(super) fn write(&self, bytes: &[u8], at: u64) -> Result<(), ApplyError> {
+        self.file.write_all_at(bytes, at).map_err(io_at(self.path, "writing"))?;
+        (self.progress)(bytes.len() as u64);
+        Ok(())
+    }
+
+    /// Copies bytes, inside the kernel if supported, otherwise through the buffer.
+    ///
+    /// The kernel shares whole blocks with the donor if the file system can do it and both offsets agree; a call for more than
+    /// whole blocks would copy all of them.
+    pub(super) fn copy(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
+        let [head, whole, tail] = run.blocks();
+        self.copy_bytes(donor, head, buffer)?;
+        let rest = self.copy_in_kernel(donor, whole)?;
+        self.copy_bytes(donor, rest, buffer)?;
+        // Offsets that do not agree: the kernel copies without sharing.
+        let rest = if tail.len < BLOCK { tail } else { self.copy_in_kernel(donor, tail)? };
+        self.copy_bytes(donor, rest, buffer)
+    }
+
+    /// Copies inside the kernel, and returns the range that it did not copy because it is not supported.
+    fn copy_in_kernel<'r>(&self, donor: &DonorFile, run: Run<'r>) -> Result<Run<'r>, ApplyError> {
+        let mut rest = run;
+        while rest.len > 0 {
+            interrupted()?;
+            let next = if self.shares { rest } else { rest.split(STREAMED.saturating_sub(rest.at % STREAMED)).0 };
+            if !self.shares {
+                let later = rest.split(next.len).1.split(STREAMED).0;
+                read_ahead(donor.file(), later.from, later.len);
+            }
+            let copied = copy_in_kernel(donor.file(), next.from, self.file, next.at, next.len);
+            let Some(copied) = copied.map_err(io_at(self.path, "copying from a donor"))? else { break };
+            if !self.shares {
+                write_back(self.file, next.at, copied);
+            }
+            (self.progress)(copied);
+            rest = rest.split(copied).1;
+        }
+        Ok(rest)
+    }
+
+    /// Copies through the buffer.
+    fn copy_bytes(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
+        let mut rest = run;
+        while rest.len > 0 {
+            interrupted()?;
+            let block = block(buffer, rest.len);
+            donor.read_at(block, rest.from).map_err(|e| donor.read_error(e))?;
+            self.write(block, rest.at)?;
+            rest = rest.split(block.len() as u64).1;
+        }
+        Ok(())
+    }
+
+    /// Copies a tensor, and hashes it. What the file system can share is only read.
+    fn copy_hashed(
+        &self,
+        donor: &DonorFile,
+        run: Run<'_>,
+        place: &mut Place<'_>,
+        buffer: &mut Vec<u8>,
+    ) -> Result<(), ApplyError> {
+        let [head, whole, tail] = run.blocks();
+        let rest = if self.shares { self.copy_in_kernel(donor, whole)? } else { whole };
+        let (shared, rest) = whole.split(whole.len.saturating_sub(rest.len));
+        for (mut part, is_shared) in [(head, false), (shared, true), (rest, false), (tail, false)] {
+            while part.len > 0 {
+                interrupted()?;
+                if ends_window(part.from, buffer.len() as u64) {
+                    let (_, later) = part.split(STREAMED);
+                    read_ahead(donor.file(), later.from, later.len.min(STREAMED));
+                }
+                // Hashed and written while it is in the cache of the processor.
+                let block = block(buffer, part.len);
+                donor.read_at(block, part.from).map_err(|e| donor.read_error(e))?;
+                if is_shared {
+                    place.pass(block);
+                } else {
+                    place.write_all(block).map_err(io_at(self.path, "writing"))?;
+                }
+                part = part.split(block.len() as u64).1;
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes a tensor at an offset of the file, and its digest.
+    pub(super) fn tensor(
+        &self,
+        donor: &DonorFile,
+        tensor: &PlannedTensor,
+        at: u64,
+        hash: HashAlgorithm,
+        buffer: &mut Vec<u8>,
+    ) -> Result<WrittenTensor, ApplyError> {
+        let mut place = Place { out: self, at, left: tensor.len(), hasher: Hasher::new(hash) };
+        let streamed = if tensor.transform() == TensorTransform::Copy {
+            let from = &tensor.source.from;
+            let run = Run { path: &from.path, from: from.offset, at, len: tensor.len() };
+            self.copy_hashed(donor, run, &mut place, buffer)?;
+            Streamed::default()
+        } else {
+            stream(donor, tensor, hash, self.path, &mut place)?
+        };
+        if place.left > 0 {
+            let error = io::Error::other(format!("{} is {} bytes too short", tensor.name, place.left));
+            return Err(io_at(self.path, "writing")(error));
+        }
+        let Streamed { losses, source_digest } = streamed;
+        Ok(WrittenTensor { digest: place.hasher.finish_hex(), losses, source_digest })
+    }
+}
+
+/// The range of a file that belongs to one tensor, written from its start to its end.
+struct Place<'p> {
+    out: &'p Out<'p>,
+    /// Offset of the next byte in the file.
+    at: u64,
+    /// Number of bytes up to the end of the tensor.
+    left: u64,
+    hasher: Hasher,
+}
+
+impl Place<'_> {
+    /// Adds the next bytes, which the file already has.
+    fn pass(&mut self, bytes: &[u8]) {
+        self.hasher.update(bytes);
+        self.at = self.at.saturating_add(bytes.len() as u64);
+        self.left = self.left.saturating_sub(bytes.len() as u64);
+    }
+}
+
+impl Write for Place<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let len = bytes.len() as u64;
+        if len > self.left {
+            return Err(io::Error::other("a transform gave more bytes than its tensor has"));
+        }
+        self.out.file.write_all_at(bytes, self.at)?;
+        (self.out.progress)(len);
+        if ends_window(self.at, len) {
+            write_back(self.out.file, (self.at / STREAMED).saturating_mul(STREAMED), STREAMED);
+        }
+        self.pass(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::disallowed_methods, reason = "makes the files it reads")]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    /// Where the kernel does not copy, the bytes pass through the buffer; hashed copies always do.
+    #[test]
+    fn every_way_to_copy_gives_the_same_bytes() {
+        let work = tempfile::tempdir().unwrap();
+        let path = work.path().join("donor");
+        let bytes: Vec<u8> = (0..3_000_000_u32).map(|i| i.wrapping_mul(2_654_435_761).to_be_bytes()[0]).collect();
+        fs::write(&path, &bytes).unwrap();
+        let donor = DonorFile::open(&path).unwrap();
+        for (from, at, len) in [(0, 0, 3_000_000), (5, 4101, 2_000_000), (7, 9, 2_999_993), (4000, 4000, 200)] {
+            let run = Run { path: &path, from, at, len };
+            for way in ["kernel", "buffer", "hashed", "hashed, shared"] {
+                let target = work.path().join(way);
+                let file = File::create(&target).unwrap();
+                let out = Out { path: &target, file: &file, shares: way == "hashed, shared", progress: &|_| {} };
+                let mut buffer = Vec::new();
+                match way {
+                    "kernel" => out.copy(&donor, run, &mut buffer).unwrap(),
+                    "buffer" => out.copy_bytes(&donor, run, &mut buffer).unwrap(),
+                    _ => {
+                        let mut place = Place { out: &out, at, left: len, hasher: Hasher::new(HashAlgorithm::Blake3) };
+                        out.copy_hashed(&donor, run, &mut place, &mut buffer).unwrap();
+                        assert_eq!(place.left, 0);
+                        let [from, len] = [from, len].map(|n| usize::try_from(n).unwrap());
+                        assert_eq!(place.hasher.finish(), Some(blake3::hash(&bytes[from..][..len]).into()));
+                    }
+                }
+                let [from, at, len] = [from, at, len].map(|n| usize::try_from(n).unwrap());
+                assert!(fs::read(&target).unwrap()[at..] == bytes[from..][..len], "{way}: {from} {at} {len}");
+            }
+        }
+        let long = Run { path: &path, from: 2_999_999, at: 0, len: 2 };
+        let target = work.path().join("long");
+        let file = File::create(&target).unwrap();
+        let out = Out { path: &target, file: &file, shares: false, progress: &|_| {} };
+        let error = out.copy(&donor, long, &mut Vec::new()).unwrap_err();
+        assert!(matches!(error, ApplyError::Changed { .. }), "{error}");
+    }
+}
