@@ -3,7 +3,7 @@
 //! Without a directory, the bench writes a checkpoint of 2 GB of random numbers and removes it again. The rounds take turns, so
 //! that a disturbance meets all of them; the page cache must be able to hold the files. Each line has the median rate, the
 //! processor time of all threads for one GB, and the rate as a share of its bound. The bound of reading is a plain sum over a
-//! memory map of the same files by all cores; that of hashing is SHA-256 of one buffer in memory by all cores.
+//! memory map of the same files by all cores.
 
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 #![allow(unsafe_code, reason = "the map is what the reader is compared with; nobody changes the files of the bench")]

@@ -416,7 +416,7 @@ def donors_of(folder, size):
 
 
 def merge_programs(args, folder, host, part, out):
-    base = [TOOL, "build-merged", "--recipe", "insert", "--donor", f"model={host}", "--donor", f"part={part}", "--quiet"]
+    base = [TOOL, "build-merged", "--recipe", "insert", "--donor", f"model={host}", "--donor", f"part={part}"]
     plan = folder / "plan.json"
     plan.unlink(missing_ok=True)
     run(*base, "--out", out / "none", "--dry-run", "--plan", plan)
@@ -497,7 +497,7 @@ def measure_cold(args):
     out = folder / "out"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    base = [TOOL, "build-merged", "--recipe", "insert", "--donor", f"model={host}", "--donor", f"part={part}", "--quiet"]
+    base = [TOOL, "build-merged", "--recipe", "insert", "--donor", f"model={host}", "--donor", f"part={part}"]
     # cp copies as many bytes from the same donors: the whole part, and of the host as much as the merge takes.
     kept = sum(
         length for name, (_, _, length, *_) in tensors(host).items() if "language_model" not in name and "lm_head" not in name
@@ -549,7 +549,6 @@ def measure_reflink(args):
                 f"model={host}",
                 "--donor",
                 f"part={part}",
-                "--quiet",
             ]
             held = {"model": tensors(host), "part": tensors(part)}
             plan = args.work / "plan.json"

@@ -146,9 +146,15 @@ impl RuleFile {
 impl Deref for Rule {
     type Target = RuleFile;
 
+    fn deref(&self) -> &RuleFile {
+        self.file()
+    }
+}
+
+impl Rule {
     /// # Panics
     /// When a built-in file does not parse; a test reads them all.
-    fn deref(&self) -> &RuleFile {
+    fn file(&self) -> &RuleFile {
         self.file.get_or_init(|| {
             let text = self.path.strip_prefix("rules/").and_then(source::text).unwrap_or_default();
             source::parse_embedded(&self.path, text).unwrap_or_else(|error| panic!("{error}"))
@@ -337,7 +343,7 @@ impl RuleSet {
     /// When a built-in file is malformed.
     pub fn read_all(&self) {
         for rule in self.all() {
-            let _file: &RuleFile = rule;
+            rule.file();
         }
     }
 

@@ -117,7 +117,7 @@ pub(super) fn contained(text: &str) -> Option<String> {
     while let Some(c) = rest.next() {
         let literal = match c {
             '|' | '[' => return None,
-            '\\' => rest.next().filter(|escaped| escaped.is_ascii_punctuation()),
+            '\\' => rest.next().filter(char::is_ascii_punctuation),
             '.' | '^' | '$' | '+' => None,
             '*' | '?' | '{' => {
                 // The character before need not be there.
