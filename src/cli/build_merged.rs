@@ -1,9 +1,7 @@
 //! `build-merged`.
 
 use std::collections::BTreeMap;
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::{Context, bail};
 
@@ -11,6 +9,7 @@ use clap::CommandFactory as _;
 
 use super::args::{BuildMergedArgs, Cli, SeverityName};
 use super::exit::{CLEAN, FAILED, FINDINGS};
+use super::progress::Meter;
 use super::{library, output, signals};
 use crate::check::Severity;
 use crate::knowledge::Knowledge;
@@ -30,15 +29,9 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     }
     let request = request(args, &knowledge)?;
     signals::install()?;
-    let terminal = std::io::stderr().is_terminal();
-    let last = AtomicU64::new(0);
-    let progress = |done: u64, total: u64| {
-        let percent = done.saturating_mul(100).checked_div(total).unwrap_or(100);
-        if terminal && percent > last.fetch_max(percent, Ordering::Relaxed) {
-            output::progress(percent);
-        }
-    };
-    let run = merge::run(&request, &knowledge, &progress)?;
+    let meter = Meter::new("writing");
+    let run = merge::run(&request, &knowledge, &|done, total| meter.reach(done, total))?;
+    drop(meter);
     run.notices.iter().for_each(|notice| output::note(&output::safe(notice)));
     let stage = run.record.stage;
     if let (Some(file), Some(plan)) = (&args.plan, &run.plan) {

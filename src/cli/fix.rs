@@ -1,14 +1,13 @@
 //! `check --fix`, `--diff` and `--output`.
 
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::bail;
 
 use super::args::FixArgs;
 use super::output;
+use super::progress::Meter;
 use crate::check::Outcome;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, escape};
@@ -101,15 +100,8 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         return Ok(None);
     }
     let total = repair.changes.iter().fold(0_u64, |n, change| n.saturating_add(change.new.len()));
-    let (done, last) = (AtomicU64::new(0), AtomicU64::new(0));
-    let terminal = std::io::stderr().is_terminal();
-    let progress = |bytes: u64| {
-        let done = done.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes);
-        let percent = done.saturating_mul(100).checked_div(total).unwrap_or(100);
-        if terminal && percent > last.fetch_max(percent, Ordering::Relaxed) {
-            output::progress(percent);
-        }
-    };
+    let meter = Meter::new("writing");
+    let progress = |bytes: u64| meter.add("", bytes, total);
     if let Some(out) = &args.output {
         let copy = overlay(repair, out, &progress).map_err(|error| name_interrupted(error, out))?;
         if let Some(cleared) = &copy.cleared {

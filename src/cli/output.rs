@@ -68,9 +68,3 @@ pub fn safe(line: &str) -> String {
 pub fn create(file: &Path, text: &str) -> std::io::Result<()> {
     fs::OpenOptions::new().write(true).create_new(true).open(file)?.write_all(text.as_bytes())
 }
-
-/// Progress on a terminal, on one line.
-pub fn progress(percent: u64) {
-    let end = if percent >= 100 { "\r             \r" } else { "" };
-    let _ = write!(std::io::stderr(), "\rwriting {percent:3} %{end}");
-}

@@ -18,7 +18,7 @@ const RATE: u8 = 10;
 /// What is shown of an operation that reads or writes bytes: share, rate, time left and the current file. Any thread adds to it.
 ///
 /// Nothing is written unless standard error is a terminal, and the line is removed at the end. An operation makes one, calls
-/// [`Self::add`] with the bytes since the last call, and drops it.
+/// [`Self::add`] with the bytes since the last call, or [`Self::reach`] with all so far, and drops it.
 pub struct Meter {
     /// What the operation does, in one word: `reading`.
     verb: &'static str,
@@ -37,12 +37,21 @@ impl Meter {
 
     /// Adds `bytes` that were read or written of `file`, of `total` in all files.
     pub fn add(&self, file: &str, bytes: u64, total: u64) {
+        self.update(file, total, |done| done.saturating_add(bytes));
+    }
+
+    /// States that `done` bytes of `total` were written, unless another thread has already stated more.
+    pub fn reach(&self, done: u64, total: u64) {
+        self.update("", total, |before| before.max(done));
+    }
+
+    fn update(&self, file: &str, total: u64, change: impl Fn(u64) -> u64) {
         if !self.is_shown {
             return;
         }
         let mut line = self.line.lock().unwrap_or_else(PoisonError::into_inner);
         let (bar, done) = &mut *line;
-        *done = done.saturating_add(bytes);
+        *done = change(*done);
         if bar.is_none() && self.begun.elapsed() < PATIENCE {
             return;
         }
@@ -52,7 +61,7 @@ impl Meter {
     }
 
     fn bar(&self, total: u64) -> ProgressBar {
-        let template = "{prefix} {percent:>3} % of {total_bytes}, {bytes_per_sec}, {eta} left: {wide_msg}";
+        let template = "{prefix} {percent:>3} % of {total_bytes}, {bytes_per_sec}, {eta} left {wide_msg}";
         let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
         let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(RATE));
         bar.with_style(style).with_prefix(self.verb).with_elapsed(self.begun.elapsed())

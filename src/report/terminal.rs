@@ -39,7 +39,7 @@ pub fn render(report: &Report, style: Style) -> String {
             for (load, loaders) in agreeing(&checkpoint.loads) {
                 load::render(&mut out, load, &loaders, style);
             }
-            contents::render(&mut out, &checkpoint.contents, style);
+            contents::render(&mut out, &checkpoint.contents);
         }
         out.push('\n');
         above = Some(checkpoint);

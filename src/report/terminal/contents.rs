@@ -2,28 +2,43 @@
 
 use std::fmt::Write as _;
 
-use super::load::table;
 use crate::checkpoint::{TensorContents, TensorStats};
-use crate::report::Style;
 use crate::report::format::name;
 
-/// A row for each tensor, however many there are: the user asked for them.
-pub fn render(out: &mut String, contents: &[TensorContents], style: Style) {
-    let rows: Vec<[String; 10]> =
-        contents.iter().filter_map(|tensor| Some(row(tensor, tensor.stats.as_ref()?))).collect();
+/// What the columns in front of the names contain.
+const HEADER: [&str; 9] = ["dtype", "min", "max", "mean", "rms", "zeros", "denormal", "NaN", "infinite"];
+
+/// A line for each tensor, however many there are: the user asked for them. Names are last, since they are of any length.
+pub fn render(out: &mut String, contents: &[TensorContents]) {
+    let rows: Vec<([String; 9], String)> = contents
+        .iter()
+        .filter_map(|tensor| Some((row(tensor, tensor.stats.as_ref()?), name(&tensor.tensor))))
+        .collect();
     if rows.is_empty() {
         return;
     }
-    let header = ["tensor", "dtype", "min", "max", "mean", "rms", "zeros", "denormal", "NaN", "infinite"];
-    table(out, header, &rows, Style { cap: usize::MAX, ..style });
+    let header = (HEADER.map(str::to_owned), "tensor".to_owned());
+    let lines = || std::iter::once(&header).chain(&rows);
+    let mut widths = [0; 9];
+    for (cells, _) in lines() {
+        for (width, cell) in widths.iter_mut().zip(cells) {
+            *width = cell.chars().count().max(*width);
+        }
+    }
+    for (cells, tensor) in lines() {
+        let _ok = write!(out, " ");
+        for (cell, width) in cells.iter().zip(widths) {
+            let _ok = write!(out, " {cell:>width$} ");
+        }
+        let _ok = writeln!(out, " {tensor}");
+    }
     let _ok = writeln!(out);
 }
 
-fn row(tensor: &TensorContents, stats: &TensorStats) -> [String; 10] {
+fn row(tensor: &TensorContents, stats: &TensorStats) -> [String; 9] {
     let number = |n: Option<f64>| n.map_or_else(String::new, short);
     let share = |n: u64| share(n, tensor.elements);
     [
-        name(&tensor.tensor),
         tensor.dtype.to_owned(),
         number(stats.min),
         if tensor.constant { "same".to_owned() } else { number(stats.max) },
@@ -69,6 +84,34 @@ fn share(n: u64, of: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_of_any_length_are_last() {
+        let tensor = |name: &str, min: f64, zeros: u64| TensorContents {
+            file: "model.safetensors".to_owned(),
+            tensor: name.to_owned(),
+            dtype: "BF16",
+            elements: 8,
+            nan: 0,
+            infinite: 1,
+            zeros,
+            constant: zeros == 7,
+            stats: Some(TensorStats { min: Some(min), max: Some(0.0), mean: None, rms: Some(2.5e-9), denormals: 0 }),
+        };
+        let mut out = String::new();
+        let long = format!("model.{}.weight", "x".repeat(80));
+        render(&mut out, &[tensor(&long, -1.25, 2), tensor("b", 0.0, 7)]);
+        let expected = "
+  dtype    min   max  mean       rms   zeros  denormal  NaN  infinite  tensor
+   BF16  -1.25     0        2.500e-9  25.0 %                   12.5 %  model.LONG.weight
+   BF16      0  same        2.500e-9  87.5 %                   12.5 %  b
+
+";
+        assert_eq!(format!("\n{}", out.replace(&"x".repeat(80), "LONG")), expected);
+        out.clear();
+        render(&mut out, &[TensorContents { stats: None, ..tensor("b", 0.0, 7) }]);
+        assert_eq!(out, "");
+    }
 
     #[test]
     fn numbers_are_short() {
