@@ -8,7 +8,8 @@ use crate::report::format::name;
 /// What the columns in front of the names contain.
 const HEADER: [&str; 9] = ["dtype", "min", "max", "mean", "rms", "zeros", "denormal", "NaN", "infinite"];
 
-/// A line for each tensor, however many there are: the user asked for them. Names are last, since they are of any length.
+/// A line for each tensor, however many there are: the user asked for them. Names are last, since they are of any length, and
+/// columns without a value are left out.
 pub fn render(out: &mut String, contents: &[TensorContents]) {
     let rows: Vec<([String; 9], String)> = contents
         .iter()
@@ -25,9 +26,14 @@ pub fn render(out: &mut String, contents: &[TensorContents]) {
             *width = cell.chars().count().max(*width);
         }
     }
+    for (column, width) in widths.iter_mut().enumerate() {
+        if rows.iter().all(|(cells, _)| cells.get(column).is_none_or(String::is_empty)) {
+            *width = 0;
+        }
+    }
     for (cells, tensor) in lines() {
         let _ok = write!(out, " ");
-        for (cell, width) in cells.iter().zip(widths) {
+        for (cell, width) in cells.iter().zip(widths).filter(|(_, width)| *width > 0) {
             let _ok = write!(out, " {cell:>width$} ");
         }
         let _ok = writeln!(out, " {tensor}");
@@ -102,9 +108,9 @@ mod tests {
         let long = format!("model.{}.weight", "x".repeat(80));
         render(&mut out, &[tensor(&long, -1.25, 2), tensor("b", 0.0, 7)]);
         let expected = "
-  dtype    min   max  mean       rms   zeros  denormal  NaN  infinite  tensor
-   BF16  -1.25     0        2.500e-9  25.0 %                   12.5 %  model.LONG.weight
-   BF16      0  same        2.500e-9  87.5 %                   12.5 %  b
+  dtype    min   max       rms   zeros  infinite  tensor
+   BF16  -1.25     0  2.500e-9  25.0 %    12.5 %  model.LONG.weight
+   BF16      0  same  2.500e-9  87.5 %    12.5 %  b
 
 ";
         assert_eq!(format!("\n{}", out.replace(&"x".repeat(80), "LONG")), expected);
