@@ -696,7 +696,8 @@ every tensor and saves them with `safetensors.torch.save_file`. The bound is the
 when they begin to write back. Digests are computed while the bytes pass.""",
     "cold": """The page cache is dropped before every run.""",
     "reflink": """File systems in a loop device. The result shares the blocks of the donors: the header of a shard is padded, so that its data
-starts where the donor's does within a block.""",
+starts where the donor's does within a block. A header satisfies one donor's file; tensors of files with other offsets are
+copied.""",
 }
 
 

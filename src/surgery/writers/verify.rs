@@ -1,7 +1,7 @@
 //! Verifies written shards with the reference implementation of the format.
 //!
-//! This is the only module that maps files into memory. It maps files in this run's locked staging directory, which no
-//! other run truncates.
+//! The files that it maps into memory are in this run's locked staging directory, where no other run truncates them. Files of
+//! others are mapped by the readers of contents alone, which handle that.
 
 use std::fs::File;
 use std::io;
