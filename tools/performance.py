@@ -415,33 +415,48 @@ def donors_of(folder, size):
     return checkpoint(folder / "host", llava(layers)), checkpoint(folder / "part", llama(layers))
 
 
-def merge_programs(args, folder, host, part, out):
-    base = [TOOL, "build-merged", "--recipe", "insert", "--donor", f"model={host}", "--donor", f"part={part}"]
+def emptied(folder):
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+def merging(host, part, out, algorithm):
+    """The command that merges the donors."""
+    donors = ["--donor", f"model={host}", "--donor", f"part={part}"]
+    return [TOOL, "build-merged", "--recipe", "insert", *donors, "--hash", algorithm, "--out", out]
+
+
+def planned(host, part, folder):
+    """Each tensor of the plan of the merge, and where its bytes are in the donors."""
     plan = folder / "plan.json"
     plan.unlink(missing_ok=True)
-    run(*base, "--out", out / "none", "--dry-run", "--plan", plan)
+    run(*merging(host, part, folder / "planned", "none"), "--dry-run", "--plan", plan)
     held = {"model": tensors(host), "part": tensors(part)}
+    found = json.loads(plan.read_text())["tensors"]
+    return [(tensor, held[tensor["source"]["donor"]][tensor["source"]["name"]]) for tensor in found]
+
+
+def merge_programs(args, folder, host, part, out):
     ranges, names, expected = {}, {}, {}
-    for tensor in json.loads(plan.read_text())["tensors"]:
-        source = tensor["source"]
-        where = held[source["donor"]][source["name"]]
+    for tensor, where in planned(host, part, folder):
         expected[tensor["name"]] = where
         ranges.setdefault(tensor["shard"], {})[tensor["name"]] = where
-        names.setdefault(tensor["shard"], {})[tensor["name"]] = (where[0], source["name"])
+        names.setdefault(tensor["shard"], {})[tensor["name"]] = (where[0], tensor["source"]["name"])
     (folder / "ranges.json").write_text(json.dumps(ranges))
     (folder / "names.json").write_text(json.dumps(names))
     total = sum(where[2] for where in expected.values())
-    # What cp copies is as large as the result, to 1 %: files of the donors up to that size.
-    run(*base, "--hash", "none", "--out", out / "first")
+    # cp copies the files of a first result, which has the size of the others.
+    run(*merging(host, part, out / "first", "none"))
     result = sorted((out / "first").glob("*.safetensors"))
     script = folder / "cp.sh"
     script.write_text(
         f"set -e\nmkdir -p {out}/cp\ncp --reflink=never {' '.join(map(str, result))} {out}/cp/\nsync {out}/cp/* {out}/cp\n"
     )
     programs = {
-        "merge": [*base, "--hash", "none", "--out", out / "none"],
-        "merge + BLAKE3": [*base, "--hash", "blake3", "--out", out / "blake3"],
-        "merge + SHA-256": [*base, "--hash", "sha256", "--out", out / "sha256"],
+        "merge": merging(host, part, out / "none", "none"),
+        "merge + BLAKE3": merging(host, part, out / "blake3", "blake3"),
+        "merge + SHA-256": merging(host, part, out / "sha256", "sha256"),
         "cp + sync": ["sh", script],
         "Python byte copy": [sys.executable, "-c", COPY, folder / "ranges.json", out / "python"],
     }
@@ -463,9 +478,7 @@ def compare(folder, expected):
 def measure_merge(args):
     folder = args.work / "merge"
     host, part = donors_of(folder, args.size)
-    out = folder / "out"
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir()
+    out = emptied(folder / "out")
     programs, expected, total = merge_programs(args, folder, host, part, out)
     written = {
         "merge": "none",
@@ -494,10 +507,7 @@ def measure_merge(args):
 def measure_cold(args):
     folder = args.work / "cold"
     host, part = donors_of(folder, args.cold_size)
-    out = folder / "out"
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir()
-    base = [TOOL, "build-merged", "--recipe", "insert", "--donor", f"model={host}", "--donor", f"part={part}"]
+    out = emptied(folder / "out")
     # cp copies as many bytes from the same donors: the whole part, and of the host as much as the merge takes.
     kept = sum(
         length for name, (_, _, length, *_) in tensors(host).items() if "language_model" not in name and "lm_head" not in name
@@ -519,8 +529,8 @@ def measure_cold(args):
             shutil.rmtree(child)
 
     programs = {
-        "merge": [*base, "--hash", "none", "--out", out / "none"],
-        "merge + BLAKE3": [*base, "--hash", "blake3", "--out", out / "blake3"],
+        "merge": merging(host, part, out / "none", "none"),
+        "merge + BLAKE3": merging(host, part, out / "blake3", "blake3"),
         "cp + sync": ["sh", script],
     }
     measured = rounds(max(1, args.rounds // 2), programs, before, after)
@@ -540,34 +550,15 @@ def measure_reflink(args):
         run("mount", "-o", "loop", image, mount)
         try:
             host, part = donors_of(mount, args.size)
-            base = [
-                TOOL,
-                "build-merged",
-                "--recipe",
-                "insert",
-                "--donor",
-                f"model={host}",
-                "--donor",
-                f"part={part}",
-            ]
-            held = {"model": tensors(host), "part": tensors(part)}
-            plan = args.work / "plan.json"
-            plan.unlink(missing_ok=True)
-            run(*base, "--out", mount / "out", "--dry-run", "--plan", plan)
-            entries = json.loads(plan.read_text())["tensors"]
-            expected = {t["name"]: held[t["source"]["donor"]][t["source"]["name"]] for t in entries}
+            expected = {tensor["name"]: where for tensor, where in planned(host, part, args.work)}
             os.sync()
-            used = []
 
             def after(_):
                 compare(mount / "out", expected)
                 shutil.rmtree(mount / "out")
                 os.sync()
 
-            def before():
-                used.append(shutil.disk_usage(mount).used)
-
-            found[system] = rounds(args.rounds, {"merge": [*base, "--hash", "none", "--out", mount / "out"]}, before, after)
+            found[system] = rounds(args.rounds, {"merge": merging(host, part, mount / "out", "none")}, after=after)
             found[system]["bytes"] = sum(where[2] for where in expected.values())
         finally:
             run("umount", mount)

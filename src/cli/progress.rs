@@ -1,11 +1,12 @@
 //! Progress of a long operation, on a terminal.
 
 use std::borrow::Cow;
+use std::fmt;
 use std::io::IsTerminal as _;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{BinaryBytes, HumanDuration, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use super::output::safe;
 
@@ -61,11 +62,24 @@ impl Meter {
     }
 
     fn bar(&self, total: u64) -> ProgressBar {
-        let template = "{prefix} {percent:>3} % of {total_bytes}, {bytes_per_sec}, {eta} left {wide_msg}";
+        let template = "{prefix} {percent:>3} % of {total_bytes}, {pace} {wide_msg}";
         let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+        // The rate of the crate counts from the first line on, and with what was done before it.
+        let style = style.with_key("pace", move |state: &ProgressState, out: &mut dyn fmt::Write| {
+            let _ok = out.write_str(&pace(state.pos(), total, state.elapsed()));
+        });
         let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(RATE));
         bar.with_style(style).with_prefix(self.verb).with_elapsed(self.begun.elapsed())
     }
+}
+
+/// Mean rate since the start, and the time left at this rate: `1.50 GiB/s, 4s left`.
+fn pace(done: u64, total: u64, elapsed: Duration) -> String {
+    let milliseconds = elapsed.as_millis().max(1);
+    let rate = u128::from(done).saturating_mul(1000).checked_div(milliseconds).unwrap_or(0);
+    let left = u128::from(total.saturating_sub(done)).checked_div(rate.max(1)).unwrap_or(0);
+    let [rate, left] = [rate, left].map(|n| u64::try_from(n).unwrap_or(u64::MAX));
+    format!("{}/s, {:#} left", BinaryBytes(rate), HumanDuration(Duration::from_secs(left)))
 }
 
 impl Drop for Meter {
@@ -74,5 +88,19 @@ impl Drop for Meter {
         if let Some(bar) = bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_pace_is_that_since_the_start() {
+        let pace = |done: u64, total: u64, seconds| pace(done << 30, total << 30, Duration::from_secs(seconds));
+        assert_eq!(pace(3, 9, 2), "1.50 GiB/s, 4s left");
+        assert_eq!(pace(9, 9, 3), "3.00 GiB/s, 0s left");
+        assert_eq!(pace(1, 300, 2), "512.00 MiB/s, 10m left");
+        assert!(pace(0, 9, 0).starts_with("0 B/s"));
     }
 }

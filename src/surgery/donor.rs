@@ -68,8 +68,7 @@ impl DonorSnapshot {
 
 /// A donor's file from which tensors are read.
 ///
-/// Reads are positioned or copies inside the kernel. The file is never mapped: truncating a mapped file ends the
-/// process with SIGBUS.
+/// Reads are positioned, or copies inside the kernel.
 pub(super) struct DonorFile {
     pub(super) path: PathBuf,
     opened: Opened,

@@ -6,9 +6,7 @@
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::path::Path;
-use std::sync::OnceLock;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::thread;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
@@ -17,7 +15,7 @@ use super::pieces::{Piece, WINDOW, each_piece};
 use super::tally::{BLOCK, Sums, Tally, as_u64};
 use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::shard::tail::zero_tail;
-use crate::checkpoint::{Fault, FaultKind, Shard, Tensor};
+use crate::checkpoint::{Fault, FaultKind, Shard, Tensor, parallel};
 
 /// Bytes of a part: a few milliseconds of work.
 const PART: u64 = WINDOW as u64;
@@ -324,38 +322,22 @@ struct Run<'a> {
 impl Run<'_> {
     /// What each part contains. Each thread takes one after the other.
     fn outcomes(&self) -> Vec<Outcome> {
-        let outcomes: Vec<OnceLock<Outcome>> = self.parts.iter().map(|_| OnceLock::new()).collect();
         let failed: Vec<AtomicBool> = self.plans.iter().map(|_| AtomicBool::new(false)).collect();
-        let next = AtomicUsize::new(0);
-        let work = || {
-            let mut buffer = vec![0_u8; CHUNK];
-            // The shard of the last part: most parts have the same one.
-            let mut open: Option<(usize, Opened)> = None;
-            loop {
-                let at = next.fetch_add(1, Ordering::Relaxed);
-                let (Some(part), Some(slot)) = (self.parts.get(at), outcomes.get(at)) else { break };
-                let is_failed = failed.get(part.shard);
-                // A part before this one has the reason.
-                if is_failed.is_some_and(|failed| failed.load(Ordering::Relaxed)) {
-                    continue;
-                }
-                let outcome = self.part(part, &mut open, &mut buffer);
-                if let (Err(_), Some(failed)) = (&outcome, is_failed) {
-                    failed.store(true, Ordering::Relaxed);
-                }
-                let _first = slot.set(outcome);
+        // A buffer, and the shard of the last part: most parts have the same one.
+        let state = || (vec![0_u8; CHUNK], None::<(usize, Opened)>);
+        let threads = self.options.threads.map_or_else(parallel::threads, usize::from);
+        parallel::map(threads, self.parts, state, |(buffer, open), part| {
+            let is_failed = failed.get(part.shard);
+            // A part before this one has the reason.
+            if is_failed.is_some_and(|failed| failed.load(Ordering::Relaxed)) {
+                return Ok(None);
             }
-        };
-        let cores = || thread::available_parallelism().map_or(1, usize::from);
-        let threads = self.options.threads.map_or_else(cores, usize::from).min(self.parts.len());
-        thread::scope(|scope| {
-            for _ in 1..threads {
-                // Without another thread, this one does all of the work.
-                let _started = thread::Builder::new().spawn_scoped(scope, work);
+            let outcome = self.part(part, open, buffer);
+            if let (Err(_), Some(failed)) = (&outcome, is_failed) {
+                failed.store(true, Ordering::Relaxed);
             }
-            work();
-        });
-        outcomes.into_iter().map(|slot| slot.into_inner().unwrap_or(Ok(None))).collect()
+            outcome
+        })
     }
 
     fn part(&self, part: &Part<'_>, open: &mut Option<(usize, Opened)>, buffer: &mut [u8]) -> Outcome {

@@ -1,6 +1,6 @@
 //! Finds the files that describe a class or a model type without parsing them.
 
-use std::cmp::Ordering;
+use crate::knowledge::source;
 
 /// The index of the embedded files, as the build script writes it: sorted lines of a kind and a name, and the stems of
 /// files after tabs.
@@ -19,23 +19,8 @@ pub(super) fn with_model_type(model_type: &str) -> impl Iterator<Item = &'static
 }
 
 fn stems(kind: &str, name: &str) -> impl Iterator<Item = &'static str> + use<> {
-    find(EMBEDDED, kind, name).unwrap_or_default().split('\t').filter(|stem| !stem.is_empty())
-}
-
-/// The rest of the line that starts with this kind and name, by bisection.
-fn find<'t>(mut text: &'t str, kind: &str, name: &str) -> Option<&'t str> {
-    loop {
-        let middle = text.as_bytes().get(..text.len() / 2)?;
-        let start = memchr::memrchr(b'\n', middle).map_or(0, |at| at.saturating_add(1));
-        let (before, rest) = text.split_at_checked(start)?;
-        let (line, after) = rest.split_once('\n')?;
-        let (key, found) = line.split_once('\t')?;
-        match key.split_once(' ')?.cmp(&(kind, name)) {
-            Ordering::Equal => return Some(found),
-            Ordering::Less => text = after,
-            Ordering::Greater => text = before,
-        }
-    }
+    let found = source::line_of(EMBEDDED.as_bytes(), &format!("{kind} {name}"));
+    found.unwrap_or_default().split('\t').filter(|stem| !stem.is_empty())
 }
 
 #[cfg(test)]
@@ -43,7 +28,6 @@ mod tests {
     use super::super::scan;
     use super::*;
     use crate::knowledge::architecture::Blueprint;
-    use crate::knowledge::source;
 
     #[test]
     fn every_class_and_model_type_of_every_file_is_found() {
