@@ -28,10 +28,11 @@ import plants
 import traced
 from plants import SECRET, SETTINGS, Site
 
-# Files that any process opens: its libraries, the limits of the system, the time zone.
+# Files that any process opens: its libraries, the limits of the system, the time zone. glibc reads `overcommit_memory` before
+# it gives memory of a thread back (`check_may_shrink_heap` in sysdeps/unix/sysv/linux/malloc-sysdep.h).
 SYSTEM = (
     "/etc/ld.so.cache", "/etc/ld.so.preload", "/lib/", "/lib64/", "/usr/lib/", "/usr/lib64/", "/usr/local/lib/", "/etc/localtime",
-    "/usr/share/zoneinfo/", "/sys/fs/cgroup/", "/sys/devices/system/cpu/", "/dev/null",
+    "/usr/share/zoneinfo/", "/sys/fs/cgroup/", "/sys/devices/system/cpu/", "/dev/null", "/proc/sys/vm/overcommit_memory",
 )  # fmt: skip
 # Blobs of any model in a hub cache: a name that is a hash says what the file contains.
 BLOB = re.compile(r"/models--[^/]+/blobs/([0-9a-f]{40}|[0-9a-f]{64})$")
@@ -120,9 +121,8 @@ def reads_inside(job, outcome, _):
 
 def of_the_system(path):
     proc = path.split("/")
-    if proc[1] == "proc":
-        return len(proc) == 4 and proc[2].isdigit() and proc[3] in OF_ITSELF
-    return path.startswith(SYSTEM)
+    of_itself = len(proc) == 4 and proc[1] == "proc" and proc[2].isdigit() and proc[3] in OF_ITSELF
+    return of_itself or path.startswith(SYSTEM)
 
 
 def settings_from_here(job, outcome, _):
