@@ -164,7 +164,7 @@ mod tests {
         for residue in (0..BLOCK).step_by(8) {
             let (shard, at) = shard(vec![tensor("x", 8 * BLOCK + residue, 2 * MIB)]);
             assert_eq!(at % BLOCK, residue);
-            assert!(at < BLOCK + 8 + PlannedShard { residue: None, ..shard }.header().len() as u64);
+            assert!(at < BLOCK + 8 + PlannedShard { data_start: None, ..shard }.header().len() as u64);
         }
     }
 

@@ -42,9 +42,10 @@ pub struct PlannedShard {
     pub tensors: Vec<PlannedTensor>,
     /// `__metadata__`; transformers refuses a shard without `format` in it.
     pub metadata: BTreeMap<String, String>,
-    /// What the offset of the data leaves when it is divided by [`BLOCK`], a multiple of eight; see [`align::residue`]. `None`
-    /// if it does not matter.
-    pub residue: Option<u64>,
+    /// Where the data should start: at this offset, or a whole number of [`BLOCK`]s after it if the header needs more room. A
+    /// multiple of eight; `None` if it does not matter. A merge takes it from [`align::residue`], a repair from the shard
+    /// whose header it edits.
+    pub data_start: Option<u64>,
 }
 
 /// The metadata that `save_pretrained` writes.
@@ -247,8 +248,8 @@ impl PlannedShard {
         (self.header().len() as u64).saturating_add(self.data_len())
     }
 
-    /// The header: length prefix and JSON, padded with spaces so that the data starts on a multiple of eight, and leaves the
-    /// planned residue.
+    /// The header: length prefix and JSON, padded with spaces so that the data starts on a multiple of eight, and where it is
+    /// planned to.
     ///
     /// Keys are `__metadata__`, then the tensors in file order: equal plans give equal bytes.
     #[must_use]
@@ -277,9 +278,9 @@ impl PlannedShard {
         json.push('}');
         // The length prefix has eight bytes too.
         let end = (json.len() as u64).saturating_add(8).next_multiple_of(8);
-        let end = self.residue.map_or(end, |residue| {
-            end.saturating_add(residue.saturating_add(BLOCK).saturating_sub(end % BLOCK) % BLOCK)
-        });
+        let end = self
+            .data_start
+            .map_or(end, |first| first.saturating_add(end.saturating_sub(first).next_multiple_of(BLOCK)));
         json.extend((json.len() as u64..end.saturating_sub(8)).map(|_| ' '));
         let mut bytes = (json.len() as u64).to_le_bytes().to_vec();
         bytes.extend_from_slice(json.as_bytes());
@@ -359,8 +360,13 @@ pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard>
         .enumerate()
         .map(|(i, mut tensors)| {
             tensors.sort_by(align::file_order);
-            let residue = align::residue(&tensors);
-            PlannedShard { name: FileName::shard(i.saturating_add(1), count), tensors, metadata: format_pt(), residue }
+            let data_start = align::residue(&tensors);
+            PlannedShard {
+                name: FileName::shard(i.saturating_add(1), count),
+                tensors,
+                metadata: format_pt(),
+                data_start,
+            }
         })
         .collect()
 }

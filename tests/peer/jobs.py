@@ -11,6 +11,9 @@ from harm import PROGRAM, Broken, Job, identity, tree
 from peer import DONORS, INDEX
 
 
+SHARDS = ("model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors")
+
+
 def without_format(shard):
     """The shard with a header without `__metadata__`."""
     length = int.from_bytes(shard[:8], "little")
@@ -18,6 +21,25 @@ def without_format(shard):
     header.pop("__metadata__")
     text = json.dumps(header).encode()
     return len(text).to_bytes(8, "little") + text + shard[8 + length :]
+
+
+def with_room(shard, room):
+    """A shard whose header lacks `__metadata__`, ends on a multiple of eight and has at least `room` spaces at its end."""
+    length = int.from_bytes(shard[:8], "little")
+    header = json.loads(shard[8 : 8 + length])
+    header.pop("__metadata__")
+    text = json.dumps(header, separators=(",", ":")).encode() + b" " * room
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + shard[8 + length :]
+
+
+def inserts(directory):
+    """Whether the file system can insert blocks: ext4 and XFS can, btrfs and tmpfs cannot."""
+    probe = directory / "probe"
+    probe.write_bytes(bytes(8192))
+    done = subprocess.run(["fallocate", "--insert-range", "--length", "4096", probe], capture_output=True)
+    probe.unlink()
+    return done.returncode == 0
 
 
 def damaged(directory):
@@ -83,6 +105,7 @@ class Repair(Job):
     blocks_first = 2  # .gitignore and the lock
     blocks_more = 4  # folders and the journal
     race_codes = ([0, 0], [0, 2])
+    edits_in_place = False
     model = property(lambda self: self.work / "model")
     broken = property(lambda self: self.place / "broken")
     kept = property(lambda self: self.model / ".ckpt-doctor")
@@ -158,7 +181,11 @@ class Undo(Repair):
 
     def lay(self):
         super().lay()
-        done = subprocess.run(super().argv(), capture_output=True, text=True)
+        self.as_fixed()
+
+    def as_fixed(self):
+        """Makes the repaired checkpoint the start."""
+        done = subprocess.run(Repair.argv(self), capture_output=True, text=True)
         if done.returncode != 0:
             raise Broken(f"the repair to undo: {done.stdout}{done.stderr}")
         self.start = self.place / "fixed"
@@ -173,6 +200,47 @@ class Undo(Repair):
 
     def refused(self):
         return None if self.pending() else ("has no repair to undo", 2)
+
+
+class Edit(Repair):
+    """`check --fix` that edits the headers of two shards in place, one with room and one that needs a block more; and writes
+    an index."""
+
+    name = "edit"
+    takes_room = False
+    edits_in_place = True
+
+    def lay(self):
+        shutil.copytree(DONORS / "llava3d-tiny", self.broken)
+        (self.broken / INDEX).unlink()
+        for name, room in zip(SHARDS, (64, 0), strict=True):
+            shard = self.broken / name
+            shard.write_bytes(with_room(shard.read_bytes(), room))
+        self.start = self.broken
+        self.sound = {"config.json", "tokenizer.model", "generation_config.json", "tokenizer_config.json"}
+        self.reset()
+        self.old, self.old_kept = self.target(), self.names_kept()
+
+    def measure(self):
+        super().measure()
+        self.reset()
+        before = {name: (self.model / name).stat().st_ino for name in SHARDS}
+        self.run()
+        for name, inode in before.items():
+            is_edited = (self.model / name).stat().st_ino == inode
+            if is_edited != inserts(self.work):
+                raise Broken(f"{self.name}: {name} was {'edited in place' if is_edited else 'written anew'}")
+
+
+class Unedit(Undo):
+    """`undo` of that repair."""
+
+    name = "unedit"
+    edits_in_place = True
+
+    def lay(self):
+        Edit.lay(self)
+        self.as_fixed()
 
 
 class Overlay(Build):
@@ -198,4 +266,4 @@ class Overlay(Build):
         return [PROGRAM, "check", str(self.donors / "model"), "--fix", "--output", str(self.out), "--output-format", "concise"]
 
 
-JOBS = [Build, Repair, Undo, Overlay]
+JOBS = [Build, Repair, Undo, Edit, Unedit, Overlay]

@@ -8,7 +8,6 @@ use serde_json::{Map, Value, json};
 use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
 use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
-use crate::surgery::align;
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
 /// Result of applying the edits of one fix.
@@ -303,9 +302,13 @@ impl RepairDraft {
             }),
         });
         let metadata = shard.metadata.clone().unwrap_or_default();
-        let tensors: Vec<PlannedTensor> = tensors.collect();
-        let residue = align::residue(&tensors);
-        Some(PlannedShard { name: FileName::parse(file).ok()?, tensors, metadata, residue })
+        Some(PlannedShard {
+            name: FileName::parse(file).ok()?,
+            tensors: tensors.collect(),
+            metadata,
+            // Where the tensors are, the header can be edited in place, and a copy can share their blocks.
+            data_start: Some(shard.data_start).filter(|start| start.is_multiple_of(8)),
+        })
     }
 
     fn header(&mut self, file: &str) -> Option<()> {

@@ -74,9 +74,11 @@ pub(super) fn write_content(
 }
 
 /// Converts an error of the system into an error of a repair, with the bytes needed and free.
-pub(super) fn explain_error(error: RepairError, dir: &Path, repair: &Repair) -> RepairError {
+///
+/// `sizes` are those of the files to write.
+pub(super) fn explain_error(error: RepairError, dir: &Path, sizes: &[u64]) -> RepairError {
     let RepairError::Apply(error) = error else { return error };
-    match with_figures(error, dir, &repair.sizes()) {
+    match with_figures(error, dir, sizes) {
         ApplyError::Space { path, cause, need, have } => RepairError::Space { path, cause, need, have },
         other => other.into(),
     }

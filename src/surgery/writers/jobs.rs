@@ -89,7 +89,7 @@ mod tests {
             name: FileName::constant("model.safetensors"),
             tensors,
             metadata: BTreeMap::new(),
-            residue: None,
+            data_start: None,
         }
     }
 

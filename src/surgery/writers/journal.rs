@@ -8,6 +8,7 @@
 
 mod exchange;
 mod folder;
+mod header;
 mod record;
 mod recover;
 mod replay;

@@ -28,7 +28,7 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &(dyn Fn(u64) + Sync)) -> 
     let Target { path: out, cleared } = claim_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let donor = DonorSnapshot::record(&original.root)?;
-    let explained = |error| explain_error(error, parent, repair);
+    let explained = |error| explain_error(error, parent, &repair.sizes());
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
     let written = check_space(parent, &repair.sizes())
         .map_err(RepairError::from)

@@ -215,7 +215,7 @@ mod tests {
             name: FileName::shard(shard + 1, 3),
             tensors: (0..40).map(|index| tensor(shard, index)).collect(),
             metadata: BTreeMap::new(),
-            residue: None,
+            data_start: None,
         };
         (0..3).map(shard).collect()
     }

@@ -6,6 +6,7 @@ use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
 #[cfg(target_os = "linux")]
 use std::num::NonZeroU64;
+use std::ops::Range;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
@@ -213,6 +214,60 @@ pub(super) fn reserve(file: &File, len: u64) -> io::Result<()> {
 #[cfg(not(target_os = "linux"))]
 pub(super) fn reserve(_: &File, _: u64) -> io::Result<()> {
     Ok(())
+}
+
+/// Inserts zero bytes before offset `at` of a file, in whole blocks and without a copy of the bytes behind it. `false` when the
+/// file system cannot do it.
+#[cfg(target_os = "linux")]
+pub(super) fn insert_range(file: &File, at: u64, len: u64) -> io::Result<bool> {
+    move_range(file, rustix::fs::FallocateFlags::INSERT_RANGE, at, len)
+}
+
+/// Removes `len` bytes from offset `at` of a file, in whole blocks and without a copy of the bytes behind them. `false` when the
+/// file system cannot do it.
+#[cfg(target_os = "linux")]
+pub(super) fn collapse_range(file: &File, at: u64, len: u64) -> io::Result<bool> {
+    move_range(file, rustix::fs::FallocateFlags::COLLAPSE_RANGE, at, len)
+}
+
+#[cfg(target_os = "linux")]
+fn move_range(file: &File, flags: rustix::fs::FallocateFlags, at: u64, len: u64) -> io::Result<bool> {
+    match retry_on_intr(|| rustix::fs::fallocate(file, flags, at, len)) {
+        Ok(()) => Ok(true),
+        Err(Errno::NOSYS | Errno::OPNOTSUPP | Errno::INVAL | Errno::NODEV | Errno::PERM) => Ok(false),
+        Err(error) => Err(error.into()),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn insert_range(_: &File, _: u64, _: u64) -> io::Result<bool> {
+    Ok(false)
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn collapse_range(_: &File, _: u64, _: u64) -> io::Result<bool> {
+    Ok(false)
+}
+
+/// The first hole of a sparse file: the offsets of its first byte and of the data behind it. `None` without a hole.
+#[cfg(target_os = "linux")]
+pub(super) fn first_hole(file: &File) -> io::Result<Option<Range<u64>>> {
+    use rustix::fs::SeekFrom::{Data, Hole};
+    let len = file.metadata()?.len();
+    let start = retry_on_intr(|| rustix::fs::seek(file, Hole(0)))?;
+    if start >= len {
+        return Ok(None); // every file ends with a hole
+    }
+    match retry_on_intr(|| rustix::fs::seek(file, Data(start))) {
+        Ok(end) => Ok(Some(start..end)),
+        Err(Errno::NXIO) => Ok(Some(start..len)),
+        Err(error) => Err(error.into()),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn first_hole(_: &File) -> io::Result<Option<Range<u64>>> {
+    Ok(None)
 }
 
 /// Starts to write a range of a file to the disk, and does not wait for it: later syncs then have less to do. Pages of the range

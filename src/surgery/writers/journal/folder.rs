@@ -28,8 +28,8 @@ const DRAFT: &str = "journal.json.part";
 /// The lock file; contains the process of the run.
 const LOCK: &str = "lock";
 
-/// Version of the journal format.
-pub(super) const VERSION: u32 = 1;
+/// Version of the journal format. Version 1 had no edits of headers.
+pub(super) const VERSION: u32 = 2;
 
 /// What an ended run left in the folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -164,7 +164,7 @@ impl Folder {
             other => other.map_err(|e| unusable(e.to_string()))?,
         };
         let journal: Journal = serde_json::from_slice(&bytes).map_err(|e| unusable(e.to_string()))?;
-        if journal.version != VERSION {
+        if !(1..=VERSION).contains(&journal.version) {
             return Err(unusable(format!("version {} is unknown", journal.version)));
         }
         // The checkpoint may come from elsewhere: nothing outside it may be changed.

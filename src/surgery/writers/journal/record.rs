@@ -20,6 +20,28 @@ pub(super) struct JournaledFile {
     /// The file before the repair; null when it did not exist.
     pub(super) old: Option<OldFile>,
     pub(super) new: NewFile,
+    /// The edit, if only the header of a shard changes, in place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) header: Option<HeaderEdit>,
+}
+
+/// An edit of the header of a shard, in place; `undo/N/NAME` contains the old header and then the new one.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct HeaderEdit {
+    /// Number of bytes before the tensors.
+    pub(super) old_len: u64,
+    /// Number of bytes before the tensors after the edit.
+    pub(super) new_len: u64,
+    /// Inode of the shard: a file of another one was saved by another program, and was never edited.
+    pub(super) inode: u64,
+}
+
+impl HeaderEdit {
+    /// Number of bytes of both headers.
+    pub(super) const fn kept_len(&self) -> u64 {
+        self.old_len.saturating_add(self.new_len)
+    }
 }
 
 /// A file before the repair. The original itself is kept in `undo/`, so no hash is needed.
@@ -37,5 +59,6 @@ pub(super) struct OldFile {
 #[serde(deny_unknown_fields)]
 pub(super) struct NewFile {
     pub(super) len: u64,
+    /// Of the file; with [`JournaledFile::header`], of its header.
     pub(super) sha256: String,
 }

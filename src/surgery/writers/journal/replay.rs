@@ -10,7 +10,9 @@ use sha2::{Digest, Sha256};
 
 use super::exchange::{Taken, exchange, keep, rename_new, take_away};
 use super::folder::{Folder, remove_file, remove_tree};
-use super::record::{Journal, JournaledFile, NewFile, OldFile};
+use super::header::{Headers, State};
+use super::record::{HeaderEdit, Journal, JournaledFile, NewFile, OldFile};
+use super::write::copy_owner_and_mode;
 use crate::checkpoint::hex;
 use crate::checkpoint::open::{Identity, open_regular};
 use crate::surgery::error::{RepairError, io_at};
@@ -40,6 +42,8 @@ enum StepBack {
     MoveBack,
     /// Return a file of another program from the staging folder.
     Displaced,
+    /// Restore the header of a shard.
+    Header(Headers),
 }
 
 /// A journal and its folder.
@@ -80,10 +84,65 @@ impl<'a> Replay<'a> {
         })
     }
 
+    /// The headers of an edit in place; `None` when they are already removed.
+    fn headers(&self, entry: &JournaledFile, edit: &HeaderEdit) -> Result<Option<Headers>, RepairError> {
+        let kept = self.original(entry);
+        if look(&kept)?.is_none() {
+            return Ok(None);
+        }
+        let file_len = entry.old.as_ref().map_or(0, |old| old.len);
+        let unusable = || RepairError::UnusableJournal {
+            path: kept.clone(),
+            reason: "it does not contain the two headers that the journal lists".to_owned(),
+        };
+        let headers = Headers::read(&kept, edit, file_len).map_err(io_at(&kept, "reading"))?;
+        headers.ok_or_else(unusable).map(Some)
+    }
+
+    /// What a shard contains whose header is edited in place, and its inode; `None` when it is missing or no regular file.
+    fn header_state(&self, entry: &JournaledFile, headers: &Headers) -> Result<Option<(State, u64)>, RepairError> {
+        let target = self.target(entry);
+        if !look(&target)?.is_some_and(|m| m.is_file()) {
+            return Ok(None);
+        }
+        let (state, identity) = headers.state(&target).map_err(io_at(&target, "reading"))?;
+        Ok(Some((state, identity.ino)))
+    }
+
+    /// Whether the shard of an entry has the new header.
+    fn has_new_header(&self, entry: &JournaledFile, edit: &HeaderEdit) -> Result<bool, RepairError> {
+        let Some(headers) = self.headers(entry, edit)? else { return Ok(false) };
+        Ok(self.header_state(entry, &headers)?.is_some_and(|(state, _)| state == State::New))
+    }
+
+    /// Edits the headers of shards in place; called after the journal was written. `false` when the file system cannot do it:
+    /// then nothing has changed but shards that were already edited.
+    pub(super) fn edit_headers(&self) -> Result<bool, RepairError> {
+        for entry in &self.journal.files {
+            let Some(edit) = &entry.header else { continue };
+            let Some(headers) = self.headers(entry, edit)? else { continue };
+            let target = self.target(entry);
+            let is_expected = |m: &Metadata| Some(OldFile::from_metadata(m)) == entry.old && m.ino() == edit.inode;
+            match headers.apply(&target, is_expected).map_err(io_at(&target, "editing the header"))? {
+                // Another program may have given the name to another file meanwhile.
+                Some(true) if self.has_new_header(entry, edit)? => {}
+                Some(false) => return Ok(false),
+                _ => return Err(RepairError::ChangedWhileRepaired { path: target }),
+            }
+        }
+        Ok(true)
+    }
+
     /// Whether all files needed to finish the repair are present and unchanged.
     pub(super) fn can_finish(&self) -> Result<bool, RepairError> {
         for entry in &self.journal.files {
             let target = self.target(entry);
+            if let Some(edit) = &entry.header {
+                if !self.has_new_header(entry, edit)? {
+                    return Ok(false);
+                }
+                continue;
+            }
             let ready = match self.staged_file(entry)? {
                 Staged::New => match (look(&target)?, &entry.old) {
                     (Some(is), Some(was)) => OldFile::from_metadata(&is) == *was,
@@ -100,8 +159,8 @@ impl<'a> Replay<'a> {
         Ok(true)
     }
 
-    /// Links the originals, moves the new files into place, and archives the journal. Returns the staging folder if it
-    /// could not be removed.
+    /// Links the originals, moves the new files into place, and archives the journal; headers are already edited. Returns the
+    /// staging folder if it could not be removed.
     pub(super) fn finish(&self) -> Result<Option<Leftover>, RepairError> {
         self.folder.folder(&self.originals())?;
         let staged: Vec<_> = self.journal.files.iter().filter(|entry| self.is_staged(entry)).collect();
@@ -168,6 +227,10 @@ impl<'a> Replay<'a> {
                 StepBack::TakeAway(new) => take_away(&target, &original, &new),
                 StepBack::MoveBack => rename_new(&original, &target).map(|()| Taken::Expected),
                 StepBack::Displaced => retry(|| fs::rename(self.staged(entry), &target)).map(|()| Taken::Expected),
+                StepBack::Header(headers) => {
+                    self.restore_header(entry, &headers)?;
+                    Ok(Taken::Expected)
+                }
             };
             if taken.map_err(io_at(&target, "restoring"))? == Taken::Changed {
                 return Err(self.changed_since(target));
@@ -177,9 +240,30 @@ impl<'a> Replay<'a> {
         self.forget()
     }
 
+    /// Restores the header of a shard, and the time of its last change.
+    fn restore_header(&self, entry: &JournaledFile, headers: &Headers) -> Result<(), RepairError> {
+        let (target, copy) = (self.target(entry), self.staged(entry));
+        let mtime = entry.old.as_ref().map_or((0, 0), |old| old.mtime);
+        if headers.restore(&target, mtime).map_err(io_at(&target, "restoring the header"))? {
+            return Ok(());
+        }
+        self.folder.folder(&self.folder.staged())?;
+        headers.copy(&target, &copy, mtime).map_err(io_at(&copy, "writing"))?;
+        copy_owner_and_mode(&copy, &fs::metadata(&target).map_err(io_at(&target, "reading metadata"))?)?;
+        Ok(retry(|| fs::rename(&copy, &target)).map_err(io_at(&target, "restoring"))?)
+    }
+
     /// The step that restores this file; `None` when it was never replaced, or is already restored.
     fn step_back(&self, entry: &JournaledFile) -> Result<Option<StepBack>, RepairError> {
         let (target, original) = (self.target(entry), self.original(entry));
+        if let Some(edit) = &entry.header {
+            let Some(headers) = self.headers(entry, edit)? else { return Ok(None) };
+            return match self.header_state(entry, &headers)? {
+                Some((State::Other, inode)) if inode == edit.inode => Err(self.changed_since(target)),
+                None | Some((State::Old | State::Other, _)) => Ok(None),
+                Some(_) => Ok(Some(StepBack::Header(headers))),
+            };
+        }
         let staged = self.staged_file(entry)?;
         let new = entry.new.identity(&target)?;
         Ok(match (staged, look(&original)?, look(&target)?) {
@@ -209,11 +293,16 @@ impl<'a> Replay<'a> {
     pub(super) fn changed(&self) -> Result<Option<PathBuf>, RepairError> {
         for entry in &self.journal.files {
             let kept = look(&self.original(entry))?.map(|m| m.len());
-            if entry.new.identity(&self.target(entry))?.is_none() {
-                return Ok(Some(self.target(entry)));
-            }
-            if kept != entry.old.as_ref().map(|old| old.len) {
+            let expected = entry.header.as_ref().map(HeaderEdit::kept_len).or(entry.old.as_ref().map(|old| old.len));
+            if kept != expected {
                 return Ok(Some(self.original(entry)));
+            }
+            let is_new = match &entry.header {
+                Some(edit) => self.has_new_header(entry, edit)?,
+                None => entry.new.identity(&self.target(entry))?.is_some(),
+            };
+            if !is_new {
+                return Ok(Some(self.target(entry)));
             }
         }
         Ok(None)
@@ -242,6 +331,11 @@ impl OldFile {
 }
 
 impl NewFile {
+    /// The file after an edit of its header.
+    pub(super) fn of_headers(headers: &Headers) -> Self {
+        Self { len: headers.new_file_len(), sha256: hex(&Sha256::digest(headers.new_header())) }
+    }
+
     /// Hashes a file.
     pub(super) fn hash(path: &Path) -> Result<Self, RepairError> {
         Ok(Self::hash_opened(path)?.0)

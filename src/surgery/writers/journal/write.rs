@@ -5,12 +5,13 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
 use super::folder::{Folder, VERSION};
+use super::header::Headers;
 use super::record::{Journal, JournaledFile, NewFile, OldFile};
 use super::replay::Replay;
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
-use crate::surgery::repair::Repair;
+use crate::surgery::repair::{Change, Content, Repair};
 use crate::surgery::stop::interrupted;
 use crate::surgery::writers::changes::{check_unchanged, explain_error, write_content};
 use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
@@ -32,24 +33,85 @@ pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<
             return Err(RepairError::Linked { path, target });
         }
     }
-    let folder = Folder::create(root).map_err(|error| explain_error(error, root, repair))?;
-    let written = stage(repair, &folder, progress).and_then(|journal| {
-        folder.begin(&journal)?;
-        let replay = Replay::new(&folder, &journal);
-        let undo = || folder.reopen(journal.number).and_then(|()| replay.roll_back());
-        replay.finish().map_err(|error| match undo() {
-            Ok(()) => error,
-            Err(_) => RepairError::Unfinished { error: Box::new(error) },
-        })
-    });
+    let mut steps: Vec<Step<'_>> = repair.changes.iter().map(|change| Step::new(repair, change)).collect();
+    let sizes = |steps: &[Step<'_>]| steps.iter().map(Step::bytes).collect::<Vec<u64>>();
+    let folder = Folder::create(root).map_err(|error| explain_error(error, root, &sizes(&steps)))?;
+    let written = loop {
+        match attempt(repair, &steps, &folder, progress) {
+            // The second attempt edits nothing in place, so it is the last one.
+            Ok(Attempt::NotInPlace) => steps.iter_mut().for_each(|step| step.headers = None),
+            Ok(Attempt::Written(leftover)) => break Ok(leftover),
+            Err(error) => break Err(error),
+        }
+    };
     match written {
         Ok(leftover) => Ok(leftover.or(folder.tidy())),
-        Err(error) => Err(explain_error(error, root, repair).with_leftover(folder.tidy())),
+        Err(error) => Err(explain_error(error, root, &sizes(&steps)).with_leftover(folder.tidy())),
     }
 }
 
-/// Stages the new files.
-fn stage(repair: &Repair, folder: &Folder, progress: &(dyn Fn(u64) + Sync)) -> Result<Journal, RepairError> {
+/// How an attempt to write a repair ended.
+enum Attempt {
+    /// All changes are made; the staging folder, if it could not be removed.
+    Written(Option<Leftover>),
+    /// The file system cannot insert blocks for a header; nothing has changed.
+    NotInPlace,
+}
+
+/// A change, and the headers if only the header of a shard changes, in place.
+struct Step<'r> {
+    change: &'r Change,
+    headers: Option<Headers>,
+}
+
+impl<'r> Step<'r> {
+    fn new(repair: &Repair, change: &'r Change) -> Self {
+        let original = &repair.original;
+        let headers = match (&change.new, original.shards.get(&change.name)) {
+            (Content::Shard(plan), Some(shard)) => {
+                Headers::of(plan, &original.root.join(&change.name), shard.data_start)
+            }
+            _ => None,
+        };
+        Self { change, headers }
+    }
+
+    /// Number of bytes to write.
+    fn bytes(&self) -> u64 {
+        self.headers.as_ref().map_or_else(|| self.change.new.len(), Headers::bytes)
+    }
+}
+
+/// Stages the changes and makes them.
+fn attempt(
+    repair: &Repair,
+    steps: &[Step<'_>],
+    folder: &Folder,
+    progress: &(dyn Fn(u64) + Sync),
+) -> Result<Attempt, RepairError> {
+    let journal = stage(repair, steps, folder, progress)?;
+    folder.begin(&journal)?;
+    let replay = Replay::new(folder, &journal);
+    let undo = || folder.reopen(journal.number).and_then(|()| replay.roll_back());
+    let unfinished = |error| RepairError::Unfinished { error: Box::new(error) };
+    let finished = match replay.edit_headers() {
+        Ok(false) => return replay.roll_back().map(|()| Attempt::NotInPlace).map_err(unfinished),
+        Ok(true) => replay.finish(),
+        Err(error) => Err(error),
+    };
+    finished.map(Attempt::Written).map_err(|error| match undo() {
+        Ok(()) => error,
+        Err(_) => unfinished(error),
+    })
+}
+
+/// Stages the new files, and the headers of shards that are edited in place.
+fn stage(
+    repair: &Repair,
+    steps: &[Step<'_>],
+    folder: &Folder,
+    progress: &(dyn Fn(u64) + Sync),
+) -> Result<Journal, RepairError> {
     let root = &repair.original.root;
     let donor = DonorSnapshot::record(root)?;
     if folder.pending()?.is_some() {
@@ -57,35 +119,47 @@ fn stage(repair: &Repair, folder: &Folder, progress: &(dyn Fn(u64) + Sync)) -> R
     }
     folder.clear()?;
     // One more block each for the journal and for the folder of new files, and two for the originals.
-    let sizes: Vec<u64> = repair.sizes().into_iter().chain([1; 4]).collect();
+    let sizes: Vec<u64> = steps.iter().map(Step::bytes).chain([1; 4]).collect();
     check_space(root, &sizes)?;
     let number = folder.numbers()?.last().map_or(1, |n| n.saturating_add(1));
-    let staging = folder.staged();
+    let (staging, originals) = (folder.staged(), folder.originals(number));
     folder.folder(&staging)?;
+    if steps.iter().any(|step| step.headers.is_some()) {
+        folder.folder(&originals)?;
+    }
     let mut files = Vec::new();
-    for change in &repair.changes {
+    for Step { change, headers } in steps {
         interrupted()?;
         let (target, path) = (root.join(&change.name), staging.join(&change.name));
         let old = look(&target)?;
         check_unchanged(repair, change, &target)?;
+        let name = change.name.clone();
+        if let (Some(headers), Some(old)) = (headers, &old) {
+            let kept = originals.join(&name);
+            headers.write(&kept).map_err(io_at(&kept, "writing"))?;
+            progress(change.new.len());
+            let (new, header) = (NewFile::of_headers(headers), Some(headers.record(old.ino())));
+            files.push(JournaledFile { name, old: Some(OldFile::from_metadata(old)), new, header });
+            continue;
+        }
         write_content(&path, &change.new, progress)?;
         if let Some(old) = &old {
             copy_owner_and_mode(&path, old)?;
         }
-        files.push(JournaledFile {
-            name: change.name.clone(),
-            old: old.as_ref().map(OldFile::from_metadata),
-            new: NewFile::hash(&path)?,
-        });
+        let old = old.as_ref().map(OldFile::from_metadata);
+        files.push(JournaledFile { name, old, new: NewFile::hash(&path)?, header: None });
     }
     sync_dir(&staging)?;
+    if files.iter().any(|file| file.header.is_some()) {
+        sync_dir(&originals)?;
+    }
     donor.unchanged()?;
     interrupted()?;
     Ok(Journal { version: VERSION, number, files })
 }
 
-/// Gives a new file the owner and the mode of the original.
-fn copy_owner_and_mode(path: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
+/// Gives a new file the owner and the mode of the original, and syncs it.
+pub(super) fn copy_owner_and_mode(path: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
     let new = fs::metadata(path).map_err(io_at(path, "reading metadata"))?;
     if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
         retry(|| std::os::unix::fs::chown(path, Some(old.uid()), Some(old.gid())))
