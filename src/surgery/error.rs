@@ -172,7 +172,7 @@ pub enum RepairError {
         path: PathBuf,
     },
     /// A file changed after the repair.
-    #[error("{path} has changed since the repair, so it was not restored; its original is in {originals}",
+    #[error("{path} has changed since the repair, so it was not restored; what the repair replaced is in {originals}",
         path = path.display(), originals = originals.display())]
     ChangedSinceRepair {
         /// The file.

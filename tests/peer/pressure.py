@@ -169,12 +169,14 @@ class Pressure:
     # Files that an editor saves during a repair.
 
     def saves(self):
-        """A file that is saved while it is repaired, or while the repair is undone, is never lost."""
-        for job in (j for j in self.jobs if j.name in ("fix", "undo")):
+        """A file that is saved while it is repaired, or while the repair is undone, is never lost. What is written into a shard
+        at the moment of an edit in place can be lost, so these are only replaced."""
+        for job in (j for j in self.jobs if j.name in ("fix", "undo", "edit", "unedit")):
             calls, first, last = job.calls()
             changes = [c for c in calls[first : last + 1] if c.changes]
             victims = sorted(n for n in job.complete.keys() | job.old.keys() if job.complete.get(n) != job.old.get(n))
             cases = [(call, name, save) for call in changes for name in victims for save in SAVES.items()]
+            cases = [case for case in cases if not job.edits_in_place or case[2][1] is save_by_rename]
             cases = cases if self.full else self.sample(cases, 40)
             ended = sum(self.each(job, [(call, name, *save) for call, name, save in cases], self.save))
             self.report(

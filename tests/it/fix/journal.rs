@@ -159,6 +159,108 @@ fn an_interrupted_undo_is_finished() {
     }
 }
 
+/// A shard whose header lacks its metadata, and has room for it.
+fn without_metadata() -> (TempDir, PathBuf, PathBuf) {
+    let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
+    let dir = support::made("llama-sharded", "[]", room.path());
+    let path = dir.join("model-00001-of-00002.safetensors");
+    let bytes = fs::read(&path).expect("a shard");
+    let at = 8 + usize::try_from(u64::from_le_bytes(bytes[..8].try_into().expect("eight bytes"))).expect("a length");
+    let text = std::str::from_utf8(&bytes[8..at]).expect("text");
+    let bare = text.replace(r#""__metadata__":{"format":"pt"},"#, "");
+    assert_ne!(bare, text);
+    fs::write(&path, [&bytes[..8], format!("{bare:width$}", width = text.len()).as_bytes(), &bytes[at..]].concat())
+        .expect("a shard");
+    (room, dir, path)
+}
+
+fn fix(dir: &Path) {
+    let knowledge = support::knowledge();
+    let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
+    let repair = plan(&checkpoint, check(&checkpoint, &knowledge), false, &|c| check(c, &knowledge));
+    journal::write(&repair, &|_| {}).expect("written");
+}
+
+#[test]
+fn a_header_is_edited_in_place() {
+    let (_room, dir, path) = without_metadata();
+    let (before, inode) = (seen(&dir), fs::metadata(&path).expect("a shard").ino());
+    fix(&dir);
+    assert_eq!(fs::metadata(&path).expect("a shard").ino(), inode, "the shard was not written anew");
+    let (after, folder) = (seen(&dir), dir.join(".ckpt-doctor"));
+    let name = "model-00001-of-00002.safetensors";
+    let (old, new) = (&before[name].3, &after[name].3);
+    assert!(old.len() == new.len() && old != new);
+    assert!(fs::metadata(folder.join("undo/1").join(name)).expect("both headers").len() < old.len() as u64);
+    journal::undo(&dir).expect("undone");
+    assert_eq!(seen(&dir), before);
+
+    // Each state that a killed repair or undo can leave: the journal is current, and the shard has the old header, the new
+    // one, or parts of both.
+    let torn = [&new[..100], &old[100..]].concat();
+    for (bytes, outcome) in [(old, Recovered::RolledBack), (&torn, Recovered::RolledBack), (new, Recovered::Finished)] {
+        fix(&dir);
+        fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
+        fs::write(&path, bytes).expect("a shard");
+        assert_eq!(journal::recover(&dir).expect("recovered").outcome, Some(outcome));
+        if outcome == Recovered::Finished {
+            journal::undo(&dir).expect("undone");
+        }
+        assert_eq!((&contents(&dir)[name], folder.exists()), (old, false));
+    }
+
+    // Another program saved the shard: under another inode it was never edited, under the same one nobody knows.
+    for is_replaced in [true, false] {
+        fix(&dir);
+        fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
+        let saved = [&old[..], b"more"].concat();
+        if is_replaced {
+            fs::write(dir.join("new"), &saved).expect("a file");
+            fs::rename(dir.join("new"), &path).expect("a rename");
+            assert_eq!(journal::recover(&dir).expect("recovered").outcome, Some(Recovered::RolledBack));
+        } else {
+            fs::write(&path, &saved).expect("a file");
+            let error = journal::recover(&dir).expect_err("refused");
+            assert!(matches!(error, RepairError::ChangedSinceRepair { .. }), "{error}");
+        }
+        assert_eq!(contents(&dir)[name], saved);
+        fs::write(&path, old).expect("a file");
+    }
+}
+
+/// A journal may come with a download.
+#[test]
+fn headers_that_do_not_fit_the_journal_are_not_written() {
+    let (_room, dir, path) = without_metadata();
+    fix(&dir);
+    let folder = dir.join(".ckpt-doctor");
+    let kept = folder.join("undo/1").join(path.file_name().expect("a name"));
+    let (journal, headers) = (folder.join("undo/1.json"), fs::read(&kept).expect("both headers"));
+    let text = fs::read_to_string(&journal).expect("a journal");
+    let after = contents(&dir);
+    let harms: [(&str, &dyn Fn()); 4] = [
+        ("changed since", &|| fs::write(&kept, &headers[1..]).expect("a file")),
+        ("changed since", &|| fs::remove_file(&kept).expect("removed")),
+        ("changed since", &|| {
+            fs::write(&journal, text.replace(r#""old_len": "#, r#""old_len": 9"#)).expect("a journal");
+        }),
+        ("version 3", &|| fs::write(&journal, text.replace(r#""version": 2"#, r#""version": 3"#)).expect("a journal")),
+    ];
+    for (word, harm) in harms {
+        harm();
+        let error = journal::undo(&dir).expect_err("refused").to_string();
+        assert!(error.contains(word), "{error}");
+        assert_eq!(contents(&dir), after);
+        fs::write(&kept, &headers).expect("a file");
+        fs::write(&journal, &text).expect("a journal");
+    }
+    fs::rename(&journal, folder.join("journal.json")).expect("a rename");
+    fs::write(&kept, &headers[1..]).expect("a file");
+    let error = journal::recover(&dir).expect_err("refused");
+    assert!(matches!(error, RepairError::UnusableJournal { .. }), "{error}");
+    assert_eq!(contents(&dir), after);
+}
+
 /// Another program saved a file between the link to the original and the exchange, and the run was killed before it could
 /// exchange the files back.
 #[test]
@@ -196,6 +298,20 @@ fn an_empty_folder_is_removed_by_the_next_run() {
     fs::write(folder.join("notes"), "mine").expect("a file");
     journal::recover(&dir).expect("recovered");
     assert_eq!(seen(&folder).into_keys().collect::<Vec<_>>(), ["notes"]);
+}
+
+/// Repairs of ckpt-doctor 0.1 before headers were edited in place.
+#[test]
+fn a_repair_with_a_journal_of_version_1_is_undone() {
+    let (_room, dir) = broken();
+    let before = contents(&dir);
+    journal::write(&repair(&dir), &|_| {}).expect("written");
+    let path = dir.join(".ckpt-doctor/undo/1.json");
+    let text = fs::read_to_string(&path).expect("a journal");
+    assert!(text.contains(r#""version": 2"#) && !text.contains("header"), "{text}");
+    fs::write(&path, text.replace(r#""version": 2"#, r#""version": 1"#)).expect("a journal");
+    journal::undo(&dir).expect("undone");
+    assert_eq!(contents(&dir), before);
 }
 
 #[test]

@@ -248,3 +248,238 @@ fn set_mtime(file: &File, (seconds, nanoseconds): (i64, i64)) -> io::Result<()> 
         None => Ok(()),
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::arithmetic_side_effects, clippy::indexing_slicing, reason = "small numbers")]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::fs;
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::checkpoint::{Dtype, FileName};
+    use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, format_pt};
+
+    /// Number of bytes of the tensor: several blocks and a part of one.
+    const LEN: usize = 5 * 4096 + 5;
+    const MTIME: (i64, i64) = (1_000_000_000, 7);
+
+    /// The plan of a shard at `path` with one tensor from `data_start` on.
+    fn plan(path: &Path, data_start: u64, metadata: BTreeMap<String, String>) -> PlannedShard {
+        let from = TensorRef {
+            donor: String::new(),
+            path: path.to_owned(),
+            name: "a".to_owned(),
+            dtype: Dtype::U8,
+            shape: vec![LEN as u64],
+            offset: data_start,
+            len: LEN as u64,
+            slice: None,
+        };
+        let source = TensorSource::copy(from);
+        let tensor = PlannedTensor { name: "a".to_owned(), dtype: Dtype::U8, shape: vec![LEN as u64], source };
+        let name = FileName::parse("model.safetensors").unwrap();
+        PlannedShard { name, tensors: vec![tensor], metadata, data_start: Some(data_start) }
+    }
+
+    /// A shard without metadata in its header, which has at least `room` spaces; and its header.
+    fn shard(dir: &Path, room: usize) -> (PathBuf, Vec<u8>) {
+        let path = dir.join("model.safetensors");
+        let text = format!(r#"{{"a":{{"dtype":"U8","shape":[{LEN}],"data_offsets":[0,{LEN}]}}}}"#);
+        let len = (text.len() + room).next_multiple_of(8);
+        let mut header = (len as u64).to_le_bytes().to_vec();
+        header.extend(format!("{text:len$}").bytes());
+        fs::write(&path, [&header[..], &data()].concat()).unwrap();
+        set_mtime(&open(&path).unwrap(), MTIME).unwrap();
+        (path, header)
+    }
+
+    fn data() -> Vec<u8> {
+        (0..LEN).map(|i| u8::try_from(i * 31 % 251).unwrap() + 1).collect()
+    }
+
+    /// The headers of the edit that adds the metadata `pt`.
+    fn headers(path: &Path, old: &[u8]) -> Headers {
+        Headers::of(&plan(path, old.len() as u64, format_pt()), path, old.len() as u64).unwrap()
+    }
+
+    fn seen(path: &Path) -> (Vec<u8>, (i64, i64)) {
+        (fs::read(path).unwrap(), Identity::from_metadata(&fs::metadata(path).unwrap()).mtime)
+    }
+
+    /// Whether the file system of the tests can insert blocks. The states are the same without, but for those with a hole.
+    fn inserts(dir: &Path) -> bool {
+        let path = dir.join("probe");
+        fs::write(&path, [1; 8192]).unwrap();
+        insert_range(&open(&path).unwrap(), 0, BLOCK).unwrap()
+    }
+
+    #[test]
+    fn a_header_is_edited_and_restored() {
+        for room in [64, 0] {
+            let dir = tempfile::tempdir().unwrap();
+            let (path, old) = shard(dir.path(), room);
+            let (before, headers) = (seen(&path), headers(&path, &old));
+            assert_eq!(headers.new.len() - old.len(), if room == 0 { 4096 } else { 0 });
+            assert_eq!(headers.apply(&path, |_| false).unwrap(), None);
+            assert_eq!(seen(&path), before);
+            let edited = headers.apply(&path, |m| m.len() == before.0.len() as u64).unwrap();
+            assert_eq!(edited, Some(room > 0 || inserts(dir.path())));
+            if edited == Some(false) {
+                assert_eq!(seen(&path), before);
+                continue;
+            }
+            assert_eq!(seen(&path).0, [&headers.new[..], &data()].concat());
+            assert_eq!(headers.state(&path).unwrap().0, State::New);
+            assert_eq!(headers.apply(&path, |_| true).unwrap(), None);
+            assert!(headers.restore(&path, MTIME).unwrap());
+            assert_eq!(seen(&path), before);
+        }
+    }
+
+    /// What a kill or a power failure leaves of an edit or of its removal.
+    #[test]
+    fn every_state_is_recognised_and_restored() {
+        let dir = tempfile::tempdir().unwrap();
+        let inserts = inserts(dir.path());
+        for room in [64, 0] {
+            let (path, old) = shard(dir.path(), room);
+            let (before, headers) = (seen(&path), headers(&path, &old));
+            let shift = headers.new.len() - old.len();
+            let inserted = [&vec![0; shift][..], &old].concat();
+            let part = |cut: usize| [&headers.new[..cut], &inserted[cut..]].concat();
+            let rear = |cut: usize| [&inserted[..cut], &headers.new[cut..]].concat();
+            let mut states = vec![(old.clone(), State::Old), (headers.new.clone(), State::New)];
+            for cut in [1, 9, 20, 60] {
+                // With the same length, the first bytes of both headers agree.
+                let state = |bytes: Vec<u8>| match bytes {
+                    _ if bytes == headers.new => State::New,
+                    _ if bytes == old => State::Old,
+                    _ => State::Torn,
+                };
+                states.extend([part(cut), rear(cut)].map(|bytes| (bytes.clone(), state(bytes))));
+            }
+            if shift > 0 {
+                states.extend([(inserted.clone(), State::Torn), (part(4096), State::Torn)]);
+            }
+            for cut in [0, 12, 40] {
+                let mut other = headers.new.clone();
+                other[cut] ^= 0x80;
+                states.push((other, State::Other));
+            }
+            states.push(([&headers.new[..], b"more"].concat(), State::Other));
+            for (head, want) in states {
+                fs::write(&path, [&head[..], &data()].concat()).unwrap();
+                assert_eq!(headers.state(&path).unwrap().0, want);
+                let now = seen(&path);
+                match headers.restore(&path, MTIME) {
+                    Err(_) if want == State::Other => assert_eq!(seen(&path), now),
+                    Ok(true) => assert_eq!(seen(&path).0, before.0),
+                    Ok(false) => {
+                        assert!(shift > 0 && !inserts);
+                        let copy = dir.path().join("copy");
+                        headers.copy(&path, &copy, MTIME).unwrap();
+                        assert_eq!(seen(&copy), before);
+                    }
+                    other => panic!("{want:?}: {other:?}"),
+                }
+            }
+        }
+    }
+
+    /// An insertion or a removal that a power failure has stopped, with all extents from an offset on moved.
+    #[test]
+    fn a_hole_of_an_insertion_is_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        let inserts = inserts(dir.path());
+        let (path, old) = shard(dir.path(), 0);
+        let (before, headers) = (seen(&path), headers(&path, &old));
+        for hole in [4096, 8192, 5 * 4096] {
+            for (len, is_ours) in [(4096, true), (8192, false)] {
+                fs::remove_file(&path).unwrap();
+                let file = File::create(&path).unwrap();
+                file.write_all_at(&before.0[..hole], 0).unwrap();
+                let moved = if is_ours { hole } else { hole + 4096 };
+                if let Some(rest) = before.0.get(moved..) {
+                    file.write_all_at(rest, (hole + len) as u64).unwrap();
+                }
+                file.set_len(headers.new_file_len()).unwrap();
+                let state = headers.state(&path).unwrap().0;
+                if !is_ours {
+                    assert_eq!(state, State::Other);
+                    continue;
+                }
+                assert_eq!(state, State::Hole(hole as u64));
+                match headers.restore(&path, MTIME) {
+                    Ok(is_done) => assert!(is_done && inserts),
+                    Err(error) => {
+                        assert!(!inserts && error.kind() == io::ErrorKind::Unsupported);
+                        continue;
+                    }
+                }
+                assert_eq!(seen(&path), before);
+            }
+        }
+    }
+
+    /// Also when the file got the name after the edit: the other name keeps the edited file.
+    #[test]
+    fn a_file_with_two_names_is_copied() {
+        let dir = tempfile::tempdir().unwrap();
+        let (path, old) = shard(dir.path(), 64);
+        let (before, headers) = (seen(&path), headers(&path, &old));
+        assert_eq!(headers.apply(&path, |_| true).unwrap(), Some(true));
+        let (linked, copy) = (dir.path().join("linked"), dir.path().join("copy"));
+        fs::hard_link(&path, &linked).unwrap();
+        let after = seen(&linked);
+        assert!(!headers.restore(&path, MTIME).unwrap());
+        headers.copy(&path, &copy, MTIME).unwrap();
+        assert_eq!((seen(&copy), seen(&linked)), (before, after));
+        fs::remove_file(&path).unwrap();
+        fs::rename(&copy, &path).unwrap();
+        fs::remove_file(&linked).unwrap();
+        fs::hard_link(&path, &linked).unwrap();
+        assert_eq!(Headers::of(&plan(&path, old.len() as u64, format_pt()), &path, old.len() as u64), None);
+    }
+
+    #[test]
+    fn a_shard_is_written_anew_where_its_tensors_move() {
+        let dir = tempfile::tempdir().unwrap();
+        let (path, old) = shard(dir.path(), 0);
+        let start = old.len() as u64;
+        let of = |plan: &PlannedShard| Headers::of(plan, &path, start).is_some();
+        let good = plan(&path, start, format_pt());
+        assert!(of(&good));
+        assert!(!of(&PlannedShard { data_start: None, ..good.clone() }), "another place in the block");
+        assert!(!of(&plan(&path, start + 8, format_pt())), "a gap");
+        assert!(!of(&plan(&dir.path().join("other"), start, format_pt())), "of another file");
+        let mut converted = good.clone();
+        converted.tensors[0].dtype = Dtype::I8;
+        assert!(!of(&converted));
+        OpenOptions::new().append(true).open(&path).unwrap().write_all(b"more").unwrap();
+        assert!(!of(&good), "bytes behind the tensors");
+        for (room, is_edited) in [(0, false), (64, true)] {
+            let (_, old) = shard(dir.path(), room);
+            let (start, file) = (old.len() as u64, open(&path).unwrap());
+            file.set_len(start).unwrap();
+            file.set_len(start + LEN as u64).unwrap();
+            // With a hole of its own, the file must not get blocks.
+            let plan = plan(&path, start, format_pt());
+            assert_eq!(Headers::of(&plan, &path, start).is_some(), is_edited);
+        }
+    }
+
+    #[test]
+    fn headers_of_another_size_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let (path, old) = shard(dir.path(), 0);
+        let (headers, kept) = (headers(&path, &old), dir.path().join("kept"));
+        headers.write(&kept).unwrap();
+        let (edit, len) = (headers.record(1), headers.file_len);
+        assert_eq!(Headers::read(&kept, &edit, len).unwrap(), Some(headers));
+        for (old_len, new_len) in [(edit.new_len, edit.old_len), (edit.old_len, edit.new_len + 1), (0, u64::MAX)] {
+            assert_eq!(Headers::read(&kept, &HeaderEdit { old_len, new_len, ..edit }, len).unwrap(), None);
+        }
+        assert!(Headers::read(&kept, &HeaderEdit { old_len: 1, new_len: 2, ..edit }, len).is_err(), "a larger file");
+    }
+}
