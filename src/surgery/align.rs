@@ -17,6 +17,10 @@ pub const BLOCK: u64 = 4096;
 /// Minimum number of bytes that a padded header must allow to share; a copy of fewer costs no time.
 const WORTHWHILE: u64 = 1 << 20;
 
+/// Minimum number of bytes that are copied from a file of a donor for shards of its own. A copy of fewer takes a moment, and
+/// the result stays one file.
+const LARGE: u64 = 256 << 20;
+
 /// The order of tensors in a shard: wider types first; then copies, in the order of the donor's files; then others by name.
 #[must_use]
 pub fn file_order(a: &PlannedTensor, b: &PlannedTensor) -> Ordering {
@@ -29,6 +33,31 @@ fn place(tensor: &PlannedTensor) -> impl Ord {
     let is_copy = tensor.transform() == TensorTransform::Copy;
     let source = is_copy.then(|| (from.donor.clone(), from.path.file_name().map(OsStr::to_owned), from.offset));
     (Reverse(tensor.dtype), Reverse(is_copy), source, tensor.name.clone())
+}
+
+/// Tensors in an order in which those of one large file of a donor are adjacent, with the number of that file. `None`, and last,
+/// for the others; for all if there are not two such files.
+///
+/// One header can make the offsets of a shard agree with those of one file, so a shard of each file lets the result share the
+/// blocks of all of them.
+#[must_use]
+pub fn by_file(tensors: Vec<PlannedTensor>) -> Vec<(Option<usize>, PlannedTensor)> {
+    // The place of the first tensor of each file, which is its number, and the bytes of all.
+    let mut files: BTreeMap<&Path, (usize, u64)> = BTreeMap::new();
+    let copied = |t: &PlannedTensor| t.transform() == TensorTransform::Copy;
+    for (i, tensor) in tensors.iter().enumerate().filter(|(_, t)| copied(t)) {
+        let (_, bytes) = files.entry(&tensor.source.from.path).or_insert((i, 0));
+        *bytes = bytes.saturating_add(tensor.len());
+    }
+    files.retain(|_, (_, bytes)| *bytes >= LARGE);
+    if files.len() < 2 {
+        files.clear();
+    }
+    let number = |t: &PlannedTensor| files.get(t.source.from.path.as_path()).filter(|_| copied(t)).map(|(i, _)| *i);
+    let numbers: Vec<Option<usize>> = tensors.iter().map(number).collect();
+    let mut numbered: Vec<(Option<usize>, PlannedTensor)> = numbers.into_iter().zip(tensors).collect();
+    numbered.sort_by_key(|(file, _)| file.unwrap_or(usize::MAX));
+    numbered
 }
 
 /// A range of a donor's file that goes unchanged into a shard: one tensor or adjacent ones, or a part of them.
@@ -186,6 +215,27 @@ mod tests {
         let (shard, _) = shard(tensors);
         let names: Vec<&str> = shard.tensors.iter().map(|t| t.name.as_str()).collect();
         assert_eq!(names, ["x 9", "x 100", "y 5", "a 0"]);
+    }
+
+    #[test]
+    fn large_files_of_donors_have_shards_of_their_own() {
+        let large = |path, offset| tensor(path, offset, LARGE);
+        let mut made = tensor("x", 1 << 40, 2 * MIB);
+        made.source.fit = TensorTransform::Reinit;
+        let tensors = vec![large("x", 800), tensor("z", 8, MIB), large("y", 16), made, large("x", 800 + LARGE)];
+        let names = |shards: &[PlannedShard]| -> Vec<Vec<String>> {
+            shards.iter().map(|s| s.tensors.iter().map(|t| t.name.clone()).collect()).collect()
+        };
+        let shards = into_shards(tensors.clone(), u64::MAX);
+        let second = ["y 16".to_owned(), "z 8".to_owned(), format!("x {}", 1_u64 << 40)];
+        assert_eq!(names(&shards), [vec!["x 800".to_owned(), format!("x {}", 800 + LARGE)], second.to_vec()]);
+        for (shard, residue) in shards.iter().zip([800, 16]) {
+            assert_eq!(shard.header().len() as u64 % BLOCK, residue);
+        }
+        // The limit holds as well, and one large file alone needs no shard.
+        assert_eq!(names(&into_shards(tensors.clone(), LARGE)).len(), 4);
+        let alone = tensors.into_iter().filter(|t| !t.name.starts_with('y')).collect();
+        assert_eq!(names(&into_shards(alone, u64::MAX)).len(), 1);
     }
 
     #[test]

@@ -335,16 +335,18 @@ impl Plan {
 /// Distributes tensors over shards of at most `limit` bytes each, in order, and names the shards.
 ///
 /// A tensor starts a new shard when it would exceed the limit of the current one; a single shard is named
-/// `model.safetensors`. Within a shard, wider types come first, as the safetensors crate writes them; tensors of one type
+/// `model.safetensors`. Tensors of several large files of donors go to shards of their own, see [`align::by_file`]. Within a shard, wider types come first, as the safetensors crate writes them; tensors of one type
 /// have the order of the donors' files, so that copies are long. Source: `split_state_dict_into_shards_factory` in `huggingface_hub`.
 #[must_use]
 pub fn into_shards(tensors: Vec<PlannedTensor>, limit: u64) -> Vec<PlannedShard> {
     let mut groups: Vec<Vec<PlannedTensor>> = Vec::new();
     let mut used = 0_u64;
-    for t in tensors {
+    let mut last = None;
+    for (file, t) in align::by_file(tensors) {
         let len = t.len();
+        let is_other_file = file.is_some() && std::mem::replace(&mut last, file) != file;
         match groups.last_mut() {
-            Some(group) if used.saturating_add(len) <= limit => {
+            Some(group) if used.saturating_add(len) <= limit && !is_other_file => {
                 used = used.saturating_add(len);
                 group.push(t);
             }

@@ -168,7 +168,9 @@ impl Writers<'_> {
         }
         if open.is_none() {
             let new = create(shard.path).and_then(|file| {
-                reserve(&file, shard.len).map_err(io_at(shard.path, "writing"))?;
+                // Blocks that will be shared need no space.
+                let sized = if shares_blocks(&file) { file.set_len(shard.len) } else { reserve(&file, shard.len) };
+                sized.map_err(io_at(shard.path, "writing"))?;
                 Ok(file)
             });
             // Before the lock is released: otherwise another thread would report that the file exists.

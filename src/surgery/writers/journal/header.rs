@@ -250,7 +250,7 @@ fn set_mtime(file: &File, (seconds, nanoseconds): (i64, i64)) -> io::Result<()> 
 }
 
 #[cfg(test)]
-#[allow(clippy::arithmetic_side_effects, clippy::indexing_slicing, reason = "small numbers")]
+#[allow(clippy::disallowed_methods, clippy::arithmetic_side_effects, reason = "makes the files it reads")]
 mod tests {
     use std::collections::BTreeMap;
     use std::fs;
