@@ -6,14 +6,15 @@
 
 `measure` generates checkpoints below --work, whose file system is the one that is measured, runs every program of a part
 once in each round, checks the bytes of every result, and writes the raw times to docs/performance/figures.json. `page` makes
-docs/performance.md and its plots from that file. Parts: check, growth, deep, hash, merge, cold, reflink. `cold` drops the page
-cache and `reflink` mounts file systems in files: both need root.
+docs/performance.md and its plots from that file. Parts: check, growth, deep, hash, merge, cold, reflink, header. `cold` drops the
+page cache and `reflink` mounts file systems in files: both need root.
 
 CKPT_DOCTOR names the program. --python names an interpreter with torch, numpy and safetensors for the peers that need them;
 without it they are left out, and the page says so.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import platform
@@ -566,6 +567,71 @@ def measure_reflink(args):
     return found
 
 
+def data_digest(file):
+    """SHA-256 of what follows the header."""
+    with open(file, "rb") as shard:
+        shard.seek(header(file)[1])
+        return hashlib.file_digest(shard, "sha256").hexdigest()
+
+
+def without_format(folder, size, room):
+    """A Llama in one shard whose header lacks its metadata and ends with `room` spaces."""
+    layers = max(1, round((size * 1e9 - 263e6) / 121.6e6))
+    model = checkpoint(folder, llama(layers), limit=1 << 60)
+    file = model / "model.safetensors"
+    known, start = header(file)
+    if "__metadata__" in known:
+        del known["__metadata__"]
+        text = json.dumps(known, separators=(",", ":")).encode() + b" " * room
+        text += b" " * (-len(text) % 8)
+        new = file.with_suffix(".new")
+        with open(file, "rb") as old, open(new, "wb") as out:
+            old.seek(start)
+            out.write(struct.pack("<Q", len(text)) + text)
+            shutil.copyfileobj(old, out, BLOCK)
+        new.rename(file)
+    return model
+
+
+def measure_header(args):
+    folder = args.work / "header"
+    folder.mkdir(exist_ok=True)
+    models = {"room": without_format(folder / "room", args.size, 64), "blocks": without_format(folder / "blocks", args.size, 0)}
+    files = {name: model / "model.safetensors" for name, model in models.items()}
+    digests = {name: data_digest(file) for name, file in files.items()}
+    copy = folder / "copy"
+    times, memory = {}, {}
+
+    def timed(name, *command):
+        begun = time.perf_counter()
+        done = run("/usr/bin/time", "-o", "/dev/stderr", "-f", "peak %M", *command, check=False)
+        times.setdefault(name, []).append(time.perf_counter() - begun)
+        if done.returncode not in (0, 1):
+            sys.exit(f"{command}: {done.stderr}")
+        memory[name] = max(memory.get(name, 0), int(done.stderr.split()[-1]))
+
+    for turn in range(args.rounds):
+        os.sync()
+        timed("check", TOOL, "check", models["room"])
+        for name, what in (("room", "fix, room in the header"), ("blocks", "fix, blocks inserted")):
+            before = files[name].stat()
+            timed(what, TOOL, "check", "--fix", models[name])
+            after = files[name].stat()
+            if header(files[name])[0].get("__metadata__") != {"format": "pt"} or data_digest(files[name]) != digests[name]:
+                sys.exit(f"{what}: another result")
+            timed(f"undo of it ({name})", TOOL, "undo", models[name])
+            restored = files[name].stat()
+            if (restored.st_size, restored.st_mtime_ns) != (
+                before.st_size,
+                before.st_mtime_ns,
+            ) or before.st_ino != after.st_ino:
+                sys.exit(f"{what}: not in place")
+        timed("cp + sync", "sh", "-c", f"cp --reflink=never {files['room']} {copy} && sync {copy}")
+        copy.unlink()
+        print(f"  round {turn + 1}: " + ", ".join(f"{name} {each[-1]:.4f}" for name, each in times.items()), flush=True)
+    return {"times": times, "memory": memory}
+
+
 PARTS = {
     "check": measure_check,
     "growth": measure_growth,
@@ -574,6 +640,7 @@ PARTS = {
     "merge": measure_merge,
     "cold": measure_cold,
     "reflink": measure_reflink,
+    "header": measure_header,
 }
 
 
@@ -686,9 +753,12 @@ files of the size of the result. The Python script copies byte ranges of the don
 every tensor and saves them with `safetensors.torch.save_file`. The bound is the rate of the disk: `cp` and `merge` differ in
 when they begin to write back. Digests are computed while the bytes pass.""",
     "cold": """The page cache is dropped before every run.""",
-    "reflink": """File systems in a loop device. The result shares the blocks of the donors: the header of a shard is padded, so that its data
-starts where the donor's does within a block. A header satisfies one donor's file; tensors of files with other offsets are
-copied.""",
+    "reflink": """File systems in a loop device. The result shares the blocks of the donors: each large file of a donor has shards of its own,
+and the header of a shard is padded, so that its data starts where the donor's does within a block. What is left are the plan, the
+checks of donors and result, and the syncs.""",
+    "header": """`check --fix` adds the metadata that a shard lacks, and `undo` removes it. With room in the header only the header is written,
+otherwise the file system inserts a block before the tensors. The times contain the checks before and after the repair, and the
+syncs of the journal, of which there are about twenty; `check` is what the check alone takes, and `cp` what a copy would.""",
 }
 
 
@@ -703,6 +773,7 @@ def page(_):
         "merge": "## Merging, donors in the page cache",
         "cold": "## Merging, donors on the disk",
         "reflink": "## Merging where files share blocks",
+        "header": "## Editing the header of a shard",
     }.items():
         if part not in figures:
             continue

@@ -91,10 +91,3 @@ pub struct Repair {
     /// The files that change, by name.
     pub changes: Vec<Change>,
 }
-
-impl Repair {
-    /// Size of each file to write.
-    pub(super) fn sizes(&self) -> Vec<u64> {
-        self.changes.iter().map(|change| change.new.len()).collect()
-    }
-}

@@ -8,6 +8,7 @@ mod lock;
 mod out;
 mod overlay;
 mod shards;
+mod sharing;
 mod staging;
 mod system;
 mod target;

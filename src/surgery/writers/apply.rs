@@ -3,20 +3,17 @@
 //! All files are written into a [`Staging`] directory beside the target and synced before the rename, so the target
 //! never exists incomplete.
 
-use std::collections::BTreeMap;
-use std::fs::{self, File};
 use std::io::Write;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use super::shards::write_shards;
+use super::sharing::Sharing;
 use super::staging::Staging;
-use super::system::{check_space, create, shares_blocks, with_figures};
-use crate::surgery::align::Run;
+use super::system::{check_space, create, with_figures};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{ApplyError, io_at};
 use crate::surgery::leftover::Leftover;
-use crate::surgery::plan::{Plan, PlannedFile, PlannedShard, TensorTransform};
+use crate::surgery::plan::{Plan, PlannedFile, PlannedShard};
 use crate::surgery::stop::interrupted;
 use crate::surgery::written::{Writing, WrittenShard};
 
@@ -43,7 +40,7 @@ pub fn apply(
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let files = plan.files.iter().map(|f| f.bytes.len() as u64);
     let sharing = Sharing::of(parent);
-    let shards = plan.shards.iter().map(|shard| shard.file_len().saturating_sub(sharing.shared(shard)));
+    let shards = plan.shards.iter().map(|shard| sharing.space(shard));
     let sizes: Vec<u64> = files.chain(shards).chain(recorded.iter().copied()).collect();
     let explained = |error| with_figures(error, parent, &sizes);
     let staging = Staging::new(out).map_err(explained)?;
@@ -57,38 +54,6 @@ pub fn apply(
         (Ok(()), leftover) => Ok(leftover),
         (Err(error), None) => Err(explained(error)),
         (Err(error), Some(leftover)) => Err(ApplyError::Left { error: Box::new(explained(error)), leftover }),
-    }
-}
-
-/// Whether the target can share blocks with donors.
-struct Sharing {
-    /// Device of the target, if its file system shares blocks.
-    dev: Option<u64>,
-}
-
-impl Sharing {
-    fn of(parent: &Path) -> Self {
-        let dev = File::open(parent).ok().filter(shares_blocks).and_then(|dir| Some(dir.metadata().ok()?.dev()));
-        Self { dev }
-    }
-
-    /// Number of bytes of a shard that need no space: whole blocks of tensors of donors on the same device.
-    fn shared(&self, shard: &PlannedShard) -> u64 {
-        let Some(dev) = self.dev else { return 0 };
-        let mut devices: BTreeMap<&Path, bool> = BTreeMap::new();
-        let mut at = shard.header().len() as u64;
-        let mut shared = 0_u64;
-        for tensor in &shard.tensors {
-            let (from, len) = (&tensor.source.from, tensor.len());
-            let path = from.path.as_path();
-            let is_here = || fs::metadata(path).is_ok_and(|m| m.dev() == dev);
-            if tensor.transform() == TensorTransform::Copy && *devices.entry(path).or_insert_with(is_here) {
-                let [_, whole, _] = Run { path, from: from.offset, at, len }.blocks();
-                shared = shared.saturating_add(whole.len);
-            }
-            at = at.saturating_add(len);
-        }
-        shared
     }
 }
 

@@ -6,6 +6,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::shards::write_shards;
+use super::sharing::Sharing;
 use super::system::{create, look, with_figures};
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
 use crate::checkpoint::{FaultKind, HashAlgorithm, Shard};
@@ -50,6 +51,14 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
         Some(error) => Err(io_at(path, "reading")(error).into()),
         None if same => Ok(()),
         None => Err(RepairError::ChangedWhilePlanned { path: path.to_owned() }),
+    }
+}
+
+/// Number of bytes that a new file needs.
+pub(super) fn space(content: &Content, sharing: &Sharing) -> u64 {
+    match content {
+        Content::Text(text) => text.len() as u64,
+        Content::Shard(shard) => sharing.space(shard),
     }
 }
 

@@ -5,7 +5,8 @@ use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsuppo
 use std::os::unix::fs::symlink;
 use std::path::Path;
 
-use super::changes::{check_unchanged, explain_error, write_content};
+use super::changes::{check_unchanged, explain_error, space, write_content};
+use super::sharing::Sharing;
 use super::staging::Staging;
 use super::system::{check_space, retry};
 use super::target::claim_target;
@@ -28,9 +29,11 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &(dyn Fn(u64) + Sync)) -> 
     let Target { path: out, cleared } = claim_target(out, &[&original.root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let donor = DonorSnapshot::record(&original.root)?;
-    let explained = |error| explain_error(error, parent, &repair.sizes());
+    let sharing = Sharing::of(parent);
+    let sizes: Vec<u64> = repair.changes.iter().map(|change| space(&change.new, &sharing)).collect();
+    let explained = |error| explain_error(error, parent, &sizes);
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
-    let written = check_space(parent, &repair.sizes())
+    let written = check_space(parent, &sizes)
         .map_err(RepairError::from)
         .and_then(|()| fill(repair, staging.content(), progress))
         .and_then(|()| Ok(donor.unchanged()?))

@@ -13,7 +13,8 @@ use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
 use crate::surgery::repair::{Change, Content, Repair};
 use crate::surgery::stop::interrupted;
-use crate::surgery::writers::changes::{check_unchanged, explain_error, write_content};
+use crate::surgery::writers::changes::{check_unchanged, explain_error, space, write_content};
+use crate::surgery::writers::sharing::Sharing;
 use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
 
 /// Replaces the changed files of a repair, all of them or none.
@@ -34,8 +35,7 @@ pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<
         }
     }
     let mut steps: Vec<Step<'_>> = repair.changes.iter().map(|change| Step::new(repair, change)).collect();
-    let sizes = |steps: &[Step<'_>]| steps.iter().map(Step::bytes).collect::<Vec<u64>>();
-    let folder = Folder::create(root).map_err(|error| explain_error(error, root, &sizes(&steps)))?;
+    let folder = Folder::create(root).map_err(|error| explain_error(error, root, &sizes(root, &steps)))?;
     let written = loop {
         match attempt(repair, &steps, &folder, progress) {
             // The second attempt edits nothing in place, so it is the last one.
@@ -46,7 +46,7 @@ pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<
     };
     match written {
         Ok(leftover) => Ok(leftover.or(folder.tidy())),
-        Err(error) => Err(explain_error(error, root, &sizes(&steps)).with_leftover(folder.tidy())),
+        Err(error) => Err(explain_error(error, root, &sizes(root, &steps)).with_leftover(folder.tidy())),
     }
 }
 
@@ -77,9 +77,15 @@ impl<'r> Step<'r> {
     }
 
     /// Number of bytes to write.
-    fn bytes(&self) -> u64 {
-        self.headers.as_ref().map_or_else(|| self.change.new.len(), Headers::bytes)
+    fn bytes(&self, sharing: &Sharing) -> u64 {
+        self.headers.as_ref().map_or_else(|| space(&self.change.new, sharing), Headers::bytes)
     }
+}
+
+/// Number of bytes to write for each step in the checkpoint `root`.
+fn sizes(root: &Path, steps: &[Step<'_>]) -> Vec<u64> {
+    let sharing = Sharing::of(root);
+    steps.iter().map(|step| step.bytes(&sharing)).collect()
 }
 
 /// Stages the changes and makes them.
@@ -119,7 +125,7 @@ fn stage(
     }
     folder.clear()?;
     // One more block each for the journal and for the folder of new files, and two for the originals.
-    let sizes: Vec<u64> = steps.iter().map(Step::bytes).chain([1; 4]).collect();
+    let sizes: Vec<u64> = sizes(root, steps).into_iter().chain([1; 4]).collect();
     check_space(root, &sizes)?;
     let number = folder.numbers()?.last().map_or(1, |n| n.saturating_add(1));
     let (staging, originals) = (folder.staged(), folder.originals(number));
