@@ -19,6 +19,7 @@ import json
 import os
 import platform
 import random
+import re
 import shutil
 import statistics
 import struct
@@ -35,6 +36,8 @@ FIGURES = FOLDER / "figures.json"
 TOOL = os.environ.get("CKPT_DOCTOR", str(ROOT / "target" / "release" / "ckpt-doctor"))
 WIDTH = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "F8_E4M3": 1}
 BLOCK = 1 << 20
+# An expression that no name matches.
+NOTHING = "(?!)"
 
 
 def run(*command, check=True, **kwargs):
@@ -58,9 +61,9 @@ def finite(length, seed):
     return random.Random(seed).randbytes(length).translate(bytes(byte & 0xBF for byte in range(256)))
 
 
-def write_shards(folder, tensors, limit, content=True):
-    """Writes tensors (name to dtype and shape) in shards of at most `limit` bytes, with their index. Without `content` their
-    bytes are a hole."""
+def write_shards(folder, tensors, limit, content=""):
+    """Writes tensors (name to dtype and shape) in shards of at most `limit` bytes, with their index. Names that do not match
+    the expression `content` have a hole in place of bytes."""
     shards, size = [{}], 0
     for name, (dtype, shape) in tensors.items():
         length = WIDTH[dtype]
@@ -71,7 +74,7 @@ def write_shards(folder, tensors, limit, content=True):
             size = 0
         shards[-1][name] = (dtype, shape, size, size + length)
         size += length
-    noise = finite(8 * BLOCK, 1) if content else b""
+    noise = finite(8 * BLOCK, 1)
     index, total = {}, 0
     for number, shard in enumerate(shards, 1):
         file = "model.safetensors" if len(shards) == 1 else f"model-{number:05}-of-{len(shards):05}.safetensors"
@@ -85,18 +88,23 @@ def write_shards(folder, tensors, limit, content=True):
         text += b" " * (-len(text) % 8)
         with open(folder / file, "wb") as out:
             out.write(struct.pack("<Q", len(text)) + text)
-            left = end if content else 0
-            while left > 0:
-                # Every block starts elsewhere in the noise, so that no two are equal.
-                start = (left // 7) % (7 * BLOCK) & ~1
-                left -= out.write(noise[start : start + min(left, BLOCK)])
-            out.truncate(8 + len(text) + end)
+            data = out.tell()
+            for name, (_, _, begin, end) in shard.items():
+                if not re.match(content, name):
+                    continue
+                out.seek(data + begin)
+                left = end - begin
+                while left > 0:
+                    # Every block starts elsewhere in the noise, so that no two are equal.
+                    start = ((begin + left) // 7) % (7 * BLOCK) & ~1
+                    left -= out.write(noise[start : start + min(left, BLOCK)])
+            out.truncate(data + end)
     if len(shards) > 1:
         document = {"metadata": {"total_size": total}, "weight_map": index}
         (folder / "model.safetensors.index.json").write_text(json.dumps(document))
 
 
-def checkpoint(folder, config, limit=4 * 10**9, content=True):
+def checkpoint(folder, config, limit=4 * 10**9, content=""):
     if not (folder / ".complete").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -198,7 +206,7 @@ def experts(folder, layers, count=512, shards=163):
         (folder / "config.json").write_text(json.dumps(config))
         size = sum(2 * shape[0] * (shape[1] if len(shape) > 1 else 1) for shape in names.values())
         limit = size // max(1, min(shards, len(names) // 20))
-        write_shards(folder, {name: ("BF16", shape) for name, shape in names.items()}, limit, content=False)
+        write_shards(folder, {name: ("BF16", shape) for name, shape in names.items()}, limit, content=NOTHING)
         (folder / ".complete").touch()
     return folder, len(names)
 
@@ -346,7 +354,7 @@ def cores():
 def measure_check(args):
     folder = args.work / "check"
     tiny = checkpoint(folder / "tiny", llama(2, hidden=64, vocabulary=320))
-    donors = [checkpoint(folder / "vlm", llava(23), content=False), checkpoint(folder / "llama", llama(30), content=False)]
+    donors = [checkpoint(folder / "vlm", llava(23), content=NOTHING), checkpoint(folder / "llama", llama(30), content=NOTHING)]
     large, count = experts(folder / "experts", 58)
     python = [sys.executable, "-c", HEADERS]
     programs = {
@@ -413,7 +421,9 @@ def measure_hash(args):
 def donors_of(folder, size):
     # A layer of the language model has 122 MB, its embeddings 263 MB and the vision tower 615 MB.
     layers = max(1, round((size * 1e9 - 878e6) / 121.6e6))
-    return checkpoint(folder / "host", llava(layers)), checkpoint(folder / "part", llama(layers))
+    # The merge takes nothing from the language model of the host.
+    host = checkpoint(folder / "host", llava(layers), content="vision_tower|multi_modal_projector")
+    return host, checkpoint(folder / "part", llama(layers))
 
 
 def emptied(folder):
