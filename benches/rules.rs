@@ -31,7 +31,8 @@ fn main() {
     }
 }
 
-/// Measures one checkpoint: its headers and documents, the names of its tensors in the newest loader, and all rules.
+/// Measures one checkpoint: its headers and documents, the names of its tensors in the newest loader that has
+/// the class, and all rules.
 fn measure(dir: &Path, knowledge: &Knowledge) {
     let open = || Checkpoint::open(dir).expect("a checkpoint");
     fastest("headers and documents", 50, open);
@@ -39,7 +40,8 @@ fn measure(dir: &Path, knowledge: &Knowledge) {
     let stored = Stored::of(&checkpoint);
     let names = || checkpoint.shards.values().flat_map(|shard| shard.tensors.iter().map(|tensor| tensor.name.as_str()));
     let config = checkpoint.config().cloned().unwrap_or_default();
-    if let Some(class) = knowledge.library.find(&config, names(), Loader::NEWEST) {
+    let class = |loader| knowledge.library.find(&config, names(), loader);
+    if let Some(class) = Loader::ALL.into_iter().rev().find_map(class) {
         fastest("names that the class expects", 50, || build(class, &config, &stored).is_ok());
         if let Ok(expected) = build(class, &config, &stored) {
             fastest("names that the loader matches", 50, || predict(&expected, &stored));
