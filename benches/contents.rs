@@ -3,7 +3,9 @@
 //! Without a directory, the bench writes a checkpoint of 2 GB of random numbers and removes it again. The rounds take turns, so
 //! that a disturbance meets all of them; the page cache must be able to hold the files. Each line has the median rate, the
 //! processor time of all threads for one GB, and the rate as a share of its bound. The bound of reading is a plain sum over a
-//! memory map of the same files by all cores.
+//! memory map of the same files by all cores. The hashes are those of `verify` and of `check --hash`, over parts of the same map.
+//!
+//! The environment variable `DTYPE` chooses the element type of the numbers; the default is `BF16`.
 
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 #![allow(unsafe_code, reason = "the map is what the reader is compared with; nobody changes the files of the bench")]
@@ -30,6 +32,8 @@ use memmap2::{Mmap, MmapOptions};
 use multiversion::multiversion;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+use sha1::Sha1;
+use sha2::{Digest, Sha256};
 
 /// Bytes that a thread takes at a time.
 const PART: u64 = 24 << 20;
@@ -51,13 +55,16 @@ fn main() {
         checkpoint.read_contents(ReadOptions { stats, ..ReadOptions::default() }, &|_| {});
         black_box(checkpoint.contents.len());
     };
-    let runs: [(&str, &dyn Fn()); 6] = [
+    let runs: [(&str, &dyn Fn()); 9] = [
         ("bound: sum of a memory map, unmapping not counted", &|| map(&files)),
         ("sum of windows of a memory map", &|| windows(&files)),
         ("sum of positioned reads of 1 MB", &|| reads(&files)),
         ("check --deep", &|| read(false)),
         ("check --stats", &|| read(true)),
-        ("sum of a memory map", &|| drop(map_and_sum(&files))),
+        ("sum of a memory map", &|| drop(map_and(&files, sum))),
+        ("SHA-256 of a memory map", &|| drop(map_and(&files, first_byte::<Sha256>))),
+        ("SHA-1 of a memory map, as of git", &|| drop(map_and(&files, first_byte::<Sha1>))),
+        ("BLAKE3 of a memory map", &|| drop(map_and(&files, |bytes| blake3::hash(bytes).as_bytes()[0].into()))),
     ];
     let mut results = vec![Vec::new(); runs.len()];
     for round in 0..=ROUNDS {
@@ -117,15 +124,16 @@ fn at(n: u64) -> usize {
     usize::try_from(n).expect("a place in memory")
 }
 
-fn map_and_sum(files: &[File]) -> Vec<Mmap> {
+/// Calls `work` with the parts of maps of the files, in all threads.
+fn map_and(files: &[File], work: impl Fn(&[u8]) -> u64 + Sync) -> Vec<Mmap> {
     // SAFETY: the files are those of the bench.
     let maps: Vec<Mmap> = files.iter().map(|file| unsafe { Mmap::map(file) }.expect("a map")).collect();
-    each_part(files, |file, start, end| sum(&maps[file][at(start)..at(end)]));
+    each_part(files, |file, start, end| work(&maps[file][at(start)..at(end)]));
     maps
 }
 
 fn map(files: &[File]) {
-    let maps = map_and_sum(files);
+    let maps = map_and(files, sum);
     let begun = Instant::now();
     drop(maps);
     UNMAPPING.store(u64::try_from(begun.elapsed().as_nanos()).expect("short"), Ordering::Relaxed);
@@ -161,6 +169,11 @@ fn sum(bytes: &[u8]) -> u64 {
     lanes.into_iter().fold(0, u64::wrapping_add)
 }
 
+/// Hashes the bytes. The result is only for the compiler, which must not leave the work out.
+fn first_byte<D: Digest>(bytes: &[u8]) -> u64 {
+    D::digest(bytes)[0].into()
+}
+
 /// Seconds of all threads of this process, from `/proc/self/stat`; 0 where there is none.
 fn processor_time() -> f64 {
     let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
@@ -190,12 +203,23 @@ fn write(dir: &Path) {
         let mut block = vec![0_u8; 1 << 20];
         for _ in 0..tensors * rows {
             random.fill_bytes(&mut block);
-            if dtype == Dtype::BF16 {
-                // Exponents around that of one.
-                block.chunks_exact_mut(2).for_each(|pair| pair[1] = pair[1] & 0x83 | 0x3c);
+            if let Some(width) = float_width(dtype) {
+                // Exponents around that of one: all are finite.
+                block.chunks_exact_mut(width).for_each(|bytes| bytes[width - 1] = bytes[width - 1] & 0x83 | 0x3c);
             }
             file.write_all(&block).expect("a write");
         }
         file.flush().expect("a write");
+    }
+}
+
+/// Bytes of a float of this type; `None` for integers, and for floats that share a byte.
+fn float_width(dtype: Dtype) -> Option<usize> {
+    match dtype {
+        Dtype::F64 => Some(8),
+        Dtype::F32 | Dtype::C64 => Some(4),
+        Dtype::F16 | Dtype::BF16 => Some(2),
+        Dtype::F8_E4M3 | Dtype::F8_E5M2 => Some(1),
+        _ => None,
     }
 }

@@ -1,4 +1,5 @@
-//! The bit patterns of each element type: which are NaN, infinite, zero or denormal, and which number each one is.
+//! The bit patterns of each element type: which are NaN, infinite, zero or denormal, which number each one is, and how they
+//! are ordered.
 
 #![allow(
     clippy::cast_precision_loss,
@@ -17,6 +18,10 @@ pub(super) trait Word<const N: usize>:
     const ZERO: Self;
     /// Elements that a counter of this type can count.
     const RUN: usize;
+    /// A signed integer of the same width: every processor has vectors for its minimum and maximum.
+    type Key: Copy + Ord;
+    const FIRST_KEY: Self::Key;
+    const LAST_KEY: Self::Key;
 
     fn read(bytes: [u8; N]) -> Self;
 
@@ -25,10 +30,13 @@ pub(super) trait Word<const N: usize>:
 }
 
 macro_rules! words {
-    ($($word:ident, $width:literal, $run:literal;)*) => { $(
+    ($($word:ident, $key:ident, $width:literal, $run:literal;)*) => { $(
         impl Word<$width> for $word {
             const ZERO: Self = 0;
             const RUN: usize = $run;
+            type Key = $key;
+            const FIRST_KEY: $key = $key::MIN;
+            const LAST_KEY: $key = $key::MAX;
 
             #[inline(always)]
             fn read(bytes: [u8; $width]) -> Self {
@@ -44,32 +52,18 @@ macro_rules! words {
 }
 
 words! {
-    u8, 1, 192;
-    u16, 2, 6144;
-    u32, 4, 3072;
-    u64, 8, 1536;
-}
-
-/// A number that an element can be: `f32`, or `f64` for those that `f32` cannot represent.
-pub(super) trait Number: Copy + PartialOrd + Into<f64> {
-    const HIGHEST: Self;
-    const LOWEST: Self;
-}
-
-impl Number for f32 {
-    const HIGHEST: Self = Self::INFINITY;
-    const LOWEST: Self = Self::NEG_INFINITY;
-}
-
-impl Number for f64 {
-    const HIGHEST: Self = Self::INFINITY;
-    const LOWEST: Self = Self::NEG_INFINITY;
+    u8, i8, 1, 192;
+    u16, i16, 2, 6144;
+    u32, i32, 4, 3072;
+    u64, i64, 8, 1536;
 }
 
 /// An element type whose elements have `N` bytes.
 pub(super) trait Format<const N: usize> {
     type Word: Word<N>;
-    type Number: Number;
+
+    /// Whether the square of every number fits into 53 bits.
+    const SQUARES_ARE_EXACT: bool = N <= 2;
 
     /// Whether the element is NaN or infinite.
     #[inline(always)]
@@ -94,18 +88,32 @@ pub(super) trait Format<const N: usize> {
         false
     }
 
-    /// The number, of an element that is not special.
-    fn number(word: Self::Word) -> Self::Number;
+    /// The number, of an element that is not special. Exact, except for integers of 64 bits.
+    fn number(word: Self::Word) -> f64;
+
+    /// An integer that is ordered as the number is, of an element that is not special. That of -0 is below that of 0.
+    fn key(word: Self::Word) -> <Self::Word as Word<N>>::Key;
+
+    /// The element with this key.
+    fn with_key(key: <Self::Word as Word<N>>::Key) -> Self::Word;
+}
+
+/// Flips the magnitude of negative numbers: makes a key of a sign and a magnitude, and these of a key.
+macro_rules! flipped {
+    ($bits:expr, $key:ident) => {{
+        let bits: $key = $bits;
+        bits ^ ((bits >> ($key::BITS - 1)) & $key::MAX)
+    }};
 }
 
 /// Formats of IEEE 754 layout: all exponent bits are set in NaN, whose fraction is nonzero, and in infinity.
 macro_rules! ieee {
-    ($($format:ident, $word:ident, $width:literal, $number:ident, $magnitude:literal, $exponent:literal, $convert:expr;)*) => { $(
+    ($($format:ident, $word:ident, $key:ident, $width:literal, $magnitude:literal, $exponent:literal, $convert:expr;)*) => { $(
         pub(super) struct $format;
 
         impl Format<$width> for $format {
             type Word = $word;
-            type Number = $number;
+            const SQUARES_ARE_EXACT: bool = $width <= 4;
 
             #[inline(always)]
             fn special(word: $word) -> bool {
@@ -129,19 +137,29 @@ macro_rules! ieee {
             }
 
             #[inline(always)]
-            fn number(word: $word) -> $number {
-                $convert(word)
+            fn number(word: $word) -> f64 {
+                f64::from($convert(word))
+            }
+
+            #[inline(always)]
+            fn key(word: $word) -> $key {
+                flipped!(word.cast_signed(), $key)
+            }
+
+            #[inline(always)]
+            fn with_key(key: $key) -> $word {
+                flipped!(key, $key).cast_unsigned()
             }
         }
     )* };
 }
 
 ieee! {
-    F64, u64, 8, f64, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, f64::from_bits;
-    F32, u32, 4, f32, 0x7fff_ffff, 0x7f80_0000, f32::from_bits;
-    Bf16, u16, 2, f32, 0x7fff, 0x7f80, |word: u16| f32::from_bits(u32::from(word) << 16);
-    F16, u16, 2, f32, 0x7fff, 0x7c00, |word: u16| widened::<5, 10, 15>(word.into());
-    F8E5M2, u8, 1, f32, 0x7f, 0x7c, |word: u8| widened::<5, 2, 15>(word.into());
+    F64, u64, i64, 8, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, f64::from_bits;
+    F32, u32, i32, 4, 0x7fff_ffff, 0x7f80_0000, f32::from_bits;
+    Bf16, u16, i16, 2, 0x7fff, 0x7f80, |word: u16| f32::from_bits(u32::from(word) << 16);
+    F16, u16, i16, 2, 0x7fff, 0x7c00, |word: u16| widened::<5, 10, 15>(word.into());
+    F8E5M2, u8, i8, 1, 0x7f, 0x7c, |word: u8| widened::<5, 2, 15>(word.into());
 }
 
 /// The number of a code with a sign, an exponent and a fraction, of these many bits. Exact, and without denormal operands,
@@ -167,7 +185,6 @@ macro_rules! small {
 
         impl Format<1> for $format {
             type Word = u8;
-            type Number = f32;
 
             #[inline(always)]
             fn special(word: u8) -> bool {
@@ -186,8 +203,19 @@ macro_rules! small {
             }
 
             #[inline(always)]
-            fn number(word: u8) -> f32 {
-                widened::<$exponent, $fraction, $bias>(word.into())
+            fn number(word: u8) -> f64 {
+                f64::from(widened::<$exponent, $fraction, $bias>(word.into()))
+            }
+
+            #[inline(always)]
+            fn key(word: u8) -> i8 {
+                // The sign becomes the highest bit.
+                flipped!((word << (7 - $exponent - $fraction)).cast_signed(), i8)
+            }
+
+            #[inline(always)]
+            fn with_key(key: i8) -> u8 {
+                flipped!(key, i8).cast_unsigned() >> (7 - $exponent - $fraction)
             }
         }
     )* };
@@ -209,7 +237,6 @@ pub(super) struct F8E8M0;
 
 impl Format<1> for F8E8M0 {
     type Word = u8;
-    type Number = f64;
 
     #[inline(always)]
     fn special(word: u8) -> bool {
@@ -225,34 +252,53 @@ impl Format<1> for F8E8M0 {
     fn number(word: u8) -> f64 {
         f64::from_bits(u64::from(word).wrapping_add(1023 - 127) << 52)
     }
+
+    #[inline(always)]
+    fn key(word: u8) -> i8 {
+        U8::key(word)
+    }
+
+    #[inline(always)]
+    fn with_key(key: i8) -> u8 {
+        U8::with_key(key)
+    }
 }
 
-/// Integers and truth values.
+/// Integers and truth values. The key of an unsigned one has the highest bit flipped.
 macro_rules! integers {
-    ($($format:ident, $word:ident, $width:literal, $number:ident, $convert:expr;)*) => { $(
+    ($($format:ident, $word:ident, $key:ident, $width:literal, $flip:expr, $convert:expr;)*) => { $(
         pub(super) struct $format;
 
         impl Format<$width> for $format {
             type Word = $word;
-            type Number = $number;
 
             #[inline(always)]
-            fn number(word: $word) -> $number {
+            fn number(word: $word) -> f64 {
                 $convert(word)
+            }
+
+            #[inline(always)]
+            fn key(word: $word) -> $key {
+                word.cast_signed() ^ $flip
+            }
+
+            #[inline(always)]
+            fn with_key(key: $key) -> $word {
+                (key ^ $flip).cast_unsigned()
             }
         }
     )* };
 }
 
 integers! {
-    U8, u8, 1, f32, f32::from;
-    I8, u8, 1, f32, |word: u8| f32::from(word.cast_signed());
-    U16, u16, 2, f32, f32::from;
-    I16, u16, 2, f32, |word: u16| f32::from(word.cast_signed());
-    U32, u32, 4, f64, f64::from;
-    I32, u32, 4, f64, |word: u32| f64::from(word.cast_signed());
-    U64, u64, 8, f64, |word: u64| word as f64;
-    I64, u64, 8, f64, |word: u64| word.cast_signed() as f64;
+    U8, u8, i8, 1, i8::MIN, f64::from;
+    I8, u8, i8, 1, 0, |word: u8| f64::from(word.cast_signed());
+    U16, u16, i16, 2, i16::MIN, f64::from;
+    I16, u16, i16, 2, 0, |word: u16| f64::from(word.cast_signed());
+    U32, u32, i32, 4, i32::MIN, f64::from;
+    I32, u32, i32, 4, 0, |word: u32| f64::from(word.cast_signed());
+    U64, u64, i64, 8, i64::MIN, |word: u64| word as f64;
+    I64, u64, i64, 8, 0, |word: u64| word.cast_signed() as f64;
 }
 
 /// Takes elements of four bits apart, low half first.

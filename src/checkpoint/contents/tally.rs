@@ -5,12 +5,15 @@
 
 #![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the oldest processors")]
 
+use std::array::from_ref;
+
 use multiversion::multiversion;
+use multiversion::target::target_cfg_f;
 
 use super::super::{Dtype, Fault, FaultKind, Place};
 use super::formats::{
     Bf16, F4, F6E2M3, F6E3M2, F8E4M3, F8E4M3Fnuz, F8E5M2, F8E5M2Fnuz, F8E8M0, F16, F32, F64, Format, I8, I16, I32, I64,
-    Number, U8, U16, U32, U64, Word, unpack4, unpack6,
+    U8, U16, U32, U64, Word, unpack4, unpack6,
 };
 
 /// Bytes that are counted at a time: they fit into the fastest cache. A multiple of every width of an element, and of the
@@ -19,6 +22,9 @@ pub(super) const BLOCK: usize = 24 << 10;
 
 /// Sums that are kept side by side: enough for a loop over them to be vectorised.
 const LANES: usize = 64;
+
+/// Numbers that are added to a lane between reading and writing its sums. With many more, the loop is not vectorised.
+const ROWS: usize = 4;
 
 /// What a tensor, or a part of it, contains.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -159,37 +165,39 @@ pub(super) fn as_u64(n: usize) -> u64 {
     "x86_64+avx+avx2+bmi1+bmi2+fma+lzcnt+popcnt",
 ))]
 fn piece(tally: &mut Tally, bytes: &[u8]) {
+    /// Whether a multiplication and an addition are one instruction.
+    const FUSED: bool = target_cfg_f!(target_feature = "fma");
     let mut codes = Vec::new();
     for block in bytes.chunks(BLOCK) {
         let any = match tally.dtype {
-            Dtype::BF16 => add::<2, Bf16>(tally, block),
-            Dtype::F16 => add::<2, F16>(tally, block),
-            Dtype::F32 | Dtype::C64 => add::<4, F32>(tally, block),
-            Dtype::F64 => add::<8, F64>(tally, block),
-            Dtype::F8_E4M3 => add::<1, F8E4M3>(tally, block),
-            Dtype::F8_E5M2 => add::<1, F8E5M2>(tally, block),
-            Dtype::F8_E8M0 => add::<1, F8E8M0>(tally, block),
-            Dtype::F8_E4M3FNUZ => add::<1, F8E4M3Fnuz>(tally, block),
-            Dtype::F8_E5M2FNUZ => add::<1, F8E5M2Fnuz>(tally, block),
-            Dtype::U8 | Dtype::BOOL => add::<1, U8>(tally, block),
-            Dtype::I8 => add::<1, I8>(tally, block),
-            Dtype::U16 => add::<2, U16>(tally, block),
-            Dtype::I16 => add::<2, I16>(tally, block),
-            Dtype::U32 => add::<4, U32>(tally, block),
-            Dtype::I32 => add::<4, I32>(tally, block),
-            Dtype::U64 => add::<8, U64>(tally, block),
-            Dtype::I64 => add::<8, I64>(tally, block),
+            Dtype::BF16 => add::<2, Bf16, FUSED>(tally, block),
+            Dtype::F16 => add::<2, F16, FUSED>(tally, block),
+            Dtype::F32 | Dtype::C64 => add::<4, F32, FUSED>(tally, block),
+            Dtype::F64 => add::<8, F64, FUSED>(tally, block),
+            Dtype::F8_E4M3 => add::<1, F8E4M3, FUSED>(tally, block),
+            Dtype::F8_E5M2 => add::<1, F8E5M2, FUSED>(tally, block),
+            Dtype::F8_E8M0 => add::<1, F8E8M0, FUSED>(tally, block),
+            Dtype::F8_E4M3FNUZ => add::<1, F8E4M3Fnuz, FUSED>(tally, block),
+            Dtype::F8_E5M2FNUZ => add::<1, F8E5M2Fnuz, FUSED>(tally, block),
+            Dtype::U8 | Dtype::BOOL => add::<1, U8, FUSED>(tally, block),
+            Dtype::I8 => add::<1, I8, FUSED>(tally, block),
+            Dtype::U16 => add::<2, U16, FUSED>(tally, block),
+            Dtype::I16 => add::<2, I16, FUSED>(tally, block),
+            Dtype::U32 => add::<4, U32, FUSED>(tally, block),
+            Dtype::I32 => add::<4, I32, FUSED>(tally, block),
+            Dtype::U64 => add::<8, U64, FUSED>(tally, block),
+            Dtype::I64 => add::<8, I64, FUSED>(tally, block),
             Dtype::F4 => {
                 unpack4(block, &mut codes);
-                add::<1, F4>(tally, &codes)
+                add::<1, F4, FUSED>(tally, &codes)
             }
             Dtype::F6_E2M3 => {
                 unpack6(block, &mut codes);
-                add::<1, F6E2M3>(tally, &codes)
+                add::<1, F6E2M3, FUSED>(tally, &codes)
             }
             Dtype::F6_E3M2 => {
                 unpack6(block, &mut codes);
-                add::<1, F6E3M2>(tally, &codes)
+                add::<1, F6E3M2, FUSED>(tally, &codes)
             }
         };
         if let Some(last) = any.then(|| block.iter().rposition(|byte| *byte != 0)).flatten() {
@@ -201,7 +209,7 @@ fn piece(tally: &mut Tally, bytes: &[u8]) {
 
 /// Counts one block of elements of `N` bytes, and returns whether one of their bits is set.
 #[inline(always)]
-fn add<const N: usize, F: Format<N>>(tally: &mut Tally, bytes: &[u8]) -> bool {
+fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes: &[u8]) -> bool {
     let (elements, _) = bytes.as_chunks::<N>();
     let Some(start) = elements.first() else { return false };
     let start = F::Word::read(*start);
@@ -233,119 +241,115 @@ fn add<const N: usize, F: Format<N>>(tally: &mut Tally, bytes: &[u8]) -> bool {
     tally.value = tally.value.or(Some(start.into()));
     tally.elements = tally.elements.saturating_add(as_u64(elements.len()));
     if let Some(sums) = &mut tally.sums {
-        sums.denormals = sums.denormals.saturating_add(denormals);
-        sums.add(&if special { sums_of_some::<N, F>(elements) } else { sums_of_all::<N, F>(elements) });
+        let (min, max) = if special { range::<N, F, true>(elements) } else { range::<N, F, false>(elements) };
+        let (sum, squares) =
+            if special { added::<N, F, true, FUSED>(elements) } else { added::<N, F, false, FUSED>(elements) };
+        sums.add(&Sums { min, max, sum, squares, denormals });
     }
     any != F::Word::ZERO
 }
 
-/// Counts the NaN and infinities of a block that has some.
-#[inline(never)]
+/// Counts the NaN and infinities of a block that has some. Called before its elements are counted.
+#[inline(always)]
 fn specials<const N: usize, F: Format<N>>(tally: &mut Tally, elements: &[[u8; N]]) {
-    for (number, element) in (0..).zip(elements) {
-        let word = F::Word::read(*element);
-        if F::special(word) {
-            let counter = if F::infinite(word) { &mut tally.infinite } else { &mut tally.nan };
-            *counter = counter.saturating_add(1);
-            tally.first.get_or_insert(tally.elements.saturating_add(number));
+    for run in elements.chunks(F::Word::RUN) {
+        let (mut special, mut infinite) = (F::Word::ZERO, F::Word::ZERO);
+        for element in run {
+            let word = F::Word::read(*element);
+            special = special.plus(F::special(word));
+            infinite = infinite.plus(F::infinite(word));
         }
+        let (special, infinite): (u64, u64) = (special.into(), infinite.into());
+        tally.nan = tally.nan.saturating_add(special.saturating_sub(infinite));
+        tally.infinite = tally.infinite.saturating_add(infinite);
+    }
+    if tally.first.is_none() {
+        let first = elements.iter().position(|element| F::special(F::Word::read(*element)));
+        tally.first = first.map(|first| tally.elements.saturating_add(as_u64(first)));
     }
 }
 
-/// The sums of a block of finite elements.
+/// The smallest and the largest number of a block; infinities of the opposite sign when no element is finite. `SPECIAL` is
+/// whether there may be elements that are not: they are left out.
 #[inline(always)]
-fn sums_of_all<const N: usize, F: Format<N>>(elements: &[[u8; N]]) -> Sums {
-    let mut lanes = Lanes::<F::Number>::NONE;
-    let mut rows = [[F::Number::HIGHEST; LANES]; 4];
-    let (groups, rest) = elements.as_chunks::<{ LANES * 4 }>();
+fn range<const N: usize, F: Format<N>, const SPECIAL: bool>(elements: &[[u8; N]]) -> (f64, f64) {
+    let (mut low, mut high) = (F::Word::LAST_KEY, F::Word::FIRST_KEY);
+    for element in elements {
+        let word = F::Word::read(*element);
+        let (key, skip) = (F::key(word), SPECIAL && F::special(word));
+        low = low.min(if skip { F::Word::LAST_KEY } else { key });
+        high = high.max(if skip { F::Word::FIRST_KEY } else { key });
+    }
+    if low > high {
+        return (f64::INFINITY, f64::NEG_INFINITY);
+    }
+    (F::number(F::with_key(low)), F::number(F::with_key(high)))
+}
+
+/// The sum of the finite numbers of a block, and of their squares. Each lane adds up every sixty-fourth element, in order.
+/// `SPECIAL` is whether there may be elements that are not finite: they count as 0.
+#[inline(always)]
+fn added<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool>(elements: &[[u8; N]]) -> (f64, f64) {
+    let (mut sum, mut squares) = ([0.0; LANES], [0.0; LANES]);
+    let (rows, rest) = elements.as_chunks();
+    let (groups, last) = rows.as_chunks();
     for group in groups {
-        for (number, element) in rows.as_flattened_mut().iter_mut().zip(group) {
-            *number = F::number(F::Word::read(*element));
-        }
-        lanes.add(&rows);
+        add_rows::<N, F, SPECIAL, FUSED, ROWS>(&mut sum, &mut squares, group);
     }
-    for (place, element) in rest.iter().enumerate() {
-        lanes.add_one(place % LANES, F::number(F::Word::read(*element)));
+    for row in last {
+        add_rows::<N, F, SPECIAL, FUSED, 1>(&mut sum, &mut squares, from_ref(row));
     }
-    lanes.sums()
+    for ((sum, squares), element) in sum.iter_mut().zip(&mut squares).zip(rest) {
+        add_one::<N, F, SPECIAL, FUSED>(sum, squares, *element);
+    }
+    let mut half = LANES / 2;
+    while half > 0 {
+        fold(&mut sum, half);
+        fold(&mut squares, half);
+        half /= 2;
+    }
+    let ([sum, ..], [squares, ..]) = (sum, squares);
+    (sum, squares)
 }
 
-/// The sums of the finite elements of a block that has others, in the order of [`sums_of_all`].
-#[inline(never)]
-fn sums_of_some<const N: usize, F: Format<N>>(elements: &[[u8; N]]) -> Sums {
-    let mut lanes = Lanes::<F::Number>::NONE;
-    for (place, element) in elements.iter().enumerate() {
-        let word = F::Word::read(*element);
-        if !F::special(word) {
-            lanes.add_one(place % LANES, F::number(word));
-        }
-    }
-    lanes.sums()
-}
-
-/// Sums of every sixty-fourth element.
-struct Lanes<T> {
-    min: [T; LANES],
-    max: [T; LANES],
-    sum: [f64; LANES],
-    squares: [f64; LANES],
-}
-
-impl<T: Number> Lanes<T> {
-    const NONE: Self =
-        Self { min: [T::HIGHEST; LANES], max: [T::LOWEST; LANES], sum: [0.0; LANES], squares: [0.0; LANES] };
-
-    /// Adds four numbers to each lane, one after the other.
-    #[inline(always)]
-    fn add(&mut self, [one, two, three, four]: &[[T; LANES]; 4]) {
-        let numbers = || one.iter().zip(two).zip(three).zip(four);
-        for ((min, max), (((one, two), three), four)) in self.min.iter_mut().zip(&mut self.max).zip(numbers()) {
-            for number in [*one, *two, *three, *four] {
-                *min = if number < *min { number } else { *min };
-                *max = if number > *max { number } else { *max };
-            }
-        }
-        for ((sum, squares), (((one, two), three), four)) in self.sum.iter_mut().zip(&mut self.squares).zip(numbers()) {
-            for number in [*one, *two, *three, *four] {
-                let number: f64 = number.into();
-                *sum += number;
-                *squares += number * number;
-            }
-        }
-    }
-
-    fn add_one(&mut self, lane: usize, number: T) {
-        let lanes = self.min.iter_mut().zip(&mut self.max).zip(self.sum.iter_mut().zip(&mut self.squares));
-        if let Some(((min, max), (sum, squares))) = lanes.into_iter().nth(lane) {
-            *min = if number < *min { number } else { *min };
-            *max = if number > *max { number } else { *max };
-            let number: f64 = number.into();
-            *sum += number;
-            *squares += number * number;
-        }
-    }
-
-    #[inline(always)]
-    fn sums(mut self) -> Sums {
-        let mut half = LANES / 2;
-        while half > 0 {
-            fold(&mut self.min, half, |one, other| if other < one { other } else { one });
-            fold(&mut self.max, half, |one, other| if other > one { other } else { one });
-            fold(&mut self.sum, half, |one, other| one + other);
-            fold(&mut self.squares, half, |one, other| one + other);
-            half /= 2;
-        }
-        let ([min, ..], [max, ..], [sum, ..], [squares, ..]) = (self.min, self.max, self.sum, self.squares);
-        Sums { min: min.into(), max: max.into(), sum, squares, denormals: 0 }
-    }
-}
-
-/// Combines the second `half` lanes with the first.
+/// Adds one element of each of the `R` rows to every lane.
 #[inline(always)]
-fn fold<T: Copy>(lanes: &mut [T; LANES], half: usize, combine: impl Fn(T, T) -> T) {
+#[expect(clippy::indexing_slicing, reason = "all have this length, and zipped iterators are not vectorised")]
+fn add_rows<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool, const R: usize>(
+    sum: &mut [f64; LANES],
+    squares: &mut [f64; LANES],
+    rows: &[[[u8; N]; LANES]; R],
+) {
+    for lane in 0..LANES {
+        // Kept in registers until all rows are added.
+        let mut both = (sum[lane], squares[lane]);
+        for row in rows {
+            add_one::<N, F, SPECIAL, FUSED>(&mut both.0, &mut both.1, row[lane]);
+        }
+        (sum[lane], squares[lane]) = both;
+    }
+}
+
+#[inline(always)]
+fn add_one<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool>(
+    sum: &mut f64,
+    squares: &mut f64,
+    element: [u8; N],
+) {
+    let word = F::Word::read(element);
+    let number = if SPECIAL && F::special(word) { 0.0 } else { F::number(word) };
+    *sum += number;
+    // An exact square is rounded with the sum alone, so both are the same on every processor.
+    *squares =
+        if FUSED && F::SQUARES_ARE_EXACT { number.mul_add(number, *squares) } else { *squares + number * number };
+}
+
+/// Adds the second `half` lanes to the first.
+#[inline(always)]
+fn fold(lanes: &mut [f64; LANES], half: usize) {
     if let Some((first, second)) = lanes.split_at_mut_checked(half) {
         for (one, other) in first.iter_mut().zip(second) {
-            *one = combine(*one, *other);
+            *one += *other;
         }
     }
 }

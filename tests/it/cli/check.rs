@@ -441,3 +441,37 @@ fn a_program_is_judged_by_known_facts() {
     let said = String::from_utf8_lossy(&said.stdout).into_owned();
     assert!(said.contains(", and mlx-lm 0.32.2"), "{said}");
 }
+
+/// Another program cuts the shard off while a part of it is mapped: a finding, and no signal. Tried again when the check was
+/// over before.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_shard_that_is_cut_off_during_the_read_is_a_finding() {
+    const NAME: &str = "model.safetensors";
+    const LEN: usize = 48 << 20;
+    let dir = TempDir::new().unwrap();
+    let path = dir.path().join(NAME);
+    let entry = format!(r#"{{"dtype":"U8","shape":[{LEN}],"data_offsets":[0,{LEN}]}}"#);
+    let header = format!(r#"{{"__metadata__":{{"format":"pt"}},"w":{entry}}}"#);
+    let shard = [&header.len().to_le_bytes()[..], header.as_bytes(), &vec![1; LEN]].concat();
+    let reason = (0..20).find_map(|_| {
+        fs::write(&path, &shard).unwrap();
+        let mut check = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+        check.args(["check", "--deep", "--fail-on", "warning", "--output-format", "json"]).arg(dir.path());
+        let mut check = check.stdout(std::process::Stdio::piped()).spawn().unwrap();
+        let maps = format!("/proc/{}/maps", check.id());
+        while !fs::read_to_string(&maps).is_ok_and(|maps| maps.contains(NAME)) && check.try_wait().unwrap().is_none() {}
+        fs::File::options().write(true).open(&path).unwrap().set_len(8192).unwrap();
+        let output = check.wait_with_output().unwrap();
+        assert!(output.status.code().is_some(), "{output:?}");
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let findings = report["checkpoints"][0]["findings"].as_array().unwrap();
+        let unread = findings.iter().find(|finding| finding["code"] == "FIL004")?;
+        assert_eq!(output.status.code(), Some(1));
+        let message = unread["message"].as_str().unwrap();
+        // A thread that opens the shard later sees another size.
+        assert!(message.contains("while it was read"), "{message}");
+        message.contains("became shorter").then(|| message.to_owned())
+    });
+    assert_eq!(reason.as_deref(), Some("model.safetensors could not be read: it became shorter while it was read"));
+}

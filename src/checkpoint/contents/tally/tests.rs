@@ -33,8 +33,8 @@ fn defined(code: u32, exponent: u32, fraction: u32, bias: i32) -> f64 {
 fn codes_are_the_numbers_of_their_definitions() {
     for code in 0..=0xff_u8 {
         let at = u32::from(code);
-        let same = |number: f32, exponent, fraction, bias| {
-            assert_eq!(f64::from(number), defined(at, exponent, fraction, bias), "{code:#x} {exponent} {fraction}");
+        let same = |number: f64, exponent, fraction, bias| {
+            assert_eq!(number, defined(at, exponent, fraction, bias), "{code:#x} {exponent} {fraction}");
         };
         same(F8E4M3::number(code), 4, 3, 7);
         same(F8E5M2::number(code), 5, 2, 15);
@@ -43,12 +43,12 @@ fn codes_are_the_numbers_of_their_definitions() {
         assert_eq!(F8E8M0::number(code), (f64::from(code) - 127.0).exp2());
     }
     for code in 0..0x40_u8 {
-        assert_eq!(f64::from(F6E2M3::number(code)), defined(code.into(), 2, 3, 1));
-        assert_eq!(f64::from(F6E3M2::number(code)), defined(code.into(), 3, 2, 3));
-        assert_eq!(f64::from(F4::number(code & 0xf)), defined((code & 0xf).into(), 2, 1, 1));
+        assert_eq!(F6E2M3::number(code), defined(code.into(), 2, 3, 1));
+        assert_eq!(F6E3M2::number(code), defined(code.into(), 3, 2, 3));
+        assert_eq!(F4::number(code & 0xf), defined((code & 0xf).into(), 2, 1, 1));
     }
     for code in (0..=0xffff_u16).filter(|code| !F16::special(*code)) {
-        assert_eq!(F16::number(code).to_bits(), half::f16::from_bits(code).to_f32().to_bits());
+        assert_eq!(F16::number(code).to_bits(), half::f16::from_bits(code).to_f64().to_bits());
     }
 }
 
@@ -116,4 +116,54 @@ fn each_type_has_its_own_patterns() {
     assert_eq!(counts(Dtype::F6_E2M3, &[0xe0, 0x07, 0x04]), (0, 0, 2, 1, None));
     assert_eq!(counts(Dtype::U8, &[0xff, 0, 1]), (0, 0, 1, 0, None));
     assert_eq!(counts(Dtype::C64, &floats[..8]).4, None);
+}
+
+/// Keys of all elements of a type, in the order of their numbers.
+fn ordered<const N: usize, F: Format<N>>(words: impl Iterator<Item = F::Word>) {
+    let mut elements: Vec<(f64, F::Word)> =
+        words.filter(|word| !F::special(*word)).map(|word| (F::number(word), word)).collect();
+    elements.sort_by(|one, other| one.0.total_cmp(&other.0));
+    let keys: Vec<_> = elements.iter().map(|(_, word)| F::key(*word)).collect();
+    assert!(keys.is_sorted());
+    assert!(elements.iter().zip(keys).all(|((_, word), key)| F::with_key(key) == *word));
+}
+
+#[test]
+fn keys_have_the_order_of_the_numbers() {
+    ordered::<2, Bf16>(0..=u16::MAX);
+    ordered::<2, F16>(0..=u16::MAX);
+    ordered::<2, I16>(0..=u16::MAX);
+    ordered::<2, U16>(0..=u16::MAX);
+    ordered::<1, F8E4M3>(0..=u8::MAX);
+    ordered::<1, F8E5M2>(0..=u8::MAX);
+    ordered::<1, F8E4M3Fnuz>(0..=u8::MAX);
+    ordered::<1, F8E5M2Fnuz>(0..=u8::MAX);
+    ordered::<1, F8E8M0>(0..=u8::MAX);
+    ordered::<1, F6E2M3>(0..=0x3f);
+    ordered::<1, F6E3M2>(0..=0x3f);
+    ordered::<1, F4>(0..=0xf);
+    ordered::<1, I8>(0..=u8::MAX);
+    ordered::<1, U8>(0..=u8::MAX);
+    let wide = [0, 1, 0x7f7f_ffff, 0x8000_0000, 0x8000_0001, 0xff7f_ffff, 0x3f80_0000, 0xbf80_0000];
+    ordered::<4, F32>(wide.into_iter());
+    ordered::<4, I32>(wide.into_iter());
+    ordered::<4, U32>(wide.into_iter());
+    let wide = wide.map(|word| u64::from(word) << 32 | 1);
+    ordered::<8, F64>(wide.into_iter());
+    ordered::<8, I64>(wide.into_iter());
+    ordered::<8, U64>(wide.into_iter());
+}
+
+/// NaN and infinities count as nothing: the sums have the bits of those with zeros in their places.
+#[test]
+fn special_elements_are_left_out_of_sums() {
+    for dtype in [Dtype::BF16, Dtype::F16] {
+        let (exponent, bytes) = (if dtype == Dtype::BF16 { 0x7f80 } else { 0x7c00 }, bytes(3));
+        let words = bytes.as_chunks().0.iter().map(|word| u16::from_le_bytes(*word));
+        let zeroed = words.map(|word| if word & exponent == exponent { 0 } else { word });
+        let zeroed: Vec<u8> = zeroed.flat_map(u16::to_le_bytes).collect();
+        let (found, expected) = (tally(dtype, &bytes), tally(dtype, &zeroed));
+        assert!(found.nan > 0, "{dtype}");
+        assert_eq!(found.sums, expected.sums, "{dtype}");
+    }
 }
