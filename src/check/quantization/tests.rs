@@ -4,8 +4,8 @@ use super::*;
 use crate::check::load;
 use crate::checkpoint::Parts;
 use crate::checkpoint::{Document, Dtype, FaultKind, Shard, Tensor};
-use crate::knowledge::{ExpectedTensor, Table};
 use crate::knowledge::quantization::declared_scheme;
+use crate::knowledge::{ExpectedTensor, Table};
 
 fn schemes() -> &'static Table<Vec<Scheme>> {
     static SCHEMES: Table<Vec<Scheme>> = Table::new(|| Scheme::embedded().expect("schemes"));

@@ -225,7 +225,7 @@ impl<'l> Builder<'l> {
         place: Place<'_>,
     ) -> Outcome<()> {
         let Some(((index, count), inner)) = repeats.split_first() else {
-            return self.member(name, member, around, scope, place);
+            return self.member(name, member, member.when.as_ref(), around, scope, place);
         };
         if let Some(negative) = count.eval(scope)?.as_i64().filter(|n| *n < 0) {
             return Err(Refusal::impossible(format!("`{count}` is {negative}: no layer is built")));
@@ -234,18 +234,31 @@ impl<'l> Builder<'l> {
         if count_of > TENSOR_CAP as u64 {
             return Err(Refusal::impossible(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
         }
+        // Of the experts of a layer one condition decides, which costs more than the tensors of one.
+        let shared = member.when.as_ref().filter(|when| {
+            inner.is_empty() && count_of > 1 && !when.variables().iter().any(|variable| variable == index)
+        });
+        if !holds(shared, scope)? {
+            return Ok(());
+        }
         for i in 0..count_of {
             let mut scope = scope.child();
             scope.bind_int(index, i);
-            self.repeat(name, member, inner, around, &scope, place)?;
+            if shared.is_some() {
+                self.member(name, member, None, around, &scope, place)?;
+            } else {
+                self.repeat(name, member, inner, around, &scope, place)?;
+            }
         }
         Ok(())
     }
 
+    /// Adds one member, on the condition `when`.
     fn member(
         &mut self,
         name: &'l Template,
         member: &'l Member,
+        when: Option<&Expression>,
         around: Around<'_, 'l>,
         scope: &Scope<'_>,
         place: Place<'_>,
@@ -261,7 +274,7 @@ impl<'l> Builder<'l> {
                 Refusal::NotCovered(vec![Doubt::Corner(reason)])
             });
         }
-        if !holds(member.when.as_ref(), scope)? {
+        if !holds(when, scope)? {
             return Ok(());
         }
         let mut scope = scope.child();
