@@ -2,6 +2,8 @@
 
 use std::cell::OnceCell;
 
+use memchr::memmem::Finder;
+
 use super::pattern::{Pattern, Simple, contained};
 use crate::knowledge::Conversion;
 
@@ -81,7 +83,7 @@ pub(super) struct Transform<'c> {
     row: &'c Conversion,
     /// For each branch a text that every match contains: most models have no name with any of them, and compiling a pattern
     /// takes as long as a hundred searches. `None` where a branch has no such text.
-    contained: Option<Vec<String>>,
+    contained: Option<Vec<Finder<'static>>>,
     branches: OnceCell<Branches>,
     target: Target,
     /// What a name has to start with, the longer first; none for a transform of the whole model.
@@ -102,7 +104,7 @@ impl<'c> Transform<'c> {
             let scope = dotted(scope);
             [format!("{}{scope}", dotted(base_model_prefix)), scope]
         });
-        let contained = row.from.iter().map(|text| contained(&glob(text))).collect();
+        let contained = row.from.iter().map(|text| Some(Finder::new(&contained(&glob(text))?).into_owned())).collect();
         Self { row, contained, branches: OnceCell::new(), target, prefixes }
     }
 
@@ -120,7 +122,8 @@ impl<'c> Transform<'c> {
             None => ("", name),
             Some(prefixes) => prefixes.iter().find_map(|p| Some((p.as_str(), name.strip_prefix(p.as_str())?)))?,
         };
-        if self.contained.as_ref().is_some_and(|texts| !texts.iter().any(|text| inner.contains(text))) {
+        if self.contained.as_ref().is_some_and(|texts| !texts.iter().any(|text| text.find(inner.as_bytes()).is_some()))
+        {
             return None;
         }
         let Matched { branch, text, inside } = self.branches.get_or_init(|| Branches::new(self.row)).find(inner)?;

@@ -177,7 +177,7 @@ impl<'e> Loading<'e> {
                 return rest.as_str().to_owned();
             }
         }
-        let longer = format!("{prefix}.{name}");
+        let longer = [prefix, ".", &name].concat();
         if self.in_model(&longer) { longer } else { name }
     }
 

@@ -277,24 +277,28 @@ impl<'l> Builder<'l> {
         if !holds(when, scope)? {
             return Ok(());
         }
-        let mut scope = scope.child();
-        bind_all(&member.lets, &mut scope)?;
-        let name = format!("{}{}", place.prefix, name.try_render(&scope)?);
+        // Each scope makes the look-up of a variable of an outer one longer.
+        let mut inner = None;
+        if !member.lets.is_empty() {
+            bind_all(&member.lets, inner.insert(scope.child()))?;
+        }
+        let scope = inner.as_ref().unwrap_or(scope);
+        let name = [place.prefix, &name.try_render(scope)?].concat();
         if name.len() > NAME_CAP {
             return Err(Refusal::impossible(format!("the config makes a tensor name of {} bytes", name.len())));
         }
         let place = Place { optional: member.optional.as_deref().or(place.optional), ..place };
         match &member.kind {
             Kind::Tensor { shape, tied } => {
-                let shape = dimensions(shape, &scope)?;
-                self.tensor(name, shape, tied.as_ref(), &scope, place)
+                let shape = dimensions(shape, scope)?;
+                self.tensor(name, shape, tied.as_ref(), scope, place)
             }
             Kind::Layer { weight, bias, tied } => {
-                let shape = dimensions(weight, &scope)?;
+                let shape = dimensions(weight, scope)?;
                 let first: Vec<u64> = shape.first().copied().into_iter().collect();
-                self.tensor(format!("{name}.weight"), shape, tied.as_ref(), &scope, place)?;
-                if bias.is_some() && holds(bias.as_ref(), &scope)? {
-                    self.tensor(format!("{name}.bias"), first, None, &scope, place)?;
+                self.tensor(format!("{name}.weight"), shape, tied.as_ref(), scope, place)?;
+                if bias.is_some() && holds(bias.as_ref(), scope)? {
+                    self.tensor(format!("{name}.bias"), first, None, scope, place)?;
                 }
                 Ok(())
             }
@@ -311,10 +315,10 @@ impl<'l> Builder<'l> {
                     let model_type = model.model_type.clone().or_else(|| model_type(around.config.map, around.file));
                     self.module(&name, &model.class, model_type, around.file);
                 }
-                self.members(members, around, &scope, Place { prefix: &name, ..place })
+                self.members(members, around, scope, Place { prefix: &name, ..place })
             }
             Kind::Part(_) if place.leaves_out(&name) => Ok(()),
-            Kind::Part(part) => self.part(part, &name, around, &scope, place),
+            Kind::Part(part) => self.part(part, &name, around, scope, place),
         }
     }
 
