@@ -48,7 +48,7 @@ use parts::ModelParts;
 use peft::PeftKeys;
 use pickles::Pickles;
 use processor::Processor;
-use program::Programs;
+use program::{AskedProgram, Program, Programs};
 use quantization::Scheme;
 use recipe::Recipe;
 use refusals::Refusals;
@@ -125,7 +125,17 @@ impl Knowledge {
     /// The processor of an architecture, if it is known.
     #[must_use]
     pub fn processor_of(&self, architecture: &str) -> Option<&Processor> {
+        // Most architectures have none: then the table need not be parsed.
+        if LazyLock::get(&self.processors).is_none() && !Processor::may_have(architecture) {
+            return None;
+        }
         self.processors.iter().find(|processor| processor.architectures.iter().any(|name| name == architecture))
+    }
+
+    /// The other programs that a run asks for. Most runs ask for none, and do not parse the table.
+    #[must_use]
+    pub fn asked_programs(&self, programs: &[Program]) -> Vec<AskedProgram<'_>> {
+        if programs.is_empty() { Vec::new() } else { self.programs.asked(programs) }
     }
 
     /// Parses all tables, for tests.

@@ -17,6 +17,7 @@ use serde_json::Value;
 use super::card::{base_on_hub, is_path};
 use crate::checkpoint::adapter::{Adapter, CONFIG, PREFIX, WEIGHTS};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
+use crate::knowledge::Table;
 use crate::knowledge::peft::PeftKeys;
 use keys::{AdapterKey, MatrixRole};
 use targets::Targets;
@@ -26,7 +27,7 @@ type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
 /// Faults of the adapter in this directory, for these versions of PEFT; without an adapter, the LoRA files of other programs.
 #[must_use]
-pub fn faults(checkpoint: &Checkpoint, table: &PeftKeys, versions: &[String]) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[String]) -> Vec<Fault> {
     let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return formats::faults(checkpoint) };
     let mut faults = Vec::new();
     if let Some((key, library)) = adapter.config().and_then(other_library) {

@@ -35,7 +35,7 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
-    let (versions, programs) = (versions.as_slice(), knowledge.programs.asked(&programs));
+    let (versions, programs) = (versions.as_slice(), knowledge.asked_programs(&programs));
     let mut faults = faults_of_files(checkpoint, knowledge, &programs);
     faults.extend(adapter::faults(checkpoint, &knowledge.peft, &peft));
     let stored = Stored::of(checkpoint);

@@ -1,14 +1,15 @@
 //! The index against the shards, and the shards against each other.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
+use indexmap::IndexMap;
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
 use super::model_type::is_model;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::pickle::is_training_state;
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_NAME, Place, Shard, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_NAME, Place, Shard, Tensor, pointer};
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
@@ -55,7 +56,7 @@ pub fn all_read(checkpoint: &Checkpoint) -> bool {
 pub(super) fn is_complete(checkpoint: &Checkpoint) -> bool {
     let map = checkpoint.index.as_ref().and_then(|index| checkpoint.document(&index.document)?.get("/weight_map"));
     let listed = map.and_then(Value::as_object).into_iter().flat_map(|map| map.keys());
-    let held: BTreeSet<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+    let held: HashSet<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
     let mut families: BTreeMap<(&str, u32), BTreeSet<u32>> = BTreeMap::new();
     for (prefix, number, count) in shard_names(checkpoint).into_iter().filter_map(numbered) {
         families.entry((prefix, count)).or_default().insert(number);
@@ -78,9 +79,9 @@ pub(super) fn lost_shards(checkpoint: &Checkpoint) -> Vec<String> {
     lost.take(8).collect()
 }
 
-/// Which shard holds a tensor of that name; the first when there are several.
-pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
-    let mut map: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+/// The shards that hold a tensor of each name, in the order of the names.
+pub(super) fn by_tensor(checkpoint: &Checkpoint) -> IndexMap<&str, Vec<&str>> {
+    let mut map: IndexMap<&str, Vec<&str>> = IndexMap::new();
     for (shard, tensor) in checkpoint.tensors() {
         let shards = map.entry(&tensor.name).or_default();
         // A name twice in one shard is the reader's fault to report.
@@ -88,6 +89,7 @@ pub(super) fn by_tensor(checkpoint: &Checkpoint) -> BTreeMap<&str, Vec<&str>> {
             shards.push(&shard.name);
         }
     }
+    map.sort_unstable_keys();
     map
 }
 
@@ -171,7 +173,7 @@ struct IndexComparison<'c> {
     /// Files that the index names: how many tensors it maps to each, and the first of them.
     referenced: BTreeMap<&'c str, (usize, &'c str)>,
     /// The shards that hold each tensor.
-    holders: BTreeMap<&'c str, Vec<&'c str>>,
+    holders: IndexMap<&'c str, Vec<&'c str>>,
     lookalikes: Lookalikes<'c>,
     /// Whether the header of every shard that the index names was read.
     all_read: bool,
@@ -180,11 +182,12 @@ struct IndexComparison<'c> {
 impl<'c> IndexComparison<'c> {
     /// `None` for an index without entries, which implies nothing about missing ones.
     fn new(checkpoint: &'c Checkpoint, index: &'c Index) -> Option<Self> {
-        let mut referenced: BTreeMap<&str, (usize, &str)> = BTreeMap::new();
+        let mut referenced: HashMap<&str, (usize, &str)> = HashMap::new();
         for (tensor, file) in &index.weight_map {
             let (count, _) = referenced.entry(file).or_insert((0, tensor));
             *count = count.saturating_add(1);
         }
+        let referenced: BTreeMap<&str, (usize, &str)> = referenced.into_iter().collect();
         let all_read = referenced.keys().all(|n| checkpoint.shards.get(*n).is_some_and(readable));
         let (holders, lookalikes) = (by_tensor(checkpoint), Lookalikes::new(checkpoint));
         let comparison = Self { checkpoint, index, referenced, holders, lookalikes, all_read };
@@ -249,8 +252,10 @@ impl<'c> IndexComparison<'c> {
     fn misplaced_entries(&self, faults: &mut Faults) {
         let shards = &self.checkpoint.shards;
         let unreadable: BTreeSet<&str> = shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
+        let readable: HashMap<&str, &Shard> =
+            shards.values().filter(|s| readable(s)).map(|s| (s.name.as_str(), s)).collect();
         for (tensor, said) in &self.index.weight_map {
-            let Some(shard) = shards.get(said).filter(|s| readable(s)) else { continue };
+            let Some(shard) = readable.get(said.as_str()) else { continue };
             let held = self.holders.get(tensor.as_str());
             let unreadable = held.is_none() && unreadable.contains(tensor.as_str());
             if held.is_some_and(|h| h.contains(&shard.name.as_str())) || unreadable {
@@ -272,17 +277,18 @@ impl<'c> IndexComparison<'c> {
         // Entries that name no file are the reader's fault to report.
         let places = self.index.faults.iter().flat_map(|f| &f.places);
         let unusable: BTreeSet<&str> = places.filter_map(|place| place.tensor.as_deref()).collect();
+        let referenced: HashSet<&str> = self.referenced.keys().copied().collect();
         for (tensor, shards) in self.holders.iter().filter(|(tensor, _)| !unusable.contains(*tensor)) {
-            let mut mapped = shards.iter().filter(|s| self.referenced.contains_key(**s));
+            let mut mapped = shards.iter().filter(|shard| referenced.contains(**shard));
             let Some(first) = mapped.next() else { continue };
-            let place = Place::file(*first).in_tensor(*tensor);
+            let place = || Place::file(*first).in_tensor(*tensor);
             match (self.index.weight_map.get(*tensor), mapped.next()) {
                 (None, _) => {
-                    let fault = Fault::new(FaultKind::ShardTensorNotInIndex).at(place);
+                    let fault = Fault::new(FaultKind::ShardTensorNotInIndex).at(place());
                     faults.push(fault.with("index", self.index.document.as_str()));
                 }
                 (Some(kept), Some(second)) => {
-                    let fault = Fault::new(FaultKind::TensorInTwoShards).at(place);
+                    let fault = Fault::new(FaultKind::TensorInTwoShards).at(place());
                     faults.push(fault.with("other", *second).with("kept", kept.as_str()));
                 }
                 (Some(_), None) => {}
@@ -292,16 +298,12 @@ impl<'c> IndexComparison<'c> {
 
     /// Safetensors files that the index does not name.
     fn stray_shards(&self) -> Vec<Fault> {
-        let mut shared: BTreeMap<&str, u64> = BTreeMap::new();
-        let mapped = self.holders.iter().filter(|(tensor, _)| self.index.weight_map.contains_key(**tensor));
-        for shard in mapped.flat_map(|(_, shards)| shards) {
-            let count = shared.entry(shard).or_default();
-            *count = count.saturating_add(1);
-        }
         // Under a name that differs in case only a shard is missing already.
         let missed: BTreeSet<&str> = self.referenced.keys().filter_map(|name| self.lookalikes.get(name)).collect();
         let fault = |name: &str| {
-            let twice = shared.get(name).copied().unwrap_or_default();
+            let is_mapped = |tensor: &&Tensor| self.index.weight_map.contains_key(&tensor.name);
+            let held = self.checkpoint.shards.get(name).into_iter().flat_map(|shard| &shard.tensors);
+            let twice = held.filter(is_mapped).count();
             let kind = match name {
                 SINGLE | PICKLE_NAME => FaultKind::SingleFileBesideIndex,
                 _ if twice > 0 || numbered(name).is_some() => FaultKind::StrayShard,

@@ -22,7 +22,8 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[
     let Some(config) = checkpoint.config().filter(|_| is_model(checkpoint)) else { return Vec::new() };
     let mut faults: Vec<Fault> = Vec::new();
     for target in targets {
-        for (at, part) in configs(config) {
+        // Without such an object no key of it is lost, and the table need not be parsed.
+        for (at, part) in configs(config).filter(|(_, part)| part.contains_key("rope_parameters")) {
             let model_type = part.get("model_type").and_then(Value::as_str).unwrap_or_default();
             let Some(keys) = knowledge.ropes.of(target.loader, model_type) else { continue };
             let Some(unread) = unread(at.as_str(), part, keys) else { continue };

@@ -40,6 +40,22 @@ impl Budget {
         left.is_some()
     }
 
+    /// What each of `count` files may take that are read at the same time: together they take no more than is left.
+    pub(super) fn share(&self, count: usize) -> Self {
+        Self { left: self.left.checked_div(as_u64(count)).unwrap_or(0) }
+    }
+
+    /// Takes what was spent of a share; `false`, and nothing is taken, where the file needed more than its share or than is
+    /// left now.
+    pub(super) fn spend_share(&mut self, share: &Self, rest: &Self) -> bool {
+        let left = self.left.checked_sub(share.left.saturating_sub(rest.left)).filter(|left| *left > 0);
+        let is_enough = !rest.is_spent() && left.is_some();
+        if is_enough {
+            self.left = left.unwrap_or(0);
+        }
+        is_enough
+    }
+
     /// Whether more was needed than there was.
     pub(super) const fn is_spent(&self) -> bool {
         self.left == 0

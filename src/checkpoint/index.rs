@@ -1,6 +1,6 @@
 //! The index of a sharded checkpoint: a map from tensors to shards.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use serde_json::Value;
 
@@ -91,14 +91,15 @@ impl Index {
             Some(other) => return faults.push(malformed(self.place("/weight_map"), other)),
             None => return faults.push(Fault::new(FaultKind::WeightMapMissing).at(self.place(""))),
         };
+        // A file is named by many tensors.
+        let mut files: HashSet<&str> = HashSet::new();
+        let mut entries = Vec::with_capacity(map.len());
         for (tensor, file) in map {
             let place = || self.place(&pointer::join("/weight_map", tensor)).in_tensor(tensor.clone());
             match file.as_str() {
-                Some(file) if is_plain_file_name(file) => {
-                    if !self.files.contains(file) {
-                        self.files.insert(file.to_owned());
-                    }
-                    self.weight_map.insert(tensor.clone(), file.to_owned());
+                Some(file) if files.contains(file) || is_plain_file_name(file) => {
+                    files.insert(file);
+                    entries.push((tensor.clone(), file.to_owned()));
                 }
                 Some(file) => {
                     faults.push(Fault::new(FaultKind::IndexUnsafePath).at(place()).with("path", escape(file, 200)));
@@ -106,6 +107,8 @@ impl Index {
                 None => faults.push(malformed(place(), file)),
             }
         }
+        self.files = files.into_iter().map(str::to_owned).collect();
+        self.weight_map = entries.into_iter().collect();
     }
 
     /// `total_size` as a number of bytes; `None` when it is not one.

@@ -14,6 +14,7 @@ use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
 use super::list::list;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_own, real_target};
+use super::parallel;
 use super::pickle::{is_pickle_name, may_be_pickle, starts_like_pickle};
 use super::tokenizer::is_vocabulary;
 use super::{
@@ -113,9 +114,11 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
         vocabulary_faults: Vec::new(),
         budget: Budget::default(),
         unread: Unread::default(),
+        ahead: BTreeMap::new(),
     };
     let (names, more) = names(root)?;
     reader.unread.count = more;
+    reader.read_ahead(&names);
     for name in names {
         let entry = entry(root, &name, &mut reader.checkpoint.faults);
         reader.read_within_budget(&name, &entry);
@@ -143,7 +146,19 @@ struct DirectoryReader {
     vocabulary_faults: Vec<Fault>,
     budget: Budget,
     unread: Unread,
+    /// Shards that were read by [`Self::read_ahead`].
+    ahead: BTreeMap<String, ReadAhead>,
 }
+
+/// A shard that was read before its turn, with the share of the budget that it had, and what it left of that.
+struct ReadAhead {
+    shard: Shard,
+    share: Budget,
+    rest: Budget,
+}
+
+/// Least number of shards that are read on several threads.
+const MANY_SHARDS: usize = 8;
 
 /// Files that were not read to their end because those before them took the budget.
 #[derive(Default)]
@@ -183,6 +198,35 @@ impl DirectoryReader {
         } else if !is_left && is_document(name) {
             let document = Document { name: name.to_owned(), ..Document::default() };
             self.checkpoint.documents.insert(name.to_owned(), document);
+        }
+    }
+
+    /// Reads the headers of many shards on all cores, each with an equal share of the budget. One that needs more is read
+    /// again in its turn, so that what is read does not depend on the threads.
+    fn read_ahead(&mut self, names: &BTreeSet<String>) {
+        let shards: Vec<&String> = names.iter().filter(|name| name.ends_with(".safetensors")).collect();
+        if shards.len() < MANY_SHARDS {
+            return;
+        }
+        let (root, budget) = (&self.checkpoint.root, &self.budget);
+        let read = parallel::map(
+            parallel::threads(),
+            &shards,
+            || (),
+            |(), name| {
+                let (share, mut rest) = (budget.share(shards.len()), budget.share(shards.len()));
+                let shard = Shard::read_within(root, name, &mut rest);
+                ((*name).clone(), ReadAhead { shard, share, rest })
+            },
+        );
+        self.ahead = read.into_iter().filter(|(_, ahead)| !ahead.rest.is_spent()).collect();
+    }
+
+    /// Reads the header of a shard in its turn.
+    fn read_shard(&mut self, name: &str) -> Shard {
+        match self.ahead.remove(name) {
+            Some(ahead) if self.budget.spend_share(&ahead.share, &ahead.rest) => ahead.shard,
+            _ => Shard::read_within(&self.checkpoint.root, name, &mut self.budget),
         }
     }
 
@@ -226,7 +270,7 @@ impl DirectoryReader {
         if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
             // A folder is a checkpoint of its own, or unrelated.
         } else if is_shard {
-            let shard = own_shard(root, name, Shard::read_within(root, name, &mut self.budget));
+            let shard = own_shard(root, name, self.read_shard(name));
             self.checkpoint.shards.insert(name.to_owned(), shard);
         } else if self.is_pickle(name, entry) {
             let pickle = own_shard(root, name, Shard::read_pickle(root, name, &mut self.budget));

@@ -162,6 +162,13 @@ impl Processor {
         source::parse(path, text)
     }
 
+    /// Whether a built-in file has the name of an architecture in it: without one, no built-in processor is of the
+    /// architecture. Called by `Knowledge::processor_of` before it parses them.
+    pub(super) fn may_have(architecture: &str) -> bool {
+        let name = memchr::memmem::Finder::new(architecture);
+        source::embedded("processors").iter().any(|(_, text)| name.find(text.as_bytes()).is_some())
+    }
+
     /// The built-in processors.
     ///
     /// # Errors

@@ -181,7 +181,7 @@ impl Refusals {
     fn line(&self, version: &str, class: &str) -> Option<ClassRefusals> {
         // The first line and the last one are the braces of the file.
         let lines = self.versions.get(version)?.strip_prefix(b"{\n")?.strip_suffix(b"\n}\n")?;
-        let entry = source::bisect(lines, class, |line| line.strip_prefix('"')?.split_once("\": "))?;
+        let entry = source::bisect(lines, class, "\"", "\": ")?;
         serde_json::from_str(entry.strip_suffix(',').unwrap_or(entry)).ok()
     }
 }

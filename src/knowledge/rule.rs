@@ -363,8 +363,8 @@ fn is_code(code: &str) -> bool {
 
 /// Kinds of fault by their names; the error for an unknown one suggests the nearest name.
 fn fault_kinds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<FaultKind>, D::Error> {
-    let names = Vec::<String>::deserialize(deserializer)?;
-    let kind = |name: &String| {
+    let names = Vec::<source::Text<'_>>::deserialize(deserializer)?;
+    let kind = |source::Text(name): &source::Text<'_>| {
         FaultKind::from_name(name).ok_or_else(|| {
             let near = source::nearest(name, FaultKind::ALL.iter().map(|kind| kind.name()));
             let hint = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();

@@ -1,8 +1,10 @@
 //! The data files in `rules/`, which are embedded in the program, and those of users: both are JSON5.
 
+use std::borrow::Cow;
 use std::cmp::Ordering;
 
 use include_dir::{Dir, include_dir};
+use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::expression::{compile_eagerly, compile_lazily};
@@ -84,28 +86,29 @@ pub fn parse_embedded<T: DeserializeOwned>(path: &str, text: &str) -> Result<T, 
     compile_lazily(|| serde_json::from_str(text)).map_err(|error| DataError::new(path, error.to_string()))
 }
 
+/// A string of a data file, borrowed from its text if it has no escapes.
+#[derive(Deserialize)]
+#[serde(transparent)]
+pub(super) struct Text<'t>(#[serde(borrow)] pub(super) Cow<'t, str>);
+
 /// The value in the line of `key`, by bisection: lines of a key, a tab and a value, sorted by their keys.
 pub(super) fn line_of<'t>(lines: &'t [u8], key: &str) -> Option<&'t str> {
-    bisect(lines, key, |line| line.split_once('\t'))
+    bisect(lines, key, "", "\t")
 }
 
-/// The value in the line of `key` in sorted lines, which `split` separates into their keys and values. Reads the lines that
-/// it compares, and of a built-in file only their pages.
-pub(super) fn bisect<'t>(
-    lines: &'t [u8],
-    key: &str,
-    split: impl Fn(&'t str) -> Option<(&'t str, &'t str)>,
-) -> Option<&'t str> {
+/// The value in the line of `key` in sorted lines, each of which has `before`, a key, `between` and a value. Reads the lines
+/// that it compares, and of a built-in file only their pages.
+pub(super) fn bisect<'t>(lines: &'t [u8], key: &str, before: &str, between: &str) -> Option<&'t str> {
     let (mut start, mut end) = (0, lines.len());
     while start < end {
         let middle = start.midpoint(end);
-        let before = lines.get(start..middle)?;
-        let from = memchr::memrchr(b'\n', before).map_or(Some(start), |at| start.checked_add(at)?.checked_add(1))?;
+        let above = lines.get(start..middle)?;
+        let from = memchr::memrchr(b'\n', above).map_or(Some(start), |at| start.checked_add(at)?.checked_add(1))?;
         let to = memchr::memchr(b'\n', lines.get(middle..end)?).map_or(Some(end), |at| middle.checked_add(at))?;
-        let line = std::str::from_utf8(lines.get(from..to)?).ok()?;
-        let (found, value) = split(line)?;
-        match found.cmp(key) {
-            Ordering::Equal => return Some(value),
+        let line = lines.get(from..to)?.strip_prefix(before.as_bytes())?;
+        let (found, value) = line.split_at_checked(memchr::memmem::find(line, between.as_bytes())?)?;
+        match found.cmp(key.as_bytes()) {
+            Ordering::Equal => return std::str::from_utf8(value).ok()?.strip_prefix(between),
             Ordering::Less => start = to.checked_add(1)?,
             Ordering::Greater => end = from,
         }

@@ -12,7 +12,7 @@ const CAP: usize = 20;
 /// The fault of weights that are stored as integers where the class has floating-point parameters: the loaders of 4.x make
 /// parameters of them as they are, and torch refuses the gradient.
 pub(super) fn fault(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault> {
-    if !inputs.is_plain() {
+    if !inputs.is_plain() || !inputs.checkpoint.tensors().any(|(_, tensor)| tensor.dtype.is_integer()) {
         return None;
     }
     let mut fault = Fault::new(FaultKind::IntegerWeights);

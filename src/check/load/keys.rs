@@ -85,11 +85,11 @@ impl<'e> Spelling<'e> {
 
 /// Keys but for which more of the file would be recognised: they start with the prefix, and so decide for all others.
 ///
-/// `recognised` counts the tensors of the class that a file with these names has.
+/// `recognised` counts the tensors of the class that a file with these names has, up to a number.
 pub(super) fn hijackers<'f>(
     expected: &Expected,
     file: &'f BTreeSet<String>,
-    recognised: impl Fn(&BTreeSet<String>) -> usize,
+    recognised: impl Fn(&BTreeSet<String>, usize) -> usize,
 ) -> Vec<&'f str> {
     if expected.base_model_prefix.is_empty() {
         return Vec::new();
@@ -99,15 +99,17 @@ pub(super) fn hijackers<'f>(
     if others.is_empty() || others.len() == file.len() {
         return Vec::new();
     }
-    if recognised(&others) > recognised(file) {
+    // The others are few in most files: a head.
+    let of_others = recognised(&others, usize::MAX);
+    if of_others > recognised(file, of_others) {
         file.iter().filter(is_stray).map(String::as_str).collect()
     } else {
         Vec::new()
     }
 }
 
-/// Tensors of the class that a file with these names has, as transformers 4.47 spells them.
-pub(super) fn recognised(expected: &Expected, file: &BTreeSet<String>) -> usize {
+/// Tensors of the class that a file with these names has, as transformers 4.47 spells them; counted up to `most`.
+pub(super) fn recognised(expected: &Expected, file: &BTreeSet<String>, most: usize) -> usize {
     let spelling = Spelling::of(expected, file);
-    expected.tensors.keys().filter(|name| file.contains(&spelling.in_file(name))).count()
+    expected.tensors.keys().filter(|name| file.contains(&spelling.in_file(name))).take(most).count()
 }

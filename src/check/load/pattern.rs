@@ -14,6 +14,77 @@ const BACKTRACKS: usize = 10_000;
 /// it.
 const LONGEST: usize = 512;
 
+/// What stands at the end of a pattern whose match ends with a word.
+pub(super) const NAME_ENDS: &str = r"(?!\w)";
+
+/// A pattern of characters that stand for themselves, `.`, and at most one `.*`: most of them are. A large model has a name
+/// for each of its experts, and a regular expression takes ten times as long for it.
+#[derive(Debug)]
+pub(super) struct Simple {
+    /// Whether a match starts where the name does.
+    starts: bool,
+    /// Up to the `.*`, or the whole; `None` is any character.
+    first: Vec<Option<u8>>,
+    /// After the `.*`.
+    last: Option<Vec<Option<u8>>>,
+    /// Whether no word goes on after a match.
+    ends: bool,
+}
+
+impl Simple {
+    /// `None` for a pattern with anything else.
+    pub(super) fn new(text: &str) -> Option<Self> {
+        let (text, ends) = text.strip_suffix(NAME_ENDS).map_or((text, false), |text| (text, true));
+        let (text, starts) = text.strip_prefix('^').map_or((text, false), |text| (text, true));
+        let mut runs = text.split(".*").map(Self::run);
+        let (first, last, more) = (runs.next()??, runs.next(), runs.next());
+        let last = match last {
+            Some(run) => Some(run?),
+            None => None,
+        };
+        more.is_none().then_some(Self { starts, first, last, ends })
+    }
+
+    fn run(text: &str) -> Option<Vec<Option<u8>>> {
+        let mut rest = text.bytes();
+        let mut run = Vec::new();
+        while let Some(byte) = rest.next() {
+            run.push(match byte {
+                b'.' => None,
+                b'\\' => Some(rest.next().filter(u8::is_ascii_punctuation)?),
+                b'_' | b'-' => Some(byte),
+                _ if byte.is_ascii_alphanumeric() => Some(byte),
+                _ => return None,
+            });
+        }
+        Some(run)
+    }
+
+    /// Whether a name is one that `find` reads: of another one a character may be several bytes, or a line may end in it.
+    pub(super) fn reads(name: &str) -> bool {
+        name.len() <= LONGEST && name.is_ascii() && !name.contains('\n')
+    }
+
+    /// The first match, as a search for the regular expression finds it.
+    pub(super) fn find(&self, name: &str) -> Option<Range<usize>> {
+        let name = name.as_bytes();
+        let ends = |at: usize| !self.ends || !name.get(at).is_some_and(|b| b.is_ascii_alphanumeric() || *b == b'_');
+        let fits = |run: &[Option<u8>], at: usize| {
+            let end = at.checked_add(run.len())?;
+            let there = name.get(at..end)?;
+            run.iter().zip(there).all(|(wanted, byte)| wanted.is_none_or(|w| w == *byte)).then_some(end)
+        };
+        let starts = 0..=if self.starts { 0 } else { name.len() };
+        let Some(last) = &self.last else {
+            return starts.into_iter().find_map(|at| Some(at..fits(&self.first, at).filter(|end| ends(*end))?));
+        };
+        // What can end a later match can end the first one too, and the last of the ends is taken.
+        let (start, next) = starts.into_iter().find_map(|at| Some((at, fits(&self.first, at)?)))?;
+        let end = (next..=name.len()).rev().find_map(|at| fits(last, at).filter(|end| ends(*end)))?;
+        Some(start..end)
+    }
+}
+
 /// A compiled pattern.
 #[derive(Debug, Clone)]
 pub(super) enum Pattern {
@@ -41,7 +112,7 @@ impl Pattern {
     /// Python's syntax is that of both crates in all that these patterns use.
     pub(super) fn new(text: &str) -> Option<Self> {
         // The only lookaround of most patterns has another spelling in the crate without lookarounds.
-        let regular = regex::Regex::new(&text.replace(r"(?!\w)", r"\b{end-half}")).map(Self::Regular);
+        let regular = regex::Regex::new(&text.replace(NAME_ENDS, r"\b{end-half}")).map(Self::Regular);
         let backtracking = || RegexBuilder::new(text).backtrack_limit(BACKTRACKS).build().map(Self::Backtracking);
         regular.or_else(|_| backtracking()).ok()
     }

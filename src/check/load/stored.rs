@@ -1,7 +1,6 @@
 //! What the loader finds in a checkpoint: keys, and the tensors behind them.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::sync::OnceLock;
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use crate::checkpoint::{Checkpoint, PICKLE_NAME, Shard};
 use crate::knowledge::Evidence;
@@ -25,13 +24,13 @@ const SEARCHED_BYTES: usize = 24 << 20;
 /// the index is used, and still reported missing.
 #[derive(Debug, Clone, Default)]
 pub struct Stored {
-    keys: BTreeSet<String>,
-    shapes: BTreeMap<String, Vec<u64>>,
+    /// Every key, and every tensor in the files that the loader opens, which have shapes.
+    tensors: Evidence,
+    /// The tensors that are no keys.
+    unlisted: BTreeSet<String>,
     absent: BTreeSet<String>,
     /// Whether a file that the loader opens was read without a fault: without a tensor in it, everything is missing.
     was_read: bool,
-    /// What [`Stored::evidence`] made.
-    evidence: OnceLock<Evidence>,
 }
 
 impl Stored {
@@ -50,107 +49,125 @@ impl Stored {
     pub fn new<'s>(index: Option<&BTreeMap<String, String>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
         let shards: BTreeMap<&str, &Shard> = shards.into_iter().map(|s| (s.name.as_str(), s)).collect();
         match (shards.get(SINGLE).or_else(|| shards.get(PICKLE_NAME)), index) {
-            (Some(single), _) => Self::together([*single]),
-            (None, None) => Self::together(shards.into_values().filter(|s| is_of_model(&s.name))),
+            (Some(single), _) => Self::together(&[single]),
+            (None, None) => {
+                let of_model: Vec<&Shard> = shards.into_values().filter(|s| is_of_model(&s.name)).collect();
+                Self::together(&of_model)
+            }
             (None, Some(index)) => {
-                let files: BTreeSet<&str> = index.values().map(String::as_str).collect();
-                let opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
+                let files: HashSet<&str> = index.values().map(String::as_str).collect();
+                let mut opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
+                opened.sort_unstable_by_key(|shard| shard.name.as_str());
                 // A shard that is not there or could not be read may hold anything.
                 let all_read = opened.len() == files.len() && opened.iter().all(|shard| !shard.unread);
-                let Self { shapes, was_read, .. } = Self::together(opened);
-                let keys: BTreeSet<String> = index.keys().cloned().collect();
-                let absent = keys.iter().filter(|key| all_read && !shapes.contains_key(*key)).cloned().collect();
-                Self { keys, shapes, absent, was_read, ..Self::default() }
+                let together = Self::together(&opened);
+                let keys: BTreeSet<&str> = index.keys().map(String::as_str).collect();
+                let held: BTreeSet<&str> = together.shapes().map(|(name, _)| name).collect();
+                let owned = |names: &mut dyn Iterator<Item = &&str>| names.map(|name| (*name).to_owned()).collect();
+                let unlisted: BTreeSet<String> = owned(&mut held.difference(&keys));
+                let unread: BTreeSet<String> = owned(&mut keys.difference(&held));
+                let tensors = if unread.is_empty() {
+                    together.tensors
+                } else {
+                    let keys = unread.iter().map(|name| (name.clone(), None));
+                    let held = together.shapes().map(|(name, shape)| (name.to_owned(), Some(shape.to_vec())));
+                    held.chain(keys).collect()
+                };
+                let absent = if all_read { unread } else { BTreeSet::new() };
+                Self { tensors, unlisted, absent, was_read: together.was_read }
             }
         }
     }
 
-    fn together<'s>(shards: impl IntoIterator<Item = &'s Shard>) -> Self {
-        let (mut shapes, mut was_read) = (BTreeMap::new(), false);
-        for shard in shards {
-            was_read |= shard.is_sound();
-            shapes.extend(shard.tensors.iter().map(|t| (t.name.clone(), t.shape.clone())));
-        }
-        Self { was_read, ..Self::from_shapes(shapes) }
+    /// What these shards hold; of tensors of one name that of the last shard.
+    fn together(shards: &[&Shard]) -> Self {
+        let tensors = shards.iter().flat_map(|shard| &shard.tensors);
+        let tensors = tensors.map(|t| (t.name.clone(), Some(t.shape.clone()))).collect();
+        Self { tensors, was_read: shards.iter().any(|shard| shard.is_sound()), ..Self::default() }
     }
 
     /// Names and shapes of one file.
     #[must_use]
     pub fn from_shapes(shapes: BTreeMap<String, Vec<u64>>) -> Self {
-        Self { keys: shapes.keys().cloned().collect(), shapes, ..Self::default() }
+        Self { tensors: shapes.into_iter().map(|(name, shape)| (name, Some(shape))).collect(), ..Self::default() }
     }
 
     /// The same with some tensors taken out and others put in; of those the shape may be unknown.
     #[must_use]
     pub fn replacing(&self, taken: &BTreeSet<String>, added: BTreeMap<String, Option<Vec<u64>>>) -> Self {
-        let mut replaced = Self { evidence: OnceLock::new(), ..self.clone() };
-        replaced.keys.retain(|name| !taken.contains(name));
-        replaced.absent.retain(|name| !taken.contains(name));
-        replaced.shapes.retain(|name, _| !taken.contains(name));
-        for (name, shape) in added {
-            replaced.shapes.extend(shape.map(|shape| (name.clone(), shape)));
-            replaced.keys.insert(name);
-        }
-        replaced
+        let is_kept = |name: &str| !taken.contains(name);
+        let of = |set: &BTreeSet<String>| set.iter().filter(|name| is_kept(name)).cloned().collect();
+        let (mut unlisted, absent): (BTreeSet<String>, _) = (of(&self.unlisted), of(&self.absent));
+        unlisted.retain(|name| !added.contains_key(name));
+        let kept = self.tensors.iter().filter(|(name, _)| is_kept(name));
+        let kept = kept.map(|(name, shape)| (name.to_owned(), shape.map(<[u64]>::to_vec)));
+        let added = added.into_iter().map(|(name, shape)| {
+            let before = || self.shape(&name).filter(|_| is_kept(&name)).map(<[u64]>::to_vec);
+            let shape = shape.or_else(before);
+            (name, shape)
+        });
+        Self { tensors: kept.chain(added).collect(), unlisted, absent, was_read: self.was_read }
     }
 
     /// The same with these names starting with `to` instead of `from`.
     #[must_use]
     pub fn under(&self, names: &[String], from: &str, to: &str) -> Self {
-        let names: BTreeSet<&String> = names.iter().collect();
-        let renamed = |name: &String| match name.strip_prefix(from).filter(|_| names.contains(name)) {
+        let names: BTreeSet<&str> = names.iter().map(String::as_str).collect();
+        let renamed = |name: &str| match name.strip_prefix(from).filter(|_| names.contains(name)) {
             Some(rest) => format!("{to}{rest}"),
-            None => name.clone(),
+            None => name.to_owned(),
         };
+        let keys: BTreeSet<String> = self.names().map(renamed).collect();
+        let unlisted = self.unlisted.iter().map(|name| renamed(name)).filter(|name| !keys.contains(name)).collect();
+        let unread = self.tensors.iter().filter(|(_, shape)| shape.is_none()).map(|(name, _)| (renamed(name), None));
+        let held = self.shapes().map(|(name, shape)| (renamed(name), Some(shape.to_vec())));
         Self {
-            keys: self.keys.iter().map(renamed).collect(),
-            shapes: self.shapes.iter().map(|(name, shape)| (renamed(name), shape.clone())).collect(),
-            absent: self.absent.iter().map(renamed).collect(),
+            tensors: unread.chain(held).collect(),
+            unlisted,
+            absent: self.absent.iter().map(|name| renamed(name)).collect(),
             was_read: self.was_read,
-            ..Self::default()
         }
     }
 
     /// What the loader reads as keys.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.keys.iter().map(String::as_str)
+        let all = self.tensors.iter().map(|(name, _)| name);
+        all.filter(|name| self.unlisted.is_empty() || !self.unlisted.contains(*name))
     }
 
     /// Whether nothing is known of what a loader finds: no tensor was read, and no file that is known to be empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.keys.is_empty() && self.shapes.is_empty() && !self.was_read
+        self.tensors.iter().next().is_none() && !self.was_read
     }
 
     /// Whether causes and similar classes are searched for these tensors: a search keeps further copies of their names.
     #[must_use]
     pub(in crate::check) fn is_searchable(&self) -> bool {
-        let bytes = self.keys.iter().fold(0_usize, |sum, name| sum.saturating_add(name.len()));
-        self.keys.len().max(self.shapes.len()) <= SEARCHED && bytes <= SEARCHED_BYTES
+        let bytes = self.names().fold(0_usize, |sum, name| sum.saturating_add(name.len()));
+        self.tensors.iter().count() <= SEARCHED && bytes <= SEARCHED_BYTES
     }
 
     /// The stored tensors, for what an architecture reads off them.
     #[must_use]
     pub fn evidence(&self) -> Evidence {
-        let shapes = self.shapes.iter().map(|(name, shape)| (name.clone(), Some(shape.clone())));
-        let others = self.keys.iter().filter(|key| !self.shapes.contains_key(*key)).map(|key| (key.clone(), None));
-        self.evidence.get_or_init(|| shapes.chain(others).collect()).clone()
+        self.tensors.clone()
     }
 
-    /// Names in the files the loader opens; those of the index stand in for files that are not there.
-    pub(super) fn file_names(&self) -> impl Iterator<Item = &str> {
-        let unread = self.keys.iter().filter(|key| !self.shapes.contains_key(*key) && !self.absent.contains(*key));
-        self.shapes.keys().chain(unread).map(String::as_str)
+    /// Tensors in the files the loader opens; those of the index stand in for files that are not there, without a shape.
+    pub(super) fn in_files(&self) -> impl Iterator<Item = (&str, Option<&[u64]>)> {
+        let held = self.shapes().map(|(name, shape)| (name, Some(shape)));
+        held.chain(self.tensors.iter().filter(|(name, shape)| shape.is_none() && !self.absent.contains(*name)))
     }
 
     /// Shape of a tensor, when its file was read.
     pub(in crate::check) fn shape(&self, name: &str) -> Option<&[u64]> {
-        self.shapes.get(name).map(Vec::as_slice)
+        self.tensors.shape(name)
     }
 
     /// Tensors in the files the loader opens, by name.
     pub(in crate::check) fn shapes(&self) -> impl Iterator<Item = (&str, &[u64])> {
-        self.shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_slice()))
+        self.tensors.iter().filter_map(|(name, shape)| Some((name, shape?)))
     }
 
     /// Keys that are in no shard although every shard was read.

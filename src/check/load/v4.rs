@@ -48,7 +48,7 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     for name in stored.absent().filter(|name| model.contains_key(&keys::renamed(name))) {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::IndexedButAbsent, by: None });
     }
-    for name in keys::hijackers(expected, &file, |file| keys::recognised(expected, file)) {
+    for name in keys::hijackers(expected, &file, |file, most| keys::recognised(expected, file, most)) {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None });
     }
     silent.sort_by(|a, b| (a.reason, &a.name).cmp(&(b.reason, &b.name)));

@@ -67,12 +67,12 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::IndexedButAbsent, by: None });
     }
     let all: BTreeSet<String> = stored.names().map(str::to_owned).collect();
-    let recognised = |file: &BTreeSet<String>| {
+    let recognised = |file: &BTreeSet<String>, most: usize| {
         let renaming = Renaming::of(expected, file.iter().map(String::as_str));
         let named = file
             .iter()
             .filter(|key| matches!(renaming.name(key), Renamed::Is(name) if expected.tensors.contains_key(&name)));
-        named.count()
+        named.take(most).count()
     };
     for name in keys::hijackers(expected, &all, recognised) {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None });

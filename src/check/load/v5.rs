@@ -116,10 +116,10 @@ impl<'e> Loading<'e> {
     /// With everything collected that is stored.
     fn of(expected: &'e Expected, stored: &Stored) -> Self {
         let mut loading = Self::new(expected);
-        let mut names: Vec<&str> = stored.file_names().collect();
-        names.sort_by_cached_key(|name| natural(name));
-        for name in names {
-            loading.collect(name, stored.shape(name).map_or(Shape::Unknown, |dims| Shape::Known(dims.to_vec())));
+        let mut tensors: Vec<(&str, Option<&[u64]>)> = stored.in_files().collect();
+        tensors.sort_by_cached_key(|(name, _)| natural(name));
+        for (name, shape) in tensors {
+            loading.collect(name, shape.map_or(Shape::Unknown, |dims| Shape::Known(dims.to_vec())));
         }
         loading
     }
@@ -177,7 +177,7 @@ impl<'e> Loading<'e> {
                 return rest.as_str().to_owned();
             }
         }
-        let longer = format!("{prefix}.{name}");
+        let longer = [prefix, ".", &name].concat();
         if self.in_model(&longer) { longer } else { name }
     }
 
@@ -246,11 +246,10 @@ fn natural(name: &str) -> Vec<u8> {
         let (text, digits) = trailing_digits(part);
         // A number is digits alone.
         key.push(u8::from(!text.is_empty() || digits.is_empty()));
-        for byte in text.bytes() {
-            match byte {
-                0 | 1 => key.extend([1, byte]),
-                _ => key.push(byte),
-            }
+        if text.bytes().all(|byte| byte > 1) {
+            key.extend_from_slice(text.as_bytes());
+        } else {
+            key.extend(text.bytes().flat_map(|byte| (byte <= 1).then_some(1).into_iter().chain([byte])));
         }
         // A text ends before all that goes on.
         key.push(0);
@@ -264,14 +263,14 @@ fn natural(name: &str) -> Vec<u8> {
                 key.extend(u32::try_from(value.len()).unwrap_or(u32::MAX).to_be_bytes());
             }
         }
-        key.extend(value.bytes());
+        key.extend_from_slice(value.as_bytes());
     }
     key
 }
 
 fn trailing_digits(part: &str) -> (&str, &str) {
-    let text = part.trim_end_matches(|c: char| c.is_ascii_digit());
-    part.split_at(text.len())
+    let digits = part.bytes().rev().take_while(u8::is_ascii_digit).count();
+    part.split_at_checked(part.len().saturating_sub(digits)).unwrap_or((part, ""))
 }
 
 #[cfg(test)]

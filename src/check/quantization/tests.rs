@@ -1,16 +1,14 @@
-use std::sync::LazyLock;
-
 use serde_json::{Value, json};
 
 use super::*;
 use crate::check::load;
 use crate::checkpoint::Parts;
 use crate::checkpoint::{Document, Dtype, FaultKind, Shard, Tensor};
-use crate::knowledge::ExpectedTensor;
 use crate::knowledge::quantization::declared_scheme;
+use crate::knowledge::{ExpectedTensor, Table};
 
-fn schemes() -> &'static [Scheme] {
-    static SCHEMES: LazyLock<Vec<Scheme>> = LazyLock::new(|| Scheme::embedded().expect("schemes"));
+fn schemes() -> &'static Table<Vec<Scheme>> {
+    static SCHEMES: Table<Vec<Scheme>> = Table::new(|| Scheme::embedded().expect("schemes"));
     &SCHEMES
 }
 

@@ -40,6 +40,15 @@ macro_rules! fault_kinds {
                 }
             }
 
+            /// The kind of this name; `None` for an unknown name.
+            #[must_use]
+            pub fn from_name(name: &str) -> Option<Self> {
+                match name {
+                    $($($name => Some(Self::$variant),)*)*
+                    _ => None,
+                }
+            }
+
             /// The stage that produces faults of this kind.
             #[cfg(feature = "internals")]
             #[must_use]
@@ -251,14 +260,6 @@ fault_kinds! {
         UnknownArchitecture = "unknown-architecture",
         UnknownQuantization = "unknown-quantization",
         ValueRefused = "value-refused",
-    }
-}
-
-impl FaultKind {
-    /// The kind of this name; `None` for an unknown name.
-    #[must_use]
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.iter().copied().find(|kind| kind.name() == name)
     }
 }
 

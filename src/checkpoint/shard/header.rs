@@ -83,6 +83,7 @@ fn parse(mut shard: Shard, head: &[u8], budget: &mut Budget) -> Shard {
     };
     let entries = without_duplicates(&shard, entries, &mut faults);
     layout::check(&shard, &entries, &mut faults);
+    shard.tensors.reserve_exact(entries.len());
     for entry in entries {
         match entry.into_tensor() {
             Ok(tensor) => shard.tensors.push(tensor),

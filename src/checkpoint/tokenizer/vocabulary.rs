@@ -101,8 +101,10 @@ impl Vocabulary {
             vocabulary.tokens.push((start, end, id));
         }
         let Self { arena, tokens, .. } = &mut vocabulary;
-        let text = |t: &(u32, u32, u32)| token(arena, *t);
-        tokens.sort_by(|a, b| text(a).cmp(text(b)).then(a.0.cmp(&b.0)));
+        // The bytes of tokens have the order of their text, without a look at the bounds of characters.
+        let bytes = arena.as_bytes();
+        let text = |t: &(u32, u32, u32)| bytes.get(t.0 as usize..t.1 as usize).unwrap_or_default();
+        tokens.sort_unstable_by(|a, b| text(a).cmp(text(b)).then(a.0.cmp(&b.0)));
         // Of duplicate tokens the last counts, as in a Python dict.
         tokens.reverse();
         tokens.dedup_by(|a, b| text(a) == text(b));

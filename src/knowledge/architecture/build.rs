@@ -225,7 +225,7 @@ impl<'l> Builder<'l> {
         place: Place<'_>,
     ) -> Outcome<()> {
         let Some(((index, count), inner)) = repeats.split_first() else {
-            return self.member(name, member, around, scope, place);
+            return self.member(name, member, member.when.as_ref(), around, scope, place);
         };
         if let Some(negative) = count.eval(scope)?.as_i64().filter(|n| *n < 0) {
             return Err(Refusal::impossible(format!("`{count}` is {negative}: no layer is built")));
@@ -234,18 +234,31 @@ impl<'l> Builder<'l> {
         if count_of > TENSOR_CAP as u64 {
             return Err(Refusal::impossible(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
         }
+        // Of the experts of a layer one condition decides, which costs more than the tensors of one.
+        let shared = member.when.as_ref().filter(|when| {
+            inner.is_empty() && count_of > 1 && !when.variables().iter().any(|variable| variable == index)
+        });
+        if !holds(shared, scope)? {
+            return Ok(());
+        }
         for i in 0..count_of {
             let mut scope = scope.child();
             scope.bind_int(index, i);
-            self.repeat(name, member, inner, around, &scope, place)?;
+            if shared.is_some() {
+                self.member(name, member, None, around, &scope, place)?;
+            } else {
+                self.repeat(name, member, inner, around, &scope, place)?;
+            }
         }
         Ok(())
     }
 
+    /// Adds one member, on the condition `when`.
     fn member(
         &mut self,
         name: &'l Template,
         member: &'l Member,
+        when: Option<&Expression>,
         around: Around<'_, 'l>,
         scope: &Scope<'_>,
         place: Place<'_>,
@@ -261,27 +274,31 @@ impl<'l> Builder<'l> {
                 Refusal::NotCovered(vec![Doubt::Corner(reason)])
             });
         }
-        if !holds(member.when.as_ref(), scope)? {
+        if !holds(when, scope)? {
             return Ok(());
         }
-        let mut scope = scope.child();
-        bind_all(&member.lets, &mut scope)?;
-        let name = format!("{}{}", place.prefix, name.try_render(&scope)?);
+        // Each scope makes the look-up of a variable of an outer one longer.
+        let mut inner = None;
+        if !member.lets.is_empty() {
+            bind_all(&member.lets, inner.insert(scope.child()))?;
+        }
+        let scope = inner.as_ref().unwrap_or(scope);
+        let name = [place.prefix, &name.try_render(scope)?].concat();
         if name.len() > NAME_CAP {
             return Err(Refusal::impossible(format!("the config makes a tensor name of {} bytes", name.len())));
         }
         let place = Place { optional: member.optional.as_deref().or(place.optional), ..place };
         match &member.kind {
             Kind::Tensor { shape, tied } => {
-                let shape = dimensions(shape, &scope)?;
-                self.tensor(name, shape, tied.as_ref(), &scope, place)
+                let shape = dimensions(shape, scope)?;
+                self.tensor(name, shape, tied.as_ref(), scope, place)
             }
             Kind::Layer { weight, bias, tied } => {
-                let shape = dimensions(weight, &scope)?;
+                let shape = dimensions(weight, scope)?;
                 let first: Vec<u64> = shape.first().copied().into_iter().collect();
-                self.tensor(format!("{name}.weight"), shape, tied.as_ref(), &scope, place)?;
-                if bias.is_some() && holds(bias.as_ref(), &scope)? {
-                    self.tensor(format!("{name}.bias"), first, None, &scope, place)?;
+                self.tensor(format!("{name}.weight"), shape, tied.as_ref(), scope, place)?;
+                if bias.is_some() && holds(bias.as_ref(), scope)? {
+                    self.tensor(format!("{name}.bias"), first, None, scope, place)?;
                 }
                 Ok(())
             }
@@ -298,10 +315,10 @@ impl<'l> Builder<'l> {
                     let model_type = model.model_type.clone().or_else(|| model_type(around.config.map, around.file));
                     self.module(&name, &model.class, model_type, around.file);
                 }
-                self.members(members, around, &scope, Place { prefix: &name, ..place })
+                self.members(members, around, scope, Place { prefix: &name, ..place })
             }
             Kind::Part(_) if place.leaves_out(&name) => Ok(()),
-            Kind::Part(part) => self.part(part, &name, around, &scope, place),
+            Kind::Part(part) => self.part(part, &name, around, scope, place),
         }
     }
 

@@ -1,9 +1,10 @@
 //! Expressions: compiled while their file is parsed, or at the first evaluation.
 
-use std::borrow::Cow;
+use std::borrow::Borrow;
 use std::cell::RefCell;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashSet};
 use std::fmt;
+use std::hash::{Hash, Hasher};
 use std::sync::{Arc, OnceLock};
 
 use cel::Value as Cel;
@@ -13,6 +14,7 @@ use serde_json::Value;
 use super::program::Program;
 use super::scope::{self, Scope};
 use super::steps;
+use crate::knowledge::source::Text;
 
 /// Maximum length of an evaluation error in characters: the crate prints whole operands.
 const MESSAGE_CAP: usize = 300;
@@ -57,7 +59,7 @@ struct Reading {
     /// Whether an invalid expression is an error of the file, with its position.
     at_once: bool,
     /// Expressions of the file so far; duplicates are compiled once.
-    seen: Option<HashMap<Box<str>, Expression>>,
+    seen: Option<HashSet<Expression>>,
 }
 
 thread_local! {
@@ -82,7 +84,7 @@ fn reading<T>(at_once: bool, read: impl FnOnce() -> T) -> T {
             READING.set(std::mem::take(&mut self.0));
         }
     }
-    let _before = RestoreReading(READING.replace(Reading { at_once, seen: Some(HashMap::new()) }));
+    let _before = RestoreReading(READING.replace(Reading { at_once, seen: Some(HashSet::new()) }));
     read()
 }
 
@@ -113,7 +115,7 @@ impl Expression {
             super::parsed::tests::record(source);
             Self(Arc::new(Inner { source: source.into(), counted: false, program: OnceLock::new() }))
         };
-        READING.with_borrow_mut(|r| Some(r.seen.as_mut()?.insert(source.into(), expression.clone())));
+        READING.with_borrow_mut(|r| Some(r.seen.as_mut()?.insert(expression.clone())));
         Ok(expression)
     }
 
@@ -212,6 +214,18 @@ impl PartialEq for Expression {
 
 impl Eq for Expression {}
 
+impl Hash for Expression {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.source().hash(state);
+    }
+}
+
+impl Borrow<str> for Expression {
+    fn borrow(&self) -> &str {
+        self.source()
+    }
+}
+
 impl fmt::Display for Expression {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0.source)
@@ -226,7 +240,7 @@ impl fmt::Debug for Expression {
 
 impl<'de> Deserialize<'de> for Expression {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let source = Cow::<str>::deserialize(deserializer)?;
+        let Text(source) = Text::deserialize(deserializer)?;
         Self::from_data_file(&source).map_err(serde::de::Error::custom)
     }
 }

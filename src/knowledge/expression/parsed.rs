@@ -4,13 +4,15 @@
 //! Each line has the text of an expression and its tree, both as JSON; the lines are sorted. A text without a line is
 //! parsed as usual. A test writes the file, and compares it with what CEL's parser makes of each text.
 
+use std::fmt;
 use std::sync::LazyLock;
 
 use cel::common::ast::{
     CallExpr, ComprehensionExpr, EntryExpr, Expr, IdedEntryExpr, IdedExpr, ListExpr, LiteralValue, MapEntryExpr,
     MapExpr, SelectExpr,
 };
-use serde_json::Value;
+use serde::de::{Error, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 
 use crate::knowledge::source;
 
@@ -20,68 +22,107 @@ static LINES: LazyLock<&[u8]> = LazyLock::new(|| source::bytes("expressions.txt"
 /// The tree of an expression, if the file has one.
 pub(super) fn find(expression: &str) -> Option<IdedExpr> {
     let wanted = serde_json::to_string(expression).ok()?;
-    let tree = source::line_of(&LINES, &wanted)?;
-    decode(&serde_json::from_str(tree).ok()?)
+    let Tree(tree) = serde_json::from_str(source::line_of(&LINES, &wanted)?).ok()?;
+    Some(tree)
 }
 
-/// The expression that a value of [`encode`] stands for.
-fn decode(value: &Value) -> Option<IdedExpr> {
-    let expr = match value {
-        Value::Null => Expr::Literal(LiteralValue::Null),
-        Value::Bool(value) => Expr::Literal(LiteralValue::Boolean((*value).into())),
-        Value::Number(number) => Expr::Literal(match number.as_i64() {
-            Some(int) => LiteralValue::Int(int.into()),
-            None => LiteralValue::Double(number.as_f64()?.into()),
-        }),
-        Value::String(name) => Expr::Ident(name.clone()),
-        Value::Array(parts) => composed(parts)?,
-        Value::Object(_) => return None,
-    };
-    Some(IdedExpr { id: 0, expr })
+/// An expression, read from its JSON: a name is a variable, other plain values are themselves, and all else is an array of a
+/// kind and its parts.
+struct Tree(IdedExpr);
+
+impl<'de> Deserialize<'de> for Tree {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(TreeVisitor).map(|expr| Self(IdedExpr { id: 0, expr }))
+    }
 }
 
-fn composed(parts: &[Value]) -> Option<Expr> {
-    let (kind, parts) = parts.split_first()?;
-    let name = |value: &Value| value.as_str().map(str::to_owned);
-    let all = |parts: &[Value]| parts.iter().map(decode).collect::<Option<Vec<_>>>();
-    Some(match (kind.as_str()?, parts) {
-        ("string", [text]) => Expr::Literal(LiteralValue::String(name(text)?.into())),
-        ("call", [function, args @ ..]) => {
-            Expr::Call(CallExpr { func_name: name(function)?, target: None, args: all(args)? })
-        }
-        ("method", [function, target, args @ ..]) => {
-            let target = Some(Box::new(decode(target)?));
-            Expr::Call(CallExpr { func_name: name(function)?, target, args: all(args)? })
-        }
-        ("key" | "has", [operand, field]) => {
-            let test = kind == "has";
-            Expr::Select(SelectExpr { operand: Box::new(decode(operand)?), field: name(field)?, test })
-        }
-        ("list", elements) => Expr::List(ListExpr::new(all(elements)?)),
-        ("map", entries) => {
-            let entry = |pair: &[Value]| match pair {
-                [key, value] => {
-                    let entry = MapEntryExpr { key: decode(key)?, value: decode(value)?, optional: false };
-                    Some(IdedEntryExpr { id: 0, expr: EntryExpr::MapEntry(entry) })
+struct TreeVisitor;
+
+impl<'de> Visitor<'de> for TreeVisitor {
+    type Value = Expr;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("an expression")
+    }
+
+    fn visit_unit<E>(self) -> Result<Expr, E> {
+        Ok(Expr::Literal(LiteralValue::Null))
+    }
+
+    fn visit_bool<E>(self, value: bool) -> Result<Expr, E> {
+        Ok(Expr::Literal(LiteralValue::Boolean(value.into())))
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<Expr, E> {
+        Ok(Expr::Literal(LiteralValue::Int(value.into())))
+    }
+
+    fn visit_u64<E: Error>(self, value: u64) -> Result<Expr, E> {
+        self.visit_i64(i64::try_from(value).map_err(E::custom)?)
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<Expr, E> {
+        Ok(Expr::Literal(LiteralValue::Double(value.into())))
+    }
+
+    fn visit_str<E>(self, name: &str) -> Result<Expr, E> {
+        Ok(Expr::Ident(name.to_owned()))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut parts: A) -> Result<Expr, A::Error> {
+        let parts = &mut parts;
+        Ok(match part(parts)? {
+            "string" => Expr::Literal(LiteralValue::String(part::<String, A>(parts)?.into())),
+            "call" => Expr::Call(CallExpr { func_name: part(parts)?, target: None, args: rest(parts)? }),
+            "method" => {
+                let func_name = part(parts)?;
+                Expr::Call(CallExpr { func_name, target: Some(Box::new(tree(parts)?)), args: rest(parts)? })
+            }
+            kind @ ("key" | "has") => {
+                let operand = Box::new(tree(parts)?);
+                Expr::Select(SelectExpr { operand, field: part(parts)?, test: kind == "has" })
+            }
+            "list" => Expr::List(ListExpr::new(rest(parts)?)),
+            "map" => {
+                let mut entries = Vec::new();
+                while let Some(Tree(key)) = parts.next_element()? {
+                    let entry = MapEntryExpr { key, value: tree(parts)?, optional: false };
+                    entries.push(IdedEntryExpr { id: 0, expr: EntryExpr::MapEntry(entry) });
                 }
-                _ => None,
-            };
-            Expr::Map(MapExpr { entries: entries.chunks(2).map(entry).collect::<Option<_>>()? })
-        }
-        ("loop", [range, var, var2, accu, init, cond, step, result]) => {
-            Expr::Comprehension(Box::new(ComprehensionExpr {
-                iter_range: decode(range)?,
-                iter_var: name(var)?,
-                iter_var2: name(var2),
-                accu_var: name(accu)?,
-                accu_init: decode(init)?,
-                loop_cond: decode(cond)?,
-                loop_step: decode(step)?,
-                result: decode(result)?,
-            }))
-        }
-        _ => return None,
-    })
+                Expr::Map(MapExpr { entries })
+            }
+            "loop" => Expr::Comprehension(Box::new(ComprehensionExpr {
+                iter_range: tree(parts)?,
+                iter_var: part(parts)?,
+                iter_var2: part(parts)?,
+                accu_var: part(parts)?,
+                accu_init: tree(parts)?,
+                loop_cond: tree(parts)?,
+                loop_step: tree(parts)?,
+                result: tree(parts)?,
+            })),
+            other => return Err(Error::custom(format!("no kind of expression: {other}"))),
+        })
+    }
+}
+
+/// The next part of an array.
+fn part<'de, T: Deserialize<'de>, A: SeqAccess<'de>>(parts: &mut A) -> Result<T, A::Error> {
+    parts.next_element()?.ok_or_else(|| Error::custom("a part is missing"))
+}
+
+fn tree<'de, A: SeqAccess<'de>>(parts: &mut A) -> Result<IdedExpr, A::Error> {
+    let Tree(tree) = part(parts)?;
+    Ok(tree)
+}
+
+/// The other parts of an array.
+fn rest<'de, A: SeqAccess<'de>>(parts: &mut A) -> Result<Vec<IdedExpr>, A::Error> {
+    let mut trees = Vec::with_capacity(parts.size_hint().unwrap_or(2));
+    while let Some(Tree(tree)) = parts.next_element()? {
+        trees.push(tree);
+    }
+    Ok(trees)
 }
 
 #[cfg(test)]
@@ -90,7 +131,7 @@ pub(super) mod tests {
     use std::collections::BTreeSet;
     use std::fmt::Write as _;
 
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
     use crate::knowledge::Knowledge;
@@ -177,7 +218,8 @@ pub(super) mod tests {
             let program = ENV.compile(text).expect("an expression");
             let tree = encode(program.expression()).expect("a kind that is encoded");
             // What comes back from the file is the same tree.
-            assert_eq!(encode(&decode(&tree).expect("the same")), Some(tree.clone()), "{text}");
+            let Tree(decoded) = Tree::deserialize(&tree).expect("a tree");
+            assert_eq!(encode(&decoded), Some(tree.clone()), "{text}");
             (serde_json::to_string(text).expect("a string"), tree)
         };
         let mut lines: Vec<(String, Value)> = texts().iter().map(line).collect();

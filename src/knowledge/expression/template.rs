@@ -1,6 +1,5 @@
 //! Messages with `{expression}` placeholders.
 
-use std::borrow::Cow;
 use std::fmt;
 
 use serde::{Deserialize, Deserializer};
@@ -8,6 +7,7 @@ use serde::{Deserialize, Deserializer};
 use super::compiled::{EvalError, Expression, ParseError};
 use super::limits;
 use super::scope::{Scope, plain};
+use crate::knowledge::source::Text;
 
 /// A text with `{expression}` placeholders; `{{` and `}}` are literal braces.
 #[derive(Clone, PartialEq, Eq)]
@@ -166,7 +166,7 @@ impl fmt::Debug for Template {
 
 impl<'de> Deserialize<'de> for Template {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let source = Cow::<str>::deserialize(deserializer)?;
+        let Text(source) = Text::deserialize(deserializer)?;
         Self::from_data_file(&source).map_err(serde::de::Error::custom)
     }
 }

@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use super::Scheme;
 use super::applied::AppliedScheme;
-use crate::knowledge::Scope;
+use crate::knowledge::{Scope, Table};
 
 /// How the weights are stored, as config.json declares it.
 pub enum DeclaredScheme<'k> {
@@ -29,7 +29,7 @@ pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
 
 /// The scheme that a config declares, if it is one of `schemes`.
 #[must_use]
-pub fn declared_scheme<'k>(config: &Value, schemes: &'k [Scheme]) -> DeclaredScheme<'k> {
+pub fn declared_scheme<'k>(config: &Value, schemes: &'k Table<Vec<Scheme>>) -> DeclaredScheme<'k> {
     let Some((pointer, block)) = block(config) else { return DeclaredScheme::Plain };
     let mut scope = Scope::new();
     scope.bind("config", config);
