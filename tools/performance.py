@@ -422,7 +422,7 @@ def donors_of(folder, size):
     # A layer of the language model has 122 MB, its embeddings 263 MB and the vision tower 615 MB.
     layers = max(1, round((size * 1e9 - 878e6) / 121.6e6))
     # The merge takes nothing from the language model of the host.
-    host = checkpoint(folder / "host", llava(layers), content="vision_tower|multi_modal_projector")
+    host = checkpoint(folder / "host", llava(layers), content=r"(model\.)?(vision_tower|multi_modal_projector)")
     return host, checkpoint(folder / "part", llama(layers))
 
 
@@ -524,7 +524,7 @@ def measure_cold(args):
         length for name, (_, _, length, *_) in tensors(host).items() if "language_model" not in name and "lm_head" not in name
     )
     script = folder / "cp.sh"
-    first = sorted(host.glob("*.safetensors"))[-1]
+    first = sorted(host.glob("*.safetensors"))[0]
     script.write_text(
         f"set -e\nmkdir -p {out}/cp\ncp --reflink=never {part}/*.safetensors {out}/cp/\n"
         f"head -c {kept} {first} > {out}/cp/rest\nsync {out}/cp/* {out}/cp\n"
