@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Measures ckpt-doctor beside other programs in interleaved rounds, and writes docs/performance.md from the figures.
 
-    tools/performance.py measure --work DIR [--size GB] [--rounds N] [--only PART...] [--python PYTHON] [--real DIR]
+    tools/performance.py measure --work DIR [--size GB] [--rounds N] [--only PART...] [--python PYTHON] [--mergekit COMMAND]
+                             [--real DIR]
     tools/performance.py page
 
 `measure` generates checkpoints below --work, whose file system is the one that is measured, runs every program of a part
 once in each round, checks the bytes of every result, and writes the raw times to docs/performance/figures.json. `page` makes
-docs/performance.md and its plots from that file. Parts: check, growth, deep, hash, merge, cold, reflink, header. `cold` drops the
-page cache and `reflink` mounts file systems in files: both need root.
+docs/performance.md and its plots from that file. Parts: check, growth, deep, hash, merge, mergekit, cold, reflink, header.
+`cold` drops the page cache and `reflink` mounts file systems in files: both need root.
 
 CKPT_DOCTOR names the program. --python names an interpreter with torch, numpy and safetensors for the peers that need them;
 without it they are left out, and the page says so.
@@ -515,6 +516,52 @@ def measure_merge(args):
     return {"bytes": total} | measured
 
 
+LAYERS = """{
+  recipe: "layers",
+  summary: "the tensors of a Llama",
+  donors: [{ role: "part", what: "a Llama", architectures: ["llama"] }],
+  documents: [{ name: "config.json", from: "part" }],
+  tensors: [{ from: "part", names: "." }],
+}
+"""
+
+
+def measure_mergekit(args):
+    folder = args.work / "mergekit"
+    layers = max(1, round((args.size * 1e9 - 263e6) / 121.6e6))
+    part = checkpoint(folder / "part", llama(layers))
+    out = emptied(folder / "out")
+    (folder / "layers.json5").write_text(LAYERS)
+    (folder / "layers.yaml").write_text(f"merge_method: passthrough\nmodels: [{{ model: {part} }}]\ndtype: bfloat16\n")
+    programs = {
+        "merge + BLAKE3": [
+            TOOL,
+            "build-merged",
+            "--recipe",
+            folder / "layers.json5",
+            "--donor",
+            f"part={part}",
+            "--out",
+            out / "ours",
+        ],
+        "cp + sync": f"mkdir {out}/cp && cp --reflink=never {part}/*.safetensors {out}/cp && sync {out}/cp/*",
+    }
+    if args.mergekit:
+        tool = f"{args.mergekit} {folder}/layers.yaml {out}/mergekit --no-copy-tokenizer --quiet"
+        programs["mergekit passthrough"] = f"{tool} && sync {out}/mergekit/*"
+    expected = tensors(part)
+
+    def after(_):
+        for child in out.iterdir():
+            compare(child, expected)
+            shutil.rmtree(child)
+        os.sync()
+
+    measured = rounds(args.rounds, programs, after=after)
+    shutil.rmtree(folder)
+    return {"bytes": sum(where[2] for where in expected.values())} | measured
+
+
 def measure_cold(args):
     folder = args.work / "cold"
     host, part = donors_of(folder, args.cold_size)
@@ -648,6 +695,7 @@ PARTS = {
     "deep": measure_deep,
     "hash": measure_hash,
     "merge": measure_merge,
+    "mergekit": measure_mergekit,
     "cold": measure_cold,
     "reflink": measure_reflink,
     "header": measure_header,
@@ -762,6 +810,8 @@ proportional to the number of its tensors. Several directories are checked on al
 files of the size of the result. The Python script copies byte ranges of the donors and hashes nothing; the torch script loads
 every tensor and saves them with `safetensors.torch.save_file`. The bound is the rate of the disk: `cp` and `merge` differ in
 when they begin to write back. Digests are computed while the bytes pass.""",
+    "mergekit": """mergekit 0.1.5 cannot insert a language model into a LLaVA. Its method `passthrough` copies all tensors of one Llama, as a
+recipe with one donor and one pattern does here.""",
     "cold": """The page cache is dropped before every run.""",
     "reflink": """File systems in a loop device. The result shares the blocks of the donors: each large file of a donor has shards of its own,
 and the header of a shard is padded, so that its data starts where the donor's does within a block. What is left are the plan, the
@@ -781,6 +831,7 @@ def page(_):
         "deep": "## Reading every byte",
         "hash": "## Hashing",
         "merge": "## Merging, donors in the page cache",
+        "mergekit": "## Beside mergekit",
         "cold": "## Merging, donors on the disk",
         "reflink": "## Merging where files share blocks",
         "header": "## Editing the header of a shard",
@@ -807,7 +858,7 @@ def page(_):
                 text += [f"### {system}", "", table(measured[system]), ""]
             text.pop()
         else:
-            against = {"hash": "openssl", "merge": "cp + sync", "cold": "cp + sync"}.get(part)
+            against = {"hash": "openssl", "merge": "cp + sync", "cold": "cp + sync", "mergekit": "cp + sync"}.get(part)
             if part == "deep" and "sum of mapped words" in measured["times"]:
                 against = "sum of mapped words"
             text.append(table(measured, against))
@@ -825,6 +876,7 @@ def main():
     command.add_argument("--rounds", type=int, default=5)
     command.add_argument("--only", nargs="+", choices=PARTS, metavar="PART")
     command.add_argument("--python", help="interpreter with torch, numpy and safetensors")
+    command.add_argument("--mergekit", help="command that runs mergekit-yaml")
     command.add_argument("--real", type=Path, help="folder with directories from the Hub")
     command.set_defaults(run=measure)
     commands.add_parser("page").set_defaults(run=page)

@@ -314,19 +314,20 @@ fn added<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool>(e
 
 /// Adds one element of each of the `R` rows to every lane.
 #[inline(always)]
-#[expect(clippy::indexing_slicing, reason = "all have this length, and zipped iterators are not vectorised")]
 fn add_rows<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool, const R: usize>(
     sum: &mut [f64; LANES],
     squares: &mut [f64; LANES],
     rows: &[[[u8; N]; LANES]; R],
 ) {
+    // By number: zipped iterators are not vectorised.
     for lane in 0..LANES {
+        let (Some(sum), Some(squares)) = (sum.get_mut(lane), squares.get_mut(lane)) else { continue };
         // Kept in registers until all rows are added.
-        let mut both = (sum[lane], squares[lane]);
-        for row in rows {
-            add_one::<N, F, SPECIAL, FUSED>(&mut both.0, &mut both.1, row[lane]);
+        let mut both = (*sum, *squares);
+        for element in rows.iter().filter_map(|row| row.get(lane)) {
+            add_one::<N, F, SPECIAL, FUSED>(&mut both.0, &mut both.1, *element);
         }
-        (sum[lane], squares[lane]) = both;
+        (*sum, *squares) = both;
     }
 }
 

@@ -454,7 +454,7 @@ fn a_shard_that_is_cut_off_during_the_read_is_a_finding() {
     let entry = format!(r#"{{"dtype":"U8","shape":[{LEN}],"data_offsets":[0,{LEN}]}}"#);
     let header = format!(r#"{{"__metadata__":{{"format":"pt"}},"w":{entry}}}"#);
     let shard = [&header.len().to_le_bytes()[..], header.as_bytes(), &vec![1; LEN]].concat();
-    let reason = (0..20).find_map(|_| {
+    let reason = (0..200).find_map(|_| {
         fs::write(&path, &shard).unwrap();
         let mut check = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
         check.args(["check", "--deep", "--fail-on", "warning", "--output-format", "json"]).arg(dir.path());
