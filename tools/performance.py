@@ -797,11 +797,12 @@ tools/performance.py page
 
 `DIR` needs room for four times the size of a merge. `PYTHON` has torch, numpy and safetensors.""",
     "check": """`check` reads the headers of shards and the documents, and nothing of the tensors. Of the time of a small model, the start of
-the process is a quarter (`--version`). The rest is 24 million instructions, by callgrind: evaluation of the rules 22 %,
-building classes and predicting loads 22 %, reading the conditions of the rules 13 %, values that classes refuse 4 %,
-processors 4 %. Before data files were read when they are first needed, it took 185 million: parsing expressions 33 %,
-parsing JSON5 30 %, freeing both, looking up embedded files, and predicting loads 11 %. The time of a large model is
-proportional to the number of its tensors. Several directories are checked on all cores.""",
+the process is a good part (`--version`). The whole is 15 million instructions, by callgrind: evaluating the rules 22 % (of which
+decoding their expressions 14 %), reading the heads of the rules 20 %, memory allocation 13 %, building classes 11 %, the dynamic
+linker 6 %. Before data files were read when they are first needed, it was 185 million: parsing expressions 33 %, parsing JSON5
+30 %, freeing both, looking up embedded files, and predicting loads 11 %. The time of a large model is proportional to the number
+of its tensors: names are parsed, sorted, renamed as the loader renames them, and looked up. Several directories are checked on
+all cores.""",
     "growth": """Qwen3-MoE models of 512 experts with 1 to 58 layers. Time and memory are linear in the number of tensors.""",
     "deep": """The bound is the rate at which memory is read: numpy sums the words of the mapped files with a thread for each core, and
 `start of numpy` is what it takes before it reads. `cargo bench --bench contents` compares both in one process.""",
@@ -809,10 +810,13 @@ proportional to the number of its tensors. Several directories are checked on al
     "merge": """The `insert` recipe with a LLaVA and a Llama of random bytes. Every program leaves its result on the disk (`fsync`). `cp` copies
 files of the size of the result. The Python script copies byte ranges of the donors and hashes nothing; the torch script loads
 every tensor and saves them with `safetensors.torch.save_file`. The bound is the rate of the disk: `cp` and `merge` differ in
-when they begin to write back. Digests are computed while the bytes pass.""",
+when they begin to write back. The disk of this machine is shared with others, so its rate varies by more than a factor of two between
+rounds. Digests are computed while the bytes pass. Without digests the kernel copies (`copy_file_range`), which on ext4 is slower
+than to read and write through a buffer, as the runs with digests do.""",
     "mergekit": """mergekit 0.1.5 cannot insert a language model into a LLaVA. Its method `passthrough` copies all tensors of one Llama, as a
 recipe with one donor and one pattern does here.""",
-    "cold": """The page cache is dropped before every run.""",
+    "cold": """The page cache is dropped before every run, and the result is larger than what the cache may hold of it unwritten. The
+bound is the rate of the disk, at which `cp` runs as well: reads and writes of all programs come to about 1 GB/s.""",
     "reflink": """File systems in a loop device. The result shares the blocks of the donors: each large file of a donor has shards of its own,
 and the header of a shard is padded, so that its data starts where the donor's does within a block. What is left are the plan, the
 checks of donors and result, and the syncs.""",
