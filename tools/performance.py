@@ -811,8 +811,8 @@ all cores.""",
 files of the size of the result. The Python script copies byte ranges of the donors and hashes nothing; the torch script loads
 every tensor and saves them with `safetensors.torch.save_file`. The bound is the rate of the disk: `cp` and `merge` differ in
 when they begin to write back. The disk of this machine is shared with others, so its rate varies by more than a factor of two between
-rounds. Digests are computed while the bytes pass. Without digests the kernel copies (`copy_file_range`), which on ext4 is slower
-than to read and write through a buffer, as the runs with digests do.""",
+rounds. Digests are computed while the bytes pass. Without digests the kernel copies (`copy_file_range`), as for the Python
+script: in these rounds both are slower than the copies through a buffer that digests need. Alone on a quiet disk they are not.""",
     "mergekit": """mergekit 0.1.5 cannot insert a language model into a LLaVA. Its method `passthrough` copies all tensors of one Llama, as a
 recipe with one donor and one pattern does here.""",
     "cold": """The page cache is dropped before every run, and the result is larger than what the cache may hold of it unwritten. The
