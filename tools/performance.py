@@ -669,6 +669,7 @@ def measure_header(args):
 
     for turn in range(args.rounds):
         os.sync()
+        run(TOOL, "check", *models.values(), check=False)  # after the copy of the last round, with the page cache warm again
         timed("check", TOOL, "check", models["room"])
         for name, what in (("room", "fix, room in the header"), ("blocks", "fix, blocks inserted")):
             before = files[name].stat()
@@ -791,13 +792,15 @@ are in [figures.json](performance/figures.json).
 
 ```sh
 cargo build --release
-tools/performance.py measure --work DIR --python PYTHON
+tools/performance.py measure --work DIR --python PYTHON --mergekit COMMAND --real MODELS
 tools/performance.py page
 ```
 
-`DIR` needs room for four times the size of a merge. `PYTHON` has torch, numpy and safetensors.""",
+`DIR` needs room for four times the size of a merge, and for twice the 15 GB of the one from the disk. `PYTHON` has torch, numpy
+and safetensors, `COMMAND` runs mergekit-yaml, and `MODELS` is a folder of directories from the Hub. Without the last three, their
+lines are missing.""",
     "check": """`check` reads the headers of shards and the documents, and nothing of the tensors. Of the time of a small model, the start of
-the process is a good part (`--version`). The whole is 15 million instructions, by callgrind: evaluating the rules 22 % (of which
+the process is a third (`--version`). The whole is 15 million instructions, by callgrind: evaluating the rules 22 % (of which
 decoding their expressions 14 %), reading the heads of the rules 20 %, memory allocation 13 %, building classes 11 %, the dynamic
 linker 6 %. Before data files were read when they are first needed, it was 185 million: parsing expressions 33 %, parsing JSON5
 30 %, freeing both, looking up embedded files, and predicting loads 11 %. The time of a large model is proportional to the number
@@ -822,7 +825,8 @@ and the header of a shard is padded, so that its data starts where the donor's d
 checks of donors and result, and the syncs.""",
     "header": """`check --fix` adds the metadata that a shard lacks, and `undo` removes it. With room in the header only the header is written,
 otherwise the file system inserts a block before the tensors. The times contain the checks before and after the repair, and the
-syncs of the journal, of which there are about twenty; `check` is what the check alone takes, and `cp` what a copy would.""",
+syncs of the journal, of which there are about twenty; `check` is what the check alone takes, and `cp` what a copy would. The
+insertion drops the file from the page cache, which takes most of the time where all of it was there (the slowest run).""",
 }
 
 

@@ -4,12 +4,12 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use fast_glob::glob_match;
 use serde_json::{Map, Value, json};
 
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;
 use super::{exceptions, index, model_type, modules, templates};
+use crate::checkpoint::glob::glob;
 use crate::checkpoint::tokenizer::is_vocabulary;
 use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
 use crate::knowledge::{Expression, Scope};
@@ -137,7 +137,8 @@ impl Allowance {
 
 /// The names of entries, and the paths below folders, that match a pattern; those of folders end with `/`.
 fn names(checkpoint: &Checkpoint, pattern: &str) -> Value {
-    let mut found: Vec<_> = checkpoint.names().filter(|name| glob_match(pattern, name.as_ref())).collect();
+    let Ok(pattern) = glob(pattern) else { return Value::Null };
+    let mut found: Vec<_> = checkpoint.names().filter(|name| pattern.is_match(name.as_ref())).collect();
     found.sort_unstable();
     json!(found)
 }

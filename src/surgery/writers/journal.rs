@@ -2,7 +2,8 @@
 //!
 //! The folder `.ckpt-doctor/` in the checkpoint contains the state of a repair. New files are staged in `new/`. Then
 //! `journal.json` lists the changes. Then the originals are linked into `undo/N/`, and the new files are exchanged for
-//! them. Last, the journal becomes `undo/N.json`. `undo` renames it back, which needs no space, and rolls the repair back.
+//! them. A shard of which only the header changes is edited in place instead, with both headers in `undo/N/` (`header.rs`).
+//! Last, the journal becomes `undo/N.json`. `undo` renames it back, which needs no space, and rolls the repair back.
 //! A run killed before the journal exists has changed nothing; after that, the next run ([`recover`]) finishes the repair
 //! or rolls it back. The folder is locked meanwhile.
 
