@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 
-use super::system::{copy_in_kernel, read_ahead, write_back};
+use super::system::{KernelCopy, copy_in_kernel, read_ahead, write_back};
 use crate::checkpoint::HashAlgorithm;
 use crate::checkpoint::digest::Hasher;
 use crate::surgery::align::{BLOCK, Run};
@@ -28,8 +28,8 @@ fn ends_window(at: u64, len: u64) -> bool {
 pub(super) struct Out<'o> {
     pub(super) path: &'o Path,
     pub(super) file: &'o File,
-    /// Whether copies inside the kernel share blocks.
-    pub(super) shares: bool,
+    /// What copies inside the kernel do on its file system.
+    pub(super) kernel: KernelCopy,
     pub(super) progress: &'o (dyn Fn(u64) + Sync),
 }
 
@@ -40,52 +40,52 @@ impl Out<'_> {
         Ok(())
     }
 
-    /// Copies bytes, inside the kernel if supported, otherwise through the buffer.
+    /// Copies bytes, inside the kernel where that shares blocks or the file system does it, otherwise through the buffer.
     ///
-    /// The kernel shares whole blocks with the donor if the file system can do it and both offsets agree; a call for more than
-    /// whole blocks would copy all of them.
+    /// The kernel shares whole blocks with the donor if both offsets agree; a call for more than whole blocks would copy all of
+    /// them.
     pub(super) fn copy(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
+        let mut place = Place { out: self, at: run.at, left: run.len, hasher: Hasher::new(HashAlgorithm::None) };
         let [head, whole, tail] = run.blocks();
-        self.copy_bytes(donor, head, buffer)?;
-        let rest = self.copy_in_kernel(donor, whole)?;
-        self.copy_bytes(donor, rest, buffer)?;
+        place.copy(donor, head, buffer)?;
+        self.copy_rest(donor, whole, &mut place, buffer)?;
         // Offsets that do not agree: the kernel copies without sharing.
-        let rest = if tail.len < BLOCK { tail } else { self.copy_in_kernel(donor, tail)? };
-        self.copy_bytes(donor, rest, buffer)
+        if tail.len < BLOCK { place.copy(donor, tail, buffer) } else { self.copy_rest(donor, tail, &mut place, buffer) }
     }
 
-    /// Copies inside the kernel, and returns the range that it did not copy because it is not supported.
+    /// Copies inside the kernel what it can, and the rest through the buffer.
+    fn copy_rest(
+        &self,
+        donor: &DonorFile,
+        run: Run<'_>,
+        place: &mut Place<'_>,
+        buffer: &mut Vec<u8>,
+    ) -> Result<(), ApplyError> {
+        let rest = self.copy_in_kernel(donor, run)?;
+        place.skip(run.len.saturating_sub(rest.len));
+        place.copy(donor, rest, buffer)
+    }
+
+    /// Copies inside the kernel, and returns the range that it did not copy because it is not supported or would be slower.
     fn copy_in_kernel<'r>(&self, donor: &DonorFile, run: Run<'r>) -> Result<Run<'r>, ApplyError> {
         let mut rest = run;
-        while rest.len > 0 {
+        while rest.len > 0 && self.kernel != KernelCopy::Splices {
             interrupted()?;
-            let next = if self.shares { rest } else { rest.split(STREAMED.saturating_sub(rest.at % STREAMED)).0 };
-            if !self.shares {
+            let shares = self.kernel == KernelCopy::Shares;
+            let next = if shares { rest } else { rest.split(STREAMED.saturating_sub(rest.at % STREAMED)).0 };
+            if !shares {
                 let later = rest.split(next.len).1.split(STREAMED).0;
                 read_ahead(donor.file(), later.from, later.len);
             }
             let copied = copy_in_kernel(donor.file(), next.from, self.file, next.at, next.len);
             let Some(copied) = copied.map_err(io_at(self.path, "copying from a donor"))? else { break };
-            if !self.shares {
+            if !shares {
                 write_back(self.file, next.at, copied);
             }
             (self.progress)(copied);
             rest = rest.split(copied).1;
         }
         Ok(rest)
-    }
-
-    /// Copies through the buffer.
-    fn copy_bytes(&self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
-        let mut rest = run;
-        while rest.len > 0 {
-            interrupted()?;
-            let block = block(buffer, rest.len);
-            donor.read_at(block, rest.from).map_err(|e| donor.read_error(e))?;
-            self.write(block, rest.at)?;
-            rest = rest.split(block.len() as u64).1;
-        }
-        Ok(())
     }
 
     /// Copies a tensor, and hashes it. What the file system can share is only read.
@@ -97,27 +97,15 @@ impl Out<'_> {
         buffer: &mut Vec<u8>,
     ) -> Result<(), ApplyError> {
         let [head, whole, tail] = run.blocks();
-        let rest = if self.shares { self.copy_in_kernel(donor, whole)? } else { whole };
+        let rest = if self.kernel == KernelCopy::Shares { self.copy_in_kernel(donor, whole)? } else { whole };
         let (shared, rest) = whole.split(whole.len.saturating_sub(rest.len));
-        for (mut part, is_shared) in [(head, false), (shared, true), (rest, false), (tail, false)] {
-            while part.len > 0 {
-                interrupted()?;
-                if ends_window(part.from, buffer.len() as u64) {
-                    let (_, later) = part.split(STREAMED);
-                    read_ahead(donor.file(), later.from, later.len.min(STREAMED));
-                }
-                // Hashed and written while it is in the cache of the processor.
-                let block = block(buffer, part.len);
-                donor.read_at(block, part.from).map_err(|e| donor.read_error(e))?;
-                if is_shared {
-                    place.pass(block);
-                } else {
-                    place.write_all(block).map_err(io_at(self.path, "writing"))?;
-                }
-                part = part.split(block.len() as u64).1;
-            }
-        }
-        Ok(())
+        place.copy(donor, head, buffer)?;
+        read_blocks(donor, shared, buffer, |bytes| {
+            place.pass(bytes);
+            Ok(())
+        })?;
+        place.copy(donor, rest, buffer)?;
+        place.copy(donor, tail, buffer)
     }
 
     /// Makes a tensor at an offset of the file, and its digest.
@@ -158,12 +146,44 @@ struct Place<'p> {
 }
 
 impl Place<'_> {
+    /// Copies a range of a donor through the buffer to the next bytes.
+    fn copy(&mut self, donor: &DonorFile, run: Run<'_>, buffer: &mut Vec<u8>) -> Result<(), ApplyError> {
+        read_blocks(donor, run, buffer, |bytes| self.write_all(bytes).map_err(io_at(self.out.path, "writing")))
+    }
+
     /// Adds the next bytes, which the file already has.
     fn pass(&mut self, bytes: &[u8]) {
         self.hasher.update(bytes);
-        self.at = self.at.saturating_add(bytes.len() as u64);
-        self.left = self.left.saturating_sub(bytes.len() as u64);
+        self.skip(bytes.len() as u64);
     }
+
+    /// Leaves out the next bytes, which the file already has and nobody hashes.
+    fn skip(&mut self, len: u64) {
+        self.at = self.at.saturating_add(len);
+        self.left = self.left.saturating_sub(len);
+    }
+}
+
+/// Reads a range of a donor in blocks, and ahead of them. Each is passed on while it is in the cache of the processor.
+fn read_blocks(
+    donor: &DonorFile,
+    run: Run<'_>,
+    buffer: &mut Vec<u8>,
+    mut pass: impl FnMut(&[u8]) -> Result<(), ApplyError>,
+) -> Result<(), ApplyError> {
+    let mut rest = run;
+    while rest.len > 0 {
+        interrupted()?;
+        let block = block(buffer, rest.len);
+        if ends_window(rest.from, block.len() as u64) {
+            let (_, later) = rest.split(STREAMED);
+            read_ahead(donor.file(), later.from, later.len.min(STREAMED));
+        }
+        donor.read_at(block, rest.from).map_err(|e| donor.read_error(e))?;
+        pass(block)?;
+        rest = rest.split(block.len() as u64).1;
+    }
+    Ok(())
 }
 
 impl Write for Place<'_> {
@@ -206,11 +226,15 @@ mod tests {
             for way in ["kernel", "buffer", "hashed", "hashed, shared"] {
                 let target = work.path().join(way);
                 let file = File::create(&target).unwrap();
-                let out = Out { path: &target, file: &file, shares: way == "hashed, shared", progress: &|_| {} };
+                let kernel = match way {
+                    "kernel" => KernelCopy::Delegates,
+                    "hashed, shared" => KernelCopy::Shares,
+                    _ => KernelCopy::Splices,
+                };
+                let out = Out { path: &target, file: &file, kernel, progress: &|_| {} };
                 let mut buffer = Vec::new();
                 match way {
-                    "kernel" => out.copy(&donor, run, &mut buffer).unwrap(),
-                    "buffer" => out.copy_bytes(&donor, run, &mut buffer).unwrap(),
+                    "kernel" | "buffer" => out.copy(&donor, run, &mut buffer).unwrap(),
                     _ => {
                         let mut place = Place { out: &out, at, left: len, hasher: Hasher::new(HashAlgorithm::Blake3) };
                         out.copy_hashed(&donor, run, &mut place, &mut buffer).unwrap();
@@ -226,8 +250,10 @@ mod tests {
         let long = Run { path: &path, from: 2_999_999, at: 0, len: 2 };
         let target = work.path().join("long");
         let file = File::create(&target).unwrap();
-        let out = Out { path: &target, file: &file, shares: false, progress: &|_| {} };
-        let error = out.copy(&donor, long, &mut Vec::new()).unwrap_err();
-        assert!(matches!(error, ApplyError::Changed { .. }), "{error}");
+        for kernel in [KernelCopy::Shares, KernelCopy::Delegates, KernelCopy::Splices] {
+            let out = Out { path: &target, file: &file, kernel, progress: &|_| {} };
+            let error = out.copy(&donor, long, &mut Vec::new()).unwrap_err();
+            assert!(matches!(error, ApplyError::Changed { .. }), "{error}");
+        }
     }
 }

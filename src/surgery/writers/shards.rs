@@ -14,7 +14,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::jobs::{Job, jobs};
 use super::out::Out;
-use super::system::{create, reserve, shares_blocks};
+use super::system::{KernelCopy, create, reserve};
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::open_regular;
 use crate::checkpoint::{HashAlgorithm, hex, parallel};
@@ -137,7 +137,7 @@ impl Writers<'_> {
         interrupted()?;
         let Some(shard) = self.shards.get(shard) else { return Ok(None) };
         let Some(file) = self.open(shard)? else { return Ok(None) };
-        let out = Out { path: shard.path, file: &file, shares: shares_blocks(&file), progress: self.progress };
+        let out = Out { path: shard.path, file: &file, kernel: KernelCopy::of(&file), progress: self.progress };
         let tensor = match job {
             Job::Header => {
                 out.write(&shard.header, 0)?;
@@ -169,7 +169,10 @@ impl Writers<'_> {
         if open.is_none() {
             let new = create(shard.path).and_then(|file| {
                 // Blocks that will be shared need no space.
-                let sized = if shares_blocks(&file) { file.set_len(shard.len) } else { reserve(&file, shard.len) };
+                let sized = match KernelCopy::of(&file) {
+                    KernelCopy::Shares => file.set_len(shard.len),
+                    KernelCopy::Delegates | KernelCopy::Splices => reserve(&file, shard.len),
+                };
                 sized.map_err(io_at(shard.path, "writing"))?;
                 Ok(file)
             });

@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
-use super::system::shares_blocks;
+use super::system::KernelCopy;
 use crate::surgery::align::Run;
 use crate::surgery::plan::{PlannedShard, TensorTransform};
 
@@ -17,7 +17,8 @@ pub(super) struct Sharing {
 
 impl Sharing {
     pub(super) fn of(dir: &Path) -> Self {
-        let dev = File::open(dir).ok().filter(shares_blocks).and_then(|opened| Some(opened.metadata().ok()?.dev()));
+        let opened = File::open(dir).ok().filter(|opened| KernelCopy::of(opened) == KernelCopy::Shares);
+        let dev = opened.and_then(|opened| Some(opened.metadata().ok()?.dev()));
         Self { dev }
     }
 

@@ -299,17 +299,36 @@ pub(super) fn read_ahead(file: &File, at: u64, len: u64) {
 #[cfg(not(target_os = "linux"))]
 pub(super) fn read_ahead(_: &File, _: u64, _: u64) {}
 
-/// Whether copies inside the kernel share blocks on the file system of a file: XFS and btrfs.
-#[cfg(target_os = "linux")]
-pub(super) fn shares_blocks(file: &File) -> bool {
-    // Source: linux/magic.h.
-    const XFS: u64 = 0x5846_5342;
-    const BTRFS: u64 = 0x9123_683E;
-    rustix::fs::fstatfs(file)
-        .is_ok_and(|stats| u64::try_from(stats.f_type).is_ok_and(|kind| [XFS, BTRFS].contains(&kind)))
+/// What a copy inside the kernel does on a file system.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum KernelCopy {
+    /// Shares whole blocks: XFS and btrfs.
+    Shares,
+    /// May be done by the file system or its server, as on NFS.
+    Delegates,
+    /// Passes through the page cache by small pieces, which takes longer than a buffer does: ext4 and tmpfs.
+    Splices,
 }
 
-#[cfg(not(target_os = "linux"))]
-pub(super) fn shares_blocks(_: &File) -> bool {
-    false
+impl KernelCopy {
+    /// For the file system of a file.
+    #[cfg(target_os = "linux")]
+    pub(super) fn of(file: &File) -> Self {
+        // Source: linux/magic.h.
+        const XFS: u64 = 0x5846_5342;
+        const BTRFS: u64 = 0x9123_683E;
+        const EXT: u64 = 0xEF53;
+        const TMPFS: u64 = 0x0102_1994;
+        let kind = rustix::fs::fstatfs(file).ok().and_then(|stats| u64::try_from(stats.f_type).ok());
+        match kind {
+            Some(XFS | BTRFS) => Self::Shares,
+            Some(EXT | TMPFS) => Self::Splices,
+            _ => Self::Delegates,
+        }
+    }
+
+    #[cfg(not(target_os = "linux"))]
+    pub(super) fn of(_: &File) -> Self {
+        Self::Splices
+    }
 }
