@@ -98,8 +98,8 @@ def check_archive(program):
         room = Path(room)
         for name in ("README.md", "CHANGELOG.md", "LICENSE", "packaging"):
             (room / name).symlink_to(PROJECT / name)
-        (room / "target" / target / "release").mkdir(parents=True)
-        (room / "target" / target / "release/ckpt-doctor").symlink_to(program)
+        (room / "target" / target / "dist").mkdir(parents=True)
+        (room / "target" / target / "dist/ckpt-doctor").symlink_to(program)
         (room / "dist").mkdir()
         env = {"PATH": os.environ["PATH"], "TARGET": target, "GITHUB_REF_NAME": f"v{version}"}
         subprocess.run(["bash", "-eo", "pipefail", "-c", pack["run"]], cwd=room, env=env, check=True)
