@@ -275,7 +275,7 @@ impl Checkpoint {
     /// Searches the headers on each call; for many names, collect [`Checkpoint::tensors`] once.
     #[must_use]
     pub fn tensor(&self, name: &str) -> Option<(&Shard, &Tensor)> {
-        let mapped = self.index.as_ref().and_then(|i| self.shards.get(i.weight_map.get(name)?));
+        let mapped = self.index.as_ref().and_then(|i| self.shards.get(&**i.weight_map.get(name)?));
         let of = |shard: &'_ Shard| shard.tensors.iter().position(|t| t.name == name);
         mapped.into_iter().chain(self.shards.values()).find_map(|s| Some((s, s.tensors.get(of(s)?)?)))
     }

@@ -161,9 +161,8 @@ pub(super) fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
 pub fn first_absent_shard(checkpoint: &Checkpoint) -> Option<&str> {
     let index = checkpoint.index.as_ref()?;
     let mut named = index.weight_map.values();
-    let is_there = |name: &&String| checkpoint.has_file(name);
-    let some = named.clone().any(|name| is_there(&name)) && single(checkpoint).is_none();
-    named.find(|name| some && !is_there(name)).map(String::as_str)
+    let some = named.clone().any(|name| checkpoint.has_file(name)) && single(checkpoint).is_none();
+    named.find(|name| some && !checkpoint.has_file(name)).map(|name| &**name)
 }
 
 /// An index and what it is compared with.
@@ -255,7 +254,7 @@ impl<'c> IndexComparison<'c> {
         let readable: HashMap<&str, &Shard> =
             shards.values().filter(|s| readable(s)).map(|s| (s.name.as_str(), s)).collect();
         for (tensor, said) in &self.index.weight_map {
-            let Some(shard) = readable.get(said.as_str()) else { continue };
+            let Some(shard) = readable.get(&**said) else { continue };
             let held = self.holders.get(tensor.as_str());
             let unreadable = held.is_none() && unreadable.contains(tensor.as_str());
             if held.is_some_and(|h| h.contains(&shard.name.as_str())) || unreadable {
@@ -264,10 +263,10 @@ impl<'c> IndexComparison<'c> {
             let place = Place::file(&self.index.document).pointer(pointer_to(tensor)).in_tensor(tensor);
             if let Some(other) = held.and_then(|h| h.first()) {
                 let fault = Fault::new(FaultKind::IndexNamesOtherShard).at(place);
-                faults.push(fault.with("said", said.as_str()).with("held", *other));
+                faults.push(fault.with("said", &**said).with("held", *other));
             } else if self.all_read {
                 // Otherwise the tensor may be in a shard whose header could not be read.
-                faults.push(Fault::new(FaultKind::IndexKeyNowhere).at(place).with("said", said.as_str()));
+                faults.push(Fault::new(FaultKind::IndexKeyNowhere).at(place).with("said", &**said));
             }
         }
     }
@@ -289,7 +288,7 @@ impl<'c> IndexComparison<'c> {
                 }
                 (Some(kept), Some(second)) => {
                     let fault = Fault::new(FaultKind::TensorInTwoShards).at(place());
-                    faults.push(fault.with("other", *second).with("kept", kept.as_str()));
+                    faults.push(fault.with("other", *second).with("kept", &**kept));
                 }
                 (Some(_), None) => {}
             }

@@ -1,6 +1,7 @@
 //! The index of a sharded checkpoint: a map from tensors to shards.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::sync::Arc;
 
 use serde_json::Value;
 
@@ -21,7 +22,7 @@ pub struct Index {
     /// File name of the document.
     pub document: String,
     /// Tensor name to file name, without entries whose file name is not a plain one.
-    pub weight_map: BTreeMap<String, String>,
+    pub weight_map: BTreeMap<String, Arc<str>>,
     /// The files that `weight_map` names.
     pub files: BTreeSet<String>,
     /// `metadata.total_size` as written.
@@ -92,14 +93,15 @@ impl Index {
             None => return faults.push(Fault::new(FaultKind::WeightMapMissing).at(self.place(""))),
         };
         // A file is named by many tensors.
-        let mut files: HashSet<&str> = HashSet::new();
+        let mut files: HashSet<Arc<str>> = HashSet::new();
         let mut entries = Vec::with_capacity(map.len());
         for (tensor, file) in map {
             let place = || self.place(&pointer::join("/weight_map", tensor)).in_tensor(tensor.clone());
             match file.as_str() {
                 Some(file) if files.contains(file) || is_plain_file_name(file) => {
-                    files.insert(file);
-                    entries.push((tensor.clone(), file.to_owned()));
+                    let shared = files.get(file).map_or_else(|| Arc::from(file), Arc::clone);
+                    files.insert(Arc::clone(&shared));
+                    entries.push((tensor.clone(), shared));
                 }
                 Some(file) => {
                     faults.push(Fault::new(FaultKind::IndexUnsafePath).at(place()).with("path", escape(file, 200)));
@@ -107,7 +109,7 @@ impl Index {
                 None => faults.push(malformed(place(), file)),
             }
         }
-        self.files = files.into_iter().map(str::to_owned).collect();
+        self.files = files.iter().map(ToString::to_string).collect();
         self.weight_map = entries.into_iter().collect();
     }
 

@@ -1,7 +1,7 @@
 //! Work on several threads.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::thread;
 
 /// Maximum number of threads: more do not make storage faster, and each has its buffers.
@@ -11,8 +11,11 @@ const THREADS: usize = 16;
 const STACK: usize = 8 << 20;
 
 /// Number of threads for reading, hashing and writing tensors: one for each processor that this process may use.
+///
+/// The system is asked once: that reads files of the control groups.
 pub(crate) fn threads() -> usize {
-    thread::available_parallelism().map_or(1, usize::from).min(THREADS)
+    static COUNT: OnceLock<usize> = OnceLock::new();
+    *COUNT.get_or_init(|| thread::available_parallelism().map_or(1, usize::from).min(THREADS))
 }
 
 /// Applies `work` to every item, on at most `threads` threads, which take the items in order; returns the results in the

@@ -1,6 +1,7 @@
 //! What the loader finds in a checkpoint: keys, and the tensors behind them.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::sync::Arc;
 
 use crate::checkpoint::{Checkpoint, PICKLE_NAME, Shard};
 use crate::knowledge::Evidence;
@@ -46,7 +47,7 @@ impl Stored {
     /// A `model.safetensors` or `pytorch_model.bin` beside an index wins. Without either no loader opens anything; then the shards that
     /// an index would name are taken together.
     #[must_use]
-    pub fn new<'s>(index: Option<&BTreeMap<String, String>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
+    pub fn new<'s>(index: Option<&BTreeMap<String, Arc<str>>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
         let shards: BTreeMap<&str, &Shard> = shards.into_iter().map(|s| (s.name.as_str(), s)).collect();
         match (shards.get(SINGLE).or_else(|| shards.get(PICKLE_NAME)), index) {
             (Some(single), _) => Self::together(&[single]),
@@ -55,7 +56,7 @@ impl Stored {
                 Self::together(&of_model)
             }
             (None, Some(index)) => {
-                let files: HashSet<&str> = index.values().map(String::as_str).collect();
+                let files: HashSet<&str> = index.values().map(|file| &**file).collect();
                 let mut opened: Vec<&Shard> = files.iter().filter_map(|file| shards.get(file).copied()).collect();
                 opened.sort_unstable_by_key(|shard| shard.name.as_str());
                 // A shard that is not there or could not be read may hold anything.

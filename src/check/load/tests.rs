@@ -1,4 +1,5 @@
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use serde_json::json;
 
@@ -122,11 +123,11 @@ fn tied_tensors_stand_for_each_other() {
 fn the_index_says_what_is_there_and_the_shards_what_is_loaded() {
     let expected = llama(false);
     let (norm, head) = ("model.norm.weight".to_owned(), "lm_head.weight".to_owned());
-    let mut index: BTreeMap<String, String> =
-        expected.tensors.keys().map(|n| (n.clone(), "a.safetensors".to_owned())).collect();
+    let mut index: BTreeMap<String, Arc<str>> =
+        expected.tensors.keys().map(|n| (n.clone(), Arc::from("a.safetensors"))).collect();
     let mut first = all(&expected);
     let report =
-        |index: &BTreeMap<String, String>, shards: &[Shard]| predict(&expected, &Stored::new(Some(index), shards));
+        |index: &BTreeMap<String, Arc<str>>, shards: &[Shard]| predict(&expected, &Stored::new(Some(index), shards));
     assert_eq!(report(&index, &[shard("a.safetensors", &first)]), clean());
 
     // In the index and in no shard: nothing is reported, and it stays random.
@@ -135,7 +136,7 @@ fn the_index_says_what_is_there_and_the_shards_what_is_loaded() {
     assert_eq!((found.missing.len(), reasons(&found)), (0, vec![(norm.as_str(), SilentReason::IndexedButAbsent)]));
 
     // In a shard the index names for others: loaded all the same.
-    index.insert(head.clone(), "b.safetensors".to_owned());
+    index.insert(head.clone(), Arc::from("b.safetensors"));
     let second = Shapes::from([(norm.clone(), vec![4]), (head.clone(), vec![10, 4])]);
     let shards = [shard("a.safetensors", &first), shard("b.safetensors", &second)];
     assert_eq!(report(&index, &shards), clean());

@@ -240,8 +240,8 @@ impl RepairDraft {
         let old = self.current.document(file).and_then(|d| d.value.as_ref());
         let entries = |key: &str| old.and_then(|v| v.get(key)).and_then(Value::as_object).cloned().unwrap_or_default();
         let listed = self.current.index.as_ref().map(|index| &index.weight_map);
-        let mut map: BTreeMap<String, String> = listed.cloned().unwrap_or_default();
-        let named: BTreeSet<&String> = shards.iter().collect();
+        let mut map: BTreeMap<String, Arc<str>> = listed.cloned().unwrap_or_default();
+        let named: BTreeSet<&str> = shards.iter().map(String::as_str).collect();
         let mut bytes = 0_u64;
         for shard in shards {
             let shard = self.current.shards.get(shard)?;
@@ -249,11 +249,11 @@ impl RepairDraft {
                 bytes = bytes.saturating_add(tensor.len());
                 // If two shards contain the tensor, the entry of the index stays.
                 let right = map.get(&tensor.name).is_some_and(|listed| {
-                    named.contains(listed)
-                        && self.current.shards.get(listed).is_some_and(|s| s.tensor(&tensor.name).is_some())
+                    named.contains(&**listed)
+                        && self.current.shards.get(&**listed).is_some_and(|s| s.tensor(&tensor.name).is_some())
                 });
                 if !right {
-                    map.insert(tensor.name.clone(), shard.name.clone());
+                    map.insert(tensor.name.clone(), Arc::from(shard.name.as_str()));
                 }
             }
         }
@@ -267,7 +267,7 @@ impl RepairDraft {
             root.extend(old.clone());
         }
         root.insert("metadata".to_owned(), Value::Object(metadata));
-        let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k, Value::String(v))).collect();
+        let map: Map<String, Value> = map.into_iter().map(|(k, v)| (k, Value::from(&*v))).collect();
         root.insert("weight_map".to_owned(), Value::Object(map));
         let mut new = Document::from_value(file, Value::Object(root));
         if let Some(old) = self.current.document(file) {

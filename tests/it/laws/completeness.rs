@@ -118,7 +118,8 @@ fn clean_implies_that_every_tensor_is_stored() {
         let opened = checkpoint.index.as_ref().is_none_or(|index| {
             let map = serde_json::from_str::<Value>(&fs::read_to_string(dir.join(INDEX)).unwrap()).unwrap();
             let keys = map["weight_map"].as_object().unwrap().len();
-            keys == index.weight_map.len() && index.weight_map.values().all(|file| checkpoint.shards.contains_key(file))
+            keys == index.weight_map.len()
+                && index.weight_map.values().all(|file| checkpoint.shards.contains_key(&**file))
         });
         let is_short = found.is_empty() || is_known && found != all || !opened;
         let codes: Vec<_> = outcome.findings.iter().map(|finding| finding.code.as_str()).collect();

@@ -96,7 +96,7 @@ pub fn index(bytes: &[u8]) {
     let stated = document.get("/weight_map").and_then(Value::as_object);
     for (tensor, file) in &index.weight_map {
         assert!(is_plain_file_name(file), "{file:?} would be opened");
-        assert_eq!(stated.and_then(|map| map.get(tensor)).and_then(Value::as_str), Some(file.as_str()));
+        assert_eq!(stated.and_then(|map| map.get(tensor)).and_then(Value::as_str), Some(&**file));
     }
     // Ignored entries are reported.
     let left = stated.map_or(0, |map| map.len() - index.weight_map.len());
