@@ -2,6 +2,12 @@
 
 use std::process::ExitCode;
 
+/// The allocator of musl takes several times as long for the many short strings of headers. This one also grows large buffers
+/// without copying them, and reserves no address space.
+#[cfg(target_env = "musl")]
+#[global_allocator]
+static ALLOCATOR: dlmalloc::GlobalDlmalloc = dlmalloc::GlobalDlmalloc;
+
 fn main() -> ExitCode {
     ckpt_doctor::main()
 }
