@@ -8,16 +8,16 @@
     reason = "a function that is not inlined is compiled for the oldest processors, masks are compared in vectors, and sums of large integers are not exact"
 )]
 
-use std::ops::{BitOr, BitXor};
+use std::ops::{BitAnd, BitOr, BitXor};
 
 /// A little-endian word of `N` bytes: the bits of one element.
 pub(super) trait Word<const N: usize>:
-    Copy + Eq + BitOr<Output = Self> + BitXor<Output = Self> + Into<u64>
+    Copy + Eq + BitAnd<Output = Self> + BitOr<Output = Self> + BitXor<Output = Self> + Into<u64>
 {
     /// The word of zeros.
     const ZERO: Self;
-    /// Elements that a counter of this type can count.
-    const RUN: usize;
+    /// Counts the elements of a block. As narrow as the word if that is wide enough, so that vectors hold many.
+    type Count: Copy + Default + Into<u64>;
     /// A signed integer of the same width: every processor has vectors for its minimum and maximum.
     type Key: Copy + Ord;
     const FIRST_KEY: Self::Key;
@@ -25,15 +25,15 @@ pub(super) trait Word<const N: usize>:
 
     fn read(bytes: [u8; N]) -> Self;
 
-    /// Adds 1 if the condition holds. The sum must not exceed [`Self::RUN`].
-    fn plus(self, condition: bool) -> Self;
+    /// Adds 1 if the condition holds.
+    fn plus(count: Self::Count, condition: bool) -> Self::Count;
 }
 
 macro_rules! words {
-    ($($word:ident, $key:ident, $width:literal, $run:literal;)*) => { $(
+    ($($word:ident, $key:ident, $count:ident, $width:literal;)*) => { $(
         impl Word<$width> for $word {
             const ZERO: Self = 0;
-            const RUN: usize = $run;
+            type Count = $count;
             type Key = $key;
             const FIRST_KEY: $key = $key::MIN;
             const LAST_KEY: $key = $key::MAX;
@@ -44,18 +44,26 @@ macro_rules! words {
             }
 
             #[inline(always)]
-            fn plus(self, condition: bool) -> Self {
-                self.wrapping_add(Self::from(condition))
+            fn plus(count: $count, condition: bool) -> $count {
+                count.wrapping_add($count::from(condition))
             }
         }
     )* };
 }
 
 words! {
-    u8, i8, 1, 192;
-    u16, i16, 2, 6144;
-    u32, i32, 4, 3072;
-    u64, i64, 8, 1536;
+    u8, i8, u16, 1;
+    u16, i16, u16, 2;
+    u32, i32, u32, 4;
+    u64, i64, u64, 8;
+}
+
+/// Widths in bits, and the bias, of a float of at most eight bits.
+#[derive(Clone, Copy)]
+pub(super) struct Small {
+    pub(super) exponent: u32,
+    pub(super) fraction: u32,
+    pub(super) bias: u32,
 }
 
 /// An element type whose elements have `N` bytes.
@@ -64,6 +72,9 @@ pub(super) trait Format<const N: usize> {
 
     /// Whether the square of every number fits into 53 bits.
     const SQUARES_ARE_EXACT: bool = N <= 2;
+
+    /// The layout of a float of at most eight bits; `N` is 1.
+    const SMALL: Option<Small> = None;
 
     /// Whether the element is NaN or infinite.
     #[inline(always)]
@@ -114,6 +125,9 @@ macro_rules! ieee {
         impl Format<$width> for $format {
             type Word = $word;
             const SQUARES_ARE_EXACT: bool = $width <= 4;
+            // The only one of a byte is F8E5M2.
+            const SMALL: Option<Small> =
+                if $width == 1 { Some(Small { exponent: 5, fraction: 2, bias: 15 }) } else { None };
 
             #[inline(always)]
             fn special(word: $word) -> bool {
@@ -185,6 +199,7 @@ macro_rules! small {
 
         impl Format<1> for $format {
             type Word = u8;
+            const SMALL: Option<Small> = Some(Small { exponent: $exponent, fraction: $fraction, bias: $bias });
 
             #[inline(always)]
             fn special(word: u8) -> bool {

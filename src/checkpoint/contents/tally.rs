@@ -207,33 +207,31 @@ fn piece(tally: &mut Tally, bytes: &[u8]) {
     }
 }
 
+/// The counter of elements of a block.
+type Count<const N: usize, F> = <<F as Format<N>>::Word as Word<N>>::Count;
+
 /// Counts one block of elements of `N` bytes, and returns whether one of their bits is set.
 #[inline(always)]
 fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes: &[u8]) -> bool {
     let (elements, _) = bytes.as_chunks::<N>();
     let Some(start) = elements.first() else { return false };
     let start = F::Word::read(*start);
-    let (mut differs, mut any, mut special) = (F::Word::ZERO, F::Word::ZERO, F::Word::ZERO);
-    let mut denormals = 0_u64;
-    for run in elements.chunks(F::Word::RUN) {
-        let mut zeros = F::Word::ZERO;
-        for element in run {
-            let word = F::Word::read(*element);
-            differs = differs | (word ^ start);
-            any = any | word;
-            zeros = zeros.plus(F::zero(word));
-            special = special | F::Word::ZERO.plus(F::special(word));
-        }
-        tally.zeros = tally.zeros.saturating_add(zeros.into());
-        if tally.sums.is_some() {
-            let mut small = F::Word::ZERO;
-            for element in run {
-                small = small.plus(F::denormal(F::Word::read(*element)));
-            }
-            denormals = denormals.saturating_add(small.into());
+    let (mut differs, mut any, mut all, mut special) = (F::Word::ZERO, F::Word::ZERO, start, false);
+    let (mut zeros, mut denormals) = (Count::<N, F>::default(), Count::<N, F>::default());
+    for element in elements {
+        let word = F::Word::read(*element);
+        differs = differs | (word ^ start);
+        any = any | word;
+        all = all & word;
+        zeros = F::Word::plus(zeros, F::zero(word));
+        special |= F::special(word);
+    }
+    if tally.sums.is_some() {
+        for element in elements {
+            denormals = F::Word::plus(denormals, F::denormal(F::Word::read(*element)));
         }
     }
-    let special = special != F::Word::ZERO;
+    tally.zeros = tally.zeros.saturating_add(zeros.into());
     if special {
         specials::<N, F>(tally, elements);
     }
@@ -242,9 +240,16 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
     tally.elements = tally.elements.saturating_add(as_u64(elements.len()));
     if let Some(sums) = &mut tally.sums {
         let (min, max) = if special { range::<N, F, true>(elements) } else { range::<N, F, false>(elements) };
-        let (sum, squares) =
-            if special { added::<N, F, true, FUSED>(elements) } else { added::<N, F, false, FUSED>(elements) };
-        sums.add(&Sums { min, max, sum, squares, denormals });
+        let (sum, squares) = if let Some(layout) = F::SMALL
+            && let Some(class) = small::class(layout, any.into(), all.into()).filter(|_| !special)
+        {
+            small::added(elements.as_flattened(), layout, class)
+        } else if special {
+            added::<N, F, true, FUSED>(elements)
+        } else {
+            added::<N, F, false, FUSED>(elements)
+        };
+        sums.add(&Sums { min, max, sum, squares, denormals: denormals.into() });
     }
     any != F::Word::ZERO
 }
@@ -252,17 +257,15 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
 /// Counts the NaN and infinities of a block that has some. Called before its elements are counted.
 #[inline(always)]
 fn specials<const N: usize, F: Format<N>>(tally: &mut Tally, elements: &[[u8; N]]) {
-    for run in elements.chunks(F::Word::RUN) {
-        let (mut special, mut infinite) = (F::Word::ZERO, F::Word::ZERO);
-        for element in run {
-            let word = F::Word::read(*element);
-            special = special.plus(F::special(word));
-            infinite = infinite.plus(F::infinite(word));
-        }
-        let (special, infinite): (u64, u64) = (special.into(), infinite.into());
-        tally.nan = tally.nan.saturating_add(special.saturating_sub(infinite));
-        tally.infinite = tally.infinite.saturating_add(infinite);
+    let (mut special, mut infinite) = (Count::<N, F>::default(), Count::<N, F>::default());
+    for element in elements {
+        let word = F::Word::read(*element);
+        special = F::Word::plus(special, F::special(word));
+        infinite = F::Word::plus(infinite, F::infinite(word));
     }
+    let (special, infinite): (u64, u64) = (special.into(), infinite.into());
+    tally.nan = tally.nan.saturating_add(special.saturating_sub(infinite));
+    tally.infinite = tally.infinite.saturating_add(infinite);
     if tally.first.is_none() {
         let first = elements.iter().position(|element| F::special(F::Word::read(*element)));
         tally.first = first.map(|first| tally.elements.saturating_add(as_u64(first)));
@@ -274,11 +277,22 @@ fn specials<const N: usize, F: Format<N>>(tally: &mut Tally, elements: &[[u8; N]
 #[inline(always)]
 fn range<const N: usize, F: Format<N>, const SPECIAL: bool>(elements: &[[u8; N]]) -> (f64, f64) {
     let (mut low, mut high) = (F::Word::LAST_KEY, F::Word::FIRST_KEY);
-    for element in elements {
-        let word = F::Word::read(*element);
-        let (key, skip) = (F::key(word), SPECIAL && F::special(word));
-        low = low.min(if skip { F::Word::LAST_KEY } else { key });
-        high = high.max(if skip { F::Word::FIRST_KEY } else { key });
+    if SPECIAL {
+        // Two loops: one with both choices is not vectorised.
+        for element in elements {
+            let word = F::Word::read(*element);
+            low = low.min(if F::special(word) { F::Word::LAST_KEY } else { F::key(word) });
+        }
+        for element in elements {
+            let word = F::Word::read(*element);
+            high = high.max(if F::special(word) { F::Word::FIRST_KEY } else { F::key(word) });
+        }
+    } else {
+        for element in elements {
+            let key = F::key(F::Word::read(*element));
+            low = low.min(key);
+            high = high.max(key);
+        }
     }
     if low > high {
         return (f64::INFINITY, f64::NEG_INFINITY);
@@ -355,5 +369,6 @@ fn fold(lanes: &mut [f64; LANES], half: usize) {
     }
 }
 
+mod small;
 #[cfg(test)]
 mod tests;

@@ -167,3 +167,128 @@ fn special_elements_are_left_out_of_sums() {
         assert_eq!(found.sums, expected.sums, "{dtype}");
     }
 }
+
+/// What a loop over the elements counts, one after the other; sums are exact, as integers in units of 2^-24.
+fn counted<const N: usize, F: Format<N>>(dtype: Dtype, bytes: &[u8]) -> Tally {
+    let mut tally = Tally::new(dtype, true);
+    let (mut sums, mut sum, mut squares) = (Sums::NONE, 0_i128, 0_i128);
+    for (at, element) in bytes.as_chunks::<N>().0.iter().enumerate() {
+        let word = F::Word::read(*element);
+        tally.elements += 1;
+        tally.zeros += u64::from(F::zero(word));
+        tally.varies |= tally.value.is_some_and(|value| value != word.into());
+        tally.value = tally.value.or(Some(word.into()));
+        if F::special(word) {
+            tally.infinite += u64::from(F::infinite(word));
+            tally.nan += u64::from(!F::infinite(word));
+            tally.first = tally.first.or(Some(as_u64(at)));
+            continue;
+        }
+        let number = F::number(word);
+        sums.denormals += u64::from(F::denormal(word));
+        sums.min = if number.total_cmp(&sums.min).is_lt() { number } else { sums.min };
+        sums.max = if number.total_cmp(&sums.max).is_gt() { number } else { sums.max };
+        #[allow(clippy::cast_possible_truncation, reason = "a multiple of the unit")]
+        let units = (number * 24_f64.exp2()) as i128;
+        sum += units;
+        squares += units * units;
+    }
+    #[allow(clippy::cast_precision_loss, reason = "rounded once")]
+    let number = |units: i128, exponent: f64| units as f64 * exponent.exp2();
+    (sums.sum, sums.squares) = (number(sum, -24.0), number(squares, -48.0));
+    tally.bytes = as_u64(bytes.len());
+    tally.last = bytes.iter().rposition(|byte| *byte != 0).map_or(0, |last| as_u64(last) + 1);
+    tally.sums = Some(sums);
+    tally
+}
+
+/// Compares contents of many kinds and lengths with a loop, whole and in parts between blocks. Sums of these types have the
+/// bits of the exact ones where `exact` says so.
+fn compared<const N: usize, F: Format<N>>(dtype: Dtype, high: u8, exact: fn(&str) -> bool) {
+    let bits = |mask: u8, set: u8| {
+        let words = bytes(4).into_iter().enumerate();
+        words.map(|(n, byte)| if n % N == N - 1 { byte & mask | set } else { byte }).collect::<Vec<u8>>()
+    };
+    let mut mixed = bits(0x87, 0x30);
+    mixed[BLOCK + 40..BLOCK + 60].fill(0xff);
+    mixed[2 * BLOCK..2 * BLOCK + 2 * N].fill(high);
+    let kinds = [
+        ("random", bits(0xff, 0)),
+        ("lowest exponents", bits(0x83, 0)),
+        ("around one", bits(0x83, 0x3c)),
+        ("one class", bits(0x9f, 0x20)),
+        ("lower half", bits(0xbf, 0)),
+        ("upper half", bits(0x9b, 0x40)),
+        ("zeros", bits(0, 0).into_iter().map(|_| 0).collect()),
+        (
+            "negative",
+            bits(0, 0xff).into_iter().enumerate().map(|(n, b)| if n % N == N - 1 { 0x80 } else { b }).collect(),
+        ),
+        ("special elements in a few places", mixed),
+        ("no finite element", vec![0xff; 3 * BLOCK + 96]),
+    ];
+    for (kind, bytes) in &kinds {
+        for elements in [1, 2, 31, 33, 63, 65, 1023, 1024, 1025, 5000, BLOCK / N, BLOCK / N + 1, bytes.len() / N] {
+            let bytes = &bytes[..elements * N];
+            let (found, expected) = (tally(dtype, bytes), counted::<N, F>(dtype, bytes));
+            let (sums, exactly) = (found.sums.unwrap(), expected.sums.unwrap());
+            if exact(kind) {
+                assert_eq!(found, expected, "{dtype} {kind} {elements}");
+                assert_eq!(sums.sum.to_bits(), exactly.sum.to_bits(), "{dtype} {kind} {elements}");
+            }
+            let near = |one: f64, other: f64| {
+                let allowed = 1e-13 * exactly.squares.max(exactly.sum.abs());
+                assert!((one - other).abs() <= allowed, "{dtype} {kind} {elements}: {one} {other}");
+            };
+            near(sums.sum, exactly.sum);
+            near(sums.squares, exactly.squares);
+            assert_eq!(Tally { sums: None, ..found }, Tally { sums: None, ..expected }, "{dtype} {kind} {elements}");
+            let counts = |sums: Sums| (sums.min.to_bits(), sums.max.to_bits(), sums.denormals);
+            assert_eq!(counts(sums), counts(exactly), "{dtype} {kind} {elements}");
+            for blocks in 1..3 {
+                let mut parts = Tally::new(dtype, true);
+                bytes.chunks(blocks * BLOCK).for_each(|part| parts.add(part));
+                assert_eq!(parts, found, "{dtype} {kind} {elements} {blocks}");
+            }
+        }
+    }
+}
+
+#[test]
+fn small_floats_are_counted_as_a_loop_counts_them() {
+    compared::<1, F8E4M3>(Dtype::F8_E4M3, 0x7f, |_| true);
+    compared::<1, F8E4M3Fnuz>(Dtype::F8_E4M3FNUZ, 0x80, |_| true);
+    let one_class = |kind: &str| !["random", "lower half", "upper half"].contains(&kind);
+    compared::<1, F8E5M2>(Dtype::F8_E5M2, 0x7c, one_class);
+    compared::<1, F8E5M2Fnuz>(Dtype::F8_E5M2FNUZ, 0x80, one_class);
+    compared::<2, F16>(Dtype::F16, 0x7c, |kind| ["zeros", "negative", "no finite element"].contains(&kind));
+}
+
+/// Blocks of one class are added up as integers, and as floats with the same result.
+#[test]
+fn integers_and_floats_have_the_same_sums() {
+    fn same<F: Format<1, Word = u8>>() {
+        let layout = F::SMALL.unwrap();
+        let mut classes = 0;
+        for class in 0..4 {
+            let codes: Vec<u8> = (bytes(5).into_iter())
+                .filter(|code| {
+                    small::class(layout, (*code).into(), (*code).into()) == Some(class) && !F::special(*code)
+                })
+                .collect();
+            classes += u32::from(!codes.is_empty());
+            for len in [0, 1, 63, 1025, codes.len()] {
+                let codes = &codes[..len.min(codes.len())];
+                let (integers, floats) =
+                    (small::added(codes, layout, class), added::<1, F, false, false>(codes.as_chunks().0));
+                assert_eq!(integers.0.to_bits(), floats.0.to_bits(), "{class} {len}");
+                assert_eq!(integers.1.to_bits(), floats.1.to_bits(), "{class} {len}");
+            }
+        }
+        assert_eq!(classes, 1 << (layout.exponent - 3));
+    }
+    same::<F8E4M3>();
+    same::<F8E4M3Fnuz>();
+    same::<F8E5M2>();
+    same::<F8E5M2Fnuz>();
+}
