@@ -312,23 +312,27 @@ pub(super) enum KernelCopy {
 
 impl KernelCopy {
     /// For the file system of a file.
-    #[cfg(target_os = "linux")]
     pub(super) fn of(file: &File) -> Self {
         // Source: linux/magic.h.
         const XFS: u64 = 0x5846_5342;
         const BTRFS: u64 = 0x9123_683E;
         const EXT: u64 = 0xEF53;
         const TMPFS: u64 = 0x0102_1994;
-        let kind = rustix::fs::fstatfs(file).ok().and_then(|stats| u64::try_from(stats.f_type).ok());
-        match kind {
+        match file_system(file) {
             Some(XFS | BTRFS) => Self::Shares,
             Some(EXT | TMPFS) => Self::Splices,
             _ => Self::Delegates,
         }
     }
+}
 
-    #[cfg(not(target_os = "linux"))]
-    pub(super) fn of(_: &File) -> Self {
-        Self::Splices
-    }
+/// The number of a file's file system, as Linux counts them.
+#[cfg(target_os = "linux")]
+fn file_system(file: &File) -> Option<u64> {
+    u64::try_from(rustix::fs::fstatfs(file).ok()?.f_type).ok()
+}
+
+#[cfg(not(target_os = "linux"))]
+fn file_system(_: &File) -> Option<u64> {
+    None
 }
