@@ -317,15 +317,22 @@ integers! {
 }
 
 /// Takes elements of four bits apart, low half first.
+#[inline(always)]
 pub(super) fn unpack4(bytes: &[u8], codes: &mut Vec<u8>) {
-    codes.clear();
-    codes.extend(bytes.iter().flat_map(|byte| [byte & 0xf, byte >> 4]));
+    codes.resize(bytes.len().saturating_mul(2), 0);
+    for (pair, byte) in codes.as_chunks_mut().0.iter_mut().zip(bytes) {
+        *pair = [byte & 0xf, byte >> 4];
+    }
 }
 
 /// Takes elements of six bits apart, from the lowest bit on: four in three bytes.
+#[inline(always)]
 pub(super) fn unpack6(bytes: &[u8], codes: &mut Vec<u8>) {
-    codes.clear();
-    codes.extend(bytes.as_chunks().0.iter().flat_map(|[one, two, three]: &[u8; 3]| {
-        [one & 0x3f, one >> 6 | (two & 0xf) << 2, two >> 4 | (three & 3) << 4, three >> 2]
-    }));
+    let (triples, _) = bytes.as_chunks();
+    codes.resize(triples.len().saturating_mul(4), 0);
+    for (four, [one, two, three]) in codes.as_chunks_mut().0.iter_mut().zip(triples) {
+        let bits = u32::from_le_bytes([*one, *two, *three, 0]);
+        let apart = bits & 0x3f | bits << 2 & 0x3f00 | bits << 4 & 0x003f_0000 | bits << 6 & 0x3f00_0000;
+        *four = apart.to_le_bytes();
+    }
 }

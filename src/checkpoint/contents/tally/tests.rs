@@ -292,3 +292,18 @@ fn integers_and_floats_have_the_same_sums() {
     same::<F8E5M2>();
     same::<F8E5M2Fnuz>();
 }
+
+/// Elements of four and six bits are taken apart from the lowest bit of a block on.
+#[test]
+fn packed_elements_are_taken_apart() {
+    let bytes: Vec<u8> = (0..300_u32).map(|i| i.wrapping_mul(2_654_435_761).to_be_bytes()[0]).collect();
+    let defined = |width: usize| -> Vec<u8> {
+        let bit = |at: usize| bytes[at / 8] >> (at % 8) & 1;
+        (0..bytes.len() * 8 / width).map(|n| (0..width).map(|i| bit(n * width + i) << i).sum()).collect()
+    };
+    let mut codes = Vec::new();
+    unpack4(&bytes, &mut codes);
+    assert_eq!(codes, defined(4));
+    unpack6(&bytes, &mut codes);
+    assert_eq!(codes, defined(6));
+}
