@@ -726,8 +726,7 @@ REPORTING = Path("/sys/module/page_reporting/parameters/page_reporting_order")
 def memory_kept():
     """Keeps a virtual machine from giving free memory back to its host, where this can be switched off.
 
-    The next program that uses such memory waits until the host has given it again: up to 15 seconds of system time for a
-    merge of 3.7 GB, which takes 1.7 otherwise."""
+    The next program that uses such memory waits until the host has given it again, so rounds of one program differ."""
     if not os.access(REPORTING, os.W_OK):
         yield
         return
@@ -820,7 +819,7 @@ ABOUT = {
 rounds, and compares the bytes of every merge with those of the donors. The times are those of whole processes, with their
 start. A ratio is the median of the ratios of each round, so that what disturbs the machine disturbs both sides. The raw times
 are in [figures.json](performance/figures.json). As root on a virtual machine, the script keeps free memory from being given back
-to the host, which otherwise adds up to 15 seconds to a merge of 3.7 GB.
+to the host. Otherwise the next program that uses it waits for the host, and the rounds differ.
 
 ```sh
 cargo build --profile dist
@@ -832,7 +831,7 @@ tools/performance.py page
 `DIR` needs room for four times the size of a merge, and for twice the 15 GB of the one from the disk. `PYTHON` has torch, numpy
 and safetensors, `COMMAND` runs mergekit-yaml, and `MODELS` is a folder of directories from the Hub. Without the last three, their
 lines are missing. The sections on reading, hashing, mergekit, shared blocks and headers were measured with the profile `release`,
-which takes a fifth longer where the processor is the bound.""",
+which is slower where the processor is the bound.""",
     "check": """`check` reads the headers of shards and the documents, and nothing of the tensors. Of the time of a small model, the start of
 the process is a third (`--version`). By perf, the kernel takes 43 % of it (start, page faults and end), the program 38 %, the C
 library 11 % and the dynamic linker 7 %. The whole is 15 million instructions, by callgrind: evaluating the rules 22 % (of which
@@ -840,8 +839,8 @@ decoding their expressions 14 %), reading the heads of the rules 20 %, memory al
 linker 6 %. Before data files were read when they are first needed, it was 185 million: parsing expressions 33 %, parsing JSON5
 30 %, freeing both, looking up embedded files, and predicting loads 11 %. The time of a large model is proportional to the number
 of its tensors: names are parsed, sorted, renamed as the loader renames them, and looked up. Several directories are checked on
-all cores. The ratio to Python's json, which parses the same two headers and starts as well, holds for slower and faster
-machines alike.""",
+all cores. The ratio to Python's json, which parses the same two headers and starts as well, depends less on the
+machine than the times do.""",
     "growth": """Qwen3-MoE models of 512 experts with 1 to 58 layers. Time and memory are linear in the number of tensors.""",
     "deep": """The bound is the rate at which memory is read: numpy sums the words of the mapped files with a thread for each core, and
 `start of numpy` is what it takes before it reads. `cargo bench --bench contents` compares both in one process.""",
@@ -850,7 +849,7 @@ machines alike.""",
 files of the size of the result. The Python script copies byte ranges of the donors and hashes nothing; the torch script loads
 every tensor and saves them with `safetensors.torch.save_file`. The bound is the rate of the disk: `cp` and `merge` differ in
 when they begin to write back. The disk of this machine is shared with others, so its rate varies by more than a factor of two between
-rounds. Digests are computed while the bytes pass. All copies pass through a buffer that fits the cache of the processor: on ext4
+rounds. Digests are computed while the bytes pass. Blocks that are not shared pass through a buffer that fits the cache of the processor: on ext4
 `copy_file_range`, which the Python script uses, copies by smaller pieces.""",
     "mergekit": """mergekit 0.1.5 cannot insert a language model into a LLaVA. Its method `passthrough` copies all tensors of one Llama, as a
 recipe with one donor and one pattern does here.""",

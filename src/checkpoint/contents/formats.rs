@@ -16,7 +16,7 @@ pub(super) trait Word<const N: usize>:
 {
     /// The word of zeros.
     const ZERO: Self;
-    /// Counts the elements of a block. As narrow as the word if that is wide enough, so that vectors hold many.
+    /// Counts the elements of a block. As narrow as the word where that is wide enough, so that vectors hold many counters.
     type Count: Copy + Default + Into<u64>;
     /// A signed integer of the same width: every processor has vectors for its minimum and maximum.
     type Key: Copy + Ord;
@@ -25,7 +25,7 @@ pub(super) trait Word<const N: usize>:
 
     fn read(bytes: [u8; N]) -> Self;
 
-    /// Adds 1 if the condition holds.
+    /// Adds 1 to the counter of a block if the condition holds.
     fn plus(count: Self::Count, condition: bool) -> Self::Count;
 }
 
@@ -119,15 +119,13 @@ macro_rules! flipped {
 
 /// Formats of IEEE 754 layout: all exponent bits are set in NaN, whose fraction is nonzero, and in infinity.
 macro_rules! ieee {
-    ($($format:ident, $word:ident, $key:ident, $width:literal, $magnitude:literal, $exponent:literal, $convert:expr;)*) => { $(
+    ($($format:ident, $word:ident, $key:ident, $width:literal, $magnitude:literal, $exponent:literal, $small:expr, $convert:expr;)*) => { $(
         pub(super) struct $format;
 
         impl Format<$width> for $format {
             type Word = $word;
             const SQUARES_ARE_EXACT: bool = $width <= 4;
-            // The only one of a byte is F8E5M2.
-            const SMALL: Option<Small> =
-                if $width == 1 { Some(Small { exponent: 5, fraction: 2, bias: 15 }) } else { None };
+            const SMALL: Option<Small> = $small;
 
             #[inline(always)]
             fn special(word: $word) -> bool {
@@ -169,11 +167,11 @@ macro_rules! ieee {
 }
 
 ieee! {
-    F64, u64, i64, 8, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, f64::from_bits;
-    F32, u32, i32, 4, 0x7fff_ffff, 0x7f80_0000, f32::from_bits;
-    Bf16, u16, i16, 2, 0x7fff, 0x7f80, |word: u16| f32::from_bits(u32::from(word) << 16);
-    F16, u16, i16, 2, 0x7fff, 0x7c00, |word: u16| widened::<5, 10, 15>(word.into());
-    F8E5M2, u8, i8, 1, 0x7f, 0x7c, |word: u8| widened::<5, 2, 15>(word.into());
+    F64, u64, i64, 8, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, None, f64::from_bits;
+    F32, u32, i32, 4, 0x7fff_ffff, 0x7f80_0000, None, f32::from_bits;
+    Bf16, u16, i16, 2, 0x7fff, 0x7f80, None, |word: u16| f32::from_bits(u32::from(word) << 16);
+    F16, u16, i16, 2, 0x7fff, 0x7c00, None, |word: u16| widened::<5, 10, 15>(word.into());
+    F8E5M2, u8, i8, 1, 0x7f, 0x7c, Some(Small { exponent: 5, fraction: 2, bias: 15 }), |word: u8| widened::<5, 2, 15>(word.into());
 }
 
 /// The number of a code with a sign, an exponent and a fraction, of these many bits. Exact, and without denormal operands,

@@ -20,6 +20,9 @@ use super::formats::{
 /// three bytes of four elements of six bits.
 pub(super) const BLOCK: usize = 24 << 10;
 
+// A block has at most two elements for each byte, and the narrowest counter has 16 bits.
+const _: () = assert!(BLOCK <= (u16::MAX / 2) as usize);
+
 /// Sums that are kept side by side: enough for a loop over them to be vectorised.
 const LANES: usize = 64;
 

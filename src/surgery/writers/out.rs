@@ -157,7 +157,7 @@ impl Place<'_> {
         self.skip(bytes.len() as u64);
     }
 
-    /// Leaves out the next bytes, which the file already has and nobody hashes.
+    /// Moves past bytes that the file has.
     fn skip(&mut self, len: u64) {
         self.at = self.at.saturating_add(len);
         self.left = self.left.saturating_sub(len);

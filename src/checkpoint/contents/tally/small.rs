@@ -1,8 +1,8 @@
 //! Sums of floats of at most eight bits, in integers.
 //!
-//! Eight adjacent exponents are a class: the numbers of one class are multiples of its unit that fit into 16 bits. In
-//! `F8_E4M3`, all numbers below 2 are of one class, so most weights are that were converted without a scale. Sums of one
-//! class are exact, in integers as in 64-bit floats, so they have the same bits.
+//! Eight adjacent exponents are a class: the numbers of one class are multiples of its unit, and the multiples fit into 16
+//! bits. In `F8_E4M3`, all numbers below 2 are of one class, as are most weights that were converted without a scale. Sums of
+//! one class are exact in integers and in 64-bit floats, so both have the same bits.
 
 use super::super::formats::Small;
 
@@ -32,7 +32,7 @@ pub(super) fn added(codes: &[u8], layout: Small, class: u32) -> (f64, f64) {
         for (part, code) in parts.iter_mut().zip(run) {
             *part = multiple(*code, layout);
         }
-        // Two loops: the second one becomes products of pairs.
+        // Two loops, so that the compiler uses the instruction that adds products of pairs in the second one.
         let (mut all, mut products) = (0_i32, 0_i32);
         for part in &*parts {
             all = all.wrapping_add(i32::from(*part));
