@@ -186,7 +186,8 @@ fn write(dir: &Path) {
     let dtype = std::env::var("DTYPE").ok().and_then(|name| Dtype::from_name(&name)).unwrap_or(Dtype::BF16);
     let mut random = ChaCha8Rng::seed_from_u64(1);
     for shard in 1..=4 {
-        let (rows, tensors) = (16_u64, 32);
+        // Elements of six bits fill three bytes.
+        let (rows, tensors) = (24_u64, 21);
         let size = rows << 20;
         let columns = size * 8 / dtype.bits() / rows;
         let entry = |n: u64| {

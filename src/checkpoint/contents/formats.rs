@@ -178,17 +178,22 @@ ieee! {
 /// which some processors multiply slowly.
 #[inline(always)]
 fn widened<const EXPONENT: u32, const FRACTION: u32, const BIAS: u32>(code: u32) -> f32 {
-    let size = const { EXPONENT.wrapping_add(FRACTION) };
-    let shift = const { 23_u32.wrapping_sub(FRACTION) };
-    // The exponent of the smallest normal number, in f32.
-    let least = const { 128_u32.wrapping_sub(BIAS) << 23 };
-    let magnitude = code & const { (1_u32 << (EXPONENT.wrapping_add(FRACTION))).wrapping_sub(1) };
-    let bits = (magnitude << shift).wrapping_add(least);
-    let normal = f32::from_bits(bits.wrapping_sub(const { 1 << 23 }));
-    let denormal = f32::from_bits(bits) - f32::from_bits(least);
-    let number = if magnitude < const { 1 << FRACTION } { denormal } else { normal };
-    f32::from_bits(number.to_bits() | ((code >> size) & 1) << 31)
+    // The sign becomes the highest bit, and the fraction that of f32. What is between the sign and the exponent is cleared.
+    let aligned = code << const { 31_u32.wrapping_sub(EXPONENT).wrapping_sub(FRACTION) };
+    let shifted = (aligned.cast_signed() >> const { 8_u32.wrapping_sub(EXPONENT) }).cast_unsigned();
+    let exponents = const { (1_u32 << EXPONENT).wrapping_sub(1) << 23 };
+    let code = shifted & const { SIGN | (1_u32 << EXPONENT.wrapping_add(23)).wrapping_sub(1) };
+    let normal = code.wrapping_add(const { 127_u32.wrapping_sub(BIAS) << 23 });
+    // A denormal number is what the fraction adds to the smallest normal number.
+    let above = normal.wrapping_add(1 << 23);
+    let denormal = f32::from_bits(above) - f32::from_bits(above & SIGN_AND_EXPONENT);
+    let denormal = denormal.to_bits() | code & SIGN;
+    f32::from_bits(if code & exponents == 0 { denormal } else { normal })
 }
+
+/// Parts of the bits of f32.
+const SIGN: u32 = 1 << 31;
+const SIGN_AND_EXPONENT: u32 = 0x1ff << 23;
 
 /// Formats of at most eight bits without infinity: at most one magnitude, or one pattern, is NaN.
 macro_rules! small {

@@ -3,7 +3,11 @@
 //! The loops have neither early ends nor calls, so that the compiler vectorises them, once for each set of instructions in
 //! `targets`; the one that the processor has is chosen at run time. Sums are made in the same order on every processor.
 
-#![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the oldest processors")]
+#![allow(
+    clippy::inline_always,
+    clippy::verbose_bit_mask,
+    reason = "a function that is not inlined is compiled for the oldest processors, and masks are compared in vectors"
+)]
 
 use std::array::from_ref;
 
@@ -173,6 +177,7 @@ fn piece(tally: &mut Tally, bytes: &[u8]) {
     let mut codes = Vec::new();
     for block in bytes.chunks(BLOCK) {
         let any = match tally.dtype {
+            Dtype::F4 if tally.sums.is_none() => pairs(tally, block),
             Dtype::BF16 => add::<2, Bf16, FUSED>(tally, block),
             Dtype::F16 => add::<2, F16, FUSED>(tally, block),
             Dtype::F32 | Dtype::C64 => add::<4, F32, FUSED>(tally, block),
@@ -255,6 +260,28 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
         sums.add(&Sums { min, max, sum, squares, denormals: denormals.into() });
     }
     any != F::Word::ZERO
+}
+
+/// Counts one block of elements of four bits, two in a byte, without taking them apart: there are no sums, and none is NaN or
+/// infinite. Returns whether a bit is set.
+#[inline(always)]
+fn pairs(tally: &mut Tally, bytes: &[u8]) -> bool {
+    let Some(first) = bytes.first() else { return false };
+    // The lower half is the first element.
+    let start = first & 0xf;
+    let same = start << 4 | start;
+    let (mut differs, mut any, mut zeros) = (0_u8, 0_u8, 0_u16);
+    for pair in bytes {
+        differs |= pair ^ same;
+        any |= pair;
+        let of_pair = u8::from(pair & 0x07 == 0).wrapping_add((pair & 0x70 == 0).into());
+        zeros = zeros.wrapping_add(of_pair.into());
+    }
+    tally.zeros = tally.zeros.saturating_add(zeros.into());
+    tally.varies |= differs != 0 || tally.value.is_some_and(|value| value != u64::from(start));
+    tally.value = tally.value.or(Some(start.into()));
+    tally.elements = tally.elements.saturating_add(as_u64(bytes.len()).saturating_mul(2));
+    any != 0
 }
 
 /// Counts the NaN and infinities of a block that has some. Called before its elements are counted.

@@ -293,6 +293,23 @@ fn integers_and_floats_have_the_same_sums() {
     same::<F8E5M2Fnuz>();
 }
 
+/// What is counted of elements of four bits in pairs is what is counted of them one by one.
+#[test]
+fn pairs_are_counted_as_their_elements() {
+    let random = bytes(6);
+    let constant = |byte: u8| vec![byte; BLOCK + 100];
+    let mut late = constant(0x22);
+    late[BLOCK + 50] = 0x12;
+    for bytes in [&random, &constant(0), &constant(0x88), &constant(0x80), &constant(0x08), &constant(0x55), &late] {
+        for len in [0, 1, 31, 65, BLOCK, BLOCK + 51, bytes.len()] {
+            let bytes = &bytes[..len.min(bytes.len())];
+            let mut pairs = Tally::new(Dtype::F4, false);
+            pairs.add(bytes);
+            assert_eq!(pairs, Tally { sums: None, ..tally(Dtype::F4, bytes) }, "{len}");
+        }
+    }
+}
+
 /// Elements of four and six bits are taken apart from the lowest bit of a block on.
 #[test]
 fn packed_elements_are_taken_apart() {
