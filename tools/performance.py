@@ -830,8 +830,7 @@ tools/performance.py page
 
 `DIR` needs room for four times the size of a merge, and for twice the 15 GB of the one from the disk. `PYTHON` has torch, numpy
 and safetensors, `COMMAND` runs mergekit-yaml, and `MODELS` is a folder of directories from the Hub. Without the last three, their
-lines are missing. The sections on reading, hashing, mergekit, shared blocks and headers were measured with the profile `release`,
-which is slower where the processor is the bound.""",
+lines are missing.""",
     "check": """`check` reads the headers of shards and the documents, and nothing of the tensors. Of the time of a small model, the start of
 the process is a third (`--version`). By perf, the kernel takes 43 % of it (start, page faults and end), the program 38 %, the C
 library 11 % and the dynamic linker 7 %. The whole is 15 million instructions, by callgrind: evaluating the rules 22 % (of which
