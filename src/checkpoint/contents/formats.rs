@@ -70,6 +70,9 @@ pub(super) struct Small {
 pub(super) trait Format<const N: usize> {
     type Word: Word<N>;
 
+    /// A float that has all its numbers.
+    type Number: Copy + Default + Into<f64>;
+
     /// Whether the square of every number fits into 53 bits.
     const SQUARES_ARE_EXACT: bool = N <= 2;
 
@@ -100,7 +103,7 @@ pub(super) trait Format<const N: usize> {
     }
 
     /// The number, of an element that is not special. Exact, except for integers of 64 bits.
-    fn number(word: Self::Word) -> f64;
+    fn number(word: Self::Word) -> Self::Number;
 
     /// An integer that is ordered as the number is, of an element that is not special. That of -0 is below that of 0.
     fn key(word: Self::Word) -> <Self::Word as Word<N>>::Key;
@@ -119,11 +122,12 @@ macro_rules! flipped {
 
 /// Formats of IEEE 754 layout: all exponent bits are set in NaN, whose fraction is nonzero, and in infinity.
 macro_rules! ieee {
-    ($($format:ident, $word:ident, $key:ident, $width:literal, $magnitude:literal, $exponent:literal, $small:expr, $convert:expr;)*) => { $(
+    ($($format:ident, $word:ident, $key:ident, $width:literal, $magnitude:literal, $exponent:literal, $small:expr, $number:ident, $convert:expr;)*) => { $(
         pub(super) struct $format;
 
         impl Format<$width> for $format {
             type Word = $word;
+            type Number = $number;
             const SQUARES_ARE_EXACT: bool = $width <= 4;
             const SMALL: Option<Small> = $small;
 
@@ -149,8 +153,8 @@ macro_rules! ieee {
             }
 
             #[inline(always)]
-            fn number(word: $word) -> f64 {
-                f64::from($convert(word))
+            fn number(word: $word) -> $number {
+                $convert(word)
             }
 
             #[inline(always)]
@@ -167,33 +171,28 @@ macro_rules! ieee {
 }
 
 ieee! {
-    F64, u64, i64, 8, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, None, f64::from_bits;
-    F32, u32, i32, 4, 0x7fff_ffff, 0x7f80_0000, None, f32::from_bits;
-    Bf16, u16, i16, 2, 0x7fff, 0x7f80, None, |word: u16| f32::from_bits(u32::from(word) << 16);
-    F16, u16, i16, 2, 0x7fff, 0x7c00, None, |word: u16| widened::<5, 10, 15>(word.into());
-    F8E5M2, u8, i8, 1, 0x7f, 0x7c, Some(Small { exponent: 5, fraction: 2, bias: 15 }), |word: u8| widened::<5, 2, 15>(word.into());
+    F64, u64, i64, 8, 0x7fff_ffff_ffff_ffff, 0x7ff0_0000_0000_0000, None, f64, f64::from_bits;
+    F32, u32, i32, 4, 0x7fff_ffff, 0x7f80_0000, None, f32, f32::from_bits;
+    Bf16, u16, i16, 2, 0x7fff, 0x7f80, None, f32, |word: u16| f32::from_bits(u32::from(word) << 16);
+    F16, u16, i16, 2, 0x7fff, 0x7c00, None, f32, |word: u16| widened::<5, 10, 15>(word.into());
+    F8E5M2, u8, i8, 1, 0x7f, 0x7c, Some(Small { exponent: 5, fraction: 2, bias: 15 }), f32, |word: u8| widened::<5, 2, 15>(word.into());
 }
 
 /// The number of a code with a sign, an exponent and a fraction, of these many bits. Exact, and without denormal operands,
 /// which some processors multiply slowly.
 #[inline(always)]
 fn widened<const EXPONENT: u32, const FRACTION: u32, const BIAS: u32>(code: u32) -> f32 {
-    // The sign becomes the highest bit, and the fraction that of f32. What is between the sign and the exponent is cleared.
-    let aligned = code << const { 31_u32.wrapping_sub(EXPONENT).wrapping_sub(FRACTION) };
-    let shifted = (aligned.cast_signed() >> const { 8_u32.wrapping_sub(EXPONENT) }).cast_unsigned();
-    let exponents = const { (1_u32 << EXPONENT).wrapping_sub(1) << 23 };
-    let code = shifted & const { SIGN | (1_u32 << EXPONENT.wrapping_add(23)).wrapping_sub(1) };
-    let normal = code.wrapping_add(const { 127_u32.wrapping_sub(BIAS) << 23 });
-    // A denormal number is what the fraction adds to the smallest normal number.
-    let above = normal.wrapping_add(1 << 23);
-    let denormal = f32::from_bits(above) - f32::from_bits(above & SIGN_AND_EXPONENT);
-    let denormal = denormal.to_bits() | code & SIGN;
-    f32::from_bits(if code & exponents == 0 { denormal } else { normal })
+    let width = const { EXPONENT.wrapping_add(FRACTION) };
+    let magnitude = code & const { (1_u32 << EXPONENT.wrapping_add(FRACTION)).wrapping_sub(1) };
+    let exponent = |biased: u32| biased.wrapping_sub(BIAS) << 23;
+    let normal = f32::from_bits((magnitude << 23_u32.wrapping_sub(FRACTION)).wrapping_add(exponent(127)));
+    // With an exponent of zero, this is 2^-BIAS * (1 + fraction), and the number is 2^(1 - BIAS) * fraction. With any other
+    // exponent, the same calculation never makes a number smaller.
+    let denormal = normal + (normal - f32::from_bits(exponent(128)));
+    let number = if denormal < normal { denormal } else { normal };
+    let sign = code << 31_u32.wrapping_sub(width) & (1 << 31);
+    f32::from_bits(number.to_bits() | sign)
 }
-
-/// Parts of the bits of f32.
-const SIGN: u32 = 1 << 31;
-const SIGN_AND_EXPONENT: u32 = 0x1ff << 23;
 
 /// Formats of at most eight bits without infinity: at most one magnitude, or one pattern, is NaN.
 macro_rules! small {
@@ -202,6 +201,7 @@ macro_rules! small {
 
         impl Format<1> for $format {
             type Word = u8;
+            type Number = f32;
             const SMALL: Option<Small> = Some(Small { exponent: $exponent, fraction: $fraction, bias: $bias });
 
             #[inline(always)]
@@ -221,8 +221,8 @@ macro_rules! small {
             }
 
             #[inline(always)]
-            fn number(word: u8) -> f64 {
-                f64::from(widened::<$exponent, $fraction, $bias>(word.into()))
+            fn number(word: u8) -> f32 {
+                widened::<$exponent, $fraction, $bias>(word.into())
             }
 
             #[inline(always)]
@@ -255,6 +255,7 @@ pub(super) struct F8E8M0;
 
 impl Format<1> for F8E8M0 {
     type Word = u8;
+    type Number = f64;
 
     #[inline(always)]
     fn special(word: u8) -> bool {
@@ -284,14 +285,15 @@ impl Format<1> for F8E8M0 {
 
 /// Integers and truth values. The key of an unsigned one has the highest bit flipped.
 macro_rules! integers {
-    ($($format:ident, $word:ident, $key:ident, $width:literal, $flip:expr, $convert:expr;)*) => { $(
+    ($($format:ident, $word:ident, $key:ident, $width:literal, $flip:expr, $number:ident, $convert:expr;)*) => { $(
         pub(super) struct $format;
 
         impl Format<$width> for $format {
             type Word = $word;
+            type Number = $number;
 
             #[inline(always)]
-            fn number(word: $word) -> f64 {
+            fn number(word: $word) -> $number {
                 $convert(word)
             }
 
@@ -309,14 +311,14 @@ macro_rules! integers {
 }
 
 integers! {
-    U8, u8, i8, 1, i8::MIN, f64::from;
-    I8, u8, i8, 1, 0, |word: u8| f64::from(word.cast_signed());
-    U16, u16, i16, 2, i16::MIN, f64::from;
-    I16, u16, i16, 2, 0, |word: u16| f64::from(word.cast_signed());
-    U32, u32, i32, 4, i32::MIN, f64::from;
-    I32, u32, i32, 4, 0, |word: u32| f64::from(word.cast_signed());
-    U64, u64, i64, 8, i64::MIN, |word: u64| word as f64;
-    I64, u64, i64, 8, 0, |word: u64| word.cast_signed() as f64;
+    U8, u8, i8, 1, i8::MIN, f32, f32::from;
+    I8, u8, i8, 1, 0, f32, |word: u8| f32::from(word.cast_signed());
+    U16, u16, i16, 2, i16::MIN, f32, f32::from;
+    I16, u16, i16, 2, 0, f32, |word: u16| f32::from(word.cast_signed());
+    U32, u32, i32, 4, i32::MIN, f64, f64::from;
+    I32, u32, i32, 4, 0, f64, |word: u32| f64::from(word.cast_signed());
+    U64, u64, i64, 8, i64::MIN, f64, |word: u64| word as f64;
+    I64, u64, i64, 8, 0, f64, |word: u64| word.cast_signed() as f64;
 }
 
 /// Takes elements of four bits apart, low half first.

@@ -178,6 +178,12 @@ fn piece(tally: &mut Tally, bytes: &[u8]) {
     for block in bytes.chunks(BLOCK) {
         let any = match tally.dtype {
             Dtype::F4 if tally.sums.is_none() => pairs(tally, block),
+            Dtype::F6_E2M3 | Dtype::F6_E3M2 if tally.sums.is_none() => {
+                let (groups, rest) = block.as_chunks();
+                unpack6(rest, &mut codes);
+                // Both types have the same zeros.
+                quartets(tally, groups) | add::<1, F6E2M3, FUSED>(tally, &codes)
+            }
             Dtype::BF16 => add::<2, Bf16, FUSED>(tally, block),
             Dtype::F16 => add::<2, F16, FUSED>(tally, block),
             Dtype::F32 | Dtype::C64 => add::<4, F32, FUSED>(tally, block),
@@ -226,6 +232,14 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
     let start = F::Word::read(*start);
     let (mut differs, mut any, mut all, mut special) = (F::Word::ZERO, F::Word::ZERO, start, false);
     let (mut zeros, mut denormals) = (Count::<N, F>::default(), Count::<N, F>::default());
+    // The first loop waits for the memory, so it is the one with the most work. What it adds up is right unless an element is
+    // special, or of another class than the first ones.
+    let class = F::SMALL.and_then(|layout| small::class_of_first(layout, elements.as_flattened()));
+    let early = match (F::SMALL, class) {
+        _ if tally.sums.is_none() => (0.0, 0.0),
+        (Some(layout), Some(class)) => small::added(elements.as_flattened(), layout, class),
+        _ => added::<N, F, false, FUSED>(elements),
+    };
     for element in elements {
         let word = F::Word::read(*element);
         differs = differs | (word ^ start);
@@ -248,14 +262,14 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
     tally.elements = tally.elements.saturating_add(as_u64(elements.len()));
     if let Some(sums) = &mut tally.sums {
         let (min, max) = if special { range::<N, F, true>(elements) } else { range::<N, F, false>(elements) };
-        let (sum, squares) = if let Some(layout) = F::SMALL
-            && let Some(class) = small::class(layout, any.into(), all.into()).filter(|_| !special)
-        {
-            small::added(elements.as_flattened(), layout, class)
-        } else if special {
+        let (sum, squares) = if special {
             added::<N, F, true, FUSED>(elements)
-        } else {
+        } else if F::SMALL
+            .is_some_and(|layout| class.is_some() && class != small::class(layout, any.into(), all.into()))
+        {
             added::<N, F, false, FUSED>(elements)
+        } else {
+            early
         };
         sums.add(&Sums { min, max, sum, squares, denormals: denormals.into() });
     }
@@ -282,6 +296,58 @@ fn pairs(tally: &mut Tally, bytes: &[u8]) -> bool {
     tally.value = tally.value.or(Some(start.into()));
     tally.elements = tally.elements.saturating_add(as_u64(bytes.len()).saturating_mul(2));
     any != 0
+}
+
+/// Counts elements of six bits, four in three bytes, as [`pairs`] counts those of four. A group has thirty-two.
+#[inline(always)]
+fn quartets(tally: &mut Tally, groups: &[[u8; 24]]) -> bool {
+    let Some([first, ..]) = groups.first() else { return false };
+    let start = u64::from(first & 0x3f);
+    let mut eights = Eights { same: start.wrapping_mul(Eights::LOWEST), differs: 0, any: 0 };
+    let mut nonzero = 0_u64;
+    for group in groups {
+        let ([one, two, three], _) = group.as_chunks() else { continue };
+        let (one, two, three) = (u64::read(*one), u64::read(*two), u64::read(*three));
+        let first = eights.nonzero(one);
+        let second = eights.nonzero(one >> 48 | two << 16);
+        let third = eights.nonzero(two >> 32 | three << 32);
+        let fourth = eights.nonzero(three >> 16);
+        // Each has one bit in six.
+        let found = first | second >> 1 | third >> 2 | fourth >> 3;
+        nonzero = nonzero.wrapping_add(found.count_ones().into());
+    }
+    let elements = as_u64(groups.len()).saturating_mul(32);
+    tally.zeros = tally.zeros.saturating_add(elements.saturating_sub(nonzero));
+    tally.varies |= eights.differs != 0 || tally.value.is_some_and(|value| value != start);
+    tally.value = tally.value.or(Some(start));
+    tally.elements = tally.elements.saturating_add(elements);
+    eights.any != 0
+}
+
+/// Words of eight elements of six bits.
+struct Eights {
+    /// The first element, eight times.
+    same: u64,
+    differs: u64,
+    any: u64,
+}
+
+impl Eights {
+    /// The lowest bit of each element.
+    const LOWEST: u64 = 0x0410_4104_1041;
+    const ALL: u64 = Self::LOWEST * 0x3f;
+    const SIGNS: u64 = Self::LOWEST * 0x20;
+    const MAGNITUDES: u64 = Self::LOWEST * 0x1f;
+
+    /// Adds the eight elements in the lower bits of a word; returns the sign bit of those that are not zero.
+    #[inline(always)]
+    const fn nonzero(&mut self, word: u64) -> u64 {
+        let eight = word & Self::ALL;
+        self.differs |= eight ^ self.same;
+        self.any |= eight;
+        // A magnitude that is not zero carries into the bit of its sign.
+        (eight & Self::MAGNITUDES).wrapping_add(Self::MAGNITUDES) & Self::SIGNS
+    }
 }
 
 /// Counts the NaN and infinities of a block that has some. Called before its elements are counted.
@@ -327,7 +393,7 @@ fn range<const N: usize, F: Format<N>, const SPECIAL: bool>(elements: &[[u8; N]]
     if low > high {
         return (f64::INFINITY, f64::NEG_INFINITY);
     }
-    (F::number(F::with_key(low)), F::number(F::with_key(high)))
+    (F::number(F::with_key(low)).into(), F::number(F::with_key(high)).into())
 }
 
 /// The sum of the finite numbers of a block, and of their squares. Each lane adds up every sixty-fourth element, in order.
@@ -337,14 +403,23 @@ fn added<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool>(e
     let (mut sum, mut squares) = ([0.0; LANES], [0.0; LANES]);
     let (rows, rest) = elements.as_chunks();
     let (groups, last) = rows.as_chunks();
+    let mut numbers = [[F::Number::default(); LANES]; ROWS];
     for group in groups {
-        add_rows::<N, F, SPECIAL, FUSED, ROWS>(&mut sum, &mut squares, group);
+        if N > 2 {
+            add_rows::<N, F, FUSED, _, ROWS>(&mut sum, &mut squares, group, decoded::<N, F, SPECIAL>);
+        } else {
+            // Vectors of the narrower numbers have more of them, so these are decoded first.
+            for (number, element) in numbers.as_flattened_mut().iter_mut().zip(group.as_flattened()) {
+                *number = decoded::<N, F, SPECIAL>(*element);
+            }
+            add_rows::<N, F, FUSED, _, ROWS>(&mut sum, &mut squares, &numbers, |number| number);
+        }
     }
     for row in last {
-        add_rows::<N, F, SPECIAL, FUSED, 1>(&mut sum, &mut squares, from_ref(row));
+        add_rows::<N, F, FUSED, _, 1>(&mut sum, &mut squares, from_ref(row), decoded::<N, F, SPECIAL>);
     }
     for ((sum, squares), element) in sum.iter_mut().zip(&mut squares).zip(rest) {
-        add_one::<N, F, SPECIAL, FUSED>(sum, squares, *element);
+        add_one::<N, F, FUSED>(sum, squares, decoded::<N, F, SPECIAL>(*element));
     }
     let mut half = LANES / 2;
     while half > 0 {
@@ -356,12 +431,20 @@ fn added<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool>(e
     (sum, squares)
 }
 
+/// The number of an element; 0 for one that is not finite.
+#[inline(always)]
+fn decoded<const N: usize, F: Format<N>, const SPECIAL: bool>(element: [u8; N]) -> F::Number {
+    let word = F::Word::read(element);
+    if SPECIAL && F::special(word) { F::Number::default() } else { F::number(word) }
+}
+
 /// Adds one element of each of the `R` rows to every lane.
 #[inline(always)]
-fn add_rows<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool, const R: usize>(
+fn add_rows<const N: usize, F: Format<N>, const FUSED: bool, T: Copy, const R: usize>(
     sum: &mut [f64; LANES],
     squares: &mut [f64; LANES],
-    rows: &[[[u8; N]; LANES]; R],
+    rows: &[[T; LANES]; R],
+    number: impl Fn(T) -> F::Number,
 ) {
     // By number: zipped iterators are not vectorised.
     for lane in 0..LANES {
@@ -369,20 +452,15 @@ fn add_rows<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool
         // Kept in registers until all rows are added.
         let mut both = (*sum, *squares);
         for element in rows.iter().filter_map(|row| row.get(lane)) {
-            add_one::<N, F, SPECIAL, FUSED>(&mut both.0, &mut both.1, *element);
+            add_one::<N, F, FUSED>(&mut both.0, &mut both.1, number(*element));
         }
         (*sum, *squares) = both;
     }
 }
 
 #[inline(always)]
-fn add_one<const N: usize, F: Format<N>, const SPECIAL: bool, const FUSED: bool>(
-    sum: &mut f64,
-    squares: &mut f64,
-    element: [u8; N],
-) {
-    let word = F::Word::read(element);
-    let number = if SPECIAL && F::special(word) { 0.0 } else { F::number(word) };
+fn add_one<const N: usize, F: Format<N>, const FUSED: bool>(sum: &mut f64, squares: &mut f64, number: F::Number) {
+    let number: f64 = number.into();
     *sum += number;
     // An exact square is rounded with the sum alone, so both are the same on every processor.
     *squares =

@@ -9,6 +9,14 @@ use super::super::formats::Small;
 /// Codes whose sums are kept in 32 bits: the square of a multiple is at most 1920².
 const RUN: usize = 1024;
 
+/// The class of the first elements of a block, if they are of one: most likely that of all.
+#[inline(always)]
+pub(super) fn class_of_first(layout: Small, codes: &[u8]) -> Option<u32> {
+    let first = codes.iter().take(64);
+    let (any, all) = first.fold((0, 0xff), |(any, all), code| (any | code, all & code));
+    class(layout, any.into(), all.into())
+}
+
 /// The class of all elements of a block, from the bits that any and that all of them have; `None` for more than one.
 #[inline(always)]
 pub(super) fn class(layout: Small, any: u64, all: u64) -> Option<u32> {

@@ -33,7 +33,8 @@ fn defined(code: u32, exponent: u32, fraction: u32, bias: i32) -> f64 {
 fn codes_are_the_numbers_of_their_definitions() {
     for code in 0..=0xff_u8 {
         let at = u32::from(code);
-        let same = |number: f64, exponent, fraction, bias| {
+        let same = |number: f32, exponent, fraction, bias| {
+            let number = f64::from(number);
             assert_eq!(number, defined(at, exponent, fraction, bias), "{code:#x} {exponent} {fraction}");
         };
         same(F8E4M3::number(code), 4, 3, 7);
@@ -43,12 +44,12 @@ fn codes_are_the_numbers_of_their_definitions() {
         assert_eq!(F8E8M0::number(code), (f64::from(code) - 127.0).exp2());
     }
     for code in 0..0x40_u8 {
-        assert_eq!(F6E2M3::number(code), defined(code.into(), 2, 3, 1));
-        assert_eq!(F6E3M2::number(code), defined(code.into(), 3, 2, 3));
-        assert_eq!(F4::number(code & 0xf), defined((code & 0xf).into(), 2, 1, 1));
+        assert_eq!(f64::from(F6E2M3::number(code)), defined(code.into(), 2, 3, 1));
+        assert_eq!(f64::from(F6E3M2::number(code)), defined(code.into(), 3, 2, 3));
+        assert_eq!(f64::from(F4::number(code & 0xf)), defined((code & 0xf).into(), 2, 1, 1));
     }
     for code in (0..=0xffff_u16).filter(|code| !F16::special(*code)) {
-        assert_eq!(F16::number(code).to_bits(), half::f16::from_bits(code).to_f64().to_bits());
+        assert_eq!(f64::from(F16::number(code)).to_bits(), half::f16::from_bits(code).to_f64().to_bits());
     }
 }
 
@@ -121,7 +122,7 @@ fn each_type_has_its_own_patterns() {
 /// Keys of all elements of a type, in the order of their numbers.
 fn ordered<const N: usize, F: Format<N>>(words: impl Iterator<Item = F::Word>) {
     let mut elements: Vec<(f64, F::Word)> =
-        words.filter(|word| !F::special(*word)).map(|word| (F::number(word), word)).collect();
+        words.filter(|word| !F::special(*word)).map(|word| (F::number(word).into(), word)).collect();
     elements.sort_by(|one, other| one.0.total_cmp(&other.0));
     let keys: Vec<_> = elements.iter().map(|(_, word)| F::key(*word)).collect();
     assert!(keys.is_sorted());
@@ -184,7 +185,7 @@ fn counted<const N: usize, F: Format<N>>(dtype: Dtype, bytes: &[u8]) -> Tally {
             tally.first = tally.first.or(Some(as_u64(at)));
             continue;
         }
-        let number = F::number(word);
+        let number: f64 = F::number(word).into();
         sums.denormals += u64::from(F::denormal(word));
         sums.min = if number.total_cmp(&sums.min).is_lt() { number } else { sums.min };
         sums.max = if number.total_cmp(&sums.max).is_gt() { number } else { sums.max };
@@ -212,11 +213,14 @@ fn compared<const N: usize, F: Format<N>>(dtype: Dtype, high: u8, exact: fn(&str
     let mut mixed = bits(0x87, 0x30);
     mixed[BLOCK + 40..BLOCK + 60].fill(0xff);
     mixed[2 * BLOCK..2 * BLOCK + 2 * N].fill(high);
+    let mut later = bits(0x9f, 0x20);
+    later[BLOCK + 100 * N + N - 1] = 0x50;
     let kinds = [
         ("random", bits(0xff, 0)),
         ("lowest exponents", bits(0x83, 0)),
         ("around one", bits(0x83, 0x3c)),
         ("one class", bits(0x9f, 0x20)),
+        ("another class later", later),
         ("lower half", bits(0xbf, 0)),
         ("upper half", bits(0x9b, 0x40)),
         ("zeros", bits(0, 0).into_iter().map(|_| 0).collect()),
@@ -258,7 +262,7 @@ fn compared<const N: usize, F: Format<N>>(dtype: Dtype, high: u8, exact: fn(&str
 fn small_floats_are_counted_as_a_loop_counts_them() {
     compared::<1, F8E4M3>(Dtype::F8_E4M3, 0x7f, |_| true);
     compared::<1, F8E4M3Fnuz>(Dtype::F8_E4M3FNUZ, 0x80, |_| true);
-    let one_class = |kind: &str| !["random", "lower half", "upper half"].contains(&kind);
+    let one_class = |kind: &str| !["random", "lower half", "upper half", "another class later"].contains(&kind);
     compared::<1, F8E5M2>(Dtype::F8_E5M2, 0x7c, one_class);
     compared::<1, F8E5M2Fnuz>(Dtype::F8_E5M2FNUZ, 0x80, one_class);
     compared::<2, F16>(Dtype::F16, 0x7c, |kind| ["zeros", "negative", "no finite element"].contains(&kind));
@@ -293,19 +297,29 @@ fn integers_and_floats_have_the_same_sums() {
     same::<F8E5M2Fnuz>();
 }
 
-/// What is counted of elements of four bits in pairs is what is counted of them one by one.
+/// What is counted of packed elements without sums is what is counted of them one by one.
 #[test]
-fn pairs_are_counted_as_their_elements() {
+fn packed_elements_are_counted_as_single_ones() {
     let random = bytes(6);
-    let constant = |byte: u8| vec![byte; BLOCK + 100];
-    let mut late = constant(0x22);
-    late[BLOCK + 50] = 0x12;
-    for bytes in [&random, &constant(0), &constant(0x88), &constant(0x80), &constant(0x08), &constant(0x55), &late] {
-        for len in [0, 1, 31, 65, BLOCK, BLOCK + 51, bytes.len()] {
-            let bytes = &bytes[..len.min(bytes.len())];
-            let mut pairs = Tally::new(Dtype::F4, false);
-            pairs.add(bytes);
-            assert_eq!(pairs, Tally { sums: None, ..tally(Dtype::F4, bytes) }, "{len}");
+    let constant = |bytes: [u8; 3]| bytes.into_iter().cycle().take(BLOCK + 99).collect::<Vec<u8>>();
+    // Of six bits: signs only, ones only, and magnitudes of a single bit in the first and in the last element.
+    let sixes = [[0x20, 0x08, 0x82], [0x41, 0x10, 0x04], [0x01, 0, 0], [0, 0, 0x40]];
+    let mut all: Vec<Vec<u8>> =
+        [0, 0x88, 0x80, 0x08, 0x55, 0x22].map(|byte| [byte; 3]).into_iter().chain(sixes).map(constant).collect();
+    for late in [1, 25, BLOCK - 3, BLOCK - 1, BLOCK + 50] {
+        let mut bytes = constant([0; 3]);
+        bytes[late] = 0x10;
+        all.push(bytes);
+    }
+    all.push(random);
+    for dtype in [Dtype::F4, Dtype::F6_E2M3, Dtype::F6_E3M2] {
+        for (kind, bytes) in all.iter().enumerate() {
+            for len in [0, 3, 21, 24, 27, 48, 66, BLOCK, BLOCK + 51, bytes.len()] {
+                let bytes = &bytes[..len.min(bytes.len())];
+                let mut packed = Tally::new(dtype, false);
+                packed.add(bytes);
+                assert_eq!(packed, Tally { sums: None, ..tally(dtype, bytes) }, "{dtype} {kind} {len}");
+            }
         }
     }
 }
