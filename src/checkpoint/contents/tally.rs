@@ -33,6 +33,15 @@ const LANES: usize = 64;
 /// Numbers that are added to a lane between reading and writing its sums. With many more, the loop is not vectorised.
 const ROWS: usize = 4;
 
+/// Bytes of a lane that are counted between reading and writing its counter.
+const BYTE_ROWS: usize = 8;
+
+/// Bytes of a lane that a counter of eight bits is wide enough for.
+const PART_ROWS: usize = 96;
+
+// A byte has at most two elements.
+const _: () = assert!(PART_ROWS <= (u8::MAX / 2) as usize);
+
 /// What a tensor, or a part of it, contains.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::checkpoint) struct Tally {
@@ -231,7 +240,7 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
     let Some(start) = elements.first() else { return false };
     let start = F::Word::read(*start);
     let (mut differs, mut any, mut all, mut special) = (F::Word::ZERO, F::Word::ZERO, start, false);
-    let (mut zeros, mut denormals) = (Count::<N, F>::default(), Count::<N, F>::default());
+    let mut zeros = Count::<N, F>::default();
     // The first loop waits for the memory, so it is the one with the most work. What it adds up is right unless an element is
     // special, or of another class than the first ones.
     let class = F::SMALL.and_then(|layout| small::class_of_first(layout, elements.as_flattened()));
@@ -245,15 +254,14 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
         differs = differs | (word ^ start);
         any = any | word;
         all = all & word;
-        zeros = F::Word::plus(zeros, F::zero(word));
+        // Those of one byte are counted faster by themselves.
+        if N > 1 {
+            zeros = F::Word::plus(zeros, F::zero(word));
+        }
         special |= F::special(word);
     }
-    if tally.sums.is_some() {
-        for element in elements {
-            denormals = F::Word::plus(denormals, F::denormal(F::Word::read(*element)));
-        }
-    }
-    tally.zeros = tally.zeros.saturating_add(zeros.into());
+    let zeros = if N > 1 { zeros.into() } else { count::<N, F>(elements, F::zero) };
+    tally.zeros = tally.zeros.saturating_add(zeros);
     if special {
         specials::<N, F>(tally, elements);
     }
@@ -271,9 +279,47 @@ fn add<const N: usize, F: Format<N>, const FUSED: bool>(tally: &mut Tally, bytes
         } else {
             early
         };
-        sums.add(&Sums { min, max, sum, squares, denormals: denormals.into() });
+        let denormals = count::<N, F>(elements, F::denormal);
+        sums.add(&Sums { min, max, sum, squares, denormals });
     }
     any != F::Word::ZERO
+}
+
+/// The elements of a block for which a condition holds.
+#[inline(always)]
+fn count<const N: usize, F: Format<N>>(elements: &[[u8; N]], holds: impl Fn(F::Word) -> bool) -> u64 {
+    if N == 1 {
+        return count_bytes(elements.as_flattened(), |byte| holds(F::Word::read([byte; N])).into());
+    }
+    let mut found = Count::<N, F>::default();
+    for element in elements {
+        found = F::Word::plus(found, holds(F::Word::read(*element)));
+    }
+    found.into()
+}
+
+/// The sum of `found`, which is at most 2, over the bytes of a block.
+#[inline(always)]
+fn count_bytes(bytes: &[u8], found: impl Fn(u8) -> u8) -> u64 {
+    let mut all = 0_u64;
+    for part in bytes.chunks(PART_ROWS * LANES) {
+        let mut counters = [0_u8; LANES];
+        let (rows, rest) = part.as_chunks::<LANES>();
+        let (groups, last) = rows.as_chunks::<BYTE_ROWS>();
+        for group in groups {
+            // By number, as in `add_rows`.
+            for lane in 0..LANES {
+                let Some(counter) = counters.get_mut(lane) else { continue };
+                let bytes = group.iter().filter_map(|row| row.get(lane));
+                *counter = bytes.fold(*counter, |sum, byte| sum.wrapping_add(found(*byte)));
+            }
+        }
+        // Two sums: one over both is not vectorised.
+        let counted: u64 = counters.iter().map(|counter| u64::from(*counter)).sum();
+        let rest: u64 = last.as_flattened().iter().chain(rest).map(|byte| u64::from(found(*byte))).sum();
+        all = all.saturating_add(counted).saturating_add(rest);
+    }
+    all
 }
 
 /// Counts one block of elements of four bits, two in a byte, without taking them apart: there are no sums, and none is NaN or
@@ -284,14 +330,13 @@ fn pairs(tally: &mut Tally, bytes: &[u8]) -> bool {
     // The lower half is the first element.
     let start = first & 0xf;
     let same = start << 4 | start;
-    let (mut differs, mut any, mut zeros) = (0_u8, 0_u8, 0_u16);
+    let (mut differs, mut any) = (0_u8, 0_u8);
     for pair in bytes {
         differs |= pair ^ same;
         any |= pair;
-        let of_pair = u8::from(pair & 0x07 == 0).wrapping_add((pair & 0x70 == 0).into());
-        zeros = zeros.wrapping_add(of_pair.into());
     }
-    tally.zeros = tally.zeros.saturating_add(zeros.into());
+    let zeros = count_bytes(bytes, |pair| u8::from(pair & 0x07 == 0).wrapping_add((pair & 0x70 == 0).into()));
+    tally.zeros = tally.zeros.saturating_add(zeros);
     tally.varies |= differs != 0 || tally.value.is_some_and(|value| value != u64::from(start));
     tally.value = tally.value.or(Some(start.into()));
     tally.elements = tally.elements.saturating_add(as_u64(bytes.len()).saturating_mul(2));
@@ -353,13 +398,7 @@ impl Eights {
 /// Counts the NaN and infinities of a block that has some. Called before its elements are counted.
 #[inline(always)]
 fn specials<const N: usize, F: Format<N>>(tally: &mut Tally, elements: &[[u8; N]]) {
-    let (mut special, mut infinite) = (Count::<N, F>::default(), Count::<N, F>::default());
-    for element in elements {
-        let word = F::Word::read(*element);
-        special = F::Word::plus(special, F::special(word));
-        infinite = F::Word::plus(infinite, F::infinite(word));
-    }
-    let (special, infinite): (u64, u64) = (special.into(), infinite.into());
+    let (special, infinite) = (count::<N, F>(elements, F::special), count::<N, F>(elements, F::infinite));
     tally.nan = tally.nan.saturating_add(special.saturating_sub(infinite));
     tally.infinite = tally.infinite.saturating_add(infinite);
     if tally.first.is_none() {
