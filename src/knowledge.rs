@@ -31,6 +31,7 @@ pub mod statistics;
 pub mod text_classes;
 pub mod tokenizer_parts;
 pub mod tokenizers;
+pub mod wrappers;
 
 use std::sync::LazyLock;
 
@@ -61,6 +62,7 @@ use statistics::StatisticsPlaces;
 use text_classes::TextTypes;
 use tokenizer_parts::TokenizerPart;
 use tokenizers::TokenizerClasses;
+use wrappers::Wrappers;
 
 /// Built-in data, parsed when it is first used: a check of one model needs a few of the tables.
 pub type Table<T> = LazyLock<T>;
@@ -117,6 +119,8 @@ pub struct Knowledge {
     pub text_types: Table<TextTypes>,
     /// Factors of classes on embeddings and image features.
     pub scales: Table<Scales>,
+    /// Parts of tensor names that wrappers add.
+    pub wrappers: Table<Wrappers>,
     /// Severities and suppressions of a settings file for single findings.
     pub policy: Policy,
 }
@@ -161,6 +165,7 @@ impl Knowledge {
         LazyLock::force(&self.tokenizers);
         LazyLock::force(&self.text_types);
         LazyLock::force(&self.scales);
+        LazyLock::force(&self.wrappers);
     }
 
     /// The built-in data files.
@@ -195,6 +200,7 @@ impl Knowledge {
             tokenizers: table!(TokenizerClasses::embedded),
             text_types: table!(TextTypes::embedded),
             scales: table!(Scales::embedded),
+            wrappers: table!(Wrappers::embedded),
             policy: Policy::default(),
         }
     }

@@ -10,6 +10,7 @@ mod rename;
 mod report;
 mod stored;
 mod target;
+mod unwrapped;
 mod v4;
 mod v4_57;
 mod v5;

@@ -5,6 +5,7 @@
 
 mod draft;
 mod planner;
+mod unused;
 
 use std::sync::Arc;
 

@@ -4,6 +4,7 @@ mod cli;
 mod edits;
 mod journal;
 mod sarif;
+mod wrapped;
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -230,6 +230,7 @@ fn the_page_of_data_files_is_fresh() {
          | `directories.json5` | kinds of directories that other programs open, or none, with what to do |\n\
          | `statistics.json5` | where policies of robots keep their statistics |\n\
          | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
+         | `wrappers.json5` | parts of tensor names that wrappers such as torch.compile add |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\
          | `expressions.txt` | the expressions of all these files, parsed; written by `CKPT_DOCTOR_WRITE=1 cargo test --lib` |\n\n\

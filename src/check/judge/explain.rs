@@ -45,7 +45,7 @@ fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> Explained
     let Some(report) = report.as_ref().filter(|_| is_searched) else {
         return ExplainedLoad { prediction, prefixes: Vec::new(), explanation: None };
     };
-    let moved = load::moved(*architecture, inputs.config, expected, inputs.stored, report);
+    let moved = load::moved(&inputs.knowledge.wrappers, *architecture, inputs.config, expected, inputs.stored, report);
     // Tensors under another prefix load nowhere, but their shapes still imply config values.
     let (class, stored, moved_report) =
         moved.as_ref().map_or((expected, inputs.stored, report), |m| (&m.expected, &m.stored, &m.report));

@@ -2,7 +2,8 @@
 //!
 //! `torch.compile` puts `_orig_mod.` before every name, `DataParallel` and `DeepSpeed` `module.`, a class that holds the
 //! model in an attribute that attribute's name. A loader reports every tensor twice then, as missing and as unexpected.
-//! Which prefix stands for which is read off the names themselves; nothing here knows any of them.
+//! First the stored names lose what wrappers add ([`Unwrapped`]); which prefix stands for which of the class's is then read off
+//! the names themselves.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,9 +11,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 
 use super::LoadReport;
+use super::unwrapped::Unwrapped;
 use super::wrapped::Wrapped;
 use super::{Stored, build, predict, with_names};
 use crate::checkpoint::{Fault, FaultKind};
+use crate::knowledge::wrappers::Wrappers;
 use crate::knowledge::{Architecture, Expected};
 
 /// Stored names from which prefixes are guessed.
@@ -40,6 +43,7 @@ pub struct Moved {
 /// Finds prefixes under which tensors of the class lie, and parts of their names that wrappers added; `None` when there are none, or renaming does not help.
 #[must_use]
 pub fn moved(
+    wrappers: &Wrappers,
     architecture: Architecture<'_>,
     config: &Value,
     expected: &Expected,
@@ -48,9 +52,21 @@ pub fn moved(
 ) -> Option<Moved> {
     let mut found =
         Moved { stored: stored.clone(), expected: expected.clone(), report: report.clone(), faults: Vec::new() };
+    if is_listed(report)
+        && let Some(unwrapped) = Unwrapped::find(wrappers, expected, stored, report)
+    {
+        found.faults.push(unwrapped.fault());
+        found.report = unwrapped.report;
+        found.stored = unwrapped.stored;
+        if architecture.reads_tensors()
+            && let Ok(expected) = build(architecture, config, &found.stored)
+        {
+            found.report = predict(&expected, &found.stored);
+            found.expected = expected;
+        }
+    }
     for _ in 0..ROUNDS {
-        let listed = !found.report.missing.is_empty() && !found.report.unexpected.is_empty();
-        if !listed && found.report.raises.is_none() {
+        if !is_listed(&found.report) {
             break;
         }
         let step = best(&found.expected, &found.stored);
@@ -91,6 +107,11 @@ pub fn moved(
         found.report = report;
     }
     (!found.faults.is_empty()).then_some(found)
+}
+
+/// Whether a report lists tensors twice, as missing and as unexpected, or nothing because the loader raised.
+const fn is_listed(report: &LoadReport) -> bool {
+    (!report.missing.is_empty() && !report.unexpected.is_empty()) || report.raises.is_some()
 }
 
 fn size(report: &LoadReport) -> usize {

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use super::draft::{Made, RepairDraft};
+use super::unused::left_unused;
 use super::{Change, Content, Fixed, Repair, Withdrawn};
 use crate::check::{Edit, Finding, Outcome, Severity};
 use crate::checkpoint::Checkpoint;
@@ -122,7 +123,10 @@ impl Planner<'_> {
 fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<String> {
     // Of several findings of one rule, some may be fixed and others remain: the next round handles the rest.
     let stays = |f: &&Finding| count(after, |g| g.code == f.code) >= count(before, |g| g.code == f.code);
-    worse(before, after).or_else(|| made.iter().find(stays).map(|_| "the finding would remain".to_owned()))
+    let unused = || left_unused(before, after).map(|name| format!("{name} would stay in the file, unused"));
+    worse(before, after)
+        .or_else(|| made.iter().find(stays).map(|_| "the finding would remain".to_owned()))
+        .or_else(unused)
 }
 
 /// Number of findings of a kind, including those that are only counted.
