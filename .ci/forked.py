@@ -20,6 +20,7 @@ import time
 # Variables that are read while transformers is imported: an environment is one of these values, and has a server of its own.
 FIXED = ("PYTHONPATH", "HF_HUB_OFFLINE", "PYTHONHASHSEED")
 WAIT = 120  # seconds for the imports, on a busy machine
+IDLE = 1800  # seconds without a request, after which a server of a killed run ends
 
 
 def interpreter(arguments):
@@ -53,6 +54,8 @@ def connect(place):
             return server
         except OSError:
             server.close()
+        if os.path.exists(place + ".failed"):
+            return None
         try:
             os.close(os.open(place + ".lock", os.O_CREAT | os.O_EXCL))
         except FileExistsError:
@@ -82,17 +85,22 @@ def serve(place):
     os.rename(place + ".new", place)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listener.settimeout(2)
-    while os.path.exists(place):
+    last = time.monotonic()
+    while os.path.exists(place) and time.monotonic() - last < IDLE:
         try:
             connection, _ = listener.accept()
         except TimeoutError:
             continue
+        last = time.monotonic()
         connection.setblocking(True)
         if os.fork() == 0:
             listener.close()
             supervise(connection)
         connection.close()
     shutil.rmtree(modules, ignore_errors=True)
+    for path in (place, place + ".lock"):
+        if os.path.exists(path):
+            os.unlink(path)
 
 
 def supervise(connection):
@@ -146,7 +154,7 @@ def run(arguments, folder, environment, descriptors):
     os.environ.clear()
     os.environ.update(environment)
     sys.argv, sys.executable = arguments, environment["CKPT_DOCTOR_FORKED"]
-    sys.path[0] = os.path.dirname(os.path.abspath(arguments[0]))
+    sys.path.insert(0, os.path.dirname(os.path.abspath(arguments[0])))
     sys.stdin, sys.stdout, sys.stderr = (os.fdopen(n, mode, closefd=False) for n, mode in enumerate(("r", "w", "w")))
     sys.stderr.reconfigure(line_buffering=True)
     levels = {"debug": 10, "info": 20, "warning": 30, "error": 40, "critical": 50}
@@ -175,5 +183,10 @@ def run(arguments, folder, environment, descriptors):
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--serve"]:
-        serve(sys.argv[2])
+        del sys.path[0]  # this folder, whose modules are none of a script's
+        try:
+            serve(sys.argv[2])
+        except ImportError:
+            open(sys.argv[2] + ".failed", "w").close()
+            raise
     client(sys.argv[1:])

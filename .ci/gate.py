@@ -371,6 +371,7 @@ def main():
         return
     seed = f"{datetime.date.today():%Y%m%d}" if args.tier == "deep" else "1"
     again = args.again or args.tier == "deep" or bool(args.words)
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     run = Run(steps, args.tier, seed, again)
     print(f"{len(steps)} steps of the tier {args.tier}, seed {seed}", flush=True)
     try:
