@@ -4,6 +4,7 @@
 //! nothing is written before the stage `write`. This stage combines checks, plans, writes and reports; it is the only
 //! one above `report`.
 
+mod alike;
 mod card;
 mod choice;
 mod context;
@@ -23,6 +24,7 @@ mod options;
 mod parts;
 mod plan;
 mod publish;
+mod quantised;
 mod recipe_file;
 mod record;
 mod run;
@@ -99,6 +101,7 @@ pub fn run(
     run.note("recipe", &format!("{}: {}", recipe.recipe, recipe.summary));
 
     choice::check_architectures(recipe, &run)?;
+    quantised::check(recipe, &donors, &knowledge.schemes)?;
     let draft = plan::plan(recipe, &donors, &options, &request.versions, knowledge)?;
     run.record_draft(&draft);
     if !draft.seams.is_empty() {

@@ -21,7 +21,7 @@ use module::{TensorLookup, kind};
 use shapes::{ModuleShapes, ModuleState, QuantizedModule, plain_of};
 use skipped::SkippedModules;
 
-pub use config::undeclared;
+pub use config::{signature, undeclared};
 
 /// Faults of the declared scheme and of the tensors that it covers.
 #[must_use]

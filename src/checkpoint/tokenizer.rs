@@ -72,6 +72,26 @@ pub struct AddedToken {
     pub content: String,
 }
 
+/// How the vocabularies of two tokenizers compare.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Comparison {
+    /// One of them was not read.
+    Unknown,
+    /// Every token has the same id in both.
+    Equal,
+    /// Tokens have other ids, or are in one of them only.
+    Different {
+        /// The first of these tokens, by its id.
+        token: String,
+        /// Its id in the first tokenizer.
+        own: Option<u64>,
+        /// Its id in the other one.
+        others: Option<u64>,
+        /// The number of these tokens.
+        count: usize,
+    },
+}
+
 /// Facts about a tokenizer.
 #[derive(Debug, Clone, Default)]
 pub struct Tokenizer {
@@ -245,6 +265,32 @@ impl Tokenizer {
     #[must_use]
     pub fn id_of(&self, token: &str) -> Option<u64> {
         self.added.get(token).copied().or_else(|| self.base()?.id_of(token))
+    }
+
+    /// Compares the ids of all tokens with those of another tokenizer. Called before a part of a model is put into another one.
+    #[must_use]
+    pub fn compare(&self, other: &Self) -> Comparison {
+        let (Some(base), Some(other_base)) = (self.base(), other.base()) else { return Comparison::Unknown };
+        // Classes for these files shift ids, so that they compare with each other alone.
+        let shifts = |one: &Self| matches!(one.source.as_deref(), Some("spiece.model" | "sentencepiece.bpe.model"));
+        if self.source != other.source && (shifts(self) || shifts(other)) {
+            return Comparison::Unknown;
+        }
+        let of = |base: &Vocabulary, added: &BTreeMap<String, u64>| -> BTreeSet<String> {
+            let apart = |token: &&str| self.id_of(token) != other.id_of(token);
+            base.iter()
+                .map(|(token, _)| token)
+                .chain(added.keys().map(String::as_str))
+                .filter(apart)
+                .map(str::to_owned)
+                .collect()
+        };
+        let mut tokens = of(base, &self.added);
+        tokens.append(&mut of(other_base, &other.added));
+        let ids = |token: String| (self.id_of(&token), other.id_of(&token), token);
+        let count = tokens.len();
+        let first = tokens.into_iter().map(ids).min_by_key(|(own, others, _)| own.or(*others));
+        first.map_or(Comparison::Equal, |(own, others, token)| Comparison::Different { token, own, others, count })
     }
 
     /// Whether the tokenizer contains this token.

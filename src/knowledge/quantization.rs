@@ -5,6 +5,7 @@
 
 mod applied;
 mod declared;
+mod stated;
 
 use serde::Deserialize;
 
@@ -14,6 +15,7 @@ use super::source::{self, DataError};
 
 pub use applied::{AppliedScheme, Shapes};
 pub use declared::{DeclaredScheme, block, declared_scheme};
+pub use stated::stated;
 
 /// A quantisation scheme, as read from its file in `rules/quantization/`.
 ///

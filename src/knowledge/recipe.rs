@@ -52,6 +52,9 @@ pub struct Recipe {
     /// Processor and tokenizer of the result; `tokens` then holds the ids of the tokens that the processor adds.
     #[serde(default)]
     pub tokens: Option<TokenSpec>,
+    /// A part that must be of the kind of the one whose place it takes, because the model keeps its class and its tokenizer.
+    #[serde(default)]
+    pub alike: Option<AlikeSpec>,
     /// Conditions that the donors must meet before the merge is planned.
     #[serde(default)]
     pub seams: Vec<SeamSpec>,
@@ -205,6 +208,39 @@ pub struct TokenSpec {
     /// Role of the donor whose processor needs the tokens, instead of `processor`: `rules/parts/` names them.
     #[serde(default)]
     pub of: Option<String>,
+}
+
+/// A part that must have the model type, the vocabulary and the special tokens of the part whose place it takes. Any other part
+/// stops the merge.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct AlikeSpec {
+    /// Name of the part.
+    pub part: Template,
+    /// Role of the donor that has the new part.
+    pub from: String,
+    /// Role of the donor whose part it replaces.
+    pub into: String,
+    /// Names of the parts that are trained with a tokenizer; the model type of any part is compared.
+    #[serde(default)]
+    pub reads_text: Vec<String>,
+    /// Recipes that exchange a part of another kind, for the error.
+    #[serde(default)]
+    pub otherwise: Vec<Exchange>,
+}
+
+/// A recipe that exchanges a part.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Exchange {
+    /// Name of the part.
+    pub part: String,
+    /// Name of the recipe.
+    pub recipe: String,
+    /// Its roles, each with the role of this recipe that has the donor.
+    pub roles: BTreeMap<String, String>,
 }
 
 /// A condition that the donors must meet.

@@ -108,6 +108,11 @@ impl<'a> PartOf<'a> {
         })
     }
 
+    /// The donor that has the part.
+    pub(super) const fn donor(self) -> &'a Donor {
+        self.donor
+    }
+
     /// The config of the part as written; `None` for a part without one.
     pub(super) fn stored(self) -> Option<(&'a str, &'a Map<String, Value>)> {
         let config = self.donor.checkpoint.document("config.json")?.value.as_ref()?;

@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::context::{Context, Donor, Options};
 use super::draft::MergeDraft;
 use super::error::MergeError;
-use super::{documents, files, options, parts, tensors};
+use super::{alike, documents, files, options, parts, tensors};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::Seam;
@@ -25,6 +25,7 @@ pub(super) fn plan(
 ) -> Result<MergeDraft, MergeError> {
     let context = Context::new(recipe, donors, options, versions, knowledge)?;
     let mut draft = MergeDraft::default();
+    draft.notes.extend(alike::check(&context)?);
     for (i, seam) in recipe.seams.iter().enumerate() {
         let place = format!("seam {}", i.saturating_add(1));
         if seam.that.eval_bool(&context.scope).map_err(context.at(place.as_str()))? {

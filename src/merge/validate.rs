@@ -40,6 +40,7 @@ pub fn validate(recipe: &Recipe, path: &str, text: &str, knowledge: &Knowledge) 
     validator.roles()?;
     validator.options()?;
     validator.tokens()?;
+    validator.alike()?;
     validator.tensors()?;
     validator.files()?;
     validator.expressions()
@@ -179,6 +180,21 @@ impl Validator<'_> {
         };
         let known: Vec<&str> = self.knowledge.processors.iter().map(|p| p.processor.as_str()).collect();
         self.known("processor", "processor", processor, &known)
+    }
+
+    fn alike(&self) -> Result<(), DataError> {
+        let Some(alike) = &self.recipe.alike else { return Ok(()) };
+        self.role("from", &alike.from)?;
+        self.role("into", &alike.into)?;
+        for part in alike.reads_text.iter().chain(alike.otherwise.iter().map(|exchange| &exchange.part)) {
+            self.part("alike", part)?;
+        }
+        let recipes: Vec<&str> = self.knowledge.recipes.iter().map(|recipe| recipe.recipe.as_str()).collect();
+        for exchange in &alike.otherwise {
+            self.known("recipe", "recipe", &exchange.recipe, &recipes)?;
+            exchange.roles.values().try_for_each(|role| self.role("roles", role))?;
+        }
+        Ok(())
     }
 
     fn tensors(&self) -> Result<(), DataError> {

@@ -1,5 +1,6 @@
 //! `build-merged` from the outside: what it writes, what it refuses, and unchanged donors.
 
+mod foreign;
 mod law;
 mod parts;
 mod recipes;

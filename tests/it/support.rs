@@ -55,10 +55,10 @@ pub struct Case {
     #[serde(skip)]
     pub code: Option<String>,
     /// One of [`BASES`].
-    base: String,
+    pub base: String,
     /// Changes, in order.
     #[serde(default)]
-    changes: Vec<Change>,
+    pub changes: Vec<Change>,
     /// Whether to read the bytes of tensors and files, as `check --deep --hash` does; always for sound cases.
     #[serde(default)]
     pub deep: bool,

@@ -54,11 +54,21 @@ pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
     faults
 }
 
+/// The scheme whose tensors have these names, with a module that has all of them. Called where a config declares no scheme, and
+/// for donors of merges.
+#[must_use]
+pub fn signature<'k, 'n>(
+    schemes: &'k [Scheme],
+    names: impl IntoIterator<Item = &'n str>,
+) -> Option<(&'k Scheme, &'n str)> {
+    let names: BTreeSet<&str> = names.into_iter().collect();
+    module::signature(schemes, &names)
+}
+
 /// The fault of tensors with the endings of a scheme, under a config that declares none.
 #[must_use]
 pub fn undeclared<'n>(schemes: &[Scheme], names: impl IntoIterator<Item = &'n str>) -> Option<Fault> {
-    let names: BTreeSet<&str> = names.into_iter().collect();
-    let (scheme, module) = module::signature(schemes, &names)?;
+    let (scheme, module) = signature(schemes, names)?;
     let carrier = scheme.endings().next().unwrap_or_default();
     let at = Place::tensor(format!("{module}{carrier}"));
     Some(

@@ -52,6 +52,7 @@ impl Validator<'_> {
     ) -> Result<(), DataError> {
         let some = |key, expression: Option<&'e Expression>| expression.map_or(Ok(()), |e| check(key, e));
         let template = |key, text: &'e Template| text.expressions().try_for_each(|e| check(key, e));
+        self.recipe.alike.as_ref().map_or(Ok(()), |alike| template("part", &alike.part))?;
         for seam in &self.recipe.seams {
             check("that", &seam.that)?;
             template("message", &seam.message)?;
