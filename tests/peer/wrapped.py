@@ -243,7 +243,17 @@ def apart(one, other):
 
 def repaired(folder, version, unsafe):
     """What the program says after its fixes: exit code, verdict on the model, codes of the fixes."""
-    args = [PROGRAM, "check", folder, "--for", version, "--fix", "--output-format", "json", *(["--unsafe-fixes"] if unsafe else [])]
+    args = [
+        PROGRAM,
+        "check",
+        folder,
+        "--for",
+        version,
+        "--fix",
+        "--output-format",
+        "json",
+        *(["--unsafe-fixes"] if unsafe else []),
+    ]
     done = subprocess.run(args, capture_output=True, text=True)
     entry = json.loads(done.stdout)["checkpoints"][0]
     (load,) = entry["loads"]
@@ -260,7 +270,15 @@ def told_of(cls, folder, version, unsafe, sound):
     is_good = code == 0 and verdict == "loads"
     is_equal = far == 0 and not wrong
     result = "equal" if is_equal and is_good else "unsaid" if is_equal else "WRONG" if is_good else "refused"
-    return {"result": result, "far": far, "wrong": [str(w) for w in wrong[:3]], "exit": code, "verdict": verdict, "fixed": fixed, "left": left}
+    return {
+        "result": result,
+        "far": far,
+        "wrong": [str(w) for w in wrong[:3]],
+        "exit": code,
+        "verdict": verdict,
+        "fixed": fixed,
+        "left": left,
+    }
 
 
 def worker(_, work, cells):
