@@ -7,6 +7,7 @@ pub mod directories;
 pub mod embeddings;
 pub mod evidence;
 pub mod expression;
+pub mod initial;
 pub mod library;
 pub mod loader;
 pub mod modules;
@@ -38,12 +39,14 @@ use std::sync::LazyLock;
 pub use architecture::{Architecture, Conversion, Doubt, Expected, ExpectedTensor, Refusal};
 pub use evidence::Evidence;
 pub use expression::{EvalError, Expression, Scope, Template};
+pub use initial::Initial;
 pub use library::Library;
 pub use loader::Loader;
 
 use classes::ClassNames;
 use directories::Directories;
 use embeddings::TokenEmbedding;
+use initial::InitialValues;
 use names::LoaderNames;
 use parts::ModelParts;
 use peft::PeftKeys;
@@ -87,6 +90,8 @@ pub struct Knowledge {
     pub processors: Table<Vec<Processor>>,
     /// Parts of models.
     pub parts: Table<Vec<ModelParts>>,
+    /// The values that classes give to new tensors.
+    pub initial: Table<InitialValues>,
     /// Recipes; a merge selects one by its donors.
     pub recipes: Table<Vec<Recipe>>,
     /// Quantisation schemes.
@@ -150,6 +155,7 @@ impl Knowledge {
         self.rules.read_all();
         LazyLock::force(&self.processors);
         LazyLock::force(&self.parts);
+        LazyLock::force(&self.initial);
         LazyLock::force(&self.recipes);
         LazyLock::force(&self.schemes);
         LazyLock::force(&self.names);
@@ -184,6 +190,7 @@ impl Knowledge {
             library,
             processors: table!(Processor::embedded),
             parts: table!(ModelParts::embedded),
+            initial: table!(InitialValues::embedded),
             recipes: table!(Recipe::embedded),
             schemes: table!(Scheme::embedded),
             names: table!(LoaderNames::embedded),

@@ -17,9 +17,11 @@ mod error;
 mod explain;
 mod file;
 mod files;
+mod fit;
 mod functions;
 mod hub;
 pub(crate) mod manifest;
+mod named;
 mod options;
 mod parts;
 mod plan;
@@ -126,7 +128,14 @@ pub fn run(
     let digests = manifest::donor_digests(&donors, &draft.plan, request.hash_donors)?;
     let total = draft.plan.len();
     let done = AtomicU64::new(0);
-    let recorded = Recorded { recipe, donors: &donors, digests: &digests, plan: &draft.plan, hash: request.hash };
+    let recorded = Recorded {
+        recipe,
+        donors: &donors,
+        digests: &digests,
+        plan: &draft.plan,
+        hash: request.hash,
+        changeable: &draft.changeable,
+    };
     let sizes = record::sizes(&run, &recorded);
     let mut record = |written: &[WrittenShard]| record::files(&mut run, &recorded, written);
     let leftover = apply(&draft.plan, &snapshots, &out, &sizes, &mut record, Writing::new(request.hash), &|bytes| {

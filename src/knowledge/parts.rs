@@ -48,6 +48,10 @@ pub struct Part {
     /// any, the part has no config.
     #[serde(default)]
     pub config: Vec<String>,
+    /// The part whose class builds this one, such as the tower of Qwen2-VL that ends in its projector: tensors of this part
+    /// belong to that one, too.
+    #[serde(default)]
+    pub within: Option<String>,
     /// Model types that the class builds in this place; any that Auto classes know when missing.
     #[serde(default)]
     pub takes: Option<Vec<String>>,
@@ -146,6 +150,13 @@ impl ModelParts {
         self.layouts.iter().rev().map(Layout::new)
     }
 
+    /// The parts that belong to a part as a whole: itself, and those that its class builds.
+    pub fn inside<'p>(&'p self, part: &'p str) -> impl Iterator<Item = &'p str> {
+        let built =
+            |(name, inner): (&'p String, &Part)| (inner.within.as_deref() == Some(part)).then_some(name.as_str());
+        std::iter::once(part).chain(self.parts.iter().filter_map(built))
+    }
+
     /// The layout that names most of these tensors; the first one when none names any.
     #[must_use]
     pub fn layout_of(&self, names: &[&str]) -> Option<Layout> {
@@ -182,6 +193,34 @@ impl Layout {
             let rest = stored.strip_prefix(start.as_str())?;
             Some((part.as_str(), format!("{inside}{rest}")))
         })
+    }
+
+    /// Whether a tensor belongs to a part and to no other: [`Self::locate`] without the name.
+    fn is_of(&self, stored: &str, parts: &[&str]) -> bool {
+        self.starts
+            .iter()
+            .find(|(_, _, start)| stored.starts_with(start.as_str()))
+            .is_some_and(|(part, ..)| parts.contains(&part.as_str()))
+    }
+
+    /// The name inside a part of a tensor of a checkpoint, also of one that belongs to one of the parts `built` by its class.
+    #[must_use]
+    pub fn inside(&self, part: &str, built: &[&str], stored: &str) -> Option<String> {
+        if !self.is_of(stored, built) {
+            return None;
+        }
+        let mut own = self.starts.iter().filter(|(of, ..)| of == part);
+        own.find_map(|(_, inside, start)| Some(format!("{inside}{}", stored.strip_prefix(start.as_str())?)))
+    }
+
+    /// The starts of names in a checkpoint of the parts, and those of other parts that begin with one of them.
+    #[must_use]
+    pub fn area(&self, parts: &[&str]) -> (Vec<String>, Vec<String>) {
+        let (own, others): (Vec<_>, Vec<_>) = self.starts.iter().partition(|(part, ..)| parts.contains(&part.as_str()));
+        let starts: Vec<String> = own.into_iter().map(|(_, _, start)| start.clone()).collect();
+        let inner = |start: &String| starts.iter().any(|own| start.starts_with(own.as_str()) && start != own);
+        let without = others.into_iter().map(|(_, _, start)| start.clone()).filter(inner).collect();
+        (starts, without)
     }
 
     /// The name in a checkpoint of a tensor inside a part; `None` when this layout has no place for it.

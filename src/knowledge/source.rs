@@ -42,14 +42,27 @@ impl DataError {
     /// An error in `file` at the first member `key` of `text` whose value is the string `word`, or else as [`Self::about`].
     #[must_use]
     pub fn about_value(file: &str, text: &str, key: &str, word: &str, reason: impl Into<String>) -> Self {
+        Self::about_nth_value(file, text, key, word, 0, reason)
+    }
+
+    /// As [`Self::about_value`], at a member with `before` of the same key and value before it.
+    #[must_use]
+    pub fn about_nth_value(
+        file: &str,
+        text: &str,
+        key: &str,
+        word: &str,
+        before: usize,
+        reason: impl Into<String>,
+    ) -> Self {
         let quoted = serde_json::to_string(word).unwrap_or_default();
         let spelled = quoted.get(1..quoted.len().saturating_sub(1)).unwrap_or_default();
         let member = || {
             let string = r#""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"#;
             let pattern = format!(r#"(?s)\b{}["']?\s*:\s*({string})"#, regex::escape(key));
             let members = regex::Regex::new(&pattern).ok()?;
-            let mut values = members.captures_iter(text).filter_map(|found| found.get(1));
-            let found = values.find(|value| json5::from_str(value.as_str()) == Ok(word.to_owned()))?;
+            let values = members.captures_iter(text).filter_map(|found| found.get(1));
+            let found = values.filter(|value| json5::from_str(value.as_str()) == Ok(word.to_owned())).nth(before)?;
             Some(line_column(text, found.start().saturating_add(1)))
         };
         let other = || Self::about(file, text, if text.contains(word) { word } else { spelled }, "").place;

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 
+use super::named::Changeable;
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
 use crate::checkpoint::{Checkpoint, Document, Entry, Parts, PythonModule, Vocabulary};
 use crate::report::model::{ChangedTensor, Dropped, MergedFile, Seam};
@@ -22,6 +23,8 @@ pub(super) struct MergeDraft {
     pub(super) changed: Vec<ChangedTensor>,
     /// Names of the tensors that must be trained.
     pub(super) train: BTreeSet<String>,
+    /// What the entries of the recipe may change.
+    pub(super) changeable: Changeable,
     /// Donor tensors that are not in the result.
     pub(super) dropped: Vec<Dropped>,
     /// Repairs of donor documents.

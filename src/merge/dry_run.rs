@@ -11,7 +11,7 @@ use super::manifest::DonorTensor;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::{ConfigChange, DryRun, MergedFile, PlannedShardSize, ToolInfo};
 use crate::surgery::free_space;
-use crate::surgery::plan::TensorTransform;
+use crate::surgery::plan::{NewValues, TensorTransform};
 
 /// A plan as JSON: every tensor of the result with its shard and its source.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -46,6 +46,9 @@ pub(crate) struct TensorPlan {
     /// Factor on all values.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
+    /// The values that it starts again with, for `reinit`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub values: Option<NewValues>,
     /// The donor tensor that it is made from, or that it replaces.
     pub source: DonorTensor,
 }
@@ -102,6 +105,7 @@ pub(super) fn document(draft: &MergeDraft, recipe: &Recipe) -> PlanDocument {
         shape: t.shape.clone(),
         transform: t.transform(),
         scale: t.source.scale,
+        values: t.source.values,
         source: DonorTensor::new(&t.source.from, None),
     });
     let file = |file: &MergedFile| PlannedFileOrigin { name: file.name.clone(), origin: file.origin.clone() };

@@ -8,6 +8,7 @@ use sha2::{Digest as _, Sha256};
 use super::CARD;
 use super::context::{Donor, Options};
 use super::hub::HubOrigin;
+use super::named::Changeable;
 use super::record::Recorded;
 use super::run::MergeRun;
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
@@ -17,7 +18,7 @@ use crate::knowledge::source;
 use crate::report::model::{ToolInfo, Training};
 use crate::surgery::ApplyError;
 use crate::surgery::donor::{digest_own, sha256};
-use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorRef, TensorTransform};
+use crate::surgery::plan::{NewValues, Plan, PlannedFile, RowSlice, TensorRef, TensorTransform};
 use crate::surgery::written::WrittenShard;
 
 /// File name in the merged directory.
@@ -30,7 +31,7 @@ pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct Manifest {
-    /// Version of this contract: 3.
+    /// Version of this contract: 4.
     pub schema: u32,
     /// The program that made the merge.
     pub tool: ToolInfo,
@@ -40,6 +41,8 @@ pub(crate) struct Manifest {
     pub options: Options,
     /// The donors, by role.
     pub donors: BTreeMap<String, DonorDigests>,
+    /// What the entries of the recipe name, and may change: every other tensor has its donor's bytes, or is cast.
+    pub changes: Changeable,
     /// Tensors to train, and to freeze meanwhile.
     pub training: Training,
     /// Every file of the result except the shards and this one, by file name.
@@ -131,6 +134,9 @@ pub(crate) struct TensorOrigin {
     /// Factor on all values.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
+    /// The values that it starts again with, for `reinit`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub values: Option<NewValues>,
     /// The donor tensor that it was made from, or that it replaces.
     pub source: DonorTensor,
 }
@@ -228,15 +234,17 @@ pub(super) fn manifest(
             digest: written.digest.clone(),
             transform: t.transform(),
             scale: t.source.scale,
+            values: t.source.values,
             source: DonorTensor::new(from, written.source_digest.clone()),
         }
     });
     Manifest {
-        schema: 3,
+        schema: 4,
         tool: ToolInfo::this(),
         recipe: recipe_digest(merge.recipe),
         options: run.record.options.clone(),
         donors: merge.digests.clone(),
+        changes: merge.changeable.clone(),
         training: run.record.training.clone().unwrap_or_default(),
         files: others.collect(),
         shards: shards.collect(),

@@ -154,7 +154,14 @@ impl<'a> PartOf<'a> {
 
     /// The name of a tensor inside the part; `None` when it belongs to another one.
     pub(super) fn inside(self, stored: &str) -> Option<String> {
-        self.parts.layout.locate(stored).filter(|(part, _)| *part == self.name).map(|(_, inside)| inside)
+        let built: Vec<&str> = self.parts.model.inside(self.name).collect();
+        self.parts.layout.inside(self.name, &built, stored)
+    }
+
+    /// The starts of the names of its tensors in the donor, and those of other parts among them.
+    pub(super) fn area(self) -> (Vec<String>, Vec<String>) {
+        let built: Vec<&str> = self.parts.model.inside(self.name).collect();
+        self.parts.layout.area(&built)
     }
 
     /// The parts of the same donor.

@@ -48,7 +48,7 @@ pub(super) fn plan(
     let documents = documents::plan(&context, &mut draft)?;
     let limit =
         options.get("shard-size").map_or(Ok(options::DEFAULT_SHARD), |s| options::parse_size("shard-size", s))?;
-    tensors::plan(&context, &documents, &knowledge.library, limit, &mut draft)?;
+    tensors::plan(&context, &documents, knowledge, limit, &mut draft)?;
     files::plan(&context, documents, &mut draft)?;
     for note in &recipe.notes {
         if context.holds(Some(&note.when), "a note")? {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use super::context::Donor;
 use super::manifest::{self, DonorDigests};
+use super::named::Changeable;
 use super::run::{MergeRun, count};
 use super::{CARD, REPORT, card};
 use crate::checkpoint::HashAlgorithm;
@@ -19,6 +20,8 @@ pub(super) struct Recorded<'m> {
     pub(super) donors: &'m [Donor],
     pub(super) digests: &'m BTreeMap<String, DonorDigests>,
     pub(super) plan: &'m Plan,
+    /// What the entries of the recipe may change.
+    pub(super) changeable: &'m Changeable,
     /// Algorithm of the digests of the tensors.
     pub(super) hash: HashAlgorithm,
 }

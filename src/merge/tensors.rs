@@ -1,6 +1,6 @@
 //! The tensors of the result: their origin, transform and shape.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use regex::Regex;
 use serde_json::Value;
@@ -11,23 +11,25 @@ use super::draft::MergeDraft;
 use super::dtypes;
 use super::error::MergeError;
 use super::explain;
+use super::fit::{Fit, StartedModules};
+use super::named::{AnnouncedCast, Bounds, Changeable, NamedTensors};
 use super::parts::PartOf;
 use super::run::count;
 use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::quantization;
 use crate::knowledge::recipe::TensorSpec;
-use crate::knowledge::{Evidence, Expression, Library, Loader};
+use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
+use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
 use crate::surgery::values::can_compute;
 
 /// A tensor spec with its parts evaluated once.
-struct TensorRule<'a> {
+pub(super) struct TensorRule<'a> {
     spec: &'a TensorSpec,
     names: Regex,
     rename: Option<String>,
     slice: Option<[u64; 2]>,
-    fit: TensorTransform,
+    pub(super) fit: Fit,
     scale: Option<f64>,
     dtype: Option<Dtype>,
     /// The part that the tensors belong to, and the one whose place they take.
@@ -39,6 +41,17 @@ impl TensorRule<'_> {
     /// What the tensors are, for the report.
     fn pattern(&self) -> &str {
         self.part.filter(|_| self.spec.names.is_empty()).map_or(self.spec.names.as_str(), |part| part.name)
+    }
+
+    /// The tensors that the entry may change; `None` when it changes none, or names none.
+    fn changeable(&self) -> Option<NamedTensors> {
+        let changes = self.fit != Fit::Copy || self.scale.is_some() || self.slice.is_some();
+        NamedTensors::of_entry(&self.spec.from, self.part, &self.spec.names).filter(|_| changes)
+    }
+
+    /// The cast that the entry announces.
+    fn cast(&self) -> Option<AnnouncedCast> {
+        Some(AnnouncedCast { donor: self.spec.from.clone(), to: self.dtype?.name().to_owned() })
     }
 
     /// Whether a donor tensor is meant.
@@ -62,17 +75,17 @@ impl TensorRule<'_> {
 }
 
 /// A donor tensor that the recipe selects, with its name in the result.
-struct TakenTensor<'a> {
+pub(super) struct TakenTensor<'a> {
     name: String,
-    donor: &'a Donor,
+    pub(super) donor: &'a Donor,
     shard: &'a Shard,
-    tensor: &'a Tensor,
-    rule: &'a TensorRule<'a>,
+    pub(super) tensor: &'a Tensor,
+    pub(super) rule: &'a TensorRule<'a>,
 }
 
 impl TakenTensor<'_> {
     /// The shape of the rows that are used.
-    fn shape(&self) -> Vec<u64> {
+    pub(super) fn shape(&self) -> Vec<u64> {
         let mut shape = self.tensor.shape.clone();
         if let (Some(rows), Some([_, count])) = (shape.first_mut(), self.rule.slice) {
             *rows = count;
@@ -90,7 +103,7 @@ impl TakenTensor<'_> {
 pub(super) fn plan(
     context: &Context<'_>,
     documents: &[MergedDocument],
-    library: &Library,
+    knowledge: &Knowledge,
     limit: u64,
     draft: &mut MergeDraft,
 ) -> Result<(), MergeError> {
@@ -104,7 +117,7 @@ pub(super) fn plan(
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
     let names = taken.iter().map(|t| t.name.as_str());
     let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
-    let mut expected = expected_shapes(library, config, names, &evidence);
+    let mut expected = expected_shapes(&knowledge.library, config, names, &evidence);
     if let Some(place) = rules.iter().find_map(|rule| rule.into) {
         // The class of a newer version has other names than the checkpoint, which it renames when it loads.
         let spelled = |(name, shape): (String, _)| Some((place.model_parts().spelled(&name)?, shape));
@@ -113,20 +126,19 @@ pub(super) fn plan(
             expected.entry(name).or_insert(shape);
         }
     }
+    distinct(context, &taken)?;
+    let places: Vec<(usize, Vec<u64>)> =
+        taken.iter().map(|t| expected.get(&t.name).cloned().unwrap_or_else(|| (usize::MAX, t.shape()))).collect();
+    let started = StartedModules::find(taken.iter().zip(&places).map(|(t, (_, shape))| (t, shape.as_slice())));
+    draft.notes.extend(kept_modules(&rules, &taken, &started));
     let mut tensors = Vec::new();
-    let mut seen: HashMap<String, String> = HashMap::new();
-    for taken in taken {
-        if let Some(first) = seen.insert(taken.name.clone(), taken.tensor.name.clone()) {
-            return Err(MergeError::Recipe(format!(
-                "{}: {first} and {} would both become {}",
-                context.recipe.recipe, taken.tensor.name, taken.name
-            )));
-        }
-        let (position, shape) = match expected.get(&taken.name) {
-            Some((position, shape)) => (*position, shape.clone()),
-            None => (usize::MAX, taken.shape()),
-        };
-        match source(&taken, &shape) {
+    for (taken, (position, shape)) in taken.into_iter().zip(places) {
+        let values = started.has(&taken).then(|| {
+            config
+                .and_then(|config| knowledge.initial.of(&knowledge.parts, config, &taken.name, &shape))
+                .map(in_numbers)
+        });
+        match source(&taken, &shape, values) {
             Ok(source) => tensors.push((position, planned(taken, shape, source, draft))),
             Err(why) => draft.seams.push(misfit(context, &taken, shape, &why)),
         }
@@ -136,7 +148,68 @@ pub(super) fn plan(
     // In the order of the class, so that shards are split where save_pretrained would split them.
     tensors.sort_by(|a, b| a.0.cmp(&b.0).then_with(|| a.1.name.cmp(&b.1.name)));
     draft.plan.shards = into_shards(tensors.into_iter().map(|t| t.1).collect(), limit);
+    draft.notes.extend(blind(draft));
+    draft.changeable = changeable(&rules);
+    let bounds = Bounds::new(&draft.changeable).map_err(MergeError::Recipe)?;
+    bounds.hold(&context.recipe.recipe, &draft.plan)
+}
+
+/// What the entries of the recipe may change with these donors and options.
+fn changeable(rules: &[TensorRule<'_>]) -> Changeable {
+    let kept = || rules.iter().filter(|rule| rule.spec.drop.is_none());
+    let casts: BTreeSet<AnnouncedCast> = kept().filter_map(TensorRule::cast).collect();
+    Changeable { named: kept().filter_map(TensorRule::changeable).collect(), casts: casts.into_iter().collect() }
+}
+
+/// Fails when two tensors would have one name.
+fn distinct(context: &Context<'_>, taken: &[TakenTensor<'_>]) -> Result<(), MergeError> {
+    let mut seen: HashMap<&str, &str> = HashMap::new();
+    for taken in taken {
+        if let Some(first) = seen.insert(&taken.name, &taken.tensor.name) {
+            return Err(MergeError::Recipe(format!(
+                "{}: {first} and {} would both become {}",
+                context.recipe.recipe, taken.tensor.name, taken.name
+            )));
+        }
+    }
     Ok(())
+}
+
+/// A note for each entry that says `reinit`, and of whose tensors none starts again.
+fn kept_modules(rules: &[TensorRule<'_>], taken: &[TakenTensor<'_>], started: &StartedModules) -> Vec<String> {
+    let note = |rule: &TensorRule<'_>| {
+        let mut own = taken.iter().filter(|taken| std::ptr::eq(taken.rule, rule)).peekable();
+        own.peek()?;
+        (!own.any(|taken| started.has(taken))).then(|| {
+            format!(
+                "Nothing of {} of the {} donor was reinitialised: every module has the shape that the result needs. reinit-always reinitialises it all the same.",
+                rule.pattern(),
+                rule.spec.from
+            )
+        })
+    };
+    rules.iter().filter(|rule| rule.fit == Fit::Reinit && rule.spec.drop.is_none()).filter_map(note).collect()
+}
+
+/// A note for matrices that start with zeros: what they multiply has no effect at first.
+fn blind(draft: &MergeDraft) -> Option<String> {
+    let is_blind = |t: &&PlannedTensor| t.source.values == Some(NewValues::Zeros) && t.shape.len() > 1;
+    let names: Vec<&str> = draft.plan.tensors().map(|(_, t)| t).filter(is_blind).map(|t| t.name.as_str()).collect();
+    let (first, others) = names.split_first()?;
+    let more = if others.is_empty() { String::new() } else { format!(", and {} more", others.len()) };
+    Some(format!(
+        "{first}{more}: its class starts it with zeros, so that what it multiplies has no effect until it is trained."
+    ))
+}
+
+/// The values of a new tensor, as a plan has them.
+const fn in_numbers(initial: Initial) -> NewValues {
+    match initial {
+        Initial::Zeros => NewValues::Zeros,
+        Initial::Ones => NewValues::Ones,
+        Initial::Normal(deviation) => NewValues::Normal(deviation),
+        Initial::Uniform(limit) => NewValues::Uniform(limit),
+    }
 }
 
 /// The reason why the result would have no tensor.
@@ -218,8 +291,10 @@ fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft:
             transform,
             from: Some(tensor.shape.clone()),
             to: planned.shape.clone(),
-            scale: planned.source.scale.filter(|_| transform != TensorTransform::Reinit),
-            cast: (tensor.dtype != dtype).then(|| Cast { from: tensor.dtype.name(), to: dtype.name() }),
+            scale: planned.source.scale,
+            values: planned.source.values.map(NewValues::words),
+            cast: (tensor.dtype != dtype && transform != TensorTransform::Reinit)
+                .then(|| Cast { from: tensor.dtype.name(), to: dtype.name() }),
             losses: None,
         });
     }
@@ -301,12 +376,12 @@ fn parse_slice(value: &Value) -> Result<Option<[u64; 2]>, &'static str> {
     items.and_then(|items| items.try_into().ok()).map(Some).ok_or(expected)
 }
 
-fn parse_fit(value: &Value) -> Result<TensorTransform, &'static str> {
-    let known = |name: &str| TensorTransform::FITS.into_iter().find(|fit| fit.name() == name);
+fn parse_fit(value: &Value) -> Result<Fit, &'static str> {
+    let known = |name: &str| Fit::ALL.into_iter().find(|fit| fit.name() == name);
+    let expected = "copy, pad, grow-rows, sample-rows, reinit or reinit-always";
     match value {
-        Value::Null => Ok(TensorTransform::Copy),
-        Value::String(name) => known(name).ok_or("copy, pad, grow-rows, sample-rows or reinit"),
-        _ => Err("copy, pad, grow-rows, sample-rows or reinit"),
+        Value::Null => Ok(Fit::Copy),
+        value => value.as_str().and_then(known).ok_or(expected),
     }
 }
 
@@ -350,31 +425,38 @@ fn expected_shapes<'n>(
     shapes
 }
 
-/// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used.
-fn source(taken: &TakenTensor<'_>, shape: &[u64]) -> Result<TensorSource, String> {
+/// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used. `values` are those of a tensor that
+/// starts again, if they are known.
+fn source(taken: &TakenTensor<'_>, shape: &[u64], values: Option<Option<NewValues>>) -> Result<TensorSource, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
     let from = TensorRef::new(&donor.role, &donor.checkpoint.root, shard, tensor, rule.slice)?;
+    let starts = values.is_some();
     let changes = rule.scale.is_some() || taken.dtype() != tensor.dtype;
-    let fits = from.shape == shape && rule.fit != TensorTransform::Reinit;
-    if (changes || !(fits || rule.fit == TensorTransform::Copy)) && !can_compute(tensor.dtype) {
+    let fits = from.shape == shape && !starts;
+    if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
     let nests = nests(&from.shape, shape);
     let fit = match rule.fit {
         _ if fits => TensorTransform::Copy,
-        TensorTransform::Reinit => TensorTransform::Reinit,
-        TensorTransform::Pad if nests => TensorTransform::Pad,
-        TensorTransform::Pad => return Err(CANNOT_SHRINK.to_owned()),
-        rows @ (TensorTransform::GrowRows | TensorTransform::SampleRows) => {
-            if !nests || !from.shape.iter().skip(1).eq(shape.iter().skip(1)) {
-                return Err("only rows can be added".to_owned());
-            }
-            rows
+        Fit::Copy => return Err(String::new()),
+        Fit::Pad if !nests => return Err(CANNOT_SHRINK.to_owned()),
+        Fit::GrowRows | Fit::SampleRows if !nests || !from.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
+            return Err("only rows can be added".to_owned());
         }
-        TensorTransform::Copy | TensorTransform::Convert => return Err(String::new()),
+        fit => fit.transform(),
     };
-    Ok(TensorSource { from, fit, scale: rule.scale })
+    let values = match values {
+        Some(None) => return Err(UNKNOWN_VALUES.to_owned()),
+        Some(values) => values,
+        None => None,
+    };
+    // New values have the size that the class gives them.
+    Ok(TensorSource { from, fit, scale: rule.scale.filter(|_| !starts), values })
 }
+
+/// Why `reinit` does not help.
+const UNKNOWN_VALUES: &str = "the values that its class starts it with are not recorded in rules/initial-values.json, so it cannot be reinitialised";
 
 /// Why `pad` does not help.
 const CANNOT_SHRINK: &str = "padding cannot shrink a tensor";
@@ -413,7 +495,7 @@ fn helpful(context: &Context<'_>, taken: &TakenTensor<'_>, shape: &[u64]) -> Vec
         let mut scope = context.scope.child();
         scope.bind_map("opt", &changed);
         let fit = spec.fit.as_ref().and_then(|fit| fit.eval(&scope).ok());
-        fit.is_none_or(|fit| fit != TensorTransform::Pad.name() || nests(&taken.shape(), shape))
+        fit.is_none_or(|fit| fit != Fit::Pad.name() || nests(&taken.shape(), shape))
     };
     spec.options.iter().filter(helps).map(|option| format!("--set {option}")).collect()
 }

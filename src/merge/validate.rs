@@ -14,9 +14,10 @@ use std::collections::BTreeSet;
 
 use regex::Regex;
 
+use super::named::starts_literally;
 use super::options;
 use crate::knowledge::Knowledge;
-use crate::knowledge::recipe::{ANY, OptionKind, OptionSpec, Recipe, SeamTensor};
+use crate::knowledge::recipe::{ANY, OptionKind, OptionSpec, Recipe, SeamTensor, TensorSpec};
 use crate::knowledge::source::{DataError, hint};
 
 /// Names of the scope of expressions that no role and no `let` may take.
@@ -208,6 +209,7 @@ impl Validator<'_> {
                 return Err(self.wrong("from", &tensor.from, reason));
             }
             self.seam_tensor(tensor.meets.as_ref())?;
+            self.named(tensor)?;
             if let Err(error) = Regex::new(&tensor.names) {
                 let error = error.to_string();
                 let cause = error.lines().last().unwrap_or_default().trim_start_matches("error: ");
@@ -224,6 +226,31 @@ impl Validator<'_> {
             return Err(DataError::about(self.path, self.text, "tensors", reason));
         }
         Ok(())
+    }
+
+    /// Fails for an entry that changes tensors, and does not name them.
+    fn named(&self, tensor: &TensorSpec) -> Result<(), DataError> {
+        let keys = [("fit", &tensor.fit), ("scale", &tensor.scale), ("slice", &tensor.slice)];
+        let Some((key, Some(expression))) = keys.into_iter().find(|(_, value)| value.is_some()) else { return Ok(()) };
+        if tensor.part.is_some() || starts_literally(&tensor.names) || Regex::new(&tensor.names).is_err() {
+            return Ok(());
+        }
+        let own = |other: &&TensorSpec| {
+            let value = match key {
+                "fit" => &other.fit,
+                "scale" => &other.scale,
+                _ => &other.slice,
+            };
+            value.as_ref().is_some_and(|value| value.source() == expression.source())
+        };
+        let before = self.recipe.tensors.iter().take_while(|other| !std::ptr::eq(*other, tensor)).filter(own).count();
+        let named =
+            if tensor.names.is_empty() { "no `names`".to_owned() } else { format!("`names: {:?}`", tensor.names) };
+        let reason = format!(
+            "`{key}` changes tensors, and this entry has no `part` and {named}: it could reach any tensor of the {} donor; add `part`, or `names` that start with `^` and literal text, such as \"^multi_modal_projector\\\\.\"",
+            tensor.from
+        );
+        Err(DataError::about_nth_value(self.path, self.text, key, expression.source(), before, reason))
     }
 
     fn seam_tensor(&self, tensor: Option<&SeamTensor>) -> Result<(), DataError> {

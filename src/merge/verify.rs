@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use self::recorded::{Recorded, RecordedFile, RecordedShard, RecordedTensor};
 use super::manifest;
+use super::named::Bounds;
 use super::run::count;
 use crate::checkpoint::contents::digests::{HashJob, hash};
 use crate::checkpoint::open::{OpenError, open_own};
@@ -16,7 +17,7 @@ use crate::knowledge::source::hint;
 use crate::report::verification::{DifferenceKind, Verification, VerifiedPart};
 use crate::surgery::ApplyError;
 use crate::surgery::compare::compare;
-use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform};
+use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform};
 
 /// Why a result could not be verified.
 #[derive(Debug, thiserror::Error)]
@@ -56,7 +57,11 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
         let known: Vec<&str> = recorded.donors.keys().map(String::as_str).collect();
         return Err(VerifyError::Role { role: role.clone(), hint: hint(role, &known) });
     }
-    let mut run = Run::new(&result, &recorded);
+    let bounds = recorded.bounds().transpose().map_err(|reason| VerifyError::Manifest {
+        path: dir.join(&*manifest::NAME),
+        reason: format!("{reason}; the manifest is damaged"),
+    })?;
+    let mut run = Run::new(&result, &recorded, bounds);
     let mut parts = Vec::new();
     if recorded.schema >= 2 {
         parts.push(run.files()?);
@@ -73,6 +78,8 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
 struct Run<'v> {
     result: &'v Checkpoint,
     recorded: &'v Recorded,
+    /// What the merge was allowed to change; `None` for a manifest that does not say it.
+    bounds: Option<Bounds<'v>>,
     /// The tensors of the result by shard and name.
     present: BTreeMap<(&'v str, &'v str), (&'v Shard, &'v Tensor)>,
     /// What could not be verified, one sentence each.
@@ -80,7 +87,7 @@ struct Run<'v> {
 }
 
 impl<'v> Run<'v> {
-    fn new(result: &'v Checkpoint, recorded: &'v Recorded) -> Self {
+    fn new(result: &'v Checkpoint, recorded: &'v Recorded, bounds: Option<Bounds<'v>>) -> Self {
         let tensors = result.tensors();
         let present = tensors.map(|(s, t)| ((s.name.as_str(), t.name.as_str()), (s, t))).collect();
         let mut unverified = Vec::new();
@@ -89,10 +96,13 @@ impl<'v> Run<'v> {
         } else if recorded.hash() == HashAlgorithm::None {
             unverified.push("the manifest has no digests of tensors: the merge ran with --hash none".to_owned());
         }
+        if bounds.is_none() {
+            unverified.extend(without_bounds(recorded));
+        }
         if result.is_partial() {
             unverified.push("the checkpoint is too large to be read whole".to_owned());
         }
-        Self { result, recorded, present, unverified }
+        Self { result, recorded, bounds, present, unverified }
     }
 
     /// The files of the result against the digests of the manifest, and its shards against those of their headers.
@@ -160,7 +170,7 @@ impl<'v> Run<'v> {
                 part.differ(&tensor.name, DifferenceKind::Missing, Some(detail));
                 continue;
             };
-            if let Some(detail) = header_difference(found, tensor) {
+            if let Some(detail) = header_difference(found, tensor).or_else(|| self.stray(tensor)) {
                 part.differ(&tensor.name, DifferenceKind::Differs, Some(detail));
                 continue;
             }
@@ -183,6 +193,11 @@ impl<'v> Run<'v> {
             part.differ(name, DifferenceKind::Extra, Some(format!("in {shard}")));
         }
         Ok(part)
+    }
+
+    /// Why the merge cannot have been allowed to make a tensor.
+    fn stray(&self, tensor: &RecordedTensor) -> Option<String> {
+        self.bounds.as_ref().and_then(|bounds| tensor.stray(bounds))
     }
 
     /// The digests of the recorded tensors that the result has, by shard and name. One that overlaps another one has none:
@@ -248,7 +263,8 @@ impl<'v> Run<'v> {
                 continue;
             };
             let from = there.get(tensor.source.name.as_str());
-            let planned = from.and_then(|(shard, from)| planned(tensor, found, role, &donor.root, shard, from));
+            let named = self.bounds.as_ref().is_none_or(|bounds| bounds.name(role, &tensor.source.name));
+            let planned = from.and_then(|(shard, from)| planned(tensor, named, found, role, &donor.root, shard, from));
             let planned = planned.filter(|planned| shard.is_whole() && planned.is_possible());
             let at = shard.data_start.saturating_add(found.begin);
             work.push((tensor, planned, self.result.root.join(&shard.name), at));
@@ -319,9 +335,24 @@ fn header_difference(found: &Tensor, recorded: &RecordedTensor) -> Option<String
     })
 }
 
-/// The plan of a recorded tensor; `None` when the donor's tensor has another type or shape than the recorded one.
+/// What a manifest before version 4 leaves open: it does not say which tensors the recipe was allowed to change.
+fn without_bounds(recorded: &Recorded) -> Option<String> {
+    let changed: Vec<&RecordedTensor> = recorded.tensors.iter().filter(|tensor| tensor.is_changed()).collect();
+    let (first, _) = changed.split_first()?;
+    Some(format!(
+        "a manifest of version {} does not say which tensors the recipe was allowed to change: {} recorded as changed, the first one {} ({}), and made again as recorded; merge again to verify the others",
+        recorded.schema,
+        count(changed.len(), "tensor is", "tensors are"),
+        first.name,
+        first.transform.name(),
+    ))
+}
+
+/// The plan of a recorded tensor; `None` when the donor's tensor has another type or shape than the recorded one. One that is
+/// not `named` has the donor's values, whatever is recorded.
 fn planned(
     recorded: &RecordedTensor,
+    named: bool,
     result: &Tensor,
     role: &str,
     root: &Path,
@@ -331,19 +362,22 @@ fn planned(
     let source = &recorded.source;
     // Version 1 knew no casts.
     let dtype = source.dtype.as_deref().map_or(Some(result.dtype), Dtype::from_name)?;
-    let rows = source.slice.and_then(|slice| Some([slice.first, *source.shape.first()?]));
+    let rows = source.slice.filter(|_| named).and_then(|slice| Some([slice.first, *source.shape.first()?]));
     let from = TensorRef::new(role, root, shard, tensor, rows).ok()?;
-    if from.dtype != dtype || from.shape != source.shape || !shard.is_whole() {
+    if from.dtype != dtype || (named && from.shape != source.shape) || !shard.is_whole() {
         return None;
     }
     let fit = match recorded.transform {
         TensorTransform::Convert => TensorTransform::Copy,
+        _ if !named => TensorTransform::Copy,
         fit => fit,
     };
+    let former = NewValues::former(&result.shape);
+    let values = (fit == TensorTransform::Reinit).then(|| recorded.values.unwrap_or(former));
     Some(PlannedTensor {
         name: recorded.name.clone(),
         dtype: result.dtype,
         shape: result.shape.clone(),
-        source: TensorSource { from, fit, scale: recorded.scale },
+        source: TensorSource { from, fit, scale: recorded.scale.filter(|_| named), values },
     })
 }

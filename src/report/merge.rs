@@ -154,6 +154,9 @@ pub struct ChangedTensor {
     /// Factor on all values.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
+    /// The values that it starts again with: `normal 0.020`, `zeros`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub values: Option<String>,
     /// The cast of its values.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cast: Option<Cast>,
@@ -176,7 +179,7 @@ impl ChangedTensor {
         let fit = (self.transform != TensorTransform::Convert).then(|| self.transform.name().to_owned());
         let scale = self.scale.map(|scale| format!("scale {scale}"));
         let cast = self.cast.as_ref().map(|_| "cast".to_owned());
-        fit.into_iter().chain(scale).chain(cast).collect::<Vec<_>>().join(", ")
+        fit.into_iter().chain(self.values.clone()).chain(scale).chain(cast).collect::<Vec<_>>().join(", ")
     }
 }
 

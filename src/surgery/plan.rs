@@ -109,6 +109,52 @@ pub struct TensorSource {
     pub fit: TensorTransform,
     /// Factor on all values.
     pub scale: Option<f64>,
+    /// The values that [`TensorTransform::Reinit`] writes; `None` for the others.
+    pub values: Option<NewValues>,
+}
+
+/// The values of a tensor that starts again, as its class gives them to a new model.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub enum NewValues {
+    /// Zeros: biases, and norms that add 1 to their weight.
+    Zeros,
+    /// Ones: the weights of other norms.
+    Ones,
+    /// Seeded normal values with mean 0 and this standard deviation.
+    Normal(f64),
+    /// Seeded values that are evenly spread between the negative of this number and the number.
+    Uniform(f64),
+}
+
+impl NewValues {
+    /// The values that manifests before version 4 mean by `reinit`: they did not record any.
+    #[must_use]
+    pub const fn former(shape: &[u64]) -> Self {
+        if shape.len() < 2 { Self::Zeros } else { Self::Normal(0.02) }
+    }
+
+    /// Whether the number can be that of a distribution; one in a manifest may be anything.
+    #[must_use]
+    pub fn is_possible(self) -> bool {
+        match self {
+            Self::Zeros | Self::Ones => true,
+            Self::Normal(size) | Self::Uniform(size) => size.is_finite() && size > 0.0,
+        }
+    }
+
+    /// What reports call them: `zeros`, `normal 0.02`.
+    #[must_use]
+    pub fn words(self) -> String {
+        match self {
+            Self::Zeros => "zeros".to_owned(),
+            Self::Ones => "ones".to_owned(),
+            Self::Normal(deviation) => format!("normal {deviation:.3}"),
+            Self::Uniform(limit) => format!("uniform {limit:.3}"),
+        }
+    }
 }
 
 /// How the bytes of a tensor are made from those of a donor. All values except [`Self::Copy`] and [`Self::Reinit`] may also
@@ -128,12 +174,12 @@ pub enum TensorTransform {
     SampleRows,
     /// The donor's values in the leading corner, zeros elsewhere.
     Pad,
-    /// Seeded normal values with standard deviation 0.02; zeros for vectors (biases).
+    /// The values that the class gives to a new model; random ones are seeded with the name of the tensor.
     Reinit,
 }
 
 impl TensorTransform {
-    /// The values of `fit` in a recipe.
+    /// The ways in which a tensor gets its shape.
     pub const FITS: [Self; 5] = [Self::Copy, Self::GrowRows, Self::SampleRows, Self::Pad, Self::Reinit];
 
     /// The name in recipes, options and reports.
@@ -190,7 +236,7 @@ impl TensorSource {
     /// The bytes of a donor tensor, unchanged.
     #[must_use]
     pub const fn copy(from: TensorRef) -> Self {
-        Self { from, fit: TensorTransform::Copy, scale: None }
+        Self { from, fit: TensorTransform::Copy, scale: None, values: None }
     }
 }
 
@@ -207,7 +253,7 @@ impl PlannedTensor {
             TensorTransform::GrowRows | TensorTransform::SampleRows => {
                 nests && !to.is_empty() && from.iter().skip(1).eq(to.iter().skip(1))
             }
-            TensorTransform::Reinit => true,
+            TensorTransform::Reinit => self.source.values.is_some_and(NewValues::is_possible),
         };
         let types = !is_computed || (can_compute(self.dtype) && can_compute(self.source.from.dtype));
         fits && types && self.source.scale.is_none_or(|scale| scale.is_finite() && scale != 0.0)

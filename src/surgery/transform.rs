@@ -6,16 +6,13 @@ use std::io::{self, Write};
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
-use rand_distr::{Distribution, Normal, StandardNormal};
+use rand_distr::{Distribution, Normal, StandardNormal, Uniform};
 use sha2::{Digest, Sha256};
 
 use super::convert::{CastLosses, Converter};
-use super::plan::{PlannedTensor, TensorTransform};
+use super::plan::{NewValues, PlannedTensor, TensorTransform};
 use super::values::Codec;
 use crate::checkpoint::Dtype;
-
-/// Standard deviation of reinitialised weights: the usual `initializer_range` of transformers.
-const INIT_STD: f64 = 0.02;
 
 /// Factor on the covariance of sampled rows. Source: `_init_added_embeddings_weights_with_mean` in transformers 4.47 to 5.23.
 const SAMPLE_VARIANCE: f64 = 1e-9;
@@ -31,7 +28,8 @@ const SAMPLE_TERMS: u32 = 64;
 pub fn write(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<CastLosses> {
     let source = &tensor.source;
     if source.fit == TensorTransform::Reinit {
-        reinit(&tensor.name, tensor.dtype, &tensor.shape, out)?;
+        let values = source.values.unwrap_or(NewValues::former(&tensor.shape));
+        new_values(&tensor.name, tensor.dtype, &tensor.shape, values, out)?;
         return Ok(CastLosses::default());
     }
     if tensor.dtype == source.from.dtype && source.scale.is_none() {
@@ -239,23 +237,36 @@ fn below(rng: &mut ChaCha8Rng, limit: u64) -> u64 {
     u64::try_from(product >> 64).unwrap_or_default()
 }
 
-/// Writes reinitialised values: normal with standard deviation 0.02 for matrices, zeros for vectors.
+/// Writes the values of a tensor that starts again.
 ///
 /// # Errors
-/// Errors of writing.
-pub fn reinit(name: &str, dtype: Dtype, shape: &[u64], out: &mut dyn Write) -> io::Result<()> {
-    let mut left = shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
-    if shape.len() < 2 {
-        return zeros(out, left.saturating_mul(dtype.bits() / 8));
+/// Errors of writing; [`io::ErrorKind::Other`] for a distribution that does not exist.
+pub fn new_values(name: &str, dtype: Dtype, shape: &[u64], values: NewValues, out: &mut dyn Write) -> io::Result<()> {
+    let count = shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
+    match values {
+        NewValues::Zeros => zeros(out, count.saturating_mul(dtype.bits() / 8)),
+        NewValues::Ones => draw(dtype, count, || 1.0, out),
+        NewValues::Normal(deviation) => {
+            let mut rng = seeded(name);
+            let normal = Normal::new(0.0, deviation).map_err(io::Error::other)?;
+            draw(dtype, count, || normal.sample(&mut rng), out)
+        }
+        NewValues::Uniform(limit) => {
+            let mut rng = seeded(name);
+            let uniform = Uniform::new_inclusive(-limit, limit).map_err(io::Error::other)?;
+            draw(dtype, count, || uniform.sample(&mut rng), out)
+        }
     }
-    let mut rng = seeded(name);
-    let normal = Normal::new(0.0, INIT_STD).map_err(io::Error::other)?;
+}
+
+/// Writes `left` values, one after the other.
+fn draw(dtype: Dtype, mut left: u64, mut next: impl FnMut() -> f64, out: &mut dyn Write) -> io::Result<()> {
     let mut codec = Codec::default();
     let (mut values, mut block) = (Vec::new(), Vec::new());
     while left > 0 {
         let n = usize::try_from(left).map_or(RANDOM_BLOCK, |n| n.min(RANDOM_BLOCK));
         values.clear();
-        values.extend((0..n).map(|_| normal.sample(&mut rng)));
+        values.extend((0..n).map(|_| next()));
         block.clear();
         codec.encode_values(dtype, &values, &mut block);
         out.write_all(&block)?;
@@ -343,19 +354,23 @@ mod tests {
     }
 
     #[test]
-    fn fresh_values_are_seeded_by_name_and_small() {
-        let make = |name| {
+    fn new_values_are_seeded_by_name_and_have_the_size_that_is_asked_for() {
+        let make = |name, values| {
             let mut out = Vec::new();
-            reinit(name, Dtype::BF16, &[64, 64], &mut out).unwrap();
+            new_values(name, Dtype::BF16, &[64, 64], values, &mut out).unwrap();
             out
         };
-        assert_eq!(make("a"), make("a"));
-        assert_ne!(make("a"), make("b"));
-        let values = Codec::default().decode(Dtype::BF16, &make("a")).clone();
-        let spread = (values.iter().map(|v| v * v).sum::<f64>() / 4096.0).sqrt();
-        assert!((spread - INIT_STD).abs() < 0.002, "{spread}");
-        let mut bias = Vec::new();
-        reinit("bias", Dtype::F16, &[3], &mut bias).unwrap();
-        assert_eq!(bias, [0; 6]);
+        for (values, want) in [(NewValues::Normal(0.02), 0.02), (NewValues::Uniform(0.3), 0.3 / 3_f64.sqrt())] {
+            assert_eq!(make("a", values), make("a", values));
+            assert_ne!(make("a", values), make("b", values));
+            let drawn = Codec::default().decode(Dtype::BF16, &make("a", values)).clone();
+            let spread = (drawn.iter().map(|v| v * v).sum::<f64>() / 4096.0).sqrt();
+            assert!((spread / want - 1.0).abs() < 0.05, "{values:?}: {spread}");
+        }
+        for (values, want) in [(NewValues::Zeros, [0, 0, 0, 0]), (NewValues::Ones, [0, 0x3c, 0, 0x3c])] {
+            let mut out = Vec::new();
+            new_values("norm", Dtype::F16, &[2], values, &mut out).unwrap();
+            assert_eq!(out, want);
+        }
     }
 }

@@ -221,6 +221,7 @@ fn the_page_of_data_files_is_fresh() {
          | `processors/` | tokens that a processor adds to a tokenizer |\n\
          | `parts/` | the language model, vision tower and projector inside model classes |\n\
          | `recipes/` | merges, with the Python modules that they write |\n\
+         | `initial-values.json` | values that each version gives to the tensors of a new model, written by `tools/loader_initial.py` |\n\
          | `ropes.json` | rope keys that config classes read before transformers 5, written by `tools/loader_ropes.py` |\n\
          | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
          | `classes.json` | tokenizer and processor classes that each version opens by name, written by `tools/loader_classes.py` |\n\

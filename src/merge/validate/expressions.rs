@@ -8,7 +8,7 @@ use crate::knowledge::recipe::{DocumentEdit, FileSpec};
 use crate::knowledge::source::{DataError, hint, nearest};
 use crate::knowledge::{Expression, Template};
 use crate::merge::dtypes::FLOAT_NAMES;
-use crate::surgery::plan::TensorTransform;
+use crate::merge::fit::Fit;
 
 /// Names of CEL's types, which expressions may compare with `type(…)`.
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
@@ -33,7 +33,7 @@ impl Validator<'_> {
         }
         self.all(|key, expression| self.expression(key, expression, &variables))?;
         for tensor in &self.recipe.tensors {
-            self.one_of("fit", "treatment", tensor.fit.as_ref(), &TensorTransform::FITS.map(TensorTransform::name))?;
+            self.one_of("fit", "treatment", tensor.fit.as_ref(), &Fit::ALL.map(Fit::name))?;
             self.one_of("dtype", "dtype", tensor.dtype.as_ref(), &FLOAT_NAMES)?;
         }
         let edits = self.recipe.documents.iter().flat_map(|document| &document.edits);

@@ -1,4 +1,4 @@
-//! Reads `merge-manifest.json` of versions 1 to 3. It is untrusted, like every file of a checkpoint.
+//! Reads `merge-manifest.json` of versions 1 to 4. It is untrusted, like every file of a checkpoint.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -10,7 +10,8 @@ use super::VerifyError;
 use crate::checkpoint::open::{JSON_CAP, read_own};
 use crate::checkpoint::{HashAlgorithm, is_plain_file_name};
 use crate::merge::manifest;
-use crate::surgery::plan::{RowSlice, TensorTransform};
+use crate::merge::named::{Bounds, Changeable};
+use crate::surgery::plan::{NewValues, RowSlice, TensorTransform};
 
 /// A recorded merge. Keys that not all versions have are optional.
 #[derive(Debug, Deserialize)]
@@ -26,6 +27,8 @@ pub(super) struct Recorded {
     /// Since version 3: the shards of the result.
     #[serde(default)]
     pub(super) shards: BTreeMap<String, RecordedShard>,
+    /// Since version 4: what the entries of the recipe may change.
+    changes: Option<Changeable>,
     /// Since version 3: the algorithm of the digests of tensors. It was SHA-256 before.
     hash: Option<HashAlgorithm>,
     pub(super) tensors: Vec<RecordedTensor>,
@@ -71,6 +74,8 @@ pub(super) struct RecordedTensor {
     pub(super) digest: Option<String>,
     pub(super) transform: TensorTransform,
     pub(super) scale: Option<f64>,
+    /// Since version 4.
+    pub(super) values: Option<NewValues>,
     pub(super) source: RecordedSource,
 }
 
@@ -84,6 +89,33 @@ pub(super) struct RecordedSource {
     pub(super) slice: Option<RowSlice>,
     #[serde(alias = "sha256")]
     pub(super) digest: Option<String>,
+}
+
+impl RecordedTensor {
+    /// Whether it is more than the donor's whole tensor, cast or not.
+    pub(super) fn is_changed(&self) -> bool {
+        let keeps = matches!(self.transform, TensorTransform::Copy | TensorTransform::Convert);
+        !keeps || self.scale.is_some() || self.source.slice.is_some()
+    }
+
+    /// Whether its values were cast; version 1 did not record the type of the source.
+    fn is_cast(&self) -> bool {
+        self.transform != TensorTransform::Reinit && self.source.dtype.as_ref().is_some_and(|from| *from != self.dtype)
+    }
+
+    /// Why the merge cannot have been allowed to make it; `None` when it was.
+    pub(super) fn stray(&self, bounds: &Bounds<'_>) -> Option<String> {
+        let RecordedSource { donor, name, .. } = &self.source;
+        if self.is_changed() && !bounds.name(donor, name) {
+            let how = if self.is_changed() && self.scale.is_some() { "scaled" } else { self.transform.name() };
+            return Some(format!(
+                "is recorded as {how}, and nothing that the recipe names has {name} of the {donor} donor"
+            ));
+        }
+        (self.is_cast() && !bounds.casts_to(donor, &self.dtype)).then(|| {
+            format!("is recorded as cast to {}, and the recipe announces no such cast of the {donor} donor", self.dtype)
+        })
+    }
 }
 
 impl Recorded {
@@ -102,10 +134,10 @@ impl Recorded {
         let damaged = |reason: String| wrong(format!("{reason}; the manifest is damaged"));
         let value: Value = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
         let schema = value.get("schema").and_then(Value::as_u64);
-        if !matches!(schema, Some(1..=3)) {
+        if !matches!(schema, Some(1..=4)) {
             let schema = value.get("schema").map_or_else(|| "missing".to_owned(), Value::to_string);
             return Err(wrong(format!(
-                "its schema is {schema}, and this version of ckpt-doctor reads 1 to 3; use a newer version"
+                "its schema is {schema}, and this version of ckpt-doctor reads 1 to 4; use a newer version"
             )));
         }
         let mut recorded: Self = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
@@ -115,6 +147,9 @@ impl Recorded {
         }
         if recorded.schema >= 3 && recorded.hash.is_none() {
             return Err(damaged("it has no \"hash\"".to_owned()));
+        }
+        if recorded.schema >= 4 && recorded.changes.is_none() {
+            return Err(damaged("it has no \"changes\"".to_owned()));
         }
         recorded.check().map_err(damaged)?;
         Ok(recorded)
@@ -133,6 +168,11 @@ impl Recorded {
             Some(tensor) => Err(format!("{:?} is recorded twice", tensor.name)),
             None => Ok(()),
         }
+    }
+
+    /// What the merge was allowed to change; `None` before version 4.
+    pub(super) fn bounds(&self) -> Option<Result<Bounds<'_>, String>> {
+        self.changes.as_ref().map(Bounds::new)
     }
 
     /// Algorithm of the digests of tensors.

@@ -194,7 +194,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform};
+    use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform};
 
     /// Shards with tensors of every transform, from one donor's file.
     fn plans(donor: &Path) -> Vec<PlannedShard> {
@@ -213,7 +213,8 @@ mod tests {
             let fit = TensorTransform::FITS[index % TensorTransform::FITS.len()];
             let more = u64::from(fit != TensorTransform::Copy);
             let dtype = if index % 3 == 2 { Dtype::BF16 } else { Dtype::F32 };
-            let source = TensorSource { from, fit, scale: (index == 7).then_some(2.0) };
+            let values = (fit == TensorTransform::Reinit).then_some(NewValues::Normal(0.02));
+            let source = TensorSource { from, fit, scale: (index == 7).then_some(2.0), values };
             PlannedTensor { name: format!("{shard}.{index}"), dtype, shape: vec![rows + more, width], source }
         };
         let shard = |shard: usize| PlannedShard {

@@ -1,11 +1,13 @@
 //! Recipes and merge files that are refused when they are read: each error names the place, the word and the nearest known
 //! one.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 
+use ckpt_doctor::HashAlgorithm;
 use ckpt_doctor::knowledge::recipe::Recipe;
-use ckpt_doctor::merge::validate;
+use ckpt_doctor::merge::{self, MergeRequest, validate};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -18,6 +20,35 @@ fn built_in_recipes_are_valid() {
     for (path, text) in texts("rules/recipes") {
         let recipe = Recipe::parse(&path, &text).unwrap_or_else(|e| panic!("{e}"));
         validate(&recipe, &path, &text, &knowledge).unwrap_or_else(|e| panic!("{e}"));
+    }
+}
+
+/// A recipe that reaches the planner without validation: the plan itself is refused.
+#[test]
+fn a_plan_that_changes_what_no_entry_names_is_refused() {
+    let work = TempDir::new().unwrap();
+    for (entry, how) in [
+        (json!({ "from": "from", "names": "norm", "scale": "2.0" }), "convert"),
+        (json!({ "from": "from", "fit": "'reinit-always'" }), "reinit"),
+    ] {
+        let text = recipe(json!({ "tensors": [entry] })).to_string().replace("\"llama\"", "\"llava_llama\"");
+        let request = MergeRequest {
+            recipe: Some(Recipe::parse("own.json5", &text).unwrap()),
+            donors: [("from".to_owned(), donor("llava3d-tiny"))].into(),
+            options: BTreeMap::new(),
+            versions: Vec::new(),
+            out: work.path().join("out"),
+            dry_run: true,
+            hash: HashAlgorithm::None,
+            hash_donors: false,
+        };
+        let seams_or_error = match merge::run(&request, &knowledge(), &|_, _| {}) {
+            Err(error) => error.to_string(),
+            Ok(run) => run.record.seams.iter().map(|seam| seam.message.clone()).collect(),
+        };
+        let says = how == "convert" && seams_or_error.contains("would be changed (convert");
+        let is_unknown = how == "reinit" && seams_or_error.contains("cannot be reinitialised");
+        assert!(says || is_unknown, "{entry}: {seams_or_error}");
     }
 }
 
@@ -92,7 +123,19 @@ fn names() -> Vec<(&'static str, Value)> {
         ("name twice", json!({ "let": [{ "name": "a", "is": "1" }, { "name": "a", "is": "2" }] })),
         ("name before its definition", json!({ "let": [{ "name": "a", "is": "b" }, { "name": "b", "is": "2" }] })),
         ("regular expression", json!({ "tensors": [{ "from": "from", "names": "^(model" }] })),
-        ("treatment", tensors("fit", json!("opt.rows == 'grow' ? 'grow-row' : 'copy'"))),
+        (
+            "treatment",
+            json!({ "tensors": [{ "from": "from", "names": "^lm_head", "fit": "opt.rows == 'grow' ? 'grow-row' : 'copy'" }] }),
+        ),
+        ("change of any tensor", tensors("fit", json!("'pad'"))),
+        ("factor on any tensor", json!({ "tensors": [{ "from": "from", "scale": "2.0" }] })),
+        (
+            "second entry that names nothing",
+            json!({ "tensors": [
+                { "from": "from", "names": "^lm_head", "fit": "'pad'" },
+                { "from": "from", "names": "^.*norm", "fit": "'pad'" },
+            ] }),
+        ),
         ("no tensors", json!({ "tensors": [] })),
         ("only dropped tensors", tensors("drop", json!("why"))),
     ]

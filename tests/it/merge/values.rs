@@ -277,7 +277,7 @@ fn slices_scales_and_types_that_do_not_fit_are_refused_in_words() {
         (json!({ "scale": "0" }), "is 0, not a finite number other than 0"),
         (json!({ "dtype": "'int' + '8'" }), "is \"int8\", not bfloat16, float16, float32 or float64"),
         (json!({ "dtype": "'float8'" }), "unknown dtype `float8` in `dtype`"),
-        (json!({ "fit": "'conv' + 'ert'" }), "not copy, pad, grow-rows, sample-rows or reinit"),
+        (json!({ "fit": "'conv' + 'ert'" }), "not copy, pad, grow-rows, sample-rows, reinit or reinit-always"),
     ] {
         let refused = narrowed(work.path(), &entry, 64);
         assert!(refused.contains(words), "{entry}: {refused}");

@@ -278,6 +278,9 @@ fn tensors(draw: &mut Draw, recipe: &mut Value) {
         _ => ("when", draw.one(&["false", "own", "7"])),
     };
     if let Some(entry) = recipe.pointer_mut("/tensors/0").and_then(Value::as_object_mut) {
+        if key == "fit" && draw.below(4) > 0 {
+            entry.insert("names".to_owned(), json!("^(?:model|lm_head)\\."));
+        }
         entry.insert(key.to_owned(), json!(value));
     }
 }

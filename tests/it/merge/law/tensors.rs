@@ -104,7 +104,7 @@ fn case(random: &mut Draw) -> Case {
         len,
         slice: None,
     };
-    let source = TensorSource { from, fit, scale };
+    let source = TensorSource { from, fit, scale, values: None };
     Case { bytes, tensor: PlannedTensor { name: "x".to_owned(), dtype: to, shape: wanted, source } }
 }
 

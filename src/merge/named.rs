@@ -1,0 +1,166 @@
+//! What the entries of a recipe name: the tensors of donors that a merge may change. Every other one keeps its bytes.
+
+use regex::Regex;
+use regex_syntax::hir::Look;
+use regex_syntax::hir::literal::Extractor;
+use serde::{Deserialize, Serialize};
+
+use super::error::MergeError;
+use super::parts::PartOf;
+use crate::surgery::plan::{Plan, PlannedTensor, TensorTransform};
+
+/// The tensors of a donor that an entry of the recipe names, and may change: those of a part, of a pattern, or of both.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct NamedTensors {
+    /// Role of the donor.
+    pub donor: String,
+    /// The part.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub part: Option<String>,
+    /// Starts of the names in the donor, for a part.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub starts: Vec<String>,
+    /// Starts among them of names that belong to other parts.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub without: Vec<String>,
+    /// Regular expression for the names in the donor; any of the part when missing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub names: Option<String>,
+}
+
+/// A type to which an entry of the recipe casts the tensors of a donor.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct AnnouncedCast {
+    /// Role of the donor.
+    pub donor: String,
+    /// Element type, as safetensors spells it.
+    pub to: String,
+}
+
+/// What a merge may change.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct Changeable {
+    /// Tensors that it may fit, scale, slice or start again.
+    pub named: Vec<NamedTensors>,
+    /// Types to which it may cast any tensor.
+    pub casts: Vec<AnnouncedCast>,
+}
+
+impl NamedTensors {
+    /// The tensors of an entry with a part, or with names that start with `^` and literal text; `None` for an entry that names
+    /// nothing.
+    pub(super) fn of_entry(donor: &str, part: Option<PartOf<'_>>, names: &str) -> Option<Self> {
+        if part.is_none() && !starts_literally(names) {
+            return None;
+        }
+        let (starts, without) = part.map(PartOf::area).unwrap_or_default();
+        Some(Self {
+            donor: donor.to_owned(),
+            part: part.map(|part| part.name.to_owned()),
+            starts,
+            without,
+            names: (!names.is_empty()).then(|| names.to_owned()),
+        })
+    }
+
+    /// Why no recipe can have named these tensors.
+    fn fault(&self) -> Option<String> {
+        let names = self.names.as_deref();
+        match (&self.part, names) {
+            (None, None) => Some("names no tensors".to_owned()),
+            (None, Some(names)) if !starts_literally(names) => {
+                Some(format!("names tensors by {names:?}, which does not start with ^ and literal text"))
+            }
+            (_, Some(names)) if Regex::new(names).is_err() => Some(format!("{names:?} is not a regular expression")),
+            _ => None,
+        }
+    }
+}
+
+/// [`Changeable`] with its expressions parsed.
+pub(super) struct Bounds<'c> {
+    named: Vec<(&'c NamedTensors, Option<Regex>)>,
+    casts: &'c [AnnouncedCast],
+}
+
+impl<'c> Bounds<'c> {
+    /// The bounds of a merge.
+    ///
+    /// # Errors
+    /// Why an entry is none that a recipe can have; one in a manifest may be anything.
+    pub(super) fn new(changeable: &'c Changeable) -> Result<Self, String> {
+        let entry = |named: &'c NamedTensors| {
+            if let Some(fault) = named.fault() {
+                return Err(format!("\"changes\" of the {} donor {fault}", named.donor));
+            }
+            Ok((named, named.names.as_deref().and_then(|names| Regex::new(names).ok())))
+        };
+        let named = changeable.named.iter().map(entry).collect::<Result<_, _>>()?;
+        Ok(Self { named, casts: &changeable.casts })
+    }
+
+    /// Whether a tensor of a donor may be changed.
+    pub(super) fn name(&self, donor: &str, tensor: &str) -> bool {
+        let starts = |of: &[String]| of.iter().any(|start| tensor.starts_with(start.as_str()));
+        self.named.iter().any(|(named, regex)| {
+            let of_part = || named.part.is_none() || (starts(&named.starts) && !starts(&named.without));
+            named.donor == donor && of_part() && regex.as_ref().is_none_or(|regex| regex.is_match(tensor))
+        })
+    }
+
+    /// Whether a cast was announced.
+    pub(super) fn casts_to(&self, donor: &str, dtype: &str) -> bool {
+        self.casts.iter().any(|cast| cast.donor == donor && cast.to == dtype)
+    }
+
+    /// Fails when a plan changes a tensor that no entry names.
+    pub(super) fn hold(&self, recipe: &str, plan: &Plan) -> Result<(), MergeError> {
+        let strays: Vec<&PlannedTensor> = plan.tensors().map(|(_, t)| t).filter(|t| !self.allow(t)).collect();
+        let Some(first) = strays.first() else { return Ok(()) };
+        Err(MergeError::Recipe(format!(
+            "{recipe}: {} of the {} donor would be changed ({}{}), and no entry that changes tensors names it by `part`, or by `names` that start with ^ and literal text; name what the entry is for",
+            first.source.from.name,
+            first.source.from.donor,
+            first.transform().name(),
+            if strays.len() > 1 { format!(", and {} more", strays.len().saturating_sub(1)) } else { String::new() },
+        )))
+    }
+
+    fn allow(&self, tensor: &PlannedTensor) -> bool {
+        let source = &tensor.source;
+        let from = &source.from;
+        let is_cast = tensor.dtype != from.dtype && source.fit != TensorTransform::Reinit;
+        let changes = source.fit != TensorTransform::Copy || source.scale.is_some() || from.slice.is_some();
+        (!is_cast || self.casts_to(&from.donor, tensor.dtype.name()))
+            && (!changes || self.name(&from.donor, &from.name))
+    }
+}
+
+/// Whether every match of an expression starts at the start of the text, with at least one literal character.
+pub(super) fn starts_literally(names: &str) -> bool {
+    let Ok(parsed) = regex_syntax::parse(names) else { return false };
+    let is_anchored = parsed.properties().look_set_prefix().contains(Look::Start);
+    is_anchored && Extractor::new().extract(&parsed).min_literal_len().is_some_and(|len| len > 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pattern_names_tensors_when_it_starts_with_literal_text() {
+        for names in
+            ["^model\\.norm", "^(lm_head\\.weight)$", "^(?:model\\.embed_tokens|lm_head)\\.weight$", "^v.*", "\\Av"]
+        {
+            assert!(starts_literally(names), "{names}");
+        }
+        for names in
+            ["", ".", "^", "^.*", "^.*norm", "norm", "^(?:a|)b?", "^(?:a|.*)", "a|^b", "(?m)^a", "^a?b*", "^\\w+", "("]
+        {
+            assert!(!starts_literally(names), "{names}");
+        }
+    }
+}
