@@ -10,6 +10,7 @@ mod rename;
 mod report;
 mod stored;
 mod target;
+mod unbuilt;
 mod unwrapped;
 mod v4;
 mod v4_57;
@@ -39,7 +40,8 @@ pub fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
         Loader::V4_57_6 => v4_57::predict(expected, stored),
         Loader::V5_23_0 => v5::predict(expected, stored),
     };
-    LoadReport { loader: expected.loader.version().to_owned(), ..report }
+    let unbuilt = unbuilt::unbuilt(expected, &report.unexpected);
+    LoadReport { loader: expected.loader.version().to_owned(), unbuilt, ..report }
 }
 
 /// The stored tensors under the names that the loader has for them in the model, renamed and converted. A shape is
@@ -120,11 +122,11 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     }
     // A hijack is the cause of everything else: the lists repeat it a thousand times.
     if !report.silent.iter().any(|s| s.reason == SilentReason::PrefixHijack) {
-        for (kind, names) in
-            [(FaultKind::MissingTensors, &report.missing), (FaultKind::UnexpectedTensors, &report.unexpected)]
-        {
-            faults.extend(of_names(kind, names.iter().map(String::as_str)));
-        }
+        let unbuilt: BTreeSet<&str> = report.unbuilt.iter().map(String::as_str).collect();
+        let others = report.unexpected.iter().map(String::as_str).filter(|name| !unbuilt.contains(name));
+        faults.extend(of_names(FaultKind::MissingTensors, report.missing.iter().map(String::as_str)));
+        faults.extend(of_names(FaultKind::UnbuiltTensors, report.unbuilt.iter().map(String::as_str)));
+        faults.extend(of_names(FaultKind::UnexpectedTensors, others));
         // A shape of no elements is no other shape: nothing was stored.
         let is_empty = |m: &&Mismatch| m.stored.contains(&0) && !m.expected.contains(&0);
         let (empty, others): (Vec<&Mismatch>, Vec<&Mismatch>) = report.mismatched.iter().partition(is_empty);

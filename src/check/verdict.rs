@@ -270,7 +270,10 @@ fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
     let silent = report.silent.iter().filter(|silent| silent.reason != SilentReason::TiedOver).count();
     let [missing, ..] = report.lengths();
     match (missing, silent) {
-        (0, 0) => (LoadVerdict::Loads, None),
+        (0, 0) if report.unbuilt.is_empty() => (LoadVerdict::Loads, None),
+        (0, 0) => {
+            (LoadVerdict::LoadsWrong, Some("stored layers of the model are ignored: its class builds fewer".to_owned()))
+        }
         (missing, silent) => {
             let n = missing.saturating_add(silent);
             let tensors = if n == 1 { "1 tensor gets".to_owned() } else { format!("{n} tensors get") };

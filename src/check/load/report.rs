@@ -17,6 +17,9 @@ pub struct LoadReport {
     pub missing: Vec<String>,
     /// Provided, not part of the model: ignored.
     pub unexpected: Vec<String>,
+    /// Those of `unexpected` that lie in layers of the model behind the last that the class builds: it computes without them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub unbuilt: Vec<String>,
     /// In both, with different shapes: the load raises.
     pub mismatched: Vec<Mismatch>,
     /// Wrong, and reported by nobody.
@@ -91,7 +94,9 @@ impl LoadReport {
     /// Whether two loaders say the same.
     #[must_use]
     pub(crate) fn agrees(&self, other: &Self) -> bool {
-        let Self { loader: _, stands_for: _, missing, unexpected, mismatched, silent, raises, unlisted } = self;
+        // What is not built follows from the names that are not used.
+        let Self { loader: _, stands_for: _, missing, unexpected, unbuilt: _, mismatched, silent, raises, unlisted } =
+            self;
         (missing, unexpected, mismatched) == (&other.missing, &other.unexpected, &other.mismatched)
             && (silent, raises, unlisted) == (&other.silent, &other.raises, &other.unlisted)
     }
@@ -99,6 +104,7 @@ impl LoadReport {
     /// Shortens the lists to what a report has room for. Called when the whole lists were compared
     /// and bound for the rules.
     pub(in crate::check) fn shorten(&mut self) {
+        shorten(&mut self.unbuilt, |name| name);
         self.unlisted = Unlisted {
             missing: shorten(&mut self.missing, |name| name),
             unexpected: shorten(&mut self.unexpected, |name| name),

@@ -256,6 +256,7 @@ fault_kinds! {
         TotalSizeNotOfClass = "total-size-not-of-class",
         TotalSizeWrong = "total-size-wrong",
         TurnEndsElsewhere = "turn-ends-elsewhere",
+        UnbuiltTensors = "unbuilt-tensors",
         UnexpectedTensors = "unexpected-tensors",
         UnknownArchitecture = "unknown-architecture",
         UnknownQuantization = "unknown-quantization",
