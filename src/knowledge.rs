@@ -96,6 +96,8 @@ pub struct Knowledge {
     pub recipes: Table<Vec<Recipe>>,
     /// Quantisation schemes.
     pub schemes: Table<Vec<Scheme>>,
+    /// Where loaders read which scheme applies.
+    pub scheme_places: Table<quantization::Places>,
     /// Names that transformers accepts in config.json.
     pub names: Table<LoaderNames>,
     /// Tokenizer and processor classes that transformers opens by name.
@@ -158,6 +160,7 @@ impl Knowledge {
         LazyLock::force(&self.initial);
         LazyLock::force(&self.recipes);
         LazyLock::force(&self.schemes);
+        LazyLock::force(&self.scheme_places);
         LazyLock::force(&self.names);
         LazyLock::force(&self.classes);
         LazyLock::force(&self.peft);
@@ -193,6 +196,7 @@ impl Knowledge {
             initial: table!(InitialValues::embedded),
             recipes: table!(Recipe::embedded),
             schemes: table!(Scheme::embedded),
+            scheme_places: table!(quantization::Places::embedded),
             names: table!(LoaderNames::embedded),
             classes: table!(ClassNames::embedded),
             peft: table!(PeftKeys::embedded),

@@ -21,8 +21,9 @@ use serde_json::Value;
 use super::load::{LoadReport, Stored, Target};
 use super::votes::Vote;
 use crate::checkpoint::{Checkpoint, Fault};
-use crate::knowledge::Knowledge;
-use crate::knowledge::quantization::{DeclaredScheme, declared_scheme};
+use crate::knowledge::{Knowledge, Loader};
+
+use crate::knowledge::quantization::{DeclaredScheme, declared_scheme, scheme_read};
 
 /// The predictions for all loaders, and what rules take from them.
 #[derive(Debug, Default)]
@@ -52,11 +53,18 @@ struct Inputs<'a> {
     stored: &'a Stored,
     /// Versions of transformers that the user named; empty for the defaults.
     versions: &'a [String],
-    /// The quantisation scheme that the config declares.
+    /// The quantisation scheme that the config declares at a place that some loader reads.
     scheme: DeclaredScheme<'a>,
+    /// The scheme that each loader reads.
+    read: Vec<(Loader, DeclaredScheme<'a>)>,
 }
 
-impl Inputs<'_> {
+impl<'a> Inputs<'a> {
+    /// The scheme that a loader reads.
+    fn scheme_of(&self, loader: Loader) -> &DeclaredScheme<'a> {
+        self.read.iter().find(|(one, _)| *one == loader).map_or(&self.scheme, |(_, scheme)| scheme)
+    }
+
     fn is_plain(&self) -> bool {
         matches!(self.scheme, DeclaredScheme::Plain)
     }
@@ -69,7 +77,8 @@ impl Inputs<'_> {
 pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String], stored: &Stored) -> Judgement {
     let Some(config) = checkpoint.config().filter(|_| !checkpoint.is_partial()) else { return Judgement::default() };
     let scheme = declared_scheme(config, &knowledge.schemes);
-    let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme };
+    let read = schemes_read(config, knowledge);
+    let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme, read };
     let targets = classes::resolve_targets(&inputs);
     let architecture = targets.first().map(|target| target.architecture.name().to_owned());
     let classes = classes::build_classes(&inputs, targets);
@@ -84,4 +93,9 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();
     faults.extend(faults::undeclared_scheme(&inputs, &loads));
     Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
+}
+
+fn schemes_read<'a>(config: &'a Value, knowledge: &'a Knowledge) -> Vec<(Loader, DeclaredScheme<'a>)> {
+    let read = |loader| scheme_read(config, &knowledge.schemes, &knowledge.scheme_places, loader);
+    Loader::ALL.into_iter().map(|loader| (loader, read(loader))).collect()
 }

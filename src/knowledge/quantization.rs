@@ -5,6 +5,7 @@
 
 mod applied;
 mod declared;
+mod places;
 mod stated;
 
 use serde::Deserialize;
@@ -14,7 +15,8 @@ use super::processor::Let;
 use super::source::{self, DataError};
 
 pub use applied::{AppliedScheme, Shapes};
-pub use declared::{DeclaredScheme, block, declared_scheme};
+pub use declared::{DeclaredScheme, block, declared_scheme, scheme_read};
+pub use places::Places;
 pub use stated::stated;
 
 /// A quantisation scheme, as read from its file in `rules/quantization/`.

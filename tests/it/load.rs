@@ -1,6 +1,7 @@
 //! Architectures, predicted loads and config values, compared with records of the real loaders.
 
 mod architectures;
+mod quantised;
 mod recorded_all;
 mod recorded_sample;
 mod remote_code;

@@ -7,6 +7,7 @@ use crate::check::layers;
 use crate::check::load::{self, LoadReport, Stored, Target};
 use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::names::NameKind;
+use crate::knowledge::quantization::DeclaredScheme;
 use crate::knowledge::{Architecture, Doubt, Expected, Refusal};
 
 /// A target, and the architecture of the class that its loader would build.
@@ -39,8 +40,9 @@ pub(super) fn resolve_targets<'a>(inputs: &Inputs<'a>) -> Vec<TargetClass<'a>> {
 
 /// Builds the class of each target.
 pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a>>) -> Vec<BuiltClass<'a>> {
-    // The layout in which another version packs quantised weights is unknown.
-    let comparable = targets.into_iter().filter(|one| one.target.leads || inputs.is_plain());
+    // The layout in which another version packs quantised weights is unknown. One that reads no scheme builds plain modules.
+    let reads_none = |one: &TargetClass<'_>| matches!(inputs.scheme_of(one.target.loader), DeclaredScheme::Plain);
+    let comparable = targets.into_iter().filter(|one| one.target.leads || reads_none(one));
     let is_unnamed = inputs.config.pointer("/architectures/0").is_none() && inputs.is_plain();
     let fitting = comparable.map(|one| if is_unnamed { with_fitting_class(inputs, one) } else { one });
     let built = fitting.map(|TargetClass { target, architecture }| BuiltClass {

@@ -15,9 +15,10 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 /// tensors contradict.
 pub(super) fn faults(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>], votes: &[Vote]) -> Vec<Fault> {
     let mut faults: Vec<Fault> = loads.iter().flat_map(prefixes).collect();
-    let without_class = if loads.is_empty() { quantised(inputs, None) } else { None };
+    let scheme = loads.first().map_or(&inputs.scheme, |load| inputs.scheme_of(load.prediction.target.loader));
+    let without_class = if loads.is_empty() { quantised(inputs, scheme, None) } else { None };
     let modules = loads.first().and_then(|load| load.prediction.quantised.as_ref()).or(without_class.as_ref());
-    faults.extend(quantization::faults(inputs.checkpoint, &inputs.scheme, modules));
+    faults.extend(quantization::faults(inputs.checkpoint, scheme, modules));
     faults.extend(total_size(inputs, loads));
     faults.extend(pointer_sizes(inputs, loads));
     faults.extend(integers::fault(inputs, loads));

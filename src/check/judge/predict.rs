@@ -27,7 +27,7 @@ pub(super) struct Prediction<'a> {
 pub(super) fn predict<'a>(inputs: &'a Inputs<'a>, built: Vec<BuiltClass<'a>>) -> Vec<Prediction<'a>> {
     let predicted = built.into_iter().filter_map(|one| {
         let expected = one.class.ok()?;
-        let quantised = quantised(inputs, Some(&expected));
+        let quantised = quantised(inputs, inputs.scheme_of(one.target.loader), Some(&expected));
         let report = report(inputs, &one.target, &expected, quantised.as_ref());
         Some(Prediction { target: one.target, architecture: one.architecture, expected, quantised, report })
     });
@@ -35,8 +35,12 @@ pub(super) fn predict<'a>(inputs: &'a Inputs<'a>, built: Vec<BuiltClass<'a>>) ->
 }
 
 /// The quantised modules of the checkpoint, for a scheme that is known.
-pub(super) fn quantised<'a>(inputs: &'a Inputs<'a>, expected: Option<&Expected>) -> Option<Quantised<'a>> {
-    match &inputs.scheme {
+pub(super) fn quantised<'a>(
+    inputs: &'a Inputs<'a>,
+    scheme: &'a DeclaredScheme<'a>,
+    expected: Option<&Expected>,
+) -> Option<Quantised<'a>> {
+    match scheme {
         DeclaredScheme::Known(applied) => Some(Quantised::new(applied, expected, inputs.checkpoint, inputs.stored)),
         _ => None,
     }
@@ -49,7 +53,7 @@ fn report(
     quantised: Option<&Quantised<'_>>,
 ) -> Option<LoadReport> {
     // The layout of an unknown scheme is unknown.
-    if matches!(inputs.scheme, DeclaredScheme::Unknown(_)) || inputs.stored.is_empty() {
+    if matches!(inputs.scheme_of(target.loader), DeclaredScheme::Unknown(_)) || inputs.stored.is_empty() {
         return None;
     }
     let plain = quantised.map_or(Cow::Borrowed(inputs.stored), |q| Cow::Owned(q.plain(inputs.stored)));

@@ -12,7 +12,7 @@ pub type Shapes = Vec<Option<Vec<u64>>>;
 pub struct AppliedScheme<'k> {
     scheme: &'k Scheme,
     block: Value,
-    pointer: &'static str,
+    pointer: &'k str,
     /// Binds `config`, `q` and the functions; parameters are bound in scopes inside it.
     scope: Scope<'static>,
     /// Values of the parameters, in the order of [`Scheme::parameters`].
@@ -20,7 +20,7 @@ pub struct AppliedScheme<'k> {
 }
 
 impl<'k> AppliedScheme<'k> {
-    pub(super) fn new(scheme: &'k Scheme, config: &Value, (pointer, block): (&'static str, &Value)) -> Self {
+    pub(super) fn new(scheme: &'k Scheme, config: &Value, (pointer, block): (&'k str, &Value)) -> Self {
         // MLX writes two equal blocks; only the older one, `quantization`, contains parameters of single modules.
         let block = if scheme.overrides { config.get("quantization").unwrap_or(block) } else { block }.clone();
         let mut scope = Scope::new();
@@ -50,7 +50,7 @@ impl<'k> AppliedScheme<'k> {
 
     /// JSON pointer to the quantisation block of the config.
     #[must_use]
-    pub const fn pointer(&self) -> &'static str {
+    pub const fn pointer(&self) -> &'k str {
         self.pointer
     }
 

@@ -2,9 +2,9 @@
 
 use serde_json::Value;
 
-use super::Scheme;
 use super::applied::AppliedScheme;
-use crate::knowledge::{Scope, Table};
+use super::{Places, Scheme};
+use crate::knowledge::{Loader, Scope, Table};
 
 /// How the weights are stored, as config.json declares it.
 pub enum DeclaredScheme<'k> {
@@ -16,7 +16,7 @@ pub enum DeclaredScheme<'k> {
     Known(Box<AppliedScheme<'k>>),
 }
 
-/// The quantisation block of a config.json, with its JSON pointer.
+/// The quantisation block of a config.json that some loader reads, with its JSON pointer; [`Places`] tells which loader does.
 ///
 /// MLX writes `quantization` and, since 2024, the same block as `quantization_config`; compositions may have it in
 /// their text part. Source: `get_hf_quantizer` of transformers 5.23.0, `load_model` of mlx-lm.
@@ -30,7 +30,25 @@ pub fn block(config: &Value) -> Option<(&'static str, &Value)> {
 /// The scheme that a config declares, if it is one of `schemes`.
 #[must_use]
 pub fn declared_scheme<'k>(config: &Value, schemes: &'k Table<Vec<Scheme>>) -> DeclaredScheme<'k> {
-    let Some((pointer, block)) = block(config) else { return DeclaredScheme::Plain };
+    block(config).map_or(DeclaredScheme::Plain, |found| scheme_of(config, schemes, found))
+}
+
+/// As [`declared_scheme`], from the places that this loader reads; called by the prediction of its load.
+#[must_use]
+pub fn scheme_read<'k>(
+    config: &Value,
+    schemes: &'k Table<Vec<Scheme>>,
+    places: &'k Places,
+    loader: Loader,
+) -> DeclaredScheme<'k> {
+    places.block(config, loader).map_or(DeclaredScheme::Plain, |found| scheme_of(config, schemes, found))
+}
+
+fn scheme_of<'k>(
+    config: &Value,
+    schemes: &'k Table<Vec<Scheme>>,
+    (pointer, block): (&'k str, &Value),
+) -> DeclaredScheme<'k> {
     let mut scope = Scope::new();
     scope.bind("config", config);
     scope.bind("q", block);
