@@ -10,6 +10,7 @@ pub mod engine;
 mod evaluate;
 mod exceptions;
 pub mod finding;
+mod finite;
 pub mod fix;
 pub mod index;
 pub mod inspect;

@@ -13,9 +13,9 @@ use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
 use super::verdict::{Basis, PredictedLoad};
 use super::{
-    adapter, built_tokenizer, card, class_names, directory, index, inspect, judge, model_type, module_imports, modules,
-    pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json, tokens,
-    variables,
+    adapter, built_tokenizer, card, class_names, directory, finite, index, inspect, judge, model_type, module_imports,
+    modules, pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json,
+    tokens, variables,
 };
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
@@ -63,6 +63,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     scope.bind("missing_attributes", &processor::missing_attributes(checkpoint, of_class));
     scope.bind("placeholders", &processor::placeholders(checkpoint, of_class, opened.as_ref()));
     variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
+    let mut faults: Vec<Fault> = faults.into_iter().map(|fault| finite::under_users(fault, &outcome.loads)).collect();
     outcome.loads.iter_mut().for_each(LoadReport::shorten);
     scope.bind("programs", &programs.iter().map(|asked| asked.program.name()).collect());
     let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &programs, &outcome.loads);

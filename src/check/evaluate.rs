@@ -364,7 +364,8 @@ impl Caused {
                 let same = |e: &FindingEffect| {
                     (e.object, e.outcome, e.loader.as_str()) == (object, effect.consequence, loader)
                 };
-                if !is_meant || !effect.loaders.contains(target.version()) || self.effects.iter().any(same) {
+                let is_hit = target.versions.iter().any(|version| effect.loaders.contains(version));
+                if !is_meant || !is_hit || self.effects.iter().any(same) {
                     continue;
                 }
                 let is_stated = loaders.is_empty();

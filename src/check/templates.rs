@@ -81,6 +81,9 @@ pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
                 faults.extend(end_of_turn(checkpoint, &rendered, place.clone()));
                 faults.extend(second_begin(checkpoint, &rendered, place));
             }
+            Rendering::Refused(reason) => {
+                faults.push(Fault::new(FaultKind::TemplateNotRendered).at(place).with("reason", reason));
+            }
             Rendering::Unknown => {}
         }
     }

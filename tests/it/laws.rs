@@ -3,8 +3,10 @@
 //! `SECURITY.md` names the test of each promise. `CKPT_DOCTOR_LAWS=500` sets the number of cases of each test.
 
 mod completeness;
+mod exit;
 mod judgement;
 mod leaks;
+mod templates;
 
 use std::path::Path;
 use std::sync::LazyLock;

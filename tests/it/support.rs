@@ -244,7 +244,7 @@ pub fn look(dir: &Path, deep: bool, knowledge: &Knowledge) -> Outcome {
 }
 
 /// As [`look`], for the loaders of `--for`.
-fn open(dir: &Path, deep: bool, loaders: &[String], knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
+pub fn open(dir: &Path, deep: bool, loaders: &[String], knowledge: &Knowledge) -> (Arc<Checkpoint>, Outcome) {
     let mut checkpoint = read(dir);
     if deep {
         checkpoint.read_contents(ReadOptions::default(), &|_| {});

@@ -15,6 +15,8 @@ pub struct Target {
     pub versions: Vec<String>,
     /// Whether the checkpoint must load there. For another target, only the fact that it does not load is reported.
     pub leads: bool,
+    /// Whether the user named the version. The exit code follows what is predicted for it, by whichever loader.
+    pub named: bool,
     /// Whether transformers itself has the class; otherwise the version says little about it.
     of_transformers: bool,
 }
@@ -26,14 +28,16 @@ impl Target {
         self.stands_for.as_deref().unwrap_or(self.loader.version())
     }
 
-    fn new(loader: Loader, version: &str, leads: bool) -> Self {
+    fn new(loader: Loader, version: &str, leads: bool, named: bool) -> Self {
         let stands_for = (version != loader.version()).then(|| version.to_owned());
-        Self { loader, stands_for, versions: vec![version.to_owned()], leads, of_transformers: true }
+        Self { loader, stands_for, versions: vec![version.to_owned()], leads, named, of_transformers: true }
     }
 
-    /// Whether a prediction holds for a version that was asked for, and is not only near to one.
+    /// Whether what fails here is an error: the user named the version, or the prediction is for the loader's own version
+    /// and not only near to it.
     pub(in crate::check) fn is_certain(&self) -> bool {
-        self.stands_for.is_none()
+        self.named
+            || self.stands_for.is_none()
             || !self.of_transformers
             || self.versions.iter().any(|version| version == self.loader.version())
     }
@@ -71,7 +75,7 @@ pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<
         let loader = Loader::nearest(version);
         match targets.iter_mut().find(|target| target.loader == loader) {
             Some(target) => target.versions.push(version.to_owned()),
-            None => targets.push(Target::new(loader, version, leads)),
+            None => targets.push(Target::new(loader, version, leads, !named.is_empty())),
         }
     }
     targets
@@ -113,7 +117,7 @@ pub fn targets<'l>(
         let Some((loader, architecture)) = library.stands_for(version, config, names) else { continue };
         match known.iter_mut().find(|(target, _)| target.loader == loader) {
             Some((target, _)) => target.versions.push(version.to_owned()),
-            None => known.push((Target::new(loader, version, leads), architecture)),
+            None => known.push((Target::new(loader, version, leads, !named.is_empty()), architecture)),
         }
     }
     for (target, architecture) in &mut known {
@@ -123,7 +127,7 @@ pub fn targets<'l>(
         if known.is_empty() {
             let built = |loader| Some((loader, library.find(config, names.iter().copied(), loader)?));
             let other = Loader::ALL.into_iter().find_map(built);
-            known.extend(other.map(|(loader, class)| (Target::new(loader, loader.version(), true), class)));
+            known.extend(other.map(|(loader, class)| (Target::new(loader, loader.version(), true, false), class)));
         }
         if let Some((target, _)) = known.first_mut() {
             target.lead(version);

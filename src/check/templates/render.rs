@@ -1,13 +1,13 @@
 //! Renders a chat template in a sandbox with bounded work.
 
 use minijinja::syntax::SyntaxConfig;
-use minijinja::value::Rest;
-use minijinja::{Environment, Error, ErrorKind, State, Value, context};
+use minijinja::value::{Kwargs, Rest};
+use minijinja::{Environment, Error, ErrorKind, State, Value, context, filters};
 use minijinja_contrib::pycompat;
 use regex::Regex;
 use std::sync::LazyLock;
 
-use super::tame::is_tame;
+use super::tame;
 
 /// Longest template that is parsed, in bytes: the parser counts columns in 16 bits. Those of published models have at most
 /// some 30 000.
@@ -21,6 +21,12 @@ const MAX_STRING: usize = 64 << 10;
 
 /// Depth of calls and loops.
 const MAX_DEPTH: usize = 60;
+
+/// Spaces that `tojson` may indent by; the engine charges for its text when that exists.
+const MAX_INDENT: u64 = 8;
+
+/// Start of the detail of an error that stops a rendering because of what it would cost.
+const COSTLY: &str = "costly: ";
 
 /// What the messages say, so that their places in the text are known.
 const USER: &str = "qhGxUser1wVk";
@@ -54,7 +60,9 @@ pub(super) enum Rendering {
     Invalid { line: usize, reason: String },
     /// Text of a short conversation.
     Done(Rendered),
-    /// It failed, or took too long.
+    /// It would cost too much, and why.
+    Refused(String),
+    /// It failed.
     Unknown,
 }
 
@@ -69,8 +77,11 @@ pub(super) struct Rendered {
 impl Rendering {
     /// Renders a template for one turn of each side, with these special tokens.
     pub(super) fn of(text: &str, special: &[(&str, &str)]) -> Self {
-        if text.len() > MAX_TEXT || !is_tame(text) {
-            return Self::Unknown;
+        if text.len() > MAX_TEXT {
+            return Self::Refused(format!("it has {} bytes, more than {MAX_TEXT}", text.len()));
+        }
+        if let Some(cost) = tame::cost(text) {
+            return Self::Refused(cost.reason().to_owned());
         }
         let plain = without_generation(text);
         let Some(environment) = environment() else { return Self::Unknown };
@@ -82,12 +93,17 @@ impl Rendering {
         let parts = |text: &str| Value::from(vec![context! { type => "text", text => text }]);
         let words = |text: &str| Value::from(text);
         let contents: [&dyn Fn(&str) -> Value; 2] = [&words, &parts];
-        let rendered = contents.into_iter().find_map(|content| {
-            let text = template.render(variables(content, special)).ok()?;
-            let (_, after) = text.split_once(ASSISTANT).filter(|(before, _)| before.contains(USER))?;
-            Some(Rendered { after_assistant: after.to_owned(), text })
-        });
-        rendered.map_or(Self::Unknown, Self::Done)
+        let mut refused = None;
+        for content in contents {
+            match template.render(variables(content, special)) {
+                Ok(text) => match text.split_once(ASSISTANT).filter(|(before, _)| before.contains(USER)) {
+                    Some((_, after)) => return Self::Done(Rendered { after_assistant: after.to_owned(), text }),
+                    None => continue,
+                },
+                Err(error) => refused = refused.or_else(|| excess(&error)),
+            }
+        }
+        refused.map_or(Self::Unknown, Self::Refused)
     }
 
     fn of_error(error: &Error) -> Self {
@@ -96,6 +112,26 @@ impl Rendering {
             return Self::Unknown;
         }
         Self::Invalid { line: error.line().unwrap_or(1), reason: reason.to_owned() }
+    }
+}
+
+/// What a rendering would have cost, if that is why it stopped.
+fn excess(error: &Error) -> Option<String> {
+    let own = error.detail().and_then(|detail| detail.strip_prefix(COSTLY)).map(str::to_owned);
+    let is_long = error.kind() == ErrorKind::OutOfFuel;
+    own.or_else(|| is_long.then(|| format!("a conversation of two messages takes more than {FUEL} steps")))
+}
+
+/// The filter `tojson`, with indents that text has.
+fn tojson(value: &Value, indent: Option<Value>, options: Kwargs) -> Result<Value, Error> {
+    let asked = indent.clone().or_else(|| options.peek::<Value>("indent").ok());
+    let spaces = asked.filter(Value::is_number).map(|asked| u64::try_from(asked).unwrap_or(u64::MAX));
+    match spaces.filter(|spaces| *spaces > MAX_INDENT) {
+        Some(spaces) => {
+            let detail = format!("{COSTLY}tojson indents by {spaces} spaces, more than {MAX_INDENT}");
+            Err(Error::new(ErrorKind::InvalidOperation, detail))
+        }
+        None => filters::tojson(value, indent, options),
     }
 }
 
@@ -116,6 +152,7 @@ fn environment() -> Option<Environment<'static>> {
     environment.set_recursion_limit(MAX_DEPTH);
     environment.set_auto_escape_callback(|_| minijinja::AutoEscape::None);
     environment.set_unknown_method_callback(method);
+    environment.add_filter("tojson", tojson);
     environment.add_function("raise_exception", |_: Rest<Value>| -> Result<Value, Error> {
         Err(Error::new(ErrorKind::InvalidOperation, "raised by the template"))
     });

@@ -1,6 +1,10 @@
 //! Refuses templates whose cost the engine does not bound: it charges for strings, but builds sums of lists for free once
 //! they are nested deeply, and its parser recurses over chains of operators.
 
+mod nesting;
+
+use nesting::Nesting;
+
 /// Operators and names of operators in one tag; templates of published models have at most some 60.
 const MAX_OPERATORS: usize = 250;
 
@@ -10,12 +14,41 @@ const MAX_SUMS: usize = 20;
 /// Tags that continue a condition: the parser recurses over them.
 const MAX_BRANCHES: usize = 300;
 
+/// Why a template is not rendered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Cost {
+    /// One tag has too many operators.
+    Operators,
+    /// A raw block, whose text looks like tags.
+    Raw,
+    /// Sums that may double a list.
+    Sums,
+    /// A condition has too many branches.
+    Branches,
+    /// A list or dictionary holds itself again and again, or one value too often.
+    Nesting,
+}
+
+impl Cost {
+    /// The words of a finding.
+    pub(super) const fn reason(self) -> &'static str {
+        match self {
+            Self::Operators => "a tag has more than 250 operators",
+            Self::Raw => "it has a raw block",
+            Self::Sums => "sums may double a list again and again",
+            Self::Branches => "a condition has more than 300 branches",
+            Self::Nesting => "lists or dictionaries are nested in themselves again and again",
+        }
+    }
+}
+
 /// Words that are operators.
 const WORDS: [&str; 7] = ["if", "else", "and", "or", "not", "in", "is"];
 
-/// Whether a template may be given to the engine.
-pub(super) fn is_tame(text: &str) -> bool {
+/// Why a template may not be given to the engine; `None` if it may.
+pub(super) fn cost(text: &str) -> Option<Cost> {
     let mut rest = text;
+    let mut nesting = Nesting::default();
     let (mut depth, mut in_macro, mut sums, mut branches) = (0_usize, 0_usize, 0_usize, 0_usize);
     while let Some(at) = rest.find('{') {
         let (_, opened) = rest.split_at(at);
@@ -29,6 +62,7 @@ pub(super) fn is_tame(text: &str) -> bool {
             continue;
         }
         let tag = Tag::of(found);
+        nesting.add(tag.word, &tag.expression, depth > 0 || in_macro > 0);
         match tag.word {
             // Its body is called with other lists.
             "for" if tag.is_recursive => in_macro = in_macro.saturating_add(1),
@@ -41,16 +75,17 @@ pub(super) fn is_tame(text: &str) -> bool {
         }
         sums = sums.saturating_add(tag.sums);
         let keeps = matches!(tag.word, "set" | "with") && depth > 0 || in_macro > 0;
-        if tag.operators > MAX_OPERATORS
-            || tag.word == "raw"
-            || sums > MAX_SUMS
-            || branches > MAX_BRANCHES
-            || keeps && tag.sums > 0
-        {
-            return false;
+        let over = [
+            (tag.operators > MAX_OPERATORS, Cost::Operators),
+            (tag.word == "raw", Cost::Raw),
+            (sums > MAX_SUMS || keeps && tag.sums > 0, Cost::Sums),
+            (branches > MAX_BRANCHES, Cost::Branches),
+        ];
+        if let Some((_, cost)) = over.into_iter().find(|(is_over, _)| *is_over) {
+            return Some(cost);
         }
     }
-    true
+    nesting.is_excessive().then_some(Cost::Nesting)
 }
 
 /// Where a tag that begins here ends; `None` for a brace that begins none, or one without an end, which does not parse.
@@ -100,6 +135,8 @@ struct Tag<'t> {
     /// Additions without a literal beside them.
     sums: usize,
     is_recursive: bool,
+    /// The text behind the word, without the content of string literals.
+    expression: String,
 }
 
 impl<'t> Tag<'t> {
@@ -127,13 +164,20 @@ impl<'t> Tag<'t> {
         // The signs beside the delimiters control whitespace.
         let sums = plain.match_indices('+').filter(is_sum).count();
         let is_recursive = word == "for" && plain.split(|c| !is_word(c)).any(|word| word == "recursive");
-        Self { word, operators: words.saturating_add(symbols), sums, is_recursive }
+        let expression = plain.get(2..plain.len().saturating_sub(2)).unwrap_or_default();
+        let expression = expression.trim_matches(|c: char| matches!(c, '-' | '+') || c.is_whitespace());
+        let expression = expression.strip_prefix(word).unwrap_or(expression).to_owned();
+        Self { word, operators: words.saturating_add(symbols), sums, is_recursive, expression }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::is_tame;
+    use super::{Cost, cost};
+
+    fn is_tame(text: &str) -> bool {
+        cost(text).is_none()
+    }
 
     #[test]
     fn templates_that_cost_too_much_are_refused() {
@@ -154,5 +198,38 @@ mod tests {
         }
         assert!(!is_tame(&format!("{{{{ {}1 }}}}", "a if b else ".repeat(200))));
         assert!(is_tame(&"{{ 'a' ~ b }}".repeat(4_000)));
+    }
+
+    #[test]
+    fn values_that_hold_themselves_again_and_again_are_refused() {
+        let looped = |tag: &str| format!("{{% for i in range(50) %}}{tag}{{% endfor %}}");
+        for tag in [
+            "{% set n.a = [n.a, n.a] %}",
+            "{% set n.a = {'x': n.a, 'y': n.a} %}",
+            "{% set n.a = n.a|chain(n.a) %}",
+            "{% set n.a = [n.a] %}",
+            "{% set n.a = [n['a'], 1] %}",
+            "{% set b = [n.a] %}{% set n.a = [b] %}",
+            "{% for b in [[n.a, n.a]] %}{% set n.a = b %}{% endfor %}",
+            "{% with b = [n.a, n.a] %}{% set n.a = b %}{% endwith %}",
+        ] {
+            assert_eq!(cost(&format!("{{% set n = namespace(a=[1]) %}}{}", looped(tag))), Some(Cost::Nesting), "{tag}");
+        }
+        let alias = "{% set n = namespace(a=[1]) %}{% set m = n %}";
+        assert_eq!(cost(&format!("{alias}{}", looped("{% set m.a = [n.a, n.a] %}"))), Some(Cost::Nesting));
+        assert_eq!(cost("{% macro f(a) %}{{ f([a, a]) }}{% endmacro %}{{ f(1) }}"), Some(Cost::Nesting));
+        assert_eq!(cost("{% for a in messages recursive %}{{ loop([a, a]) }}{% endfor %}"), Some(Cost::Nesting));
+        assert_eq!(cost(&"{% set a = [a, a] %}".repeat(17)), Some(Cost::Nesting));
+        let chain: String = (0..20).map(|i| format!("{{% set a{} = [a{i}, a{i}] %}}", i + 1)).collect();
+        assert_eq!(cost(&chain), Some(Cost::Nesting));
+        for text in [
+            "{% for m in messages %}{% set role = m.role %}{% set x = {'role': role, 'content': m.content} %}{% endfor %}",
+            "{% set n = namespace(found=false) %}{% for m in messages %}{% set n.found = (n.found or m.role == 'x') %}{% endfor %}",
+            "{% macro f(a) %}{{ f(a.items) }}{{ {'x': a.x, 'y': a.y}|tojson }}{% endmacro %}",
+            "{% set a = [messages, messages] %}{% set b = [a, a] %}{{ b }}",
+            "{% set n = namespace(last=none) %}{% for m in messages[::-1] %}{% set n.last = messages[n.last] %}{% endfor %}",
+        ] {
+            assert_eq!(cost(text), None, "{text}");
+        }
     }
 }

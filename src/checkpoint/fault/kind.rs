@@ -244,6 +244,7 @@ fault_kinds! {
         StatisticsWidthsDiffer = "statistics-widths-differ",
         StrayShard = "stray-shard",
         SuppressionUnused = "suppression-unused",
+        TemplateNotRendered = "template-not-rendered",
         TemplateSyntax = "template-syntax",
         TensorInTwoShards = "tensor-in-two-shards",
         TiedOver = "tied-over",
