@@ -2,6 +2,7 @@
 
 use super::load::LoadReport;
 use crate::checkpoint::{Fault, FaultKind};
+use crate::knowledge::Loader;
 
 /// Start of the names of files that PEFT reads in place of a class.
 const ADAPTER: &str = "adapter_model.";
@@ -17,10 +18,9 @@ pub(super) fn under_users(fault: Fault, loads: &[LoadReport]) -> Fault {
         return fault.with("used", true);
     }
     let tensor = place.and_then(|place| place.tensor.clone()).unwrap_or_default();
-    let users: Vec<&str> = loads.iter().filter(|load| uses(load, &tensor)).map(|load| load.loader.as_str()).collect();
-    let known = crate::knowledge::Loader::ALL.into_iter().map(crate::knowledge::Loader::version);
-    let known: Vec<&'static str> = known.filter(|version| users.contains(version)).collect();
-    fault.with("used", !known.is_empty()).under_all(known)
+    let is_user = |version: &&str| loads.iter().any(|load| load.loader == **version && uses(load, &tensor));
+    let users: Vec<&'static str> = Loader::ALL.into_iter().map(Loader::version).filter(is_user).collect();
+    fault.with("used", !users.is_empty()).under_all(users)
 }
 
 /// Whether a loader reads the tensor into the model. The report may spell a name as the loader renames it, so the end of a

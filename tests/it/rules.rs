@@ -213,14 +213,14 @@ fn weights_of_another_program_are_an_error_when_transformers_is_named() {
     }
 }
 
-/// What only a nearby version predicts is no error, unless a version that was asked for fails as well.
+/// What a nearby version predicts is an error for a version that the user named.
 #[test]
-fn a_finding_that_rests_on_a_nearby_version_is_a_warning() {
+fn a_finding_that_rests_on_a_nearby_version_is_an_error_for_a_named_one() {
     let room = tempfile::tempdir().expect("a directory");
     let old = r#"{ set: { file: "config.json", at: "/transformers_version", to: "4.40.0" } }"#;
     let dir = crate::support::made("llama", &format!(r#"[{old}, {{ drop_tensors: "model.norm." }}]"#), room.path());
     for (versions, severity) in [
-        (&["4.40.0"] as &[&str], Severity::Warning),
+        (&["4.40.0"] as &[&str], Severity::Error),
         (&["4.47.0"], Severity::Error),
         (&["4.40.0", "5.23.0"], Severity::Error),
         (&[], Severity::Error),

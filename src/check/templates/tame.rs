@@ -23,6 +23,8 @@ pub(super) enum Cost {
     Raw,
     /// Sums that may double a list.
     Sums,
+    /// Products that may repeat a list too often.
+    Products,
     /// A condition has too many branches.
     Branches,
     /// A list or dictionary holds itself again and again, or one value too often.
@@ -36,11 +38,15 @@ impl Cost {
             Self::Operators => "a tag has more than 250 operators",
             Self::Raw => "it has a raw block",
             Self::Sums => "sums may double a list again and again",
+            Self::Products => "products may repeat a list more than 100000 times",
             Self::Branches => "a condition has more than 300 branches",
             Self::Nesting => "lists or dictionaries are nested in themselves again and again",
         }
     }
 }
+
+/// Times that the products of a template may repeat a list: one that is printed is not charged for before it exists.
+const MAX_REPEATED: u64 = 100_000;
 
 /// Words that are operators.
 const WORDS: [&str; 7] = ["if", "else", "and", "or", "not", "in", "is"];
@@ -49,6 +55,7 @@ const WORDS: [&str; 7] = ["if", "else", "and", "or", "not", "in", "is"];
 pub(super) fn cost(text: &str) -> Option<Cost> {
     let mut rest = text;
     let mut nesting = Nesting::default();
+    let mut repeated = 1_u64;
     let (mut depth, mut in_macro, mut sums, mut branches) = (0_usize, 0_usize, 0_usize, 0_usize);
     while let Some(at) = rest.find('{') {
         let (_, opened) = rest.split_at(at);
@@ -74,11 +81,13 @@ pub(super) fn cost(text: &str) -> Option<Cost> {
             _ => {}
         }
         sums = sums.saturating_add(tag.sums);
+        repeated = repeated.saturating_mul(tag.repeated);
         let keeps = matches!(tag.word, "set" | "with") && depth > 0 || in_macro > 0;
         let over = [
             (tag.operators > MAX_OPERATORS, Cost::Operators),
             (tag.word == "raw", Cost::Raw),
             (sums > MAX_SUMS || keeps && tag.sums > 0, Cost::Sums),
+            (repeated > MAX_REPEATED || keeps && tag.repeated > 1, Cost::Products),
             (branches > MAX_BRANCHES, Cost::Branches),
         ];
         if let Some((_, cost)) = over.into_iter().find(|(is_over, _)| *is_over) {
@@ -135,6 +144,8 @@ struct Tag<'t> {
     /// Additions without a literal beside them.
     sums: usize,
     is_recursive: bool,
+    /// The product of the numbers that multiply something; the largest number for a factor that is not a number.
+    repeated: u64,
     /// The text behind the word, without the content of string literals.
     expression: String,
 }
@@ -167,8 +178,35 @@ impl<'t> Tag<'t> {
         let expression = plain.get(2..plain.len().saturating_sub(2)).unwrap_or_default();
         let expression = expression.trim_matches(|c: char| matches!(c, '-' | '+') || c.is_whitespace());
         let expression = expression.strip_prefix(word).unwrap_or(expression).to_owned();
-        Self { word, operators: words.saturating_add(symbols), sums, is_recursive, expression }
+        let repeated = repeated(&plain);
+        Self { word, operators: words.saturating_add(symbols), sums, is_recursive, repeated, expression }
     }
+}
+
+/// The product of the numbers beside `*` in a tag without literals: of the smaller one of each pair, if both are numbers.
+fn repeated(plain: &str) -> u64 {
+    if !plain.contains('*') {
+        return 1;
+    }
+    // `2 * 10 ** 9`.
+    if plain.contains("**") {
+        return if plain.replace("**", "").contains('*') { u64::MAX } else { 1 };
+    }
+    let is_digit = |c: char| c.is_ascii_digit();
+    let number = |text: &str| text.parse::<u64>().ok();
+    let factor = |(at, _): (usize, &str)| {
+        let before = plain.get(..at).unwrap_or_default().trim_end();
+        let after = plain.get(at.saturating_add(1)..).unwrap_or_default().trim_start();
+        let left = number(before.get(before.trim_end_matches(is_digit).len()..).unwrap_or_default());
+        let right = number(
+            after.get(..after.len().saturating_sub(after.trim_start_matches(is_digit).len())).unwrap_or_default(),
+        );
+        match (left, right) {
+            (Some(_), Some(_)) => 1,
+            (left, right) => left.or(right).unwrap_or(u64::MAX),
+        }
+    };
+    plain.match_indices('*').map(factor).fold(1, u64::saturating_mul)
 }
 
 #[cfg(test)]
@@ -198,6 +236,20 @@ mod tests {
         }
         assert!(!is_tame(&format!("{{{{ {}1 }}}}", "a if b else ".repeat(200))));
         assert!(is_tame(&"{{ 'a' ~ b }}".repeat(4_000)));
+    }
+
+    #[test]
+    fn products_that_repeat_a_list_too_often_are_refused() {
+        for (text, is_refused) in [
+            ("{{ [1] * 999999 }}", true),
+            ("{{ [1] * ('99999999'|int) }}", true),
+            ("{{ [1] * 10 ** 9 }}", true),
+            ("{% set a = [1] * 9999 %}{% set b = a * 9999 %}{{ b }}", true),
+            ("{% for m in messages %}{% set n.a = n.a * 2 %}{% endfor %}", true),
+            ("{{ '=' * 80 }}{{ loop.index0 * 2 }}{{ 10 ** 3 }}{{ 100000 * 100000 }}", false),
+        ] {
+            assert_eq!(cost(text) == Some(Cost::Products), is_refused, "{text}");
+        }
     }
 
     #[test]

@@ -139,18 +139,16 @@ fn looped(draw: &mut Draw) -> (bool, String) {
     (true, text)
 }
 
-/// Checks directories in one run within the limits; the report.
-fn check(room: &Path) -> Value {
+/// Checks directories in one run within the limits; the report, or what ended the run.
+fn check(room: &Path) -> Result<Value, String> {
     let script = format!("ulimit -c 0; ulimit -v {SPACE}; ulimit -t {BATCH}; exec \"$0\" \"$@\"");
     let output = Command::new("/bin/sh")
         .args(["-c", &script, env!("CARGO_BIN_EXE_ckpt-doctor"), "check", "--isolated", "--output-format", "json"])
         .arg(room)
         .output()
         .unwrap();
-    serde_json::from_slice(&output.stdout).unwrap_or_else(|_| {
-        let errors = String::from_utf8_lossy(&output.stderr);
-        panic!("{}: no report: {:?} {errors}", room.display(), output.status)
-    })
+    serde_json::from_slice(&output.stdout)
+        .map_err(|_| format!("{:?} {}", output.status, String::from_utf8_lossy(&output.stderr)))
 }
 
 #[test]
@@ -168,7 +166,11 @@ fn a_template_costs_little_or_is_refused() {
             fs::write(dir.join("config.json"), "{}").unwrap();
             fs::write(dir.join("chat_template.jinja"), text).unwrap();
         }
-        let report = check(room.path());
+        let report = check(room.path()).unwrap_or_else(|why| {
+            let alone = |number: &usize| check(&room.path().join(format!("{number:02}"))).is_err();
+            let texts: Vec<&str> = (0..batch.len()).filter(alone).map(|number| batch[number].1.as_str()).collect();
+            panic!("{why}\nends the program alone: {texts:#?}")
+        });
         for checkpoint in report["checkpoints"].as_array().unwrap() {
             let number: usize = checkpoint["path"].as_str().unwrap().rsplit('/').next().unwrap().parse().unwrap();
             let (costly, text) = &batch[number];
