@@ -4,10 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use super::{Error, knowledge};
-use crate::check::check_for;
+use crate::check::{check_for, try_for};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Progress, ReadOptions};
 use crate::report::model::CheckpointReport;
+use crate::surgery::repair::tried;
 
 /// Checks checkpoint directories with the rules of this crate.
 #[derive(Debug, Clone, Default)]
@@ -87,7 +88,8 @@ impl Checker {
             checkpoint.check_hashes(progress);
         }
         let checkpoint = Arc::new(checkpoint);
-        let outcome = check_for(&checkpoint, knowledge, &self.versions);
+        let judge = |checkpoint: &Arc<Checkpoint>| try_for(checkpoint, knowledge, &self.versions);
+        let outcome = tried(&checkpoint, check_for(&checkpoint, knowledge, &self.versions), &judge);
         Ok(CheckpointReport::new(shown(path), None, &checkpoint, &outcome))
     }
 }

@@ -22,7 +22,7 @@ use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::program::AskedProgram;
-use crate::knowledge::rule::Object;
+use crate::knowledge::rule::{Object, Rule};
 use crate::knowledge::{Knowledge, Loader, Scope};
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest of each major version.
@@ -34,6 +34,18 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 /// As [`check`], for these versions of transformers unless the list is empty; `peft==0.13.2` is one of PEFT.
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
+    run(checkpoint, knowledge, versions, false)
+}
+
+/// As [`check_for`], with verdicts by all rules, whether selected or not. Called for a checkpoint with a fix that is tried: a
+/// loader that refuses what the fix writes refuses it whichever rules the user selected.
+#[must_use]
+pub fn try_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
+    run(checkpoint, knowledge, versions, true)
+}
+
+/// Checks a checkpoint; `judged_by_all` is whether rules that were not selected count in the verdicts.
+fn run(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String], judged_by_all: bool) -> Outcome {
     let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
     let (versions, programs) = (versions.as_slice(), knowledge.asked_programs(&programs));
     let mut faults = faults_of_files(checkpoint, knowledge, &programs);
@@ -74,12 +86,19 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
     faults.extend(refused);
     faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
-    run_rules(knowledge, &context, &faults, &scope, &mut outcome);
+    run_rules(&knowledge.rules.rules, &context, &faults, &scope, &mut outcome);
     let unselected = knowledge.rules.unselected.iter();
     outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
-    outcome.verdicts = verdicts(checkpoint, knowledge, &context, &faults, &outcome, &judged.unpredicted);
+    outcome.verdicts = if judged_by_all {
+        let mut whole = outcome.clone();
+        run_rules(&knowledge.rules.unselected, &context, &faults, &scope, &mut whole);
+        verdicts(checkpoint, &[], &context, &faults, &whole, &judged.unpredicted)
+    } else {
+        verdicts(checkpoint, &knowledge.rules.unselected, &context, &faults, &outcome, &judged.unpredicted)
+    };
+    outcome.by_all_rules = judged_by_all || knowledge.rules.unselected.is_empty();
     outcome.findings = bounded(std::mem::take(&mut outcome.findings));
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
@@ -115,17 +134,17 @@ fn faults_of_versions(
     faults
 }
 
-/// What each loader does with each object, by the findings and the predicted loads.
+/// What each loader does with each object, by the findings and the predicted loads. `silent` are the rules that did not run.
 fn verdicts(
     checkpoint: &Checkpoint,
-    knowledge: &Knowledge,
+    silent: &[Rule],
     context: &Context<'_>,
     faults: &[Fault],
     outcome: &Outcome,
     unpredicted: &[(&'static str, String)],
 ) -> Vec<PredictedLoad> {
     // An effect without an object is on the one that reads the file of the fault, which may be any.
-    let unjudged = knowledge.rules.unselected.iter().flat_map(|rule| &rule.effects);
+    let unjudged = silent.iter().flat_map(|rule| &rule.effects);
     let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
     let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
     let basis = Basis {

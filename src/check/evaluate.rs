@@ -51,14 +51,14 @@ impl<'a> Context<'a> {
 
 /// Runs the selected rules, and adds their findings and the skipped rules to the outcome.
 pub(super) fn run_rules(
-    knowledge: &Knowledge,
+    rules: &[Rule],
     context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,
     outcome: &mut Outcome,
 ) {
     let architecture = outcome.architecture.clone();
-    for rule in &knowledge.rules.rules {
+    for rule in rules {
         // Built-in rules are known to end; a user's rule gets a limit.
         let (found, stopped) = match rule.origin {
             Some(_) => within(STEPS, || evaluate(rule, context, faults, scope, architecture.as_deref())),

@@ -63,7 +63,8 @@ pub enum Edit {
         /// The shards, by file name.
         shards: Vec<String>,
     },
-    /// Rewrites the header of a shard, with `"format": "pt"` added to its metadata; the bytes of the tensors stay.
+    /// Rewrites the header of a shard, with `"format": "pt"` in its metadata unless it has a format that transformers accepts;
+    /// the bytes of the tensors stay.
     Header {
         /// File name of the shard.
         file: String,
@@ -76,6 +77,20 @@ pub enum Edit {
 }
 
 impl Edit {
+    /// The file that the edit changes; `None` for a rename, which changes all that hold the names.
+    const fn file(&self) -> Option<&String> {
+        match self {
+            Self::Splice { file, .. }
+            | Self::Set { file, .. }
+            | Self::Remove { file, .. }
+            | Self::Write { file, .. }
+            | Self::Reencode { file }
+            | Self::Index { file, .. }
+            | Self::Header { file } => Some(file),
+            Self::Rename { .. } => None,
+        }
+    }
+
     /// The text file that the edit changes in place; `None` for edits that write whole files.
     #[must_use]
     pub(crate) const fn text_file(&self) -> Option<&String> {
@@ -121,25 +136,54 @@ pub struct FixHint {
     /// The changes that `check --fix` makes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub edits: Vec<Edit>,
+    /// Whether it rests on the description of a class, so that only a complete load after it proves it.
+    #[serde(skip)]
+    pub needs_whole_load: bool,
 }
 
 impl FixHint {
     /// A fix with edits.
     #[must_use]
     pub fn new(safety: Safety, title: impl Into<String>, edits: Vec<Edit>) -> Self {
-        Self { safety, title: Some(title.into()), help: None, edits }
+        Self { safety, title: Some(title.into()), help: None, edits, needs_whole_load: false }
     }
 
     /// Advice without edits.
     #[must_use]
     pub(crate) fn manual(help: impl Into<String>) -> Self {
-        Self { safety: Safety::Manual, title: None, help: Some(help.into()), edits: Vec::new() }
+        Self {
+            safety: Safety::Manual,
+            title: None,
+            help: Some(help.into()),
+            edits: Vec::new(),
+            needs_whole_load: false,
+        }
     }
 
     /// The same as advice, without its edits.
     #[must_use]
     pub fn without_edits(self) -> Self {
         Self::manual(self.help.or(self.title).unwrap_or_default())
+    }
+
+    /// The advice in place of edits that were tried on the checkpoint in memory and withdrawn for a reason.
+    #[must_use]
+    pub(crate) fn withheld(self, reason: &str) -> Self {
+        let help = match (self.help, self.title) {
+            (Some(help), None) => help,
+            (help, title) => {
+                let first = help.map(|help| format!("{help}; ")).unwrap_or_default();
+                let title = title.unwrap_or_default();
+                format!("{first}find the cause by hand: a trial of the fix, to {title}, showed that {reason}")
+            }
+        };
+        Self::manual(help)
+    }
+
+    /// The files that the edits change by name, the first one first. A rename names none.
+    #[must_use]
+    pub(crate) fn files(&self) -> Vec<String> {
+        self.edits.iter().filter_map(Edit::file).cloned().collect()
     }
 
     /// What the edits do; for a manual fix, the advice.
@@ -196,8 +240,15 @@ impl<'a> Site<'a> {
 pub(super) fn hint(fixes: &[Fix], site: &Site<'_>) -> Option<FixHint> {
     let holds = |fix: &&Fix| fix.when.as_ref().is_none_or(|when| when.eval_bool(site.scope).unwrap_or(false));
     let render = |text: &Option<Template>| text.as_ref().map(|text| text.render(site.scope));
-    let resolved =
-        |fix: &Fix, edits| FixHint { safety: fix.safety, title: render(&fix.title), help: render(&fix.help), edits };
+    let needs_whole_load =
+        |fix: &Fix| fix.needs_whole_load.as_ref().is_some_and(|is| is.eval_bool(site.scope).unwrap_or(true));
+    let resolved = |fix: &Fix, edits| FixHint {
+        safety: fix.safety,
+        title: render(&fix.title),
+        help: render(&fix.help),
+        edits,
+        needs_whole_load: needs_whole_load(fix),
+    };
     let mut advice = None;
     for fix in fixes.iter().filter(holds) {
         let edits = each(fix, site);

@@ -77,6 +77,9 @@ pub struct PredictedLoad {
     /// The version that the user named, or that wrote config.json, when `loader` stands for it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stands_for: Option<String>,
+    /// Whether the checkpoint must load there: the user named the version, or it wrote config.json.
+    #[serde(skip)]
+    pub leads: bool,
     /// The worst verdict of the objects. One that is not predicted counts only for the model, or when nothing else is
     /// offered.
     pub verdict: LoadVerdict,
@@ -96,6 +99,7 @@ impl PredictedLoad {
         Self {
             loader: report.loader.clone(),
             stands_for: report.stands_for.clone(),
+            leads: true,
             verdict,
             objects: vec![object],
             tensors: Some(report),
@@ -134,7 +138,7 @@ impl Basis<'_> {
         if is_judged && !offered.contains(&Object::Processor) {
             offered.push(Object::Processor);
         }
-        let verdict = |loader: &str, stands_for: Option<String>| {
+        let verdict = |loader: &str, stands_for: Option<String>, leads: bool| {
             let mut objects: Vec<ObjectVerdict> = offered.iter().map(|object| self.object(*object, loader)).collect();
             objects.sort_by_key(|object| (std::cmp::Reverse(object.verdict), object.object));
             let judged = objects
@@ -144,13 +148,15 @@ impl Basis<'_> {
             PredictedLoad {
                 loader: loader.to_owned(),
                 stands_for,
+                leads,
                 verdict: judged.max().unwrap_or(LoadVerdict::NotPredicted),
                 tensors: self.report(loader).cloned(),
                 objects,
             }
         };
-        let own = targets.iter().map(|target| verdict(target.loader.version(), target.stands_for.clone()));
-        own.chain(programs.iter().map(|asked| verdict(&asked.loader(), None))).collect()
+        let own =
+            targets.iter().map(|target| verdict(target.loader.version(), target.stands_for.clone(), target.leads));
+        own.chain(programs.iter().map(|asked| verdict(&asked.loader(), None, false))).collect()
     }
 
     /// Whether any shard was read; the names of an index alone tell nothing of a load.

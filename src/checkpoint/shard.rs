@@ -10,7 +10,7 @@ use super::{Fault, Place};
 
 mod dtype;
 mod entry;
-pub(super) mod header;
+pub(crate) mod header;
 mod layout;
 mod read;
 pub(super) mod tail;

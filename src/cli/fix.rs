@@ -16,7 +16,7 @@ use crate::report::{diff, fixes};
 use crate::surgery::repair::{Repair, plan};
 use crate::surgery::{ApplyError, Leftover, Recovered, Recovery, RepairError, journal, overlay};
 
-/// Checks a checkpoint with the selected rules.
+/// Judges a checkpoint on which fixes are tried.
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
 
 impl FixArgs {
@@ -66,8 +66,10 @@ fn warn(leftover: Option<&Leftover>) {
 pub struct Repaired {
     /// The repaired directory: the original or the copy.
     pub dir: PathBuf,
+    /// Read again, if files were written.
     pub checkpoint: Arc<Checkpoint>,
-    pub outcome: Outcome,
+    /// The result of the check, if no file was written.
+    pub outcome: Option<Outcome>,
     pub fixed: Vec<Fixed>,
     pub withdrawn: Vec<Withdrawn>,
 }
@@ -79,18 +81,14 @@ pub fn repair(
     checkpoint: &Arc<Checkpoint>,
     outcome: Outcome,
     open: &dyn Fn(&Path) -> anyhow::Result<Arc<Checkpoint>>,
-    check: CheckFn<'_>,
+    judge: CheckFn<'_>,
 ) -> anyhow::Result<Repaired> {
-    let repair = plan(checkpoint, outcome, args.unsafe_fixes, check);
+    let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, judge);
     let written = write(args, &dir, &repair)?;
-    let Repair { outcome, fixed, withdrawn, .. } = repair;
+    let Repair { fixed, withdrawn, .. } = repair;
     Ok(match written {
-        // The written files are read and checked again.
-        Some(dir) => {
-            let checkpoint = open(&dir)?;
-            Repaired { outcome: check(&checkpoint), dir, checkpoint, fixed, withdrawn }
-        }
-        None => Repaired { dir, checkpoint: Arc::clone(checkpoint), outcome, fixed, withdrawn },
+        Some(dir) => Repaired { checkpoint: open(&dir)?, outcome: None, dir, fixed, withdrawn },
+        None => Repaired { dir, checkpoint: Arc::clone(checkpoint), outcome: Some(outcome), fixed, withdrawn },
     })
 }
 
@@ -129,9 +127,9 @@ pub fn show(
     dir: &Path,
     checkpoint: &Arc<Checkpoint>,
     outcome: &Outcome,
-    check: CheckFn<'_>,
+    judge: CheckFn<'_>,
 ) -> anyhow::Result<usize> {
-    let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, check);
+    let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, judge);
     output::print(&diff::render(&shown(dir), &repair))?;
     output::note(&fixes::would(repair.fixed.len(), repair.changes.len()));
     Ok(repair.changes.len())

@@ -180,6 +180,13 @@ pub enum RepairError {
         /// The folder with the originals.
         originals: PathBuf,
     },
+    /// A fix would leave a file as it is: the plan is wrong, and no other program has changed anything.
+    #[error("{path}: the planned repair of this file changes nothing, and nothing was written; this is an error of \
+             ckpt-doctor, please report it with the header or text of the file", path = path.display())]
+    ChangesNothing {
+        /// The file.
+        path: PathBuf,
+    },
     /// The checkpoint has no repair to undo.
     #[error("{path} has no repair to undo", path = path.display())]
     NothingToUndo {

@@ -333,28 +333,12 @@ impl PlannedShard {
         bytes
     }
 
-    /// The shard as a reader would see it.
+    /// The shard as a reader will see it, with the faults that its header then has.
     #[must_use]
     pub fn preview(&self) -> Shard {
-        let data_start = self.header().len() as u64;
-        let mut at = 0_u64;
-        let tensors = self
-            .tensors
-            .iter()
-            .map(|t| {
-                let begin = at;
-                at = at.saturating_add(t.len());
-                Tensor { name: t.name.clone(), dtype: t.dtype, shape: t.shape.clone(), begin, end: at }
-            })
-            .collect();
-        Shard {
-            name: self.name.to_string(),
-            file_len: data_start.saturating_add(at),
-            data_start,
-            tensors,
-            metadata: Some(self.metadata.clone()),
-            ..Shard::default()
-        }
+        let header = self.header();
+        let file_len = (header.len() as u64).saturating_add(self.data_len());
+        Shard { header_sha256: String::new(), ..Shard::parse(self.name.to_string(), file_len, &header) }
     }
 }
 

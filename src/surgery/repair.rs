@@ -1,9 +1,10 @@
 //! Combines fixes into one repair: planned on the checkpoint in memory, checked by the same rules, written once.
 //!
 //! Fixes are applied in rounds, as in ruff: fixes that do not overlap are applied together, then the rules run again,
-//! until no fix is left. A fix is withdrawn when its finding remains, or when it introduces another error.
+//! until no fix is left. A fix is withdrawn when its finding remains, or when any loader would do worse after it.
 
 mod draft;
+mod objection;
 mod planner;
 mod unused;
 
@@ -12,10 +13,10 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::plan::PlannedShard;
-use crate::check::{Outcome, Safety};
+use crate::check::{Edit, Outcome, Safety};
 use crate::checkpoint::Checkpoint;
 
-pub use planner::plan;
+pub use planner::{plan, tried};
 
 /// A finding whose fix was applied.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -26,7 +27,7 @@ pub struct Fixed {
     pub code: String,
     /// Its name.
     pub name: String,
-    /// File of the finding.
+    /// The first file that the fix edited.
     pub file: Option<String>,
     /// Message of the finding.
     pub message: String,
@@ -37,7 +38,7 @@ pub struct Fixed {
 }
 
 /// A fix that was tried and rolled back.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
 pub struct Withdrawn {
@@ -47,6 +48,9 @@ pub struct Withdrawn {
     pub title: String,
     /// Why it was rolled back.
     pub reason: String,
+    /// Its edits.
+    #[serde(skip)]
+    pub edits: Vec<Edit>,
 }
 
 /// A file that the repair changes.

@@ -12,11 +12,12 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Arc;
 
+use ckpt_doctor::check::load::LoadReport;
 use ckpt_doctor::check::{Finding, Outcome, Safety, Severity, check};
 use ckpt_doctor::checkpoint::{Checkpoint, ReadOptions};
 use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::surgery::RepairError;
-use ckpt_doctor::surgery::repair::{Repair, plan};
+use ckpt_doctor::surgery::repair::{Repair, Withdrawn, plan, tried};
 
 /// The state of a directory: names, kinds, bytes, modes and times.
 fn seen(dir: &Path) -> BTreeMap<String, (u32, i64, i64, Vec<u8>)> {
@@ -38,8 +39,9 @@ fn planned(dir: &Path, deep: bool, knowledge: &Knowledge) -> (Outcome, Repair) {
         checkpoint.read_contents(ReadOptions::default(), &|_| {});
     }
     let checkpoint = Arc::new(checkpoint);
-    let outcome = check(&checkpoint, knowledge);
-    (outcome.clone(), plan(&checkpoint, outcome, true, &|c| check(c, knowledge)))
+    let (outcome, judge) = (check(&checkpoint, knowledge), |c: &Arc<Checkpoint>| check(c, knowledge));
+    let repair = plan(&checkpoint, outcome.clone(), true, &judge);
+    (tried(&checkpoint, outcome, &judge), repair)
 }
 
 /// The codes of these findings, with a count if more than one.
@@ -58,18 +60,23 @@ fn is_automatic(finding: &Finding) -> bool {
 
 /// Repairs one fixture and describes the result in a line; `None` without fixes.
 ///
-/// An offered fix is applied, kept, and removes its finding; a finding whose fix cannot be applied offers none. The
-/// remaining findings need a person.
+/// An offered fix is applied, kept, and removes its finding; a finding whose fix was tried and withdrawn offers none. The
+/// remaining findings need a person. No load is worse afterwards.
 fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<String>, String> {
     let before = seen(dir);
     let (outcome, repair) = planned(dir, deep, knowledge);
-    if let Some(w) = repair.withdrawn.first() {
+    let is_offered = |w: &&Withdrawn| outcome.findings.iter().any(|f| f.code == w.code && is_automatic(f));
+    if let Some(w) = repair.withdrawn.iter().find(is_offered) {
         return Err(format!("{} offers to {}, but is withdrawn: {}", w.code, w.title, w.reason));
     }
+    if let Some(w) = repair.withdrawn.iter().find(|w| w.reason.starts_with("its edits")) {
+        return Err(format!("{} has edits that cannot be made: {}", w.code, w.title));
+    }
+    let withheld = repair.withdrawn.iter().map(|w| format!("; withheld {}: {}", w.code, w.reason)).collect::<String>();
     if repair.changes.is_empty() {
         return match outcome.findings.iter().find(|f| is_automatic(f)) {
             Some(finding) => Err(format!("{} offers a fix that is not applied", finding.code)),
-            None => Ok(None),
+            None => Ok(withheld.strip_prefix("; ").map(str::to_owned)),
         };
     }
     let fixed = codes(repair.fixed.iter().map(|f| &f.code));
@@ -79,8 +86,11 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
         other => assert!(other.map_err(|e| format!("writing: {e}"))?.is_none(), "every temporary file is removed"),
     }
     let (after, again) = planned(dir, deep, knowledge);
-    if after.findings != repair.outcome.findings {
+    if without_fixes(&after.findings) != without_fixes(&repair.outcome.findings) {
         return Err("the written checkpoint is not the planned one".to_owned());
+    }
+    if let Some(worse) = worse(&outcome, &after) {
+        return Err(worse);
     }
     if !again.changes.is_empty() {
         return Err(format!("a second run would change {} files", again.changes.len()));
@@ -93,7 +103,34 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
         return Err("undo has not restored everything".to_owned());
     }
     let left = codes(after.findings.iter().filter(|f| f.severity != Severity::Info).map(|f| &f.code));
-    Ok(Some(if left.is_empty() { fixed } else { format!("{fixed}, by hand: {left}") }))
+    let done = if left.is_empty() { fixed } else { format!("{fixed}, by hand: {left}") };
+    Ok(Some(format!("{done}{withheld}")))
+}
+
+fn without_fixes(findings: &[Finding]) -> Vec<Finding> {
+    findings.iter().map(|finding| Finding { fix: None, ..finding.clone() }).collect()
+}
+
+/// What a loader does worse after a repair than before it. Written apart from the program's own comparison.
+fn worse(before: &Outcome, after: &Outcome) -> Option<String> {
+    for (was, is) in before.verdicts.iter().zip(&after.verdicts).filter(|(was, is)| was.loader == is.loader) {
+        for object in &is.objects {
+            let old = was.objects.iter().find(|old| old.object == object.object);
+            if old.is_some_and(|old| old.verdict < object.verdict) {
+                return Some(format!("{}: {:?} is {:?} after the repair", is.loader, object.object, object.verdict));
+            }
+        }
+        let (Some(was), Some(is)) = (&was.tensors, &is.tensors) else { continue };
+        let of = |load: &LoadReport| [&load.missing, &load.unexpected].map(Vec::len);
+        let others = |load: &LoadReport| [load.mismatched.len(), load.silent.len()];
+        let grown = std::iter::zip([of(was), others(was)].concat(), [of(is), others(is)].concat());
+        let sum = |load: &LoadReport| [of(load), others(load)].concat().iter().sum::<usize>();
+        let is_better = sum(is) < sum(was) && others(is) <= others(was) && is.missing.len() <= was.missing.len();
+        if was.raises.is_none() && !is_better && grown.into_iter().any(|(was, is)| is > was) {
+            return Some(format!("{}: more tensors are wrong after the repair", is.loader));
+        }
+    }
+    None
 }
 
 #[test]

@@ -17,7 +17,7 @@ use crate::checkpoint::{Fault, FaultKind};
 mod fields;
 
 /// `format` values that transformers accepts. Source: `load_state_dict` in transformers 4.47.0.
-const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
+pub(crate) const FORMATS: [&str; 4] = ["pt", "tf", "flax", "mlx"];
 
 impl Shard {
     /// Reads a header from the first bytes of a file of `file_len` bytes.
@@ -257,7 +257,8 @@ fn check_format(shard: &Shard, metadata: &HeaderMetadata, faults: &mut Faults) {
     };
     if format.is_none_or(|f| !FORMATS.contains(&f.as_str())) {
         let fault = Fault::new(FaultKind::NoFormatMetadata).at(shard.place());
-        faults.push(fault.with("format", format.map(|f| escape(f, 80))));
+        let given = matches!(metadata, HeaderMetadata::Strings(_));
+        faults.push(fault.with("metadata", given).with("format", format.map(|f| escape(f, 80))));
     }
 }
 

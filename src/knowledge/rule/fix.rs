@@ -49,6 +49,10 @@ pub struct Fix {
     /// Condition for this fix; an expression that cannot be evaluated counts as false.
     #[serde(default)]
     pub when: Option<Expression>,
+    /// Condition under which the fix rests on the description of the class, as a vote or a rename does: then it is made only
+    /// if every leading loader takes all tensors of the class from the repaired checkpoint and leaves none over.
+    #[serde(default)]
+    pub needs_whole_load: Option<Expression>,
     /// A list; the edits are made for each element, bound as `one`.
     #[serde(default)]
     pub each: Option<Expression>,
@@ -63,6 +67,9 @@ impl Fix {
         match (self.edits.is_empty(), self.safety == Safety::Manual) {
             (true, false) => return Err(format!("a fix without edits is manual, not {}", self.safety.name())),
             (false, true) => return Err("a manual fix has no edits".to_owned()),
+            (true, true) if self.needs_whole_load.is_some() => {
+                return Err("a manual fix needs no load as its proof".to_owned());
+            }
             _ => {}
         }
         match (self.edits.is_empty(), &self.title, &self.help) {

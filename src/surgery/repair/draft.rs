@@ -7,6 +7,7 @@ use serde_json::{Map, Value, json};
 
 use crate::check::{Edit, renamed};
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
+use crate::checkpoint::shard::header::FORMATS;
 use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
 
@@ -313,8 +314,8 @@ impl RepairDraft {
 
     fn header(&mut self, file: &str) -> Option<()> {
         let mut planned = self.planned(file)?;
-        for (key, value) in format_pt() {
-            planned.metadata.entry(key).or_insert(value);
+        if !planned.metadata.get("format").is_some_and(|format| FORMATS.contains(&format.as_str())) {
+            planned.metadata.extend(format_pt());
         }
         self.shards.insert(file.to_owned(), Arc::new(planned));
         Some(())

@@ -1,16 +1,18 @@
 //! Plans a repair in rounds of fixes.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use super::draft::{Made, RepairDraft};
-use super::unused::left_unused;
+use super::objection::{objection, unproven};
 use super::{Change, Content, Fixed, Repair, Withdrawn};
-use crate::check::{Edit, Finding, Outcome, Severity};
+use crate::check::{Edit, Finding, Outcome};
 use crate::checkpoint::Checkpoint;
 
 /// Maximum number of rounds. A repair takes two or three; more indicate a cycle.
 const ROUNDS: usize = 32;
+/// Maximum number of planned checkpoints that one repair judges, so that no directory costs more than this many checks. Fixes
+/// that are refused are found by bisection; a repair of a thousand findings with one such fix takes a dozen.
+const TRIALS: usize = 64;
 
 /// Result of an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -23,53 +25,94 @@ enum Settled {
     Barred,
 }
 
+/// Runs rules on a planned checkpoint.
+type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
+
 struct Planner<'a> {
-    check: &'a dyn Fn(&Arc<Checkpoint>) -> Outcome,
+    check: CheckFn<'a>,
     draft: RepairDraft,
     outcome: Outcome,
-    fixed: Vec<Fixed>,
-    withdrawn: Vec<Withdrawn>,
-    /// Edits of withdrawn fixes, which are not tried again.
-    barred: Vec<Vec<Edit>>,
+    /// Findings whose fixes are applied.
+    made: Vec<Finding>,
+    /// Findings whose fixes are not tried again, with the reasons.
+    barred: Vec<(Finding, String)>,
+    /// Planned checkpoints that may still be judged.
+    trials: usize,
 }
 
 /// Plans the repair of a checkpoint: all safe fixes, and with `unsafe_fixes` also the unsafe ones.
 ///
-/// `check` runs the selected rules on a checkpoint; `outcome` is their result for this one.
+/// `check` runs the selected rules on a checkpoint, and judges it by all rules; `outcome` is the result for this one.
 #[must_use]
-pub fn plan(
-    checkpoint: &Arc<Checkpoint>,
-    outcome: Outcome,
-    unsafe_fixes: bool,
-    check: &dyn Fn(&Arc<Checkpoint>) -> Outcome,
-) -> Repair {
+pub fn plan(checkpoint: &Arc<Checkpoint>, outcome: Outcome, unsafe_fixes: bool, check: CheckFn<'_>) -> Repair {
+    let outcome = if outcome.by_all_rules { outcome } else { check(checkpoint) };
     let draft = RepairDraft::new(checkpoint);
-    let mut planner = Planner { check, draft, outcome, fixed: Vec::new(), withdrawn: Vec::new(), barred: Vec::new() };
-    let mut rounds = 0;
-    while rounds < ROUNDS {
-        match planner.settle(&planner.open(unsafe_fixes)) {
-            Settled::Nothing => break,
-            Settled::Kept => rounds = rounds.saturating_add(1),
-            // At most as often as there are findings.
-            Settled::Barred => {}
-        }
+    let start = (draft.clone(), outcome.clone());
+    let mut planner = Planner { check, draft, outcome, made: Vec::new(), barred: Vec::new(), trials: TRIALS };
+    planner.run(unsafe_fixes);
+    while planner.bar_unproven() {
+        (planner.draft, planner.outcome) = start.clone();
+        planner.made.clear();
+        planner.run(unsafe_fixes);
     }
-    let Planner { draft, outcome, fixed, withdrawn, .. } = planner;
+    let Planner { draft, outcome, made, barred, .. } = planner;
     let texts = draft.texts.into_iter().map(|(name, text)| Change { name, new: Content::Text(text) });
     let shards =
         draft.shards.into_iter().map(|(name, shard)| Change { name, new: Content::Shard(Arc::unwrap_or_clone(shard)) });
     let mut changes: Vec<Change> = shards.chain(texts).collect();
     changes.sort_by(|a, b| a.name.cmp(&b.name));
-    Repair { original: Arc::clone(checkpoint), outcome, fixed, withdrawn, changes }
+    Repair {
+        original: Arc::clone(checkpoint),
+        outcome,
+        fixed: made.iter().filter_map(fixed).collect(),
+        withdrawn: barred.into_iter().filter_map(|(finding, reason)| withdrawn(finding, reason)).collect(),
+        changes,
+    }
+}
+
+/// The result of a check whose fixes were tried: one that would be withdrawn is not offered, and its finding says why. Called
+/// for the reports of users, with the same `check` as [`plan`] and with the result of the selected rules as `outcome`.
+#[must_use]
+pub fn tried(checkpoint: &Arc<Checkpoint>, mut outcome: Outcome, check: CheckFn<'_>) -> Outcome {
+    if !outcome.findings.iter().any(|f| f.fix.as_ref().is_some_and(|fix| fix.is_permitted(true))) {
+        return outcome;
+    }
+    for withdrawn in plan(checkpoint, outcome.clone(), true, check).withdrawn {
+        let is_of = |finding: &&mut Finding| {
+            finding.code == withdrawn.code && finding.fix.as_ref().is_some_and(|fix| fix.edits == withdrawn.edits)
+        };
+        for finding in outcome.findings.iter_mut().filter(is_of) {
+            finding.fix = finding.fix.take().map(|fix| fix.withheld(&withdrawn.reason));
+        }
+    }
+    outcome
 }
 
 impl Planner<'_> {
+    /// Applies fixes until none is left.
+    fn run(&mut self, unsafe_fixes: bool) {
+        let mut rounds = 0;
+        while rounds < ROUNDS {
+            match self.settle(&self.open(unsafe_fixes)) {
+                Settled::Nothing => break,
+                Settled::Kept => rounds = rounds.saturating_add(1),
+                // At most as often as there are findings.
+                Settled::Barred => {}
+            }
+        }
+    }
+
     /// The findings with fixes to try, in report order.
     fn open(&self, unsafe_fixes: bool) -> Vec<Finding> {
         let permitted = |f: &&Finding| {
-            f.fix.as_ref().is_some_and(|fix| fix.is_permitted(unsafe_fixes) && !self.barred.contains(&fix.edits))
+            f.fix.as_ref().is_some_and(|fix| fix.is_permitted(unsafe_fixes) && !self.is_barred(&f.code, &fix.edits))
         };
         self.outcome.findings.iter().filter(permitted).cloned().collect()
+    }
+
+    fn is_barred(&self, code: &str, edits: &[Edit]) -> bool {
+        let is_same = |f: &Finding| f.code == code && f.fix.as_ref().is_some_and(|fix| fix.edits == edits);
+        self.barred.iter().any(|(finding, _)| is_same(finding))
     }
 
     /// Applies as many of these fixes as do not conflict.
@@ -82,26 +125,15 @@ impl Planner<'_> {
                 Made::All => made.push(finding.clone()),
                 Made::Later if !made.is_empty() => {}
                 // Edits that change nothing now, or conflict with each other, do so in later rounds too.
-                Made::Later | Made::Nothing => self.withdraw(finding, "its edits cannot be made".to_owned()),
+                Made::Later | Made::Nothing => self.bar(finding, "its edits cannot be made".to_owned()),
             }
         }
         if made.is_empty() {
             return Settled::Nothing;
         }
-        let outcome = draft.finish().map(|()| (self.check)(draft.current()));
-        let reason = match outcome {
-            None => "its edits conflict".to_owned(),
-            Some(outcome) => {
-                let Some(reason) = objection(&self.outcome, &outcome, &made) else {
-                    (self.draft, self.outcome) = (draft, outcome);
-                    self.fixed.extend(made.iter().filter_map(fixed));
-                    return Settled::Kept;
-                };
-                reason
-            }
-        };
+        let Err(reason) = self.try_out(draft, &made) else { return Settled::Kept };
         if let [one] = made.as_slice() {
-            self.withdraw(one, reason);
+            self.bar(one, reason);
             return Settled::Barred;
         }
         // Bisects the fixes until the harmful one is alone.
@@ -112,34 +144,34 @@ impl Planner<'_> {
         }
     }
 
-    fn withdraw(&mut self, finding: &Finding, reason: String) {
-        let Some(fix) = &finding.fix else { return };
-        self.barred.push(fix.edits.clone());
-        self.withdrawn.push(Withdrawn { code: finding.code.clone(), title: fix.title().to_owned(), reason });
+    /// Keeps these fixes if the checkpoint with them is better, and no load of it is worse; otherwise tells why not.
+    fn try_out(&mut self, mut draft: RepairDraft, made: &[Finding]) -> Result<(), String> {
+        draft.finish().ok_or("its edits conflict")?;
+        self.trials = self.trials.checked_sub(1).ok_or("too many fixes were tried before it")?;
+        let outcome = (self.check)(draft.current());
+        match objection(&self.outcome, &outcome, made) {
+            Some(reason) => Err(reason),
+            None => {
+                (self.draft, self.outcome) = (draft, outcome);
+                self.made.extend_from_slice(made);
+                Ok(())
+            }
+        }
     }
-}
 
-/// The reason for not keeping these fixes together.
-fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<String> {
-    // Of several findings of one rule, some may be fixed and others remain: the next round handles the rest.
-    let stays = |f: &&Finding| count(after, |g| g.code == f.code) >= count(before, |g| g.code == f.code);
-    let unused = || left_unused(before, after).map(|name| format!("{name} would stay in the file, unused"));
-    worse(before, after)
-        .or_else(|| made.iter().find(stays).map(|_| "the finding would remain".to_owned()))
-        .or_else(unused)
-}
+    fn bar(&mut self, finding: &Finding, reason: String) {
+        self.barred.push((finding.clone(), reason));
+    }
 
-/// Number of findings of a kind, including those that are only counted.
-fn count(outcome: &Outcome, kind: impl Fn(&Finding) -> bool) -> usize {
-    outcome.findings.iter().filter(|f| kind(f)).fold(0, |n, f| n.saturating_add(f.count()))
-}
-
-/// The rule of an error that occurs more often than before.
-fn worse(before: &Outcome, after: &Outcome) -> Option<String> {
-    let errors = |outcome: &Outcome, code: &str| count(outcome, |f| f.severity == Severity::Error && f.code == code);
-    let codes: BTreeSet<&str> = after.findings.iter().map(|f| f.code.as_str()).collect();
-    let code = codes.into_iter().find(|code| errors(after, code) > errors(before, code))?;
-    Some(format!("it would introduce {code}"))
+    /// Bars the applied fixes that need a complete load as their proof, if the repair does not lead to one; returns whether
+    /// there are any.
+    fn bar_unproven(&mut self) -> bool {
+        let needs_proof = |f: &&Finding| f.fix.as_ref().is_some_and(|fix| fix.needs_whole_load);
+        let open: Vec<Finding> = self.made.iter().filter(needs_proof).cloned().collect();
+        let Some(reason) = unproven(&self.outcome).filter(|_| !open.is_empty()) else { return false };
+        open.iter().for_each(|finding| self.bar(finding, reason.clone()));
+        true
+    }
 }
 
 fn fixed(finding: &Finding) -> Option<Fixed> {
@@ -147,9 +179,14 @@ fn fixed(finding: &Finding) -> Option<Fixed> {
     Some(Fixed {
         code: finding.code.clone(),
         name: finding.name.clone(),
-        file: finding.locations.first().and_then(|l| l.file.clone()),
+        file: fix.files().first().cloned().or_else(|| finding.locations.first().and_then(|l| l.file.clone())),
         message: finding.message.clone(),
         safety: fix.safety,
         title: fix.title().to_owned(),
     })
+}
+
+fn withdrawn(finding: Finding, reason: String) -> Option<Withdrawn> {
+    let fix = finding.fix?;
+    Some(Withdrawn { code: finding.code, title: fix.title().to_owned(), reason, edits: fix.edits })
 }

@@ -4,19 +4,24 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use serde_json::Value;
+use sha2::{Digest as _, Sha256};
 
 use super::shards::write_shards;
 use super::sharing::Sharing;
 use super::system::{create, look, with_figures};
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_capped};
-use crate::checkpoint::{FaultKind, HashAlgorithm, Shard};
+use crate::checkpoint::{Checkpoint, FaultKind, HashAlgorithm, Shard, hex};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::repair::{Change, Content, Repair};
 use crate::surgery::written::Writing;
 
-/// Fails when a file no longer matches the checkpoint for which the repair was planned.
+/// Fails when a file no longer matches the checkpoint for which the repair was planned, or when its new content is the old
+/// one: then no other program is at fault.
 pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> Result<(), RepairError> {
     let original = &repair.original;
+    if changes_nothing(original, change) {
+        return Err(RepairError::ChangesNothing { path: path.to_owned() });
+    }
     let there = look(path)?;
     let mut unreadable = None;
     let same = match (&change.new, original.entries.get(&change.name)) {
@@ -51,6 +56,20 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
         Some(error) => Err(io_at(path, "reading")(error).into()),
         None if same => Ok(()),
         None => Err(RepairError::ChangedWhilePlanned { path: path.to_owned() }),
+    }
+}
+
+/// Whether a change would write the bytes that the file has.
+fn changes_nothing(original: &Checkpoint, change: &Change) -> bool {
+    match &change.new {
+        Content::Text(new) => {
+            let document = original.document(&change.name).and_then(|document| document.text.as_ref());
+            let module = || original.modules.get(&change.name).and_then(|module| module.text.as_ref());
+            document.or_else(module).is_some_and(|old| old == new)
+        }
+        Content::Shard(new) => original.shards.get(&change.name).is_some_and(|old| {
+            new.file_len() == old.file_len && hex(&Sha256::digest(&new.header())) == old.header_sha256
+        }),
     }
 }
 
