@@ -55,7 +55,7 @@ impl Case {
             stored: &self.stored,
             versions: &self.versions,
             scheme,
-            read: super::schemes_read(&self.config, &self.knowledge),
+            read: schemes_read(&self.config, &self.knowledge),
         }
     }
 }
