@@ -82,16 +82,24 @@ def add_accepts(commands):
     p.set_defaults(run="derive.accepts")
 
 
+def add_retry(commands):
+    p = commands.add_parser("retry", help="try again the refused kinds of values that a declared type has; mend rules/refused")
+    p.add_argument("rows", type=Path, help="what the unit test prints: [version, class, key, kind] on each line")
+    p.add_argument("--jobs", type=int, default=2)
+    p.add_argument("--log", type=Path, help="write every outcome there")
+    p.set_defaults(run="derive.retry")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
     commands = parser.add_subparsers(required=True)
-    for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_drop, add_table, add_accepts):
+    for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_drop, add_table, add_accepts, add_retry):
         add(commands)
     for sub in set(commands.choices.values()):  # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.cache is None and args.run not in ("derive.table", "derive.drop"):
+    if args.cache is None and args.run not in ("derive.table", "derive.drop", "derive.retry"):
         parser.error("say where samples and results are kept: --cache DIR, or the environment variable DERIVE_CACHE")
     args.cache = Path(args.cache) if args.cache else None
     __import__(args.run)

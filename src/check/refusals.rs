@@ -1,6 +1,6 @@
 //! Values of config.json that a loader refuses: it raises while it builds the config or the class.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Map, Value};
 
@@ -38,24 +38,26 @@ pub(super) fn faults(
     checkpoint: &Checkpoint,
     knowledge: &Knowledge,
     asked: &Asked<'_>,
-    of_loads: &mut [Fault],
+    of_loads: &mut Vec<Fault>,
     filled: &Value,
 ) -> Vec<Fault> {
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
         return Vec::new();
     };
     let mut faults: Vec<Fault> = Vec::new();
+    let mut refused_keys: BTreeSet<String> = BTreeSet::new();
     for target in asked.targets {
         let loader = target.loader.version();
         let configs = Configs { written: config, filled };
         let class = config.pointer("/architectures/0").and_then(Value::as_str);
-        let refused = class.and_then(|class| knowledge.refusals.of_class(target.version(), class)).unwrap_or_default();
+        let refused = class.map(|class| refusals(knowledge, config, target, class)).unwrap_or_default();
         let mut found = of_class(knowledge, &configs, &refused, target.version());
         found.extend(dtype(knowledge, config, target.version()));
         let mut own = of_kinds(knowledge, &configs, &refused, target.version());
         own.retain(|rejection| {
             !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)
         });
+        refused_keys.extend(own.iter().map(|rejection| rejection.pointer.clone()));
         match of_loads.iter_mut().find(|fault| fault.kind == FaultKind::ConfigIncomputable) {
             Some(unbuilt) if !own.is_empty() && !unbuilt.loaders.contains(&loader) => unbuilt.loaders.push(loader),
             Some(_) => {}
@@ -65,8 +67,30 @@ pub(super) fn faults(
             rejection.fault().join(&mut faults, loader);
         }
     }
+    // A class is not known with a value that it refuses: then nothing else is to be said of it.
+    let is_refused = |place: &Place| place.pointer.as_ref().is_some_and(|pointer| refused_keys.contains(pointer));
+    of_loads.retain(|fault| fault.kind != FaultKind::UnknownArchitecture || !fault.places.iter().any(is_refused));
     faults.extend(quantisation(knowledge, config, asked));
     faults
+}
+
+/// What a class refuses with its parts. The class was tried with parts of the model types that it builds where none is named;
+/// a part of another type refuses what the class of that type does.
+fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str) -> ClassRefusals {
+    let of_class = |class: &str| knowledge.refusals.of_class(target.version(), class).unwrap_or_default();
+    let architecture = knowledge.library.class(class, target.loader);
+    sub_configs(config).fold(of_class(class), |refused, pointer| {
+        let key = pointer.trim_start_matches('/');
+        let named = config.pointer(&format!("{pointer}/model_type")).and_then(Value::as_str);
+        let tried = architecture.and_then(|architecture| architecture.sub_config_type(key));
+        match named.filter(|named| tried.is_some_and(|tried| tried != *named)) {
+            Some(named) => {
+                let part = knowledge.library.auto_class(named, "model", target.loader).map(of_class);
+                refused.with_part(key, part.unwrap_or_default())
+            }
+            None => refused,
+        }
+    })
 }
 
 impl Rejection {

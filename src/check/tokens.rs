@@ -75,7 +75,8 @@ pub fn open_tokenizer(
         let count = run.count.as_ref().map_or(Ok(1), |e| e.eval_u64(&scope))?;
         if count > MAX_ADDED {
             let source_text = run.content.source().to_owned();
-            return Err(EvalError { source_text, cause: format!("{count} tokens: more than any tokenizer has") });
+            let cause = format!("{count} tokens: more than any tokenizer has");
+            return Err(EvalError { source_text, cause, expression: None });
         }
         let mut expected = None;
         for i in 0..count {

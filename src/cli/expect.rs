@@ -156,6 +156,9 @@ fn text(answer: &Answer) -> String {
         Ok(e) => {
             let counts = format!("{} tensors, {} non-persistent buffers", e.tensors.len(), e.buffers.len());
             let _ok = writeln!(out, "{source}: {} ({}), transformers {}: {counts}", e.class, e.architecture, e.loader);
+            for doubt in &e.doubts {
+                let _ok = writeln!(out, "  not predicted: {}", escape(&doubt.to_string(), CAP));
+            }
             for (name, tensor) in &e.tensors {
                 let _ok = write!(out, "  {} {:?}", escape(name, CAP), tensor.shape);
                 if let Some(to) = &tensor.tied_to {

@@ -2,6 +2,7 @@
 
 mod blueprint;
 mod build;
+mod cause;
 mod conversions;
 mod doubt;
 mod field_type;
@@ -17,6 +18,8 @@ use serde_json::Value;
 pub(crate) use blueprint::{Blueprint, Class};
 pub use conversions::Conversion;
 pub use doubt::Doubt;
+#[cfg(test)]
+pub(crate) use field_type::FieldType;
 pub use refusal::Refusal;
 
 use super::{Evidence, Library, Loader};
@@ -78,6 +81,28 @@ impl<'l> Architecture<'l> {
     #[must_use]
     pub fn builds_config(&self, key: &str) -> bool {
         self.file.config(self.loader).configs.iter().any(|(name, _)| name == key)
+    }
+
+    /// The model type of the config under a key that names none.
+    #[must_use]
+    pub fn sub_config_type(&self, key: &str) -> Option<String> {
+        self.file.sub_config_type(key, self.loader)
+    }
+
+    /// The type that the config class of this loader declares for a key, given by its path without the first slash: of the
+    /// class itself, or of the class of the part's model type that is the default.
+    #[cfg(test)]
+    pub(crate) fn declared_type(&self, path: &str) -> Option<&'l FieldType> {
+        let mut file = self.file;
+        let mut steps = path.split('/').peekable();
+        while let Some(step) = steps.next() {
+            if steps.peek().is_none() {
+                return file.config(self.loader).type_of(step);
+            }
+            let part = file.sub_config_type(step, self.loader)?;
+            file = self.library.of_model_type(&part, self.loader)?;
+        }
+        None
     }
 
     /// Whether a key of a config is a word of its file.

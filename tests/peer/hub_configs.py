@@ -215,7 +215,7 @@ def worker(folder, mode, rows, work):
 def said(answer):
     if (
         answer.get("not_predicted")
-        or "not known here" in answer.get("error", "")
+        or re.search("not (known|described) here|its description fails", answer.get("error", ""))
         or "no architecture is known" in answer.get("error", "")
     ):
         return "not predicted"

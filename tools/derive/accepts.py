@@ -24,7 +24,7 @@ import torch
 import transformers
 from transformers.activations import ACT2FN
 
-from . import catalogue
+from . import catalogue, configs, sources
 from .build import TooSlow, time_limit
 from .keys import HEADS
 
@@ -36,6 +36,7 @@ ROPE = "rope_parameters" if NEW else "rope_scaling"
 NEWER = {"torch_dtype": "dtype", **({"rope_theta": ROPE, "partial_rotary_factor": ROPE, "rope_scaling": ROPE} if NEW else {})}
 PARAMETERS = 12_000_000
 SECONDS = 12
+LONGEST = 24  # elements of a list that is tried
 WIDTHS = ("hidden_size", "d_model", "n_embd", "embed_dim", "dim", "encoder_embed_dim")
 NEVER = {
     "architectures",
@@ -56,7 +57,7 @@ KINDS = {
     "negative": [-1, -2],
     "fraction": [0.37, 1.5, 1.63, 2.5],
     "above-one": [1.63, 7],
-    "list": [[], ["x"]],
+    "list": [[], ["x"]],  # and those of `Small.fitting`
     "object": [{}, {"x": 1}],
 }
 FIRST = ("null", "text", "negative", "zero", "object")
@@ -85,6 +86,7 @@ class Small:
                 raise MemoryError(f"{count} parameters")
         with time_limit(SECONDS * 4):
             cls(cls.config_class.from_dict(copy.deepcopy(config))).save_pretrained(folder)
+        self.words = configs.compared_words(*sources.texts(cls, cls.config_class))
         self.file = self.folder / "config.json"
         written = json.loads(self.file.read_text())
         # Every key that the config has, with its value; keys that the hub has and the class writes otherwise as well.
@@ -113,7 +115,7 @@ class Small:
 
     def refuses(self, pointer, kind):
         """The exception of a kind of value under a key, if all values of the kind raise it."""
-        said = [self.raises(pointer, value) for value in KINDS[kind]]
+        said = [self.raises(pointer, value) for value in [*KINDS[kind], *self.fitting(pointer, kind)]]
         names = {each and each.split(":", 1)[0] for each in said}
         if None in names:
             return None
@@ -128,6 +130,25 @@ class Small:
         ):
             return None
         return said[0].split(":", 1)[0]
+
+
+    def fitting(self, pointer, kind):
+        """Values of a kind of the element type and length that the class may want under a key.
+
+        An arbitrary list or word is refused by nearly every class that takes another: `attention_window` has one number for
+        each layer, `image_size` one for each side, `out_features` names stages of the same config.
+        """
+        if kind == "text":
+            return ["auto", *self.words.get(pointer[-1], [])]
+        if kind != "list":
+            return []
+        value, beside = at(self.config, pointer), at(self.config, pointer[:-1])
+        counts = [n for n in beside.values() if isinstance(n, int) and not isinstance(n, bool)]
+        lists = [each for each in beside.values() if isinstance(each, list) and each]
+        lengths = sorted({1, 2, 3, 4, *(n for n in counts if 0 < n <= LONGEST), *(len(each) for each in lists)})
+        single = [value] if isinstance(value, (int, float, str)) else [1, 0, 2, 0.5, *self.words.get(pointer[-1], [])[:4]]
+        fits = [[each] * n for each in single for n in lengths if n <= LONGEST]
+        return fits + lists + [each[-1:] for each in lists] + [[1, 2], [0, 1]]
 
 
 def at(config, pointer):

@@ -198,7 +198,9 @@ fn gap(one: &BuiltClass<'_>) -> Option<(String, String)> {
     let pointer = match one.class.as_ref().err()? {
         Refusal::UnknownPart(part) if part.config.is_empty() => "/model_type".to_owned(),
         Refusal::UnknownPart(part) => format!("/{}/model_type", part.config.replace('.', "/")),
-        Refusal::NotCovered(doubts) => doubts.iter().find_map(Doubt::pointer).unwrap_or("/model_type").to_owned(),
+        Refusal::NotCovered(doubts) => {
+            doubts.iter().find_map(Doubt::pointer).unwrap_or_else(|| "/model_type".to_owned())
+        }
         _ => return None,
     };
     Some((pointer, one.class.as_ref().err()?.to_string()))

@@ -93,7 +93,7 @@ fn an_unknown_class_and_one_that_cannot_be_built_are_different_faults() {
     assert!(classes.is_empty());
     assert_eq!(kinds(&class_faults(&inputs, &classes)), [FaultKind::UnknownArchitecture]);
 
-    let impossible = Case::new("llava3d-tiny").set("num_attention_heads", json!("many"));
+    let impossible = Case::new("llava3d-tiny").set("num_attention_heads", json!(0));
     let inputs = impossible.inputs();
     let classes = build_classes(&inputs, resolve_targets(&inputs));
     assert!(matches!(classes.first().unwrap().class, Err(Refusal::Impossible(_))));

@@ -140,8 +140,13 @@ pub(crate) struct ConfigClass {
 impl ConfigClass {
     /// Whether the type of a key excludes null; `false` for a key without a type.
     pub fn forbids_null(&self, key: &str) -> bool {
+        self.type_of(key).is_some_and(|kind| !kind.takes(&Value::Null))
+    }
+
+    /// The declared type of a key.
+    pub fn type_of(&self, key: &str) -> Option<&FieldType> {
         let of_key = |(_, keys): &(&FieldType, &String)| keys.split(' ').any(|k| k == key);
-        self.types.iter().find(of_key).is_some_and(|(kind, _)| !kind.takes(&Value::Null))
+        self.types.iter().find(of_key).map(|(kind, _)| kind)
     }
 }
 

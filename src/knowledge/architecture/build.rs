@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use serde_json::{Map, Value};
 
 use super::blueprint::{Blueprint, Class};
+use super::cause::Origin;
 use super::conversions::{self, Module};
 use super::doubt::{Doubt, nulls, unread_keys};
 use super::member::{Kind, Member, Part, Tied};
@@ -61,8 +62,8 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
                 ..expected
             })
         }
-        // A default that looks into a sub-config nobody knows fails before the part is reached.
-        Err(Refusal::Impossible(reasons)) => {
+        Err(failed @ (Refusal::Impossible(_) | Refusal::NotCovered(_))) => {
+            // A default that looks into a sub-config nobody knows fails before the part is reached.
             if let Some(part) = resolver.unknown_sub_config(file, written) {
                 return Err(Refusal::UnknownPart(part));
             }
@@ -70,7 +71,7 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
             let mut doubts = builder.expected.doubts;
             doubts.extend(unread_keys(library, file, loader, written));
             doubts.extend(nulls(library, file, loader, written));
-            Err(if doubts.is_empty() { Refusal::Impossible(reasons) } else { Refusal::NotCovered(doubts) })
+            Err(failed.or_doubts(doubts))
         }
         Err(unknown) => Err(unknown),
     }
@@ -161,6 +162,7 @@ impl Place<'_> {
 struct Around<'a, 'l> {
     file: &'l Blueprint,
     config: Config<'a>,
+    origin: &'a Origin<'a>,
 }
 
 impl<'l> Builder<'l> {
@@ -176,12 +178,9 @@ impl<'l> Builder<'l> {
             self.expected.ignore(&class.ignore_missing, &class.ignore_unexpected);
         }
         let mut scope = config.scope.child();
-        // Classes of one file share these, and not every class has a use, or the config keys, for each.
-        let mut failed = Vec::new();
         for (name, expression) in &file.lets {
-            if let Err(e) = expression.bind(name, &mut scope) {
-                failed.push((format!("'{name}'"), e));
-            }
+            // Classes of one file share these, and not every class has a use, or the config keys, for each.
+            let _ = expression.bind(name, &mut scope);
         }
         refused(&class.refuses, &scope)?;
         for corner in &class.not_predicted_when {
@@ -190,12 +189,13 @@ impl<'l> Builder<'l> {
                 self.expected.doubts.push(Doubt::Corner(corner.why.clone()));
             }
         }
-        let outcome = bind_all(&class.lets, &mut scope)
-            .and_then(|()| self.members(&class.tensors, Around { file, config }, &scope, place));
-        outcome.map_err(|refusal| match failed.into_iter().find(|(name, _)| refusal.mentions(name)) {
-            Some((_, cause)) => cause.into(),
-            None => refusal,
-        })
+        let defaults = &file.config(self.resolver.loader).defaults;
+        let lets = vec![file.lets.as_slice(), class.lets.as_slice()];
+        let origin = Origin { lets, members: &class.tensors, config: config.map, defaults };
+        let around = Around { file, config, origin: &origin };
+        let outcome =
+            bind_all(&class.lets, &mut scope).and_then(|()| self.members(&class.tensors, around, &scope, place));
+        outcome.map_err(|refusal| origin.explain(refusal))
     }
 
     fn module(&mut self, prefix: &str, class: &str, model_type: Option<String>, file: &'l Blueprint) {
@@ -228,11 +228,13 @@ impl<'l> Builder<'l> {
             return self.member(name, member, member.when.as_ref(), around, scope, place);
         };
         if let Some(negative) = count.eval(scope)?.as_i64().filter(|n| *n < 0) {
-            return Err(Refusal::impossible(format!("`{count}` is {negative}: no layer is built")));
+            let words = around.origin.words(count, &negative.into());
+            return Err(Refusal::impossible(format!("{words}: no layer is built")));
         }
         let count_of = count.eval_u64(scope)?;
         if count_of > TENSOR_CAP as u64 {
-            return Err(Refusal::impossible(format!("`{count}` is {count_of}, more than {TENSOR_CAP} tensors")));
+            let words = around.origin.words(count, &count_of.into());
+            return Err(self.too_many(format!("{words}, more than {TENSOR_CAP} tensors")));
         }
         // Of the experts of a layer one condition decides, which costs more than the tensors of one.
         let shared = member.when.as_ref().filter(|when| {
@@ -253,6 +255,13 @@ impl<'l> Builder<'l> {
         Ok(())
     }
 
+    /// The refusal of a config with more tensors than are built here. A loader builds such a class, so the config may be
+    /// right unless the checkpoint has far fewer tensors.
+    fn too_many(&self, reason: String) -> Refusal {
+        let is_contradicted = (1..TENSOR_CAP / 2).contains(&self.resolver.evidence.iter().count());
+        if is_contradicted { Refusal::impossible(reason) } else { Refusal::uncovered(reason) }
+    }
+
     /// Adds one member, on the condition `when`.
     fn member(
         &mut self,
@@ -265,14 +274,7 @@ impl<'l> Builder<'l> {
     ) -> Outcome<()> {
         self.steps = self.steps.saturating_add(1);
         if self.steps > STEP_CAP || self.expected.tensors.len() > TENSOR_CAP {
-            let reason = format!("the config implies more than {TENSOR_CAP} tensors");
-            // A loader builds such a class, so the config may be right unless the checkpoint has far fewer tensors.
-            let is_contradicted = (1..TENSOR_CAP / 2).contains(&self.resolver.evidence.iter().count());
-            return Err(if is_contradicted {
-                Refusal::impossible(reason)
-            } else {
-                Refusal::NotCovered(vec![Doubt::Corner(reason)])
-            });
+            return Err(self.too_many(format!("the config implies more than {TENSOR_CAP} tensors")));
         }
         if !holds(when, scope)? {
             return Ok(());
@@ -285,7 +287,7 @@ impl<'l> Builder<'l> {
         let scope = inner.as_ref().unwrap_or(scope);
         let name = [place.prefix, &name.try_render(scope)?].concat();
         if name.len() > NAME_CAP {
-            return Err(Refusal::impossible(format!("the config makes a tensor name of {} bytes", name.len())));
+            return Err(Refusal::uncovered(format!("the config makes a tensor name of {} bytes", name.len())));
         }
         let place = Place { optional: member.optional.as_deref().or(place.optional), ..place };
         match &member.kind {
@@ -332,7 +334,7 @@ impl<'l> Builder<'l> {
     ) -> Outcome<()> {
         let depth = place.depth.saturating_add(1);
         if depth > DEPTH_CAP {
-            return Err(Refusal::impossible(format!("parts are nested more than {DEPTH_CAP} deep")));
+            return Err(Refusal::uncovered(format!("parts are nested more than {DEPTH_CAP} deep")));
         }
         let outer = place.without;
         let without = Without { root: name, names: &part.without, outer };
@@ -356,10 +358,10 @@ impl<'l> Builder<'l> {
         let Some(path) = &part.config else { return built };
         built.map_err(|refusal| match (refusal, named_otherwise(part, given, file)) {
             // The loader selects the class by the model type; the description was made with another one.
-            (Refusal::Impossible(_), Some(model_type)) => Refusal::NotCovered(vec![Doubt::Corner(format!(
+            (Refusal::Impossible(_) | Refusal::NotCovered(_), Some(model_type)) => Refusal::uncovered(format!(
                 "{path} is of model type {model_type}, and the class is described with {}",
                 file.architecture
-            ))]),
+            )),
             (refusal, _) => refusal.inside(path),
         })
     }
@@ -381,7 +383,7 @@ impl<'l> Builder<'l> {
         let class = if let Some(class) = &part.class {
             class.as_str()
         } else {
-            let model_type = model_type().ok_or_else(|| Refusal::impossible(format!("`{key}` is absent")))?;
+            let model_type = model_type().ok_or_else(|| Refusal::setting(&key, None))?;
             let listed = part.by_model_type.get(model_type).and_then(Value::as_str);
             let auto = || library.of_model_type(model_type, loader)?.auto(part.auto.as_deref()?, loader);
             listed.or_else(auto).ok_or_else(|| {
@@ -421,7 +423,7 @@ impl<'l> Builder<'l> {
                 Ok(())
             }
             indexmap::map::Entry::Occupied(taken) => {
-                Err(Refusal::impossible(format!("the config makes two tensors of the name {}", taken.key())))
+                Err(Refusal::uncovered(format!("the config makes two tensors of the name {}", taken.key())))
             }
         }
     }

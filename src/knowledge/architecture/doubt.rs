@@ -6,11 +6,14 @@ use serde_json::{Map, Value};
 
 use super::blueprint::{Blueprint, ConfigClass};
 use super::resolve::DEPTH_CAP;
-use crate::knowledge::{Library, Loader};
+use crate::knowledge::{Expression, Library, Loader};
 
 /// Keys that a class of any version calculates with, so that a version without types of fields raises on null as well.
 const REQUIRED: [&str; 5] =
     ["hidden_size", "intermediate_size", "num_attention_heads", "num_hidden_layers", "vocab_size"];
+
+/// Characters of a value that a reason shows.
+const VALUE_CAP: usize = 80;
 
 /// Why nothing can be predicted of a class with a config, though both are known.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,16 +25,38 @@ pub enum Doubt {
     Corner(String),
     /// A key is null that no sample had so, though its class gives it a value of its own. The key as a pointer.
     Null(String),
+    /// An expression of the description fails on these values.
+    Values(Vec<Setting>),
+    /// An expression of the description fails, and which keys it reads is not known, or not looked up yet.
+    Expression(Option<Expression>),
+}
+
+/// A key of a config, and its value.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Setting {
+    /// Dotted path: `text_config.head_dim`.
+    pub key: String,
+    /// `None` where the config and the defaults of the class lack the key.
+    pub value: Option<Value>,
 }
 
 impl Doubt {
     /// The JSON pointer of the key it is about, where it is about one.
     #[must_use]
-    pub fn pointer(&self) -> Option<&str> {
+    pub fn pointer(&self) -> Option<String> {
         match self {
-            Self::UnreadKey(pointer) | Self::Null(pointer) => Some(pointer),
-            Self::Corner(_) => None,
+            Self::UnreadKey(pointer) | Self::Null(pointer) => Some(pointer.clone()),
+            Self::Values(settings) => settings.first().map(|setting| format!("/{}", setting.key.replace('.', "/"))),
+            Self::Corner(_) | Self::Expression(_) => None,
         }
+    }
+
+    /// The same of a config, for the one that has it under `path`.
+    pub(super) fn inside(mut self, path: &str) -> Self {
+        if let Self::Values(settings) = &mut self {
+            settings.iter_mut().for_each(|setting| setting.key = format!("{path}.{}", setting.key));
+        }
+        self
     }
 }
 
@@ -109,6 +134,37 @@ impl fmt::Display for Doubt {
             Self::UnreadKey(pointer) => write!(f, "{pointer} is read by the class, and what it does is not known here"),
             Self::Corner(why) => f.write_str(why),
             Self::Null(pointer) => write!(f, "{pointer} is null, and what the class makes of that is not known here"),
+            Self::Values(settings) => {
+                let words: Vec<String> = settings.iter().map(ToString::to_string).collect();
+                write!(f, "{}, which is not described here", words.join(" and "))
+            }
+            Self::Expression(_) => f.write_str("its description fails on this config"),
+        }
+    }
+}
+
+impl Setting {
+    pub(super) fn new(path: &[String], value: Option<Value>) -> Self {
+        Self { key: path.join("."), value }
+    }
+}
+
+/// `image_size is a list of 2 elements`.
+impl fmt::Display for Setting {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { key, value } = self;
+        match value {
+            None => write!(f, "{key} is absent"),
+            Some(Value::Array(items)) => {
+                let plural = if items.len() == 1 { "" } else { "s" };
+                write!(f, "{key} is a list of {} element{plural}", items.len())
+            }
+            Some(Value::Object(_)) => write!(f, "{key} is an object"),
+            Some(Value::String(text)) => {
+                let start: String = text.chars().take(VALUE_CAP).collect();
+                write!(f, "{key} is {}", Value::String(start))
+            }
+            Some(other) => write!(f, "{key} is {other}"),
         }
     }
 }

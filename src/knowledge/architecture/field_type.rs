@@ -3,6 +3,9 @@
 use serde::Deserialize;
 use serde_json::Value;
 
+#[cfg(test)]
+use crate::knowledge::refusals::ValueKind;
+
 /// A type in JSON's words: `int|null`, `list[int]`, `'relu'|'gelu'`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
@@ -68,6 +71,23 @@ impl FieldType {
     /// Whether a value of config.json passes. A whole number is no float, and a truth value is no number.
     pub fn takes(&self, value: &Value) -> bool {
         self.0.iter().any(|kind| kind.takes(value))
+    }
+}
+
+#[cfg(test)]
+impl FieldType {
+    /// Whether the type has values of a kind whatever they are: not only some whole numbers, or some fractions.
+    pub(crate) fn has_kind(&self, kind: ValueKind) -> bool {
+        self.0.iter().any(|own| {
+            matches!(
+                (own, kind),
+                (Kind::Null, ValueKind::Null)
+                    | (Kind::Bool, ValueKind::True | ValueKind::False)
+                    | (Kind::Str | Kind::Word(_), ValueKind::Text)
+                    | (Kind::List(_), ValueKind::List)
+                    | (Kind::Object, ValueKind::Object)
+            )
+        })
     }
 }
 

@@ -2,7 +2,9 @@
 
 use std::fmt;
 
-use super::doubt::Doubt;
+use serde_json::Value;
+
+use super::doubt::{Doubt, Setting};
 use crate::knowledge::EvalError;
 
 /// Why a class cannot be built from a config: the config is at fault, or too little is known.
@@ -30,9 +32,36 @@ pub struct UnknownPart {
 }
 
 impl Refusal {
+    /// A config that the description does not cover, for this reason.
+    pub(super) fn uncovered(reason: impl Into<String>) -> Self {
+        Self::NotCovered(vec![Doubt::Corner(reason.into())])
+    }
+
+    /// A config that the description does not cover because a key has this value, or is absent.
+    pub(super) fn setting(key: &str, value: Option<&Value>) -> Self {
+        Self::NotCovered(vec![Doubt::Values(vec![Setting { key: key.to_owned(), value: value.cloned() }])])
+    }
+
     /// A config that no loader could build, for this reason.
     pub(super) fn impossible(reason: impl Into<String>) -> Self {
         Self::Impossible(vec![reason.into()])
+    }
+
+    /// The same with what else the description does not cover, which may be the reason.
+    pub(super) fn or_doubts(self, others: Vec<Doubt>) -> Self {
+        let own = match self {
+            Self::NotCovered(doubts) => doubts,
+            _ if others.is_empty() => return self,
+            _ => Vec::new(),
+        };
+        let mut doubts = own;
+        let is_named = |doubts: &[Doubt], other: &Doubt| doubts.iter().any(|doubt| doubt.pointer() == other.pointer());
+        for other in others {
+            if other.pointer().is_none() || !is_named(&doubts, &other) {
+                doubts.push(other);
+            }
+        }
+        Self::NotCovered(doubts)
     }
 
     /// The same, found in the sub-config at `path`.
@@ -41,7 +70,8 @@ impl Refusal {
             Self::Impossible(reasons) => {
                 Self::Impossible(reasons.into_iter().map(|reason| format!("{path}: {reason}")).collect())
             }
-            Self::Raises(_) | Self::NotCovered(_) => self,
+            Self::Raises(_) => self,
+            Self::NotCovered(doubts) => Self::NotCovered(doubts.into_iter().map(|doubt| doubt.inside(path)).collect()),
             Self::UnknownPart(part) if part.config.is_empty() => {
                 Self::UnknownPart(UnknownPart { config: path.to_owned(), ..part })
             }
@@ -50,16 +80,11 @@ impl Refusal {
             }
         }
     }
-
-    /// Whether a sentence mentions a name.
-    pub(super) fn mentions(&self, name: &str) -> bool {
-        matches!(self, Self::Impossible(reasons) if reasons.iter().any(|reason| reason.contains(name)))
-    }
 }
 
 impl From<EvalError> for Refusal {
     fn from(e: EvalError) -> Self {
-        Self::impossible(e.to_string())
+        Self::NotCovered(vec![Doubt::Expression(e.expression)])
     }
 }
 
@@ -70,8 +95,11 @@ impl fmt::Display for Refusal {
             Self::Raises(error) => write!(f, "the loader raises {error}"),
             Self::UnknownPart(part) => write!(f, "{part}"),
             Self::NotCovered(doubts) => {
-                let words: Vec<String> = doubts.iter().map(ToString::to_string).collect();
-                write!(f, "it is not known here: {}", words.join("; "))
+                let mut words: Vec<String> = doubts.iter().map(ToString::to_string).collect();
+                words.dedup();
+                let fails = |doubt: &Doubt| matches!(doubt, Doubt::Values(_) | Doubt::Expression(_));
+                let start = if doubts.iter().any(fails) { "" } else { "it is not known here: " };
+                write!(f, "{start}{}", words.join("; "))
             }
         }
     }

@@ -8,6 +8,8 @@ use super::blueprint::{
     Alias, Blueprint, Computed, ComputedOtherwise, ConfigClass, EarlyAlias, Refuses, Requirement, SubConfig,
 };
 use super::build::Outcome;
+use super::cause::Origin;
+use super::doubt::Doubt;
 use super::refusal::{Refusal, UnknownPart};
 use super::{Evidence, Expected};
 use crate::knowledge::{Expression, Library, Loader, Scope};
@@ -50,10 +52,19 @@ impl Resolver<'_> {
         depth: usize,
     ) -> Outcome<Map<String, Value>> {
         if depth > DEPTH_CAP {
-            return Err(Refusal::impossible(format!("configs are nested more than {DEPTH_CAP} deep")));
+            return Err(Refusal::uncovered(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
+        let defaults = &file.config(self.loader).defaults;
+        match self.fill_in(file, &mut config, depth) {
+            Ok(()) => Ok(config),
+            Err(refusal) => Err(Origin { lets: Vec::new(), members: &[], config: &config, defaults }.explain(refusal)),
+        }
+    }
+
+    /// As [`Self::resolve`], in place; a failed expression is not explained yet.
+    fn fill_in(&self, file: &Blueprint, config: &mut Map<String, Value>, depth: usize) -> Outcome<()> {
         let class = file.config(self.loader);
-        typed(class, &config)?;
+        typed(class, config)?;
         if self.loader.major() >= 5 {
             config
                 .iter_mut()
@@ -74,12 +85,12 @@ impl Resolver<'_> {
         let given: BTreeSet<String> = config.keys().cloned().collect();
         for (key, _) in class.configs.iter().filter(|(_, spec)| spec.flat) {
             if config.get(key).is_none_or(Value::is_null) {
-                config.insert(key.clone(), Value::Object(values_of(&config)));
+                config.insert(key.clone(), Value::Object(values_of(config)));
             }
         }
-        fill(&mut config, &class.defaults);
-        as_python(&mut config, &class.defaults);
-        let mut scope = self.scope(&config);
+        fill(config, &class.defaults);
+        as_python(config, &class.defaults);
+        let mut scope = self.scope(config);
         // Those that take values of others are resolved after them.
         let takes = |spec: &SubConfig| spec.set.values().any(|v| v.as_str().is_some_and(|s| s.starts_with('=')));
         let (later, first): (Vec<_>, Vec<_>) = class.configs.iter().partition(|(_, spec)| takes(spec));
@@ -91,10 +102,10 @@ impl Resolver<'_> {
                     config.insert(key.clone(), Value::Object(sub));
                 }
             }
-            bind(&mut scope, &config);
+            bind(&mut scope, config);
         }
         required(file, &scope)?;
-        compute(&mut config, &class.computed, &given, &mut scope)?;
+        compute(config, &class.computed, &given, &mut scope)?;
         config.extend(late.into_iter().map(|(key, value)| (key.to_owned(), value)));
         // A key can be read under its other names too.
         for (alias, key) in &class.aliases {
@@ -103,10 +114,10 @@ impl Resolver<'_> {
             }
         }
         if !class.refuses.is_empty() {
-            bind(&mut scope, &config);
+            bind(&mut scope, config);
             refused(&class.refuses, &scope)?;
         }
-        Ok(config)
+        Ok(())
     }
 
     /// A sub-config as given, or as the composition builds one, resolved by the file of its model type.
@@ -123,7 +134,7 @@ impl Resolver<'_> {
             (Some(Value::Object(map)), _) => map.clone(),
             (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
             (None | Some(Value::Null), None) => return Ok(None),
-            (Some(_), _) => return Err(Refusal::impossible(format!("`{key}` is not an object"))),
+            (Some(_), _) => return Err(Refusal::setting(key, given)),
         };
         if let Some(model_type) = spec.model_type_of(owner, &sub).map(str::to_owned) {
             sub.insert("model_type".to_owned(), model_type.into());
@@ -142,7 +153,9 @@ impl Resolver<'_> {
         if !spec.computed.is_empty() {
             let mut scope = self.scope(&sub);
             let given = sub.keys().cloned().collect();
-            compute(&mut sub, &spec.computed, &given, &mut scope).map_err(inside)?;
+            let computed = compute(&mut sub, &spec.computed, &given, &mut scope);
+            let origin = || Origin { lets: Vec::new(), members: &[], config: &sub, defaults: &spec.defaults };
+            computed.map_err(|refusal| inside(origin().explain(refusal)))?;
         }
         Ok(Some(sub))
     }
@@ -177,13 +190,18 @@ impl Resolver<'_> {
 
 /// Refuses a config that does not meet what the file requires.
 fn required(file: &Blueprint, scope: &Scope<'_>) -> Outcome<()> {
-    let unmet = |requirement: &Requirement| match requirement.that.eval_bool(scope) {
-        Ok(true) => None,
-        Ok(false) => Some(requirement.message.render(scope)),
-        Err(error) => Some(error.to_string()),
-    };
-    let unmet: Vec<String> = file.require.iter().filter_map(unmet).collect();
-    if unmet.is_empty() { Ok(()) } else { Err(Refusal::Impossible(unmet)) }
+    let (mut unmet, mut failed) = (Vec::new(), None);
+    for Requirement { that, message } in &file.require {
+        match that.eval_bool(scope) {
+            Ok(true) => {}
+            Ok(false) => unmet.push(message.render(scope)),
+            Err(error) => failed = failed.or(Some(error)),
+        }
+    }
+    if !unmet.is_empty() {
+        return Err(Refusal::Impossible(unmet));
+    }
+    failed.map_or(Ok(()), |error| Err(error.into()))
 }
 
 /// Refuses a value of another type than its field has.
@@ -272,10 +290,12 @@ fn compute(
             }
             config.insert(key.clone(), expression.eval(scope)?);
             stale = true;
-        } else if let Some(value) = config.get_mut(key).filter(|value| !value.is_boolean() && !value.is_null())
-            && matches!(expression.eval(scope), Ok(Value::Bool(_)))
-        {
-            *value = is_true(value).into();
+        } else if let Some(value) = config.get_mut(key).filter(|value| !value.is_null()) {
+            match (expression.eval(scope), &*value) {
+                (Ok(Value::Bool(_)), given) if !given.is_boolean() => *value = is_true(given).into(),
+                (Ok(Value::Number(_)), Value::Bool(truth)) => *value = u8::from(*truth).into(),
+                _ => continue,
+            }
             stale = true;
         }
     }
@@ -294,7 +314,9 @@ pub(super) fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> Outcome<
 fn value(written: &Value, scope: &Scope<'_>) -> Outcome<Value> {
     Ok(match written {
         Value::String(s) => match s.strip_prefix('=') {
-            Some(source) => Expression::parse(source).map_err(|e| Refusal::impossible(e.to_string()))?.eval(scope)?,
+            Some(source) => Expression::parse(source)
+                .map_err(|_| Refusal::NotCovered(vec![Doubt::Expression(None)]))?
+                .eval(scope)?,
             None => written.clone(),
         },
         Value::Object(map) => Value::Object(evaluated(map, scope)?),
@@ -308,8 +330,7 @@ pub(super) fn at_path<'c>(config: &'c Map<String, Value>, path: &str) -> Outcome
     for key in path.split('.') {
         at = match at.get(key) {
             Some(Value::Object(map)) => map,
-            None | Some(Value::Null) => return Err(Refusal::impossible(format!("`{path}` is absent"))),
-            Some(_) => return Err(Refusal::impossible(format!("`{path}` is not an object"))),
+            other => return Err(Refusal::setting(path, other)),
         };
     }
     Ok(at)

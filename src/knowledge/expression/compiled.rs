@@ -27,6 +27,8 @@ pub struct EvalError {
     pub source_text: String,
     /// The cause, capped.
     pub cause: String,
+    /// The expression, for those who look up what it reads; `None` where a text around expressions failed.
+    pub expression: Option<Expression>,
 }
 
 /// A text that is not a valid expression.
@@ -194,7 +196,7 @@ impl Expression {
             cause.truncate(at);
             cause.push('…');
         }
-        EvalError { source_text: shortened(&self.0.source), cause }
+        EvalError { source_text: shortened(&self.0.source), cause, expression: Some(self.clone()) }
     }
 }
 

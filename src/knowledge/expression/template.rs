@@ -123,7 +123,7 @@ impl Template {
             }
             if out.len() > limits::TEXT {
                 let cause = format!("the text is longer than {} bytes", limits::TEXT);
-                return Err(EvalError { source_text: self.source.chars().take(80).collect(), cause });
+                return Err(EvalError { source_text: self.source.chars().take(80).collect(), cause, expression: None });
             }
         }
         Ok(out)

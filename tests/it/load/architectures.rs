@@ -1,6 +1,6 @@
 //! Architectures against the tensor maps of real and tiny checkpoints, name for name and shape for shape.
 
-use ckpt_doctor::knowledge::{Doubt, Evidence, Expected, Library, Loader, Refusal};
+use ckpt_doctor::knowledge::{Evidence, Expected, Library, Loader, Refusal};
 use serde_json::{Value, json};
 
 use super::total_bytes;
@@ -399,9 +399,19 @@ fn what_a_description_does_not_cover_is_said() {
     let odd = built(&json!({ "words": [], "adapter": true, "odd": 2 })).expect("built");
     let doubts: Vec<String> = odd.doubts.iter().map(ToString::to_string).collect();
     assert_eq!(doubts, ["adapters are not described", "/odd is read by the class, and what it does is not known here"]);
-    // Where the description fails, a null in place of a value that the class has may be why.
-    let null = built(&json!({ "words": [], "adapter": false, "width": null })).expect_err("no width");
-    assert_eq!(null, Refusal::NotCovered(vec![Doubt::Null("/width".to_owned())]));
+    // Where an expression fails, the key is named that it reads, through the names of the description.
+    for (width, words) in [
+        (json!(null), "width is null, which is not described here"),
+        (json!([8, 8]), "width is a list of 2 elements, which is not described here"),
+        (json!("wide"), "width is \"wide\", which is not described here"),
+    ] {
+        let refusal = built(&json!({ "words": [], "adapter": false, "width": width })).expect_err("no width");
+        assert!(matches!(refusal, Refusal::NotCovered(_)), "{refusal:?}");
+        assert_eq!(refusal.to_string(), words);
+    }
+    // No loader makes a tensor of such a size.
+    let huge = built(&json!({ "words": [], "adapter": false, "width": 1_u64 << 60 })).expect_err("too wide");
+    assert_eq!(huge.to_string(), "width is 1152921504606846976, more than any tensor can have");
     let refused = built(&json!({ "words": [], "adapter": false, "width": 9 })).expect_err("odd width");
     assert_eq!(refused, Refusal::Raises("ValueError: 9 is no multiple of 2".to_owned()));
 }

@@ -1,0 +1,290 @@
+#!/usr/bin/env python3
+"""Sound checkpoints of unusual shapes: really saved, really opened, and no error of `check`.
+
+    sound.py FOLDER... [--only REGEX] [--list]
+
+Each FOLDER has one version of transformers, for the Python that runs this. Each shape is saved by the real class in every
+version that has it, and opened again by that class: nothing is missing, unexpected or of another shape. `check --for` that version
+must say `loads` or `not predicted`, with no error. After `check --fix --unsafe-fixes` on a copy the real class opens it as before.
+Shapes that must be predicted, because the description covers them, say so.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from peer import Tally, doctor, errors, workplace
+
+# Cases.
+
+TEXT = dict(
+    vocab_size=64,
+    hidden_size=32,
+    intermediate_size=48,
+    num_hidden_layers=2,
+    num_attention_heads=4,
+    max_position_embeddings=64,
+    pad_token_id=3,
+    bos_token_id=1,
+    eos_token_id=2,
+)
+ENCODER = dict(hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=4)
+PATCHES = {"image_size": 32, "patch_size": 16}
+SIDES = {"list": {"image_size": [32, 32]}, "oblong": {"image_size": [32, 48], "patch_size": [16, 16]}}
+VISION = dict(model_type="clip_vision_model", **ENCODER, image_size=32, patch_size=16, projection_dim=16)
+BASIC = dict(embedding_size=8, hidden_sizes=[8, 16, 16, 24], depths=[2, 2, 1, 1], layer_type="basic")
+DETR = dict(
+    d_model=32,
+    encoder_layers=1,
+    decoder_layers=1,
+    encoder_attention_heads=2,
+    decoder_attention_heads=2,
+    encoder_ffn_dim=32,
+    decoder_ffn_dim=32,
+    num_queries=5,
+    use_timm_backbone=False,
+    use_pretrained_backbone=False,
+    backbone=None,
+)
+WAV = dict(**ENCODER, num_conv_pos_embeddings=4, num_conv_pos_embedding_groups=2, vocab_size=32)
+LED = dict(
+    d_model=32,
+    encoder_layers=2,
+    decoder_layers=1,
+    encoder_attention_heads=2,
+    decoder_attention_heads=2,
+    encoder_ffn_dim=32,
+    decoder_ffn_dim=32,
+    vocab_size=64,
+    max_encoder_position_embeddings=64,
+    max_decoder_position_embeddings=64,
+)
+PAGE = dict(
+    **ENCODER,
+    vocab_size=64,
+    max_position_embeddings=64,
+    coordinate_size=5,
+    shape_size=6,
+    max_2d_position_embeddings=64,
+    input_size=32,
+    patch_size=16,
+    rel_pos_bins=8,
+    rel_2d_pos_bins=8,
+)
+GRANITE = dict(
+    **TEXT,
+    num_key_value_heads=2,
+    shared_intermediate_size=16,
+    mamba_n_heads=4,
+    mamba_d_head=16,
+    mamba_d_state=8,
+    mamba_chunk_size=16,
+)
+LFM = dict(**TEXT, num_key_value_heads=2, block_multiple_of=8)
+
+
+def convolutions(n):
+    """A feature extractor of n convolutions."""
+    count = dict(conv_dim=[16] * n, conv_stride=[2] * n, conv_kernel=[3] * n, num_feat_extract_layers=n)
+    return {**WAV, **count}
+
+
+def rows():
+    """(name, class, config, whether the load must be predicted in the versions whose class is known)."""
+    for head in ("Model", "ForMaskedLM", "ForQuestionAnswering", "ForTokenClassification", "ForSequenceClassification"):
+        longformer = dict(**TEXT, type_vocab_size=1, attention_window=[4, 8])
+        yield f"longformer/{head}", f"Longformer{head}", longformer, False
+    for head in ("Model", "ForConditionalGeneration"):
+        yield f"led/{head}", f"LED{head}", dict(**LED, attention_window=[4, 8]), False
+    for head in ("Model", "ForImageClassification", "Backbone"):
+        yield f"resnet-basic/{head}", f"ResNet{head}", BASIC, True
+        yield f"resnet-basic-first/{head}", f"ResNet{head}", {**BASIC, "downsample_in_first_stage": True}, True
+        yield f"resnet-34/{head}", f"ResNet{head}", {**BASIC, "depths": [3, 4, 6, 3]}, True
+    for name in ("Detr", "TableTransformer"):
+        backbone = dict(model_type="resnet", **BASIC, out_features=["stage4"])
+        yield f"{name}/basic-resnet", f"{name}ForObjectDetection", dict(**DETR, backbone_config=backbone), False
+    for labels in (2, 9, 10, 11, 61):
+        for head in ("ForTokenClassification", "ForSequenceClassification"):
+            yield f"layoutlmv3-{labels}/{head}", f"LayoutLMv3{head}", dict(**PAGE, num_labels=labels), True
+    for head in ("Model", "ForCausalLM"):
+        for name, kinds in (("mixed", ["mamba", "attention"]), ("attention", ["attention"] * 2), ("mamba", ["mamba"] * 2)):
+            for experts in (0, 2):
+                granite = dict(**GRANITE, layer_types=kinds, num_local_experts=experts, num_experts_per_tok=1)
+                yield f"granite-4-{name}-{experts}/{head}", f"GraniteMoeHybrid{head}", granite, True
+        for name, some in (("some", [1]), ("all", [0, 1]), ("first", [0])):
+            yield f"lfm2-{name}/{head}", f"Lfm2{head}", dict(**LFM, full_attn_idxs=some), True
+        yield f"lfm2-conv-bias/{head}", f"Lfm2{head}", dict(**LFM, full_attn_idxs=[1], conv_bias=True, conv_L_cache=4), True
+    for name in ("ViT", "DeiT", "Beit", "Dinov2"):
+        for head in ("Model", "ForImageClassification"):
+            for shape, sizes in SIDES.items():
+                yield f"{name}-{shape}/{head}", f"{name}{head}", {**ENCODER, **PATCHES, **sizes}, True
+    for switch in ("use_absolute_position_embeddings", "use_relative_position_bias", "use_shared_relative_position_bias"):
+        yield f"Beit-{switch}", "BeitModel", {**ENCODER, **PATCHES, **SIDES["oblong"], switch: True}, True
+    for head in ("Model", "ForImageClassification"):
+        for shape, sizes in {"list": {"image_size": [32, 32]}, "oblong": {"image_size": [32, 64], "patch_size": [4, 4]}}.items():
+            swin = dict(patch_size=4, embed_dim=16, depths=[1, 1], num_heads=[2, 2], window_size=4)
+            yield f"Swin-{shape}/{head}", f"Swin{head}", {**swin, **sizes}, True
+            yield f"Swin-{shape}-absolute/{head}", f"Swin{head}", {**swin, **sizes, "use_absolute_embeddings": True}, True
+    for family in ("Llava", "LlavaNext", "LlavaNextVideo", "VipLlava"):
+        key = "vision_feature_layers" if family == "VipLlava" else "vision_feature_layer"
+        text = dict(model_type="llama", **TEXT, num_key_value_heads=2)
+        for layers in ([-2], [-1, -2]):
+            config = {"text_config": text, "vision_config": VISION, "image_token_index": 4, key: layers}
+            yield f"{family}-{len(layers)}-layers", f"{family}ForConditionalGeneration", config, False
+    for heads in (3, 5):
+        odd = dict(model_type="mistral", **{**TEXT, "num_attention_heads": heads}, num_key_value_heads=1, head_dim=28)
+        for family in ("Llava", "LlavaNext", "PaliGemma"):
+            vision = VISION if family != "PaliGemma" else {**VISION, "model_type": "siglip_vision_model"}
+            config = {"text_config": odd, "vision_config": vision, "image_token_index": 4, "projection_dim": 32}
+            yield f"{family}-mistral-of-{heads}-heads", f"{family}ForConditionalGeneration", config, False
+        alone = {key: value for key, value in odd.items() if key != "model_type"}
+        yield f"mistral-of-{heads}-heads", "MistralForCausalLM", alone, False
+    mixtral = dict(model_type="mixtral", **TEXT, num_key_value_heads=2, head_dim=None, num_local_experts=2)
+    siglip = {**VISION, "model_type": "siglip_vision_model"}
+    for family in ("PaliGemma", "Llava"):
+        config = {"text_config": mixtral, "vision_config": siglip, "image_token_index": 4, "projection_dim": 32}
+        yield f"{family}-mixtral", f"{family}ForConditionalGeneration", config, False
+    for name in ("Wav2Vec2", "Hubert", "WavLM", "UniSpeech", "SEW"):
+        for count in (1, 2, 3, 8):
+            extra = {"squeeze_factor": 1} if name == "SEW" else {}
+            yield f"{name}-{count}-convolutions", f"{name}Model", {**convolutions(count), **extra}, False
+
+
+# Under one version.
+
+
+def build(out, only):
+    """Saves each shape and opens it again; prints a line for each."""
+    import warnings
+
+    import torch
+    import transformers
+
+    warnings.simplefilter("ignore")
+    transformers.utils.logging.set_verbosity(50)
+    transformers.utils.logging.disable_progress_bar()
+    torch.manual_seed(0)
+    for name, cls, config, predicted in rows():
+        model_class = getattr(transformers, cls, None)
+        if not re.search(only, name) or model_class is None:
+            continue
+        told = {"name": name, "class": cls, "predicted": predicted, "folder": str(out / name.replace("/", "-"))}
+        try:
+            model_class(model_class.config_class(**config)).save_pretrained(told["folder"])
+        except Exception as error:  # a shape that this version does not have
+            told["absent"] = f"{type(error).__name__}: {error}"[:200]
+            print(json.dumps(told), flush=True)
+            continue
+        print(json.dumps({**told, "load": load(model_class, told["folder"])}), flush=True)
+
+
+def load(model_class, folder):
+    """What the class does with a folder: the lengths of its lists, or the exception."""
+    try:
+        _, info = model_class.from_pretrained(folder, output_loading_info=True)
+        return [len(info[key]) for key in ("missing_keys", "unexpected_keys", "mismatched_keys")]
+    except Exception as error:  # whatever the class raises is the answer
+        return f"{type(error).__name__}: {error}"[:200]
+
+
+def reopen(folders):
+    """Opens folders that were fixed; prints a line for each."""
+    import transformers
+
+    transformers.utils.logging.set_verbosity(50)
+    transformers.utils.logging.disable_progress_bar()
+    for line in Path(folders).read_text().splitlines():
+        row = json.loads(line)
+        print(json.dumps({**row, "load": load(getattr(transformers, row["class"]), row["folder"])}), flush=True)
+
+
+def under(folder, *arguments):
+    """The lines that this script prints as a worker with one version of transformers."""
+    env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run([sys.executable, __file__, "--worker", *map(str, arguments)], capture_output=True, text=True, env=env)
+    if done.returncode:
+        sys.exit(f"the worker failed with {folder}:\n{done.stderr[-2000:]}")
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+
+
+# The comparison.
+
+
+def version_of(folder):
+    code = "import transformers; print(transformers.__version__)"
+    env = {**os.environ, "PYTHONPATH": folder}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True).stdout.strip()
+
+
+def report(folder, version):
+    _, out, err = doctor("check", "--for", version, "--output-format", "json", folder)
+    try:
+        return json.loads(out)["checkpoints"][0]
+    except (ValueError, LookupError):
+        raise AssertionError(f"check printed no report:\n{out[:400]}\n{err[:400]}") from None
+
+
+def judge(tally, row, version, verdicts):
+    """Compares the report of one sound checkpoint with what the real class did."""
+    where = f"{version} {row['name']}"
+    entry = report(row["folder"], version)
+    model = next(o for load in entry["loads"] for o in load["objects"] if o["object"] == "model")
+    told = f"{model['verdict']}: {model.get('why')}"
+    tally.equal(errors(entry), [], f"{where}: no error")
+    tally.expect(model["verdict"] in ("loads", "not-predicted"), f"{where}: the verdict is true", told)
+    is_known = "its class is unknown" not in told and "class" not in (model.get("why") or "")
+    if row["predicted"] and is_known:
+        tally.equal(model["verdict"], "loads", f"{where}: the load is predicted ({model.get('why')})")
+    verdicts[version, model["verdict"]] = verdicts.get((version, model["verdict"]), 0) + 1
+
+
+def main():
+    if sys.argv[1:2] == ["--worker"]:
+        mode, where, *only = sys.argv[2:]
+        return build(Path(where), only[0]) if mode == "build" else reopen(where)
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("folders", nargs="*")
+    p.add_argument("--only", default="", help="regular expression on names of shapes")
+    p.add_argument("--list", action="store_true", help="print every verdict")
+    args = p.parse_args()
+    tally, verdicts, absent = Tally(), {}, 0
+    with workplace() as place:
+        for folder in args.folders:
+            version = version_of(folder)
+            out = place / version
+            built = under(folder, "build", out, args.only)
+            sound = [row for row in built if row.get("load") == [0, 0, 0]]
+            absent += sum("absent" in row for row in built)
+            for row in built:
+                if args.list:
+                    print(version, row["name"], row.get("absent") or row["load"])
+                if "load" in row and row not in sound:
+                    tally.expect(False, f"{version} {row['name']}: the real class opens its own save", row["load"])
+            for row in sound:
+                judge(tally, row, version, verdicts)
+            fixed = [{**row, "folder": fixed_copy(row["folder"], version)} for row in sound]
+            (out / "fixed.jsonl").write_text("".join(json.dumps(row) + "\n" for row in fixed))
+            for row in under(folder, "reopen", out / "fixed.jsonl"):
+                tally.equal(row["load"], [0, 0, 0], f"{version} {row['name']}: opens after the fixes")
+            shutil.rmtree(out)
+    for (version, verdict), count in sorted(verdicts.items()):
+        print(f"{version}: {count} {verdict}")
+    print(f"{absent} shapes that a version does not build")
+    tally.finish()
+
+
+def fixed_copy(folder, version):
+    """A copy of a checkpoint after every fix that the program offers for it."""
+    copy = f"{folder}-fixed"
+    shutil.copytree(folder, copy)
+    doctor("check", "--fix", "--unsafe-fixes", "--for", version, copy)
+    return copy
+
+
+if __name__ == "__main__":
+    main()
