@@ -94,7 +94,18 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=os.environ.get("DERIVE_CACHE"), help="directory of samples and results")
     commands = parser.add_subparsers(required=True)
-    for add in (add_sample, add_fit, add_draw, add_conversions, add_write, add_verify, add_drop, add_table, add_accepts, add_retry):
+    for add in (
+        add_sample,
+        add_fit,
+        add_draw,
+        add_conversions,
+        add_write,
+        add_verify,
+        add_drop,
+        add_table,
+        add_accepts,
+        add_retry,
+    ):
         add(commands)
     for sub in set(commands.choices.values()):  # --cache may stand before or after the subcommand
         sub.add_argument("--cache", type=Path, default=argparse.SUPPRESS)

@@ -94,7 +94,9 @@ def of_host(model_type, flat=False):
     more = {}
     if model_type.startswith("qwen2"):
         text["rope_scaling"] = {"type": "mrope", "mrope_section": [1, 1, 2]}
-        vision |= dict(hidden_size=WIDTH, out_hidden_size=WIDTH, embed_dim=WIDTH, depth=1, num_heads=4, fullatt_block_indexes=[0])
+        vision |= dict(
+            hidden_size=WIDTH, out_hidden_size=WIDTH, embed_dim=WIDTH, depth=1, num_heads=4, fullatt_block_indexes=[0]
+        )
     else:
         text["model_type"], vision["model_type"] = default.text_config.model_type, default.vision_config.model_type
     if model_type == "internvl":
@@ -207,6 +209,7 @@ def of_parts(model_type):
     if flat:
         paths = {"initializer_range": RANGES["text_config."], "vision_config.initializer_range": RANGES["vision_config."]}
     cls = host_class(model_type)
+
     # Newer classes have their modules in `model`, and checkpoints do not.
     def of_projector(config):
         found = {name.removeprefix("model."): tensors for name, tensors in values(cls, config).items()}

@@ -58,10 +58,10 @@ pub(super) fn faults(
             !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)
         });
         refused_keys.extend(own.iter().map(|rejection| rejection.pointer.clone()));
-        match of_loads.iter_mut().find(|fault| fault.kind == FaultKind::ConfigIncomputable) {
-            Some(unbuilt) if !own.is_empty() && !unbuilt.loaders.contains(&loader) => unbuilt.loaders.push(loader),
-            Some(_) => {}
-            None => found = own.into_iter().fold(found, with_other_pointer),
+        // What ends the load of this version is told already. Another version refuses the value with its own exception.
+        let is_told = |fault: &Fault| fault.kind == FaultKind::ConfigIncomputable && fault.loaders.contains(&loader);
+        if !of_loads.iter().any(is_told) {
+            found = own.into_iter().fold(found, with_other_pointer);
         }
         for rejection in found {
             rejection.fault().join(&mut faults, loader);

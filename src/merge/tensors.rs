@@ -137,6 +137,7 @@ pub(super) fn plan(
             config
                 .and_then(|config| knowledge.initial.of(&knowledge.parts, config, &taken.name, &shape))
                 .map(in_numbers)
+                .ok_or_else(|| UNKNOWN_VALUES.to_owned())
         });
         match source(&taken, &shape, values) {
             Ok(source) => tensors.push((position, planned(taken, shape, source, draft))),
@@ -426,8 +427,12 @@ fn expected_shapes<'n>(
 }
 
 /// The source of a tensor of `shape`, or the reason why the donor tensor cannot be used. `values` are those of a tensor that
-/// starts again, if they are known.
-fn source(taken: &TakenTensor<'_>, shape: &[u64], values: Option<Option<NewValues>>) -> Result<TensorSource, String> {
+/// starts again, or why they are not known.
+fn source(
+    taken: &TakenTensor<'_>,
+    shape: &[u64],
+    values: Option<Result<NewValues, String>>,
+) -> Result<TensorSource, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
     let from = TensorRef::new(&donor.role, &donor.checkpoint.root, shard, tensor, rule.slice)?;
     let starts = values.is_some();
@@ -446,11 +451,7 @@ fn source(taken: &TakenTensor<'_>, shape: &[u64], values: Option<Option<NewValue
         }
         fit => fit.transform(),
     };
-    let values = match values {
-        Some(None) => return Err(UNKNOWN_VALUES.to_owned()),
-        Some(values) => values,
-        None => None,
-    };
+    let values = values.transpose()?;
     // New values have the size that the class gives them.
     Ok(TensorSource { from, fit, scale: rule.scale.filter(|_| !starts), values })
 }

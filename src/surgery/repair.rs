@@ -88,6 +88,7 @@ pub struct Repair {
     /// The checkpoint before the repair.
     pub original: Arc<Checkpoint>,
     /// Result of checking the repaired checkpoint.
+    #[cfg_attr(not(feature = "internals"), allow(dead_code, reason = "the tests compare it"))]
     pub outcome: Outcome,
     /// Findings with applied fixes.
     pub fixed: Vec<Fixed>,

@@ -72,11 +72,12 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
     if let Some(w) = repair.withdrawn.iter().find(|w| w.reason.starts_with("its edits")) {
         return Err(format!("{} has edits that cannot be made: {}", w.code, w.title));
     }
-    let withheld = repair.withdrawn.iter().map(|w| format!("; withheld {}: {}", w.code, w.reason)).collect::<String>();
+    let withheld: Vec<String> = repair.withdrawn.iter().map(|w| format!("withheld {}: {}", w.code, w.reason)).collect();
+    let withheld = withheld.join("; ");
     if repair.changes.is_empty() {
         return match outcome.findings.iter().find(|f| is_automatic(f)) {
             Some(finding) => Err(format!("{} offers a fix that is not applied", finding.code)),
-            None => Ok(withheld.strip_prefix("; ").map(str::to_owned)),
+            None => Ok(Some(withheld).filter(|text| !text.is_empty())),
         };
     }
     let fixed = codes(repair.fixed.iter().map(|f| &f.code));
@@ -104,7 +105,7 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
     }
     let left = codes(after.findings.iter().filter(|f| f.severity != Severity::Info).map(|f| &f.code));
     let done = if left.is_empty() { fixed } else { format!("{fixed}, by hand: {left}") };
-    Ok(Some(format!("{done}{withheld}")))
+    Ok(Some([done, withheld].into_iter().filter(|text| !text.is_empty()).collect::<Vec<_>>().join("; ")))
 }
 
 fn without_fixes(findings: &[Finding]) -> Vec<Finding> {

@@ -126,7 +126,10 @@ def rows():
     for switch in ("use_absolute_position_embeddings", "use_relative_position_bias", "use_shared_relative_position_bias"):
         yield f"Beit-{switch}", "BeitModel", {**ENCODER, **PATCHES, **SIDES["oblong"], switch: True}, True
     for head in ("Model", "ForImageClassification"):
-        for shape, sizes in {"list": {"image_size": [32, 32]}, "oblong": {"image_size": [32, 64], "patch_size": [4, 4]}}.items():
+        for shape, sizes in {
+            "list": {"image_size": [32, 32]},
+            "oblong": {"image_size": [32, 64], "patch_size": [4, 4]},
+        }.items():
             swin = dict(patch_size=4, embed_dim=16, depths=[1, 1], num_heads=[2, 2], window_size=4)
             yield f"Swin-{shape}/{head}", f"Swin{head}", {**swin, **sizes}, True
             yield f"Swin-{shape}-absolute/{head}", f"Swin{head}", {**swin, **sizes, "use_absolute_embeddings": True}, True

@@ -131,7 +131,6 @@ class Small:
             return None
         return said[0].split(":", 1)[0]
 
-
     def fitting(self, pointer, kind):
         """Values of a kind of the element type and length that the class may want under a key.
 

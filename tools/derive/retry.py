@@ -90,8 +90,8 @@ def main(args):
     rows = collections.defaultdict(list)
     for line in args.rows.read_text().splitlines():
         if line.startswith("["):
-            of, name, key, kind = json.loads(line)
-            if of == version:
+            version_of_row, name, key, kind = json.loads(line)
+            if version_of_row == version:
                 rows[name].append((key, kind))
     outcomes = {}
     with multiprocessing.get_context("fork").Pool(args.jobs, maxtasksperchild=4) as pool:
@@ -100,9 +100,7 @@ def main(args):
     counts = collections.Counter(next(iter(answer)) for found in outcomes.values() for answer in found.values())
     file = OUT / f"{version}.json"
     entries = json.loads(file.read_text())
-    wrong = {
-        name: {where for where, answer in found.items() if "raises" not in answer} for name, found in outcomes.items()
-    }
+    wrong = {name: {where for where, answer in found.items() if "raises" not in answer} for name, found in outcomes.items()}
     # An entry may name the class whose values it has: where both are wrong alike it goes on to.
     own = {name: without(entries, name, kinds) for name, kinds in wrong.items() if kinds != wrong.get(of(entries, name), set())}
     own |= {name: without(entries, name, kinds) for name, kinds in wrong.items() if of(entries, name) is None and kinds}
@@ -114,7 +112,11 @@ def main(args):
     proofs[version] = {
         name: kept
         for name, found in sorted(outcomes.items())
-        if (kept := {f"{key} {kind}": answer["raises"][0] for (key, kind), answer in sorted(found.items()) if "raises" in answer})
+        if (
+            kept := {
+                f"{key} {kind}": answer["raises"][0] for (key, kind), answer in sorted(found.items()) if "raises" in answer
+            }
+        )
     }
     PROOF.write_text(json.dumps(dict(sorted(proofs.items())), indent=1, ensure_ascii=False) + "\n")
     print(f"{version}: {sum(map(len, rows.values()))} contradictions, {dict(counts)}")

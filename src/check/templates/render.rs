@@ -96,10 +96,11 @@ impl Rendering {
         let mut refused = None;
         for content in contents {
             match template.render(variables(content, special)) {
-                Ok(text) => match text.split_once(ASSISTANT).filter(|(before, _)| before.contains(USER)) {
-                    Some((_, after)) => return Self::Done(Rendered { after_assistant: after.to_owned(), text }),
-                    None => continue,
-                },
+                Ok(text) => {
+                    if let Some((_, after)) = text.split_once(ASSISTANT).filter(|(before, _)| before.contains(USER)) {
+                        return Self::Done(Rendered { after_assistant: after.to_owned(), text });
+                    }
+                }
                 Err(error) => refused = refused.or_else(|| excess(&error)),
             }
         }

@@ -272,7 +272,8 @@ mod tests {
         assert_eq!(cost("{% macro f(a) %}{{ f([a, a]) }}{% endmacro %}{{ f(1) }}"), Some(Cost::Nesting));
         assert_eq!(cost("{% for a in messages recursive %}{{ loop([a, a]) }}{% endfor %}"), Some(Cost::Nesting));
         assert_eq!(cost(&"{% set a = [a, a] %}".repeat(17)), Some(Cost::Nesting));
-        let chain: String = (0..20).map(|i| format!("{{% set a{} = [a{i}, a{i}] %}}", i + 1)).collect();
+        let chain: Vec<String> = (0..20).map(|i| format!("{{% set a{} = [a{i}, a{i}] %}}", i + 1)).collect();
+        let chain = chain.concat();
         assert_eq!(cost(&chain), Some(Cost::Nesting));
         for text in [
             "{% for m in messages %}{% set role = m.role %}{% set x = {'role': role, 'content': m.content} %}{% endfor %}",

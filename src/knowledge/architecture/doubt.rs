@@ -54,7 +54,9 @@ impl Doubt {
     /// The same of a config, for the one that has it under `path`.
     pub(super) fn inside(mut self, path: &str) -> Self {
         if let Self::Values(settings) = &mut self {
-            settings.iter_mut().for_each(|setting| setting.key = format!("{path}.{}", setting.key));
+            for setting in settings {
+                setting.key = format!("{path}.{}", setting.key);
+            }
         }
         self
     }

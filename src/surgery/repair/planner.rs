@@ -13,6 +13,8 @@ const ROUNDS: usize = 32;
 /// Maximum number of planned checkpoints that one repair judges, so that no directory costs more than this many checks. Fixes
 /// that are refused are found by bisection; a repair of a thousand findings with one such fix takes a dozen.
 const TRIALS: usize = 64;
+/// Maximum number of findings whose fixes a check tries for its offers alone; a directory with more has been damaged as a whole.
+const OFFERED: usize = 64;
 
 /// Result of an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -72,9 +74,13 @@ pub fn plan(checkpoint: &Arc<Checkpoint>, outcome: Outcome, unsafe_fixes: bool, 
 
 /// The result of a check whose fixes were tried: one that would be withdrawn is not offered, and its finding says why. Called
 /// for the reports of users, with the same `check` as [`plan`] and with the result of the selected rules as `outcome`.
+/// A trial costs several checks, so where there are many findings and no fix rests on a vote, they are offered untried: they
+/// are tried before they are applied.
 #[must_use]
 pub fn tried(checkpoint: &Arc<Checkpoint>, mut outcome: Outcome, check: CheckFn<'_>) -> Outcome {
-    if !outcome.findings.iter().any(|f| f.fix.as_ref().is_some_and(|fix| fix.is_permitted(true))) {
+    let fixes = || outcome.findings.iter().filter_map(|f| f.fix.as_ref()).filter(|fix| fix.is_permitted(true));
+    let is_large = outcome.findings.len() > OFFERED || outcome.findings.iter().any(|f| f.hidden > 0);
+    if fixes().next().is_none() || is_large && !fixes().any(|fix| fix.needs_whole_load) {
         return outcome;
     }
     for withdrawn in plan(checkpoint, outcome.clone(), true, check).withdrawn {
@@ -149,14 +155,12 @@ impl Planner<'_> {
         draft.finish().ok_or("its edits conflict")?;
         self.trials = self.trials.checked_sub(1).ok_or("too many fixes were tried before it")?;
         let outcome = (self.check)(draft.current());
-        match objection(&self.outcome, &outcome, made) {
-            Some(reason) => Err(reason),
-            None => {
-                (self.draft, self.outcome) = (draft, outcome);
-                self.made.extend_from_slice(made);
-                Ok(())
-            }
+        if let Some(reason) = objection(&self.outcome, &outcome, made) {
+            return Err(reason);
         }
+        (self.draft, self.outcome) = (draft, outcome);
+        self.made.extend_from_slice(made);
+        Ok(())
     }
 
     fn bar(&mut self, finding: &Finding, reason: String) {
@@ -169,7 +173,9 @@ impl Planner<'_> {
         let needs_proof = |f: &&Finding| f.fix.as_ref().is_some_and(|fix| fix.needs_whole_load);
         let open: Vec<Finding> = self.made.iter().filter(needs_proof).cloned().collect();
         let Some(reason) = unproven(&self.outcome).filter(|_| !open.is_empty()) else { return false };
-        open.iter().for_each(|finding| self.bar(finding, reason.clone()));
+        for finding in &open {
+            self.bar(finding, reason.clone());
+        }
         true
     }
 }

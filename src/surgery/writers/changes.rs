@@ -68,7 +68,7 @@ fn changes_nothing(original: &Checkpoint, change: &Change) -> bool {
             document.or_else(module).is_some_and(|old| old == new)
         }
         Content::Shard(new) => original.shards.get(&change.name).is_some_and(|old| {
-            new.file_len() == old.file_len && hex(&Sha256::digest(&new.header())) == old.header_sha256
+            new.file_len() == old.file_len && hex(&Sha256::digest(new.header())) == old.header_sha256
         }),
     }
 }

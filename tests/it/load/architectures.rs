@@ -127,14 +127,14 @@ fn hostile_configs_are_refused_with_a_message() {
         (json!({ "num_hidden_layers": 199_999 }), "more than 60000 tensors"),
         (json!({ "num_attention_heads": 0 }), "num_attention_heads is 0"),
         (json!({ "num_attention_heads": null }), "num_attention_heads"),
-        (json!({ "hidden_size": -1 }), "integer from 0 to 2^53"),
+        (json!({ "hidden_size": -1 }), "hidden_size is -1"),
         (json!({ "hidden_size": "4096" }), "hidden_size"),
         (
             json!({ "hidden_size": 9_223_372_036_854_775_807_i64, "head_dim": 128, "num_attention_heads": 1 }),
-            "integer from 0 to 2^53",
+            "hidden_size",
         ),
-        (json!({ "num_key_value_heads": 9_223_372_036_854_775_807_i64 }), "verflow"),
-        (json!({ "vocab_size": 1e300 }), "integer from 0 to 2^53"),
+        (json!({ "num_key_value_heads": 9_223_372_036_854_775_807_i64 }), "num_key_value_heads"),
+        (json!({ "vocab_size": 1e300 }), "vocab_size"),
     ] {
         let refusal = llama(patch.clone()).expect_err(&patch.to_string()).to_string();
         assert!(refusal.contains(message), "{patch}: {refusal}");
@@ -156,9 +156,9 @@ fn compositions_name_the_part_that_cannot_be_built() {
     let refusal = refuse(json!({ "model_type": "llava", "text_config": { "model_type": "mamba_9" } }));
     assert_eq!(refusal, "text_config (model type mamba_9) is not known here");
     let refusal = refuse(json!({ "model_type": "spatialvla", "vision_zoe_config": null }));
-    assert_eq!(refusal, "`vision_zoe_config` is absent");
+    assert_eq!(refusal, "vision_zoe_config is null, which is not described here");
     let refusal = refuse(json!({ "model_type": "llava", "vision_config": { "patch_size": 0 } }));
-    assert!(refusal.starts_with("vision_config: ") && refusal.contains("patch_size"), "{refusal}");
+    assert!(refusal.starts_with("vision_config") && refusal.contains("patch_size"), "{refusal}");
     let refusal = refuse(
         json!({ "model_type": "zoedepth", "bin_configurations": [{ "name": "x".repeat(2000), "n_bins": 1 }, { "name": "y", "n_bins": 1 }],
         "num_patch_transformer_layers": 0, "patch_transformer_hidden_size": 8 , "patch_transformer_intermediate_size": 8 }),
@@ -200,7 +200,7 @@ fn a_user_adds_an_architecture_or_replaces_one() {
         classes: [{ class: "M", tensors: { "": { part: { class: "M" } } } }] }"#;
     library.add("m.json5", endless).expect("parses");
     let refused = library.class("M", Loader::V4_47_0).expect("added").expect(&json!({})).expect_err("a part of itself");
-    assert_eq!(refused.to_string(), "parts are nested more than 8 deep");
+    assert_eq!(refused.to_string(), "it is not known here: parts are nested more than 8 deep");
     let error = library.add("mlp.json5", &text.replace("bias", "bais")).expect_err("misspelt");
     assert!(error.to_string().contains("bais"), "{error}");
 }

@@ -103,7 +103,7 @@ impl Nesting {
     }
 
     /// Whether a value is nested in itself again and again, or one holds too many. Called at the end of the template.
-    pub(super) fn is_excessive(mut self) -> bool {
+    pub(super) fn is_excessive(&mut self) -> bool {
         for (name, call) in std::mem::take(&mut self.calls) {
             let Some(parameters) = self.parameters.get(&name) else { continue };
             self.assignments.push(Assignment { targets: parameters.clone(), ..call });
@@ -197,9 +197,10 @@ impl<'a> Graph<'a> {
             let (mut held, mut whole) = (1_u64, 1_u64);
             for mention in &one.mentions {
                 let each = self.of_mention(mention).into_iter().map(|from| self.size(from, sizes)).max().unwrap_or(1);
-                match mention.is_held {
-                    true => held = held.saturating_add(each),
-                    false => whole = whole.max(each),
+                if mention.is_held {
+                    held = held.saturating_add(each);
+                } else {
+                    whole = whole.max(each);
                 }
             }
             most = most.max(held.saturating_add(whole));

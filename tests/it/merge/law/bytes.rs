@@ -318,10 +318,7 @@ fn run(request: &Request, donors: &Path, room: &Path) -> (&'static str, usize) {
     for (name, value) in &request.options {
         merge = merge.option(*name, *value);
     }
-    let report = match merge.run() {
-        Err(_) => return ("refused", 0),
-        Ok(report) => report,
-    };
+    let Ok(report) = merge.run() else { return ("refused", 0) };
     if report.merge.unwrap().stage != Some(MergeStage::Written) {
         return ("stopped", 0);
     }
@@ -351,15 +348,12 @@ fn no_byte_outside_the_named_parts_differs() {
                 return (outcomes, broken, equal);
             }
             let request = Request::new(&mut Draw::new(number as u64));
-            match catch_unwind(AssertUnwindSafe(|| run(&request, all.path(), room.path()))) {
-                Ok((outcome, tensors)) => {
-                    *outcomes.entry(outcome).or_default() += 1;
-                    equal += tensors;
-                }
-                Err(_) => {
-                    broken.push(format!("{number}: {} {:?} {:?}", request.recipe, request.donors, request.options));
-                    drop(fs::remove_dir_all(room.path().join("out")));
-                }
+            if let Ok((outcome, tensors)) = catch_unwind(AssertUnwindSafe(|| run(&request, all.path(), room.path()))) {
+                *outcomes.entry(outcome).or_default() += 1;
+                equal += tensors;
+            } else {
+                broken.push(format!("{number}: {} {:?} {:?}", request.recipe, request.donors, request.options));
+                drop(fs::remove_dir_all(room.path().join("out")));
             }
         }
     };
@@ -367,7 +361,9 @@ fn no_byte_outside_the_named_parts_differs() {
     std::thread::scope(|scope| {
         for worker in [scope.spawn(work), scope.spawn(work)] {
             let (some, wrong, tensors) = worker.join().unwrap();
-            some.into_iter().for_each(|(outcome, n)| *outcomes.entry(outcome).or_default() += n);
+            for (outcome, n) in some {
+                *outcomes.entry(outcome).or_default() += n;
+            }
             broken.extend(wrong);
             equal += tensors;
         }
