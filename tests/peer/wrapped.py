@@ -176,7 +176,7 @@ def damaged(kind, tensors, config):
         return {wrap(name): tensor for name, tensor in tensors.items()}, config
     if kind == "other class":
         # A reward model whose config names the class of the language model.
-        (name,) = config["architectures"]
+        (name,) = config.get("architectures") or [""]
         if not name.endswith("ForSequenceClassification") or name.startswith("Bert"):
             return None
         return tensors, {**config, "architectures": [name.replace("ForSequenceClassification", "ForCausalLM")]}

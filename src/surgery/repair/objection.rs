@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::unused::left_unused;
 use crate::check::load::{LoadReport, SilentReason};
-use crate::check::verdict::{LoadVerdict, PredictedLoad};
+use crate::check::verdict::{LoadVerdict, PredictedLoad, is_program};
 use crate::check::{Finding, Outcome, Severity};
 
 const UNEXPECTED: &str = "unexpected";
@@ -23,8 +23,8 @@ pub(super) fn objection(before: &Outcome, after: &Outcome, made: &[Finding]) -> 
     worse.or_else(|| remaining(before, after, made)).or_else(unused)
 }
 
-/// Why the load after a repair does not prove a fix that rests on the description of a class: a vote for a config value, a
-/// rename, a tie. `None` when every leading loader takes all of its tensors from the checkpoint and leaves none over. Called
+/// Why the load after a repair does not prove a fix that rests on the description of a class: a vote for a config value, or
+/// a rename. `None` when every leading loader takes all of its tensors from the checkpoint and leaves none over. Called
 /// by the planner for a whole repair, because several such fixes may be needed for one complete load.
 pub(super) fn unproven(after: &Outcome) -> Option<String> {
     let leading: Vec<&PredictedLoad> = after.verdicts.iter().filter(|load| load.leads).collect();
@@ -80,8 +80,7 @@ const fn would(verdict: LoadVerdict) -> &'static str {
 
 /// `transformers 5.23.0`, or another program with its version.
 fn loader(load: &PredictedLoad) -> String {
-    let is_program = !load.loader.starts_with(|c: char| c.is_ascii_digit());
-    if is_program { load.version() } else { format!("transformers {}", load.version()) }
+    if is_program(&load.loader) { load.version() } else { format!("transformers {}", load.version()) }
 }
 
 /// A list of a load report that would be longer than before. Tensors may become unexpected where more of the others become
