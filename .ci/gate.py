@@ -1,6 +1,6 @@
 """Runs the steps of `.ci/steps.toml`; `.ci/run` starts it. See `.ci/run` for the tiers.
 
-    gate.py [--tier push|merge|deep] [--again] [--at-least N] [--list] [WORD...]
+    gate.py [--tier push|merge|deep] [--again] [--keep-going] [--at-least N] [--list] [WORD...]
 
 Two lanes run side by side, one step of each at a time, in the order of the table: `rust` has every step that starts cargo,
 `python` the environments and the steps with real loaders. A step ends as
@@ -9,7 +9,7 @@ Two lanes run side by side, one step of each at a time, in the order of the tabl
 - unchanged: its inputs are byte for byte those of an earlier run that passed, on this machine, with the same tools and seeds;
 - skipped: it cannot run here; the reason is printed and counted. A step says so with exit status 77 and a last line
   `skipped: REASON`;
-- failed: the run ends, and exits with 1; a step of the other lane is stopped.
+- failed: the run ends, and exits with 1; a step of the other lane is stopped. With --keep-going, the others run.
 
 `target/ci/times.tsv` has the seconds of each step, and of a processor, beside its budget. The budgets of the tier `merge` are
 bounded: a new step buys its seconds by making another one cheaper.
@@ -175,12 +175,13 @@ class Stamps:
 class Run:
     """One run of the gate."""
 
-    def __init__(self, steps, tier, seed, again):
-        self.steps, self.tier, self.seed = steps, tier, seed
+    def __init__(self, steps, tier, seed, again, keep_going):
+        self.steps, self.tier, self.seed, self.keep_going = steps, tier, seed, keep_going
         self.stamps = None if again else Stamps(tier, seed)
         self.changed = threading.Condition()
         self.running = {}  # lane -> process
-        self.failed = None
+        self.failed = None  # the first step that did
+        self.ended = False  # whether no further step is started
         self.place = tempfile.mkdtemp(prefix="gate-")
         python = subprocess.run(
             [ROOT / ".ci/run", "--step", "cached", ".ci/requirements-torch.txt"], capture_output=True, text=True
@@ -215,20 +216,20 @@ class Run:
                 continue
             needed = [other for other in self.steps if other.name in step.after]
             with self.changed:
-                self.changed.wait_for(lambda: self.failed or all(other.outcome for other in needed))  # noqa: B023
-                if self.failed:
+                self.changed.wait_for(lambda: self.ended or all(other.outcome for other in needed))  # noqa: B023
+                if self.ended:
                     return
-            missing = [other for other in needed if other.outcome == "skipped"]
+            missing = [other for other in needed if other.outcome in ("skipped", "failed")]
             if missing:
-                outcome, step.reason = "skipped", f"{missing[0].name} was skipped"
+                outcome, step.reason = "skipped", f"{missing[0].name} {missing[0].outcome}"
                 say(f"--- {step.name}: {outcome}: {step.reason}")
             else:
                 outcome = self.execute(step)
             with self.changed:
                 step.outcome = outcome
-                if outcome == "failed" and not self.failed:
-                    self.failed = step
-                    self.stop()
+                if outcome == "failed":
+                    self.failed = self.failed or step
+                    self.stop(end=not self.keep_going)
                 self.changed.notify_all()
 
     def execute(self, step):
@@ -239,7 +240,7 @@ class Run:
             for seed in [self.seed, *step.seeds]:
                 status = self.process(step, seed, out)
                 if status:
-                    outcome = "skipped" if status == SKIPPED else "stopped" if self.failed else "failed"
+                    outcome = "skipped" if status == SKIPPED else "stopped" if self.ended else "failed"
                     break
         text = log.read_text(errors="replace")
         tail = text.rstrip().splitlines()[-1:] or [""]
@@ -263,8 +264,8 @@ class Run:
         )
         with self.changed:
             self.running[step.lane] = process
-            if self.failed:
-                self.stop()
+            if self.ended:
+                self.stop(end=True)
         timer = threading.Timer(60 + LIMIT * step.budget, kill, [process])
         timer.start()
         _, status, usage = os.wait4(process.pid, 0)
@@ -281,9 +282,10 @@ class Run:
             out.write(f"\nfailed with the seed {seed}\n")
         return process.returncode
 
-    def stop(self):
-        """Ends the step of the other lane; called with the condition held."""
-        for process in self.running.values():
+    def stop(self, end):
+        """Ends the run with the step of the other lane; called with the condition held."""
+        self.ended = self.ended or end
+        for process in self.running.values() if end else ():
             kill(process)
 
     def whole(self):
@@ -296,8 +298,7 @@ class Run:
                 lane.join()
         except KeyboardInterrupt:
             with self.changed:
-                self.failed = self.failed or self.steps[0]
-                self.stop()
+                self.stop(end=True)
                 self.changed.notify_all()
             raise
         finally:
@@ -356,9 +357,10 @@ def chosen(steps, tier, words):
 
 
 def main():
-    parser = argparse.ArgumentParser(usage=".ci/run [--tier TIER] [--again] [--at-least N] [--list] [WORD...]")
+    parser = argparse.ArgumentParser(usage=".ci/run [--tier TIER] [--again] [--keep-going] [--at-least N] [--list] [WORD...]")
     parser.add_argument("--tier", choices=TIERS, default="merge")
     parser.add_argument("--again", action="store_true", help="run steps whose inputs are unchanged, too")
+    parser.add_argument("--keep-going", action="store_true", help="run the other steps after one has failed")
     parser.add_argument("--at-least", type=int, default=1, metavar="N", help="fail if fewer steps passed or are unchanged")
     parser.add_argument("--list", action="store_true", help="list the steps")
     parser.add_argument("words", nargs="*", metavar="WORD", help="only steps whose name contains one of the words")
@@ -372,7 +374,7 @@ def main():
     seed = f"{datetime.date.today():%Y%m%d}" if args.tier == "deep" else "1"
     again = args.again or args.tier == "deep" or bool(args.words)
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    run = Run(steps, args.tier, seed, again)
+    run = Run(steps, args.tier, seed, again, args.keep_going)
     print(f"{len(steps)} steps of the tier {args.tier}, seed {seed}", flush=True)
     try:
         run.whole()

@@ -20,10 +20,11 @@ RECIPE = {
     "tensors": [
         {
             "from": "from",
-            "names": ".",
+            "names": start,
             "dtype": "opt.dtype",
             "scale": "opt.scale == '8' ? 8.0 : opt.scale == 'third' ? 1.0 / 3.0 : 1.0",
         }
+        for start in (r"^model\.", r"^lm_head\.")
     ],
 }
 CONFIG = {
