@@ -37,6 +37,8 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ckpt
 CI = ROOT / "target/ci"
 TIERS = ("push", "merge", "deep")
 LANES = ("rust", "python")
+# Seconds of a processor that the budgets of a tier may add up to, with nothing unchanged and nothing cached.
+BOUNDS = {"push": 2400, "merge": 6900}
 SKIPPED = 77
 LIMIT = 8  # a step is killed after this many times its budget in seconds, and a minute
 STAMPS = 12  # stamps of each step that are kept
@@ -74,6 +76,10 @@ def table(text):
         ahead = names[: names.index(step.name)]
         if names.count(step.name) != 1 or step.lane not in LANES or step.tier not in TIERS or set(step.after) - set(ahead):
             sys.exit(f".ci/steps.toml: {step.name}: a name twice, no such lane or tier, or `after` names no step before it")
+    for tier, bound in BOUNDS.items():
+        total = sum(step.budget for step in steps if TIERS.index(step.tier) <= TIERS.index(tier))
+        if total > bound:
+            sys.exit(f".ci/steps.toml: the budgets of the tier {tier} add up to {total} s, and {bound} s is its bound")
     return steps
 
 

@@ -43,7 +43,7 @@ impl Origin<'_> {
             };
             let settings = self.settings(&expression);
             if let Some(huge) = settings.iter().find(|setting| setting.value.as_ref().is_some_and(is_huge)) {
-                return Refusal::impossible(format!("{huge}, more than any tensor can have"));
+                return Refusal::impossible(format!("{huge}, which is no size of a tensor"));
             }
             explained.push(if settings.is_empty() { Doubt::Expression(None) } else { Doubt::Values(settings) });
         }

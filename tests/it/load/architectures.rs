@@ -411,7 +411,7 @@ fn what_a_description_does_not_cover_is_said() {
     }
     // No loader makes a tensor of such a size.
     let huge = built(&json!({ "words": [], "adapter": false, "width": 1_u64 << 60 })).expect_err("too wide");
-    assert_eq!(huge.to_string(), "width is 1152921504606846976, more than any tensor can have");
+    assert_eq!(huge.to_string(), "width is 1152921504606846976, which is no size of a tensor");
     let refused = built(&json!({ "words": [], "adapter": false, "width": 9 })).expect_err("odd width");
     assert_eq!(refused, Refusal::Raises("ValueError: 9 is no multiple of 2".to_owned()));
 }
