@@ -21,6 +21,7 @@ import hashlib
 import json
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -38,6 +39,7 @@ KNOWN = ("4.47.0", "4.57.6", "5.23.0")
 BETWEEN = ("4.57.3",)
 PROGRAMS = ("peft==0.13.2", "vllm", "mlx-lm", "llama.cpp")
 SECONDS = 600  # that one run may take
+BYTES = 4 << 30  # of address space that one run may take
 LARGE = 1 << 22  # of a larger file only the size counts
 UNKNOWN = "not-predicted"
 BUILT = {"cases": ("CKPT_DOCTOR_CASES", "rules::each_case"), "reported": ("CKPT_DOCTOR_REPORTED", "reported::")}
@@ -232,7 +234,9 @@ class Program:
 
     def answer(self, words):
         try:
-            done = subprocess.run([self.path, *words], capture_output=True, text=True, errors="replace", timeout=SECONDS)
+            done = subprocess.run(
+                [self.path, *words], capture_output=True, text=True, errors="replace", timeout=SECONDS, preexec_fn=bound_memory
+            )
         except subprocess.TimeoutExpired:
             return {"exit": f"none after {SECONDS} s", "objects": {}, "errors": []}
         read = expected if words[0] == "expect" else verdicts
@@ -241,6 +245,11 @@ class Program:
         except ValueError:
             words = (done.stderr.strip().splitlines() or ["nothing was printed"])[-1]
             return {"exit": done.returncode, "objects": {}, "errors": [words[:160]]}
+
+
+def bound_memory():
+    """In the child: an allocation beyond the bound aborts it, which is a result of its own."""
+    resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
 
 
 def verdicts(text):

@@ -76,7 +76,7 @@ impl Library {
 
     /// The architecture of the checkpoint with this config.json and these tensors, as `loader` builds it.
     ///
-    /// The class in `architectures` decides, unless `model_type` is that of another class. Where it is absent, or custom
+    /// The class in `architectures`, of the config or of its text config, decides, unless `model_type` is that of another class. Where it is absent, or custom
     /// code may stand behind an unknown name (`auto_map`), `model_type` decides, if its class has a head where the named one
     /// has. Where several entries describe one class, the config (`when` of the file) and the tensors (`chosen_by` of the
     /// class) choose.
@@ -88,20 +88,20 @@ impl Library {
         loader: Loader,
     ) -> Option<Architecture<'_>> {
         let mut names = names.into_iter();
-        let class = config.get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
         let model_type = config.get("model_type").and_then(Value::as_str);
+        let class = self.named_class(config);
         let mut candidates = class.map(|class| self.entries(class, loader)).unwrap_or_default();
         candidates.retain(|(file, _)| file.speaks_for(config));
         candidates.sort_by_key(|(file, _)| !model_type.is_some_and(|t| file.model_types.iter().any(|m| m == t)));
         let (file, class) = match choose(candidates, &mut names) {
             Some((file, class)) if self.is_of_type(config, file) => (file, class),
-            Some((_, named)) => {
+            Some((_, other)) => {
                 let mut files =
                     self.all_of_model_type(model_type?).filter(|file| file.has_auto() && file.speaks_for(config));
-                let base = task(&named.name).is_empty();
+                let base = task(&other.name).is_empty();
                 let same_task = |file| {
                     let of_auto = Blueprint::auto(file, "model", loader).filter(|_| base);
-                    let is_built = |class: &str| of_auto.map_or(task(class) == task(&named.name), |auto| class == auto);
+                    let is_built = |class: &str| of_auto.map_or(task(class) == task(&other.name), |auto| class == auto);
                     Some((file, Blueprint::classes(file, loader).find(|c| is_built(&c.name))?))
                 };
                 files.find_map(same_task)?
@@ -115,6 +115,20 @@ impl Library {
             }
         };
         Some(Architecture::new(self, file, class, loader))
+    }
+
+    /// The class that a config names: the first of `architectures`, or of those in its text config if that class is of the
+    /// config's own type. transformers 4.57 writes them there: `Qwen2VLConfig.__setattr__` passes on the keys that its text
+    /// config has too.
+    #[must_use]
+    pub fn named_class<'c>(&self, config: &'c Value) -> Option<&'c str> {
+        let inside = || {
+            let class = named(config.get("text_config")?)?;
+            let model_type = config.get("model_type")?.as_str()?;
+            let is_of_type = |file: &Blueprint| file.model_types.iter().any(|t| t == model_type);
+            self.candidates(index::with_class(class)).any(is_of_type).then_some(class)
+        };
+        named(config).or_else(inside)
     }
 
     /// Whether the class of this file is the one that Auto classes build for the `model_type` of the config. Otherwise they
@@ -238,6 +252,11 @@ fn task(class: &str) -> &str {
 /// Whether a class has more than the base model, by its name.
 fn has_head(class: &str) -> bool {
     class.contains("For") || class.contains("LMHead")
+}
+
+/// The class that a config names.
+fn named(config: &Value) -> Option<&str> {
+    config.get("architectures")?.get(0)?.as_str()
 }
 
 /// The class that a config of this file means when it names none.

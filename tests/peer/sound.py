@@ -88,6 +88,15 @@ GRANITE = dict(
 LFM = dict(**TEXT, num_key_value_heads=2, block_multiple_of=8)
 
 
+ROPE = {"type": "mrope", "mrope_section": [1, 1, 2]}
+QWEN_IDS = dict(image_token_id=60, video_token_id=61, vision_start_token_id=62, vision_end_token_id=63, rope_scaling=ROPE)
+QWEN2_VISION = dict(depth=1, embed_dim=32, hidden_size=32, num_heads=4, patch_size=4, mlp_ratio=2)
+QWEN25_VISION = dict(
+    depth=2, hidden_size=32, out_hidden_size=32, intermediate_size=48, num_heads=4, patch_size=4, fullatt_block_indexes=[1]
+)
+FLAT = "flat"  # in the name of a shape: its config.json is written without text_config, as before transformers 4.52
+
+
 def convolutions(n):
     """A feature extractor of n convolutions."""
     count = dict(conv_dim=[16] * n, conv_stride=[2] * n, conv_kernel=[3] * n, num_feat_extract_layers=n)
@@ -156,6 +165,11 @@ def rows():
         for count in (1, 2, 3, 8):
             extra = {"squeeze_factor": 1} if name == "SEW" else {}
             yield f"{name}-{count}-convolutions", f"{name}Model", {**convolutions(count), **extra}, False
+    for family, vision in (("Qwen2VL", QWEN2_VISION), ("Qwen2_5_VL", QWEN25_VISION)):
+        config = dict(**TEXT, **QWEN_IDS, num_key_value_heads=2, vision_config=vision, use_sliding_window=True)
+        config |= dict(max_position_embeddings=128, sliding_window=16, max_window_layers=1, tie_word_embeddings=True)
+        for form in ("saved", FLAT):
+            yield f"{family}-{form}", f"{family}ForConditionalGeneration", config, True
 
 
 # Under one version.
@@ -179,11 +193,20 @@ def build(out, only):
         told = {"name": name, "class": cls, "predicted": predicted, "folder": str(out / name.replace("/", "-"))}
         try:
             model_class(model_class.config_class(**config)).save_pretrained(told["folder"])
+            if FLAT in name:
+                flatten(Path(told["folder"], "config.json"), cls)
         except Exception as error:  # a shape that this version does not have
             told["absent"] = f"{type(error).__name__}: {error}"[:200]
             print(json.dumps(told), flush=True)
             continue
         print(json.dumps({**told, "load": load(model_class, told["folder"])}), flush=True)
+
+
+def flatten(file, cls):
+    """Writes a config.json with the keys of its text config at the top alone."""
+    config = json.loads(file.read_text())
+    inner = {key: value for key, value in config.pop("text_config", {}).items() if key != "model_type"}
+    file.write_text(json.dumps({**inner, **config, "architectures": [cls]}))
 
 
 def load(model_class, folder):

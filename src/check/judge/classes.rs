@@ -43,7 +43,7 @@ pub(super) fn build_classes<'a>(inputs: &Inputs<'a>, targets: Vec<TargetClass<'a
     // The layout in which another version packs quantised weights is unknown. One that reads no scheme builds plain modules.
     let reads_none = |one: &TargetClass<'_>| matches!(inputs.scheme_of(one.target.loader), DeclaredScheme::Plain);
     let comparable = targets.into_iter().filter(|one| one.target.leads || reads_none(one));
-    let is_unnamed = inputs.config.pointer("/architectures/0").is_none() && inputs.is_plain();
+    let is_unnamed = inputs.knowledge.library.named_class(inputs.config).is_none() && inputs.is_plain();
     let fitting = comparable.map(|one| if is_unnamed { with_fitting_class(inputs, one) } else { one });
     let built = fitting.map(|TargetClass { target, architecture }| BuiltClass {
         class: with_flat_config(inputs, &architecture).and_then(|mut class| {

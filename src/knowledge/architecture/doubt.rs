@@ -64,7 +64,9 @@ impl Doubt {
 
 /// The keys of a config, and of those in it, that the source reads and the description knows nothing of.
 ///
-/// Called with the config as it is written. A key whose value is the one that all samples had is covered.
+/// Called with the config as it is written. A key whose value is the one that all samples had is covered. A class that fills
+/// its text config from its own keys reads them there (`Qwen2VLConfig.__getattribute__` of transformers 4.57), so the text
+/// config's class says whether they are known.
 pub(super) fn unread_keys(
     library: &Library,
     file: &Blueprint,
@@ -76,10 +78,20 @@ pub(super) fn unread_keys(
         |class: &ConfigClass, key: &str, value: &Value| class.unvaried.get(key).is_some_and(|assumed| value != assumed);
     walk(library, file, loader, config, &mut Vec::new(), &mut |file, config, path| {
         let class = file.config(loader);
-        let keys = config.iter().filter(|(key, value)| unread(class, key, value)).map(|(key, _)| key);
+        let flat: Vec<&Blueprint> = flat_classes(library, class, loader);
+        let inner = |key: &str, value: &Value| flat.iter().all(|file| unread(file.config(loader), key, value));
+        let keys =
+            config.iter().filter(|(key, value)| unread(class, key, value) && inner(key, value)).map(|(key, _)| key);
         found.extend(keys.map(|key| Doubt::UnreadKey(pointer(path, key))));
     });
     found
+}
+
+/// The classes of the sub-configs that take the keys of the outer config where it has no such sub-config.
+fn flat_classes<'l>(library: &'l Library, class: &ConfigClass, loader: Loader) -> Vec<&'l Blueprint> {
+    let specs = class.configs.iter().map(|(_, spec)| spec).filter(|spec| spec.flat);
+    let types = specs.filter_map(|spec| spec.model_type.as_deref());
+    types.filter_map(|t| library.of_model_type(t, loader)).collect()
 }
 
 /// The keys of a config, and of those in it, that are null where the class has a value of its own, except those that
