@@ -52,6 +52,10 @@ pub struct Part {
     /// belong to that one, too.
     #[serde(default)]
     pub within: Option<String>,
+    /// Starts of the names, inside the part, of tensors to which the output of the part is proportional: its last layer. A
+    /// recipe that scales the part scales these alone. They are unknown when missing.
+    #[serde(default)]
+    pub outputs: Vec<String>,
     /// Model types that the class builds in this place; any that Auto classes know when missing.
     #[serde(default)]
     pub takes: Option<Vec<String>>,
@@ -157,10 +161,16 @@ impl ModelParts {
         std::iter::once(part).chain(self.parts.iter().filter_map(built))
     }
 
-    /// The layout that names most of these tensors; the first one when none names any.
+    /// The layout that names most of these tensors, and among equals the one with the longest starts: `model.` also starts
+    /// the names below `model.visual.`. The first one when none names any.
     #[must_use]
     pub fn layout_of(&self, names: &[&str]) -> Option<Layout> {
-        let score = |layout: &Layout| names.iter().filter(|name| layout.locate(name).is_some()).count();
+        let score = |layout: &Layout| {
+            let starts = names.iter().filter_map(|name| layout.start(name));
+            starts.fold((0_usize, 0_usize), |(count, len), (_, _, start)| {
+                (count.saturating_add(1), len.saturating_add(start.len()))
+            })
+        };
         // The first of the best: `max_by_key` returns the last.
         self.all_layouts().max_by_key(score)
     }
@@ -186,21 +196,21 @@ impl Layout {
         Self { starts }
     }
 
+    /// The longest start of the name of a tensor of a checkpoint.
+    fn start(&self, stored: &str) -> Option<&(String, String, String)> {
+        self.starts.iter().find(|(_, _, start)| stored.starts_with(start.as_str()))
+    }
+
     /// The part that a tensor of a checkpoint belongs to, and its name inside the part.
     #[must_use]
     pub fn locate(&self, stored: &str) -> Option<(&str, String)> {
-        self.starts.iter().find_map(|(part, inside, start)| {
-            let rest = stored.strip_prefix(start.as_str())?;
-            Some((part.as_str(), format!("{inside}{rest}")))
-        })
+        let (part, inside, start) = self.start(stored)?;
+        Some((part.as_str(), format!("{inside}{}", stored.strip_prefix(start.as_str())?)))
     }
 
     /// Whether a tensor belongs to a part and to no other: [`Self::locate`] without the name.
     fn is_of(&self, stored: &str, parts: &[&str]) -> bool {
-        self.starts
-            .iter()
-            .find(|(_, _, start)| stored.starts_with(start.as_str()))
-            .is_some_and(|(part, ..)| parts.contains(&part.as_str()))
+        self.start(stored).is_some_and(|(part, ..)| parts.contains(&part.as_str()))
     }
 
     /// The name inside a part of a tensor of a checkpoint, also of one that belongs to one of the parts `built` by its class.

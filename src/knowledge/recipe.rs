@@ -333,7 +333,8 @@ pub struct TensorSpec {
     /// `reinit`.
     #[serde(default)]
     pub fit: Option<Expression>,
-    /// Factor on all values, except those of `reinit`: a number. None when missing, null or 1.
+    /// Factor on all values, except those of `reinit`: a number. None when missing, null or 1. With `part` and without
+    /// `names`, it is a factor on what the part puts out, and so on the tensors of its last layer alone.
     #[serde(default)]
     pub scale: Option<Expression>,
     /// Type to which float16, bfloat16, float32 and float64 tensors are cast: one of these names. As stored when missing or

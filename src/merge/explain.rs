@@ -7,19 +7,27 @@ use crate::knowledge::expression::FunctionCall;
 use crate::knowledge::source::hint;
 use crate::knowledge::{EvalError, Expression};
 
-/// The cause of an error as one sentence, then the expression with the error of the expression language, which is written
-/// for authors of expressions.
+/// The cause of an error as one sentence, then the expression.
 pub(super) fn cause(context: &Context<'_>, error: &EvalError) -> String {
     let references = Expression::parse(&error.source_text).map(|e| e.references()).unwrap_or_default();
     let missing_value = || references.paths.iter().find_map(|path| missing_value(context, path));
     let missing_tensor = || references.calls.iter().find_map(|call| missing_tensor(context, call));
-    let words = missing_value().or_else(missing_tensor).or_else(|| in_words(&error.cause));
-    let Some(words) = words else { return error.to_string() };
-    if error.cause.starts_with(OF_A_FUNCTION) {
-        format!("{words} (`{}`)", error.source_text)
-    } else {
-        format!("{words} ({error})")
+    let missing_name = || references.paths.iter().find_map(|path| missing_name(context, path));
+    let words = missing_value().or_else(missing_tensor).or_else(missing_name);
+    format!("{} (`{}`)", words.unwrap_or_else(|| in_words(&error.cause)), error.source_text)
+}
+
+/// The first key that a value of the recipe's own lacks, such as one that `let` defines.
+fn missing_name(context: &Context<'_>, path: &[String]) -> Option<String> {
+    let (root, keys) = path.split_first()?;
+    let (mut here, mut place) = (context.scope.get(root)?, root.clone());
+    for key in keys {
+        let Value::Object(map) = &mut here else { break };
+        let Some(value) = map.remove(key) else { return Some(format!("{place} has no {key}")) };
+        here = value;
+        place = format!("{place}.{key}");
     }
+    here.is_null().then(|| format!("{place} is null"))
 }
 
 /// The first key of a path that a donor's config lacks.
@@ -67,11 +75,16 @@ fn missing_tensor(context: &Context<'_>, call: &FunctionCall) -> Option<String> 
     Some(format!("the {role} donor has no tensor {name}{reason}"))
 }
 
+/// The sentence about a donor without tensors.
+pub(super) fn empty(donor: &Donor) -> Option<String> {
+    without_tensors(donor).map(|reason| format!("the {} donor has no tensors: {reason}", donor.role))
+}
+
 /// File name extensions of weights from which no merge copies.
 const PICKLES: [&str; 5] = [".bin", ".pt", ".pth", ".ckpt", ".pkl"];
 
 /// The reason why no tensor of the donor was read; `None` when it has tensors.
-pub(super) fn without_tensors(donor: &Donor) -> Option<String> {
+fn without_tensors(donor: &Donor) -> Option<String> {
     if donor.checkpoint.tensors().next().is_some() {
         return None;
     }
@@ -87,8 +100,7 @@ pub(super) fn without_tensors(donor: &Donor) -> Option<String> {
 }
 
 /// The starts of errors of the crate `cel` 0.15, and their meaning.
-const WORDS: [(&str, &str); 9] = [
-    ("No such key", "a value has no such key"),
+const WORDS: [(&str, &str); 8] = [
     ("found no matching overload", "a value is missing, or of another type than the expression needs"),
     ("Unexpected type", "a value is missing, or of another type than the expression needs"),
     ("Unable to use value", "a value cannot be used as a key"),
@@ -102,14 +114,20 @@ const WORDS: [(&str, &str); 9] = [
 /// The start of an error that a function of this program states: `Error executing function 'pow': …`.
 const OF_A_FUNCTION: &str = "Error executing function '";
 
-/// An error of the crate `cel` as a sentence; `None` for the errors of this program, which are sentences.
-fn in_words(cause: &str) -> Option<String> {
+/// The start of the error about a key, which follows.
+const NO_KEY: &str = "No such key: ";
+
+/// An error of the crate `cel` as a sentence; those of this program are sentences.
+fn in_words(cause: &str) -> String {
     if let Some((function, reason)) = cause.strip_prefix(OF_A_FUNCTION).and_then(|rest| rest.split_once("': ")) {
-        return Some(format!("{function}(…) fails: {reason}"));
+        return format!("{function}(…) fails: {reason}");
+    }
+    if let Some(key) = cause.strip_prefix(NO_KEY) {
+        return format!("a value has no key {key}");
     }
     if cause.contains(" expected, got ") {
-        return None;
+        return cause.to_owned();
     }
     let known = WORDS.iter().find(|(start, _)| cause.starts_with(start)).map(|(_, words)| *words);
-    Some(known.unwrap_or("the expression cannot be evaluated with these donors").to_owned())
+    known.unwrap_or("the expression cannot be evaluated with these donors").to_owned()
 }

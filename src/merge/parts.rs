@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::context::{Context, Donor};
 use super::error::MergeError;
-use super::switches;
+use super::{explain, switches};
 use crate::check::Outcome;
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::parts::{Layout, ModelParts, Own, Part};
@@ -158,6 +158,12 @@ impl<'a> PartOf<'a> {
         self.parts.layout.inside(self.name, &built, stored)
     }
 
+    /// Whether the output of the part is proportional to a tensor of the donor.
+    pub(super) fn is_output(self, stored: &str) -> bool {
+        let starts = |inside: &str| self.part.outputs.iter().any(|start| inside.starts_with(start.as_str()));
+        self.inside(stored).is_some_and(|inside| starts(&inside))
+    }
+
     /// The starts of the names of its tensors in the donor, and those of other parts among them.
     pub(super) fn area(self) -> (Vec<String>, Vec<String>) {
         let built: Vec<&str> = self.parts.model.inside(self.name).collect();
@@ -272,7 +278,7 @@ pub(super) fn seams(context: &Context<'_>) -> Result<Vec<Seam>, MergeError> {
         }
         let name = name.try_render(&context.scope).map_err(context.at("part"))?;
         let (place, new) = (PartOf::get(context, into, &name)?, PartOf::get(context, &spec.from, &name)?);
-        if let Some(message) = place.refuses(new) {
+        if let Some(message) = place.refuses(new).or_else(|| explain::empty(new.donor)) {
             seams.push(Seam { message, ..Seam::default() });
             continue;
         }

@@ -14,6 +14,9 @@ use crate::report::model::Seam;
 
 /// Turns a recipe into a draft for these versions of transformers, or any: seams, documents, tensors, files, notes.
 ///
+/// An expression that cannot be evaluated with these donors is a seam. So is any error after another seam, which may be its
+/// cause.
+///
 /// # Errors
 /// A [`MergeError`] when the recipe cannot be applied to these donors and options.
 pub(super) fn plan(
@@ -23,8 +26,26 @@ pub(super) fn plan(
     versions: &[String],
     knowledge: &Knowledge,
 ) -> Result<MergeDraft, MergeError> {
-    let context = Context::new(recipe, donors, options, versions, knowledge)?;
     let mut draft = MergeDraft::default();
+    match fill(&mut draft, recipe, donors, options, versions, knowledge) {
+        Err(error) if matches!(error, MergeError::Expression { .. }) || !draft.seams.is_empty() => {
+            draft.seams.push(Seam { message: error.to_string(), ..Seam::default() });
+            Ok(draft)
+        }
+        filled => filled.map(|()| draft),
+    }
+}
+
+/// Adds to the draft what the recipe makes of the donors; stops at parts that cannot stand in their place.
+fn fill(
+    draft: &mut MergeDraft,
+    recipe: &Recipe,
+    donors: &[Donor],
+    options: &Options,
+    versions: &[String],
+    knowledge: &Knowledge,
+) -> Result<(), MergeError> {
+    let context = Context::new(recipe, donors, options, versions, knowledge)?;
     draft.notes.extend(alike::check(&context)?);
     for (i, seam) in recipe.seams.iter().enumerate() {
         let place = format!("seam {}", i.saturating_add(1));
@@ -43,19 +64,19 @@ pub(super) fn plan(
     let refused = parts::seams(&context)?;
     if !refused.is_empty() {
         draft.seams.extend(refused);
-        return Ok(draft);
+        return Ok(());
     }
-    let documents = documents::plan(&context, &mut draft)?;
+    let documents = documents::plan(&context, draft)?;
     let limit =
         options.get("shard-size").map_or(Ok(options::DEFAULT_SHARD), |s| options::parse_size("shard-size", s))?;
-    tensors::plan(&context, &documents, knowledge, limit, &mut draft)?;
-    files::plan(&context, documents, &mut draft)?;
+    tensors::plan(&context, &documents, knowledge, limit, draft)?;
+    files::plan(&context, documents, draft)?;
     for note in &recipe.notes {
         if context.holds(Some(&note.when), "a note")? {
             draft.notes.push(note.say.render(&context.scope));
         }
     }
-    Ok(draft)
+    Ok(())
 }
 
 fn shape_of(value: &Value) -> Option<Vec<u64>> {

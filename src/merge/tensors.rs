@@ -43,6 +43,27 @@ impl TensorRule<'_> {
         self.part.filter(|_| self.spec.names.is_empty()).map_or(self.spec.names.as_str(), |part| part.name)
     }
 
+    /// The factor on a donor tensor. The output of a part that is meant as a whole is scaled once, by its last layer.
+    fn scale_of(&self, tensor: &Tensor) -> Option<f64> {
+        let whole = self.part.filter(|_| self.spec.names.is_empty());
+        self.scale.filter(|_| whole.is_none_or(|part| part.is_output(&tensor.name)))
+    }
+
+    /// Fails for a factor on a part of which no output is known.
+    fn scales_something(&self, recipe: &str) -> Result<(), MergeError> {
+        let Some(part) = self.part.filter(|_| self.scale.is_some() && self.spec.names.is_empty()) else {
+            return Ok(());
+        };
+        if part.donor().checkpoint.tensors().any(|(_, tensor)| part.is_output(&tensor.name)) {
+            return Ok(());
+        }
+        Err(MergeError::Donor(format!(
+            "recipe {recipe}: the part {} of the {} donor cannot be scaled: rules/parts names no tensor of its last layer; name the tensors by `names`",
+            part.name,
+            part.donor().role
+        )))
+    }
+
     /// The tensors that the entry may change; `None` when it changes none, or names none.
     fn changeable(&self) -> Option<NamedTensors> {
         let changes = self.fit != Fit::Copy || self.scale.is_some() || self.slice.is_some();
@@ -219,15 +240,12 @@ fn nothing_taken(context: &Context<'_>, rules: &[TensorRule<'_>]) -> MergeError 
     let donor = |donor: &&Donor| kept().any(|rule| rule.spec.from == donor.role);
     let reason = |donor: &Donor| {
         let role = &donor.role;
-        explain::without_tensors(donor).map_or_else(
-            || {
-                let patterns: Vec<&str> =
-                    kept().filter(|rule| rule.spec.from == *role).map(|rule| rule.spec.names.as_str()).collect();
-                let count = count(donor.checkpoint.tensors().count(), "tensor", "tensors");
-                format!("none of the {role} donor's {count} is taken by {}", patterns.join(", "))
-            },
-            |reason| format!("the {role} donor has no tensors: {reason}"),
-        )
+        explain::empty(donor).unwrap_or_else(|| {
+            let patterns: Vec<&str> =
+                kept().filter(|rule| rule.spec.from == *role).map(|rule| rule.spec.names.as_str()).collect();
+            let count = count(donor.checkpoint.tensors().count(), "tensor", "tensors");
+            format!("none of the {role} donor's {count} is taken by {}", patterns.join(", "))
+        })
     };
     let reasons: Vec<String> = context.donors.iter().filter(donor).map(reason).collect();
     let reasons = if reasons.is_empty() { "no entry of `tensors` applies".to_owned() } else { reasons.join("; ") };
@@ -351,7 +369,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         };
         let (slice, fit) = (value("slice", &spec.slice)?, value("fit", &spec.fit)?);
         let (scale, dtype) = (value("scale", &spec.scale)?, value("dtype", &spec.dtype)?);
-        out.push(TensorRule {
+        let rule = TensorRule {
             spec,
             names,
             rename,
@@ -361,7 +379,9 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             fit: parse_fit(&fit).map_err(|expected| wrong("fit", &fit, expected))?,
             scale: parse_scale(&scale).map_err(|expected| wrong("scale", &scale, expected))?,
             dtype: parse_dtype(&dtype).map_err(|expected| wrong("dtype", &dtype, expected))?,
-        });
+        };
+        rule.scales_something(&context.recipe.recipe)?;
+        out.push(rule);
     }
     Ok(out)
 }
@@ -436,7 +456,8 @@ fn source(
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
     let from = TensorRef::new(&donor.role, &donor.checkpoint.root, shard, tensor, rule.slice)?;
     let starts = values.is_some();
-    let changes = rule.scale.is_some() || taken.dtype() != tensor.dtype;
+    let scale = rule.scale_of(tensor);
+    let changes = scale.is_some() || taken.dtype() != tensor.dtype;
     let fits = from.shape == shape && !starts;
     if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
@@ -453,7 +474,7 @@ fn source(
     };
     let values = values.transpose()?;
     // New values have the size that the class gives them.
-    Ok(TensorSource { from, fit, scale: rule.scale.filter(|_| !starts), values })
+    Ok(TensorSource { from, fit, scale: scale.filter(|_| !starts), values })
 }
 
 /// Why `reinit` does not help.

@@ -6,6 +6,7 @@ mod parts;
 mod recipes;
 mod record;
 mod refused;
+mod scale;
 mod users;
 mod values;
 mod verify;

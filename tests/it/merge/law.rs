@@ -3,7 +3,7 @@
 //!
 //! The recipes follow from a seed. `cargo test` runs some hundreds; `CKPT_DOCTOR_LAWS=100000` sets the number.
 
-mod bytes;
+pub mod bytes;
 mod donors;
 mod mutants;
 mod recipes;

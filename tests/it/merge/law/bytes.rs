@@ -245,7 +245,7 @@ impl Request {
 }
 
 /// The values of bytes; `None` for a type that is never cast.
-fn values(dtype: &str, bytes: &[u8]) -> Option<Vec<f32>> {
+pub fn values(dtype: &str, bytes: &[u8]) -> Option<Vec<f32>> {
     let pair = |c: &[u8]| u16::from_le_bytes([c[0], c[1]]);
     Some(match dtype {
         "BF16" => bytes.chunks(2).map(|c| bf16::from_bits(pair(c)).to_f32()).collect(),
@@ -390,7 +390,7 @@ fn reinit_reaches_the_projector_alone_and_norms_start_at_one() {
     };
     // S1: every tensor of the vision tower has the bytes of the host.
     let projector = Regex::new(PROJECTOR).unwrap();
-    for host in ["llava", "vipllava", "idefics3", "internvl", "qwen2-vl"] {
+    for host in HOSTS {
         let guest = if host.starts_with("qwen") { "qwen2-wide" } else { "llama-wide" };
         let (before, after) = (read(&all.path().join(host)), read(&merge(host, "swap-language-model", host, guest)));
         let is_language = |name: &str| {

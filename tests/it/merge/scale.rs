@@ -1,0 +1,122 @@
+//! A projector that is scaled: what it puts out is multiplied once, by its last layer.
+
+use std::fs;
+use std::path::Path;
+
+use ckpt_doctor::knowledge::{Knowledge, Loader};
+use ckpt_doctor::{Merge, MergeStage};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use super::law::bytes::{Tensors, read, values, write};
+use crate::support::base::tensors;
+use crate::support::knowledge;
+
+/// Hosts with the tensors of the last layer of their projectors.
+const LAST_LAYERS: [(&str, &[&str]); 8] = [
+    ("llava", &["multi_modal_projector.linear_2.bias", "multi_modal_projector.linear_2.weight"]),
+    ("vipllava", &["multi_modal_projector.linear_2.bias", "multi_modal_projector.linear_2.weight"]),
+    // Stands among the features, after the projector.
+    (
+        "llava-onevision",
+        &["image_newline", "multi_modal_projector.linear_2.bias", "multi_modal_projector.linear_2.weight"],
+    ),
+    ("paligemma", &["multi_modal_projector.linear.bias", "multi_modal_projector.linear.weight"]),
+    ("idefics3", &["model.connector.modality_projection.proj.weight"]),
+    ("internvl", &["model.multi_modal_projector.linear_2.bias", "model.multi_modal_projector.linear_2.weight"]),
+    ("qwen2-vl", &["visual.merger.mlp.2.bias", "visual.merger.mlp.2.weight"]),
+    ("qwen2.5-vl", &["model.visual.merger.mlp.2.bias", "model.visual.merger.mlp.2.weight"]),
+];
+
+/// The result of a merge that is written.
+fn written(merge: Merge, out: &Path) -> Tensors {
+    let report = merge.run().unwrap_or_else(|e| panic!("{e}")).merge.unwrap();
+    assert_eq!(report.stage, Some(MergeStage::Written), "{:?}", report.seams);
+    read(out)
+}
+
+/// The tensors that are `factor` times those of the host; the others have its bytes.
+fn scaled<'h>(host: &'h Tensors, result: &Tensors, factor: f32) -> Vec<&'h str> {
+    let is_scaled = |name: &&String| {
+        let ((dtype, _, before), (_, _, after)) = (&host[*name], &result[*name]);
+        let pairs = || values(dtype, before).unwrap().into_iter().zip(values(dtype, after).unwrap());
+        // A product is rounded to the eight bits of bfloat16.
+        let is_product = pairs().all(|(before, after)| (before * factor - after).abs() <= after.abs() / 256.0);
+        assert!(is_product || before == after, "{name}");
+        is_product
+    };
+    host.keys().filter(is_scaled).map(String::as_str).collect()
+}
+
+#[test]
+fn a_factor_on_a_projector_is_one_on_its_last_layer() {
+    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    write(all.path());
+    let recipe = json!({
+        "recipe": "own", "summary": "s",
+        "donors": [{ "role": "from", "what": "w", "architectures": ["*"] }],
+        "documents": [{ "name": "config.json", "from": "from" }],
+        "tensors": [{ "from": "from", "part": "projector", "scale": "2.0" }, { "from": "from" }],
+        "files": [{ "copy": { "from": "from", "names": ["*"] } }],
+    });
+    let file = work.path().join("recipe.json5");
+    fs::write(&file, recipe.to_string()).unwrap();
+    for (host, expected) in LAST_LAYERS {
+        let out = work.path().join(host);
+        let merge = Merge::new(&out).recipe(file.to_str().unwrap()).donor("from", all.path().join(host));
+        let (before, after) = (read(&all.path().join(host)), written(merge, &out));
+        assert_eq!(scaled(&before, &after, 2.0), expected, "{host}");
+    }
+}
+
+/// A Gemma multiplies image features by the root of its width, which LLaVA's own language model does not.
+#[test]
+fn scale_fold_multiplies_what_the_projector_puts_out_once() {
+    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    write(all.path());
+    let file = |dir: &Path| -> Value { serde_json::from_slice(&fs::read(dir.join("config.json")).unwrap()).unwrap() };
+    let gemma = all.path().join("llama");
+    for host in ["llava", "llava-onevision", "internvl"] {
+        let hidden = file(&all.path().join(host))["text_config"]["hidden_size"].clone();
+        let mut config = file(&gemma);
+        let changes = json!({ "model_type": "gemma", "architectures": ["GemmaForCausalLM"], "head_dim": 8,
+            "hidden_act": "gelu", "hidden_size": hidden });
+        config.as_object_mut().unwrap().extend(changes.as_object().unwrap().clone());
+        fs::write(gemma.join("config.json"), config.to_string()).unwrap();
+        tensors(&gemma, 1, &knowledge());
+        let out = work.path().join(host);
+        let merge = Merge::new(&out).recipe("swap-language-model").option("scale", "fold").loader("4.57.6").unwrap();
+        let merge = merge.donor("vision", all.path().join(host)).donor("language", &gemma);
+        let (before, after) = (read(&all.path().join(host)), written(merge, &out));
+        let is_projector = |name: &str| name.contains("multi_modal_projector.") || name == "image_newline";
+        let projector: Tensors = before.into_iter().filter(|(name, _)| is_projector(name)).collect();
+        let (_, expected) = LAST_LAYERS.iter().find(|(name, _)| *name == host).unwrap();
+        #[expect(clippy::cast_possible_truncation, reason = "the test compares eight bits")]
+        let factor = (1.0 / hidden.as_f64().unwrap().sqrt()) as f32;
+        assert_eq!(scaled(&projector, &after, factor), *expected, "{host}");
+    }
+}
+
+/// The starts that `rules/parts/` gives the last layer are those of tensors that the classes build.
+#[test]
+fn the_last_layer_of_each_projector_is_one_of_its_class() {
+    let knowledge = Knowledge::embedded().unwrap();
+    for model in knowledge.parts.iter() {
+        let outputs = model.parts.get("projector").map_or(&[][..], |part| &part.outputs);
+        let is_last = |name: &String| {
+            let of_layout = |(part, inside): (&str, String)| {
+                part == "projector" && outputs.iter().any(|start| inside.starts_with(start.as_str()))
+            };
+            model.all_layouts().any(|layout| layout.locate(name).is_some_and(of_layout))
+        };
+        // A class that cannot be built from its type alone is not compared.
+        let class = |(architecture, loader): (&String, Loader)| {
+            let config = json!({ "model_type": architecture });
+            knowledge.library.find(&config, [], loader)?.expect(&config).ok()
+        };
+        let pairs = model.architectures.iter().flat_map(|name| Loader::ALL.map(|loader| (name, loader)));
+        let mut classes = pairs.filter_map(class).peekable();
+        let is_compared = !outputs.is_empty() && classes.peek().is_some();
+        assert!(!is_compared || classes.any(|class| class.tensors.keys().any(is_last)), "{}", model.model);
+    }
+}
