@@ -29,7 +29,7 @@ const LAST_LAYERS: [(&str, &[&str]); 8] = [
 ];
 
 /// The result of a merge that is written.
-fn written(merge: Merge, out: &Path) -> Tensors {
+fn written(merge: &Merge, out: &Path) -> Tensors {
     let report = merge.run().unwrap_or_else(|e| panic!("{e}")).merge.unwrap();
     assert_eq!(report.stage, Some(MergeStage::Written), "{:?}", report.seams);
     read(out)
@@ -64,7 +64,7 @@ fn a_factor_on_a_projector_is_one_on_its_last_layer() {
     for (host, expected) in LAST_LAYERS {
         let out = work.path().join(host);
         let merge = Merge::new(&out).recipe(file.to_str().unwrap()).donor("from", all.path().join(host));
-        let (before, after) = (read(&all.path().join(host)), written(merge, &out));
+        let (before, after) = (read(&all.path().join(host)), written(&merge, &out));
         assert_eq!(scaled(&before, &after, 2.0), expected, "{host}");
     }
 }
@@ -87,7 +87,7 @@ fn scale_fold_multiplies_what_the_projector_puts_out_once() {
         let out = work.path().join(host);
         let merge = Merge::new(&out).recipe("swap-language-model").option("scale", "fold").loader("4.57.6").unwrap();
         let merge = merge.donor("vision", all.path().join(host)).donor("language", &gemma);
-        let (before, after) = (read(&all.path().join(host)), written(merge, &out));
+        let (before, after) = (read(&all.path().join(host)), written(&merge, &out));
         let is_projector = |name: &str| name.contains("multi_modal_projector.") || name == "image_newline";
         let projector: Tensors = before.into_iter().filter(|(name, _)| is_projector(name)).collect();
         let (_, expected) = LAST_LAYERS.iter().find(|(name, _)| *name == host).unwrap();
