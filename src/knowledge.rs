@@ -16,6 +16,7 @@ mod ordered;
 pub mod parts;
 pub mod peft;
 pub mod pickles;
+pub mod prediction;
 pub mod processor;
 pub mod program;
 pub mod quantization;
@@ -56,7 +57,7 @@ use program::{AskedProgram, Program, Programs};
 use quantization::Scheme;
 use recipe::Recipe;
 use refusals::Refusals;
-use ropes::RopeKeys;
+use ropes::{RopeForms, RopeKeys};
 use rule::RuleSet;
 use scales::Scales;
 use settings::Policy;
@@ -110,6 +111,8 @@ pub struct Knowledge {
     pub refusals: Refusals,
     /// Keys of rotary embeddings that classes read.
     pub ropes: Table<RopeKeys>,
+    /// Forms of `rope_scaling` that classes accept.
+    pub rope_forms: Table<RopeForms>,
     /// What torch accepts in pickles, and imports that harm.
     pub pickles: Table<Pickles>,
     /// Names of token embeddings.
@@ -166,6 +169,7 @@ impl Knowledge {
         LazyLock::force(&self.peft);
         LazyLock::force(&self.programs);
         LazyLock::force(&self.ropes);
+        LazyLock::force(&self.rope_forms);
         LazyLock::force(&self.pickles);
         LazyLock::force(&self.token_embedding);
         LazyLock::force(&self.directories);
@@ -203,6 +207,7 @@ impl Knowledge {
             programs: table!(Programs::embedded),
             refusals: Refusals::embedded(),
             ropes: table!(RopeKeys::embedded),
+            rope_forms: table!(RopeForms::embedded),
             pickles: table!(Pickles::embedded),
             token_embedding: table!(TokenEmbedding::embedded),
             directories: table!(Directories::embedded),

@@ -38,7 +38,7 @@ from peer import write_holes  # noqa: E402
 KNOWN = ("4.47.0", "4.57.6", "5.23.0")
 BETWEEN = ("4.57.3",)
 PROGRAMS = ("peft==0.13.2", "vllm", "mlx-lm", "llama.cpp")
-SECONDS = 600  # that one run may take
+SECONDS = 60  # that one run may take
 BYTES = 4 << 30  # of address space that one run may take
 LARGE = 1 << 22  # of a larger file only the size counts
 UNKNOWN = "not-predicted"

@@ -15,7 +15,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 
 use super::card::{base_on_hub, is_path};
-use crate::checkpoint::adapter::{Adapter, CONFIG, PREFIX, WEIGHTS};
+use crate::checkpoint::adapter::{Adapter, AdapterBase, CONFIG, PREFIX, WEIGHTS};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
 use crate::knowledge::Table;
 use crate::knowledge::peft::PeftKeys;
@@ -128,7 +128,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
     let alike = vectors == 0 || vectors == modules.len();
     let trained = if targets.is_uniform() { trained_rank(&modules) } else { None };
     for (name, module) in &modules {
-        pairs(name, module, &targets, trained, faults);
+        pairs(name, module, &targets, checkpoint.base.as_ref(), trained, faults);
         let magnitude = module.get(&MatrixRole::Magnitude);
         if magnitude.is_some() != targets.dora {
             let at = module.values().next().map(|t| Place::tensor(&*t.name)).unwrap_or_default();
@@ -212,8 +212,31 @@ fn trained_rank(modules: &BTreeMap<&str, AdapterModule<'_>>) -> Option<u64> {
     ranks.first().copied().filter(|rank| *rank > 0)
 }
 
+/// Whether matrices of a parameter have this rank in all: that of one expert, times the number of experts. A parameter of
+/// three dimensions has one matrix for each expert; the number is that of the base model, where it is known. Which of the other
+/// two dimensions is the input depends on the class and the version of PEFT, and is not compared. Source: peft 0.21.2,
+/// `ParamWrapper.update_layer`.
+fn fits_experts(rank: u64, each: Option<u64>, parameter: &str, base: Option<&AdapterBase>) -> bool {
+    let Some(each) = each.filter(|each| *each > 0) else { return true };
+    let experts = base.and_then(|base| base.shape(parameter)).map(|shape| match shape {
+        [experts, _, _] => *experts,
+        _ => 1,
+    });
+    match experts {
+        Some(experts) => each.checked_mul(experts) == Some(rank),
+        None => rank.checked_rem(each) == Some(0),
+    }
+}
+
 /// `lora_A [r, in]` and `lora_B [out, r]` of one module, of one rank, and that of the config.
-fn pairs(name: &str, module: &AdapterModule<'_>, targets: &Targets<'_>, trained: Option<u64>, faults: &mut Vec<Fault>) {
+fn pairs(
+    name: &str,
+    module: &AdapterModule<'_>,
+    targets: &Targets<'_>,
+    base: Option<&AdapterBase>,
+    trained: Option<u64>,
+    faults: &mut Vec<Fault>,
+) {
     for (down, up) in PAIRS {
         let (a, b) = match (module.get(&down), module.get(&up)) {
             (None, None) => continue,
@@ -231,11 +254,16 @@ fn pairs(name: &str, module: &AdapterModule<'_>, targets: &Targets<'_>, trained:
             faults.push(fault.with("a", a.shape.clone()).with("b", b.shape.clone()).with("rank", Value::Null));
             continue;
         };
-        let expected = targets.rank(name);
-        if rank != other || expected.is_some_and(|expected| expected != rank) {
+        let parameters: Vec<(String, Option<u64>)> = targets.parameters(name).collect();
+        let (expected, fits) = match parameters.first() {
+            None => (targets.rank(name), targets.rank(name).is_none_or(|expected| expected == rank)),
+            Some((_, expected)) => (*expected, parameters.iter().any(|(of, each)| fits_experts(rank, *each, of, base))),
+        };
+        if rank != other || !fits {
             let fault = Fault::new(FaultKind::AdapterRankDisagrees).at(Place::tensor(&*a.name)).with("module", name);
             let fault = fault.with("a", a.shape.clone()).with("b", b.shape.clone());
             let fault = fault.with("rank", expected.map_or(Value::Null, Value::from));
+            let fault = if parameters.is_empty() { fault } else { fault.with("experts", true) };
             faults.push(trained.into_iter().fold(fault, |fault, trained| fault.with("trained", trained)));
         }
         if down == MatrixRole::A

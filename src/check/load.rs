@@ -22,6 +22,7 @@ use std::collections::BTreeSet;
 use serde_json::Value;
 
 use crate::checkpoint::{Fault, FaultKind, Place};
+use crate::knowledge::prediction::{PredictionLayers, lies_in, numbered};
 use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
 
 pub use difference::{Judged, difference};
@@ -102,12 +103,28 @@ fn with_names<'n>(fault: Fault, key: &str, names: impl Iterator<Item = &'n str> 
     names.into_iter().fold(fault, |fault, name| fault.at(Place::tensor(name)))
 }
 
+/// The ignored layers that predict further tokens, if the config states that there are any: transformers builds none of them,
+/// and the classes of published models ignore theirs without a warning. A layer that the class builds is an ordinary one to it,
+/// whose other tensors are told.
+fn predicting<'r>(report: &'r LoadReport, expected: &'r Expected) -> BTreeSet<(&'r str, u64)> {
+    let layers = PredictionLayers::built_in();
+    if report.unexpected.is_empty() || layers.stated(&expected.config).is_none() {
+        return BTreeSet::new();
+    }
+    let built = expected.tensors.keys().map(String::as_str);
+    let mut found = layers.among(&expected.config, report.unexpected.iter().map(String::as_str).chain(built.clone()));
+    for (list, number, _) in built.flat_map(numbered) {
+        found.remove(&(list, number));
+    }
+    found
+}
+
 /// Faults of a load report, one for each cause.
 ///
 /// `indexed-but-absent` is not among them: the comparison of the index with the shards reports it without a class.
 /// `under` names the loader when loaders differ.
 #[must_use]
-pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
+pub fn faults(report: &LoadReport, expected: &Expected, under: Option<&str>) -> Vec<Fault> {
     let mut faults = Vec::new();
     let causes = [(SilentReason::PrefixHijack, FaultKind::PrefixHijack), (SilentReason::TiedOver, FaultKind::TiedOver)];
     for (reason, kind) in causes {
@@ -123,7 +140,9 @@ pub fn faults(report: &LoadReport, under: Option<&str>) -> Vec<Fault> {
     // A hijack is the cause of everything else: the lists repeat it a thousand times.
     if !report.silent.iter().any(|s| s.reason == SilentReason::PrefixHijack) {
         let unbuilt: BTreeSet<&str> = report.unbuilt.iter().map(String::as_str).collect();
-        let others = report.unexpected.iter().map(String::as_str).filter(|name| !unbuilt.contains(name));
+        let predicting = predicting(report, expected);
+        let is_other = |name: &&str| !unbuilt.contains(name) && !lies_in(&predicting, name);
+        let others = report.unexpected.iter().map(String::as_str).filter(is_other);
         faults.extend(of_names(FaultKind::MissingTensors, report.missing.iter().map(String::as_str)));
         faults.extend(of_names(FaultKind::UnbuiltTensors, report.unbuilt.iter().map(String::as_str)));
         faults.extend(of_names(FaultKind::UnexpectedTensors, others));

@@ -24,10 +24,21 @@ pub(super) fn short(value: &Value) -> Value {
     }
 }
 
-/// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class.
+/// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class, and that of
+/// a sentence encoder whose own module is a table of embeddings is model2vec's.
 pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {
     let has = |key| checkpoint.config().is_some_and(|config| config.get(key).is_some());
-    (has("model_type") || has("architectures")) && !has("_class_name")
+    (has("model_type") || has("architectures")) && !has("_class_name") && !is_table(checkpoint)
+}
+
+/// Whether modules.json says that sentence-transformers reads this directory itself as a table of embeddings. Source:
+/// sentence-transformers 6.2.0, `models/StaticEmbedding.py`.
+fn is_table(checkpoint: &Checkpoint) -> bool {
+    let modules = checkpoint.document("modules.json").and_then(|file| file.value.as_ref()?.as_array());
+    modules.into_iter().flatten().any(|module| {
+        let text = |key: &str| module.get(key).and_then(Value::as_str).unwrap_or_default();
+        matches!(text("path"), "" | "." | "./") && text("type").ends_with(".StaticEmbedding")
+    })
 }
 
 /// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.

@@ -53,6 +53,7 @@ pub(super) fn faults(
         let refused = class.map(|class| refusals(knowledge, config, target, class)).unwrap_or_default();
         let mut found = of_class(knowledge, &configs, &refused, target.version());
         found.extend(dtype(knowledge, config, target.version()));
+        found.extend(rope_form(knowledge, config, target.version()));
         let mut own = of_kinds(knowledge, &configs, &refused, target.version());
         own.retain(|rejection| {
             !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)
@@ -123,6 +124,20 @@ impl<'c> Configs<'c> {
         let default = || defaults.get(pointer.trim_start_matches('/')).copied().map(Value::from);
         self.read(pointer).cloned().or_else(default)
     }
+}
+
+/// A `rope_scaling` in another form than the one that its config class accepts.
+fn rope_form(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Rejection> {
+    let scaling = config.get("rope_scaling")?;
+    let model_type = config.get("model_type").and_then(Value::as_str)?;
+    let form = knowledge.rope_forms.of(version, model_type).filter(|form| !form.accepts(scaling))?;
+    Some(Rejection {
+        pointer: "/rope_scaling".to_owned(),
+        value: scaling.clone(),
+        because: "which has another form than the class accepts".to_owned(),
+        raises: form.raises.clone(),
+        similar: None,
+    })
 }
 
 /// Values that the model class refuses, by rules of their own.

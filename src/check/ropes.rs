@@ -12,6 +12,7 @@ use super::load::Target;
 use super::model_type::{is_model, short};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Knowledge;
+use crate::knowledge::ropes::RopeForm;
 
 /// Keys of `rope_parameters` that are no parameters of a scaling.
 const BESIDE: [&str; 3] = ["rope_theta", "partial_rotary_factor", "rope_type"];
@@ -26,7 +27,8 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[
         for (at, part) in configs(config).filter(|(_, part)| part.contains_key("rope_parameters")) {
             let model_type = part.get("model_type").and_then(Value::as_str).unwrap_or_default();
             let Some(keys) = knowledge.ropes.of(target.loader, model_type) else { continue };
-            let Some(unread) = unread(at.as_str(), part, keys) else { continue };
+            let form = knowledge.rope_forms.of(target.loader.version(), model_type);
+            let Some(unread) = unread(at.as_str(), part, keys, form) else { continue };
             unread.join(&mut faults, target.loader.version());
         }
     }
@@ -42,8 +44,14 @@ fn configs(config: &Value) -> impl Iterator<Item = (String, &Map<String, Value>)
     whole.map(|whole| (String::new(), whole)).into_iter().chain(parts)
 }
 
-/// The values of `rope_parameters` that a class with these keys takes from elsewhere.
-fn unread(at: &str, part: &Map<String, Value>, keys: &BTreeMap<String, Value>) -> Option<Fault> {
+/// The values of `rope_parameters` that a class with these keys takes from elsewhere; `form` is the one that it accepts, if it
+/// does not accept every form.
+fn unread(
+    at: &str,
+    part: &Map<String, Value>,
+    keys: &BTreeMap<String, Value>,
+    form: Option<&RopeForm>,
+) -> Option<Fault> {
     let parameters = part.get("rope_parameters")?.as_object()?;
     let by_layer = parameters.get("full_attention").and_then(Value::as_object);
     // Kinds of layers with other names, or without a key for each of them, have no form that these versions read.
@@ -52,11 +60,14 @@ fn unread(at: &str, part: &Map<String, Value>, keys: &BTreeMap<String, Value>) -
     }
     let of_all = by_layer.unwrap_or(parameters);
     let local = parameters.get("sliding_attention").and_then(|local| local.get("rope_theta"));
+    let needed_scaling = scaling(of_all);
+    let in_form = form.zip(needed_scaling.as_ref()).map(|(form, _)| form.written(of_all));
+    let is_unwritable = in_form == Some(None);
     let written = [
         ("rope_theta", of_all.get("rope_theta").cloned()),
         ("partial_rotary_factor", of_all.get("partial_rotary_factor").cloned()),
         ("rope_local_base_freq", local.cloned()),
-        ("rope_scaling", scaling(of_all)),
+        ("rope_scaling", in_form.flatten().or(needed_scaling)),
     ];
     let mut values = Vec::new();
     for (key, needed) in written {
@@ -74,6 +85,7 @@ fn unread(at: &str, part: &Map<String, Value>, keys: &BTreeMap<String, Value>) -
     let fault = Fault::new(FaultKind::RopeParametersUnread)
         .at(Place::file("config.json").pointer(format!("{at}/rope_parameters")))
         .with("given", values.iter().any(|value| value.get("given") == Some(&Value::Bool(true))))
+        .with("unwritable", is_unwritable)
         .with("at", at.replace('/', "."))
         .with("key", first.get("key").cloned())
         .with("keys", values.iter().filter_map(|value| value.get("key")).cloned().collect::<Value>())

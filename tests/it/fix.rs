@@ -3,6 +3,7 @@
 mod cli;
 mod edits;
 mod journal;
+mod named;
 mod sarif;
 mod wrapped;
 

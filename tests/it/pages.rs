@@ -223,6 +223,7 @@ fn the_page_of_data_files_is_fresh() {
          | `recipes/` | merges, with the Python modules that they write |\n\
          | `initial-values.json` | values that each version gives to the tensors of a new model, written by `tools/loader_initial.py` |\n\
          | `ropes.json` | rope keys that config classes read before transformers 5, written by `tools/loader_ropes.py` |\n\
+         | `rope-forms.json5` | forms of `rope_scaling` that config classes before transformers 5 accept |\n\
          | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
          | `classes.json` | tokenizer and processor classes that each version opens by name, written by `tools/loader_classes.py` |\n\
          | `modules.json` | modules and names of transformers that some version lacks, written by `tools/loader_modules.py` |\n\
@@ -231,6 +232,7 @@ fn the_page_of_data_files_is_fresh() {
          | `directories.json5` | kinds of directories that other programs open, or none, with what to do |\n\
          | `statistics.json5` | where policies of robots keep their statistics |\n\
          | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
+         | `prediction-layers.json5` | layers that predict further tokens, which no class builds |\n\
          | `wrappers.json5` | parts of tensor names that wrappers such as torch.compile add |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\

@@ -36,7 +36,7 @@ pub(super) fn faults(config: &Value, table: &PeftKeys, versions: &[String]) -> V
         return Vec::new();
     }
     let Some(keys) = table.of_type(kind) else { return vec![unknown_type(kind, table, table.newest())] };
-    let mut faults = refused(config, versions);
+    let mut faults = refused(config, keys, versions);
     if versions.is_empty() {
         faults.extend(table.newest().and_then(|newest| lost(config, keys, newest)));
         faults.extend(table.last_raising().and_then(|version| unknown(config, keys, table, version, None)));
@@ -116,13 +116,15 @@ fn lost(config: &Value, keys: &BTreeMap<String, PeftKey>, newest: &str) -> Optio
 }
 
 /// Values that every version of the config class refuses, or that its model fails over.
-fn refused(config: &Value, versions: &[String]) -> Vec<Fault> {
+fn refused(config: &Value, keys: &BTreeMap<String, PeftKey>, versions: &[String]) -> Vec<Fault> {
     let is_null = |key: &str| config.get(key).is_some_and(Value::is_null);
     let fault = |key: &str, value: &Value| {
         Fault::new(FaultKind::AdapterValueRefused).at(at(key)).with("key", key).with("value", value.clone())
     };
     let mut found: Vec<Fault> = Vec::new();
-    for key in ["rank_pattern", "alpha_pattern"].into_iter().filter(|key| is_null(key)) {
+    // AdaLoRA has null there until it first moves ranks.
+    let may_be_null = |key: &str| keys.get(key).is_none_or(|key| key.default.as_ref().is_none_or(Value::is_null));
+    for key in ["rank_pattern", "alpha_pattern"].into_iter().filter(|key| is_null(key) && !may_be_null(key)) {
         let text = "AttributeError: 'NoneType' object has no attribute 'keys'";
         found.push(
             fault(key, &Value::Null).with("raises", text).with("default_value", Value::Object(serde_json::Map::new())),

@@ -10,6 +10,7 @@ use crate::check::load::{self, Judged, LoadReport, Stored};
 use crate::check::votes::{self, Vote};
 use crate::check::{quantization, size};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
+use crate::knowledge::Expected;
 
 /// Faults of the loads: prefixes, quantised modules, the size in the index, tensors, and config values that the stored
 /// tensors contradict.
@@ -70,18 +71,18 @@ fn plain<'l>(inputs: &Inputs<'_>, loads: &'l [ExplainedLoad<'_>]) -> impl Iterat
 /// Faults of the tensors: for a leading loader all of them; for another one, that the checkpoint does not load there.
 fn tensors(loads: &[ExplainedLoad<'_>], stored: &Stored) -> Vec<Fault> {
     // Loaders that agree have their faults reported once.
-    let mut distinct: Vec<(&LoadReport, Vec<&'static str>)> = Vec::new();
+    let mut distinct: Vec<(&LoadReport, &Expected, Vec<&'static str>)> = Vec::new();
     for load in loads.iter().filter(|load| load.prediction.target.leads) {
         let Some(report) = load.unexplained() else { continue };
-        match distinct.iter_mut().find(|(one, _)| one.agrees(report)) {
-            Some((_, loaders)) => loaders.push(load.loader()),
-            None => distinct.push((report, vec![load.loader()])),
+        match distinct.iter_mut().find(|(one, ..)| one.agrees(report)) {
+            Some((.., loaders)) => loaders.push(load.loader()),
+            None => distinct.push((report, &load.prediction.expected, vec![load.loader()])),
         }
     }
     let under = |report: &LoadReport| (distinct.len() > 1).then(|| format!("transformers {}", report.version()));
     let mut faults = Vec::new();
-    for (report, loaders) in &distinct {
-        let own = load::faults(report, under(report).as_deref());
+    for (report, expected, loaders) in &distinct {
+        let own = load::faults(report, expected, under(report).as_deref());
         faults.extend(own.into_iter().map(|fault| Fault { loaders: loaders.clone(), ..fault }));
     }
     let judged = |leads: bool| {

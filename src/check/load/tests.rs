@@ -44,7 +44,7 @@ fn a_whole_checkpoint_loads_clean() {
     let expected = llama(false);
     let report = predict(&expected, &Stored::from_shapes(all(&expected)));
     assert_eq!(report, clean());
-    assert!(faults(&report, None).is_empty());
+    assert!(faults(&report, &expected, None).is_empty());
 }
 
 #[test]
@@ -67,7 +67,7 @@ fn base_model_keys_load_into_a_class_with_a_head() {
     stored.insert("lm_head.weight".to_owned(), vec![10, 4]);
     let report = predict(&expected, &Stored::from_shapes(stored));
     assert!(report.raises.as_deref().is_some_and(|r| r.starts_with("ValueError: The state dictionary")));
-    assert_eq!(faults(&report, None).iter().map(|f| f.kind).collect::<Vec<_>>(), [FaultKind::LoadRaises]);
+    assert_eq!(faults(&report, &expected, None).iter().map(|f| f.kind).collect::<Vec<_>>(), [FaultKind::LoadRaises]);
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn one_stray_key_with_the_prefix_hijacks_the_whole_model() {
     assert_eq!(report.missing, ["model.language_model.model.w", "model.vision_tower.w"]);
     assert_eq!(report.unexpected, ["language_model.model.w", "modelx.weight", "vision_tower.w"]);
     assert_eq!(reasons(&report), [("modelx.weight", SilentReason::PrefixHijack)]);
-    let faults = faults(&report, None);
+    let faults = faults(&report, &expected, None);
     assert_eq!(faults.iter().map(|f| f.kind).collect::<Vec<_>>(), [FaultKind::PrefixHijack]);
     assert_eq!(faults[0].detail["tensor"], json!("modelx.weight"));
 }
@@ -175,7 +175,7 @@ fn an_optional_group_is_whole_or_absent() {
 #[test]
 fn a_fault_names_every_tensor() {
     let report = LoadReport { missing: (0..7).map(|i| format!("t{i}")).collect(), ..LoadReport::default() };
-    let faults = faults(&report, None);
+    let faults = faults(&report, &Expected::default(), None);
     assert_eq!(faults[0].detail["names"], json!(["t0", "t1", "t2", "t3", "t4", "t5", "t6"]));
     assert_eq!(
         (faults[0].kind, &faults[0].detail["count"], faults[0].places.len()),

@@ -6,10 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::knowledge::Expected;
-
-/// Parts of the names of a layer that predicts further tokens, beside those of an ordinary layer. Such a layer is stored behind
-/// the last one (DeepSeek-V3, GLM-4.5, Ling), and transformers builds none. Sources: the indices of the published checkpoints.
-const PREDICTION: [&str; 4] = ["eh_proj", "enorm", "hnorm", "shared_head"];
+use crate::knowledge::prediction::{PredictionLayers, numbered};
 
 /// A list of layers that the class builds.
 #[derive(Default)]
@@ -28,21 +25,16 @@ pub(in crate::check) fn unbuilt(expected: &Expected, ignored: &[String]) -> Vec<
     let prefix = format!("{}.", expected.base_model_prefix);
     let mut built: BTreeMap<&str, Layers<'_>> = BTreeMap::new();
     for name in expected.tensors.keys() {
-        for (list, number, rest) in places(bare(name, &prefix)) {
+        for (list, number, rest) in numbered(bare(name, &prefix)) {
             let layers = built.entry(list).or_default();
             layers.last = layers.last.max(number);
             layers.tensors.insert(rest);
         }
     }
-    // Lists of layers that predict further tokens, with the number.
-    let predicting: BTreeSet<(&str, u64)> = ignored
-        .iter()
-        .flat_map(|name| places(bare(name, &prefix)))
-        .filter(|(_, _, rest)| rest.split('.').any(|part| PREDICTION.contains(&part)))
-        .map(|(list, number, _)| (list, number))
-        .collect();
+    let names = expected.tensors.keys().chain(ignored).map(|name| bare(name, &prefix));
+    let predicting = PredictionLayers::built_in().among(&expected.config, names);
     let is_unbuilt = |name: &&String| {
-        places(bare(name, &prefix)).any(|(list, number, rest)| {
+        numbered(bare(name, &prefix)).any(|(list, number, rest)| {
             let beyond = |layers: &Layers<'_>| number > layers.last && layers.tensors.contains(rest);
             built.get(list).is_some_and(beyond) && !predicting.contains(&(list, number))
         })
@@ -53,16 +45,6 @@ pub(in crate::check) fn unbuilt(expected: &Expected, ignored: &[String]) -> Vec<
 /// A name without the prefix of the base model, which a file may have or not.
 fn bare<'n>(name: &'n str, prefix: &str) -> &'n str {
     if prefix.len() > 1 { name.strip_prefix(prefix).unwrap_or(name) } else { name }
-}
-
-/// The numbers in a name: what stands before each, the number, and what follows.
-fn places(name: &str) -> impl Iterator<Item = (&str, u64, &str)> {
-    let dots = name.match_indices('.').map(|(at, _)| at);
-    dots.filter_map(|at| {
-        let (list, rest) = (name.get(..at)?, name.get(at.checked_add(1)?..)?);
-        let (number, rest) = rest.split_once('.')?;
-        Some((list, number.parse().ok()?, rest))
-    })
 }
 
 #[cfg(test)]

@@ -1,5 +1,8 @@
 //! Runs a vote: search for better values, then count.
 
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
+
 use serde_json::Value;
 
 use super::solve::{self, SearchState};
@@ -8,6 +11,7 @@ use super::tally;
 use super::vote::{Fit, Votes};
 use crate::check::load::Stored;
 use crate::knowledge::Architecture;
+use crate::knowledge::prediction::{PredictionLayers, lies_in};
 
 /// Most times the stored names are renamed again after the config has changed.
 const PASSES: usize = 3;
@@ -21,6 +25,7 @@ pub fn vote(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> 
 
 /// As [`vote`]; with `changed`, only votes on the values that had to change.
 pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Stored, changed: bool) -> Option<Votes> {
+    let stored = &of_ordinary_layers(config, stored);
     let mut space = Space::new(architecture, stored);
     let mut state = SearchState::new(&mut space, config.clone())?;
     let (said, before) = (state.built.config.clone(), Fit::new(&state.built, &space.stored));
@@ -43,4 +48,12 @@ pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Store
     let after = Fit::new(&state.built, &space.stored);
     let resolved = state.built.config;
     Some(Votes { votes, undecided, config: state.config, resolved, before, after, exhausted: space.exhausted() })
+}
+
+/// The stored tensors without those of layers that predict further tokens, which lie behind the last one and are named like
+/// it: they imply nothing about the number of layers that the class builds.
+fn of_ordinary_layers<'s>(config: &Value, stored: &'s Stored) -> Cow<'s, Stored> {
+    let layers = PredictionLayers::built_in().among(config, stored.names());
+    let taken: BTreeSet<String> = stored.names().filter(|name| lies_in(&layers, name)).map(ToOwned::to_owned).collect();
+    if taken.is_empty() { Cow::Borrowed(stored) } else { Cow::Owned(stored.replacing(&taken, BTreeMap::new())) }
 }

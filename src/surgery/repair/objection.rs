@@ -9,6 +9,7 @@ use super::unused::left_unused;
 use crate::check::load::{LoadReport, SilentReason};
 use crate::check::verdict::{LoadVerdict, PredictedLoad, is_program};
 use crate::check::{Finding, Outcome, Severity};
+use crate::knowledge::rule::Object;
 
 const UNEXPECTED: &str = "unexpected";
 /// What the lists of a load report hold, in their order.
@@ -56,13 +57,21 @@ fn tensors(n: usize) -> String {
 }
 
 /// The object that a loader would open worse than before.
+///
+/// A model whose tensors were compared, which loads wrong and is not predicted after a fix, counts as worse: the fix took away
+/// what the prediction rests on, so nothing shows that the load became right. Without a comparison there is none to lose: a
+/// loader that raised before it, or one whose class is unknown and of which a rule alone said that it loads wrong.
 fn worse_verdict(before: &Outcome, after: &Outcome) -> Option<String> {
     after.verdicts.iter().find_map(|load| {
         let was = before.verdicts.iter().find(|was| was.loader == load.loader)?;
+        let was_compared = before.loads.iter().any(|report| report.loader == load.loader);
         load.objects.iter().find_map(|object| {
             let old = was.objects.iter().find(|old| old.object == object.object);
             let old = old.map_or(LoadVerdict::NotPredicted, |old| old.verdict);
-            let is_worse = object.verdict > old;
+            let is_lost = was_compared
+                && object.object == Object::Model
+                && (old, object.verdict) == (LoadVerdict::LoadsWrong, LoadVerdict::NotPredicted);
+            let is_worse = object.verdict > old || is_lost;
             is_worse.then(|| format!("the {} {} with {}", object.object.name(), would(object.verdict), loader(load)))
         })
     })

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use ckpt_doctor::check::check;
 use ckpt_doctor::checkpoint::Checkpoint;
-use ckpt_doctor::surgery::repair::{Repair, plan};
+use ckpt_doctor::surgery::repair::{Content, Repair, plan};
 use ckpt_doctor::surgery::{Recovered, RepairError, journal, overlay};
 use tempfile::TempDir;
 
@@ -335,6 +335,18 @@ fn a_file_that_changes_during_planning_stops_the_repair() {
     assert!(matches!(journal::write(&repair, &|_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
     assert_eq!(contents(&dir), now);
     assert!(!dir.join(".ckpt-doctor").exists());
+}
+
+#[test]
+fn an_edit_that_changes_nothing_is_an_error_of_the_program() {
+    let (_owner, dir) = broken();
+    let mut repair = repair(&dir);
+    let before = contents(&dir);
+    repair.changes.retain(|change| change.name == "config.json");
+    let text = fs::read_to_string(dir.join("config.json")).expect("text");
+    repair.changes[0].new = Content::Text(text.into());
+    assert!(matches!(journal::write(&repair, &|_| {}), Err(RepairError::ChangesNothing { .. })));
+    assert_eq!(contents(&dir), before);
 }
 
 #[test]
