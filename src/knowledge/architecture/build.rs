@@ -63,8 +63,10 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
             })
         }
         Err(failed @ (Refusal::Impossible(_) | Refusal::NotCovered(_))) => {
-            // A default that looks into a sub-config nobody knows fails before the part is reached.
-            if let Some(part) = resolver.unknown_sub_config(file, written) {
+            // A default that looks into a sub-config nobody knows fails before the part is reached. A corner has a cause of its
+            // own: a class that builds its part by name, as Florence-2 does, opens a config of another model type.
+            let unknown = resolver.unknown_sub_config(file, written).filter(|_| !failed.is_corner());
+            if let Some(part) = unknown {
                 return Err(Refusal::UnknownPart(part));
             }
             // What is not covered may be what it failed on.

@@ -47,6 +47,11 @@ impl Refusal {
         Self::Impossible(vec![reason.into()])
     }
 
+    /// Whether the description knows where it ends, and ends there.
+    pub(super) fn is_corner(&self) -> bool {
+        matches!(self, Self::NotCovered(doubts) if doubts.iter().any(|doubt| matches!(doubt, Doubt::Corner(_))))
+    }
+
     /// The same with what else the description does not cover, which may be the reason.
     pub(super) fn or_doubts(self, others: Vec<Doubt>) -> Self {
         let own = match self {

@@ -166,6 +166,18 @@ fn compositions_name_the_part_that_cannot_be_built() {
     assert!(refusal.contains("a tensor name of"), "{refusal}");
 }
 
+/// transformers 4.57.6 and 5.23.0 open this config: `Florence2Config` builds its vision config by name. Of what the class makes
+/// of it nothing is known.
+#[test]
+fn a_part_that_is_built_by_name_may_have_another_model_type() {
+    let library = Library::embedded();
+    let config = json!({ "model_type": "florence2", "text_config": { "d_model": 1024 },
+        "vision_config": { "model_type": "davit", "patch_size": [7, 3, 3, 3], "depths": [1, 1, 9, 1] } });
+    let refusal = library.find(&config, [], Loader::V5_23_0).expect("known").expect(&config).expect_err("refused");
+    assert!(matches!(refusal, Refusal::NotCovered(_)), "{refusal:?}");
+    assert!(refusal.to_string().contains("vision_config is of model type davit"), "{refusal}");
+}
+
 #[test]
 fn the_class_decides_unless_the_model_type_is_of_another() {
     let library = Library::embedded();
