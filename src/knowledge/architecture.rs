@@ -83,6 +83,17 @@ impl<'l> Architecture<'l> {
         self.file.config(self.loader).configs.iter().any(|(name, _)| name == key)
     }
 
+    /// Whether this loader reads at the top of config.json what a later version writes into `text_config`: a class that
+    /// generates then raises, and one of another shape would be built from its defaults.
+    #[must_use]
+    pub fn misses_text_config(&self, config: &Value) -> bool {
+        let generates = ["ForCausalLM", "ForConditionalGeneration", "LMHeadModel"];
+        config.get("text_config").is_some_and(Value::is_object)
+            && self.has_auto()
+            && !self.builds_config("text_config")
+            && generates.iter().any(|end| self.class().ends_with(end))
+    }
+
     /// The model type of the config under a key that names none.
     #[must_use]
     pub fn sub_config_type(&self, key: &str) -> Option<String> {

@@ -426,7 +426,7 @@ fn parse_dtype(value: &Value) -> Result<Option<Dtype>, &'static str> {
 /// Position and shape of each tensor that the class has with the planned config.
 ///
 /// Under its names of every loader, those of the loader that the config names first: `save_pretrained` of transformers 4.57
-/// writes names that the classes of 4.47 have.
+/// writes names that the classes of 4.47 have. A loader that does not read the text config knows no shape.
 fn expected_shapes<'n>(
     library: &Library,
     config: Option<&Value>,
@@ -438,6 +438,7 @@ fn expected_shapes<'n>(
     let mut shapes = HashMap::new();
     for loader in std::iter::once(Loader::of_config(config)).chain(Loader::ALL) {
         let class = library.find(config, names.iter().copied(), loader);
+        let class = class.filter(|class| !class.misses_text_config(config));
         let Some(expected) = class.and_then(|class| class.expect_given(config, evidence).ok()) else { continue };
         for (i, (name, tensor)) in expected.tensors.iter().enumerate() {
             shapes.entry(name.clone()).or_insert_with(|| (i, tensor.shape.clone()));

@@ -64,12 +64,7 @@ const NESTED: &str = "AttributeError: 'dict' object has no attribute 'to_dict'";
 /// The class, unless this loader reads its values at the top of config.json and finds them in `text_config`, as a later
 /// version writes them.
 fn with_flat_config(inputs: &Inputs<'_>, architecture: &Architecture<'_>) -> Result<Expected, Refusal> {
-    let generates = ["ForCausalLM", "ForConditionalGeneration", "LMHeadModel"];
-    let is_nested = inputs.config.get("text_config").is_some_and(Value::is_object)
-        && architecture.has_auto()
-        && !architecture.builds_config("text_config")
-        && generates.iter().any(|end| architecture.class().ends_with(end));
-    if is_nested {
+    if architecture.misses_text_config(inputs.config) {
         return Err(Refusal::Raises(NESTED.to_owned()));
     }
     load::build(*architecture, inputs.config, inputs.stored)

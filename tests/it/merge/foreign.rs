@@ -4,9 +4,10 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 use tempfile::TempDir;
 
+use super::law::bytes::read;
 use super::{content, doctor, text};
 use crate::support::base::{copy, make, tensors};
 use crate::support::change::apply_all;
@@ -123,6 +124,29 @@ fn a_part_of_another_kind_is_refused_with_the_command_that_exchanges_it() {
         fs::remove_dir_all(changed).unwrap();
     }
     snapshot!("merge-foreign-parts", table);
+}
+
+/// transformers 4.57 writes the values of Qwen2-VL's language model into text_config, under the names of 4.47, which does not
+/// read them there.
+#[test]
+fn a_model_takes_its_own_part_in_the_form_of_a_later_version() {
+    let (work, knowledge) = (TempDir::new().unwrap(), knowledge());
+    let (host, out) = (work.path().join("host"), work.path().join("out"));
+    make("qwen2-vl", &host, &knowledge);
+    edit(&host.join("config.json"), |config| {
+        let whole = config.as_object_mut().unwrap();
+        let of_whole = |key: &str| key == "vision_config" || key == "model_type" || key.ends_with("_token_id");
+        let inner: Vec<String> = whole.keys().filter(|key| !of_whole(key)).cloned().collect();
+        let mut text: Map<String, Value> =
+            inner.into_iter().map(|key| (key.clone(), whole.remove(&key).unwrap())).collect();
+        text.insert("model_type".to_owned(), json!("qwen2_vl_text"));
+        whole.insert("text_config".to_owned(), text.into());
+        whole.insert("transformers_version".to_owned(), json!("4.57.6"));
+    });
+    let part = host.to_str().unwrap();
+    let (code, said) = run(&["insert", part, "--part", "language", "--from", part], &out);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(read(&host) == read(&out), "{said}");
 }
 
 /// The sound quantised checkpoints of `fixtures/sound`, as the guest of every recipe that puts a language model into another one.
