@@ -122,18 +122,36 @@ impl<'de> Deserialize<'de> for Loader {
 /// [`Library::stands_for`](super::Library::stands_for) maps it to a loader.
 ///
 /// # Errors
-/// The expected form, with the known versions.
+/// The expected form, with the known versions; or that there is no such version.
 pub fn parse_requirement(text: &str) -> Result<String, String> {
-    let version = text.strip_prefix("transformers==").unwrap_or(text);
+    let version = parse_version(text.strip_prefix("transformers==").unwrap_or(text))?;
+    if was_never_released(&version) {
+        return Err(format!("transformers {version} was never released: 4.57.6 is the last version before 5.0.0"));
+    }
+    Ok(version)
+}
+
+/// The version that a text is, of transformers or PEFT.
+fn parse_version(text: &str) -> Result<String, String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '+' | '-' | '!' | '_');
-    if version.starts_with(|c: char| c.is_ascii_digit()) && version.chars().all(plain) && version.len() < 40 {
-        return Ok(version.to_owned());
+    if text.starts_with(|c: char| c.is_ascii_digit()) && text.chars().all(plain) && text.len() < 40 {
+        return Ok(text.to_owned());
     }
     let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
     Err(format!(
         "expected VERSION or transformers==VERSION; known versions are {}, others are predicted as the nearest one",
         known.join(", ")
     ))
+}
+
+/// Whether a version lies between the last one of transformers 4 and the first one of 5. Development builds were numbered
+/// there. Source: the tags of huggingface/transformers.
+fn was_never_released(version: &str) -> bool {
+    let minor = match version_numbers(version).as_slice() {
+        [4, minor, ..] => *minor,
+        _ => return false,
+    };
+    minor > 57 && !version.contains("dev")
 }
 
 /// The word for all known versions, where several can be named.
@@ -160,7 +178,7 @@ pub fn parse_program(text: &str) -> Result<String, String> {
         return Ok(text.to_owned());
     }
     if let Some(version) = text.strip_prefix(PEFT) {
-        return parse_requirement(version).map(|version| format!("{PEFT}{version}"));
+        return parse_version(version).map(|version| format!("{PEFT}{version}"));
     }
     let names = Program::ALL.map(Program::name).join(", ");
     parse_requirement_or_all(text).map_err(|error| format!("{error}; peft==VERSION, {names} are known as well"))
@@ -244,6 +262,12 @@ mod tests {
             assert_eq!(parse_requirement(text), Ok("4.57.3".to_owned()));
         }
         assert_eq!(parse_requirement("4.57"), Ok("4.57".to_owned()));
+        for version in ["4.58.0.dev0", "5.30", "4", "4.9.1"] {
+            assert_eq!(parse_requirement(version), Ok(version.to_owned()));
+        }
+        for version in ["4.58", "transformers==4.99.1"] {
+            assert!(parse_requirement(version).unwrap_err().contains("never released"), "{version}");
+        }
         for text in ["", "transformers==", "transformers", "torch==2.1", "4 57", "v4.57"] {
             assert!(parse_requirement_or_all(text).is_err(), "{text}");
         }
