@@ -126,7 +126,7 @@ fn a_part_of_another_kind_is_refused_with_the_command_that_exchanges_it() {
     snapshot!("merge-foreign-parts", table);
 }
 
-/// transformers 4.57 writes the values of Qwen2-VL's language model into text_config, under the names of 4.47, which does not
+/// transformers 4.57 writes the values of Qwen2-VL's language model into `text_config`, under the names of 4.47, which does not
 /// read them there.
 #[test]
 fn a_model_takes_its_own_part_in_the_form_of_a_later_version() {
