@@ -124,11 +124,16 @@ impl<'de> Deserialize<'de> for Loader {
 /// # Errors
 /// The expected form, with the known versions; or that there is no such version.
 pub fn parse_requirement(text: &str) -> Result<String, String> {
-    let version = parse_version(text.strip_prefix("transformers==").unwrap_or(text))?;
+    let version = parse_version(of_transformers(text))?;
     if was_never_released(&version) {
         return Err(format!("transformers {version} was never released: 4.57.6 is the last version before 5.0.0"));
     }
     Ok(version)
+}
+
+/// What may be a version in a requirement on transformers.
+fn of_transformers(text: &str) -> &str {
+    text.strip_prefix("transformers==").unwrap_or(text)
 }
 
 /// The version that a text is, of transformers or PEFT.
@@ -181,7 +186,10 @@ pub fn parse_program(text: &str) -> Result<String, String> {
         return parse_version(version).map(|version| format!("{PEFT}{version}"));
     }
     let names = Program::ALL.map(Program::name).join(", ");
-    parse_requirement_or_all(text).map_err(|error| format!("{error}; peft==VERSION, {names} are known as well"))
+    parse_requirement_or_all(text).map_err(|error| match parse_version(of_transformers(text)) {
+        Ok(_) => error,
+        Err(_) => format!("{error}; peft==VERSION, {names} are known as well"),
+    })
 }
 
 /// What a checkpoint must load with, by program.
@@ -278,6 +286,7 @@ mod tests {
         assert_eq!((all.peft, all.transformers), (vec!["0.13.2".to_owned()], vec!["4.57".to_owned()]));
         assert_eq!(all.programs, [Program::Vllm]);
         assert!(parse_program("vlm").unwrap_err().contains("vllm"));
+        assert!(!parse_program("4.99").unwrap_err().contains("vllm"));
         assert!(parse_program("peft==new").is_err());
     }
 }
