@@ -9,8 +9,9 @@ use super::predict::{Prediction, quantised, same_bytes};
 use crate::check::load::{self, Judged, LoadReport, Stored};
 use crate::check::votes::{self, Vote};
 use crate::check::{quantization, size};
-use crate::checkpoint::{Checkpoint, Fault, FaultKind};
-use crate::knowledge::Expected;
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, pointer};
+use crate::knowledge::quantization::DeclaredScheme;
+use crate::knowledge::{Expected, Loader};
 
 /// Faults of the loads: prefixes, quantised modules, the size in the index, tensors, and config values that the stored
 /// tensors contradict.
@@ -120,11 +121,27 @@ fn compare_tied(checkpoint: &Checkpoint, fault: Fault) -> Fault {
     if same == Some(false) { Fault { kind: FaultKind::TiedOverAnother, ..fault } } else { fault }
 }
 
-/// The fault of tensors that look quantised although the config declares no scheme.
-pub(super) fn undeclared_scheme(inputs: &Inputs<'_>, loads: &[LoadReport]) -> Option<Fault> {
+/// The fault of tensors that look quantised although the first loader reads no scheme from the config. A block at a place that it
+/// does not read is named.
+pub(super) fn undeclared_scheme(inputs: &Inputs<'_>, first: Option<Loader>, loads: &[LoadReport]) -> Option<Fault> {
+    let scheme = first.map_or(&inputs.scheme, |loader| inputs.scheme_of(loader));
     let is_explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
-    if !inputs.is_plain() || is_explained {
+    if !matches!(scheme, DeclaredScheme::Plain) || is_explained {
         return None;
     }
-    quantization::undeclared(&inputs.knowledge.schemes, inputs.stored.names())
+    let fault = quantization::undeclared(&inputs.knowledge.schemes, inputs.stored.names())?;
+    let unread = unread_block(inputs.config, "", UNREAD_DEPTH);
+    Some(unread.into_iter().fold(fault, |fault, at| fault.with("unread", at)))
+}
+
+/// Levels of a config that are searched for a block that no loader reads. Compositions have two.
+const UNREAD_DEPTH: usize = 4;
+
+/// JSON pointer of the first `quantization_config` in a config.
+fn unread_block(config: &Value, at: &str, depth: usize) -> Option<String> {
+    let object = config.as_object().filter(|_| depth > 0)?;
+    if object.get("quantization_config").is_some_and(Value::is_object) {
+        return Some(format!("{at}/quantization_config"));
+    }
+    object.iter().find_map(|(key, value)| unread_block(value, &pointer::join(at, key), depth.saturating_sub(1)))
 }

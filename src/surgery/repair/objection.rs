@@ -131,3 +131,35 @@ fn remaining(before: &Outcome, after: &Outcome, made: &[Finding]) -> Option<Stri
 fn count(outcome: &Outcome, kind: impl Fn(&Finding) -> bool) -> usize {
     outcome.findings.iter().filter(|f| kind(f)).fold(0, |n, f| n.saturating_add(f.count()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::check::verdict::ObjectVerdict;
+
+    /// An outcome with one loader, whose model has this verdict; with a load report if its tensors were compared.
+    fn outcome(verdict: LoadVerdict, is_compared: bool) -> Outcome {
+        let report = LoadReport { loader: "4.57.6".to_owned(), ..LoadReport::default() };
+        let object = ObjectVerdict { object: Object::Model, verdict, why: None, findings: BTreeSet::new() };
+        let load = PredictedLoad {
+            loader: report.loader.clone(),
+            stands_for: None,
+            leads: true,
+            verdict,
+            objects: vec![object],
+            tensors: None,
+        };
+        let loads = if is_compared { vec![report] } else { Vec::new() };
+        Outcome { verdicts: vec![load], loads, ..Outcome::default() }
+    }
+
+    #[test]
+    fn a_comparison_that_a_fix_takes_away_is_a_loss() {
+        let after = outcome(LoadVerdict::NotPredicted, false);
+        let reason = |before, is_compared| objection(&outcome(before, is_compared), &after, &[]);
+        let lost = "the model would no longer be predicted with transformers 4.57.6";
+        assert_eq!(reason(LoadVerdict::LoadsWrong, true).as_deref(), Some(lost));
+        assert_eq!(reason(LoadVerdict::LoadsWrong, false), None);
+        assert_eq!(reason(LoadVerdict::Raises, true), None);
+    }
+}
