@@ -231,6 +231,11 @@ def opened(cls, folder):
     return (model.state_dict(), logits), ""
 
 
+# The order of a sum depends on where a mapped file lies in memory, so the same bytes give logits that differ in the last place.
+# Their tensors must be equal byte for byte; a head that was lost moves the logits by more than 0.01.
+CLOSE = 1e-6
+
+
 def apart(one, other):
     """How far the logits of two models are apart, and how many of their tensors differ."""
     import torch
@@ -268,7 +273,7 @@ def told_of(cls, folder, version, unsafe, sound):
     model, why = opened(cls, folder)
     far, wrong = apart(model, sound) if model else (float("inf"), [why])
     is_good = code == 0 and verdict == "loads"
-    is_equal = far == 0 and not wrong
+    is_equal = far <= CLOSE and not wrong
     result = "equal" if is_equal and is_good else "unsaid" if is_equal else "WRONG" if is_good else "refused"
     return {
         "result": result,
