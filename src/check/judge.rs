@@ -89,10 +89,9 @@ pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]
     let votes = explain::distinct_votes(&loads);
     faults.extend(faults::faults(&inputs, &loads, &votes));
     let config = loads.first().map_or(Value::Null, |load| load.prediction.expected.config.clone());
-    let first = loads.first().map(|load| load.prediction.target.loader);
     let loads: Vec<LoadReport> =
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();
-    faults.extend(faults::undeclared_scheme(&inputs, first, &loads));
+    faults.extend(faults::undeclared_scheme(&inputs, &loads));
     Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
 }
 

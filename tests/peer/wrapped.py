@@ -6,8 +6,8 @@
 Each FOLDER has one version of transformers, for the Python that runs this. Small models of 22 classes, 8 of them with a vision
 tower, are saved by their real class, tied and untied. Copies of them are damaged: every name gets the prefix of a wrapper, some
 get a part in the middle, or the head is gone. `check --for V --fix` repairs each, then `--fix --unsafe-fixes`; the loader of
-that version opens what comes out. A checkpoint that the program calls good (exit 0, and the model loads) has the logits and
-every tensor of the original; anything else is a failure. What the program does not call good is counted as refused.
+that version opens what comes out. A checkpoint that the program calls good (exit 0, and the model loads) has the logits (within
+CLOSE) and every tensor of the original; anything else is a failure. What the program does not call good is counted as refused.
 """
 
 import argparse
@@ -232,7 +232,7 @@ def opened(cls, folder):
 
 
 # The order of a sum depends on where a mapped file lies in memory, so the same bytes give logits that differ in the last place.
-# Their tensors must be equal byte for byte; a head that was lost moves the logits by more than 0.01.
+# Tensors must be equal byte for byte.
 CLOSE = 1e-6
 
 

@@ -121,20 +121,32 @@ fn compare_tied(checkpoint: &Checkpoint, fault: Fault) -> Fault {
     if same == Some(false) { Fault { kind: FaultKind::TiedOverAnother, ..fault } } else { fault }
 }
 
-/// The fault of tensors that look quantised although the first loader reads no scheme from the config. A block at a place that it
-/// does not read is named.
-pub(super) fn undeclared_scheme(inputs: &Inputs<'_>, first: Option<Loader>, loads: &[LoadReport]) -> Option<Fault> {
-    let scheme = first.map_or(&inputs.scheme, |loader| inputs.scheme_of(loader));
-    let is_explained = loads.first().is_some_and(|report| report.unexpected.is_empty());
-    if !matches!(scheme, DeclaredScheme::Plain) || is_explained {
+/// The fault of tensors that look quantised although the first loader reads no scheme from the config. With a block at a place
+/// that some versions do not read, it is a fault of the loads by these alone.
+pub(super) fn undeclared_scheme(inputs: &Inputs<'_>, loads: &[LoadReport]) -> Option<Fault> {
+    let affected: Vec<&'static str> = loads.iter().filter_map(|report| plain_reader(inputs, report)).collect();
+    let is_first = match loads.first() {
+        Some(first) => affected.first().is_some_and(|version| *version == first.loader),
+        None => inputs.is_plain(),
+    };
+    if !is_first {
         return None;
     }
     let fault = quantization::undeclared(&inputs.knowledge.schemes, inputs.stored.names())?;
-    let unread = unread_block(inputs.config, "", UNREAD_DEPTH);
-    Some(unread.into_iter().fold(fault, |fault, at| fault.with("unread", at)))
+    Some(match unread_block(inputs.config, "", UNREAD_DEPTH) {
+        Some(at) => fault.with("unread", at).with("by", affected.clone()).under_all(affected),
+        None => fault,
+    })
 }
 
-/// Levels of a config that are searched for a block that no loader reads. Compositions have two.
+/// The version of a loader that reads no scheme from the config, and leaves tensors over.
+fn plain_reader(inputs: &Inputs<'_>, report: &LoadReport) -> Option<&'static str> {
+    let loader = Loader::ALL.into_iter().find(|loader| loader.version() == report.loader)?;
+    let is_plain = matches!(inputs.scheme_of(loader), DeclaredScheme::Plain);
+    (is_plain && !report.unexpected.is_empty()).then(|| loader.version())
+}
+
+/// Levels of a config that are searched for a block that is not read. Compositions have two.
 const UNREAD_DEPTH: usize = 4;
 
 /// JSON pointer of the first `quantization_config` in a config.
