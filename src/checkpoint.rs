@@ -36,6 +36,7 @@ mod read;
 mod scan;
 pub mod shard;
 mod sniff;
+pub mod source;
 pub mod text;
 pub mod tokenizer;
 
@@ -57,6 +58,7 @@ pub use nested::Nested;
 pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use pickle::{PICKLE_NAME, PickleGlobal};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
+pub use source::{MemoryFiles, Source, SourceFile};
 #[cfg(feature = "internals")]
 pub use text::hex;
 #[cfg(not(feature = "internals"))]
@@ -72,8 +74,8 @@ pub const REPAIR_JOURNAL: &str = "journal.json";
 /// A model directory: all facts that rules use, without tensor bytes.
 #[derive(Debug, Clone, Default)]
 pub struct Checkpoint {
-    /// Path of the directory.
-    pub root: PathBuf,
+    /// Where its bytes are.
+    pub source: Source,
     /// All entries of the directory that are not hidden, by name.
     pub entries: BTreeMap<String, Entry>,
     /// JSON documents, by file name.
@@ -122,9 +124,9 @@ pub struct Parts {
 }
 
 impl Checkpoint {
-    /// Builds a checkpoint that is not on disk yet, so that a plan is checked like a directory.
+    /// Builds a checkpoint that is not at `path` yet, so that a plan is checked like a directory. It has no bytes to read.
     #[must_use]
-    pub fn planned(root: impl Into<PathBuf>, parts: Parts) -> Self {
+    pub fn planned(path: impl Into<PathBuf>, parts: Parts) -> Self {
         let Parts { documents, shards, modules, vocabularies, mut entries } = parts;
         let mut entry = |name: &str, size: Option<usize>| {
             let size = size.and_then(|s| u64::try_from(s).ok()).unwrap_or(0);
@@ -143,7 +145,7 @@ impl Checkpoint {
             entry(name, None);
         }
         let mut checkpoint = Self {
-            root: root.into(),
+            source: Source::Memory(MemoryFiles::empty(path)),
             entries,
             documents: documents.into_iter().map(|d| (d.name.clone(), d)).collect(),
             shards: shards.into_iter().map(|s| (s.name.clone(), s)).collect(),
@@ -284,19 +286,19 @@ impl Checkpoint {
     #[must_use]
     pub fn sample(&self, name: &str) -> Option<Vec<u8>> {
         let (shard, tensor) = self.tensor(name)?;
-        contents::sample(&self.root, shard, tensor)
+        contents::sample(&self.source, shard, tensor)
     }
 
     /// Whether two tensors have the same bytes; `None` when they cannot be read.
     #[must_use]
     pub fn same_bytes(&self, one: &str, other: &str) -> Option<bool> {
-        contents::same_bytes(&self.root, self.tensor(one)?, self.tensor(other)?)
+        contents::same_bytes(&self.source, self.tensor(one)?, self.tensor(other)?)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.
     #[must_use]
     pub fn numbers(&self, shard: &Shard, tensor: &Tensor) -> Option<Vec<f64>> {
-        contents::numbers(&self.root, shard, tensor)
+        contents::numbers(&self.source, shard, tensor)
     }
 
     /// Faults of the directory, then of documents, index, shards, modules and tokenizer; by file name within each

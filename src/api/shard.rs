@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::Error;
-use crate::checkpoint::{Shard, open_regular};
+use crate::checkpoint::{Shard, SourceFile, open_regular};
 
 impl Shard {
     /// Reads the header of a safetensors file, and none of its tensor data.
@@ -13,8 +13,8 @@ impl Shard {
     /// [`faults`](Self::faults) then, and the entries that could be read.
     pub fn read_header(path: impl AsRef<Path>) -> Result<Self, Error> {
         let path = path.as_ref();
-        let opened = open_regular(path, u64::MAX)?;
+        let file = SourceFile::Local(open_regular(path, u64::MAX)?);
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        Ok(Self::read_opened(&name, &opened))
+        Ok(Self::read_opened(&name, &file))
     }
 }

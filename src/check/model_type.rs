@@ -154,7 +154,8 @@ fn missing(
     of_class: Option<&str>,
     targets: &[Target],
 ) -> Option<Fault> {
-    let directory = checkpoint.root.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let directory = checkpoint.source.path().file_name();
+    let directory = directory.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let old = targets.iter().find(|target| target.loader.major() < 5);
     let guess = old.and_then(|target| knowledge.names.model_type_in(target.version(), &directory));
     let raising = targets.iter().filter(|t| t.loader.major() >= 5 || guess.is_none() || guess != of_class);

@@ -359,7 +359,7 @@ fn own_as_packages(checkpoint: &Checkpoint, root: &str) -> Vec<Fault> {
 /// The name becomes a path of Python packages, which do not exist; only modules that are loaded already are found. Source:
 /// `get_class_in_module` of transformers 4.47.0; run.
 fn unimportable(checkpoint: &Checkpoint, entries: &[AutoMapEntry]) -> Option<Fault> {
-    let directory = checkpoint.root.file_name()?.to_string_lossy().into_owned();
+    let directory = checkpoint.source.path().file_name()?.to_string_lossy().into_owned();
     let roots = |is_config: bool| {
         let entries = entries.iter().filter(move |e| !e.nested && (e.key == "AutoConfig") == is_config);
         entries.filter_map(|entry| Some((entry, entry.parts()?.0)))

@@ -14,12 +14,12 @@ pub(super) fn apply_policy(policy: &Policy, checkpoint: &Checkpoint, outcome: &m
         let file = finding.locations.first().and_then(|l| l.file.as_deref());
         // A finding that also counts hidden ones, which may be in other files, stays.
         let alone = finding.hidden == 0;
-        match policy.grade(&checkpoint.root, file, &finding.code, finding.severity) {
+        match policy.grade(checkpoint.source.path(), file, &finding.code, finding.severity) {
             Some(severity) => finding.severity = severity,
             None if alone => continue,
             None => {}
         }
-        let accepted = policy.suppression(&checkpoint.root, file, &finding.code).filter(|_| alone);
+        let accepted = policy.suppression(checkpoint.source.path(), file, &finding.code).filter(|_| alone);
         match accepted.and_then(|number| policy.suppressions.get(number)) {
             Some(suppression) => {
                 let accepted = Accepted { by: suppression.written.clone(), reason: Some(suppression.reason.clone()) };

@@ -24,11 +24,11 @@ pub fn unused_suppressions(
     for suppression in &knowledge.policy.suppressions {
         let asked = knowledge.rules.rules.iter().any(|r| suppression.codes.contains(&r.code));
         let used = |outcome: &Outcome| outcome.suppressed.iter().any(|s| s.accepted.by == suppression.written);
-        let roots = looked.iter().map(|(checkpoint, _)| checkpoint.root.as_path());
+        let roots = looked.iter().map(|(checkpoint, _)| checkpoint.source.path());
         if !asked || looked.iter().any(|(_, o)| used(o)) || !is_covered(suppression, roots, searched) {
             continue;
         }
-        let concerned = |c: &Checkpoint| suppression.concerns(&c.root, c.entries.keys().map(String::as_str));
+        let concerned = |c: &Checkpoint| suppression.concerns(c.source.path(), c.entries.keys().map(String::as_str));
         let at = looked.iter().position(|(checkpoint, _)| concerned(checkpoint)).unwrap_or(0);
         let Some((checkpoint, _)) = looked.get(at) else { continue };
         let fault = Fault::new(FaultKind::SuppressionUnused)

@@ -74,7 +74,7 @@ pub fn scope(
     scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
     scope.bind("rows", &rows.map_or(Value::Null, Value::from));
     scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
-    let name = checkpoint.root.file_name().map(|n| n.to_string_lossy().into_owned());
+    let name = checkpoint.source.path().file_name().map(|n| n.to_string_lossy().into_owned());
     scope.bind("directory", &json!(name.unwrap_or_default()));
     let has_weights = checkpoint.tensors().next().is_some();
     scope.bind("has_weights", &json!(has_weights));

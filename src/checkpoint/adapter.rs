@@ -1,14 +1,12 @@
 //! A PEFT adapter: a small set of weights that changes another model, and its config.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Component, Path};
 
 use serde_json::Value;
 
 use super::budget::Budget;
-use super::list::list;
-use super::{Checkpoint, Document, Dtype, Shard, Tensor, is_plain_file_name};
+use super::{Checkpoint, Document, Dtype, Shard, Source, Tensor, is_plain_file_name};
 
 /// The document that marks an adapter directory. Source: `CONFIG_NAME` in peft/utils/constants.py.
 pub const CONFIG: &str = "adapter_config.json";
@@ -69,12 +67,9 @@ impl AdapterBase {
         let base = checkpoint.document(CONFIG)?.get("/base_model_name_or_path")?.as_str().map(Path::new)?;
         let is_near = |c: Component<'_>| matches!(c, Component::ParentDir | Component::CurDir | Component::Normal(_));
         let is_relative = base.starts_with("..") || base.starts_with(".");
-        let place = checkpoint.root.join(base);
-        let is_there = is_relative
-            && base.components().all(is_near)
-            && base.components().count() <= 4
-            && fs::symlink_metadata(place.join("config.json")).is_ok();
-        is_there.then(|| Self { shapes: shapes(&place, budget) })
+        let is_allowed = is_relative && base.components().all(is_near) && base.components().count() <= 4;
+        let place = checkpoint.source.join(base).filter(|place| is_allowed && place.exists("config.json"))?;
+        Some(Self { shapes: shapes(&place, budget) })
     }
 
     /// The shape of a tensor by its name in the base model; a head that is tied and not stored has that of the embedding.
@@ -88,8 +83,8 @@ impl AdapterBase {
     }
 }
 
-fn shapes(place: &Path, budget: &mut Budget) -> BTreeMap<String, Vec<u64>> {
-    let Ok(entries) = list(place) else { return BTreeMap::new() };
+fn shapes(place: &Source, budget: &mut Budget) -> BTreeMap<String, Vec<u64>> {
+    let Ok(entries) = place.list("") else { return BTreeMap::new() };
     let names = entries.take(MAX_SHARDS * 10).filter_map(|entry| entry.ok()?.name.into_string().ok());
     let is_shard = |name: &String| {
         name.ends_with(".safetensors")

@@ -5,10 +5,7 @@
 //! a signal (`platform/mapped.rs`). Positioned reads take its place where a file cannot be mapped, and on Windows: they take
 //! about twice as long where the page cache has large pages (`cargo bench --bench contents` compares the two).
 
-use std::path::Path;
-
-use super::open::open_regular;
-use super::{Dtype, Shard, Tensor};
+use super::{Dtype, Shard, Source, Tensor};
 
 #[cfg(feature = "cli")]
 pub(crate) mod digests;
@@ -32,12 +29,12 @@ const CHUNK: usize = 40 * BLOCK;
 const HASHED_ZEROS: u64 = 1 << 30;
 
 /// Whether two tensors of the same length have the same bytes; `None` when they cannot be read. Holes are zeros.
-pub(super) fn same_bytes(root: &Path, one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<bool> {
+pub(super) fn same_bytes(source: &Source, one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<bool> {
     let start = |(shard, tensor): (&Shard, &Tensor)| {
-        let opened = open_regular(&root.join(&shard.name), u64::MAX).ok()?;
-        let is_whole = opened.identity.size == shard.file_len && !shard.unread && shard.is_contiguous(&tensor.name);
+        let file = source.open_regular(&shard.name, u64::MAX).ok()?;
+        let is_whole = file.len() == shard.file_len && !shard.unread && shard.is_contiguous(&tensor.name);
         let start = shard.data_start.checked_add(tensor.begin)?;
-        (is_whole && start.checked_add(tensor.len())? <= shard.file_len).then_some((opened, start))
+        (is_whole && start.checked_add(tensor.len())? <= shard.file_len).then_some((file, start))
     };
     let ((one_file, one_start), (other_file, other_start)) = (start(one)?, start(other)?);
     let [mut buffer, mut there] = [(); 2].map(|()| vec![0_u8; CHUNK]);
@@ -77,9 +74,9 @@ const SAMPLE: u64 = 4096;
 
 /// The first, middle and last bytes of a tensor, to tell tensors apart without reading them; `None` when the file does not
 /// have them, as for a planned shard.
-pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<u8>> {
-    let opened = open_regular(&root.join(&shard.name), u64::MAX).ok()?;
-    if shard.unread || opened.identity.size != shard.file_len {
+pub(super) fn sample(source: &Source, shard: &Shard, tensor: &Tensor) -> Option<Vec<u8>> {
+    let file = source.open_regular(&shard.name, u64::MAX).ok()?;
+    if shard.unread || file.len() != shard.file_len {
         return None;
     }
     if !shard.is_contiguous(&tensor.name) {
@@ -91,7 +88,7 @@ pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<
     let mut bytes = Vec::new();
     for at in [0, last / 2, last] {
         let mut block = vec![0; usize::try_from(length).ok()?];
-        opened.read_exact_at(&mut block, start.checked_add(at)?).ok()?;
+        file.read_exact_at(&mut block, start.checked_add(at)?).ok()?;
         bytes.append(&mut block);
     }
     Some(bytes)
@@ -101,14 +98,14 @@ pub(super) fn sample(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<
 const NUMBERS: u64 = 64 << 10;
 
 /// The numbers of a small tensor of floats; `None` for another dtype, a large tensor, and when the file does not have them.
-pub(super) fn numbers(root: &Path, shard: &Shard, tensor: &Tensor) -> Option<Vec<f64>> {
+pub(super) fn numbers(source: &Source, shard: &Shard, tensor: &Tensor) -> Option<Vec<f64>> {
     let is_small = tensor.len() <= NUMBERS && !shard.unread;
-    let opened = is_small.then(|| open_regular(&root.join(&shard.name), u64::MAX).ok()).flatten()?;
-    if opened.identity.size != shard.file_len {
+    let file = is_small.then(|| source.open_regular(&shard.name, u64::MAX).ok()).flatten()?;
+    if file.len() != shard.file_len {
         return None;
     }
     let mut bytes = vec![0; usize::try_from(tensor.len()).ok()?];
-    opened.read_exact_at(&mut bytes, shard.data_start.checked_add(tensor.begin)?).ok()?;
+    file.read_exact_at(&mut bytes, shard.data_start.checked_add(tensor.begin)?).ok()?;
     Some(match tensor.dtype {
         Dtype::F64 => bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect(),
         Dtype::F32 => bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b).into()).collect(),

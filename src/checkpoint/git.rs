@@ -37,7 +37,9 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint, trusts: &dyn Fn(&Path) 
     if pointers.is_empty() {
         return;
     }
-    let kept = kept(&checkpoint.root, pointers, trusts);
+    // Nothing is around files in memory.
+    let Some(root) = checkpoint.source.directory() else { return };
+    let kept = kept(root, pointers, trusts);
     let mark = |fault: &mut Fault| {
         let file = fault.places.first().and_then(|place| place.file.as_deref());
         if fault.kind == FaultKind::LfsPointer && file.is_some_and(|file| kept.contains(file)) {

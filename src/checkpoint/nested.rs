@@ -4,12 +4,10 @@
 //! of a training run. So faults of these documents are not reported here.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::path::Path;
 
 use super::budget::Budget;
-use super::list::list;
-use super::open::{JSON_CAP, read_own};
-use super::{Document, is_plain_file_name};
+use super::open::JSON_CAP;
+use super::{Document, Source, is_plain_file_name};
 
 /// Depth of folders below the checkpoint: `assets/physical-intelligence/libero/norm_stats.json`.
 const MAX_DEPTH: usize = 3;
@@ -35,14 +33,14 @@ fn is_read(path: &str, has_parts: bool) -> bool {
 }
 
 impl Nested {
-    /// Lists these folders of the checkpoint in `root`, which are no links; hidden entries and links to folders are left
+    /// Lists these folders of the checkpoint, which are no links; hidden entries and links to folders are left
     /// out. `has_parts`: whether a document of the checkpoint lists them as its parts. Called when a directory is read.
-    pub(super) fn read(root: &Path, folders: Vec<String>, has_parts: bool, budget: &mut Budget) -> Self {
+    pub(super) fn read(source: &Source, folders: Vec<String>, has_parts: bool, budget: &mut Budget) -> Self {
         let mut nested = Self::default();
         let mut queue: VecDeque<(String, usize)> = folders.into_iter().map(|name| (format!("{name}/"), 1)).collect();
         while let Some((folder, depth)) = queue.pop_front() {
             nested.names.insert(folder.clone());
-            for (name, is_folder) in sorted(&root.join(&folder)) {
+            for (name, is_folder) in sorted(source, &folder) {
                 if nested.names.len() >= MAX_NAMES {
                     return nested;
                 }
@@ -51,7 +49,7 @@ impl Nested {
                     queue.push_back((format!("{path}/"), depth.saturating_add(1)));
                 } else if !is_folder {
                     if is_read(&path, has_parts) {
-                        nested.read_document(root, &path, budget);
+                        nested.read_document(source, &path, budget);
                     }
                     nested.names.insert(path);
                 }
@@ -60,11 +58,11 @@ impl Nested {
         nested
     }
 
-    fn read_document(&mut self, root: &Path, path: &str, budget: &mut Budget) {
+    fn read_document(&mut self, source: &Source, path: &str, budget: &mut Budget) {
         if budget.is_spent() {
             return;
         }
-        let document = match read_own(root, path, JSON_CAP) {
+        let document = match source.read_own(path, JSON_CAP) {
             Ok(bytes) => {
                 budget.spend(u64::try_from(bytes.len()).unwrap_or(u64::MAX));
                 Document::parse(path, &bytes)
@@ -77,8 +75,8 @@ impl Nested {
 }
 
 /// The entries of a folder by name, with whether each is a folder; empty when it cannot be listed.
-fn sorted(folder: &Path) -> BTreeMap<String, bool> {
-    let Ok(entries) = list(folder) else { return BTreeMap::new() };
+fn sorted(source: &Source, folder: &str) -> BTreeMap<String, bool> {
+    let Ok(entries) = source.list(folder) else { return BTreeMap::new() };
     let plain =
         entries.flatten().take(MAX_NAMES).filter_map(|entry| Some((entry.name.into_string().ok()?, entry.is_folder)));
     plain.filter(|(name, _)| !name.starts_with('.') && is_plain_file_name(name)).collect()

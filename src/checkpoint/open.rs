@@ -1,4 +1,4 @@
-//! The only way a file of a checkpoint is opened.
+//! The only way a file is opened; [`super::Source`] calls it for the files of a checkpoint.
 //!
 //! A plain `open` would block for ever on a FIFO named like a config, and a sparse "config" of six gigabytes would fill
 //! the memory. [`open_regular`] refuses both.

@@ -5,26 +5,22 @@
 //! more than `torch.load(weights_only=True)`: what it does not model is a [`Pickle::doubt`], never a guess.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 use super::budget::Budget;
 use super::fault::Faults;
-use super::open::{Opened, open_regular};
 use super::shard::header::other_format;
-use super::{Checkpoint, Fault, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Place, Shard, adapter};
+use super::{Checkpoint, Fault, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Place, Shard, Source, SourceFile, adapter};
 
 mod call;
 mod element;
 mod legacy;
 mod machine;
 mod opcode;
-mod source;
+mod ranges;
 mod state_dict;
 mod storage;
 mod value;
 mod zip;
-
-use source::Source;
 
 /// The pickle that transformers opens when there is no safetensors file, before it looks for an index.
 pub const PICKLE_NAME: &str = "pytorch_model.bin";
@@ -102,10 +98,10 @@ impl Shard {
         self.pickle.as_ref().is_none_or(|pickle| !pickle.strided.contains(tensor))
     }
 
-    /// Reads the pickle `name` in `dir`. Never fails: every problem becomes a fault.
-    pub(super) fn read_pickle(dir: &Path, name: &str, budget: &mut Budget) -> Self {
-        match open_regular(&dir.join(name), u64::MAX) {
-            Ok(opened) => read(name, &opened, budget),
+    /// Reads the pickle `name`. Never fails: every problem becomes a fault.
+    pub(super) fn read_pickle(source: &Source, name: &str, budget: &mut Budget) -> Self {
+        match source.open_regular(name, u64::MAX) {
+            Ok(file) => read(name, &file, budget),
             Err(error) => Self { pickle: Some(Box::default()), ..Self::unread(name, error.fault(name)) },
         }
     }
@@ -119,26 +115,21 @@ impl Shard {
     #[cfg(feature = "internals")]
     #[must_use]
     pub fn parse_pickle(name: &str, bytes: &[u8]) -> Self {
-        read_source(name, &bytes, &mut Budget::default())
+        read(name, &SourceFile::Memory(bytes.into()), &mut Budget::default())
     }
 }
 
 /// Reads an open file, for [`Shard::read_pickle`].
-fn read(name: &str, opened: &Opened, budget: &mut Budget) -> Shard {
-    read_source(name, opened, budget)
-}
-
-/// Reads a pickle from a file or from memory.
-fn read_source(name: &str, source: &dyn Source, budget: &mut Budget) -> Shard {
+fn read(name: &str, file: &SourceFile, budget: &mut Budget) -> Shard {
     let shard = Shard {
         name: name.to_owned(),
-        file_len: source.len(),
+        file_len: file.len(),
         unread: true,
         pickle: Some(Box::default()),
         ..Shard::default()
     };
     let mut reader = PickleReader { shard, pickle: Pickle::default(), faults: Faults::default(), budget };
-    if let Err(problem) = reader.read(source) {
+    if let Err(problem) = reader.read(file) {
         reader.problem(problem);
     }
     let PickleReader { mut shard, pickle, faults, .. } = reader;
@@ -171,25 +162,25 @@ struct PickleReader<'b> {
 }
 
 impl PickleReader<'_> {
-    fn read(&mut self, source: &dyn Source) -> Result<(), Problem> {
-        if source.is_empty() {
+    fn read(&mut self, file: &SourceFile) -> Result<(), Problem> {
+        if file.is_empty() {
             self.fault(FaultKind::EmptyFile);
             return Ok(());
         }
-        let head = source.bytes(0, source.len().min(4096))?;
+        let head = file.bytes(0, file.len().min(4096))?;
         if head.starts_with(b"PK\x03\x04") {
             self.pickle.format = PickleFormat::Zip;
-            return zip::read(self, source);
+            return zip::read(self, file);
         }
         if head.starts_with(&legacy::MAGIC) {
             self.pickle.format = PickleFormat::Legacy;
-            return legacy::read(self, source);
+            return legacy::read(self, file);
         }
         if head.len() < legacy::MAGIC.len() && legacy::MAGIC.starts_with(&head) {
             return Err(Problem::Cut("the first pickle".to_owned(), None));
         }
         // Pickles of protocol 0 are text, so any file may be one.
-        let is_whole = legacy::read_plain(self, source)?;
+        let is_whole = legacy::read_plain(self, file)?;
         if is_whole || matches!(head.get(..2), Some([0x80, 2..=5])) {
             return Err(Problem::Other("a pickle that torch.save did not write".to_owned()));
         }
@@ -250,11 +241,8 @@ pub(super) fn may_be_pickle(name: &str) -> bool {
 }
 
 /// Whether a file starts like one that `torch.save` writes.
-pub(super) fn starts_like_pickle(dir: &Path, name: &str) -> bool {
-    let head = open_regular(&dir.join(name), u64::MAX).ok().and_then(|opened| {
-        let source: &dyn Source = &opened;
-        source.bytes(0, source.len().min(16)).ok()
-    });
+pub(super) fn starts_like_pickle(source: &Source, name: &str) -> bool {
+    let head = source.open_regular(name, u64::MAX).ok().and_then(|file| file.bytes(0, file.len().min(16)).ok());
     head.is_some_and(|head| head.starts_with(b"PK\x03\x04") || matches!(head.get(..2), Some([0x80, 2..=5])))
 }
 

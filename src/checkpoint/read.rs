@@ -1,7 +1,6 @@
-//! Reads a directory into a [`Checkpoint`]: only its own files, never other paths that a file refers to.
+//! Reads a [`Source`] into a [`Checkpoint`]: only its own files, never other paths that a file refers to.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -12,14 +11,13 @@ use super::contents::{self, Progress, ReadOptions};
 use super::git;
 use super::is_plain_file_name;
 use super::lfs::MAX_POINTER;
-use super::list::list;
-use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP, read_own, real_target};
+use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP};
 use super::parallel;
 use super::pickle::{is_pickle_name, may_be_pickle, starts_like_pickle};
 use super::tokenizer::is_vocabulary;
 use super::{
     Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Nested, OpenError, Place, PythonModule,
-    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Vocabulary,
+    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Source, Vocabulary,
 };
 
 /// Suffixes of unfinished downloads.
@@ -77,7 +75,15 @@ impl Checkpoint {
     /// # Errors
     /// When the directory itself cannot be read. The content of its files cannot make this fail.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, OpenError> {
-        open(path.as_ref())
+        Self::read(Source::open(path.as_ref())?)
+    }
+
+    /// Reads a checkpoint from any source.
+    ///
+    /// # Errors
+    /// When its files cannot be listed. The content of them cannot make this fail.
+    pub fn read(source: Source) -> Result<Self, OpenError> {
+        read(source)
     }
 
     /// Expects Git LFS pointers where a git work tree above the checkpoint contains them on purpose, if `trusts` is true of
@@ -90,7 +96,7 @@ impl Checkpoint {
     /// error becomes a fault. `progress` is called by several threads, after each read.
     pub fn read_contents(&mut self, options: ReadOptions, progress: &(dyn Fn(Progress<'_>) + Sync)) {
         self.deep = true;
-        self.contents = contents::read(&self.root, &mut self.shards, options, progress).into();
+        self.contents = contents::read(&self.source, &mut self.shards, options, progress).into();
     }
 
     /// Hashes the files whose hash a download or git recorded, and adds a fault for each that differs. Never fails, as
@@ -103,34 +109,29 @@ impl Checkpoint {
     }
 }
 
-fn open(root: &Path) -> Result<Checkpoint, OpenError> {
-    let io = |source| OpenError::from_io(root, source);
-    if !fs::metadata(root).map_err(io)?.is_dir() {
-        return Err(OpenError::NotADirectory { path: root.to_owned() });
-    }
-    let mut reader = DirectoryReader {
-        checkpoint: Checkpoint { root: root.to_owned(), ..Checkpoint::default() },
+fn read(source: Source) -> Result<Checkpoint, OpenError> {
+    let (names, more) = names(&source)?;
+    let mut reader = SourceReader {
+        checkpoint: Checkpoint { source, ..Checkpoint::default() },
         vocabularies: BTreeMap::new(),
         vocabulary_faults: Vec::new(),
         budget: Budget::default(),
-        unread: Unread::default(),
+        unread: Unread { first: None, count: more },
         ahead: BTreeMap::new(),
     };
-    let (names, more) = names(root)?;
-    reader.unread.count = more;
     reader.read_ahead(&names);
     for name in names {
-        let entry = entry(root, &name, &mut reader.checkpoint.faults);
+        let entry = entry(&reader.checkpoint.source, &name, &mut reader.checkpoint.faults);
         reader.read_within_budget(&name, &entry);
         reader.check_entry(&name, &entry);
         reader.checkpoint.entries.insert(name, entry);
     }
     reader.report_unread();
     reader.read_folders();
-    let DirectoryReader { mut checkpoint, vocabularies, vocabulary_faults, mut budget, .. } = reader;
-    if fs::symlink_metadata(root.join(REPAIR_FOLDER).join(REPAIR_JOURNAL)).is_ok() {
-        let place = Place::file(format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}"));
-        checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(place));
+    let SourceReader { mut checkpoint, vocabularies, vocabulary_faults, mut budget, .. } = reader;
+    let journal = format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}");
+    if checkpoint.source.exists(&journal) {
+        checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(Place::file(journal)));
     }
     checkpoint.place_pickles();
     checkpoint.derive(vocabularies);
@@ -139,8 +140,8 @@ fn open(root: &Path) -> Result<Checkpoint, OpenError> {
     Ok(checkpoint)
 }
 
-/// State of reading a directory.
-struct DirectoryReader {
+/// State of reading a checkpoint.
+struct SourceReader {
     checkpoint: Checkpoint,
     vocabularies: BTreeMap<String, Arc<Vocabulary>>,
     vocabulary_faults: Vec<Fault>,
@@ -167,7 +168,7 @@ struct Unread {
     count: u64,
 }
 
-impl DirectoryReader {
+impl SourceReader {
     /// Reads the content of this file if a loader would, and if enough of the budget is left.
     fn read_within_budget(&mut self, name: &str, entry: &Entry) {
         let is_module = has_ending(name, "py");
@@ -191,7 +192,7 @@ impl DirectoryReader {
         if !is_left && is_shard && may_be_pickle(name) {
             self.checkpoint.pickles.insert(name.to_owned(), Shard::unopened_pickle(name));
         } else if !is_left && is_shard {
-            self.checkpoint.shards.insert(name.to_owned(), Shard::counted(&self.checkpoint.root, name));
+            self.checkpoint.shards.insert(name.to_owned(), Shard::counted(&self.checkpoint.source, name));
         } else if !is_left && is_module {
             let module = PythonModule { name: name.to_owned(), unread: true, ..PythonModule::default() };
             self.checkpoint.modules.insert(name.to_owned(), module);
@@ -208,14 +209,14 @@ impl DirectoryReader {
         if shards.len() < MANY_SHARDS {
             return;
         }
-        let (root, budget) = (&self.checkpoint.root, &self.budget);
+        let (source, budget) = (&self.checkpoint.source, &self.budget);
         let read = parallel::map(
             parallel::threads(),
             &shards,
             || (),
             |(), name| {
                 let (share, mut rest) = (budget.share(shards.len()), budget.share(shards.len()));
-                let shard = Shard::read_within(root, name, &mut rest);
+                let shard = Shard::read_within(source, name, &mut rest);
                 ((*name).clone(), ReadAhead { shard, share, rest })
             },
         );
@@ -226,7 +227,7 @@ impl DirectoryReader {
     fn read_shard(&mut self, name: &str) -> Shard {
         match self.ahead.remove(name) {
             Some(ahead) if self.budget.spend_share(&ahead.share, &ahead.rest) => ahead.shard,
-            _ => Shard::read_within(&self.checkpoint.root, name, &mut self.budget),
+            _ => Shard::read_within(&self.checkpoint.source, name, &mut self.budget),
         }
     }
 
@@ -250,7 +251,7 @@ impl DirectoryReader {
         let is_real = |entry: &Entry| entry.kind == EntryKind::Directory && entry.link.is_none();
         let folders = checkpoint.entries.iter().filter(|(_, entry)| is_real(entry)).map(|(name, _)| name.clone());
         let has_parts = ["model_index.json", "modules.json"].iter().any(|name| checkpoint.has_file(name));
-        checkpoint.nested = Nested::read(&checkpoint.root, folders.collect(), has_parts, budget);
+        checkpoint.nested = Nested::read(&checkpoint.source, folders.collect(), has_parts, budget);
     }
 
     /// Adds the fault of a checkpoint that is larger than the budget.
@@ -265,31 +266,31 @@ impl DirectoryReader {
 
     /// Reads the content of this file, if a loader would.
     fn read_content(&mut self, name: &str, entry: &Entry) {
-        let root = &self.checkpoint.root.clone();
+        let source = &self.checkpoint.source.clone();
         let is_shard = name.ends_with(".safetensors");
         if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
             // A folder is a checkpoint of its own, or unrelated.
         } else if is_shard {
-            let shard = own_shard(root, name, self.read_shard(name));
+            let shard = own_shard(source, name, self.read_shard(name));
             self.checkpoint.shards.insert(name.to_owned(), shard);
         } else if self.is_pickle(name, entry) {
-            let pickle = own_shard(root, name, Shard::read_pickle(root, name, &mut self.budget));
+            let pickle = own_shard(source, name, Shard::read_pickle(source, name, &mut self.budget));
             self.checkpoint.pickles.insert(name.to_owned(), pickle);
         } else if is_document(name) {
             let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
-            let document = match read_own(root, name, cap) {
+            let document = match source.read_own(name, cap) {
                 Ok(bytes) => Document::parse(name, &bytes),
                 Err(error) => Document::unread(name, error.fault(name)),
             };
             self.checkpoint.documents.insert(name.to_owned(), document);
         } else if has_ending(name, "py") {
-            let module = match read_own(root, name, MODULE_CAP) {
+            let module = match source.read_own(name, MODULE_CAP) {
                 Ok(bytes) => PythonModule::parse(name, &bytes),
                 Err(error) => PythonModule::unread(name, error.fault(name)),
             };
             self.checkpoint.modules.insert(name.to_owned(), module);
         } else if TEXTS.contains(&name) && entry.lfs.is_none() {
-            match read_own(root, name, MODULE_CAP) {
+            match source.read_own(name, MODULE_CAP) {
                 Ok(bytes) => {
                     self.checkpoint.texts.insert(name.to_owned(), String::from_utf8_lossy(&bytes).into());
                 }
@@ -297,17 +298,17 @@ impl DirectoryReader {
             }
         } else if name == CARD && entry.lfs.is_none() {
             // Nothing loads it, so that it cannot be read is no fault.
-            let bytes = read_own(root, name, CARD_CAP).ok();
+            let bytes = source.read_own(name, CARD_CAP).ok();
             self.checkpoint.card = bytes.map(|bytes| ModelCard::parse(&String::from_utf8_lossy(&bytes)));
         } else if VOCABULARIES.contains(&name) {
-            match vocabulary(root, name) {
+            match vocabulary(source, name) {
                 Ok(vocabulary) => drop(self.vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
                 Err(fault) => self.vocabulary_faults.push(*fault),
             }
         } else if entry.kind == EntryKind::Broken
-            && let Err(error) = fs::metadata(root.join(name))
+            && let Err(error) = source.stat(name)
         {
-            self.checkpoint.faults.push(OpenError::from_io(&root.join(name), error).fault(name));
+            self.checkpoint.faults.push(error.fault(name));
         }
     }
 
@@ -317,7 +318,7 @@ impl DirectoryReader {
         is_file
             && may_be_pickle(name)
             && (is_pickle_name(name)
-                || entry.kind == EntryKind::Regular && starts_like_pickle(&self.checkpoint.root, name))
+                || entry.kind == EntryKind::Regular && starts_like_pickle(&self.checkpoint.source, name))
     }
 
     /// Adds the faults that show without reading the content.
@@ -338,11 +339,11 @@ const MAX_NAMES: usize = 100_000;
 
 /// The first [`MAX_NAMES`] names of the entries, sorted, and the number of the others. Hidden entries belong to other tools.
 /// Names that are not plain UTF-8 are skipped: no loader opens them.
-fn names(root: &Path) -> Result<(BTreeSet<String>, u64), OpenError> {
-    let io = |source| OpenError::from_io(root, source);
+fn names(source: &Source) -> Result<(BTreeSet<String>, u64), OpenError> {
+    let io = |error| OpenError::from_io(source.path(), error);
     let mut names = BTreeSet::new();
     let mut more = 0_u64;
-    for entry in list(root).map_err(io)? {
+    for entry in source.list("").map_err(io)? {
         if let Ok(name) = entry.map_err(io)?.name.into_string()
             && !name.starts_with('.')
             && is_plain_file_name(&name)
@@ -358,33 +359,29 @@ fn names(root: &Path) -> Result<(BTreeSet<String>, u64), OpenError> {
 }
 
 /// Reads one directory entry, and adds the faults that no reader of its content would report.
-fn entry(root: &Path, name: &str, faults: &mut Vec<Fault>) -> Entry {
-    let path = root.join(name);
-    let link = fs::read_link(&path).ok();
-    let Ok(metadata) = fs::metadata(&path) else {
-        let link = link.map(|l| l.to_string_lossy().into_owned());
+fn entry(source: &Source, name: &str, faults: &mut Vec<Fault>) -> Entry {
+    let link = source.link(name);
+    let Ok((kind, size)) = source.stat(name) else {
         return Entry { kind: EntryKind::Broken, link, ..Entry::default() };
     };
     if !is_content(name)
-        && let Err(OpenError::Outside { target, .. }) = real_target(root, &path)
+        && let Err(OpenError::Outside { target, .. }) = source.check_link(name)
     {
         let fault = Fault::new(FaultKind::SymlinkOutside).at(Place::file(name));
         faults.push(fault.with("target", target.to_string_lossy().into_owned()));
     }
-    let kind = EntryKind::from_metadata(&metadata);
-    let size = if kind == EntryKind::Regular { metadata.len() } else { 0 };
     let small = u64::try_from(MAX_POINTER).is_ok_and(|cap| size <= cap);
     let lfs = if kind == EntryKind::Regular && size > 0 && small {
-        read_own(root, name, size).ok().and_then(|bytes| LfsPointer::parse(&bytes))
+        source.read_own(name, size).ok().and_then(|bytes| LfsPointer::parse(&bytes))
     } else {
         None
     };
-    Entry { kind, size, link: link.map(|l| l.to_string_lossy().into_owned()), lfs }
+    Entry { kind, size, link, lfs }
 }
 
 /// A shard as it was read, unless it is a link out of the directory to a file of another format: its faults would quote it.
-fn own_shard(root: &Path, name: &str, shard: Shard) -> Shard {
-    match real_target(root, &root.join(name)) {
+fn own_shard(source: &Source, name: &str, shard: Shard) -> Shard {
+    match source.check_link(name) {
         Err(error @ OpenError::Outside { .. }) if shard.tensors.is_empty() && !shard.is_sound() => {
             Shard { pickle: shard.pickle.map(|_| Box::default()), ..Shard::unread(name, error.fault(name)) }
         }
@@ -392,8 +389,8 @@ fn own_shard(root: &Path, name: &str, shard: Shard) -> Shard {
     }
 }
 
-fn vocabulary(root: &Path, name: &str) -> Result<Vocabulary, Box<Fault>> {
-    let bytes = read_own(root, name, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
+fn vocabulary(source: &Source, name: &str) -> Result<Vocabulary, Box<Fault>> {
+    let bytes = source.read_own(name, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
     let fault = |kind| Fault::new(kind).at(Place::file(name));
     if let Some(pointer) = LfsPointer::parse(&bytes) {
         return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());

@@ -56,6 +56,6 @@ fn alone(path: &Path) -> Option<Checkpoint> {
     if ["config.json", "model.safetensors.index.json"].iter().any(|beside| parent.join(beside).exists()) {
         return None;
     }
-    let shards = vec![Shard::read(parent, name)];
+    let shards = vec![Shard::read(&parent.into(), name)];
     Some(Checkpoint::planned(parent, Parts { shards, ..Parts::default() }))
 }

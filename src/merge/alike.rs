@@ -39,7 +39,7 @@ pub(super) fn check(context: &Context<'_>) -> Result<Option<String>, MergeError>
 }
 
 fn refusal(context: &Context<'_>, spec: &AlikeSpec, place: PartOf<'_>, new: PartOf<'_>, why: &str) -> MergeError {
-    let role = |role: &str| context.donor(role).map(|donor| donor.checkpoint.root.display().to_string());
+    let role = |role: &str| context.donor(role).map(|donor| donor.checkpoint.source.path().display().to_string());
     let command = |exchange: &Exchange| {
         let donors = exchange.roles.iter().filter_map(|(option, of)| Some(format!(" --donor {option}={}", role(of)?)));
         format!(
@@ -51,9 +51,9 @@ fn refusal(context: &Context<'_>, spec: &AlikeSpec, place: PartOf<'_>, new: Part
     let exchange = spec.otherwise.iter().find(|exchange| exchange.part == place.name).map(command);
     MergeError::Donor(format!(
         "{} cannot take the place of the {} part of {}: {why}; {} keeps the class and the tokenizer of the model{}",
-        new.donor().checkpoint.root.display(),
+        new.donor().checkpoint.source.path().display(),
         place.name,
-        place.donor().checkpoint.root.display(),
+        place.donor().checkpoint.source.path().display(),
         context.recipe.recipe,
         exchange.unwrap_or_default()
     ))

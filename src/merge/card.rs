@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use super::context::Donor;
 use super::manifest::DonorDigests;
 use super::{CARD, hub::HubOrigin};
-use crate::checkpoint::open::read_own;
 use crate::knowledge::recipe::Recipe;
 use crate::report::card::{Card, CardDonor, Licence};
 use crate::surgery::plan::Plan;
@@ -34,7 +33,7 @@ pub(super) fn card(recipe: &Recipe, donors: &[Donor], digests: &BTreeMap<String,
 
 /// The licence that the donor's own card states; `None` without a card, or when its front matter has none.
 fn licence(donor: &Donor) -> Option<Licence> {
-    let bytes = read_own(&donor.checkpoint.root, &CARD, CAP).ok()?;
+    let bytes = donor.checkpoint.source.read_own(&CARD, CAP).ok()?;
     let fields = front_matter(&String::from_utf8_lossy(&bytes));
     let field = |key: &str| fields.get(key).cloned();
     Some(Licence { id: field("license")?, name: field("license_name"), link: field("license_link") })

@@ -7,8 +7,7 @@ use super::error::PipelineError;
 use super::parts::DonorParts;
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
-use crate::checkpoint::Checkpoint;
-use crate::checkpoint::open::{OpenError, real_target};
+use crate::checkpoint::{Checkpoint, OpenError};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::Role;
@@ -29,7 +28,7 @@ pub(super) fn open(
         snapshots.push(seen?);
         for name in checkpoint.shards.keys() {
             // Other errors of a link are findings.
-            if let Err(error @ OpenError::Outside { .. }) = real_target(dir, &dir.join(name)) {
+            if let Err(error @ OpenError::Outside { .. }) = checkpoint.source.check_link(name) {
                 return Err(PipelineError::Donor { role: role.clone(), error });
             }
         }

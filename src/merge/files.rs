@@ -12,7 +12,7 @@ use super::draft::MergeDraft;
 use super::error::MergeError;
 use super::{CARD, REPORT, manifest, switches};
 use crate::check::modules::{entries, relative_modules};
-use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
+use crate::checkpoint::open::TOKENIZER_CAP;
 use crate::checkpoint::{Document, FileName, FilePattern, INDEX_NAME};
 use crate::knowledge::recipe::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
 use crate::report::model::MergedFile;
@@ -143,8 +143,8 @@ fn copy_of(
     if !donor.checkpoint.has_file(name) {
         return Ok(None);
     }
-    let bytes = read_own(&donor.checkpoint.root, name, TOKENIZER_CAP)
-        .map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
+    let read = donor.checkpoint.source.read_own(name, TOKENIZER_CAP);
+    let bytes = read.map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
     let mut stripped = None;
     if name.to_ascii_lowercase().ends_with(".json") && &**name != "vocab.json" {
         let read = donor.checkpoint.documents.get(&**name);

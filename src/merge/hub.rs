@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::checkpoint::Checkpoint;
-use crate::checkpoint::open::read_own;
 
 /// The origin of a donor on the Hugging Face Hub.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -32,8 +31,8 @@ impl HubOrigin {
     /// Reads the origin of a donor.
     pub(super) fn find(checkpoint: &Checkpoint) -> Self {
         let name = checkpoint.config().and_then(|config| config.get("_name_or_path")).and_then(Value::as_str);
-        let root = fs::canonicalize(&checkpoint.root).unwrap_or_default();
-        let (id, revision) = cached(&root).unzip();
+        let root = checkpoint.source.directory().and_then(|dir| fs::canonicalize(dir).ok());
+        let (id, revision) = root.and_then(|root| cached(&root)).unzip();
         Self {
             id,
             revision: revision.or_else(|| downloaded(checkpoint)),
@@ -70,17 +69,16 @@ fn cached(root: &Path) -> Option<(String, String)> {
 /// The first line of `.cache/huggingface/download/FILE.metadata` is the commit. Source: `write_download_metadata` of
 /// `huggingface_hub` 0.26.
 fn downloaded(checkpoint: &Checkpoint) -> Option<String> {
-    let mut folder = checkpoint.root.clone();
-    for step in [".cache", "huggingface", "download"] {
-        folder.push(step);
-        // A link could lead anywhere.
-        if !fs::symlink_metadata(&folder).is_ok_and(|metadata| metadata.is_dir()) {
-            return None;
-        }
+    let around = [".cache", ".cache/huggingface"];
+    let folder = ".cache/huggingface/download";
+    // A link could lead anywhere.
+    if !around.iter().chain([&folder]).all(|folder| checkpoint.source.has_folder(folder)) {
+        return None;
     }
+    let folder = checkpoint.source.join(Path::new(folder))?;
     let names = checkpoint.documents.keys().chain(checkpoint.shards.keys());
     let commits: BTreeSet<String> = names
-        .filter_map(|name| read_own(&folder, &format!("{name}.metadata"), 4096).ok())
+        .filter_map(|name| folder.read_own(&format!("{name}.metadata"), 4096).ok())
         .filter_map(|bytes| Some(std::str::from_utf8(&bytes).ok()?.lines().next()?.trim().to_owned()))
         .collect();
     let mut commits = commits.into_iter();

@@ -198,7 +198,7 @@ pub(super) fn donor_digests(
     if all_bytes {
         let shards = |donor: &Donor| {
             let names = donor.checkpoint.shards.keys().cloned();
-            names.map(|name| (donor.role.clone(), donor.checkpoint.root.join(&name), name)).collect::<Vec<_>>()
+            names.map(|name| (donor.role.clone(), donor.checkpoint.source.path().join(&name), name)).collect::<Vec<_>>()
         };
         let shards: Vec<_> = donors.iter().flat_map(shards).collect();
         let hashes = parallel::map(parallel::threads(), &shards, || (), |(), (_, path, _)| sha256(path));
@@ -272,7 +272,7 @@ fn small_files(checkpoint: &Checkpoint, plan: &Plan) -> Result<BTreeMap<String, 
     let names: BTreeSet<&str> = documents.chain(modules).chain(others).collect();
     let mut files = BTreeMap::new();
     for name in names.into_iter().filter(|name| checkpoint.has_file(name)) {
-        if let Some((bytes, sha256)) = digest_own(&checkpoint.root, name)? {
+        if let Some((bytes, sha256)) = digest_own(&checkpoint.source, name)? {
             files.insert(name.to_owned(), FileDigest { bytes, sha256 });
         }
     }

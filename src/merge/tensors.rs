@@ -455,7 +455,7 @@ fn source(
     values: Option<Result<NewValues, String>>,
 ) -> Result<TensorSource, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
-    let from = TensorRef::new(&donor.role, &donor.checkpoint.root, shard, tensor, rule.slice)?;
+    let from = TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, rule.slice)?;
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);
     let changes = scale.is_some() || taken.dtype() != tensor.dtype;

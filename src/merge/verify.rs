@@ -10,9 +10,8 @@ use super::manifest;
 use super::named::Bounds;
 use super::run::count;
 use crate::checkpoint::contents::digests::{HashJob, hash};
-use crate::checkpoint::open::{OpenError, open_own};
 use crate::checkpoint::platform::shown;
-use crate::checkpoint::{Checkpoint, Dtype, EntryKind, HashAlgorithm, Shard, Tensor, parallel};
+use crate::checkpoint::{Checkpoint, Dtype, EntryKind, HashAlgorithm, OpenError, Shard, Source, Tensor, parallel};
 use crate::knowledge::source::hint;
 use crate::report::verification::{DifferenceKind, Verification, VerifiedPart};
 use crate::surgery::ApplyError;
@@ -109,8 +108,8 @@ impl<'v> Run<'v> {
     fn files(&mut self) -> Result<VerifiedPart, VerifyError> {
         let mut part = VerifiedPart::new("files");
         let (result, recorded) = (self.result, self.recorded);
-        self.compare_files(&result.root, &recorded.files, &mut part)?;
-        let own = |name: &str| open_own(&result.root, name, u64::MAX).map(drop);
+        self.compare_files(&result.source, &recorded.files, &mut part)?;
+        let own = |name: &str| result.source.open_own(name, u64::MAX).map(drop);
         compare_headers(result, &recorded.shards, own, &mut part);
         for (name, entry) in &result.entries {
             let is_recorded = recorded.files.contains_key(name) || recorded.shards.contains_key(name);
@@ -126,12 +125,12 @@ impl<'v> Run<'v> {
     /// Files of one checkpoint against their digests.
     fn compare_files(
         &mut self,
-        root: &Path,
+        source: &Source,
         files: &BTreeMap<String, RecordedFile>,
         part: &mut VerifiedPart,
     ) -> Result<(), VerifyError> {
         let jobs: Vec<HashJob<'_>> =
-            files.keys().map(|name| HashJob { root, name, range: None, algorithm: HashAlgorithm::Sha256 }).collect();
+            files.keys().map(|name| HashJob { source, name, range: None, algorithm: HashAlgorithm::Sha256 }).collect();
         for ((name, recorded), found) in files.iter().zip(hash(&jobs)) {
             let found = match found {
                 Ok(found) => found,
@@ -217,7 +216,7 @@ impl<'v> Run<'v> {
                     end = tensor.end;
                     keys.push(key);
                     let range = Some((shard.data_start.saturating_add(tensor.begin), tensor.len()));
-                    jobs.push(HashJob { root: &self.result.root, name: key.0, range, algorithm });
+                    jobs.push(HashJob { source: &self.result.source, name: key.0, range, algorithm });
                 }
             }
         }
@@ -237,7 +236,7 @@ impl<'v> Run<'v> {
     fn donor_files(&mut self, role: &str, donor: &Checkpoint) -> Result<VerifiedPart, VerifyError> {
         let mut part = VerifiedPart::new(&format!("files of donor {role}"));
         let Some(recorded) = self.recorded.donors.get(role) else { return Ok(part) };
-        self.compare_files(&donor.root, &recorded.files, &mut part)?;
+        self.compare_files(&donor.source, &recorded.files, &mut part)?;
         let (hashed, others): (BTreeMap<_, _>, BTreeMap<_, _>) =
             recorded.shards.clone().into_iter().partition(|(name, shard)| {
                 shard.sha256.is_some() && donor.shards.get(name).is_some_and(|found| has_header(found, shard))
@@ -246,7 +245,7 @@ impl<'v> Run<'v> {
         let whole = hashed
             .into_iter()
             .filter_map(|(name, shard)| Some((name, RecordedFile { bytes: Some(shard.bytes), sha256: shard.sha256? })));
-        self.compare_files(&donor.root, &whole.collect(), &mut part)?;
+        self.compare_files(&donor.source, &whole.collect(), &mut part)?;
         Ok(part)
     }
 
@@ -264,10 +263,11 @@ impl<'v> Run<'v> {
             };
             let from = there.get(tensor.source.name.as_str());
             let named = self.bounds.as_ref().is_none_or(|bounds| bounds.name(role, &tensor.source.name));
-            let planned = from.and_then(|(shard, from)| planned(tensor, named, found, role, &donor.root, shard, from));
+            let planned =
+                from.and_then(|(shard, from)| planned(tensor, named, found, role, donor.source.path(), shard, from));
             let planned = planned.filter(|planned| shard.is_whole() && planned.is_possible());
             let at = shard.data_start.saturating_add(found.begin);
-            work.push((tensor, planned, self.result.root.join(&shard.name), at));
+            work.push((tensor, planned, self.result.source.path().join(&shard.name), at));
         }
         let hash = self.recorded.hash();
         let compared = parallel::map(

@@ -11,9 +11,9 @@ use sha2::{Digest, Sha256};
 use super::error::{ApplyError, io_at};
 use super::retry::retry;
 use super::stop::interrupted;
-use crate::checkpoint::hex;
 use crate::checkpoint::list::list;
-use crate::checkpoint::open::{Identity, OpenError, Opened, TOKENIZER_CAP, open_regular, read_own};
+use crate::checkpoint::open::{Identity, OpenError, Opened, TOKENIZER_CAP, open_regular};
+use crate::checkpoint::{Source, hex};
 
 /// The identities of a directory's files at the start of a run.
 ///
@@ -99,14 +99,14 @@ impl DonorFile {
     }
 }
 
-/// Size and SHA-256 of a small file of the donor in `root`; `None` when a merge would not read it: it is missing, not a
+/// Size and SHA-256 of a small file of the donor with these files; `None` when a merge would not read it: it is missing, not a
 /// regular file, larger than a vocabulary, or a link out of the donor.
 ///
 /// # Errors
 /// [`ApplyError::Io`] when reading fails, and [`ApplyError::Interrupted`].
-pub fn digest_own(root: &Path, name: &str) -> Result<Option<(u64, String)>, ApplyError> {
+pub fn digest_own(files: &Source, name: &str) -> Result<Option<(u64, String)>, ApplyError> {
     interrupted()?;
-    match read_own(root, name, TOKENIZER_CAP) {
+    match files.read_own(name, TOKENIZER_CAP) {
         Ok(bytes) => Ok(Some((bytes.len() as u64, hex(&Sha256::digest(&bytes))))),
         Err(OpenError::Io { path, source }) => Err(io_at(&path, "reading")(source)),
         Err(_) => Ok(None),

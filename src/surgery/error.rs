@@ -187,6 +187,12 @@ pub enum RepairError {
         /// The file.
         path: PathBuf,
     },
+    /// The checkpoint is in memory.
+    #[error("{path} is in memory, and repairs are written into a directory; write its files into one first", path = path.display())]
+    InMemory {
+        /// The path that its files were given.
+        path: PathBuf,
+    },
     /// The checkpoint has no repair to undo.
     #[error("{path} has no repair to undo", path = path.display())]
     NothingToUndo {

@@ -8,10 +8,12 @@ mod objection;
 mod planner;
 mod unused;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use serde::Serialize;
 
+use super::error::RepairError;
 use super::plan::PlannedShard;
 use crate::check::{Edit, Outcome, Safety};
 use crate::checkpoint::Checkpoint;
@@ -96,4 +98,15 @@ pub struct Repair {
     pub withdrawn: Vec<Withdrawn>,
     /// The files that change, by name.
     pub changes: Vec<Change>,
+}
+
+impl Repair {
+    /// The directory that the writers change or link.
+    ///
+    /// # Errors
+    /// [`RepairError::InMemory`].
+    pub(super) fn directory(&self) -> Result<&Path, RepairError> {
+        let source = &self.original.source;
+        source.directory().ok_or_else(|| RepairError::InMemory { path: source.path().to_owned() })
+    }
 }

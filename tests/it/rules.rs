@@ -2,6 +2,7 @@
 //! rules.
 
 pub mod failure_modes;
+mod memory;
 mod peft;
 mod seeded;
 

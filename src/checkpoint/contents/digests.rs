@@ -1,18 +1,15 @@
 //! Digests of files and of ranges in them, on several threads.
 
-use std::path::Path;
-
 use super::pieces::{Hash, each_piece, holes};
 use super::{CHUNK, HASHED_ZEROS};
 use crate::checkpoint::digest::Hasher;
-use crate::checkpoint::open::{OpenError, open_own};
-use crate::checkpoint::{HashAlgorithm, parallel};
+use crate::checkpoint::{HashAlgorithm, OpenError, Source, parallel};
 
 /// A file of a checkpoint, or a range of it, to be hashed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HashJob<'h> {
-    /// Directory of the checkpoint.
-    pub(crate) root: &'h Path,
+    /// Where the files of the checkpoint are.
+    pub(crate) source: &'h Source,
     /// File name.
     pub(crate) name: &'h str,
     /// First byte and number of bytes; the whole file if `None`.
@@ -35,7 +32,7 @@ pub(crate) struct Hashed {
 /// threads.
 ///
 /// # Errors
-/// For each job as [`open_own`], and when reading fails.
+/// For each job as [`Source::open_own`], and when reading fails.
 pub(crate) fn hash(jobs: &[HashJob<'_>]) -> Vec<Result<Hashed, OpenError>> {
     // The zeros of holes are shared out in the order of the jobs, so that the threads do not compete for them.
     let mut left = HASHED_ZEROS;
@@ -57,17 +54,17 @@ impl HashJob<'_> {
 
     /// Number of its bytes in holes; 0 for a file that cannot be opened.
     fn zeros(self) -> u64 {
-        let Ok(opened) = open_own(self.root, self.name, u64::MAX) else { return 0 };
-        self.range(opened.identity.size).map_or(0, |(start, len)| holes(&opened, start, len))
+        let Ok(opened) = self.source.open_own(self.name, u64::MAX) else { return 0 };
+        self.range(opened.len()).map_or(0, |(start, len)| holes(&opened, start, len))
     }
 
     fn run(self, buffer: &mut [u8], mut zeros: u64) -> Result<Hashed, OpenError> {
-        let opened = open_own(self.root, self.name, u64::MAX)?;
-        let file_len = opened.identity.size;
+        let opened = self.source.open_own(self.name, u64::MAX)?;
+        let file_len = opened.len();
         let Some((start, len)) = self.range(file_len) else { return Ok(Hashed { file_len, digest: None }) };
         let mut hash = Hash::of(Hasher::new(self.algorithm));
         each_piece(&opened, start, len, buffer, |piece| hash.add(&piece, &mut zeros))
-            .map_err(|source| OpenError::from_io(&self.root.join(self.name), source))?;
+            .map_err(|source| OpenError::from_io(&self.source.path().join(self.name), source))?;
         Ok(Hashed { file_len, digest: hash.finish() })
     }
 }

@@ -3,11 +3,10 @@
 //! Source: <https://git-scm.com/docs/index-format>. Git is not run.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use sha1::{Digest as _, Sha1};
 
-use crate::checkpoint::open::read_own;
+use crate::checkpoint::Source;
 
 /// Maximum number of bytes read of an index: some hundred thousand files.
 const CAP: u64 = 32 << 20;
@@ -24,11 +23,11 @@ pub(super) struct IndexEntry {
 pub(super) struct GitIndex(BTreeMap<String, IndexEntry>);
 
 impl GitIndex {
-    /// Reads the index of the work tree whose top is `root`. `None` when there is none, as below the top and in a linked work
+    /// Reads the index of the work tree whose top is the checkpoint. `None` when there is none, as below the top and in a linked work
     /// tree, and when it has a format that is not known, as that of repositories with SHA-256.
-    pub(super) fn read(root: &Path) -> Option<Self> {
-        let is_dir = root.join(".git").symlink_metadata().is_ok_and(|metadata| metadata.is_dir());
-        Self::parse(&read_own(root, ".git/index", CAP).ok().filter(|_| is_dir)?)
+    pub(super) fn read(files: &Source) -> Option<Self> {
+        let is_dir = files.has_folder(".git");
+        Self::parse(&files.read_own(".git/index", CAP).ok().filter(|_| is_dir)?)
     }
 
     pub(super) fn get(&self, name: &str) -> Option<&IndexEntry> {
@@ -149,7 +148,7 @@ mod tests {
             if version == "3" {
                 git(&["add", "--intent-to-add", "."]).unwrap();
             }
-            let index = GitIndex::read(dir.path()).expect("an index");
+            let index = GitIndex::read(&dir.path().into()).expect("an index");
             assert_eq!(index.0.keys().map(String::as_str).collect::<Vec<_>>(), names, "version {version}");
             for name in names {
                 let id = git(&["hash-object", name]).unwrap();

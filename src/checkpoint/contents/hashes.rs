@@ -4,8 +4,6 @@
 //! file of a `local_dir`, and the index of a git work tree. Of the last, only weights are compared: git may convert the
 //! line ends of text. Files are hashed by all cores, each by one thread.
 
-use std::path::Path;
-
 use sha1::Sha1;
 use sha2::{Digest as _, Sha256};
 
@@ -14,11 +12,12 @@ use super::pieces::{Hash, each_piece};
 use super::read::Progress;
 use super::tally::as_u64;
 use super::{CHUNK, HASHED_ZEROS};
-use crate::checkpoint::open::{OpenError, Opened, open_own, read_own};
-use crate::checkpoint::{Checkpoint, Entry, EntryKind, Fault, FaultKind, Place, hex, parallel};
+use crate::checkpoint::{
+    Checkpoint, Entry, EntryKind, Fault, FaultKind, OpenError, Place, Source, SourceFile, hex, parallel,
+};
 
-/// Where huggingface_hub keeps what it knows of the files of a `local_dir`. Source: `_local_folder.py` in huggingface_hub 1.0.
-const RECORDS: [&str; 3] = [".cache", "huggingface", "download"];
+/// The folder in which huggingface_hub keeps what it knows of the files of a `local_dir`, after those around it. Source: `_local_folder.py` in huggingface_hub 1.0.
+const RECORDS: [&str; 3] = [".cache", ".cache/huggingface", ".cache/huggingface/download"];
 /// Maximum number of bytes of such a record: three short lines.
 const RECORD_CAP: u64 = 4096;
 /// Largest weights that are compared with git as a file of their own. Larger ones are in Git LFS, where git has a pointer.
@@ -56,14 +55,14 @@ enum Since {
 /// Hashes the files of a checkpoint of which a record states the hash, and returns a fault for each that differs or cannot
 /// be read. Called for `check --hash`; `progress` is called by every thread, after each read.
 pub(in crate::checkpoint) fn check(checkpoint: &Checkpoint, progress: &(dyn Fn(Progress<'_>) + Sync)) -> Vec<Fault> {
-    let root = &checkpoint.root;
-    let records = Records::new(root);
+    let files = &checkpoint.source;
+    let records = Records::new(files);
     let regular = checkpoint.entries.iter().filter(|(_, entry)| entry.kind == EntryKind::Regular);
     let mut stated: Vec<Stated<'_>> = regular
         .filter(|(_, entry)| entry.lfs.is_none())
         .filter_map(|(name, entry)| {
             let is_weights = checkpoint.shards.contains_key(name) || checkpoint.pickles.contains_key(name);
-            records.of(root, name, entry, is_weights)
+            records.of(files, name, entry, is_weights)
         })
         .collect();
     // The largest first, so that no thread starts one when the others have nothing left.
@@ -76,7 +75,7 @@ pub(in crate::checkpoint) fn check(checkpoint: &Checkpoint, progress: &(dyn Fn(P
         || vec![0_u8; CHUNK],
         |buffer, file| {
             let read = |bytes| progress(Progress { file: file.name, bytes, total });
-            compare(root, file, buffer, zeros, &read)
+            compare(files, file, buffer, zeros, &read)
         },
     );
     let mut faults: Vec<Fault> = compared.into_iter().flatten().collect();
@@ -92,24 +91,20 @@ struct Records {
 }
 
 impl Records {
-    fn new(root: &Path) -> Self {
+    fn new(files: &Source) -> Self {
         // A link could lead to the records of other files.
-        let mut dir = root.to_owned();
-        let has_downloads = RECORDS.iter().all(|part| {
-            dir.push(part);
-            dir.symlink_metadata().is_ok_and(|metadata| metadata.is_dir())
-        });
-        Self { has_downloads, git: GitIndex::read(root) }
+        let has_downloads = RECORDS.iter().all(|folder| files.has_folder(folder));
+        Self { has_downloads, git: GitIndex::read(files) }
     }
 
     /// What states the hash of this file, if anything does.
-    fn of<'c>(&self, root: &Path, name: &'c str, entry: &Entry, is_weights: bool) -> Option<Stated<'c>> {
+    fn of<'c>(&self, files: &Source, name: &'c str, entry: &Entry, is_weights: bool) -> Option<Stated<'c>> {
         let size = entry.size;
         let stated = |record, source, since| Stated { name, size, record, source, since };
         if let Some(record) = blob(entry) {
             return Some(stated(record, "its name in the cache is", None));
         }
-        if let Some((record, since)) = self.has_downloads.then(|| download(root, name)).flatten() {
+        if let Some((record, since)) = self.has_downloads.then(|| download(files, name)).flatten() {
             return Some(stated(record, "its download is recorded with", Some(Since::At(since))));
         }
         let IndexEntry { id, mtime: (seconds, nanoseconds) } = self.git.as_ref()?.get(name).filter(|_| is_weights)?;
@@ -138,9 +133,10 @@ fn record(hash: &str) -> Option<Record> {
 
 /// What huggingface_hub recorded when it wrote this file: the hash, and the time in seconds since 1970. The lines of a record
 /// are the commit, the hash and the time.
-fn download(root: &Path, name: &str) -> Option<(Record, f64)> {
-    let path = format!("{}/{name}.metadata", RECORDS.join("/"));
-    let text = String::from_utf8(read_own(root, &path, RECORD_CAP).ok()?).ok()?;
+fn download(files: &Source, name: &str) -> Option<(Record, f64)> {
+    let [.., folder] = RECORDS;
+    let path = format!("{folder}/{name}.metadata");
+    let text = String::from_utf8(files.read_own(&path, RECORD_CAP).ok()?).ok()?;
     let mut lines = text.lines().map(str::trim).skip(1);
     let record = record(lines.next()?)?;
     let time: f64 = lines.next()?.parse().ok()?;
@@ -148,16 +144,16 @@ fn download(root: &Path, name: &str) -> Option<(Record, f64)> {
 }
 
 /// The fault of a file that differs from its record, or that cannot be read.
-fn compare(root: &Path, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, read: &dyn Fn(u64)) -> Option<Fault> {
+fn compare(files: &Source, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, read: &dyn Fn(u64)) -> Option<Fault> {
     let fault = |kind| Fault::new(kind).at(Place::file(file.name));
     let unread = |reason: &str| Some(fault(FaultKind::ContentsUnread).with("reason", reason));
-    let opened = match open_own(root, file.name, u64::MAX) {
+    let opened = match files.open_own(file.name, u64::MAX) {
         Ok(opened) => opened,
         // What a link outside the checkpoint leads to is no part of it.
         Err(OpenError::Outside { .. }) => return None,
         Err(error) => return unread(&error.to_string()),
     };
-    let size = opened.identity.size;
+    let size = opened.len();
     let found = match Hashes::of(&opened, &file.record, buffer, zeros, read) {
         Ok(Some(found)) => found,
         Ok(None) => return unread("its holes have more zeros than are hashed"),
@@ -177,13 +173,14 @@ fn compare(root: &Path, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, read: 
     if found == *stated {
         return None;
     }
-    let (seconds, nanoseconds) = opened.identity.mtime;
-    let is_edited = match file.since {
-        None => false,
+    let is_edited = match (&file.since, opened.modified()) {
+        (None, _) | (_, None) => false,
         // huggingface_hub allows a second, too: not every file system keeps fractions.
-        Some(Since::At(time)) => as_f64(seconds) - 1.0 > time,
+        (Some(Since::At(time)), Some((seconds, _))) => as_f64(seconds) - 1.0 > *time,
         // Git stores the low bits.
-        Some(Since::Same(s, n)) => (seconds & 0xffff_ffff, nanoseconds) != (s.into(), n.into()),
+        (Some(Since::Same(s, n)), Some((seconds, nanoseconds))) => {
+            (seconds & 0xffff_ffff, nanoseconds) != ((*s).into(), (*n).into())
+        }
     };
     let kind = if is_edited { FaultKind::ContentEdited } else { FaultKind::ContentHashDiffers };
     let fault = fault(kind).with("algorithm", algorithm).with("source", file.source);
@@ -204,13 +201,13 @@ struct Hashes {
 impl Hashes {
     /// Reads the file once; `None` when it has more zeros in holes than are hashed.
     fn of(
-        opened: &Opened,
+        opened: &SourceFile,
         record: &Record,
         buffer: &mut [u8],
         mut zeros: u64,
         read: &dyn Fn(u64),
     ) -> std::io::Result<Option<Self>> {
-        let size = opened.identity.size;
+        let size = opened.len();
         let mut sha256: Option<Hash<Sha256>> = (!matches!(record, Record::Git(_))).then(|| Hash::of(Sha256::new()));
         let is_git = matches!(record, Record::Git(_)) || matches!(record, Record::GitOrPointer(_)) && size <= PLAIN_CAP;
         let mut git: Option<Hash<Sha1>> = is_git.then(|| Hash::of(Sha1::new_with_prefix(format!("blob {size}\0"))));

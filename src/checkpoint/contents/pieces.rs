@@ -1,14 +1,15 @@
 //! The bytes of a file in pieces, without the holes of a sparse file.
 
 use std::io::{Error, ErrorKind, Result};
+use std::ops::Range;
 
 use sha2::Digest;
 
 use super::tally::{BLOCK, as_u64};
 use crate::checkpoint::digest::Hasher;
-use crate::checkpoint::hex;
 use crate::checkpoint::open::Opened;
 use crate::checkpoint::platform::{next_data, next_hole, with_window};
+use crate::checkpoint::{SourceFile, hex};
 
 /// Pieces start and end at a multiple of this many bytes from the start of the range, so that no element is split, and sums
 /// do not depend on the holes.
@@ -43,13 +44,17 @@ impl Piece<'_> {
 /// # Errors
 /// When reading fails, or the file has become shorter.
 pub(super) fn each_piece(
-    opened: &Opened,
+    file: &SourceFile,
     start: u64,
     len: u64,
     buffer: &mut [u8],
     mut each: impl FnMut(Piece<'_>),
 ) -> Result<()> {
     let end = start.saturating_add(len);
+    let opened = match file {
+        SourceFile::Local(opened) => opened,
+        SourceFile::Memory(bytes) => return each_window(bytes, start..end, each),
+    };
     let aligned = |at: u64| at.saturating_sub(at.saturating_sub(start) % ALIGNMENT);
     let mut at = start;
     while at < end {
@@ -76,10 +81,19 @@ pub(super) fn each_piece(
     Ok(())
 }
 
+/// Calls `each` with a range of bytes in memory.
+fn each_window(bytes: &[u8], range: Range<u64>, mut each: impl FnMut(Piece<'_>)) -> Result<()> {
+    let place = |at| usize::try_from(at).unwrap_or(usize::MAX);
+    let range = bytes.get(place(range.start)..place(range.end)).ok_or(ErrorKind::UnexpectedEof)?;
+    range.chunks(WINDOW).for_each(|window| each(Piece::Data(window)));
+    Ok(())
+}
+
 /// Number of the `len` bytes from `start` on that are in holes: at least as many as [`each_piece`] gives as holes. 0 where the
-/// file system does not tell holes.
+/// file system does not tell holes, and in memory.
 #[cfg(feature = "cli")]
-pub(super) fn holes(opened: &Opened, start: u64, len: u64) -> u64 {
+pub(super) fn holes(file: &SourceFile, start: u64, len: u64) -> u64 {
+    let Some(opened) = file.local() else { return 0 };
     let end = start.saturating_add(len);
     let (mut at, mut zeros) = (start, 0_u64);
     while at < end {
@@ -92,12 +106,7 @@ pub(super) fn holes(opened: &Opened, start: u64, len: u64) -> u64 {
 }
 
 /// Reads a range of the file, and returns its end.
-fn read(
-    opened: &Opened,
-    range: std::ops::Range<u64>,
-    buffer: &mut [u8],
-    each: &mut impl FnMut(Piece<'_>),
-) -> Result<u64> {
+fn read(opened: &Opened, range: Range<u64>, buffer: &mut [u8], each: &mut impl FnMut(Piece<'_>)) -> Result<u64> {
     let mut at = range.start;
     while at < range.end {
         let left = range.end.saturating_sub(at);
@@ -224,7 +233,7 @@ mod tests {
                 file.write_all_at(&bytes, at).unwrap();
             }
             let whole = std::fs::read(&path).unwrap();
-            let opened = open_regular(&path, u64::MAX).unwrap();
+            let opened = SourceFile::Local(open_regular(&path, u64::MAX).unwrap());
             for _ in 0..50 {
                 let start = next(&mut state, LEN);
                 let len = next(&mut state, LEN - start + 1);
@@ -252,7 +261,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("short");
         std::fs::write(&path, [1; 100]).unwrap();
-        let opened = open_regular(&path, u64::MAX).unwrap();
+        let opened = SourceFile::Local(open_regular(&path, u64::MAX).unwrap());
         let read = each_piece(&opened, 50, 100, &mut [0; 64], |_| {});
         assert_eq!(read.unwrap_err().kind(), ErrorKind::UnexpectedEof);
     }

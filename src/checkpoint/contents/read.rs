@@ -5,7 +5,6 @@
 
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
-use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
@@ -13,9 +12,8 @@ use serde::Serialize;
 use super::CHUNK;
 use super::pieces::{Piece, WINDOW, each_piece};
 use super::tally::{BLOCK, Sums, Tally, as_u64};
-use crate::checkpoint::open::{Opened, open_regular};
 use crate::checkpoint::shard::tail::zero_tail;
-use crate::checkpoint::{Fault, FaultKind, Shard, Tensor, parallel};
+use crate::checkpoint::{Fault, FaultKind, Shard, Source, SourceFile, Tensor, parallel};
 
 /// Bytes of a part: a few milliseconds of work.
 const PART: u64 = WINDOW as u64;
@@ -167,12 +165,12 @@ impl ShardPlan {
         Some(Self { file, file_len: shard.file_len, data_start: shard.data_start, tensors, overlap })
     }
 
-    fn open(&self, root: &Path) -> Result<Opened, String> {
-        let opened = open_regular(&root.join(&self.file), u64::MAX).map_err(|error| error.to_string())?;
-        if opened.identity.size != self.file_len {
+    fn open(&self, source: &Source) -> Result<SourceFile, String> {
+        let file = source.open_regular(&self.file, u64::MAX).map_err(|error| error.to_string())?;
+        if file.len() != self.file_len {
             return Err("it changed while it was read".to_owned());
         }
-        Ok(opened)
+        Ok(file)
     }
 }
 
@@ -220,7 +218,7 @@ type Outcome = Result<Option<Tally>, String>;
 /// order of their bytes; tensors that share the storage of another in a pickle are left out, and so are those that cannot
 /// be read. The result does not depend on the number of threads.
 pub(in crate::checkpoint) fn read(
-    root: &Path,
+    source: &Source,
     shards: &mut BTreeMap<String, Shard>,
     options: ReadOptions,
     progress: &(dyn Fn(Progress<'_>) + Sync),
@@ -228,7 +226,7 @@ pub(in crate::checkpoint) fn read(
     let plans: Vec<ShardPlan> = shards.values().filter_map(ShardPlan::new).collect();
     let parts = parts(&plans, shards);
     let total = parts.iter().fold(0_u64, |sum, part| sum.saturating_add(part.range.1));
-    let run = Run { root, plans: &plans, parts: &parts, options, total, progress };
+    let run = Run { source, plans: &plans, parts: &parts, options, total, progress };
     let outcomes = run.outcomes();
     let mut contents = Vec::new();
     let mut found: Vec<(usize, Vec<Fault>)> = Vec::new();
@@ -311,7 +309,7 @@ impl<'s> ShardContents<'s> {
 
 /// Reads parts with several threads.
 struct Run<'a> {
-    root: &'a Path,
+    source: &'a Source,
     plans: &'a [ShardPlan],
     parts: &'a [Part<'a>],
     options: ReadOptions,
@@ -324,7 +322,7 @@ impl Run<'_> {
     fn outcomes(&self) -> Vec<Outcome> {
         let failed: Vec<AtomicBool> = self.plans.iter().map(|_| AtomicBool::new(false)).collect();
         // A buffer, and the shard of the last part: most parts have the same one.
-        let state = || (vec![0_u8; CHUNK], None::<(usize, Opened)>);
+        let state = || (vec![0_u8; CHUNK], None::<(usize, SourceFile)>);
         let threads = self.options.threads.map_or_else(parallel::threads, usize::from);
         parallel::map(threads, self.parts, state, |(buffer, open), part| {
             let is_failed = failed.get(part.shard);
@@ -340,15 +338,15 @@ impl Run<'_> {
         })
     }
 
-    fn part(&self, part: &Part<'_>, open: &mut Option<(usize, Opened)>, buffer: &mut [u8]) -> Outcome {
+    fn part(&self, part: &Part<'_>, open: &mut Option<(usize, SourceFile)>, buffer: &mut [u8]) -> Outcome {
         let Some(plan) = self.plans.get(part.shard) else { return Ok(None) };
         if open.as_ref().is_none_or(|(shard, _)| *shard != part.shard) {
-            *open = Some((part.shard, plan.open(self.root)?));
+            *open = Some((part.shard, plan.open(self.source)?));
         }
-        let (Some((_, opened)), Some(tensor)) = (open, part.tensor) else { return Ok(None) };
+        let (Some((_, file)), Some(tensor)) = (open, part.tensor) else { return Ok(None) };
         let mut tally = Tally::new(tensor.dtype, self.options.stats);
         let start = plan.data_start.saturating_add(tensor.begin).saturating_add(part.range.0);
-        let read = each_piece(opened, start, part.range.1, buffer, |piece| {
+        let read = each_piece(file, start, part.range.1, buffer, |piece| {
             match &piece {
                 Piece::Data(bytes) => tally.add(bytes),
                 Piece::Hole(len) => tally.skip(*len),

@@ -4,10 +4,10 @@
 //! Source: `_legacy_load` in `torch/serialization.py` of torch 2.15.0.
 
 use super::machine::{Machine, Stop, StorageIds};
-use super::source::Source;
 use super::storage::{Storages, Stored, claimed};
 use super::value::Value;
 use super::{PICKLE_CAP, PickleReader, Problem, state_dict};
+use crate::checkpoint::SourceFile;
 
 /// The pickle of the magic number.
 pub(super) const MAGIC: [u8; 15] = *b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19\x2e";
@@ -27,9 +27,9 @@ pub(super) fn problem(stop: Stop, offset: u64, longer: Option<bool>) -> Problem 
 }
 
 /// Reads a file of this format into the reader's shard.
-pub(super) fn read(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result<(), Problem> {
-    let bytes = source.bytes(0, source.len().min(PICKLE_CAP))?;
-    let longer = Some(source.len() > PICKLE_CAP);
+pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(), Problem> {
+    let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
+    let longer = Some(file.len() > PICKLE_CAP);
     let mut machine = Machine::new(&bytes, StorageIds::None);
     machine.at = MAGIC.len();
     let result = pickles(&mut machine);
@@ -41,13 +41,13 @@ pub(super) fn read(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result
         reader.pickle.doubt = Some(doubt);
         return Ok(());
     }
-    let storages = storages(reader, source, &machine, keys)?;
+    let storages = storages(reader, file, &machine, keys)?;
     state_dict::read(reader, &mut machine, value, &storages)
 }
 
 /// Reads a pickle of another program for what it imports. Returns whether it is a pickle to its end.
-pub(super) fn read_plain(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result<bool, Problem> {
-    let bytes = source.bytes(0, source.len().min(PICKLE_CAP))?;
+pub(super) fn read_plain(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<bool, Problem> {
+    let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
     let mut machine = Machine::new(&bytes, StorageIds::None);
     let is_whole = machine.run().is_ok();
     reader.record(&machine);
@@ -70,7 +70,7 @@ fn pickles(machine: &mut Machine<'_>) -> Result<(Value, Value), Stop> {
 /// Finds the storages behind the pickles.
 fn storages(
     reader: &mut PickleReader<'_>,
-    source: &dyn Source,
+    file: &SourceFile,
     machine: &Machine<'_>,
     keys: Value,
 ) -> Result<Storages, Problem> {
@@ -92,11 +92,11 @@ fn storages(
         sizes.push((key, bytes));
     }
     let needed = sizes.iter().fold(at, |sum, (_, bytes)| sum.saturating_add(8).saturating_add(*bytes));
-    if needed > source.len() {
-        return Err(Problem::Cut("the storages".to_owned(), Some(needed.saturating_sub(source.len()))));
+    if needed > file.len() {
+        return Err(Problem::Cut("the storages".to_owned(), Some(needed.saturating_sub(file.len()))));
     }
     for (key, bytes) in sizes {
-        let stated = u64::from_le_bytes(source.array(at)?);
+        let stated = u64::from_le_bytes(file.array(at)?);
         let width = widths.get(key).copied().unwrap_or(1);
         at = at.saturating_add(8);
         if stated.checked_mul(width) != Some(bytes) {

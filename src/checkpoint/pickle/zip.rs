@@ -6,9 +6,9 @@
 use std::collections::{HashMap, HashSet};
 
 use super::machine::{Machine, StorageIds};
-use super::source::Source;
 use super::storage::{Storages, Stored, claimed};
 use super::{PICKLE_CAP, PickleReader, Problem, legacy, state_dict};
+use crate::checkpoint::SourceFile;
 
 /// Maximum number of bytes of the directory of an archive; 100 000 members take some 10 MB.
 const DIRECTORY_CAP: u64 = 32 << 20;
@@ -47,8 +47,8 @@ fn malformed(reason: &str, offset: u64) -> Problem {
 }
 
 /// Reads an archive into the reader's shard.
-pub(super) fn read(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result<(), Problem> {
-    let archive = Archive::read(source)?;
+pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(), Problem> {
+    let archive = Archive::read(file)?;
     if archive.member("constants.pkl").is_some() {
         return Err(Problem::Other("a TorchScript archive".to_owned()));
     }
@@ -58,38 +58,38 @@ pub(super) fn read(reader: &mut PickleReader<'_>, source: &dyn Source) -> Result
         reader.pickle.doubt = Some("its members are compressed".to_owned());
         return Ok(());
     }
-    archive.check_version(source)?;
-    let range = archive.range(source, member)?;
+    archive.check_version(file)?;
+    let range = archive.range(file, member)?;
     if range.bytes > PICKLE_CAP {
         return Err(Problem::TooLarge("bytes"));
     }
     if !reader.budget.spend(range.bytes) {
         return Ok(());
     }
-    let bytes = source.bytes(range.begin, range.bytes)?;
+    let bytes = file.bytes(range.begin, range.bytes)?;
     let mut machine = Machine::new(&bytes, StorageIds::Zip);
     let result = machine.run();
     reader.record(&machine);
     let value = result.map_err(|stop| legacy::problem(stop, machine.offset, None))?;
-    let storages = storages(reader, source, &archive, &machine)?;
+    let storages = storages(reader, file, &archive, &machine)?;
     state_dict::read(reader, &mut machine, value, &storages)
 }
 
 /// Finds the storages of a pickle among the members.
 fn storages(
     reader: &mut PickleReader<'_>,
-    source: &dyn Source,
+    file: &SourceFile,
     archive: &Archive,
     machine: &Machine<'_>,
 ) -> Result<Storages, Problem> {
-    let mut storages = Storages { is_big_endian: archive.is_big_endian(source)?, ..Storages::default() };
+    let mut storages = Storages { is_big_endian: archive.is_big_endian(file)?, ..Storages::default() };
     let mut ranges: Vec<(u64, u64)> = Vec::new();
     for (key, bytes) in claimed(machine)? {
         let Some(member) = archive.member(&format!("data/{key}")) else {
             reader.storage_fault(&key, None, bytes, None);
             continue;
         };
-        let range = archive.range(source, member)?;
+        let range = archive.range(file, member)?;
         if !member.is_stored {
             reader.pickle.doubt.get_or_insert_with(|| "its members are compressed".to_owned());
         } else if member.bytes == bytes {
@@ -108,12 +108,12 @@ fn storages(
 }
 
 impl Archive {
-    fn read(source: &dyn Source) -> Result<Self, Problem> {
-        let end = EndRecord::find(source)?;
+    fn read(file: &SourceFile) -> Result<Self, Problem> {
+        let end = EndRecord::find(file)?;
         if end.bytes > DIRECTORY_CAP {
             return Err(Problem::TooLarge("members"));
         }
-        let bytes = source.bytes(end.directory, end.bytes)?;
+        let bytes = file.bytes(end.directory, end.bytes)?;
         let mut fields = Fields { bytes: &bytes, at: 0, base: end.directory };
         let mut archive = Self { folder: String::new(), members: HashMap::new(), directory: end.directory };
         let mut folded = HashSet::new();
@@ -145,9 +145,9 @@ impl Archive {
     }
 
     /// The bytes of a member, which its local header precedes.
-    fn range(&self, source: &dyn Source, member: Member) -> Result<Stored, Problem> {
+    fn range(&self, file: &SourceFile, member: Member) -> Result<Stored, Problem> {
         let outside = || malformed("a member of the archive lies outside of it", member.header);
-        let header: [u8; 30] = source.array(member.header)?;
+        let header: [u8; 30] = file.array(member.header)?;
         if member.is_folder {
             return Err(malformed("a member of the archive is a folder", member.header));
         }
@@ -165,40 +165,40 @@ impl Archive {
     }
 
     /// The content of a member that is a word; `None` when it is missing.
-    fn word(&self, source: &dyn Source, name: &str) -> Result<Option<Vec<u8>>, Problem> {
+    fn word(&self, file: &SourceFile, name: &str) -> Result<Option<Vec<u8>>, Problem> {
         let Some(member) = self.member(name) else { return Ok(None) };
-        let range = self.range(source, member)?;
+        let range = self.range(file, member)?;
         if !member.is_stored || range.bytes > WORD_CAP {
             return Err(malformed("a member of the archive that states a number has another content", member.header));
         }
-        source.bytes(range.begin, range.bytes).map(Some)
+        file.bytes(range.begin, range.bytes).map(Some)
     }
 
     /// The format version, which torch requires to be 1 to 10, and other numbers that it parses.
-    fn check_version(&self, source: &dyn Source) -> Result<(), Problem> {
+    fn check_version(&self, file: &SourceFile) -> Result<(), Problem> {
         let number = |word: Vec<u8>| String::from_utf8(word).ok()?.trim_end().parse::<u64>().ok();
-        let version = match self.word(source, ".data/version")? {
+        let version = match self.word(file, ".data/version")? {
             Some(word) => Some(word),
-            None => self.word(source, "version")?,
+            None => self.word(file, "version")?,
         };
         let version = version.and_then(number);
         if !version.is_some_and(|version| (1..=10).contains(&version)) {
             return Err(malformed("the archive states no version that torch reads", self.directory));
         }
-        self.word(source, ".format_version")?;
-        let id = self.word(source, ".data/serialization_id")?;
+        self.word(file, ".format_version")?;
+        let id = self.word(file, ".data/serialization_id")?;
         if id.is_some_and(|id| std::str::from_utf8(&id).is_err()) {
             return Err(malformed("the id of the archive is not UTF-8", self.directory));
         }
-        let alignment = self.word(source, ".storage_alignment")?;
+        let alignment = self.word(file, ".storage_alignment")?;
         if alignment.is_some_and(|word| number(word).is_none()) {
             return Err(malformed("the archive states no alignment", self.directory));
         }
         Ok(())
     }
 
-    fn is_big_endian(&self, source: &dyn Source) -> Result<bool, Problem> {
-        match self.word(source, "byteorder")?.as_deref() {
+    fn is_big_endian(&self, file: &SourceFile) -> Result<bool, Problem> {
+        match self.word(file, "byteorder")?.as_deref() {
             None | Some(b"little") => Ok(false),
             Some(b"big") => Ok(true),
             Some(_) => Err(malformed("the archive states no byte order", self.directory)),
@@ -216,11 +216,11 @@ struct EndRecord {
 
 impl EndRecord {
     /// Searches the end record from the end of the file.
-    fn find(source: &dyn Source) -> Result<Self, Problem> {
+    fn find(file: &SourceFile) -> Result<Self, Problem> {
         let cut = || Problem::Cut("the directory at the end of the archive".to_owned(), None);
-        let tail_len = source.len().min(END.saturating_add(MAX_COMMENT));
-        let start = source.len().saturating_sub(tail_len);
-        let tail = source.bytes(start, tail_len)?;
+        let tail_len = file.len().min(END.saturating_add(MAX_COMMENT));
+        let start = file.len().saturating_sub(tail_len);
+        let tail = file.bytes(start, tail_len)?;
         let at = memchr::memmem::rfind(&tail, b"PK\x05\x06").ok_or_else(cut)?;
         let record = tail.get(at..).and_then(<[u8]>::first_chunk::<22>).ok_or_else(cut)?;
         let position = start.saturating_add(u64::try_from(at).unwrap_or(u64::MAX));
@@ -234,7 +234,7 @@ impl EndRecord {
         if !is_alone || fields.peek_u16(8) != fields.peek_u16(10) {
             return Err(malformed("the archive is a part of several", position));
         }
-        let (end, limit) = match Self::wide(source, position)? {
+        let (end, limit) = match Self::wide(file, position)? {
             Some(wide) => wide,
             None => (narrow, position),
         };
@@ -247,9 +247,9 @@ impl EndRecord {
 
     /// The record of an archive with 64-bit numbers, and its position; `None` when there is no locator for it before the
     /// end record.
-    fn wide(source: &dyn Source, position: u64) -> Result<Option<(Self, u64)>, Problem> {
+    fn wide(file: &SourceFile, position: u64) -> Result<Option<(Self, u64)>, Problem> {
         let Some(at) = position.checked_sub(20) else { return Ok(None) };
-        let locator: [u8; 20] = source.array(at)?;
+        let locator: [u8; 20] = file.array(at)?;
         if !locator.starts_with(b"PK\x06\x07") {
             return Ok(None);
         }
@@ -258,7 +258,7 @@ impl EndRecord {
         if record_at.checked_add(56).is_none_or(|end| end > at) {
             return Err(wrong());
         }
-        let record: [u8; 56] = source.array(record_at)?;
+        let record: [u8; 56] = file.array(record_at)?;
         if !record.starts_with(b"PK\x06\x06") {
             return Err(wrong());
         }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value, json};
 
 use crate::check::{Edit, renamed};
-use crate::checkpoint::open::{TOKENIZER_CAP, read_own};
+use crate::checkpoint::open::TOKENIZER_CAP;
 use crate::checkpoint::shard::header::FORMATS;
 use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
 use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
@@ -231,7 +231,7 @@ impl RepairDraft {
     }
 
     fn reencode(&mut self, file: &str) -> Option<()> {
-        let bytes = read_own(&self.original.root, file, TOKENIZER_CAP).ok()?;
+        let bytes = self.original.source.read_own(file, TOKENIZER_CAP).ok()?;
         let text = Document::decoded(&bytes)?;
         self.write(file, &text)
     }
@@ -284,7 +284,7 @@ impl RepairDraft {
             return Some(PlannedShard::clone(planned));
         }
         let shard = self.original.shards.get(file)?;
-        let path = self.original.root.join(file);
+        let path = self.original.source.path().join(file);
         let mut tensors: Vec<_> = shard.tensors.iter().collect();
         tensors.sort_by_key(|t| (t.begin, t.end));
         let tensors = tensors.into_iter().map(|t| PlannedTensor {

@@ -27,7 +27,7 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
     let same = match (&change.new, original.entries.get(&change.name)) {
         (_, None) => there.is_none(),
         (Content::Shard(_), Some(_)) => original.shards.get(&change.name).is_some_and(|was| {
-            let now = Shard::read(&original.root, &change.name);
+            let now = Shard::read(&original.source, &change.name);
             if let Some(fault) = now.faults.iter().find(|f| f.kind == FaultKind::UnreadableFile) {
                 let reason = fault.detail.get("reason").and_then(Value::as_str).unwrap_or_default();
                 unreadable = Some(io::Error::other(reason.to_owned()));

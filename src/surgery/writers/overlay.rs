@@ -25,17 +25,17 @@ use crate::surgery::stop::interrupted;
 /// # Errors
 /// A [`RepairError`]; then the directory was not created.
 pub fn overlay(repair: &Repair, out: &Path, progress: &(dyn Fn(u64) + Sync)) -> Result<RepairedCopy, RepairError> {
-    let original = &repair.original;
-    let Target { path: out, cleared } = claim_target(out, &[&original.root])?;
+    let root = repair.directory()?;
+    let Target { path: out, cleared } = claim_target(out, &[root])?;
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
-    let donor = DonorSnapshot::record(&original.root)?;
+    let donor = DonorSnapshot::record(root)?;
     let sharing = Sharing::of(parent);
     let sizes: Vec<u64> = repair.changes.iter().map(|change| space(&change.new, &sharing)).collect();
     let explained = |error| explain_error(error, parent, &sizes);
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
     let written = check_space(parent, &sizes)
         .map_err(RepairError::from)
-        .and_then(|()| fill(repair, staging.content(), progress))
+        .and_then(|()| fill(repair, root, staging.content(), progress))
         .and_then(|()| Ok(donor.unchanged()?))
         .and_then(|()| Ok(interrupted()?))
         .and_then(|()| Ok(staging.publish(&out)?))
@@ -46,15 +46,15 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &(dyn Fn(u64) + Sync)) -> 
     }
 }
 
-fn fill(repair: &Repair, dir: &Path, progress: &(dyn Fn(u64) + Sync)) -> Result<(), RepairError> {
+fn fill(repair: &Repair, root: &Path, dir: &Path, progress: &(dyn Fn(u64) + Sync)) -> Result<(), RepairError> {
     for change in &repair.changes {
         interrupted()?;
-        check_unchanged(repair, change, &repair.original.root.join(&change.name))?;
+        check_unchanged(repair, change, &root.join(&change.name))?;
         write_content(&dir.join(&change.name), &change.new, progress)?;
     }
     let original = &repair.original;
     for name in original.entries.keys().filter(|name| repair.changes.iter().all(|change| change.name != **name)) {
-        link(&original.root, name, &dir.join(name))?;
+        link(root, name, &dir.join(name))?;
     }
     Ok(())
 }

@@ -26,7 +26,7 @@ use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
 /// # Errors
 /// A [`RepairError`]; then the checkpoint is unchanged, except with [`RepairError::Unfinished`].
 pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<Leftover>, RepairError> {
-    let root = &repair.original.root;
+    let root = repair.directory()?;
     for change in &repair.changes {
         let path = root.join(&change.name);
         if look(&path)?.is_some_and(|m| m.is_symlink()) {
@@ -69,7 +69,7 @@ impl<'r> Step<'r> {
         let original = &repair.original;
         let headers = match (&change.new, original.shards.get(&change.name)) {
             (Content::Shard(plan), Some(shard)) => {
-                Headers::of(plan, &original.root.join(&change.name), shard.data_start)
+                Headers::of(plan, &original.source.path().join(&change.name), shard.data_start)
             }
             _ => None,
         };
@@ -118,10 +118,10 @@ fn stage(
     folder: &Folder,
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<Journal, RepairError> {
-    let root = &repair.original.root;
+    let root = repair.directory()?;
     let donor = DonorSnapshot::record(root)?;
     if folder.pending()?.is_some() {
-        return Err(RepairError::Busy { path: root.clone(), holder: "an interrupted run".to_owned() });
+        return Err(RepairError::Busy { path: root.to_owned(), holder: "an interrupted run".to_owned() });
     }
     folder.clear()?;
     // One more block each for the journal and for the folder of new files, and two for the originals.

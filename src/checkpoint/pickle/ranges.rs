@@ -1,0 +1,27 @@
+//! Ranges of bytes of a file, with the errors of a pickle.
+
+use super::Problem;
+use crate::checkpoint::SourceFile;
+
+impl SourceFile {
+    /// The bytes of a range, which the caller has bounded.
+    ///
+    /// # Errors
+    /// When the range ends behind the file, or reading fails.
+    pub(super) fn bytes(&self, at: u64, len: u64) -> Result<Vec<u8>, Problem> {
+        let short = || Problem::Malformed("a range lies outside the file".to_owned(), at);
+        at.checked_add(len).filter(|end| *end <= self.len()).ok_or_else(short)?;
+        let mut buffer = vec![0; usize::try_from(len).map_err(|_| short())?];
+        self.read_exact_at(&mut buffer, at).map_err(|error| Problem::Io(error.to_string()))?;
+        Ok(buffer)
+    }
+
+    /// An array of bytes.
+    ///
+    /// # Errors
+    /// As [`Self::bytes`].
+    pub(super) fn array<const N: usize>(&self, at: u64) -> Result<[u8; N], Problem> {
+        let bytes = self.bytes(at, u64::try_from(N).unwrap_or(u64::MAX))?;
+        bytes.first_chunk().copied().ok_or_else(|| Problem::Io("fewer bytes were read than expected".to_owned()))
+    }
+}
