@@ -40,7 +40,7 @@ pub mod verdict;
 pub mod votes;
 
 pub use crate::knowledge::rule::Safety;
-pub use engine::{check, check_for, try_for};
+pub use engine::{check, check_for};
 pub use finding::{Finding, Location, Severity};
 pub use fix::{Edit, FixHint, clamped, renamed};
 pub use outcome::Outcome;

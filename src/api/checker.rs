@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use super::{Error, knowledge};
-use crate::check::{check_for, try_for};
+use crate::check::check_for;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Progress, ReadOptions};
 use crate::report::model::CheckpointReport;
@@ -88,8 +88,8 @@ impl Checker {
             checkpoint.check_hashes(progress);
         }
         let checkpoint = Arc::new(checkpoint);
-        let judge = |checkpoint: &Arc<Checkpoint>| try_for(checkpoint, knowledge, &self.versions);
-        let outcome = tried(&checkpoint, check_for(&checkpoint, knowledge, &self.versions), &judge);
+        let check = |checkpoint: &Arc<Checkpoint>| check_for(checkpoint, knowledge, &self.versions);
+        let outcome = tried(&checkpoint, check(&checkpoint), &check);
         Ok(CheckpointReport::new(shown(path), None, &checkpoint, &outcome))
     }
 }

@@ -1,17 +1,20 @@
 //! Runs rules over a checkpoint.
 
+use std::cell::RefCell;
+use std::collections::BTreeSet;
+use std::rc::Rc;
 use std::sync::Arc;
 
 use serde_json::{Value, json};
 
 use super::bounded::bounded;
 use super::evaluate::{Context, pinpoint, run_rules};
-use super::finding::{Finding, Skipped};
+use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
 use super::model_type::Asked;
 use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
-use super::verdict::{Basis, PredictedLoad};
+use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
 use super::{
     adapter, built_tokenizer, card, class_names, directory, finite, index, inspect, judge, model_type, module_imports,
     modules, pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json,
@@ -22,7 +25,6 @@ use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::program::AskedProgram;
-use crate::knowledge::rule::{Object, Rule};
 use crate::knowledge::{Knowledge, Loader, Scope};
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest of each major version.
@@ -32,76 +34,229 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 }
 
 /// As [`check`], for these versions of transformers unless the list is empty; `peft==0.13.2` is one of PEFT.
+///
+/// Findings are those of the selected rules, with causes searched under the leading loaders. The verdict on each loader is by
+/// all rules, and that of a run for it alone: a loader does the same whatever else a run is asked for.
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
-    run(checkpoint, knowledge, versions, false)
-}
-
-/// As [`check_for`], with verdicts by all rules, whether selected or not. Called for a checkpoint with a fix that is tried: a
-/// loader that refuses what the fix writes refuses it whichever rules the user selected.
-#[must_use]
-pub fn try_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
-    run(checkpoint, knowledge, versions, true)
-}
-
-/// Checks a checkpoint; `judged_by_all` is whether rules that were not selected count in the verdicts.
-fn run(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String], judged_by_all: bool) -> Outcome {
     let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
-    let (versions, programs) = (versions.as_slice(), knowledge.asked_programs(&programs));
-    let mut faults = faults_of_files(checkpoint, knowledge, &programs);
-    faults.extend(adapter::faults(checkpoint, &knowledge.peft, &peft));
-    let stored = Stored::of(checkpoint);
-    let judged = judge::judge(checkpoint, knowledge, versions, &stored);
-    faults.extend(judged.faults.into_iter().map(|fault| with_likely_class(fault, knowledge, &stored)));
-    let config = checkpoint.config();
-    let mut outcome = Outcome {
-        architecture: judged.architecture,
-        findings: Vec::new(),
-        loads: judged.loads,
-        config: judged.config,
-        votes: judged.votes,
-        ..Outcome::default()
-    };
-    let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
-    let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
-    faults.extend(tokens::faults(checkpoint, rows));
-    let of_class = outcome.architecture.as_deref().and_then(|name| knowledge.processor_of(name));
-    let leading = load::wanted(config, versions);
-    let opened = of_class.and_then(|processor| opened_first(checkpoint, processor, &leading));
-    let mut scope = variables::scope(checkpoint, outcome.architecture.as_deref(), &model, opened.as_ref(), rows);
-    bind_run(&mut scope, knowledge, config, versions, outcome.architecture.as_deref());
-    scope.bind("robot", &robots::policy(checkpoint));
-    bind_opened(&mut scope, checkpoint, of_class);
-    scope.bind("missing_attributes", &processor::missing_attributes(checkpoint, of_class));
-    scope.bind("placeholders", &processor::placeholders(checkpoint, of_class, opened.as_ref()));
-    variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
-    let mut faults: Vec<Fault> = faults.into_iter().map(|fault| finite::under_users(fault, &outcome.loads)).collect();
-    outcome.loads.iter_mut().for_each(LoadReport::shorten);
-    scope.bind("programs", &programs.iter().map(|asked| asked.program.name()).collect());
-    let context = Context::new(checkpoint, load::of_run(config, versions, judged.targets), &programs, &outcome.loads);
-    let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
-    let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
-    faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
-    directory::recognise(checkpoint, &knowledge.directories, &mut scope, &mut faults);
-    let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
-    faults.extend(refused);
-    faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
-    run_rules(&knowledge.rules.rules, &context, &faults, &scope, &mut outcome);
-    let unselected = knowledge.rules.unselected.iter();
-    outcome.skipped.extend(unselected.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
+    let programs = knowledge.asked_programs(&programs);
+    let run = Run::new(checkpoint, knowledge, &peft, &programs);
+    let reading = run.read(&versions, Purpose::Findings);
+    let mut outcome = reading.outcome.clone();
+    let rules = &knowledge.rules;
+    run_rules(&rules.rules, &reading.context, &reading.faults, &reading.scope, &mut outcome);
+    let off = rules.unselected.iter();
+    outcome.skipped.extend(off.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
-    outcome.verdicts = if judged_by_all {
-        let mut whole = outcome.clone();
-        run_rules(&knowledge.rules.unselected, &context, &faults, &scope, &mut whole);
-        verdicts(checkpoint, &[], &context, &faults, &whole, &judged.unpredicted)
-    } else {
-        verdicts(checkpoint, &knowledge.rules.unselected, &context, &faults, &outcome, &judged.unpredicted)
-    };
-    outcome.by_all_rules = judged_by_all || knowledge.rules.unselected.is_empty();
+    let verdicts = run.verdicts(&reading, &outcome, &versions);
+    outcome.findings.iter_mut().for_each(|finding| finding.effects.retain(|effect| is_borne_out(effect, &verdicts)));
+    outcome.findings.iter_mut().for_each(|finding| defer_fix(finding, &verdicts));
+    outcome.verdicts = verdicts;
     outcome.findings = bounded(std::mem::take(&mut outcome.findings));
     policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
     outcome
+}
+
+/// What a run reads of a checkpoint whichever versions of transformers it judges.
+struct Run<'a> {
+    checkpoint: &'a Arc<Checkpoint>,
+    knowledge: &'a Knowledge,
+    programs: &'a [AskedProgram<'a>],
+    stored: Stored,
+    /// Rows of the largest token embedding, which every token id must stay below; `None` without one.
+    rows: Option<u64>,
+    /// Faults that do not depend on versions of transformers.
+    faults: Vec<Fault>,
+    /// The tokenizer as the processor of a class opens it in a version, for those that were asked for.
+    opened: RefCell<Vec<OpenedBy>>,
+}
+
+/// A tokenizer as the processor of a class opens it in a version of transformers; `None` when its ids are not known.
+struct OpenedBy {
+    class: String,
+    version: Option<&'static str>,
+    tokenizer: Option<Rc<OpenedTokenizer>>,
+}
+
+/// What a reading is for.
+#[derive(Clone, Copy)]
+enum Purpose {
+    /// Findings, with hints that no verdict rests on.
+    Findings,
+    /// Verdicts alone.
+    Verdicts,
+}
+
+/// A checkpoint as some versions of transformers read it: all that rules see, and the outcome without findings.
+struct Reading<'a> {
+    context: Context<'a>,
+    scope: Scope<'static>,
+    faults: Vec<Fault>,
+    /// For each loader without a predicted load, the reason.
+    unpredicted: Vec<(&'static str, String)>,
+    outcome: Outcome,
+}
+
+impl<'a> Run<'a> {
+    fn new(
+        checkpoint: &'a Arc<Checkpoint>,
+        knowledge: &'a Knowledge,
+        peft: &[String],
+        programs: &'a [AskedProgram<'a>],
+    ) -> Self {
+        let mut faults = faults_of_files(checkpoint, knowledge, programs);
+        faults.extend(adapter::faults(checkpoint, &knowledge.peft, peft));
+        let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
+        faults.extend(tokens::faults(checkpoint, rows));
+        let stored = Stored::of(checkpoint);
+        Self { checkpoint, knowledge, programs, stored, rows, faults, opened: RefCell::default() }
+    }
+
+    /// The tokenizer as the processor of this class opens it in a version; several readings of a run ask for the same.
+    fn opened(&self, class: &str, version: Option<&'static str>) -> Option<Rc<OpenedTokenizer>> {
+        let is_same = |one: &&OpenedBy| one.class == class && one.version == version;
+        if let Some(known) = self.opened.borrow().iter().find(is_same) {
+            return known.tokenizer.clone();
+        }
+        let config = self.checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref());
+        let open = |processor| {
+            let config = config.unwrap_or(&Value::Null);
+            tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, version).ok().flatten()
+        };
+        let tokenizer = self.knowledge.processor_of(class).and_then(open).map(Rc::new);
+        self.opened.borrow_mut().push(OpenedBy { class: class.to_owned(), version, tokenizer: tokenizer.clone() });
+        tokenizer
+    }
+
+    /// The value of `opened`: by version of transformers, the tokenizer as the version's processor opens it, and the class.
+    fn opened_by_version(&self, class: Option<&str>) -> Value {
+        let of_version = |loader: &Loader| {
+            let mut summary = self.opened(class?, Some(loader.version()))?.summary();
+            let opens_with = self.knowledge.processor_of(class?)?.opens_with(loader.version());
+            summary.as_object_mut()?.insert("class".to_owned(), json!(opens_with.map(|class| class.class.as_str())));
+            Some((loader.version().to_owned(), summary))
+        };
+        Value::Object(Loader::ALL.iter().filter_map(of_version).collect())
+    }
+
+    /// Reads the checkpoint for these versions, or for those of a run that names none.
+    fn read(&self, versions: &[String], purpose: Purpose) -> Reading<'a> {
+        let Self { checkpoint, knowledge, stored, .. } = self;
+        let config = checkpoint.config();
+        let judged = judge::judge(checkpoint, knowledge, versions, stored);
+        let with_class = |fault| match purpose {
+            Purpose::Findings => with_likely_class(fault, knowledge, stored),
+            Purpose::Verdicts => fault,
+        };
+        let mut faults: Vec<Fault> =
+            self.faults.iter().cloned().chain(judged.faults.into_iter().map(with_class)).collect();
+        let mut outcome = Outcome {
+            architecture: judged.architecture,
+            loads: judged.loads,
+            config: judged.config,
+            votes: judged.votes,
+            ..Outcome::default()
+        };
+        let model = if outcome.config.is_null() { config.cloned().unwrap_or_default() } else { outcome.config.clone() };
+        let architecture = outcome.architecture.as_deref();
+        let of_class = architecture.and_then(|name| knowledge.processor_of(name));
+        let targets = load::wanted(config, versions);
+        let leading = targets.iter().find(|target| target.leads).map(|target| target.loader.version());
+        let opened = architecture.and_then(|class| self.opened(class, leading));
+        let mut scope = variables::scope(checkpoint, architecture, &model, opened.as_deref(), self.rows);
+        bind_run(&mut scope, knowledge, config, versions, architecture);
+        scope.bind("robot", &robots::policy(checkpoint));
+        scope.bind("opened", &self.opened_by_version(architecture));
+        scope.bind("missing_attributes", &processor::missing_attributes(checkpoint, of_class));
+        scope.bind("placeholders", &processor::placeholders(checkpoint, of_class, opened.as_deref()));
+        variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
+        faults = faults.into_iter().map(|fault| finite::under_users(fault, &outcome.loads)).collect();
+        outcome.loads.iter_mut().for_each(LoadReport::shorten);
+        scope.bind("programs", &self.programs.iter().map(|asked| asked.program.name()).collect());
+        let targets = load::of_run(config, versions, judged.targets);
+        let context = Context::new(checkpoint, targets, self.programs, &outcome.loads);
+        let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
+        let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
+        faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
+        directory::recognise(checkpoint, &knowledge.directories, &mut scope, &mut faults);
+        let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
+        faults.extend(refused);
+        faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
+        Reading { context, scope, faults, unpredicted: judged.unpredicted, outcome }
+    }
+
+    /// The verdicts of a run that was read as `reading`, each as that of a run for the loader alone. `outcome` has the findings
+    /// of the selected rules; `named` are the versions of transformers that the user named.
+    fn verdicts(&self, reading: &Reading<'_>, outcome: &Outcome, named: &[String]) -> Vec<PredictedLoad> {
+        let shown: BTreeSet<&str> = outcome.findings.iter().map(|finding| finding.code.as_str()).collect();
+        let targets = &reading.context.targets;
+        let alone = |target: &Target| {
+            // A run for one version is read as it was.
+            let is_alone = targets.len() == 1 && target.versions == named;
+            let again = if is_alone { None } else { Some(self.read(&target.versions, Purpose::Verdicts)) };
+            let mut loads = self.judged(again.as_ref().unwrap_or(reading), &[]);
+            let own = loads.iter().position(|load| load.loader == target.loader.version()).unwrap_or(0);
+            let PredictedLoad { objects, verdict, tensors, .. } = loads.swap_remove(own);
+            let objects = objects.into_iter().map(|object| with_shown_causes(object, &shown)).collect();
+            PredictedLoad {
+                loader: target.loader.version().to_owned(),
+                stands_for: target.stands_for.clone(),
+                leads: target.leads,
+                verdict,
+                objects,
+                tensors,
+            }
+        };
+        let mut loads: Vec<PredictedLoad> = targets.iter().map(alone).collect();
+        if !self.programs.is_empty() {
+            // Another program is judged as in a run that names no version of transformers.
+            let again = if named.is_empty() { None } else { Some(self.read(&[], Purpose::Verdicts)) };
+            let all = self.judged(again.as_ref().unwrap_or(reading), self.programs);
+            loads.extend(all.into_iter().filter(|load| is_program(&load.loader)));
+        }
+        loads
+    }
+
+    /// The verdicts on the loaders of a reading and on programs, by all rules.
+    fn judged(&self, reading: &Reading<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
+        let Reading { context, scope, faults, unpredicted, outcome } = reading;
+        let mut outcome = outcome.clone();
+        // A rule without effects says nothing of a load.
+        let rules = self.knowledge.rules.all().filter(|rule| !rule.effects.is_empty());
+        run_rules(rules, context, faults, scope, &mut outcome);
+        outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+        verdicts(self.checkpoint, context, programs, faults, &outcome, unpredicted)
+    }
+}
+
+/// Whether a verdict is as bad as an effect that a finding states. Causes are searched under the leading loaders, and another
+/// loader may not have them.
+fn is_borne_out(effect: &FindingEffect, verdicts: &[PredictedLoad]) -> bool {
+    let Some(load) = verdicts.iter().find(|load| load.loader == effect.loader) else { return true };
+    let object = load.objects.iter().find(|object| object.object == effect.object);
+    object.is_some_and(|object| object.verdict >= effect.outcome.into())
+}
+
+/// Leaves the fix of a finding to a run for the version that needs it, where only versions fail that the checkpoint need not
+/// load with: one that transformers 5 wrote is not rewritten for 4.57.
+fn defer_fix(finding: &mut Finding, verdicts: &[PredictedLoad]) {
+    let is_other = |effect: &FindingEffect| {
+        verdicts.iter().any(|load| load.loader == effect.loader && !load.leads && !is_program(&load.loader))
+    };
+    let Some(first) = finding.effects.first().filter(|_| finding.effects.iter().all(is_other)) else { return };
+    if finding.severity < Severity::Error {
+        finding.fix = finding.fix.take().map(|fix| fix.for_version(&first.loader));
+    }
+}
+
+/// A verdict with those of its causes that the report shows, if there is one.
+fn with_shown_causes(mut object: ObjectVerdict, shown: &BTreeSet<&str>) -> ObjectVerdict {
+    if object.findings.iter().any(|code| shown.contains(code.as_str())) {
+        object.findings.retain(|code| shown.contains(code.as_str()));
+    }
+    object
 }
 
 /// Faults that do not depend on the class or on versions of transformers.
@@ -114,6 +269,7 @@ fn faults_of_files(checkpoint: &Checkpoint, knowledge: &Knowledge, programs: &[A
     faults.extend(card::faults(checkpoint));
     faults.extend(pickles::faults(checkpoint, knowledge));
     faults.extend(templates::faults(checkpoint));
+    faults.extend(tokenizer_json::faults(checkpoint, &knowledge.tokenizer_parts));
     faults
 }
 
@@ -127,25 +283,22 @@ fn faults_of_versions(
 ) -> Vec<Fault> {
     let mut faults = class_names::faults(checkpoint, knowledge, asked);
     faults.extend(module_imports::faults(checkpoint, asked));
-    faults.extend(tokenizer_json::faults(checkpoint, &knowledge.tokenizer_parts, asked));
+    faults.extend(tokenizer_json::paired_merges(checkpoint, asked));
     faults.extend(built_tokenizer::faults(checkpoint, knowledge, asked));
     faults.extend(ropes::faults(checkpoint, knowledge, asked.targets));
     faults.extend(processor::faults(checkpoint, knowledge, asked, of_class, model));
     faults
 }
 
-/// What each loader does with each object, by the findings and the predicted loads. `silent` are the rules that did not run.
+/// What each loader does with each object, by the findings of all rules and the predicted loads.
 fn verdicts(
     checkpoint: &Checkpoint,
-    silent: &[Rule],
     context: &Context<'_>,
+    programs: &[AskedProgram<'_>],
     faults: &[Fault],
     outcome: &Outcome,
     unpredicted: &[(&'static str, String)],
 ) -> Vec<PredictedLoad> {
-    // An effect without an object is on the one that reads the file of the fault, which may be any.
-    let unjudged = silent.iter().flat_map(|rule| &rule.effects);
-    let unjudged = unjudged.flat_map(|effect| effect.object.map_or(Object::ALL.to_vec(), |object| vec![object]));
     let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
     let basis = Basis {
         checkpoint,
@@ -153,32 +306,8 @@ fn verdicts(
         findings: &outcome.findings,
         loads: &outcome.loads,
         unpredicted,
-        unjudged: &unjudged.collect(),
     };
-    basis.verdicts(&context.targets, context.programs)
-}
-
-/// The tokenizer as the processor of the first leading version opens it.
-fn opened_first(checkpoint: &Checkpoint, processor: &Processor, targets: &[Target]) -> Option<OpenedTokenizer> {
-    let leading = targets.iter().find(|target| target.leads).map(|target| target.loader.version());
-    opened_under(checkpoint, processor, leading)
-}
-
-fn opened_under(checkpoint: &Checkpoint, processor: &Processor, version: Option<&str>) -> Option<OpenedTokenizer> {
-    let config = checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref()).unwrap_or(&Value::Null);
-    tokens::open_tokenizer(&checkpoint.tokenizer, processor, config, version).ok().flatten()
-}
-
-/// Binds `opened`: by version of transformers, the tokenizer as the version's processor opens it, and the class.
-fn bind_opened(scope: &mut Scope<'_>, checkpoint: &Checkpoint, processor: Option<&Processor>) {
-    let of_version = |loader: &Loader| {
-        let processor = processor?;
-        let mut summary = opened_under(checkpoint, processor, Some(loader.version()))?.summary();
-        let class = processor.opens_with(loader.version()).map(|class| class.class.as_str());
-        summary.as_object_mut()?.insert("class".to_owned(), json!(class));
-        Some((loader.version().to_owned(), summary))
-    };
-    scope.bind("opened", &Value::Object(Loader::ALL.iter().filter_map(of_version).collect()));
+    basis.verdicts(&context.targets, programs)
 }
 
 /// Binds what the run asks for, and what is known of the class.

@@ -49,9 +49,9 @@ impl<'a> Context<'a> {
     }
 }
 
-/// Runs the selected rules, and adds their findings and the skipped rules to the outcome.
-pub(super) fn run_rules(
-    rules: &[Rule],
+/// Runs rules, and adds their findings and the skipped rules to the outcome.
+pub(super) fn run_rules<'r>(
+    rules: impl IntoIterator<Item = &'r Rule>,
     context: &Context<'_>,
     faults: &[Fault],
     scope: &Scope<'_>,

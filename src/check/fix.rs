@@ -180,6 +180,14 @@ impl FixHint {
         Self::manual(help)
     }
 
+    /// The advice in place of edits that only a version of transformers needs which the run was not asked for: how to make them.
+    #[must_use]
+    pub(super) fn for_version(self, version: &str) -> Self {
+        let Some(title) = &self.title else { return self };
+        let option = if self.safety == Safety::Unsafe { " --unsafe-fixes" } else { "" };
+        Self::manual(format!("`check --for {version} --fix{option}` would {title}"))
+    }
+
     /// The files that the edits change by name, the first one first. A rename names none.
     #[must_use]
     pub(crate) fn files(&self) -> Vec<String> {

@@ -58,7 +58,7 @@ impl<'t> Asked<'t> {
     /// The targets that do not know a name. The version that config.json states is no evidence against a name that it
     /// uses and a known version has: models are published with the version of a development build.
     pub(super) fn lacking(self, names: &LoaderNames, kind: NameKind, name: &str) -> Vec<&'t Target> {
-        let is_stated = |target: &Target| target.leads && !self.named;
+        let is_stated = |target: &Target| target.leads && !self.named || target.version().contains("dev");
         let lacks = |target: &&Target| {
             names.lacks(target.version(), kind, name) && !(is_stated(target) && names.contains(kind, name))
         };

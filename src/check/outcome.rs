@@ -16,8 +16,6 @@ pub struct Outcome {
     pub findings: Vec<Finding>,
     /// What each loader of the run does, the leading ones first.
     pub verdicts: Vec<PredictedLoad>,
-    /// Whether the verdicts are by all rules, whether selected or not.
-    pub by_all_rules: bool,
     /// A report for each loader; none when the architecture is unknown or no tensor name was read.
     pub loads: Vec<LoadReport>,
     /// The config with the class's defaults filled in; null when the architecture is unknown.

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::model_type::{Asked, CAP};
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, escape, has_paired_merges};
+use crate::checkpoint::{Checkpoint, Document, Fault, FaultKind, Place, Tokenizer, escape, has_paired_merges};
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::tokenizer_parts::TokenizerPart;
 
@@ -19,25 +19,30 @@ const READS_PAIRS: [u64; 2] = [4, 45];
 /// Depth of sequences in sequences that is read.
 const MAX_DEPTH: usize = 8;
 
-/// Faults of tokenizer.json. Called by the engine with the targets of the run; a tokenizer that is built from another file
-/// has none.
-pub(super) fn faults(checkpoint: &Checkpoint, parts: &[TokenizerPart], asked: &Asked<'_>) -> Vec<Fault> {
-    let Some(document) = checkpoint.document(FILE).filter(|_| checkpoint.tokenizer.source.as_deref() == Some(FILE))
-    else {
-        return Vec::new();
-    };
+/// The file, unless the tokenizer is built from another one.
+fn document(checkpoint: &Checkpoint) -> Option<&Document> {
+    checkpoint.document(FILE).filter(|_| checkpoint.tokenizer.source.as_deref() == Some(FILE))
+}
+
+/// The fault of merges that older versions do not read. Called by the engine with the targets of the run.
+pub(super) fn paired_merges(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Option<Fault> {
+    let document = document(checkpoint)?;
+    let old =
+        asked.targets.iter().filter(|target| version_numbers(target.version()).as_slice() < READS_PAIRS.as_slice());
+    let old: Vec<&'static str> = old.map(|target| target.loader.version()).collect();
+    let is_fault = !old.is_empty() && has_paired_merges(document);
+    let fault = Fault::new(FaultKind::MergesArePairs).at(Place::file(FILE).pointer("/model/merges"));
+    is_fault.then(|| fault.under_all(old))
+}
+
+/// Faults of tokenizer.json under every version. Called by the engine once for a run.
+pub(super) fn faults(checkpoint: &Checkpoint, parts: &[TokenizerPart]) -> Vec<Fault> {
+    let Some(document) = document(checkpoint) else { return Vec::new() };
     let mut faults = Vec::new();
     for part in parts {
         if let Some(value) = document.get(&part.pointer) {
             unknown_types(value, part, &part.pointer, 0, &mut faults);
         }
-    }
-    let old =
-        asked.targets.iter().filter(|target| version_numbers(target.version()).as_slice() < READS_PAIRS.as_slice());
-    let old: Vec<&'static str> = old.map(|target| target.loader.version()).collect();
-    if !old.is_empty() && has_paired_merges(document) {
-        let fault = Fault::new(FaultKind::MergesArePairs).at(Place::file(FILE).pointer("/model/merges"));
-        faults.push(fault.under_all(old));
     }
     let added = document.get("/added_tokens").and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
     if let Some(given) = given_ids(&checkpoint.tokenizer, added) {

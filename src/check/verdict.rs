@@ -62,7 +62,7 @@ pub struct ObjectVerdict {
     /// The exception, what becomes wrong, or why nothing is predicted; missing when the object loads.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub why: Option<String>,
-    /// Codes of the findings that it rests on, suppressed ones included.
+    /// Codes of the findings that it rests on; also of suppressed ones, and of rules that were not selected.
     #[serde(skip_serializing_if = "BTreeSet::is_empty")]
     pub findings: BTreeSet<String>,
 }
@@ -124,8 +124,6 @@ pub(super) struct Basis<'a> {
     pub(super) loads: &'a [LoadReport],
     /// For a loader without a report, the reason.
     pub(super) unpredicted: &'a [(&'static str, String)],
-    /// Objects that rules which were not selected could judge.
-    pub(super) unjudged: &'a BTreeSet<Object>,
 }
 
 impl Basis<'_> {
@@ -230,11 +228,7 @@ impl Basis<'_> {
                 return (LoadVerdict::NotPredicted, Some("no tensor was read".to_owned()));
             }
             Some(report) => {
-                let (verdict, why) = of_report(report);
-                if verdict == LoadVerdict::Loads && self.unjudged.contains(&object) {
-                    return (LoadVerdict::NotPredicted, Some("rules that judge it are not selected".to_owned()));
-                }
-                return (verdict, why);
+                return of_report(report);
             }
             None => {}
         }

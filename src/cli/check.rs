@@ -11,7 +11,7 @@ use super::paths::{self, Targets};
 use super::progress::Meter;
 use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
-use crate::check::{Outcome, check_for, try_for, unused_suppressions};
+use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, ReadOptions, parallel};
 use crate::knowledge::settings::Surroundings;
@@ -76,7 +76,7 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         (true, false) => CLEAN,
     };
     if args.fix.diff {
-        let changes = looked.iter().map(|l| fix::show(&args.fix, &l.dir, &l.checkpoint, &l.outcome, &try_by(by)));
+        let changes = looked.iter().map(|l| fix::show(&args.fix, &l.dir, &l.checkpoint, &l.outcome, &judge_by(by)));
         let changes = changes.sum::<anyhow::Result<usize>>()?;
         return Ok(exit(changes > 0));
     }
@@ -116,12 +116,12 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 
 /// Checks a checkpoint under its settings. Every fix that it offers was tried.
 fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
-    |checkpoint| tried(checkpoint, check_for(checkpoint, &by.knowledge, &by.versions), &try_by(by))
+    |checkpoint| tried(checkpoint, judge_by(by)(checkpoint), &judge_by(by))
 }
 
-/// Judges a checkpoint on which fixes are tried.
-fn try_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
-    |checkpoint| try_for(checkpoint, &by.knowledge, &by.versions)
+/// Checks a checkpoint without a try of its fixes.
+fn judge_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
+    |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
 }
 
 /// Options of a run, and what surrounds the directories that it checks.
@@ -172,10 +172,11 @@ impl CheckRun<'_> {
             return Ok(checked);
         }
         let Checked { dir, checkpoint, outcome, .. } = checked;
-        let repaired = fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &try_by(self.by))?;
+        let repaired =
+            fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &judge_by(self.by))?;
         let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } = repaired;
         let outcome = outcome
-            .map_or_else(|| check_by(self.by)(&checkpoint), |outcome| tried(&checkpoint, outcome, &try_by(self.by)));
+            .map_or_else(|| check_by(self.by)(&checkpoint), |outcome| tried(&checkpoint, outcome, &judge_by(self.by)));
         Ok(Checked { dir, checkpoint, outcome, repaired: (fixed, withdrawn) })
     }
 }

@@ -330,15 +330,34 @@ pub fn governed(checkpoint: &CheckpointReport) -> Option<String> {
     (!parts.is_empty()).then(|| parts.join(", "))
 }
 
-/// The verdicts in one line, the worst first and those that are not predicted last: `raises with transformers 5.23.0; loads
-/// with 4.47.0`.
+/// The verdicts in one line: `loads with transformers 5.23.0 (raises with 4.57.6)`.
 pub fn headline(loads: &[PredictedLoad]) -> String {
+    let (first, others) = headlines(loads);
+    others.map_or_else(|| first.clone(), |others| format!("{first} {others}"))
+}
+
+/// The verdicts on the version that wrote the checkpoint, or on the loaders that the user named, and then in brackets those on
+/// other versions. In each, the worst come first and those that are not predicted last.
+pub fn headlines(loads: &[PredictedLoad]) -> (String, Option<String>) {
+    let (first, others): (Vec<&PredictedLoad>, Vec<&PredictedLoad>) =
+        loads.iter().partition(|load| load.leads || is_program(&load.loader));
+    if first.is_empty() {
+        return (by_verdict(&others, "transformers "), None);
+    }
+    let leading = by_verdict(&first, "transformers ");
+    let title = if leading.contains("transformers ") { "" } else { "transformers " };
+    let others = (!others.is_empty()).then(|| format!("({})", by_verdict(&others, title)));
+    (leading, others)
+}
+
+/// `raises with transformers 5.23.0; loads with 4.47.0`; `title` stands before the first version.
+fn by_verdict(loads: &[&PredictedLoad], title: &str) -> String {
     let order = [LoadVerdict::Raises, LoadVerdict::LoadsWrong, LoadVerdict::Loads, LoadVerdict::NotPredicted];
     let mut parts: Vec<String> = Vec::new();
     for verdict in order {
-        let loaders: Vec<&PredictedLoad> = loads.iter().filter(|load| load.verdict == verdict).collect();
+        let loaders: Vec<&PredictedLoad> = loads.iter().copied().filter(|load| load.verdict == verdict).collect();
         if !loaders.is_empty() {
-            let title = if parts.iter().any(|part| part.contains("transformers ")) { "" } else { "transformers " };
+            let title = if parts.iter().any(|part| part.contains("transformers ")) { "" } else { title };
             parts.push(format!("{} with {}", verdict.name(), listed(&loaders, title)));
         }
     }

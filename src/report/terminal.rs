@@ -11,7 +11,7 @@ use std::fmt::Write as _;
 
 use self::paint::Paint;
 use super::format::{
-    agreeing, alike, bytes, capped, counts, governed, headline, name, notes, objects, plural, summary, worst_first,
+    agreeing, alike, bytes, capped, counts, governed, headlines, name, notes, objects, plural, summary, worst_first,
     wrap,
 };
 use super::model::{CheckpointReport, Report};
@@ -73,7 +73,9 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
         let _ok = write!(out, " ({})", name(&role.to_string()));
     }
     if !checkpoint.loads.is_empty() {
-        let _ok = write!(out, ": {}", paint.strong(&headline(&checkpoint.loads)));
+        let (first, others) = headlines(&checkpoint.loads);
+        let _ok = write!(out, ": {}", paint.strong(&first));
+        let _ok = others.map(|others| write!(out, " {}", paint.quiet(&others)));
     }
     let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
     let _ok = write!(out, "\n  {architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));

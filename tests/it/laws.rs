@@ -7,6 +7,7 @@ mod exit;
 mod judgement;
 mod leaks;
 mod templates;
+mod verdicts;
 
 use std::path::Path;
 use std::sync::LazyLock;

@@ -44,10 +44,9 @@ struct Planner<'a> {
 
 /// Plans the repair of a checkpoint: all safe fixes, and with `unsafe_fixes` also the unsafe ones.
 ///
-/// `check` runs the selected rules on a checkpoint, and judges it by all rules; `outcome` is the result for this one.
+/// `check` runs the selected rules on a checkpoint; `outcome` is the result for this one.
 #[must_use]
 pub fn plan(checkpoint: &Arc<Checkpoint>, outcome: Outcome, unsafe_fixes: bool, check: CheckFn<'_>) -> Repair {
-    let outcome = if outcome.by_all_rules { outcome } else { check(checkpoint) };
     let draft = RepairDraft::new(checkpoint);
     let start = (draft.clone(), outcome.clone());
     let mut planner = Planner { check, draft, outcome, made: Vec::new(), barred: Vec::new(), trials: TRIALS };

@@ -57,7 +57,7 @@ fn compared(dir: &Path, knowledge: &Knowledge) -> Vec<String> {
             // What the load after it proves is tried elsewhere.
             fix.needs_whole_load = false;
         }
-        let one = Outcome { findings: vec![alone], by_all_rules: true, ..Outcome::default() };
+        let one = Outcome { findings: vec![alone], ..Outcome::default() };
         let report = Report::new(vec![CheckpointReport::new("model", None, &checkpoint, &one)], None);
         let log = render(&report, Format::Sarif, Style { cap: 8, ..Style::default() });
         let log: Value = serde_json::from_str(&log).expect("JSON");
