@@ -8,7 +8,7 @@ use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
 use super::load::{LoadReport, Target};
 use super::outcome::Outcome;
-use super::variables;
+use super::variables::{self, declared};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place, pointer};
 use crate::knowledge::expression::within;
@@ -57,6 +57,8 @@ pub(super) fn run_rules<'r>(
     scope: &Scope<'_>,
     outcome: &mut Outcome,
 ) {
+    debug_assert_eq!(declared::mismatch(scope), None);
+    debug_assert_eq!(faults.iter().find_map(Fault::mismatch), None);
     let architecture = outcome.architecture.clone();
     for rule in rules {
         // Built-in rules are known to end; a user's rule gets a limit.
@@ -83,6 +85,7 @@ pub(super) fn run_rules<'r>(
 
 /// The findings of the rules that name the kinds of these faults, for faults that no check of a checkpoint produces.
 pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[Fault]) -> Vec<Finding> {
+    debug_assert_eq!(faults.iter().find_map(Fault::mismatch), None);
     let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(named);
     // Without a loader: these faults concern no load.

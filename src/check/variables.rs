@@ -1,10 +1,15 @@
-//! The variables and functions of a checkpoint for the expressions of rules.
+//! The variables and functions of a checkpoint for the expressions of rules. [`declared`] lists all of them.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde_json::{Map, Value, json};
+
+pub(super) mod declared;
+
+#[cfg(feature = "internals")]
+pub use declared::{FUNCTIONS, RuleFunction, VARIABLES, Variable};
 
 use super::load::LoadReport;
 use super::tokens::OpenedTokenizer;

@@ -5,8 +5,11 @@ use std::ops::Range;
 
 use serde_json::{Map, Value};
 
+mod detail;
 mod kind;
 
+pub(crate) use detail::declared_keys;
+pub use detail::{DeclaredKey, ValueType};
 pub use kind::FaultKind;
 #[cfg(feature = "internals")]
 pub use kind::FaultSource;
@@ -21,7 +24,7 @@ pub struct Fault {
     pub kind: FaultKind,
     /// The places, most important first. Empty means the whole checkpoint.
     pub places: Vec<Place>,
-    /// Figures and names for the message, under the names that the rule's message uses.
+    /// Figures and names for the message, under the keys that the kind declares.
     pub detail: Map<String, Value>,
     /// Versions of the loaders whose predicted load has the fault; empty for a fault of the checkpoint itself.
     pub loaders: Vec<&'static str>,
@@ -34,6 +37,13 @@ impl Fault {
     #[must_use]
     pub(crate) fn new(kind: FaultKind) -> Self {
         Self { kind, places: Vec::new(), detail: Map::new(), loaders: Vec::new(), hidden: 0 }
+    }
+
+    /// The fault of a file whose bytes are UTF-8 up to `offset` only.
+    #[must_use]
+    pub(crate) fn invalid_utf8(file: &str, bytes: &[u8], offset: usize) -> Self {
+        let fault = Self::new(FaultKind::InvalidUtf8).at(Place::file(file)).with("offset", offset);
+        bytes.get(offset).into_iter().fold(fault, |fault, byte| fault.with("byte", format!("0x{byte:02x}")))
     }
 
     /// Adds a place.
@@ -65,11 +75,20 @@ impl Fault {
         }
     }
 
-    /// Adds a named detail.
+    /// Adds a detail under a key that the kind declares.
     #[must_use]
     pub(crate) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
-        self.detail.insert(name.to_owned(), value.into());
+        let value = value.into();
+        debug_assert!(self.kind.declares(name, &value), "{} has no detail {name}: {value}", self.kind);
+        self.detail.insert(name.to_owned(), value);
         self
+    }
+
+    /// The first difference between the details and the keys that the kind declares; `None` when there is none. Debug builds
+    /// compare every fault that rules see.
+    pub(crate) fn mismatch(&self) -> Option<String> {
+        let difference = detail::mismatch(self.kind.declared(), &self.detail)?;
+        Some(format!("{}: {difference}", self.kind))
     }
 }
 

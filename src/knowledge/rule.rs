@@ -213,6 +213,7 @@ pub enum Check {
 ///
 /// Expressions and templates of the rule see the details of the fault as variables, all of them as `fault`, its `kind`, and
 /// the `file`, `tensor` and `pointer` of its first place. With `group`, `faults` lists these variables of each fault.
+/// *Details of faults* lists the keys of each kind.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -230,39 +231,7 @@ pub struct FaultCheck {
 
 /// A condition that must hold.
 ///
-/// Expressions see these variables:
-/// - the documents `config`, `generation`, `processor`, `preprocessor`, `tokenizer_config` and `special_tokens`; null when
-///   missing or unreadable;
-/// - `model`: `config` with the defaults of the class filled in; `text`: its language-model part; `arch`: the name of the
-///   architecture, empty when unknown;
-/// - `rows`: rows of the token embedding;
-/// - `tokenizer`: `length`, `base`, `class`, `source`, `json_base`, `model_base`, `bos`, `eos`, `pad`, `highest`,
-///   `highest_token` (null for one of the vocabulary), `has_vocabulary`;
-/// - `tokens`: ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and
-///   `scattered`; `opened`: the same by loader, with the `class` with which its processor opens the tokenizer;
-///   `processor_tokenizers`: tokenizer classes that the processor's module names;
-/// - `missing_attributes`: tokens that the processor reads as attributes of the tokenizer, which lacks them, as `name`,
-///   `content` and `at_top`; `placeholders`: tokens that stand for images or videos, as `key`, `id`, `content`,
-///   `of_tokenizer` and `is_replaced`;
-/// - `chat_templates`: the default template by file;
-/// - `directory`: name of the directory; `has_weights`; `all_read`: every shard is present and its header was read;
-///   `of_transformers`: config.json is one of transformers; `program`: the program that opens the directory, by
-///   `rules/directories.json5`;
-/// - `robot`: features of a policy of `LeRobot`, with the statistics that each needs and has; null for other configs;
-///   `complete`: nothing suggests that a tensor was lost (see `why` of IDX014);
-/// - `lost_shards`: absent shards that the names of the others count, at most eight;
-/// - `loaders`: versions of transformers to check for; `named`: whether the user named them; `programs`: names of the other
-///   programs to check for;
-/// - `metadata_only`: weights may be missing;
-/// - `groups_heads`: the class reads `num_key_value_heads`, or is unknown.
-///
-/// Functions are `json_error(file, reason)`, `utf8_error(file)`, `python_type(found)` and `is_parsed(file)` for the words of
-/// loaders; `document(name)`: the value of a document that was read, also below a folder; `names(pattern)`: names of entries
-/// and paths below folders, of which those of folders end with `/` (both null beyond a limit on their work);
-/// `shape(tensor)`, `dtype(tensor)`, `has_tensor(prefix)`, `has_file(name)`, `is_opened(file)` (whether transformers opens a
-/// shard of this name), `is_imported(file)` (whether `auto_map` leads to the module), `id_of(token)`, and
-/// `stays_random(tensor)`: whether a loader leaves the tensor randomly initialised, null when the class is unknown. For
-/// messages there are `join(list)`, `plural(count, noun)` and `filesize(bytes)`.
+/// Expressions see the variables and functions under *Names in rules*.
 ///
 /// A condition that cannot be evaluated because a value is missing is not a finding.
 #[derive(Debug, Clone, Deserialize)]

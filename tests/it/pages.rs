@@ -2,6 +2,7 @@
 //! and the completions and manual pages in `packaging/`. `CKPT_DOCTOR_WRITE=1 cargo test --test it pages::` writes them.
 
 mod key_tables;
+mod names;
 mod share;
 
 use std::collections::BTreeMap;
@@ -245,6 +246,9 @@ fn the_page_of_data_files_is_fresh() {
         let text = fs::read_to_string(project().join(format!("schemas/{name}.schema.json"))).expect("text");
         let schema: Value = serde_json::from_str(&text).expect("JSON");
         let _ = write!(page, "\n## {title}\n{}", key_tables::tables(&schema));
+        if name == "rule" {
+            page.push_str(&names::tables());
+        }
     }
     fresh("rules/README.md", &page);
 }

@@ -3,6 +3,7 @@
 
 pub mod failure_modes;
 mod memory;
+mod names;
 mod peft;
 mod seeded;
 

@@ -2,8 +2,6 @@
 
 use std::borrow::Cow;
 
-use serde_json::Value;
-
 use crate::checkpoint::{Fault, FaultKind, Place};
 
 /// Text of a document, and whether it equals the bytes of the file.
@@ -29,9 +27,7 @@ pub(super) fn decode<'a>(name: &str, bytes: &'a [u8]) -> Decoded<'a> {
             Decoded { text: Cow::Borrowed(text), verbatim: true, faults }
         }
         Err(error) => {
-            let at = error.valid_up_to();
-            let byte = bytes.get(at).map_or(Value::Null, |b| format!("0x{b:02x}").into());
-            let fault = Fault::new(FaultKind::InvalidUtf8).at(Place::file(name)).with("offset", at).with("byte", byte);
+            let fault = Fault::invalid_utf8(name, bytes, error.valid_up_to());
             Decoded { text: String::from_utf8_lossy(bytes), verbatim: false, faults: vec![fault] }
         }
     }

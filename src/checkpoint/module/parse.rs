@@ -44,7 +44,7 @@ fn parse(name: String, bytes: &[u8]) -> PythonModule {
     let text = match std::str::from_utf8(bytes) {
         Ok(text) => text,
         Err(error) => {
-            let fault = Fault::new(FaultKind::InvalidUtf8).at(place).with("offset", error.valid_up_to());
+            let fault = Fault::invalid_utf8(&name, bytes, error.valid_up_to());
             return PythonModule::unread(name, fault);
         }
     };

@@ -17,12 +17,14 @@ pub(super) static ENV: LazyLock<Arc<Env>> = LazyLock::new(|| Arc::new(Env::stdli
 /// variables, so that a loop index costs one small allocation.
 pub struct Scope<'p> {
     context: Context<'p, 'static>,
+    /// Names of the functions that were added here; CEL does not list its own.
+    functions: Vec<&'static str>,
 }
 
 impl Scope<'static> {
     /// A root scope with CEL's standard functions only; [`Scope::new`] adds those of the data files.
     pub(super) fn bare() -> Self {
-        Self { context: Context::with_env(Arc::clone(&ENV)) }
+        Self { context: Context::with_env(Arc::clone(&ENV)), functions: Vec::new() }
     }
 
     /// Adds a function of any number of arguments; an `Err` becomes the expression's error.
@@ -31,7 +33,11 @@ impl Scope<'static> {
     ///
     /// # Panics
     /// When `name` is one of CEL's own functions, which it would shadow.
-    pub fn function(&mut self, name: &str, f: impl Fn(&[Value]) -> Result<Value, String> + Send + Sync + 'static) {
+    pub fn function(
+        &mut self,
+        name: &'static str,
+        f: impl Fn(&[Value]) -> Result<Value, String> + Send + Sync + 'static,
+    ) {
         let call = move |context: &FunctionContext| -> Result<Cel, ExecutionError> {
             let mut arguments = Vec::new();
             for argument in context.this.iter().chain(&context.args) {
@@ -48,7 +54,7 @@ impl Scope<'static> {
     ///
     /// # Panics
     /// When `name` is one of CEL's own functions.
-    pub fn function1(&mut self, name: &str, f: impl Fn(&str) -> Value + Send + Sync + 'static) {
+    pub fn function1(&mut self, name: &'static str, f: impl Fn(&str) -> Value + Send + Sync + 'static) {
         self.function(name, move |arguments| match arguments {
             [Value::String(s)] => Ok(f(s)),
             _ => Err("one string expected".to_owned()),
@@ -59,20 +65,21 @@ impl Scope<'static> {
     ///
     /// # Panics
     /// When `name` is one of CEL's own functions.
-    pub fn function2(&mut self, name: &str, f: impl Fn(&str, &str) -> Value + Send + Sync + 'static) {
+    pub fn function2(&mut self, name: &'static str, f: impl Fn(&str, &str) -> Value + Send + Sync + 'static) {
         self.function(name, move |arguments| match arguments {
             [Value::String(a), Value::String(b)] => Ok(f(a, b)),
             _ => Err("two strings expected".to_owned()),
         });
     }
 
-    pub(super) fn add<T: 'static, F>(&mut self, name: &str, f: F)
+    pub(super) fn add<T: 'static, F>(&mut self, name: &'static str, f: F)
     where
         F: cel::extractors::IntoFunction<T> + Send + Sync + 'static,
     {
         if let Err(e) = self.context.add_function(name, f) {
             panic!("{e}");
         }
+        self.functions.push(name);
     }
 }
 
@@ -104,13 +111,24 @@ impl Scope<'_> {
     /// A nested scope: reads names of this one, and binds its own.
     #[must_use]
     pub fn child(&self) -> Scope<'_> {
-        Scope { context: self.context.new_inner_scope() }
+        Scope { context: self.context.new_inner_scope(), functions: Vec::new() }
     }
 
     /// A variable bound here or in an outer scope; `None` when it is unbound or cannot be converted to JSON.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<Value> {
         to_json(&Cel::try_from(self.context.get_variable(name)?.as_ref()).ok()?)
+    }
+
+    /// Names of the variables bound here, without those of outer scopes.
+    pub(crate) fn variables(&self) -> impl Iterator<Item = &str> {
+        let (Context::Root { variables, .. } | Context::Child { variables, .. }) = &self.context;
+        variables.keys().map(String::as_str)
+    }
+
+    /// Names of the functions added here, without those of CEL.
+    pub(crate) fn functions(&self) -> &[&'static str] {
+        &self.functions
     }
 
     pub(super) fn context(&self) -> &Context<'_, 'static> {
