@@ -69,7 +69,7 @@ fn convert(folder: &Path, to: &Path, heads: &mut BTreeMap<String, Value>) -> io:
             let value: Value = json5::from_str(&fs::read_to_string(&path)?).map_err(wrong)?;
             fs::write(copy, value.to_string())?;
             if path.starts_with("rules/checks") {
-                let head = ["code", "name", "applies", "when", "check"];
+                let head = ["code", "name", "applies", "when", "let", "check"];
                 let head = head.into_iter().filter_map(|key| Some((key.to_owned(), value.get(key)?.clone())));
                 let path = path.to_string_lossy().replace('\\', "/");
                 let head: Map<String, Value> = head.chain([("path".to_owned(), path.into())]).collect();

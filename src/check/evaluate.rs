@@ -16,6 +16,8 @@ use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Assert, At, Check, Effect, FaultCheck, Object, Rule};
 use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
 
+mod lets;
+
 /// Findings of one rule that are kept, for the memory of hostile checkpoints; the last one counts the others as hidden.
 const CAP: usize = 1000;
 
@@ -135,9 +137,13 @@ fn run<'r>(
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unevaluated<'r>> {
+    let mut inner = scope.child();
+    lets::bind(&rule.lets, &mut inner);
     let mut findings = match &rule.check {
-        Check::Fault(check) => from_faults(rule, check, context, faults, scope),
-        Check::Assert(check) => from_assert(rule, check, context, scope)?,
+        Check::Fault(check) => from_faults(rule, check, context, faults, &inner),
+        Check::Assert(check) => {
+            from_assert(rule, check, context, &inner).map_err(|failed| lets::cause(&rule.lets, failed, &inner))?
+        }
     };
     let more = findings.len().saturating_sub(CAP);
     if more > 0 {
@@ -167,13 +173,13 @@ fn from_faults(
         let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
         let mut evidence = first.detail.clone();
         evidence.insert("count".to_owned(), json!(count));
-        let fix = all.iter().map(|f| hint(rule, context, f, &fault_scope(scope, f, count)));
+        let fix = all.iter().map(|f| hint(rule, context, f, &finding_scope(check, scope, f, count)));
         let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
-        let mut inner = fault_scope(scope, first, count);
+        let mut inner = finding_scope(check, scope, first, count);
         inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
         let mut caused = Caused::default();
         for fault in all.iter().take(PLACES) {
-            caused.add(rule, context, &fault.loaders, &fault_scope(scope, fault, count));
+            caused.add(rule, context, &fault.loaders, &finding_scope(check, scope, fault, count));
         }
         return vec![finding(rule, &inner, caused, places, evidence, fix)];
     }
@@ -182,7 +188,7 @@ fn from_faults(
     for fault in matching.by_ref().take(CAP) {
         let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
         more = more.saturating_add(fault.hidden);
-        let inner = fault_scope(scope, fault, 1);
+        let inner = finding_scope(check, scope, fault, 1);
         let fix = hint(rule, context, fault, &inner);
         let mut caused = Caused::default();
         caused.add(rule, context, &fault.loaders, &inner);
@@ -193,7 +199,7 @@ fn from_faults(
         more = more.saturating_add(fault.hidden).saturating_add(1);
         let last = out.last_mut().and_then(|last| last.fix.as_mut());
         if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
-            && let Some(fix) = hint(rule, context, fault, &fault_scope(scope, fault, 1))
+            && let Some(fix) = hint(rule, context, fault, &finding_scope(check, scope, fault, 1))
             && fix.safety == last.safety
         {
             last.edits.extend(fix.edits);
@@ -203,6 +209,13 @@ fn from_faults(
         last.hidden = more;
     }
     out
+}
+
+/// The variables of a finding for one of `count` faults: those of the fault, and those that the check binds.
+fn finding_scope<'a>(check: &FaultCheck, scope: &'a Scope<'_>, fault: &Fault, count: u64) -> Scope<'a> {
+    let mut inner = fault_scope(scope, fault, count);
+    lets::bind(&check.lets, &mut inner);
+    inner
 }
 
 /// The variables of a rule on faults, for one of `count` faults.
@@ -236,8 +249,7 @@ fn from_assert<'r>(
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unevaluated<'r>> {
     let Some(each) = &check.each else {
-        let found = one_assert(rule, check, context, scope).map_err(|error| (&check.that, error))?;
-        return Ok(found.into_iter().collect());
+        return Ok(one_assert(rule, check, context, scope.child())?.into_iter().collect());
     };
     let items = match each.eval(scope).map_err(|error| (each, error))? {
         Value::Array(items) => items,
@@ -248,18 +260,22 @@ fn from_assert<'r>(
         let mut inner = scope.child();
         inner.bind("it", &item);
         // A missing value cannot be wrong; another rule reports it when it is required.
-        out.extend(one_assert(rule, check, context, &inner).unwrap_or(None));
+        out.extend(one_assert(rule, check, context, inner).unwrap_or(None));
     }
     Ok(out)
 }
 
-fn one_assert(
+/// The finding for one element, whose variables `scope` has.
+fn one_assert<'r>(
     rule: &Rule,
-    check: &Assert,
+    check: &'r Assert,
     context: &Context<'_>,
-    scope: &Scope<'_>,
-) -> Result<Option<Finding>, EvalError> {
-    if check.that.eval_bool(scope)? {
+    mut scope: Scope<'_>,
+) -> Result<Option<Finding>, Unevaluated<'r>> {
+    lets::bind(&check.lets, &mut scope);
+    let scope = &scope;
+    let holds = check.that.eval_bool(scope).map_err(|error| lets::cause(&check.lets, (&check.that, error), scope))?;
+    if holds {
         return Ok(None);
     }
     let places: Vec<Place> = check.at.iter().map(|at| place(at, scope)).collect();

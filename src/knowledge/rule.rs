@@ -15,6 +15,7 @@ pub use effect::{Consequence, Effect, Harm, LoaderRange, Object};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template, compile_lazily};
+use super::ordered::ordered;
 use super::source::{self, DataError};
 use crate::checkpoint::FaultKind;
 
@@ -77,6 +78,11 @@ pub struct RuleFile {
     /// Condition for running the rule; an expression that cannot be evaluated counts as false.
     #[serde(default)]
     pub when: Option<Expression>,
+    /// Names for values that the other expressions use, evaluated in order after `when`; each may use the names before it.
+    /// One that cannot be evaluated is unbound, and so an expression that uses it cannot be evaluated.
+    #[serde(default, rename = "let", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
+    pub lets: Vec<(String, Expression)>,
     /// The condition to check.
     pub check: Check,
     /// Message of a finding: the cause with names and figures, one sentence without a full stop.
@@ -114,6 +120,9 @@ pub struct Rule {
     /// As [`RuleFile::when`].
     #[serde(default)]
     pub when: Option<Expression>,
+    /// As [`RuleFile::lets`].
+    #[serde(default, rename = "let", deserialize_with = "ordered")]
+    pub lets: Vec<(String, Expression)>,
     /// As [`RuleFile::check`].
     pub check: Check,
     /// Path of the file, for a rule from `--rules`.
@@ -169,6 +178,7 @@ impl From<RuleFile> for Rule {
             name: file.name.clone(),
             applies: file.applies.clone(),
             when: file.when.clone(),
+            lets: file.lets.clone(),
             check: file.check.clone(),
             origin: None,
             regraded: None,
@@ -224,6 +234,10 @@ pub struct FaultCheck {
     /// Report only faults for which this holds.
     #[serde(default)]
     pub only: Option<Expression>,
+    /// As `let` of the rule, evaluated after `only` for each fault; its values may depend on the fault.
+    #[serde(default, rename = "let", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
+    pub lets: Vec<(String, Expression)>,
     /// Report all faults as one finding; the variables are those of the first fault, and `count` is their number.
     #[serde(default)]
     pub group: bool,
@@ -241,6 +255,10 @@ pub struct Assert {
     /// A list; the condition is checked for each element, bound as `it`.
     #[serde(default)]
     pub each: Option<Expression>,
+    /// As `let` of the rule, evaluated before `that` for each element; its values may depend on `it`.
+    #[serde(default, rename = "let", deserialize_with = "ordered")]
+    #[cfg_attr(test, schemars(with = "std::collections::BTreeMap<String, Expression>"))]
+    pub lets: Vec<(String, Expression)>,
     /// The condition; a finding is reported when it is false.
     pub that: Expression,
     /// Places that the finding points at.
@@ -363,7 +381,8 @@ mod tests {
         for rule in &set.rules {
             let file: &RuleFile = rule;
             assert_eq!((&rule.code, &rule.name, &rule.applies), (&file.code, &file.name, &file.applies));
-            assert_eq!(format!("{:?} {:?}", rule.when, rule.check), format!("{:?} {:?}", file.when, file.check));
+            let conditions = format!("{:?} {:?} {:?}", rule.when, rule.lets, rule.check);
+            assert_eq!(conditions, format!("{:?} {:?} {:?}", file.when, file.lets, file.check));
             assert_eq!(file.check_text(), Ok(()), "{}", rule.path);
             assert!(words.insert(&rule.code) && words.insert(&rule.name), "{} is used twice", rule.code);
         }

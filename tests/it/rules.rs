@@ -2,6 +2,7 @@
 //! rules.
 
 pub mod failure_modes;
+mod lets;
 mod memory;
 mod names;
 mod peft;

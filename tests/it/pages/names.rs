@@ -11,7 +11,7 @@ use super::markdown;
 pub fn tables() -> String {
     let mut out = "\n## Names in rules\n\n\
          A test compares every name in every rule with these tables. A value of a type *or null* may be null, and a key \
-         with `?` may be missing: test it with `has(fault.key)`.\n\n\
+         with `?` may be missing: test it with `has(fault.key)`. A `let` binds a name that is none of these.\n\n\
          | variable | type | meaning |\n|---|---|---|\n"
         .to_owned();
     for variable in VARIABLES {

@@ -93,6 +93,18 @@ impl Found {
         }
     }
 
+    /// Binds the names of a `let`, each of which is new.
+    fn lets(&mut self, at: &str, lets: &[(String, Expression)], names: &mut Names) {
+        for (name, expression) in lets {
+            let at = format!("{at}.{name}");
+            let of = self.expression(&at, expression, names, Need::All);
+            if names.variables.contains_key(name) {
+                self.problems.insert((at, Problem::Taken { name: name.clone() }));
+            }
+            names.bind(name, of);
+        }
+    }
+
     /// What a finding shows.
     fn finding(&mut self, rule: &RuleFile, names: &Names) {
         for (number, effect) in rule.effects.iter().enumerate() {
@@ -112,8 +124,16 @@ impl Found {
     }
 
     fn fault(&mut self, rule: &RuleFile, check: &FaultCheck, kind: FaultKind, names: &Names) {
-        let names = names_of_fault(check, kind, names);
-        if let Some(names) = self.condition("check.fault.only", check.only.as_ref(), &names) {
+        let names = names_of_fault(kind, names);
+        let of_fault = names_of_fault(kind, &Names::default()).variables;
+        for (name, _) in rule.lets.iter().filter(|(name, _)| of_fault.contains_key(name)) {
+            self.problems.insert((format!("let.{name}"), Problem::Taken { name: name.clone() }));
+        }
+        if let Some(mut names) = self.condition("check.fault.only", check.only.as_ref(), &names) {
+            self.lets("check.fault.let", &check.lets, &mut names);
+            if check.group {
+                names.bind("faults", Type::list(type_of_faults(check)));
+            }
             self.finding(rule, &names);
         }
     }
@@ -124,6 +144,7 @@ impl Found {
             let list = self.expression("check.assert.each", each, &names, Need::Some);
             names.bind("it", list.element());
         }
+        self.lets("check.assert.let", &check.lets, &mut names);
         self.expression("check.assert.that", &check.that, &names, Need::Some);
         for at in &check.at {
             for text in [&at.file, &at.pointer, &at.tensor] {
@@ -149,7 +170,7 @@ fn own_names(kind: Option<FaultKind>) -> BTreeMap<String, Field> {
 }
 
 /// The names that a rule sees of a fault of one kind.
-fn names_of_fault(check: &FaultCheck, kind: FaultKind, names: &Names) -> Names {
+fn names_of_fault(kind: FaultKind, names: &Names) -> Names {
     let mut names = names.clone();
     names.of = format!(" of {}", kind.name());
     names.variables.extend(own_names(Some(kind)));
@@ -163,16 +184,17 @@ fn names_of_fault(check: &FaultCheck, kind: FaultKind, names: &Names) -> Names {
         }
     }
     names.bind("fault", Type::Record(details));
-    if check.group {
-        let of_kind = |kind: &FaultKind| {
-            let mut all = own_names(None);
-            all.extend(Type::record(kind.details()));
-            Type::Record(all)
-        };
-        let any = check.kinds.iter().map(of_kind).fold(Type::Nothing, |all, one| all.or(&one));
-        names.bind("faults", Type::list(any));
-    }
     names
+}
+
+/// An element of `faults`.
+fn type_of_faults(check: &FaultCheck) -> Type {
+    let of_kind = |kind: &FaultKind| {
+        let mut all = own_names(None);
+        all.extend(Type::record(kind.details()));
+        Type::Record(all)
+    };
+    check.kinds.iter().map(of_kind).fold(Type::Nothing, |all, one| all.or(&one))
 }
 
 /// The problems of a rule in its file, as `path: place: problem`.
@@ -180,7 +202,8 @@ fn problems(path: &str, text: &str) -> Vec<String> {
     let rule: RuleFile = source::parse(path, text).unwrap_or_else(|error| panic!("{error}"));
     let names = names_of_check();
     let mut found = Found::default();
-    let names_where_run = found.condition("when", rule.when.as_ref(), &names).unwrap_or(names);
+    let mut names_where_run = found.condition("when", rule.when.as_ref(), &names).unwrap_or(names);
+    found.lets("let", &rule.lets, &mut names_where_run);
     match &rule.check {
         Check::Fault(check) => {
             for kind in &check.kinds {
@@ -262,6 +285,33 @@ fn a_misspelt_key_of_an_element_is_found() {
     assert_eq!(
         problems("ABC001.json5", &text),
         ["ABC001.json5: check.assert.that: `it.prt` is no key; did you mean `part`?"]
+    );
+}
+
+#[test]
+fn a_let_binds_a_new_name() {
+    for (keys, expected) in [
+        (r#"message: "{size(wheels)}", let: { wheels: "loaders" }"#, vec![]),
+        (
+            r#"message: "{whels}", let: { wheels: "1" }"#,
+            vec!["message: `whels` is no variable; did you mean `wheels`?"],
+        ),
+        ("message: 'm', let: { twice: 'ones', ones: '1' }", vec!["let.twice: `ones` is no variable"]),
+        ("message: 'm', let: { config: '1' }", vec!["let.config: `config` has a value already"]),
+        ("message: 'm', let: { index: '1' }", vec!["let.index: `index` has a value already"]),
+    ] {
+        let expected: Vec<String> = expected.iter().map(|problem| format!("ABC001.json5: {problem}")).collect();
+        assert_eq!(of_rule(keys), expected, "{keys}");
+    }
+    let text = "{ code: 'ABC001', name: 'a-b', summary: 's', why: 'w', severity: 'info', check: { fault: { kinds: \
+                ['no-weights'], only: 'others', let: { others: 'join(fault.foreign)', kind: '1' } } }, message: '{others}' }";
+    assert_eq!(
+        problems("ABC001.json5", text),
+        [
+            "ABC001.json5: check.fault.let.kind: `kind` has a value already",
+            "ABC001.json5: check.fault.let.others: `fault.foreign` may be missing; test it with `has(fault.foreign)`",
+            "ABC001.json5: check.fault.only: `others` is no variable",
+        ]
     );
 }
 

@@ -21,6 +21,8 @@ pub enum Problem {
     Untestable { name: String, what: String, near: Option<String> },
     /// A key that may be missing, where nothing tests it.
     Untested { path: String },
+    /// A `let` of a name that is bound already.
+    Taken { name: String },
 }
 
 impl Problem {
@@ -30,6 +32,7 @@ impl Problem {
                 let near = near.as_ref().map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
                 format!("`{name}` is no {what}{near}")
             }
+            Self::Taken { name } => format!("`{name}` has a value already"),
             Self::Untested { path } => format!("`{path}` may be missing; test it with `has({path})`"),
         }
     }
