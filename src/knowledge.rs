@@ -9,6 +9,7 @@ pub mod evidence;
 pub mod expression;
 pub mod initial;
 pub mod library;
+pub mod lists;
 pub mod loader;
 pub mod modules;
 pub mod names;

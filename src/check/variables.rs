@@ -17,7 +17,7 @@ use super::{exceptions, index, model_type, modules, templates};
 use crate::checkpoint::glob::glob;
 use crate::checkpoint::tokenizer::is_vocabulary;
 use crate::checkpoint::{Checkpoint, Document, FaultKind, Index, Vocabulary};
-use crate::knowledge::{Expression, Scope};
+use crate::knowledge::{Expression, Scope, lists};
 
 /// Keys of `tokenizer_config.json` that are large; rules reach them through `tokenizer`, `id_of` and `chat_templates`.
 const BULKY: [&str; 3] = ["added_tokens_decoder", "additional_special_tokens", "chat_template"];
@@ -101,6 +101,10 @@ pub fn scope(
     let left = Allowance::new(NAMES_MATCHED);
     let count = checkpoint.names().count();
     scope.function1("names", move |pattern| if left.take(count) { names(&here, pattern) } else { Value::Null });
+    scope.function("listed", |arguments| match arguments {
+        [Value::String(name)] => lists::listed(name).cloned().ok_or_else(|| format!("there is no list `{name}`")),
+        _ => Err("listed(name) takes the name of a list".to_owned()),
+    });
     scope.bind("of_transformers", &json!(model_type::is_of_transformers(checkpoint)));
     let here = Arc::clone(checkpoint);
     scope.function1("is_opened", move |name| json!(index::is_opened(&here, name)));

@@ -235,6 +235,7 @@ fn the_page_of_data_files_is_fresh() {
          | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
          | `prediction-layers.json5` | layers that predict further tokens, which no class builds |\n\
          | `wrappers.json5` | parts of tensor names that wrappers such as torch.compile add |\n\
+         | `lists.json5` | lists that the expressions of rules read with `listed(name)` |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\
          | `expressions.txt` | the expressions of all these files, parsed; written by `CKPT_DOCTOR_WRITE=1 cargo test --lib` |\n\n\

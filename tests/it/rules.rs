@@ -1,6 +1,7 @@
 //! Every rule on every fixture: each case is reported by its own rule, and the snapshot records findings of other
 //! rules.
 
+mod expressions;
 pub mod failure_modes;
 mod lets;
 mod memory;

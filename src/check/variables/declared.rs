@@ -142,6 +142,7 @@ pub const FUNCTIONS: &[RuleFunction] = &[
     function("is_opened", &["file"], Flag, "whether transformers opens a shard of this name"),
     function("is_parsed", &["file"], Flag, "whether Python parses a document"),
     function("json_error", &["file", "reason"], Text, "the exception of a loader for a document that is no JSON"),
+    function("listed", &["name"], Any, "a list of `rules/lists.json5`: texts, or texts by key"),
     function(
         "names",
         &["pattern"],

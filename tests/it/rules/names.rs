@@ -245,6 +245,10 @@ fn a_misspelt_name_is_found_wherever_it_is() {
         ),
         ("message: 'm', when: \"confg.a == 1\"", "ABC001.json5: when: `confg` is no variable; did you mean `config`?"),
         (
+            "message: 'm', when: \"arch in listed('layer-type')\"",
+            "ABC001.json5: when: `layer-type` is no list; did you mean `layer-types`?",
+        ),
+        (
             "message: 'm', when: \"has_fil('a')\"",
             "ABC001.json5: when: `has_fil` is no function; did you mean `has_file`?",
         ),

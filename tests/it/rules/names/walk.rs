@@ -6,7 +6,9 @@ use std::sync::LazyLock;
 use cel::Env;
 use cel::common::ast::{CallExpr, ComprehensionExpr, EntryExpr, Expr, IdedExpr, LiteralValue, SelectExpr, operators};
 use ckpt_doctor::check::variables::FUNCTIONS;
+use ckpt_doctor::knowledge::lists;
 use ckpt_doctor::knowledge::source::nearest;
+use serde_json::Value;
 
 use super::types::{Field, Type};
 
@@ -266,6 +268,7 @@ impl Names {
                     _ => Type::Any,
                 }
             }
+            ("listed", [name]) => list_type(&self.walk(name, problems), problems),
             (name, _) => {
                 let types: Vec<Type> = arguments.iter().map(|argument| self.walk(argument, problems)).collect();
                 result(name, &types, problems)
@@ -419,6 +422,25 @@ fn result(name: &str, arguments: &[Type], problems: &mut Vec<Problem>) -> Type {
         _ if name.starts_with(|c: char| c.is_ascii_alphabetic()) => of_rules(name, arguments.len(), problems),
         ("-_" | "_-_" | "_*_" | "_/_" | "_%_" | operators::ADD, _) => Type::Number,
         _ => Type::Flag(None),
+    }
+}
+
+/// The type of a list of `rules/lists.json5`.
+fn list_type(name: &Type, problems: &mut Vec<Problem>) -> Type {
+    let unknown =
+        |name: &str, what: &str, near| Problem::Unknown { name: name.to_owned(), what: what.to_owned(), near };
+    let Type::Text(Some(name)) = name else {
+        problems.push(unknown("listed", "function of a computed name", None));
+        return Type::Any;
+    };
+    match lists::listed(name) {
+        Some(Value::Array(_)) => Type::list(Type::Text(None)),
+        Some(_) => Type::Map(Box::new(Type::Text(None))),
+        None => {
+            let near = nearest(name, lists::all().keys().map(String::as_str)).map(str::to_owned);
+            problems.push(unknown(name, "list", near));
+            Type::Any
+        }
     }
 }
 
