@@ -8,6 +8,9 @@ use serde_json::{Value, json};
 
 use crate::support::{project, texts};
 
+/// Maximum length of an expression in characters; `let` divides a longer one.
+const LENGTH: usize = 250;
+
 /// Maximum number of texts in a list or a map of an expression; a longer one is in `rules/lists.json5`.
 const TEXTS: usize = 8;
 
@@ -56,6 +59,13 @@ fn longest_list(tree: &Value) -> usize {
         _ => 0,
     };
     parts.iter().map(longest_list).fold(here, usize::max)
+}
+
+#[test]
+fn expressions_are_short() {
+    let is_long = |(_, expression): &(String, String)| expression.chars().count() > LENGTH;
+    let long: Vec<_> = expressions().into_iter().filter(is_long).collect();
+    assert!(long.is_empty(), "divide with `let`: {long:#?}");
 }
 
 #[test]
