@@ -8,8 +8,9 @@ use std::collections::BTreeSet;
 use serde::Serialize;
 
 use super::finding::{Finding, FindingEffect};
+use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, FaultKind, adapter};
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
 
@@ -162,6 +163,18 @@ impl Basis<'_> {
         self.checkpoint.shards.values().any(|shard| shard.is_sound() || !shard.tensors.is_empty())
     }
 
+    /// The first file beside config.json that transformers opens for a model and that was not read: it is a link out of the
+    /// directory.
+    fn unread(&self) -> Option<&str> {
+        let index = self.checkpoint.index.iter().map(|index| index.document.as_str());
+        let documents = index.chain([adapter::CONFIG, "generation_config.json"]);
+        let documents = documents.filter_map(|name| self.checkpoint.document(name)).map(|document| &document.faults);
+        let shards = self.checkpoint.shards.values();
+        let opened = shards.filter(|shard| index::is_opened(self.checkpoint, &shard.name)).map(|shard| &shard.faults);
+        let mut faults = documents.chain(opened).flatten().filter(|fault| fault.kind == FaultKind::LinkNotFollowed);
+        faults.next()?.places.first()?.file.as_deref()
+    }
+
     /// A pickle with a construct that is not modelled, and the construct.
     fn doubt(&self) -> Option<(&str, &str)> {
         let mut pickles = self.checkpoint.shards.values().filter_map(|shard| Some((shard, shard.pickle.as_ref()?)));
@@ -222,6 +235,9 @@ impl Basis<'_> {
         }
         if let Some((shard, doubt)) = self.doubt() {
             return (LoadVerdict::NotPredicted, Some(format!("{shard} was not understood: {doubt}")));
+        }
+        if let Some(file) = self.unread() {
+            return (LoadVerdict::NotPredicted, Some(format!("{file} was not read")));
         }
         match self.report(loader) {
             Some(_) if !self.was_read() => {

@@ -1,11 +1,12 @@
 //! The verdict on a loader depends on the files and that loader alone: neither on the other loaders of a run, nor on the rules
-//! that are selected, nor on severities.
+//! that are selected, nor on severities. What is not read never makes it better.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
 use ckpt_doctor::check::Severity;
-use ckpt_doctor::check::verdict::PredictedLoad;
+use ckpt_doctor::check::verdict::{LoadVerdict, PredictedLoad};
+use ckpt_doctor::knowledge::rule::Object;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::{Knowledge, Loader};
 
@@ -65,6 +66,50 @@ fn a_verdict_does_not_depend_on_the_other_loaders_of_the_run() {
                 let differing = differences(&alone[0], &among);
                 let version = among.version();
                 found.extend(differing.into_iter().map(|why| format!("{} {version} {words}: {why}", case.name)));
+            }
+        }
+        found
+    };
+    holds(look, &knowledge);
+}
+
+/// A file that leads out of the directory is not read. Then nothing is said to load that did not load with it, what raised is
+/// not said to load wrong, and a model does not load without the files that it is opened from.
+#[cfg(unix)]
+#[test]
+fn what_is_not_read_makes_no_verdict_better() {
+    let knowledge = knowledge();
+    let look = |case: &Case, made: &Path| -> Vec<String> {
+        let before = verdicts(made, case, &[], &knowledge);
+        let names = std::fs::read_dir(made).unwrap().map(|entry| entry.unwrap());
+        let mut names: Vec<_> = names.filter(|e| e.file_type().unwrap().is_file()).map(|e| e.file_name()).collect();
+        names.sort();
+        let mut draw = Draw::new(case.name.bytes().map(u64::from).sum());
+        let Some(name) = (!names.is_empty()).then(|| names[draw.below(names.len())].to_string_lossy().into_owned())
+        else {
+            return Vec::new();
+        };
+        let outside = tempfile::tempdir().unwrap();
+        let note = outside.path().join("note.txt");
+        std::fs::write(&note, "no checkpoint").unwrap();
+        std::fs::remove_file(made.join(&name)).unwrap();
+        std::os::unix::fs::symlink(&note, made.join(&name)).unwrap();
+        let after = verdicts(made, case, &[], &knowledge);
+        let is_needed = ["config.json", "model.safetensors", "model.safetensors.index.json"].contains(&name.as_str());
+        let mut found = Vec::new();
+        for (was, is) in before.iter().filter_map(|was| Some((was, after.iter().find(|is| is.loader == was.loader)?))) {
+            for object in &is.objects {
+                let before = was.objects.iter().find(|one| one.object == object.object);
+                let old = before.map_or(LoadVerdict::NotPredicted, |object| object.verdict);
+                let is_better = match object.verdict {
+                    LoadVerdict::Loads => old != LoadVerdict::Loads || is_needed && object.object == Object::Model,
+                    LoadVerdict::LoadsWrong => old == LoadVerdict::Raises,
+                    LoadVerdict::NotPredicted | LoadVerdict::Raises => false,
+                };
+                if is_better {
+                    let object = (object.object, object.verdict, &object.why);
+                    found.push(format!("{} without {name}, {}: {old:?} becomes {object:?}", case.name, is.version()));
+                }
             }
         }
         found
