@@ -436,7 +436,8 @@ fn weights_elsewhere(checkpoint: &Checkpoint) -> Option<Fault> {
     match pickle {
         // transformers reads no other name; beside weights that were not downloaded, `colbert_linear.pt` stands for none.
         Some(name) if name.starts_with("pytorch_model") || !has_pointer && !is_model(checkpoint) => {
-            Some(Fault::new(FaultKind::PickleWeights).at(Place::file(name)))
+            let fault = Fault::new(FaultKind::PickleWeights).at(Place::file(name));
+            Some(fault.with("tensors", 0).with("read", false))
         }
         _ if has_pointer => None,
         Some(name) => unread_weights(checkpoint, &[name]),

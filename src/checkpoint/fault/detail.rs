@@ -34,7 +34,8 @@ impl ValueType {
         match self {
             Self::Any => true,
             Self::Flag => value.is_boolean(),
-            Self::Integer => value.is_i64() || value.is_u64(),
+            // Beyond 64 bits with a sign, an expression sees a double.
+            Self::Integer => value.is_i64() || value.is_u64() || value.as_f64().is_some_and(|n| n >= 9.2e18),
             Self::Number => value.is_number(),
             Self::Text => value.is_string(),
             Self::List(element) => value.as_array().is_some_and(|list| list.iter().all(|value| element.accepts(value))),
