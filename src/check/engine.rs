@@ -41,7 +41,7 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
     let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
     let programs = knowledge.asked_programs(&programs);
-    let run = Run::new(checkpoint, knowledge, &peft, &programs);
+    let run = CheckFacts::new(checkpoint, knowledge, &peft, &programs);
     let reading = run.read(&versions, Purpose::Findings);
     let mut outcome = reading.outcome.clone();
     let rules = &knowledge.rules;
@@ -60,7 +60,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
 }
 
 /// What a run reads of a checkpoint whichever versions of transformers it judges.
-struct Run<'a> {
+struct CheckFacts<'a> {
     checkpoint: &'a Arc<Checkpoint>,
     knowledge: &'a Knowledge,
     programs: &'a [AskedProgram<'a>],
@@ -83,14 +83,14 @@ struct OpenedBy {
 /// What a reading is for.
 #[derive(Clone, Copy)]
 enum Purpose {
-    /// Findings, with hints that no verdict rests on.
+    /// Findings, with the class that has the tensor names where the class is unknown: a search that no verdict needs.
     Findings,
     /// Verdicts alone.
     Verdicts,
 }
 
 /// A checkpoint as some versions of transformers read it: all that rules see, and the outcome without findings.
-struct Reading<'a> {
+struct LoaderView<'a> {
     context: Context<'a>,
     scope: Scope<'static>,
     faults: Vec<Fault>,
@@ -99,7 +99,7 @@ struct Reading<'a> {
     outcome: Outcome,
 }
 
-impl<'a> Run<'a> {
+impl<'a> CheckFacts<'a> {
     fn new(
         checkpoint: &'a Arc<Checkpoint>,
         knowledge: &'a Knowledge,
@@ -142,7 +142,7 @@ impl<'a> Run<'a> {
     }
 
     /// Reads the checkpoint for these versions, or for those of a run that names none.
-    fn read(&self, versions: &[String], purpose: Purpose) -> Reading<'a> {
+    fn read(&self, versions: &[String], purpose: Purpose) -> LoaderView<'a> {
         let Self { checkpoint, knowledge, stored, .. } = self;
         let config = checkpoint.config();
         let judged = judge::judge(checkpoint, knowledge, versions, stored);
@@ -184,32 +184,32 @@ impl<'a> Run<'a> {
         let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
         faults.extend(refused);
         faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
-        Reading { context, scope, faults, unpredicted: judged.unpredicted, outcome }
+        LoaderView { context, scope, faults, unpredicted: judged.unpredicted, outcome }
     }
 
     /// The verdicts of a run that was read as `reading`, each as that of a run for the loader alone. `outcome` has the findings
     /// of the selected rules; `named` are the versions of transformers that the user named.
-    fn verdicts(&self, reading: &Reading<'_>, outcome: &Outcome, named: &[String]) -> Vec<PredictedLoad> {
+    fn verdicts(&self, reading: &LoaderView<'_>, outcome: &Outcome, named: &[String]) -> Vec<PredictedLoad> {
         let shown: BTreeSet<&str> = outcome.findings.iter().map(|finding| finding.code.as_str()).collect();
         let targets = &reading.context.targets;
         let alone = |target: &Target| {
             // A run for one version is read as it was.
             let is_alone = targets.len() == 1 && target.versions == named;
             let again = if is_alone { None } else { Some(self.read(&target.versions, Purpose::Verdicts)) };
-            let mut loads = self.judged(again.as_ref().unwrap_or(reading), &[]);
-            let own = loads.iter().position(|load| load.loader == target.loader.version()).unwrap_or(0);
-            let PredictedLoad { objects, verdict, tensors, .. } = loads.swap_remove(own);
+            let mut loads = self.judged(again.as_ref().unwrap_or(reading), &[]).into_iter();
+            let PredictedLoad { objects, verdict, tensors, .. } =
+                loads.find(|load| load.loader == target.loader.version())?;
             let objects = objects.into_iter().map(|object| with_shown_causes(object, &shown)).collect();
-            PredictedLoad {
+            Some(PredictedLoad {
                 loader: target.loader.version().to_owned(),
                 stands_for: target.stands_for.clone(),
                 leads: target.leads,
                 verdict,
                 objects,
                 tensors,
-            }
+            })
         };
-        let mut loads: Vec<PredictedLoad> = targets.iter().map(alone).collect();
+        let mut loads: Vec<PredictedLoad> = targets.iter().filter_map(alone).collect();
         if !self.programs.is_empty() {
             // Another program is judged as in a run that names no version of transformers.
             let again = if named.is_empty() { None } else { Some(self.read(&[], Purpose::Verdicts)) };
@@ -220,8 +220,8 @@ impl<'a> Run<'a> {
     }
 
     /// The verdicts on the loaders of a reading and on programs, by all rules.
-    fn judged(&self, reading: &Reading<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
-        let Reading { context, scope, faults, unpredicted, outcome } = reading;
+    fn judged(&self, reading: &LoaderView<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
+        let LoaderView { context, scope, faults, unpredicted, outcome } = reading;
         let mut outcome = outcome.clone();
         // A rule without effects says nothing of a load.
         let rules = self.knowledge.rules.all().filter(|rule| !rule.effects.is_empty());

@@ -237,15 +237,14 @@ impl Basis<'_> {
             return (LoadVerdict::NotPredicted, Some(format!("{shard} was not understood: {doubt}")));
         }
         if let Some(file) = self.unread() {
-            return (LoadVerdict::NotPredicted, Some(format!("{file} was not read")));
+            let why = format!("{file} is a link out of the directory, and was not read");
+            return (LoadVerdict::NotPredicted, Some(why));
         }
         match self.report(loader) {
             Some(_) if !self.was_read() => {
                 return (LoadVerdict::NotPredicted, Some("no tensor was read".to_owned()));
             }
-            Some(report) => {
-                return of_report(report);
-            }
+            Some(report) => return of_report(report),
             None => {}
         }
         let known = self.unpredicted.iter().find(|(of, _)| *of == loader).map(|(_, why)| why.clone());

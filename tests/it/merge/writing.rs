@@ -262,7 +262,7 @@ fn a_merge_states_which_remains_it_removed() {
         let stage = |stage: &Value| format!("stage {}: {}\n", stage["name"], stage["outcome"]);
         let stages = if expected == 0 { json(&run)["merge"]["stages"].clone() } else { Value::Array(Vec::new()) };
         let stages: String = stages.as_array().unwrap().iter().filter(|s| s["name"] == "clean up").map(stage).collect();
-        said += &format!("{target}: {}{stages}", String::from_utf8_lossy(&run.stderr)).replace(&place, "/work");
+        said += &format!("{target}: {}{stages}", String::from_utf8_lossy(&run.stderr)).replace(&place, "ROOM");
     }
     // The report in the result does not depend on what an earlier run left.
     assert!(!fs::read_to_string(out.join("merge-report.md")).unwrap().contains("ended run"));
