@@ -57,7 +57,7 @@ REFUSED = [
 
 
 # Parts that are opened here by their class, because Auto classes of some versions do not know their model type.
-BY_CLASS = r"vision of qwen2(_5)?_vl"
+BY_CLASS = r"vision of (qwen2(_5)?_vl|idefics3)"
 
 
 def start(folder, program, *arguments):
