@@ -282,17 +282,16 @@ impl Checkpoint {
         mapped.into_iter().chain(self.shards.values()).find_map(|s| Some((s, s.tensors.get(of(s)?)?)))
     }
 
-    /// A few bytes of this tensor, to tell it from another; `None` when they cannot be read.
+    /// A few bytes of this tensor in this shard, to tell it from another; `None` when they cannot be read.
     #[must_use]
-    pub fn sample(&self, name: &str) -> Option<Vec<u8>> {
-        let (shard, tensor) = self.tensor(name)?;
+    pub fn sample(&self, (shard, tensor): (&Shard, &Tensor)) -> Option<Vec<u8>> {
         contents::sample(&self.source, shard, tensor)
     }
 
-    /// Whether two tensors have the same bytes; `None` when they cannot be read.
+    /// Whether two tensors, each in its shard, have the same bytes; `None` when they cannot be read.
     #[must_use]
-    pub fn same_bytes(&self, one: &str, other: &str) -> Option<bool> {
-        contents::same_bytes(&self.source, self.tensor(one)?, self.tensor(other)?)
+    pub fn same_bytes(&self, one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<bool> {
+        contents::same_bytes(&self.source, one, other)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use serde_json::{Value, json};
 
 use super::bounded::bounded;
-use super::evaluate::{Context, pinpoint, run_rules};
+use super::evaluate::{Context, has_faults, pinpoint, run_rules};
 use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
 use super::model_type::Asked;
@@ -25,7 +25,8 @@ use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::program::AskedProgram;
-use crate::knowledge::{Knowledge, Loader, Scope};
+use crate::knowledge::rule::{Check, Rule};
+use crate::knowledge::{Expression, Knowledge, Loader, Scope};
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest of each major version.
 #[must_use]
@@ -94,9 +95,53 @@ struct LoaderView<'a> {
     context: Context<'a>,
     scope: Scope<'static>,
     faults: Vec<Fault>,
+    /// The tokenizer as the processor of the class opens it.
+    opened: Option<Rc<OpenedTokenizer>>,
     /// For each loader without a predicted load, the reason.
     unpredicted: Vec<(&'static str, String)>,
     outcome: Outcome,
+}
+
+impl LoaderView<'_> {
+    /// Names that expressions see with other values than in another reading of the same run; of those in `always` it may be so.
+    fn differences(&self, other: &Self) -> Vec<&'static str> {
+        let always = ["stays_random", "complete", "loaders", "named"];
+        let (one, two) = (&self.outcome, &other.outcome);
+        let same_class = one.architecture == two.architecture;
+        let same_tokenizer = match (&self.opened, &other.opened) {
+            (Some(one), Some(two)) => Rc::ptr_eq(one, two),
+            (one, two) => one.is_none() && two.is_none(),
+        };
+        let by_class: &[&str] = if same_class { &[] } else { &["arch", "groups_heads", "opened"] };
+        let by_config: &[&str] =
+            if same_class && one.config == two.config { &[] } else { &["model", "text", "program"] };
+        let by_processor: &[&str] =
+            if same_class && same_tokenizer { &[] } else { &["tokens", "missing_attributes", "placeholders"] };
+        [&always[..], by_class, by_config, by_processor].concat()
+    }
+}
+
+/// Rules that were run in a reading of a run and found nothing.
+struct Unmet<'a> {
+    reading: &'a LoaderView<'a>,
+    rules: BTreeSet<&'a str>,
+}
+
+impl Unmet<'_> {
+    /// Whether a rule finds nothing in this reading, either: no value differs that it depends on, or there is no fault for it.
+    fn covers(&self, rule: &Rule, again: &LoaderView<'_>, differing: &[&str]) -> bool {
+        if !has_faults(rule, &again.faults) {
+            return true;
+        }
+        let Check::Assert(check) = &rule.check else { return false };
+        let lets = rule.lets.iter().chain(&check.lets).map(|(_, expression)| expression);
+        let expressions = rule.when.iter().chain(&check.each).chain([&check.that]).chain(lets);
+        let is_word = |c: char| c.is_ascii_alphanumeric() || c == '_';
+        let depends =
+            |expression: &Expression| expression.source().split(|c| !is_word(c)).any(|word| differing.contains(&word));
+        let same_class = rule.applies.is_empty() || again.outcome.architecture == self.reading.outcome.architecture;
+        same_class && self.rules.contains(rule.code.as_str()) && !expressions.into_iter().any(depends)
+    }
 }
 
 impl<'a> CheckFacts<'a> {
@@ -184,19 +229,23 @@ impl<'a> CheckFacts<'a> {
         let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
         faults.extend(refused);
         faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
-        LoaderView { context, scope, faults, unpredicted: judged.unpredicted, outcome }
+        LoaderView { context, scope, faults, opened, unpredicted: judged.unpredicted, outcome }
     }
 
     /// The verdicts of a run that was read as `reading`, each as that of a run for the loader alone. `outcome` has the findings
     /// of the selected rules; `named` are the versions of transformers that the user named.
     fn verdicts(&self, reading: &LoaderView<'_>, outcome: &Outcome, named: &[String]) -> Vec<PredictedLoad> {
         let shown: BTreeSet<&str> = outcome.findings.iter().map(|finding| finding.code.as_str()).collect();
+        let stopped: BTreeSet<&str> = outcome.unusable.iter().map(|skipped| skipped.code.as_str()).collect();
+        let run = self.knowledge.rules.rules.iter().map(|rule| rule.code.as_str());
+        let rules = run.filter(|code| !shown.contains(code) && !stopped.contains(code)).collect();
+        let unmet = Unmet { reading, rules };
         let targets = &reading.context.targets;
         let alone = |target: &Target| {
             // A run for one version is read as it was.
             let is_alone = targets.len() == 1 && target.versions == named;
             let again = if is_alone { None } else { Some(self.read(&target.versions, Purpose::Verdicts)) };
-            let mut loads = self.judged(again.as_ref().unwrap_or(reading), &[]).into_iter();
+            let mut loads = self.judged(again.as_ref().unwrap_or(reading), &unmet, &[]).into_iter();
             let PredictedLoad { objects, verdict, tensors, .. } =
                 loads.find(|load| load.loader == target.loader.version())?;
             let objects = objects.into_iter().map(|object| with_shown_causes(object, &shown)).collect();
@@ -213,18 +262,20 @@ impl<'a> CheckFacts<'a> {
         if !self.programs.is_empty() {
             // Another program is judged as in a run that names no version of transformers.
             let again = if named.is_empty() { None } else { Some(self.read(&[], Purpose::Verdicts)) };
-            let all = self.judged(again.as_ref().unwrap_or(reading), self.programs);
+            let all = self.judged(again.as_ref().unwrap_or(reading), &unmet, self.programs);
             loads.extend(all.into_iter().filter(|load| is_program(&load.loader)));
         }
         loads
     }
 
-    /// The verdicts on the loaders of a reading and on programs, by all rules.
-    fn judged(&self, reading: &LoaderView<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
-        let LoaderView { context, scope, faults, unpredicted, outcome } = reading;
+    /// The verdicts on the loaders of a reading and on programs, by all rules; `unmet` are those that found nothing already.
+    fn judged(&self, reading: &LoaderView<'_>, unmet: &Unmet<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
+        let LoaderView { context, scope, faults, unpredicted, outcome, .. } = reading;
+        let differing = reading.differences(unmet.reading);
         let mut outcome = outcome.clone();
         // A rule without effects says nothing of a load.
         let rules = self.knowledge.rules.all().filter(|rule| !rule.effects.is_empty());
+        let rules = rules.filter(|rule| !unmet.covers(rule, reading, &differing));
         run_rules(rules, context, faults, scope, &mut outcome);
         outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
         verdicts(self.checkpoint, context, programs, faults, &outcome, unpredicted)
@@ -353,6 +404,6 @@ fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
 
 /// Rows of the largest token embedding, which every token id must stay below; `None` without one.
 fn embedding_rows(checkpoint: &Checkpoint, embedding: &TokenEmbedding) -> Option<u64> {
-    let embeddings = checkpoint.tensors().filter(|(_, t)| embedding.matches(&t.name, &t.shape));
-    embeddings.filter_map(|(_, t)| t.shape.first().copied()).max()
+    let embeddings = index::opened_tensors(checkpoint).filter(|t| embedding.matches(&t.name, &t.shape));
+    embeddings.filter_map(|t| t.shape.first().copied()).max()
 }

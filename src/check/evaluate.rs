@@ -6,6 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
+use super::index;
 use super::load::{LoadReport, Target};
 use super::outcome::Outcome;
 use super::variables::{self, declared};
@@ -48,6 +49,12 @@ impl<'a> Context<'a> {
         let is_certain = |version: &str| targets.iter().any(|t| t.loader.version() == version && t.is_certain());
         let fails_for_certain = loads.iter().any(|load| !load.is_whole() && is_certain(&load.loader));
         Self { bench: Bench::new(checkpoint), targets, programs, fails_for_certain }
+    }
+
+    /// The object that reads a file; `None` for a file that no loader opens, and for weights beside those that it opens.
+    fn object_reading(&self, file: &str) -> Option<Object> {
+        let is_left = |object: Object| object == Object::Model && index::is_set_aside(self.bench.checkpoint, file);
+        Object::reading(file).filter(|object| !is_left(*object))
     }
 }
 
@@ -128,6 +135,14 @@ fn evaluate(
     run(rule, context, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
+/// Whether the rule reports a kind of these faults, or needs none.
+pub(super) fn has_faults(rule: &Rule, faults: &[Fault]) -> bool {
+    match &rule.check {
+        Check::Fault(check) => faults.iter().any(|fault| check.kinds.contains(&fault.kind)),
+        Check::Assert(_) => true,
+    }
+}
+
 /// An expression that could not be evaluated, and the error.
 type Unevaluated<'r> = (&'r Expression, EvalError);
 
@@ -137,6 +152,9 @@ fn run<'r>(
     faults: &[Fault],
     scope: &Scope<'_>,
 ) -> Result<Vec<Finding>, Unevaluated<'r>> {
+    if !has_faults(rule, faults) {
+        return Ok(Vec::new());
+    }
     let mut inner = scope.child();
     lets::bind(&rule.lets, &mut inner);
     let mut findings = match &rule.check {
@@ -366,7 +384,7 @@ impl Caused {
                 continue;
             }
             let file = scope.get("file");
-            let reader = || Object::reading(file.as_ref()?.as_str()?);
+            let reader = || context.object_reading(file.as_ref()?.as_str()?);
             let Some(object) = effect.object.or_else(reader) else { continue };
             if let Some(program) = effect.program {
                 self.add_of_program(

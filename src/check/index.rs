@@ -6,7 +6,7 @@ use indexmap::IndexMap;
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use super::model_type::is_model;
+use super::model_type::{is_model, is_of_transformers};
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::pickle::is_training_state;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_NAME, Place, Shard, Tensor, pointer};
@@ -48,7 +48,7 @@ pub(super) fn readable(shard: &Shard) -> bool {
 #[must_use]
 pub fn all_read(checkpoint: &Checkpoint) -> bool {
     let mut named = checkpoint.index.iter().flat_map(|index| &index.files);
-    checkpoint.shards.values().all(readable) && named.all(|name| checkpoint.shards.contains_key(name))
+    opened_shards(checkpoint).all(readable) && named.all(|name| checkpoint.shards.contains_key(name))
 }
 
 /// Whether nothing suggests that a tensor was lost: every shard that the index or the shards' own names count is present
@@ -370,6 +370,33 @@ pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
         Some(index) => index.files.contains(name),
         None => numbered(name).is_some(),
     }
+}
+
+/// The shards that transformers opens or, when it opens none, all of them: then another library may open any.
+pub(super) fn opened_shards(checkpoint: &Checkpoint) -> impl Iterator<Item = &Shard> {
+    let is_any = checkpoint.shards.keys().any(|name| is_opened(checkpoint, name));
+    checkpoint.shards.values().filter(move |shard| !is_any || is_opened(checkpoint, &shard.name))
+}
+
+/// Whether a file holds weights that transformers leaves aside, because it opens others.
+pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {
+    let is_opened = || opened_shards(checkpoint).any(|shard| shard.name == name);
+    checkpoint.shards.contains_key(name) && is_of_transformers(checkpoint) && !is_opened()
+}
+
+/// The tensors of [`opened_shards`], by shard name and then in header order.
+pub(super) fn opened_tensors(checkpoint: &Checkpoint) -> impl Iterator<Item = &Tensor> {
+    opened_shards(checkpoint).flat_map(|shard| &shard.tensors)
+}
+
+/// The tensor of this name in [`opened_shards`]: that of the shard that the index maps it to, otherwise the first.
+pub(super) fn opened_tensor<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<(&'c Shard, &'c Tensor)> {
+    let (shard, tensor) = checkpoint.tensor(name)?;
+    if opened_shards(checkpoint).any(|opened| opened.name == shard.name) {
+        return Some((shard, tensor));
+    }
+    let in_shard = |shard: &'c Shard| Some((shard, shard.tensors.iter().find(|tensor| tensor.name == name)?));
+    opened_shards(checkpoint).find_map(in_shard)
 }
 
 /// For a model whose shards all have names that no loader reads: no weights, with these names.

@@ -8,6 +8,7 @@
 
 use serde_json::{Value, json};
 
+use super::index;
 use crate::checkpoint::{Checkpoint, Shard};
 
 /// The documents of the steps, with the registered name of the step that normalises or un-normalises.
@@ -50,7 +51,7 @@ pub(super) fn policy(checkpoint: &Checkpoint) -> Value {
         |name: &str| ["normalize_inputs.", "unnormalize_outputs."].iter().any(|start| name.starts_with(start));
     let layout = if PIPELINES.iter().any(|(document, _)| checkpoint.has_file(document)) {
         Layout::Processors
-    } else if checkpoint.tensors().any(|(_, tensor)| is_buffer(&tensor.name)) {
+    } else if index::opened_tensors(checkpoint).any(|tensor| is_buffer(&tensor.name)) {
         Layout::Buffers
     } else {
         Layout::Missing

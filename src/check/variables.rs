@@ -81,15 +81,19 @@ pub fn scope(
     scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
     let name = checkpoint.source.path().file_name().map(|n| n.to_string_lossy().into_owned());
     scope.bind("directory", &json!(name.unwrap_or_default()));
-    let has_weights = checkpoint.tensors().next().is_some();
+    let has_weights = index::opened_tensors(checkpoint).next().is_some();
     scope.bind("has_weights", &json!(has_weights));
     scope.bind("all_read", &json!(has_weights && index::all_read(checkpoint)));
     let here = Arc::clone(checkpoint);
-    scope.function1("shape", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.shape)));
+    scope
+        .function1("shape", move |name| index::opened_tensor(&here, name).map_or(Value::Null, |(_, t)| json!(t.shape)));
     let here = Arc::clone(checkpoint);
-    scope.function1("dtype", move |name| here.tensor(name).map_or(Value::Null, |(_, t)| json!(t.dtype.name())));
+    scope.function1("dtype", move |name| {
+        index::opened_tensor(&here, name).map_or(Value::Null, |(_, t)| json!(t.dtype.name()))
+    });
     let here = Arc::clone(checkpoint);
-    scope.function1("has_tensor", move |prefix| json!(here.tensors().any(|(_, t)| t.name.starts_with(prefix))));
+    scope
+        .function1("has_tensor", move |prefix| json!(index::opened_tensors(&here).any(|t| t.name.starts_with(prefix))));
     let here = Arc::clone(checkpoint);
     let left = Allowance::new(DOCUMENT_BYTES);
     scope.function1("document", move |name| {

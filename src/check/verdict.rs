@@ -299,7 +299,12 @@ fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
 
 /// The objects that a user of this directory can open.
 fn offered(checkpoint: &Checkpoint) -> Vec<Object> {
-    let has = |object: Object| checkpoint.entries.keys().any(|name| Object::reading(name) == Some(object));
+    let is_of = |name: &str, object: Object| match object {
+        // Code and other weights lie beside adapters, too.
+        Object::Model => name == "config.json" || checkpoint.index.is_some() || index::is_opened(checkpoint, name),
+        _ => Object::reading(name) == Some(object),
+    };
+    let has = |object: Object| checkpoint.entries.keys().any(|name| is_of(name, object));
     let found: Vec<Object> = Object::ALL.into_iter().filter(|object| has(*object)).collect();
     // A directory with nothing to open was meant to be a model.
     if found.is_empty() { vec![Object::Model] } else { found }

@@ -4,6 +4,7 @@
 
 mod completeness;
 mod exit;
+mod form;
 mod judgement;
 mod leaks;
 mod templates;

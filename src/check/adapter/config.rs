@@ -73,8 +73,10 @@ fn unknown(
     asked: Option<&str>,
 ) -> Option<Fault> {
     let is_foreign = |(key, _): &(&String, &Value)| keys.get(*key).is_none_or(|known| !known.is_in(version));
-    let foreign: Vec<(&String, &Value)> = config.as_object()?.iter().filter(is_foreign).collect();
-    let (first, _) = foreign.first()?;
+    let mut foreign: Vec<(&String, &Value)> = config.as_object()?.iter().filter(is_foreign).collect();
+    // Python names the first of the call in its TypeError.
+    let (first, _) = *foreign.first()?;
+    foreign.sort_by_key(|(key, _)| *key);
     let raises = table.raises(version);
     let names: Vec<String> = foreign.iter().map(|(key, _)| escape(key, CAP)).collect();
     let drops: Vec<String> = foreign

@@ -2,6 +2,7 @@
 
 use super::Inputs;
 use super::explain::ExplainedLoad;
+use crate::check::index;
 use crate::check::load::Stored;
 use crate::checkpoint::{Checkpoint, Dtype, Fault, FaultKind, Place};
 use crate::knowledge::{Expected, Loader};
@@ -12,7 +13,7 @@ const CAP: usize = 20;
 /// The fault of weights that are stored as integers where the class has floating-point parameters: the loaders of 4.x make
 /// parameters of them as they are, and torch refuses the gradient.
 pub(super) fn fault(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<Fault> {
-    if !inputs.is_plain() || !inputs.checkpoint.tensors().any(|(_, tensor)| tensor.dtype.is_integer()) {
+    if !inputs.is_plain() || !index::opened_tensors(inputs.checkpoint).any(|tensor| tensor.dtype.is_integer()) {
         return None;
     }
     let mut fault = Fault::new(FaultKind::IntegerWeights);
@@ -43,7 +44,7 @@ fn integers<'c>(checkpoint: &'c Checkpoint, stored: &Stored, expected: &Expected
     };
     let is_parameter =
         |name: &str, shape: &[u64]| name.ends_with("weight") || (name.ends_with("bias") && shape.len() == 1);
-    let tensors = checkpoint.tensors().map(|(_, tensor)| tensor).filter(|tensor| tensor.dtype.is_integer());
+    let tensors = index::opened_tensors(checkpoint).filter(|tensor| tensor.dtype.is_integer());
     let loaded = tensors.filter(|tensor| stored.shape(&tensor.name).is_some());
     let found = loaded.filter(|tensor| is_parameter(&tensor.name, &tensor.shape) && is_expected(&tensor.name));
     found.map(|tensor| (tensor.name.as_str(), tensor.dtype)).collect()
@@ -53,6 +54,6 @@ fn integers<'c>(checkpoint: &'c Checkpoint, stored: &Stored, expected: &Expected
 /// tensor of the class has the dtype of the model, which is float32 unless the caller asks for another
 /// (`check_support_param_buffer_assignment`); 4.57.6 always does.
 fn assigns(checkpoint: &Checkpoint, expected: &Expected) -> bool {
-    let first = expected.tensors.keys().find_map(|name| checkpoint.tensor(name));
+    let first = expected.tensors.keys().find_map(|name| index::opened_tensor(checkpoint, name));
     expected.loader != Loader::V4_47_0 || first.is_some_and(|(_, tensor)| tensor.dtype == Dtype::F32)
 }

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::skipped::SkippedModules;
+use crate::check::index;
 use crate::check::load::Stored;
 use crate::checkpoint::{Checkpoint, Dtype};
 use crate::knowledge::quantization::{Scheme, Shapes, StoredPart};
@@ -20,7 +21,7 @@ pub(super) struct TensorLookup<'c>(BTreeMap<&'c str, Held<'c>>);
 impl<'c> TensorLookup<'c> {
     pub(super) fn new(checkpoint: &'c Checkpoint, stored: &'c Stored) -> Self {
         let mut tensors: BTreeMap<&str, Held<'_>> = stored.names().map(|name| (name, Held::default())).collect();
-        for (_, tensor) in checkpoint.tensors() {
+        for tensor in index::opened_tensors(checkpoint) {
             if let Some(held) = tensors.get_mut(tensor.name.as_str()) {
                 *held = Held { shape: Some(&tensor.shape), dtype: Some(tensor.dtype) };
             }

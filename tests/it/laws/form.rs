@@ -1,0 +1,354 @@
+//! The form of a checkpoint decides nothing: the order and spelling of JSON, the order of tensors, the number of shards, the name
+//! and place of the directory, and files that no loader opens.
+
+use std::collections::BTreeSet;
+use std::fmt::Debug;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use ckpt_doctor::check::Outcome;
+use ckpt_doctor::check::finding::Finding;
+use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::check::verdict::{ObjectVerdict, PredictedLoad};
+use ckpt_doctor::checkpoint::{self, Checkpoint, hex};
+use serde_json::Value;
+use sha2::{Digest as _, Sha256};
+
+use super::verdicts::holds;
+use crate::support::change::Change;
+use crate::support::weights::{Shard, Weights, join, split};
+use crate::support::{Case, Draw, knowledge, open};
+
+/// What a form must leave as it is.
+#[derive(PartialEq, Eq)]
+struct Answer {
+    /// Loader, object, verdict, reason and codes.
+    verdicts: BTreeSet<String>,
+    findings: Vec<String>,
+}
+
+impl Answer {
+    fn new(outcome: &Outcome, with_places: bool) -> Self {
+        let finding = |finding: &Finding| {
+            let Finding { code, severity, message, locations, .. } = finding;
+            let places: Vec<_> = locations.iter().map(|at| (&at.file, &at.pointer, &at.tensor)).collect();
+            if with_places {
+                format!("{code} {severity:?} {message} {places:?}")
+            } else {
+                format!("{code} {severity:?}")
+            }
+        };
+        let verdict = |load: &PredictedLoad| {
+            let object = |object: &ObjectVerdict| {
+                let why = object.why.as_deref().filter(|_| with_places).unwrap_or_default();
+                format!("{}: {} {:?} {why} {:?}", load.version(), object.object.name(), object.verdict, object.findings)
+            };
+            load.objects.iter().map(object).collect::<Vec<_>>()
+        };
+        let lists = |load: &PredictedLoad| {
+            let lists =
+                load.tensors.as_ref().map(|LoadReport { missing, unexpected, unbuilt, mismatched, silent, .. }| {
+                    let sorted = |mut list: Vec<String>| {
+                        list.sort();
+                        list
+                    };
+                    let entries = |list: &[&dyn Debug]| sorted(list.iter().map(|entry| format!("{entry:?}")).collect());
+                    format!(
+                        "{:?} {:?} {:?} {:?} {:?}",
+                        sorted(missing.clone()),
+                        sorted(unexpected.clone()),
+                        sorted(unbuilt.clone()),
+                        entries(&mismatched.iter().map(|m| m as &dyn Debug).collect::<Vec<_>>()),
+                        entries(&silent.iter().map(|s| s as &dyn Debug).collect::<Vec<_>>()),
+                    )
+                });
+            format!("{}: {lists:?}", load.version())
+        };
+        let mut findings: Vec<String> = outcome.findings.iter().map(finding).collect();
+        findings.sort();
+        let loads = outcome.verdicts.iter();
+        Self { verdicts: loads.clone().flat_map(verdict).chain(loads.map(lists)).collect(), findings }
+    }
+
+    /// What the other answer lacks, and what it has in addition.
+    fn differences(&self, other: &Self) -> Vec<String> {
+        let lines = |answer: &Self| answer.verdicts.iter().chain(&answer.findings).cloned().collect::<Vec<String>>();
+        let (mine, others) = (lines(self), lines(other));
+        let mut found: Vec<String> =
+            mine.iter().filter(|one| !others.contains(one)).map(|one| format!("- {one}")).collect();
+        found.extend(others.iter().filter(|one| !mine.contains(one)).map(|one| format!("+ {one}")));
+        if found.is_empty() && self != other {
+            found.push("another number of equal findings".to_owned());
+        }
+        found
+    }
+}
+
+/// Copies a directory with its folders; false when it has something that is neither file nor folder.
+fn copy_whole(from: &Path, to: &Path) -> bool {
+    fs::create_dir_all(to).unwrap();
+    fs::read_dir(from).unwrap().map(|entry| entry.unwrap()).all(|entry| {
+        let (kind, target) = (entry.file_type().unwrap(), to.join(entry.file_name()));
+        match (kind.is_dir(), kind.is_file()) {
+            (true, _) => copy_whole(&entry.path(), &target),
+            // A sparse file of a fixture may have terabytes.
+            (_, true) => entry.metadata().unwrap().len() < 64 << 20 && fs::copy(entry.path(), &target).is_ok(),
+            _ => false,
+        }
+    })
+}
+
+/// The checkpoint in a copy of its own, under its own name.
+fn copied(made: &Path, room: &Path) -> Option<PathBuf> {
+    let dir = room.join(made.file_name().unwrap());
+    copy_whole(made, &dir).then_some(dir)
+}
+
+/// Another order of the members of all objects, and the characters of strings as escapes. Lists stay.
+fn respelled(value: &Value, draw: &mut Draw) -> String {
+    match value {
+        Value::Object(map) => {
+            let mut members: Vec<String> = Vec::new();
+            for (key, value) in map {
+                let member = format!("{} :\t{}", escaped(key), respelled(value, draw));
+                members.insert(draw.below(members.len() + 1), member);
+            }
+            format!("{{\n{} }}", members.join(" ,\n"))
+        }
+        Value::Array(items) => {
+            let items: Vec<String> = items.iter().map(|item| respelled(item, draw)).collect();
+            format!("[ {} ]", items.join(","))
+        }
+        Value::String(text) => escaped(text),
+        other => other.to_string(),
+    }
+}
+
+/// A string with every tenth letter and everything outside ASCII as an escape.
+fn escaped(text: &str) -> String {
+    let mut out = String::from("\"");
+    for (number, unit) in text.encode_utf16().enumerate() {
+        match u8::try_from(unit) {
+            Ok(byte @ (b' '..=b'!' | b'#'..=b'[' | b']'..=b'~')) if number % 10 != 3 => out.push(char::from(byte)),
+            _ => out.push_str(&format!("\\u{unit:04x}")),
+        }
+    }
+    out + "\""
+}
+
+/// Documents that strict JSON reads, without a key given twice.
+fn plain_documents(checkpoint: &Checkpoint) -> Vec<(String, Value)> {
+    let documents = checkpoint.documents.iter().chain(&checkpoint.nested.documents);
+    let sound = documents.filter(|(_, document)| document.faults.is_empty());
+    let index_is_sound = checkpoint.index.as_ref().is_none_or(|index| index.faults.is_empty());
+    let sound = sound.filter(|(name, _)| index_is_sound || !name.ends_with(".index.json"));
+    let parsed = sound.filter_map(|(name, document)| {
+        Some((name.clone(), serde_json::from_str::<Value>(document.text.as_deref()?).ok()?))
+    });
+    parsed.collect()
+}
+
+/// Whether the header and data of every shard are as safetensors writes them.
+fn has_plain_shards(checkpoint: &Checkpoint) -> bool {
+    let is_plain =
+        |shard: &checkpoint::Shard| !shard.is_pickle() && shard.faults.is_empty() && shard.metadata.is_some();
+    !checkpoint.shards.is_empty() && checkpoint.shards.values().all(is_plain)
+}
+
+fn respell(dir: &Path, checkpoint: &Checkpoint, draw: &mut Draw) -> bool {
+    let documents = plain_documents(checkpoint);
+    for (name, value) in &documents {
+        fs::write(dir.join(name), respelled(value, draw)).unwrap();
+    }
+    !documents.is_empty()
+}
+
+/// Another order of the tensors, in header and data, of every shard.
+fn reorder(dir: &Path, checkpoint: &Checkpoint, draw: &mut Draw) -> bool {
+    if !has_plain_shards(checkpoint) {
+        return false;
+    }
+    let names: Vec<&String> = checkpoint.shards.keys().collect();
+    for name in names {
+        let bytes = fs::read(dir.join(name)).unwrap();
+        let (header, data) = split(&bytes);
+        let Ok(Value::Object(header)) = serde_json::from_str::<Value>(header) else { return false };
+        let mut entries: Vec<(String, Value)> = Vec::new();
+        for (name, entry) in header {
+            entries.insert(draw.below(entries.len() + 1), (name, entry));
+        }
+        let (mut shuffled, mut moved) = (serde_json::Map::new(), Vec::new());
+        for (name, mut entry) in entries {
+            if let Some([Some(begin), Some(end)]) =
+                entry.pointer("/data_offsets").map(|at| [&at[0], &at[1]].map(Value::as_u64))
+            {
+                let range = usize::try_from(begin).unwrap()..usize::try_from(end).unwrap();
+                entry["data_offsets"] = serde_json::json!([moved.len(), moved.len() + range.len()]);
+                moved.extend_from_slice(&data[range]);
+            }
+            shuffled.insert(name, entry);
+        }
+        let mut header = Value::Object(shuffled).to_string();
+        header.push_str(&" ".repeat((8 - header.len() % 8) % 8));
+        fs::write(dir.join(name), join(header.as_bytes(), &moved)).unwrap();
+    }
+    true
+}
+
+/// `model.safetensors` as two shards with their index.
+fn reshard(dir: &Path, checkpoint: &Checkpoint, draw: &mut Draw) -> bool {
+    let is_whole = checkpoint.index.is_none()
+        && checkpoint.shards.keys().eq(["model.safetensors"])
+        && checkpoint.config().is_some();
+    if !is_whole || !has_plain_shards(checkpoint) {
+        return false;
+    }
+    let mut weights = Weights::read(dir);
+    let [whole] = &mut weights.shards[..] else { return false };
+    if whole.tensors.len() < 2 {
+        return false;
+    }
+    let second = whole.tensors.split_off(1 + draw.below(whole.tensors.len() - 1));
+    "model-00001-of-00002.safetensors".clone_into(&mut whole.file);
+    weights.shards.push(Shard { file: "model-00002-of-00002.safetensors".to_owned(), tensors: second });
+    fs::remove_file(dir.join("model.safetensors")).unwrap();
+    weights.write(dir);
+    weights.write_index(dir);
+    true
+}
+
+/// The directory as the hub cache has it: links to blobs.
+#[cfg(unix)]
+fn as_hub_cache(made: &Path, room: &Path) -> Option<PathBuf> {
+    let repository = room.join("models--org--name");
+    let dir = repository.join("snapshots/0123456789abcdef0123456789abcdef01234567");
+    copy_whole(made, &dir).then_some(())?;
+    fs::create_dir_all(repository.join("blobs")).unwrap();
+    for entry in fs::read_dir(&dir).unwrap() {
+        let entry = entry.unwrap();
+        if entry.file_type().unwrap().is_file() {
+            let blob = hex(&Sha256::digest(fs::read(entry.path()).unwrap()));
+            fs::rename(entry.path(), repository.join("blobs").join(&blob)).unwrap();
+            std::os::unix::fs::symlink(format!("../../blobs/{blob}"), entry.path()).unwrap();
+        }
+    }
+    Some(dir)
+}
+
+/// Whether the name and place of the directory are what the case is about: it was renamed, or lies in a work tree.
+fn is_of_a_place(case: &Case) -> bool {
+    let is_placed = |change: &Change| match change {
+        Change::Directory(_) => true,
+        Change::Write { file, .. } => file.starts_with(".."),
+        _ => false,
+    };
+    // The records of a download name its files.
+    case.code.as_deref() == Some("SAF023") || case.changes.iter().any(is_placed)
+}
+
+/// Files that no loader opens beside weights and documents.
+const UNOPENED: [(&str, &[u8]); 11] = [
+    ("notes.txt", b"loss 0.4 after 1000 steps\n"),
+    ("old.json", b"{\"model_type\": "),
+    ("results.json", b"{\"accuracy\": NaN}"),
+    ("config_old.json", b"{\"model_type\": \"llama\", \"hidden_size\": -1}"),
+    ("events.out.tfevents.1700000000.host", b"\x18\0\0\0\0\0\0\0"),
+    ("old.safetensors", b"\xff\xff\xff\xff\xff\xff\xff\xff"),
+    ("eval/metrics.json", b"{"),
+    ("plot.py", b"def f(:\n"),
+    ("training_args.bin", b"\x80\x02}q\0."),
+    ("optimizer.pt", b"PK\x03\x04"),
+    ("model.onnx", b""),
+];
+
+/// Tries a form on every case; `form` makes the other directory below a room.
+fn keeps(with_places: bool, form: impl Fn(&Path, &Path, &Checkpoint, &mut Draw) -> Option<PathBuf> + Sync) {
+    let knowledge = knowledge();
+    let look = |case: &Case, made: &Path| -> Vec<String> {
+        let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+        let (checkpoint, before) = open(made, case.deep, &case.loaders, &knowledge);
+        let mut draw = Draw::new(case.name.bytes().map(u64::from).sum());
+        let made_again = if is_of_a_place(case) { None } else { form(made, room.path(), &checkpoint, &mut draw) };
+        let Some(dir) = made_again else { return Vec::new() };
+        let (_, after) = open(&dir, case.deep, &case.loaders, &knowledge);
+        let [before, after] = [before, after].map(|outcome| Answer::new(&outcome, with_places));
+        before.differences(&after).into_iter().map(|why| format!("{}: {why}", case.name)).collect()
+    };
+    holds(20, look, &knowledge);
+}
+
+#[test]
+fn order_and_spelling_of_json_decide_nothing() {
+    keeps(true, |made, room, checkpoint, draw| {
+        let dir = copied(made, room)?;
+        respell(&dir, checkpoint, draw).then_some(dir)
+    });
+}
+
+#[test]
+fn the_order_of_tensors_decides_nothing() {
+    keeps(true, |made, room, checkpoint, draw| {
+        let dir = copied(made, room)?;
+        reorder(&dir, checkpoint, draw).then_some(dir)
+    });
+}
+
+#[test]
+fn the_number_of_shards_decides_nothing() {
+    keeps(false, |made, room, checkpoint, draw| {
+        let dir = copied(made, room)?;
+        reshard(&dir, checkpoint, draw).then_some(dir)
+    });
+}
+
+#[test]
+fn the_name_of_the_directory_decides_nothing() {
+    keeps(true, |made, room, _, _| {
+        let dir = room.join("another-name");
+        copy_whole(made, &dir).then_some(dir)
+    });
+}
+
+#[cfg(unix)]
+#[test]
+fn links_of_the_hub_cache_decide_nothing() {
+    keeps(true, |made, room, _, _| as_hub_cache(made, room));
+}
+
+/// It may have a finding of its own, of a harm or of severity info.
+#[test]
+fn a_file_that_no_loader_opens_decides_nothing() {
+    let knowledge = knowledge();
+    let look = |case: &Case, made: &Path| -> Vec<String> {
+        let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+        let Some(dir) = copied(made, room.path()) else { return Vec::new() };
+        let mut draw = Draw::new(case.name.bytes().map(u64::from).sum());
+        let (mut name, bytes) = draw.one(&UNOPENED);
+        let mut bytes = bytes.to_vec();
+        let whole = ["model.safetensors", "model-00001-of-00002.safetensors"].map(|name| fs::read(dir.join(name)));
+        if let Some(shard) = whole.into_iter().flatten().next().filter(|shard| shard.len() > 9 && draw.once_in(2)) {
+            (name, bytes) = ("old.safetensors", shard);
+            // In the length of the header, the header or the data.
+            let end = if draw.once_in(2) { bytes.len() } else { 64 };
+            let at = draw.below(end.min(bytes.len()));
+            bytes[at] ^= u8::try_from(1 + draw.below(255)).unwrap();
+        }
+        if dir.join(name).exists() || is_of_a_place(case) {
+            return Vec::new();
+        }
+        let [before, mut after] = [made, &dir].map(|dir| {
+            if dir != made {
+                fs::create_dir_all(dir.join(name).parent().unwrap()).unwrap();
+                fs::write(dir.join(name), &bytes).unwrap();
+            }
+            Answer::new(&open(dir, case.deep, &case.loaders, &knowledge).1, true)
+        });
+        let is_allowed = |finding: &str| {
+            let (code, rest) = finding.split_once(' ').unwrap();
+            rest.starts_with("Info ") || knowledge.rules.all().any(|rule| rule.code == code && rule.harm.is_some())
+        };
+        after.findings.retain(|finding| before.findings.contains(finding) || !is_allowed(finding));
+        before.differences(&after).into_iter().map(|why| format!("{} with {name}: {why}", case.name)).collect()
+    };
+    holds(20, look, &knowledge);
+}
