@@ -70,6 +70,8 @@ struct CheckFacts<'a> {
     rows: Option<u64>,
     /// Faults that do not depend on versions of transformers.
     faults: Vec<Fault>,
+    /// What explains the predicted loads, for the readings of the run.
+    causes: judge::Causes,
     /// The tokenizer as the processor of a class opens it in a version, for those that were asked for.
     opened: RefCell<Vec<OpenedBy>>,
 }
@@ -156,7 +158,16 @@ impl<'a> CheckFacts<'a> {
         let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
         faults.extend(tokens::faults(checkpoint, rows));
         let stored = Stored::of(checkpoint);
-        Self { checkpoint, knowledge, programs, stored, rows, faults, opened: RefCell::default() }
+        Self {
+            checkpoint,
+            knowledge,
+            programs,
+            stored,
+            rows,
+            faults,
+            causes: judge::Causes::default(),
+            opened: RefCell::default(),
+        }
     }
 
     /// The tokenizer as the processor of this class opens it in a version; several readings of a run ask for the same.
@@ -190,7 +201,7 @@ impl<'a> CheckFacts<'a> {
     fn read(&self, versions: &[String], purpose: Purpose) -> LoaderView<'a> {
         let Self { checkpoint, knowledge, stored, .. } = self;
         let config = checkpoint.config();
-        let judged = judge::judge(checkpoint, knowledge, versions, stored);
+        let judged = judge::judge(checkpoint, knowledge, versions, stored, &self.causes);
         let with_class = |fault| match purpose {
             Purpose::Findings => with_likely_class(fault, knowledge, stored),
             Purpose::Verdicts => fault,

@@ -16,7 +16,11 @@ mod predict;
 #[cfg(test)]
 mod tests;
 
+use std::cell::RefCell;
+
 use serde_json::Value;
+
+use explain::FoundCauses;
 
 use super::load::{LoadReport, Stored, Target};
 use super::votes::Vote;
@@ -57,7 +61,16 @@ struct Inputs<'a> {
     scheme: DeclaredScheme<'a>,
     /// The scheme that each loader reads.
     read: Vec<(Loader, DeclaredScheme<'a>)>,
+    causes: &'a Causes,
 }
+
+/// The causes that were found for the targets of a checkpoint. A run judges several lists of versions, and the causes for one of
+/// them are the same in each.
+#[derive(Debug, Default)]
+pub struct Causes(RefCell<Vec<(CauseKey, FoundCauses)>>);
+
+/// The loader, the version that it stands for, and the class.
+type CauseKey = (Loader, Option<String>, String);
 
 impl<'a> Inputs<'a> {
     /// The scheme that a loader reads.
@@ -74,11 +87,17 @@ impl<'a> Inputs<'a> {
 /// version that wrote config.json and the newest known one of each major version apply. Empty when config.json is missing or
 /// invalid, or when tensors may exist that were not read.
 #[must_use]
-pub fn judge(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String], stored: &Stored) -> Judgement {
+pub fn judge(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    versions: &[String],
+    stored: &Stored,
+    causes: &Causes,
+) -> Judgement {
     let Some(config) = checkpoint.config().filter(|_| !checkpoint.is_partial()) else { return Judgement::default() };
     let scheme = declared_scheme(config, &knowledge.schemes);
     let read = schemes_read(config, knowledge);
-    let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme, read };
+    let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme, read, causes };
     let targets = classes::resolve_targets(&inputs);
     let architecture = targets.first().map(|target| target.architecture.name().to_owned());
     let classes = classes::build_classes(&inputs, targets);

@@ -95,6 +95,10 @@ pub fn scope(
     scope
         .function1("has_tensor", move |prefix| json!(index::opened_tensors(&here).any(|t| t.name.starts_with(prefix))));
     let here = Arc::clone(checkpoint);
+    scope.function1("config_at", move |pointer| {
+        here.config().and_then(|c| c.pointer(pointer)).cloned().unwrap_or_default()
+    });
+    let here = Arc::clone(checkpoint);
     let left = Allowance::new(DOCUMENT_BYTES);
     scope.function1("document", move |name| {
         let Some(document) = here.document(name) else { return Value::Null };

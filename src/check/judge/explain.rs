@@ -38,13 +38,29 @@ pub(super) fn explain<'a>(inputs: &Inputs<'_>, predictions: Vec<Prediction<'a>>)
     predictions.into_iter().map(|prediction| explain_one(inputs, prediction)).collect()
 }
 
+/// The prefixes and values that explain a report, see [`ExplainedLoad`].
+pub(super) type FoundCauses = (Vec<Fault>, Option<Explanation>);
+
 fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> ExplainedLoad<'a> {
-    let Prediction { target, architecture, expected, report, .. } = &prediction;
+    let Prediction { target, architecture, report, .. } = &prediction;
     // A quantised tensor has the shape that its scheme packs it into, which no config value explains.
     let is_searched = target.leads && inputs.is_plain() && inputs.stored.is_searchable();
     let Some(report) = report.as_ref().filter(|_| is_searched) else {
         return ExplainedLoad { prediction, prefixes: Vec::new(), explanation: None };
     };
+    let key = (target.loader, target.stands_for.clone(), architecture.name().to_owned());
+    let known = inputs.causes.0.borrow().iter().find(|(of, _)| *of == key).map(|(_, causes)| causes.clone());
+    let causes = known.unwrap_or_else(|| {
+        let found = search(inputs, &prediction, report);
+        inputs.causes.0.borrow_mut().push((key, found.clone()));
+        found
+    });
+    let (prefixes, explanation) = causes;
+    ExplainedLoad { prediction, prefixes, explanation }
+}
+
+fn search(inputs: &Inputs<'_>, prediction: &Prediction<'_>, report: &LoadReport) -> FoundCauses {
+    let Prediction { target, architecture, expected, .. } = prediction;
     let moved = load::moved(&inputs.knowledge.wrappers, *architecture, inputs.config, expected, inputs.stored, report);
     // Tensors under another prefix load nowhere, but their shapes still imply config values.
     let (class, stored, moved_report) =
@@ -57,7 +73,7 @@ fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> Explained
     };
     let explanation = explanation
         .map(|Explanation { votes, rest }| Explanation { votes, rest: finished(inputs.checkpoint, target, rest) });
-    ExplainedLoad { prediction, prefixes, explanation }
+    (prefixes, explanation)
 }
 
 /// The votes of all loads; for each config value, those of the first load.

@@ -18,6 +18,7 @@ struct Case {
     config: Value,
     stored: Stored,
     versions: Vec<String>,
+    causes: Causes,
 }
 
 impl Case {
@@ -26,7 +27,14 @@ impl Case {
         let checkpoint = Checkpoint::open(&path).unwrap();
         let config = checkpoint.config().unwrap().clone();
         let stored = Stored::of(&checkpoint);
-        Self { checkpoint, knowledge: Knowledge::embedded().unwrap(), config, stored, versions: Vec::new() }
+        Self {
+            checkpoint,
+            knowledge: Knowledge::embedded().unwrap(),
+            config,
+            stored,
+            versions: Vec::new(),
+            causes: Causes::default(),
+        }
     }
 
     fn set(mut self, key: &str, value: Value) -> Self {
@@ -56,6 +64,7 @@ impl Case {
             versions: &self.versions,
             scheme,
             read: schemes_read(&self.config, &self.knowledge),
+            causes: &self.causes,
         }
     }
 }

@@ -128,6 +128,7 @@ const fn function(
 
 /// The functions of rules besides those of all data files, sorted by name.
 pub const FUNCTIONS: &[RuleFunction] = &[
+    function("config_at", &["pointer"], Any, "the value of config.json at a JSON pointer; null when there is none"),
     function(
         "document",
         &["file"],

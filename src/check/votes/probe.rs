@@ -79,6 +79,9 @@ fn split(
     group: &[(String, Value, Value)],
     found: &mut Vec<ProbedKey>,
 ) {
+    if space.exhausted() {
+        return;
+    }
     let mut changed = config.clone();
     for (pointer, _, other) in group {
         pointer::put(&mut changed, &base.config, pointer, other.clone());

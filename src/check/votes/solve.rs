@@ -43,6 +43,9 @@ impl SearchState {
 
     /// The state with some values replaced, if the class can be built so.
     fn with(&self, space: &Space<'_>, values: &[(String, Value)]) -> Option<Self> {
+        if space.exhausted() {
+            return None;
+        }
         let mut config = put_all(&self.config, &self.built.config, values);
         let changed = values.iter().map(|(pointer, _)| pointer.clone());
         let built = space.build(&config).or_else(|| {

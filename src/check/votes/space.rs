@@ -31,16 +31,19 @@ pub(super) struct Space<'a> {
     pub numbered: Numbered,
     /// Keys that the files of the class have defaults for, without the numbers of list elements; empty when unknown.
     known: BTreeSet<String>,
+    /// Cost of a build beside its tensors, in tensors: it copies the config.
+    overhead: usize,
     spent: Cell<usize>,
 }
 
 impl<'a> Space<'a> {
-    /// The names are those of the file until [`Self::rename`] is called with the class.
-    pub fn new(architecture: Architecture<'a>, files: &'a Stored) -> Self {
+    /// For a search that begins with this config. The names are those of the file until [`Self::rename`] is called with the class.
+    pub fn new(architecture: Architecture<'a>, config: &Value, files: &'a Stored) -> Self {
         let evidence = files.evidence();
         let numbered = Numbered::from_names(evidence.iter().map(|(name, _)| name));
         let stored = evidence.clone();
-        Self { architecture, files, evidence, stored, numbered, known: BTreeSet::new(), spent: Cell::new(0) }
+        let overhead = values(config).saturating_add(OVERHEAD);
+        Self { architecture, files, evidence, stored, numbered, known: BTreeSet::new(), overhead, spent: Cell::new(0) }
     }
 
     /// Spells the stored names as the loader would for this class; whether that changed any.
@@ -86,7 +89,7 @@ impl<'a> Space<'a> {
             return None;
         }
         let expected = self.architecture.expect_given(config, &self.evidence).ok();
-        let cost = expected.as_ref().map_or(0, |e| e.tensors.len()).saturating_add(OVERHEAD);
+        let cost = expected.as_ref().map_or(0, |e| e.tensors.len()).saturating_add(self.overhead);
         self.spent.set(self.spent.get().saturating_add(cost));
         let mut expected = expected?;
         expected.drop_absent_groups(|name| self.stored.contains(name));
@@ -140,6 +143,16 @@ impl<'a> Space<'a> {
     /// The distance of a class without any tensor.
     fn total(&self) -> u64 {
         self.stored.iter().fold(0, |sum, (_, shape)| sum.saturating_add(weight(shape.unwrap_or_default())))
+    }
+}
+
+/// The number of values in a document, keys included.
+fn values(document: &Value) -> usize {
+    let sum = |count: usize, value: &Value| count.saturating_add(values(value));
+    match document {
+        Value::Object(map) => map.values().fold(map.len(), sum),
+        Value::Array(items) => items.iter().fold(1, sum),
+        _ => 1,
     }
 }
 
