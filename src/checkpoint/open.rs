@@ -165,15 +165,15 @@ pub fn open_regular(path: &Path, cap: u64) -> Result<Opened, OpenError> {
 }
 
 /// Opens a file of the checkpoint in `root`, as [`open_regular`] does. A symbolic link is followed if its target lies in
-/// the checkpoint or is a blob of the hub cache.
+/// the checkpoint or in one of the `followed` directories, or is a blob of the hub cache.
 ///
 /// Everything that is copied, linked or quoted is opened here: a link in a download can name any file of the user.
 ///
 /// # Errors
 /// As [`open_regular`], and [`OpenError::Outside`].
-pub fn open_own(root: &Path, name: &str, cap: u64) -> Result<Opened, OpenError> {
+pub fn open_own(root: &Path, followed: &[PathBuf], name: &str, cap: u64) -> Result<Opened, OpenError> {
     let path = root.join(name);
-    let real = real_target(root, &path)?;
+    let real = real_target(root, followed, &path)?;
     // A link that somebody puts there now is not followed.
     open_at(real.as_deref().unwrap_or(&path), &path, cap, false)
 }
@@ -182,15 +182,16 @@ pub fn open_own(root: &Path, name: &str, cap: u64) -> Result<Opened, OpenError> 
 ///
 /// # Errors
 /// As [`open_own`], and when reading fails.
-pub fn read_own(root: &Path, name: &str, cap: u64) -> Result<Vec<u8>, OpenError> {
-    open_own(root, name, cap)?.read_all(&root.join(name))
+pub fn read_own(root: &Path, followed: &[PathBuf], name: &str, cap: u64) -> Result<Vec<u8>, OpenError> {
+    open_own(root, followed, name, cap)?.read_all(&root.join(name))
 }
 
-/// The file that a symbolic link of the checkpoint in `root` leads to; `None` when `path` is no link.
+/// The file that a symbolic link of the checkpoint in `root` leads to; `None` when `path` is no link. `followed` are real
+/// directories that the user named.
 ///
 /// # Errors
 /// [`OpenError::Outside`], and those of a link without a target.
-pub fn real_target(root: &Path, path: &Path) -> Result<Option<PathBuf>, OpenError> {
+pub fn real_target(root: &Path, followed: &[PathBuf], path: &Path) -> Result<Option<PathBuf>, OpenError> {
     let io = |source| OpenError::from_io(path, source);
     if !std::fs::symlink_metadata(path).map_err(io)?.is_symlink() {
         return Ok(None);
@@ -199,7 +200,8 @@ pub fn real_target(root: &Path, path: &Path) -> Result<Option<PathBuf>, OpenErro
     let real = path.canonicalize().map_err(io)?;
     // Devices and pipes have a clearer error of their own.
     let is_file = std::fs::metadata(&real).is_ok_and(|metadata| metadata.is_file());
-    if real.starts_with(&root) || is_blob(&root, &real) || !is_file {
+    let is_inside = real.starts_with(&root) || followed.iter().any(|directory| real.starts_with(directory));
+    if is_inside || is_blob(&root, &real) || !is_file {
         return Ok(Some(real));
     }
     let target = std::fs::read_link(path).map_err(io)?;

@@ -6,6 +6,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 mod file;
 mod memory;
@@ -25,10 +26,18 @@ type Entries = Box<dyn Iterator<Item = std::io::Result<ListedEntry>>>;
 /// The place of a checkpoint's files. File names are relative to it, with `/` between folders.
 #[derive(Debug, Clone)]
 pub enum Source {
-    /// The directory at this path.
-    Directory(PathBuf),
+    /// A directory of the file system.
+    Directory(LocalDirectory),
     /// Files in memory: those of a caller, or none for a checkpoint that is only planned.
     Memory(MemoryFiles),
+}
+
+/// A directory of the file system, and others that links in it may lead to.
+#[derive(Debug, Clone)]
+pub struct LocalDirectory {
+    path: PathBuf,
+    /// Real paths, without links.
+    followed: Arc<[PathBuf]>,
 }
 
 impl Default for Source {
@@ -47,7 +56,23 @@ impl Source {
         if !metadata.is_dir() {
             return Err(OpenError::NotADirectory { path: path.to_owned() });
         }
-        Ok(Self::Directory(path.to_owned()))
+        Ok(Self::from(path))
+    }
+
+    /// The same, with links followed that lead into these directories. Called for directories that the user names; files in
+    /// memory have no links.
+    ///
+    /// # Errors
+    /// When one of the directories does not exist.
+    pub fn following(self, directories: &[PathBuf]) -> Result<Self, OpenError> {
+        let real = |path: &PathBuf| path.canonicalize().map_err(|source| OpenError::from_io(path, source));
+        Ok(match self {
+            Self::Directory(LocalDirectory { path, .. }) => {
+                let followed = directories.iter().map(real).collect::<Result<_, _>>()?;
+                Self::Directory(LocalDirectory { path, followed })
+            }
+            Self::Memory(files) => Self::Memory(files),
+        })
     }
 
     /// The path of the directory or, of files in memory, the one that was given to them. Messages show it, settings match it,
@@ -55,7 +80,7 @@ impl Source {
     #[must_use]
     pub fn path(&self) -> &Path {
         match self {
-            Self::Directory(path) => path,
+            Self::Directory(directory) => &directory.path,
             Self::Memory(files) => files.path(),
         }
     }
@@ -64,7 +89,7 @@ impl Source {
     #[must_use]
     pub fn directory(&self) -> Option<&Path> {
         match self {
-            Self::Directory(path) => Some(path),
+            Self::Directory(directory) => Some(&directory.path),
             Self::Memory(_) => None,
         }
     }
@@ -74,7 +99,10 @@ impl Source {
     /// adapter, and for the records of a download.
     pub(crate) fn join(&self, path: &Path) -> Option<Self> {
         match self {
-            Self::Directory(root) => Some(Self::Directory(root.join(path))),
+            Self::Directory(LocalDirectory { path: root, followed }) => {
+                let followed = Arc::clone(followed);
+                Some(Self::Directory(LocalDirectory { path: root.join(path), followed }))
+            }
             Self::Memory(files) => files.folder(path).map(Self::Memory),
         }
     }
@@ -85,8 +113,8 @@ impl Source {
     /// When it is missing, is not a folder or cannot be opened.
     pub(super) fn list(&self, folder: &str) -> std::io::Result<Entries> {
         Ok(match self {
-            Self::Directory(root) if folder.is_empty() => Box::new(list(root)?),
-            Self::Directory(root) => Box::new(list(&root.join(folder))?),
+            Self::Directory(LocalDirectory { path: root, .. }) if folder.is_empty() => Box::new(list(root)?),
+            Self::Directory(LocalDirectory { path: root, .. }) => Box::new(list(&root.join(folder))?),
             Self::Memory(files) => Box::new(files.list(folder)?.into_iter().map(Ok)),
         })
     }
@@ -97,7 +125,7 @@ impl Source {
     /// When it is missing, or is a link without a target.
     pub(super) fn stat(&self, name: &str) -> Result<(EntryKind, u64), OpenError> {
         match self {
-            Self::Directory(root) => {
+            Self::Directory(LocalDirectory { path: root, .. }) => {
                 let path = root.join(name);
                 let metadata = fs::metadata(&path).map_err(|source| OpenError::from_io(&path, source))?;
                 let kind = EntryKind::from_metadata(&metadata);
@@ -110,7 +138,7 @@ impl Source {
     /// Whether an entry of this name exists, even as a link without a target.
     pub(super) fn exists(&self, name: &str) -> bool {
         match self {
-            Self::Directory(root) => fs::symlink_metadata(root.join(name)).is_ok(),
+            Self::Directory(LocalDirectory { path: root, .. }) => fs::symlink_metadata(root.join(name)).is_ok(),
             Self::Memory(files) => files.stat(name).is_ok(),
         }
     }
@@ -118,7 +146,9 @@ impl Source {
     /// Whether a folder of this name exists and is not a link.
     pub(crate) fn has_folder(&self, name: &str) -> bool {
         match self {
-            Self::Directory(root) => fs::symlink_metadata(root.join(name)).is_ok_and(|metadata| metadata.is_dir()),
+            Self::Directory(LocalDirectory { path: root, .. }) => {
+                fs::symlink_metadata(root.join(name)).is_ok_and(|metadata| metadata.is_dir())
+            }
             Self::Memory(files) => matches!(files.stat(name), Ok((EntryKind::Directory, _))),
         }
     }
@@ -126,7 +156,9 @@ impl Source {
     /// The target of a symbolic link, as the link states it; `None` when the entry is not a link.
     pub(super) fn link(&self, name: &str) -> Option<String> {
         match self {
-            Self::Directory(root) => Some(fs::read_link(root.join(name)).ok()?.to_string_lossy().into_owned()),
+            Self::Directory(LocalDirectory { path: root, .. }) => {
+                Some(fs::read_link(root.join(name)).ok()?.to_string_lossy().into_owned())
+            }
             Self::Memory(_) => None,
         }
     }
@@ -137,7 +169,9 @@ impl Source {
     /// [`OpenError::Outside`] for a link that leaves the checkpoint, and those of a link without a target.
     pub(crate) fn check_link(&self, name: &str) -> Result<(), OpenError> {
         match self {
-            Self::Directory(root) => real_target(root, &root.join(name)).map(drop),
+            Self::Directory(LocalDirectory { path, followed }) => {
+                real_target(path, followed, &path.join(name)).map(drop)
+            }
             Self::Memory(files) => files.stat(name).map(drop),
         }
     }
@@ -149,7 +183,9 @@ impl Source {
     /// As [`super::open_regular`].
     pub(super) fn open_regular(&self, name: &str, cap: u64) -> Result<SourceFile, OpenError> {
         match self {
-            Self::Directory(root) => open_regular(&root.join(name), cap).map(SourceFile::Local),
+            Self::Directory(LocalDirectory { path: root, .. }) => {
+                open_regular(&root.join(name), cap).map(SourceFile::Local)
+            }
             Self::Memory(files) => files.open(name, cap).map(SourceFile::Memory),
         }
     }
@@ -160,7 +196,9 @@ impl Source {
     /// As [`super::open::open_own`].
     pub(crate) fn open_own(&self, name: &str, cap: u64) -> Result<SourceFile, OpenError> {
         match self {
-            Self::Directory(root) => open_own(root, name, cap).map(SourceFile::Local),
+            Self::Directory(LocalDirectory { path, followed }) => {
+                open_own(path, followed, name, cap).map(SourceFile::Local)
+            }
             Self::Memory(files) => files.open(name, cap).map(SourceFile::Memory),
         }
     }
@@ -171,7 +209,7 @@ impl Source {
     /// As [`Self::open_own`], and when reading fails.
     pub(crate) fn read_own(&self, name: &str, cap: u64) -> Result<Vec<u8>, OpenError> {
         match self {
-            Self::Directory(root) => read_own(root, name, cap),
+            Self::Directory(LocalDirectory { path, followed }) => read_own(path, followed, name, cap),
             Self::Memory(files) => files.open(name, cap).map(|bytes| bytes.to_vec()),
         }
     }
@@ -180,6 +218,6 @@ impl Source {
 impl From<&Path> for Source {
     /// The directory at this path, which need not exist.
     fn from(path: &Path) -> Self {
-        Self::Directory(path.to_owned())
+        Self::Directory(LocalDirectory { path: path.to_owned(), followed: Arc::default() })
     }
 }

@@ -256,6 +256,10 @@ pub struct CheckArgs {
     /// Accept checkpoints without weights, such as copies of the documents alone; their load is not predicted
     #[arg(long)]
     pub metadata_only: bool,
+    /// Read files through symbolic links that lead into this directory; may be repeated. Other links out of a checkpoint are
+    /// not followed, except into the Hub cache
+    #[arg(long, value_name = "DIR")]
+    pub follow_links: Vec<PathBuf>,
     /// Run only these rules: codes, prefixes of codes (JSN) or names, comma-separated
     #[arg(long, value_name = "RULE", value_delimiter = ',', help_heading = "Rule selection")]
     pub select: Vec<String>,

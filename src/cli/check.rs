@@ -13,7 +13,7 @@ use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::platform::shown;
-use crate::checkpoint::{Checkpoint, ReadOptions, parallel};
+use crate::checkpoint::{Checkpoint, ReadOptions, Source, parallel};
 use crate::knowledge::settings::Surroundings;
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
@@ -133,7 +133,8 @@ struct CheckRun<'a> {
 
 impl CheckRun<'_> {
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
-        let mut checkpoint = Checkpoint::open(dir)?;
+        let source = Source::open(dir)?.following(&self.args.follow_links)?;
+        let mut checkpoint = Checkpoint::read(source)?;
         checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
         if self.args.deep || self.args.stats {
             let meter = Meter::new("reading");

@@ -70,7 +70,7 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 
 /// Reads a config.json, or the one in a directory.
 fn one(path: &Path) -> anyhow::Result<Input> {
-    let text = if path.is_dir() { read_own(path, "config.json", JSON_CAP) } else { read_capped(path, JSON_CAP) };
+    let text = if path.is_dir() { read_own(path, &[], "config.json", JSON_CAP) } else { read_capped(path, JSON_CAP) };
     let record = parse(&text?).map(|config| Record { config, class: None });
     Ok(Input { source: shown(path), record })
 }

@@ -130,7 +130,7 @@ impl Recorded {
                 "does not exist; `verify` compares a result of build-merged with its manifest".to_owned(),
             ));
         }
-        let bytes = read_own(root, &manifest::NAME, JSON_CAP).map_err(|error| wrong(error.to_string()))?;
+        let bytes = read_own(root, &[], &manifest::NAME, JSON_CAP).map_err(|error| wrong(error.to_string()))?;
         let damaged = |reason: String| wrong(format!("{reason}; the manifest is damaged"));
         let value: Value = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
         let schema = value.get("schema").and_then(Value::as_u64);

@@ -65,7 +65,7 @@ fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
     let from = &root.join(name);
     let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
     let is_file = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?.is_file();
-    if is_file && real_target(root, from).is_ok() {
+    if is_file && real_target(root, &[], from).is_ok() {
         match retry(|| fs::hard_link(&real, to)) {
             Ok(()) => return Ok(()),
             // Another file system, no hard links, or a file of another user: use a symbolic link.

@@ -286,6 +286,34 @@ fn a_fifo_does_not_block_and_hostile_names_are_escaped() {
     }
 }
 
+#[cfg(unix)]
+#[test]
+fn links_are_followed_into_directories_that_the_user_names_alone() {
+    let work = TempDir::new().unwrap();
+    let [dir, store, other] = ["model", "store", "other"].map(|name| work.path().join(name));
+    make_base("llama", &dir);
+    for (name, place) in [("config.json", &store), ("model.safetensors", &store), ("generation_config.json", &other)] {
+        fs::create_dir_all(place).unwrap();
+        fs::rename(dir.join(name), place.join(name)).unwrap();
+        std::os::unix::fs::symlink(place.join(name), dir.join(name)).unwrap();
+    }
+    let verdict = |report: &Value| report["checkpoints"][0]["loads"][0]["objects"].clone();
+    let codes = |report: &Value| -> Vec<String> {
+        let findings = report["checkpoints"][0]["findings"].as_array().unwrap();
+        findings.iter().map(|finding| finding["code"].as_str().unwrap().to_owned()).collect()
+    };
+    let model = dir.to_str().unwrap();
+    let (code, alone) = report(&["check", model, "--output-format", "json"]);
+    assert_eq!((code, codes(&alone)), (Some(1), ["FIL014", "FIL012", "FIL006"].map(str::to_owned).to_vec()), "{alone}");
+    let option = ["--follow-links", store.to_str().unwrap()];
+    let (code, followed) = report(&[&["check", model, "--output-format", "json"], &option[..]].concat());
+    assert_eq!((code, codes(&followed)), (Some(0), vec!["FIL012".to_owned()]), "{followed}");
+    assert_ne!(verdict(&alone), verdict(&followed));
+    let missing = doctor(&["check", model, "--follow-links", "no-such-directory"]);
+    assert_eq!(missing.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&missing.stderr).contains("no-such-directory does not exist"), "{missing:?}");
+}
+
 #[test]
 fn rules_can_be_chosen_listed_and_explained() {
     let vision = donor("spatialvla-tiny");

@@ -159,7 +159,7 @@ impl Folder {
         let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
         let (folder, name) = (path.parent().unwrap_or(path), path.file_name().unwrap_or_default());
         // A download may have a journal that is a link.
-        let bytes = match read_own(folder, &name.to_string_lossy(), JSON_CAP) {
+        let bytes = match read_own(folder, &[], &name.to_string_lossy(), JSON_CAP) {
             Err(OpenError::NotFound { .. }) => return Ok(None),
             other => other.map_err(|e| unusable(e.to_string()))?,
         };
