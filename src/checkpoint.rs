@@ -58,7 +58,7 @@ pub use nested::Nested;
 pub use open::{OpenError, is_plain_file_name, open_regular};
 pub use pickle::{PICKLE_NAME, PickleGlobal};
 pub use shard::{Dtype, Shard, Tensor, byte_len};
-pub use source::{LocalDirectory, MemoryFiles, Source, SourceFile};
+pub use source::{MemoryFiles, Source, SourceFile};
 #[cfg(feature = "internals")]
 pub use text::hex;
 #[cfg(not(feature = "internals"))]

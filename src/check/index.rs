@@ -277,6 +277,7 @@ impl<'c> IndexComparison<'c> {
         let places = self.index.faults.iter().flat_map(|f| &f.places);
         let unusable: BTreeSet<&str> = places.filter_map(|place| place.tensor.as_deref()).collect();
         let referenced: HashSet<&str> = self.referenced.keys().copied().collect();
+        let mut twice: Vec<Fault> = Vec::new();
         for (tensor, shards) in self.holders.iter().filter(|(tensor, _)| !unusable.contains(*tensor)) {
             let mut mapped = shards.iter().filter(|shard| referenced.contains(**shard));
             let Some(first) = mapped.next() else { continue };
@@ -287,12 +288,27 @@ impl<'c> IndexComparison<'c> {
                     faults.push(fault.with("index", self.index.document.as_str()));
                 }
                 (Some(kept), Some(second)) => {
+                    let taken = *mapped.next_back().unwrap_or(second);
                     let fault = Fault::new(FaultKind::TensorInTwoShards).at(place());
-                    faults.push(fault.with("other", *second).with("kept", &**kept));
+                    let fault = fault.with("other", *second).with("mapped", &**kept).with("taken", taken);
+                    let differs = if twice.len() < COMPARED { self.differs(tensor, kept, taken) } else { None };
+                    twice.push(fault.with("differs", differs));
                 }
                 (Some(_), None) => {}
             }
         }
+        // Only the first of many are findings.
+        twice.sort_by_key(|fault| fault.detail.get("differs") != Some(&Value::Bool(true)));
+        twice.into_iter().for_each(|fault| faults.push(fault));
+    }
+
+    /// Whether a tensor has other values in one shard than in another; `None` when that is not known.
+    fn differs(&self, tensor: &str, one: &str, other: &str) -> Option<bool> {
+        let held = |shard: &str| {
+            let shard = self.checkpoint.shards.get(shard).filter(|shard| readable(shard))?;
+            Some((shard, shard.tensors.iter().find(|held| held.name == tensor)?))
+        };
+        if one == other { Some(false) } else { Some(!have_same_bytes(self.checkpoint, held(one)?, held(other)?)?) }
     }
 
     /// Safetensors files that the index does not name.
@@ -377,6 +393,22 @@ pub(super) fn opened_shards(checkpoint: &Checkpoint) -> impl Iterator<Item = &Sh
     let is_any = checkpoint.shards.keys().any(|name| is_opened(checkpoint, name));
     checkpoint.shards.values().filter(move |shard| !is_any || is_opened(checkpoint, &shard.name))
 }
+
+/// Whether two tensors have the same type, shape and bytes; `None` when their bytes are not read and samples of them are
+/// equal.
+pub(super) fn have_same_bytes(checkpoint: &Checkpoint, one: Held<'_>, other: Held<'_>) -> Option<bool> {
+    if !checkpoint.deep {
+        return (checkpoint.sample(one)? != checkpoint.sample(other)?).then_some(false);
+    }
+    let is_same_kind = (one.1.dtype, &one.1.shape) == (other.1.dtype, &other.1.shape);
+    if is_same_kind { checkpoint.same_bytes(one, other) } else { Some(false) }
+}
+
+/// A tensor in its shard.
+type Held<'c> = (&'c Shard, &'c Tensor);
+
+/// Tensors in two shards whose bytes are compared.
+const COMPARED: usize = 10_000;
 
 /// Whether a file holds weights that transformers leaves aside, because it opens others.
 pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {

@@ -316,7 +316,7 @@ pub struct FixArgs {
     #[arg(long)]
     pub exit_non_zero_on_fix: bool,
     /// With --fix: write a repaired copy to this directory and leave the checkpoint unchanged; files without changes
-    /// become hard links to the originals (symbolic links on another file system)
+    /// become hard links to the originals (on another file system, copies or, above 64 MiB, symbolic links)
     #[arg(long, value_name = "DIR")]
     pub output: Option<PathBuf>,
 }

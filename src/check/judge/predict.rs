@@ -8,7 +8,7 @@ use super::classes::BuiltClass;
 use crate::check::index;
 use crate::check::load::{self, LoadReport, Target};
 use crate::check::quantization::Quantised;
-use crate::checkpoint::{Checkpoint, FaultKind, Shard, Tensor};
+use crate::checkpoint::{Checkpoint, FaultKind};
 use crate::knowledge::quantization::DeclaredScheme;
 use crate::knowledge::{Architecture, Expected};
 
@@ -82,16 +82,10 @@ pub(super) fn finished(checkpoint: &Checkpoint, target: &Target, mut report: Loa
     report
 }
 
-/// Whether two tensors have the same type, shape and bytes; `None` when their bytes are not read and samples of them are
-/// equal.
+/// Whether the tensors of these names are the same, see [`index::have_same_bytes`].
 pub(super) fn same_bytes(checkpoint: &Checkpoint, one: &str, other: &str) -> Option<bool> {
     let [one, other] = [one, other].map(|name| index::opened_tensor(checkpoint, name));
-    let (one, other) = (one?, other?);
-    if !checkpoint.deep {
-        return (checkpoint.sample(one)? != checkpoint.sample(other)?).then_some(false);
-    }
-    let kind = |(_, tensor): (&Shard, &Tensor)| (tensor.dtype, tensor.shape.clone());
-    if kind(one) == kind(other) { checkpoint.same_bytes(one, other) } else { Some(false) }
+    index::have_same_bytes(checkpoint, one?, other?)
 }
 
 /// The report for readers: with the quantised modules that do not fit, and a missing shard, which rules of other families

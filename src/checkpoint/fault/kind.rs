@@ -330,7 +330,7 @@ fault_kinds! {
         SuppressionUnused = "suppression-unused" { rule: Text, path: Text, written: Text, reason: Text },
         TemplateNotRendered = "template-not-rendered" { reason: Text },
         TemplateSyntax = "template-syntax" { line: Integer, reason: Text },
-        TensorInTwoShards = "tensor-in-two-shards" { other: Text, kept: Text },
+        TensorInTwoShards = "tensor-in-two-shards" { other: Text, mapped: Text, taken: Text, differs: OrNull(&Flag) },
         TiedOver = "tied-over" { tensor: Text, by: Text, under?: Text },
         TiedOverAnother = "tied-over-another" { tensor: Text, by: Text, under?: Text },
         TokenAboveRows = "token-above-rows" {

@@ -2,23 +2,24 @@
 
 use std::fs;
 use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsupported};
+use std::io::{self, Write as _};
 use std::os::unix::fs::symlink;
 use std::path::Path;
 
 use super::changes::{check_unchanged, explain_error, space, write_content};
 use super::sharing::Sharing;
 use super::staging::Staging;
-use super::system::{check_space, retry};
+use super::system::{check_space, create, retry};
 use super::target::claim_target;
-use crate::checkpoint::open::real_target;
+use crate::checkpoint::open::{TOKENIZER_CAP, read_own, real_target};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::outcome::{RepairedCopy, Target};
 use crate::surgery::repair::Repair;
 use crate::surgery::stop::interrupted;
 
-/// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's or, on
-/// another file system, symbolic links. Hidden files are not copied.
+/// Creates the directory `out` with the repaired checkpoint. Unchanged files are hard links to the original's. On another file
+/// system small ones are copied, and large ones, such as weights, are symbolic links. Hidden files are not copied.
 ///
 /// `progress` receives the bytes written, from several threads.
 ///
@@ -64,14 +65,31 @@ fn fill(repair: &Repair, root: &Path, dir: &Path, progress: &(dyn Fn(u64) + Sync
 fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
     let from = &root.join(name);
     let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
-    let is_file = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?.is_file();
-    if is_file && real_target(root, &[], from).is_ok() {
+    let metadata = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?;
+    let size = metadata.len();
+    if metadata.is_file() && real_target(root, &[], from).is_ok() {
         match retry(|| fs::hard_link(&real, to)) {
             Ok(()) => return Ok(()),
-            // Another file system, no hard links, or a file of another user: use a symbolic link.
-            Err(e) if matches!(e.kind(), CrossesDevices | PermissionDenied | Unsupported | TooManyLinks) => {}
+            // Another file system, no hard links, or a file of another user. No document behind a link is read in a check.
+            Err(e) if is_refused(&e) && size <= COPIED => return copy(root, name, to),
+            Err(e) if is_refused(&e) => {}
             Err(e) => return Err(io_at(to, "linking")(e)),
         }
     }
     retry(|| symlink(&real, to)).map_err(io_at(to, "linking"))
+}
+
+/// Largest file that is copied where it cannot have a second name: the limits of documents and tokenizers.
+const COPIED: u64 = TOKENIZER_CAP;
+
+fn is_refused(error: &io::Error) -> bool {
+    matches!(error.kind(), CrossesDevices | PermissionDenied | Unsupported | TooManyLinks)
+}
+
+fn copy(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
+    let from = &root.join(name);
+    let bytes = read_own(root, &[], name, COPIED).map_err(|error| io_at(from, "reading")(io::Error::other(error)))?;
+    let mut file = create(to)?;
+    file.write_all(&bytes).map_err(io_at(to, "writing"))?;
+    file.sync_all().map_err(io_at(to, "syncing"))
 }

@@ -72,7 +72,7 @@ fn links() -> Vec<Case> {
             d.small();
             d.link("config.json", "/dev/zero");
         }),
-        case("P2", "config to a file without end", "FIL012", "config.json", |d| {
+        case("P2", "config to a file without end", "FIL014", "config.json", |d| {
             d.small();
             d.link("config.json", "/proc/self/status");
         }),

@@ -50,7 +50,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l extend
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l ignore -d 'Skip these rules; if --select and --ignore both match a rule, the longer selector wins' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l config -d 'Use this settings file instead of the nearest ckpt-doctor.json5 from the working directory upward' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l baseline -d 'Do not count the findings listed in this file, and list those that no longer occur' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l output -d 'With --fix: write a repaired copy to this directory and leave the checkpoint unchanged; files without changes become hard links to the originals (symbolic links on another file system)' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l output -d 'With --fix: write a repaired copy to this directory and leave the checkpoint unchanged; files without changes become hard links to the originals (on another file system, copies or, above 64 MiB, symbolic links)' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
 concise\t''
 json\t''
