@@ -299,7 +299,9 @@ impl<'c> IndexComparison<'c> {
         }
         // Only the first of many are findings.
         twice.sort_by_key(|fault| fault.detail.get("differs") != Some(&Value::Bool(true)));
-        twice.into_iter().for_each(|fault| faults.push(fault));
+        for fault in twice {
+            faults.push(fault);
+        }
     }
 
     /// Whether a tensor has other values in one shard than in another; `None` when that is not known.
