@@ -410,7 +410,7 @@ pub(super) fn have_same_bytes(checkpoint: &Checkpoint, one: Held<'_>, other: Hel
 type Held<'c> = (&'c Shard, &'c Tensor);
 
 /// Tensors in two shards whose bytes are compared.
-const COMPARED: usize = 10_000;
+const COMPARED: usize = 1_000;
 
 /// Whether a file holds weights that transformers leaves aside, because it opens others.
 pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {

@@ -3,7 +3,7 @@
 use std::fs;
 use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsupported};
 use std::io::{self, Write as _};
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{MetadataExt as _, symlink};
 use std::path::Path;
 
 use super::changes::{check_unchanged, explain_error, space, write_content};
@@ -12,6 +12,7 @@ use super::staging::Staging;
 use super::system::{check_space, create, retry};
 use super::target::claim_target;
 use crate::checkpoint::open::{TOKENIZER_CAP, read_own, real_target};
+use crate::checkpoint::{Entry, EntryKind};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::outcome::{RepairedCopy, Target};
@@ -31,7 +32,8 @@ pub fn overlay(repair: &Repair, out: &Path, progress: &(dyn Fn(u64) + Sync)) -> 
     let parent = out.parent().unwrap_or_else(|| Path::new("/"));
     let donor = DonorSnapshot::record(root)?;
     let sharing = Sharing::of(parent);
-    let sizes: Vec<u64> = repair.changes.iter().map(|change| space(&change.new, &sharing)).collect();
+    let mut sizes: Vec<u64> = repair.changes.iter().map(|change| space(&change.new, &sharing)).collect();
+    sizes.extend(copied(repair, root, parent));
     let explained = |error| explain_error(error, parent, &sizes);
     let staging = Staging::new(&out).map_err(|error| explained(error.into()))?;
     let written = check_space(parent, &sizes)
@@ -53,11 +55,26 @@ fn fill(repair: &Repair, root: &Path, dir: &Path, progress: &(dyn Fn(u64) + Sync
         check_unchanged(repair, change, &root.join(&change.name))?;
         write_content(&dir.join(&change.name), &change.new, progress)?;
     }
-    let original = &repair.original;
-    for name in original.entries.keys().filter(|name| repair.changes.iter().all(|change| change.name != **name)) {
+    for (name, _) in unchanged(repair) {
         link(root, name, &dir.join(name))?;
     }
     Ok(())
+}
+
+/// The entries of the original that the repair leaves as they are.
+fn unchanged(repair: &Repair) -> impl Iterator<Item = (&String, &Entry)> {
+    let is_changed = |name: &str| repair.changes.iter().any(|change| change.name == name);
+    repair.original.entries.iter().filter(move |(name, _)| !is_changed(name))
+}
+
+/// The sizes of the files that are copied to another file system, see [`link`].
+fn copied(repair: &Repair, root: &Path, parent: &Path) -> Vec<u64> {
+    let device = |path: &Path| fs::metadata(path).ok().map(|metadata| metadata.dev());
+    let elsewhere = |name: &str| device(&root.join(name)) != device(parent);
+    let is_small = |entry: &Entry| entry.kind == EntryKind::Regular && entry.size <= COPIED;
+    let own = |name: &str| real_target(root, &[], &root.join(name)).is_ok();
+    let files = unchanged(repair).filter(|(name, entry)| is_small(entry) && own(name) && elsewhere(name));
+    files.map(|(_, entry)| entry.size).collect()
 }
 
 /// Links the target of a file of the original under a second name; a broken link is skipped. A file outside of the
