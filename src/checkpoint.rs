@@ -282,16 +282,18 @@ impl Checkpoint {
         mapped.into_iter().chain(self.shards.values()).find_map(|s| Some((s, s.tensors.get(of(s)?)?)))
     }
 
-    /// A few bytes of this tensor in this shard, to tell it from another; `None` when they cannot be read.
-    #[must_use]
-    pub fn sample(&self, (shard, tensor): (&Shard, &Tensor)) -> Option<Vec<u8>> {
-        contents::sample(&self.source, shard, tensor)
-    }
-
-    /// Whether two tensors, each in its shard, have the same bytes; `None` when they cannot be read.
+    /// Whether two tensors, each in its shard, have the same type, shape and bytes. Without [`Self::read_contents`] only a few
+    /// bytes of each are compared, which tells tensors apart and never that they are equal. `None` when it is not known.
     #[must_use]
     pub fn same_bytes(&self, one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<bool> {
-        contents::same_bytes(&self.source, one, other)
+        if (one.1.dtype, &one.1.shape) != (other.1.dtype, &other.1.shape) {
+            return Some(false);
+        }
+        if self.deep {
+            return contents::same_bytes(&self.source, one, other);
+        }
+        let sample = |(shard, tensor)| contents::sample(&self.source, shard, tensor);
+        (sample(one)? != sample(other)?).then_some(false)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

@@ -18,7 +18,8 @@ use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
 use super::{
     adapter, built_tokenizer, card, class_names, directory, finite, index, inspect, judge, model_type, module_imports,
     modules, pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json,
-    tokens, variables,
+    tokens,
+    variables::{self, declared},
 };
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::embeddings::TokenEmbedding;
@@ -105,8 +106,10 @@ struct LoaderView<'a> {
 }
 
 impl LoaderView<'_> {
-    /// Names that expressions see with other values than in another reading of the same run; of those in `always` it may be so.
+    /// The names whose values may differ between this reading and another of the same run. All other variables are equal, which
+    /// debug builds verify in every run.
     fn differences(&self, other: &Self) -> Vec<&'static str> {
+        // They follow from the versions and their loads.
         let always = ["stays_random", "complete", "loaders", "named"];
         let (one, two) = (&self.outcome, &other.outcome);
         let same_class = one.architecture == two.architecture;
@@ -119,7 +122,9 @@ impl LoaderView<'_> {
             if same_class && one.config == two.config { &[] } else { &["model", "text", "program"] };
         let by_processor: &[&str] =
             if same_class && same_tokenizer { &[] } else { &["tokens", "missing_attributes", "placeholders"] };
-        [&always[..], by_class, by_config, by_processor].concat()
+        let found = [&always[..], by_class, by_config, by_processor].concat();
+        debug_assert_eq!(declared::difference(&self.scope, &other.scope, &found), None);
+        found
     }
 }
 
@@ -130,7 +135,7 @@ struct Unmet<'a> {
 }
 
 impl Unmet<'_> {
-    /// Whether a rule finds nothing in this reading, either: no value differs that it depends on, or there is no fault for it.
+    /// Whether a rule finds nothing in this reading either: it reads no value that differs, or there is no fault for it.
     fn covers(&self, rule: &Rule, again: &LoaderView<'_>, differing: &[&str]) -> bool {
         if !has_faults(rule, &again.faults) {
             return true;
@@ -279,7 +284,7 @@ impl<'a> CheckFacts<'a> {
         loads
     }
 
-    /// The verdicts on the loaders of a reading and on programs, by all rules; `unmet` are those that found nothing already.
+    /// The verdicts on the loaders of a reading and on programs, by all rules. Rules that `unmet` covers are not run again.
     fn judged(&self, reading: &LoaderView<'_>, unmet: &Unmet<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
         let LoaderView { context, scope, faults, unpredicted, outcome, .. } = reading;
         let differing = reading.differences(unmet.reading);

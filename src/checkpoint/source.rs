@@ -59,20 +59,16 @@ impl Source {
         Ok(Self::from(path))
     }
 
-    /// The same, with links followed that lead into these directories. Called for directories that the user names; files in
-    /// memory have no links.
-    ///
-    /// # Errors
-    /// When one of the directories does not exist.
-    pub fn following(self, directories: &[PathBuf]) -> Result<Self, OpenError> {
-        let real = |path: &PathBuf| path.canonicalize().map_err(|source| OpenError::from_io(path, source));
-        Ok(match self {
+    /// The same, with links followed that lead into these directories: real paths of those that the user names. Files in memory
+    /// have no links.
+    #[must_use]
+    pub fn following(self, directories: &Arc<[PathBuf]>) -> Self {
+        match self {
             Self::Directory(LocalDirectory { path, .. }) => {
-                let followed = directories.iter().map(real).collect::<Result<_, _>>()?;
-                Self::Directory(LocalDirectory { path, followed })
+                Self::Directory(LocalDirectory { path, followed: Arc::clone(directories) })
             }
             Self::Memory(files) => Self::Memory(files),
-        })
+        }
     }
 
     /// The path of the directory or, of files in memory, the one that was given to them. Messages show it, settings match it,

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::bail;
+use anyhow::{Context as _, bail};
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
@@ -38,7 +38,9 @@ pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let surroundings = Surroundings::new(args.paths.iter().chain(&dirs).map(PathBuf::as_path));
     // Never freed: the process ends with the run.
     let by: &Resolved = Box::leak(Box::new(resolve(&Typed::check(args, rules), &surroundings)?));
-    let run = CheckRun { args, by, surroundings: &surroundings };
+    let real = |dir: &PathBuf| dir.canonicalize().with_context(|| format!("--follow-links {}", dir.display()));
+    let followed = args.follow_links.iter().map(real).collect::<anyhow::Result<_>>()?;
+    let run = CheckRun { args, by, surroundings: &surroundings, followed };
     args.fix.refuse(dirs.len())?;
     if args.fix.writes() {
         signals::install()?;
@@ -129,12 +131,13 @@ struct CheckRun<'a> {
     args: &'a CheckArgs,
     by: &'a Resolved,
     surroundings: &'a Surroundings,
+    /// Real paths of `--follow-links`.
+    followed: Arc<[PathBuf]>,
 }
 
 impl CheckRun<'_> {
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
-        let source = Source::open(dir)?.following(&self.args.follow_links)?;
-        let mut checkpoint = Checkpoint::read(source)?;
+        let mut checkpoint = Checkpoint::read(Source::open(dir)?.following(&self.followed))?;
         checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
         if self.args.deep || self.args.stats {
             let meter = Meter::new("reading");

@@ -82,10 +82,10 @@ pub(super) fn finished(checkpoint: &Checkpoint, target: &Target, mut report: Loa
     report
 }
 
-/// Whether the tensors of these names are the same, see [`index::have_same_bytes`].
+/// Whether the tensors of these names are the same, see [`Checkpoint::same_bytes`].
 pub(super) fn same_bytes(checkpoint: &Checkpoint, one: &str, other: &str) -> Option<bool> {
     let [one, other] = [one, other].map(|name| index::opened_tensor(checkpoint, name));
-    index::have_same_bytes(checkpoint, one?, other?)
+    checkpoint.same_bytes(one?, other?)
 }
 
 /// The report for readers: with the quantised modules that do not fit, and a missing shard, which rules of other families

@@ -182,6 +182,12 @@ pub(in crate::check) fn mismatch(scope: &Scope<'_>) -> Option<String> {
     variables.chain(functions).chain(bound).flatten().next()
 }
 
+/// The first variable that two scopes bind to other values, apart from those that are `expected` to differ.
+pub(in crate::check) fn difference(one: &Scope<'_>, other: &Scope<'_>, expected: &[&str]) -> Option<&'static str> {
+    let names = VARIABLES.iter().map(|variable| variable.name).filter(|name| !expected.contains(name));
+    names.into_iter().find(|name| one.get(name) != other.get(name))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

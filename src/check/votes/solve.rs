@@ -43,6 +43,7 @@ impl SearchState {
 
     /// The state with some values replaced, if the class can be built so.
     fn with(&self, space: &Space<'_>, values: &[(String, Value)]) -> Option<Self> {
+        // The copies of a large config are work, too.
         if space.exhausted() {
             return None;
         }

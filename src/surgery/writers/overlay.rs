@@ -77,8 +77,9 @@ fn copied(repair: &Repair, root: &Path, parent: &Path) -> Vec<u64> {
     files.map(|(_, entry)| entry.size).collect()
 }
 
-/// Links the target of a file of the original under a second name; a broken link is skipped. A file outside of the
-/// original gets no second name: a symbolic link leads to it, as in the original.
+/// Links the target of a file of the original under a second name or, where the system refuses that, copies it if it is small;
+/// a broken link is skipped. A file outside of the original gets no second name and is not copied: a symbolic link leads to it,
+/// as in the original.
 fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
     let from = &root.join(name);
     let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
@@ -87,7 +88,7 @@ fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
     if metadata.is_file() && real_target(root, &[], from).is_ok() {
         match retry(|| fs::hard_link(&real, to)) {
             Ok(()) => return Ok(()),
-            // Another file system, no hard links, or a file of another user. No document behind a link is read in a check.
+            // Another file system, no hard links, or a file of another user. A check reads no document behind a symbolic link.
             Err(e) if is_refused(&e) && size <= COPIED => return copy(root, name, to),
             Err(e) if is_refused(&e) => {}
             Err(e) => return Err(io_at(to, "linking")(e)),
