@@ -99,6 +99,9 @@ fn other_library(config: &Value) -> Option<(&'static str, &'static str)> {
 }
 
 fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
+    // The order in the file tells nothing.
+    let mut tensors: Vec<&Tensor> = tensors.iter().collect();
+    tensors.sort_by_key(|tensor| tensor.name.as_str());
     let empty: Vec<&str> = tensors.iter().filter(|t| t.shape.contains(&0)).map(|t| t.name.as_str()).collect();
     if let Some(first) = empty.first() {
         let fault = Fault::new(FaultKind::AdapterTensorsEmpty).at(Place::tensor(*first)).with("count", empty.len());
@@ -108,7 +111,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
     }
     let mut modules: BTreeMap<&str, AdapterModule<'_>> = BTreeMap::new();
     let mut whole: BTreeMap<&str, &Tensor> = BTreeMap::new();
-    for tensor in tensors {
+    for tensor in &tensors {
         match AdapterKey::parse(&tensor.name) {
             AdapterKey::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
             AdapterKey::Whole(name) => drop(whole.insert(name, tensor)),

@@ -199,7 +199,7 @@ fn from_faults(
         for fault in all.iter().take(PLACES) {
             caused.add(rule, context, &fault.loaders, &finding_scope(check, scope, fault, count));
         }
-        return vec![finding(rule, &inner, caused, places, evidence, fix)];
+        return vec![finding(rule, context, &inner, caused, places, evidence, fix)];
     }
     let mut out = Vec::new();
     let mut more = 0_u64;
@@ -210,7 +210,7 @@ fn from_faults(
         let fix = hint(rule, context, fault, &inner);
         let mut caused = Caused::default();
         caused.add(rule, context, &fault.loaders, &inner);
-        out.push(finding(rule, &inner, caused, locate(&places), fault.detail.clone(), fix));
+        out.push(finding(rule, context, &inner, caused, locate(&places), fault.detail.clone(), fix));
     }
     // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
     for fault in matching {
@@ -300,7 +300,7 @@ fn one_assert<'r>(
     let fix = fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: None, scope });
     let mut caused = Caused::default();
     caused.add(rule, context, &[], scope);
-    Ok(Some(finding(rule, scope, caused, locate(&places), Map::new(), fix)))
+    Ok(Some(finding(rule, context, scope, caused, locate(&places), Map::new(), fix)))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {
@@ -326,16 +326,23 @@ fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
 
 fn finding(
     rule: &Rule,
+    context: &Context<'_>,
     scope: &Scope<'_>,
     caused: Caused,
     locations: Vec<Location>,
     evidence: Map<String, Value>,
     fix: Option<FixHint>,
 ) -> Finding {
+    let file = locations.first().and_then(|location| location.file.as_deref());
+    let is_set_aside = file.is_some_and(|file| index::is_set_aside(context.bench.checkpoint, file));
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity: rule.severity_given(caused.leads(), caused.ahead),
+        severity: if is_set_aside && caused.effects.is_empty() {
+            rule.severity_unopened()
+        } else {
+            rule.severity_given(caused.leads(), caused.ahead)
+        },
         message: rule.message.render(scope),
         details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
         effects: caused.effects,

@@ -6,10 +6,12 @@ use indexmap::IndexMap;
 use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
-use super::model_type::{is_model, is_of_transformers};
+use super::model_type::is_model;
+use super::robots;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::pickle::is_training_state;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_NAME, Place, Shard, Tensor, pointer};
+use crate::knowledge::rule::Object;
 
 /// The file that a loader prefers to an index.
 const SINGLE: &str = "model.safetensors";
@@ -397,19 +399,21 @@ pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
     }
 }
 
-/// The shards that transformers opens or, when it opens none, all of them: then another library may open any.
+/// The shards that transformers or PEFT opens. All of them when nothing tells which: no index, and none of a name that they open;
+/// then another library may open any.
 pub(super) fn opened_shards(checkpoint: &Checkpoint) -> impl Iterator<Item = &Shard> {
-    let is_any = checkpoint.shards.keys().any(|name| is_opened(checkpoint, name));
-    checkpoint.shards.values().filter(move |shard| !is_any || is_opened(checkpoint, &shard.name))
+    let opens = |name: &str| is_opened(checkpoint, name) || Object::reading(name) == Some(Object::Adapter);
+    let is_told = checkpoint.index.is_some() || checkpoint.shards.keys().any(|name| opens(name));
+    checkpoint.shards.values().filter(move |shard| !is_told || opens(&shard.name))
 }
 
 /// Tensors in two shards whose bytes are compared.
 const COMPARED: usize = 1_000;
 
-/// Whether a file holds weights that transformers leaves aside, because it opens others.
+/// Whether a file holds weights that no loader opens, because it opens others.
 pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {
     let is_opened = || opened_shards(checkpoint).any(|shard| shard.name == name);
-    checkpoint.shards.contains_key(name) && is_of_transformers(checkpoint) && !is_opened()
+    checkpoint.shards.contains_key(name) && !is_opened() && !robots::names_state(checkpoint, name)
 }
 
 /// The tensors of [`opened_shards`], by shard name and then in header order.

@@ -15,6 +15,12 @@ use crate::checkpoint::{Checkpoint, Shard};
 const PIPELINES: [(&str, &str); 2] =
     [("policy_preprocessor.json", "normalizer_processor"), ("policy_postprocessor.json", "unnormalizer_processor")];
 
+/// Whether a step of a policy names this file, in which its statistics are.
+pub(super) fn names_state(checkpoint: &Checkpoint, file: &str) -> bool {
+    let steps = PIPELINES.iter().filter_map(|(document, _)| checkpoint.document(document)?.get("/steps")?.as_array());
+    steps.flatten().any(|step| step.get("state_file").and_then(Value::as_str) == Some(file))
+}
+
 /// Where a policy keeps its statistics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Layout {

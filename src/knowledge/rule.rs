@@ -200,6 +200,12 @@ impl Rule {
         })
     }
 
+    /// Severity of a finding without effects in a file that no loader opens.
+    #[must_use]
+    pub fn severity_unopened(&self) -> Severity {
+        if self.harm.is_some() { self.severity_given(false, false) } else { self.regraded.unwrap_or(Severity::Info) }
+    }
+
     /// The highest severity that a finding of this rule can have.
     #[must_use]
     pub fn highest_severity(&self) -> Severity {
