@@ -39,6 +39,7 @@ mod sniff;
 pub mod source;
 pub mod text;
 pub mod tokenizer;
+pub(crate) mod work;
 
 pub use contents::{Progress, ReadOptions, TensorContents, TensorStats};
 pub use digest::HashAlgorithm;

@@ -125,6 +125,7 @@ fault_kinds! {
         OddTensorName = "odd-tensor-name" { reason: Text, bytes: Integer },
         OffsetsOutOfOrder = "offsets-out-of-order" { begin: Integer, end: Integer },
         PartialDownload = "partial-download" { of: Text },
+        PatternsNotCompared = "patterns-not-compared" {},
         PickleCutShort = "pickle-cut-short" { what: Text, missing: OrNull(&Integer), file_len: Integer, zip: Flag },
         PickleMalformed = "pickle-malformed" { reason: Text, offset: Integer },
         PickleNested = "pickle-nested" { key: Text, tensors: Integer, first: Text, keys: List(&Text) },
