@@ -1,9 +1,11 @@
 //! Regular expressions that a config gives, compiled and searched within a bound of work.
 //!
-//! They are Python's, and a stranger's. One without lookarounds becomes an automaton of bounded size, which takes one step a
-//! byte whatever the expression. The others backtrack, with a bound on the steps.
+//! They are Python's, and a stranger's. One without lookarounds becomes an automaton whose states are made while it runs: few
+//! for any published expression, and a bounded number for any other. The rest backtrack, with a bound on the steps.
 
-use regex_automata::dfa::{Automaton, StartKind, dense};
+use std::cell::RefCell;
+
+use regex_automata::hybrid::dfa::{Cache, DFA};
 use regex_automata::nfa::thompson;
 use regex_automata::util::syntax;
 use regex_automata::{Anchored, Input};
@@ -15,20 +17,28 @@ use crate::checkpoint::{Checkpoint, Document};
 const LONGEST: usize = 2_000;
 const LONGEST_NAME: usize = 512;
 
-/// Largest automaton in bytes; those of published configs take some 4 kB.
-const AUTOMATON: usize = 128 << 10;
+/// Largest compiled expression, and the states that it may make, in bytes; those of published configs take some 2 kB.
+const COMPILED: usize = 16 << 10;
+const STATES: usize = 32 << 10;
 
 /// Steps of backtracking for one name, and the work of one search with them.
 const BACKTRACKS: usize = 2_000;
 const BACKTRACKING: u64 = 20_000;
 
-/// Work of compiling an expression: of any, of each byte of the automaton, and of one that does not become an automaton.
-const COMPILED: u64 = 20_000;
-const BYTE: u64 = 4;
-const NOT_COMPILED: u64 = 1_000_000;
+/// Work of compiling an expression, by the bytes of its text and of the result, and of a byte of states, as measured.
+const COMPILING: u64 = 20_000;
+const TEXT_BYTE: u64 = 400;
+const COMPILED_BYTE: u64 = 20;
+const STATE_BYTE: u64 = 16;
+/// The same of one that backtracks.
+const PARSING: u64 = 200_000;
+const PARSED_BYTE: u64 = 10_000;
 
 /// Work of a comparison with a name, besides its bytes.
 pub(super) const COMPARISON: u64 = 40;
+
+/// Judgements that share the work for the bytes of a checkpoint: a run compares the patterns once for each loader.
+const JUDGEMENTS: usize = 4;
 
 /// The work that the patterns of a document may cost: in the bytes of the document and of the names that they are compared
 /// with.
@@ -36,13 +46,13 @@ pub(super) fn allowance(checkpoint: &Checkpoint, document: Option<&Document>) ->
     let text = document.and_then(|document| document.text.as_ref()).map_or(0, |text| text.len());
     let tensors = checkpoint.shards.values().flat_map(|shard| &shard.tensors);
     let names = tensors.fold(text, |sum, tensor| sum.saturating_add(tensor.name.len()).saturating_add(64));
-    Work::for_bytes(u64::try_from(names).unwrap_or(u64::MAX))
+    Work::for_bytes(u64::try_from(names / JUDGEMENTS).unwrap_or(u64::MAX))
 }
 
 /// An expression that matches from the start of a name on, as Python's `re.match`.
 #[derive(Debug)]
 pub(super) enum ConfigPattern {
-    Automaton(Box<dense::DFA<Vec<u32>>>),
+    Automaton(Box<(DFA, RefCell<Cache>)>),
     Backtracking(Box<fancy_regex::Regex>),
 }
 
@@ -52,21 +62,24 @@ impl ConfigPattern {
     /// # Errors
     /// When the work is exceeded.
     pub(super) fn compile(text: &str, work: &mut Work) -> Result<Option<Self>, WorkExceeded> {
-        work.spend(1, COMPILED)?;
+        work.spend(1, COMPILING)?;
         if text.len() > LONGEST {
             return Ok(None);
         }
-        if let Ok(automaton) = automaton(text) {
-            work.spend(automaton.memory_usage(), BYTE)?;
-            return Ok(Some(Self::Automaton(Box::new(automaton))));
+        work.spend(text.len(), TEXT_BYTE)?;
+        if let Some(automaton) = automaton(text) {
+            work.spend(automaton.memory_usage(), COMPILED_BYTE)?;
+            let cache = automaton.create_cache();
+            return Ok(Some(Self::Automaton(Box::new((automaton, RefCell::new(cache))))));
         }
-        work.spend(1, NOT_COMPILED)?;
-        // The crate writes out what is counted.
-        if text.contains('{') || regex_syntax::parse(text).is_ok() {
+        // The crate that backtracks writes out what is counted.
+        if text.contains('{') || regex_syntax::ast::parse::Parser::new().parse(text).is_ok() {
             return Ok(None);
         }
-        let mut builder = fancy_regex::RegexBuilder::new(text);
-        let built = builder.backtrack_limit(BACKTRACKS).delegate_size_limit(AUTOMATON).build();
+        work.spend(1, PARSING)?;
+        work.spend(text.len(), PARSED_BYTE)?;
+        let mut builder = fancy_regex::RegexBuilder::new(&format!("^(?:{text})"));
+        let built = builder.backtrack_limit(BACKTRACKS).delegate_size_limit(COMPILED).build();
         Ok(built.ok().map(|regex| Self::Backtracking(Box::new(regex))))
     }
 
@@ -81,9 +94,14 @@ impl ConfigPattern {
         }
         match self {
             Self::Automaton(automaton) => {
-                work.spend(name.len(), 2)?;
+                let (automaton, cache) = automaton.as_ref();
+                let cache = &mut *cache.borrow_mut();
+                work.spend(name.len(), 4)?;
+                let before = cache.memory_usage();
                 let input = Input::new(name).anchored(Anchored::Yes).earliest(true);
-                Ok(automaton.try_search_fwd(&input).ok().map(|found| found.is_some()))
+                let found = automaton.try_search_fwd(cache, &input);
+                work.spend(cache.memory_usage().saturating_sub(before), STATE_BYTE)?;
+                Ok(found.ok().map(|found| found.is_some()))
             }
             Self::Backtracking(regex) => {
                 work.spend(1, BACKTRACKING)?;
@@ -93,18 +111,16 @@ impl ConfigPattern {
     }
 }
 
-/// The automaton of an expression, for names of ASCII.
-fn automaton(text: &str) -> Result<dense::DFA<Vec<u32>>, Box<dense::BuildError>> {
-    let config = dense::Config::new()
-        .start_kind(StartKind::Anchored)
-        .dfa_size_limit(Some(AUTOMATON))
-        .determinize_size_limit(Some(AUTOMATON));
-    dense::Builder::new()
-        .configure(config)
+/// The automaton of an expression, for names of ASCII. A search that needs more states than it may have fails.
+fn automaton(text: &str) -> Option<DFA> {
+    let states =
+        DFA::config().cache_capacity(STATES).skip_cache_capacity_check(true).minimum_cache_clear_count(Some(0));
+    let built = DFA::builder()
+        .configure(states)
         .syntax(syntax::Config::new().unicode(false).utf8(false))
-        .thompson(thompson::Config::new().nfa_size_limit(Some(AUTOMATON)))
-        .build(&format!("^(?:{text})"))
-        .map_err(Box::new)
+        .thompson(thompson::Config::new().utf8(false).nfa_size_limit(Some(COMPILED)))
+        .build(&format!("^(?:{text})"));
+    built.ok()
 }
 
 #[cfg(test)]
@@ -132,7 +148,7 @@ mod tests {
             (r"(?P<n>a)\b", "a.b", Some(true)),
             (r".*", "é", None),
             (r"(", "(", None),
-            (r"(?:a|b)*a(?:a|b){40}", "ab", None),
+            (r"\w{1,500}9", "ab", None),
             (r"(?:\pL{9}){9}x1", "a", None),
         ] {
             assert_eq!(matches(pattern, name), expected, "{pattern} {name}");
@@ -142,7 +158,8 @@ mod tests {
     #[test]
     fn every_expression_costs_work() {
         let mut work = Work::default();
-        let tried = (0..100_000).find(|i| ConfigPattern::compile(&format!("(?:a|b)*a(?:a|b){{{i}}}"), &mut work).is_err());
+        let tried =
+            (0..100_000).find(|i| ConfigPattern::compile(&format!("(?:a|b)*a(?:a|b){{{i}}}"), &mut work).is_err());
         assert!(tried.is_some_and(|tried| tried < 1_000), "{tried:?}");
         let mut work = Work::default();
         let pattern = ConfigPattern::compile("a", &mut work).unwrap().unwrap();

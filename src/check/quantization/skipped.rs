@@ -8,8 +8,8 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeSet, HashSet};
 
 use crate::check::config_pattern::{COMPARISON, ConfigPattern, allowance};
-use crate::checkpoint::work::{Work, WorkExceeded};
 use crate::checkpoint::Checkpoint;
+use crate::checkpoint::work::{Work, WorkExceeded};
 use crate::knowledge::expression::glob;
 use crate::knowledge::quantization::AppliedScheme;
 

@@ -48,11 +48,7 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
 }
 
 /// Reads a pickle of another program for what it imports. Returns whether it is a pickle to its end.
-pub(super) fn read_plain(
-    reader: &mut PickleReader<'_>,
-    file: &SourceFile,
-    work: &mut Work,
-) -> Result<bool, Problem> {
+pub(super) fn read_plain(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut Work) -> Result<bool, Problem> {
     let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
     work.grant(u64::try_from(bytes.len()).unwrap_or(u64::MAX));
     let mut machine = Machine::new(&bytes, StorageIds::None, work);

@@ -409,9 +409,7 @@ impl<'p> Machine<'p> {
 
     fn extend_list(&mut self, items: Vec<Value>) -> Result<(), Stop> {
         match self.top()? {
-            Value::List(id) => {
-self.heap.extend_list(id, items).ok_or(Stop::Broken("a list is missing"))
-            }
+            Value::List(id) => self.heap.extend_list(id, items).ok_or(Stop::Broken("a list is missing")),
             Value::Object => Ok(()),
             _ => Err(Stop::Broken("items are added to a value that is no list")),
         }
@@ -429,9 +427,7 @@ self.heap.extend_list(id, items).ok_or(Stop::Broken("a list is missing"))
             }
         }
         match target {
-            Value::Dict(id) => {
-self.heap.set_items(id, pairs).ok_or(Stop::Broken("a dict is missing"))
-            }
+            Value::Dict(id) => self.heap.set_items(id, pairs).ok_or(Stop::Broken("a dict is missing")),
             Value::Object => Ok(()),
             _ => Err(Stop::Broken("items are set of a value that is no dict")),
         }

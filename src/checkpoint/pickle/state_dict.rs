@@ -247,6 +247,7 @@ fn nested(machine: &Machine<'_>, dict: u32) -> Option<NestedTensors> {
     let holders = std::iter::successors(levels.get(at), |level| levels.get(level.holder?.0));
     let mut path: Vec<&str> = holders.filter_map(|level| Some(machine.text(level.holder?.1))).collect();
     path.reverse();
-    let keys = last_values(machine, dict).iter().filter_map(|(name, _)| Some(escape((*name)?, 80))).take(KEYS).collect();
+    let keys =
+        last_values(machine, dict).iter().filter_map(|(name, _)| Some(escape((*name)?, 80))).take(KEYS).collect();
     Some(NestedTensors { key: path.join("/"), count, first: machine.text(first).to_owned(), keys })
 }
