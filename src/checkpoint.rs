@@ -23,6 +23,7 @@ mod file_name;
 mod git;
 pub(crate) mod glob;
 pub mod index;
+pub mod journal;
 mod lfs;
 pub mod list;
 pub mod module;

@@ -91,6 +91,7 @@ fault_kinds! {
         EntryMalformed = "entry-malformed" { reason: Text },
         FileTooLarge = "file-too-large" { size: Integer, cap: Integer },
         FileTooShort = "file-too-short" { file_len: Integer },
+        ForeignJournal = "foreign-journal" { reason: Text },
         HeaderLengthOutOfRange = "header-length-out-of-range" { stated: Integer, file_len: Integer, big_endian: Flag },
         HeaderNotJson = "header-not-json" { reason: Text, offset: Integer },
         HeaderNotUtf8 = "header-not-utf8" { offset: Integer },
