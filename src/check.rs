@@ -5,6 +5,7 @@ mod bounded;
 mod built_tokenizer;
 mod card;
 mod class_names;
+mod config_pattern;
 mod directory;
 pub mod engine;
 mod evaluate;

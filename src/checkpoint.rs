@@ -23,6 +23,7 @@ mod file_name;
 mod git;
 pub(crate) mod glob;
 pub mod index;
+pub mod journal;
 mod lfs;
 pub mod list;
 pub mod module;
@@ -39,6 +40,7 @@ mod sniff;
 pub mod source;
 pub mod text;
 pub mod tokenizer;
+pub(crate) mod work;
 
 pub use contents::{Progress, ReadOptions, TensorContents, TensorStats};
 pub use digest::HashAlgorithm;

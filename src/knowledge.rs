@@ -23,6 +23,7 @@ pub mod program;
 pub mod quantization;
 pub mod recipe;
 pub mod refusals;
+mod releases;
 pub mod resemblance;
 pub mod ropes;
 pub mod rule;

@@ -14,6 +14,7 @@ mod retry;
 mod stop;
 mod stream;
 pub mod transform;
+mod trust;
 pub mod values;
 #[cfg_attr(not(unix), path = "surgery/unwritable.rs")]
 mod writers;
@@ -21,6 +22,9 @@ pub mod written;
 
 pub use error::{ApplyError, RepairError};
 pub use leftover::Leftover;
-pub use outcome::{Recovered, Recovery, Target};
+#[cfg(feature = "internals")]
+pub use outcome::Change;
+pub use outcome::{Recovered, Recovery, RepairWritten, Target};
 pub use stop::stop_on;
+pub use trust::Trust;
 pub use writers::{CAN_WRITE, apply, check_target, claim_target, free_space, journal, overlay};

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::{Error, knowledge};
 use crate::check::check_for;
+use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Progress, ReadOptions};
 use crate::report::model::CheckpointReport;
@@ -81,6 +82,7 @@ impl Checker {
         let path = path.as_ref();
         let knowledge = knowledge()?;
         let mut checkpoint = Checkpoint::open(path)?;
+        checkpoint.recognise_journal(&StateFolder::of_user());
         if self.deep || self.stats {
             checkpoint.read_contents(ReadOptions { stats: self.stats, ..ReadOptions::default() }, progress);
         }

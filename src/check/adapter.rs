@@ -122,7 +122,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
             AdapterKey::Foreign(reason) => faults.push(unread(tensor, reason).with("named", false)),
         }
     }
-    let targets = Targets::from_config(config);
+    let targets = Targets::from_config(config, checkpoint);
     if let Some(cut) = names_cut(&targets, &whole).filter(|_| modules.is_empty()) {
         faults.push(cut);
         return;
@@ -147,11 +147,15 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
     }
     // PEFT lists `classifier` and `score` for every sequence classification, and a model has one of them: only a file
     // with none of the list has lost something. It matches the last segments of a module's name.
-    let is_saved = |module: &&str| whole.keys().any(|name| format!(".{name}").contains(&format!(".{module}.")));
+    let is_saved = |module: &&str| {
+        let (first, inner) = (format!("{module}."), format!(".{module}."));
+        !targets.affords(whole.len(), 100) || whole.keys().any(|name| name.starts_with(&first) || name.contains(&inner))
+    };
     if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
         let at = Place::file(CONFIG).pointer("/modules_to_save");
         faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.clone()));
     }
+    faults.extend(targets.excess());
 }
 
 fn unread(tensor: &Tensor, reason: &str) -> Fault {

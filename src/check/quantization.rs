@@ -57,7 +57,7 @@ impl<'a> Quantised<'a> {
     ) -> Self {
         let scheme = applied.scheme();
         let tensors = TensorLookup::new(checkpoint, stored);
-        let skipped = SkippedModules::new(applied);
+        let skipped = SkippedModules::new(applied, checkpoint);
         let shapes = ModuleShapes { applied, expected, skipped: &skipped };
         let found = module::group(scheme, &tensors, |name| plain_of(expected, name).is_some());
         let (mut modules, fits) = shapes.compare(found);
@@ -98,6 +98,10 @@ impl<'a> Quantised<'a> {
     #[must_use]
     pub fn spelled(&self, mut report: LoadReport) -> Option<LoadReport> {
         let scheme = self.applied.scheme();
+        // Which modules the loader leaves plain is unknown.
+        if self.skipped.is_exceeded() {
+            return None;
+        }
         if scheme.loaded_by.is_some() && !report.unexpected.is_empty() {
             return None;
         }
@@ -107,7 +111,7 @@ impl<'a> Quantised<'a> {
             module.is_some_and(|module| self.kinds.contains(&kind(module)))
         };
         report.unexpected.retain(|name| !is_extra(name));
-        let wrapped = |module: &&str| self.kinds.contains(&kind(module)) && self.skipped.covers(module).is_none();
+        let wrapped = |module: &&str| self.kinds.contains(&kind(module)) && !self.skipped.covers(module);
         let required = self.applied.required(&[]);
         let mut missing: BTreeSet<String> = BTreeSet::new();
         for name in std::mem::take(&mut report.missing) {
@@ -156,6 +160,10 @@ impl<'a> Quantised<'a> {
     fn faults(&self) -> Vec<Fault> {
         let scheme = self.applied.scheme();
         let mut faults = Vec::new();
+        if self.skipped.is_exceeded() {
+            let at = Place::file("config.json").pointer(self.applied.pointer());
+            return vec![Fault::new(FaultKind::PatternsNotCompared).at(at)];
+        }
         if let Some(program) = &scheme.loaded_by {
             let at = Place::file("config.json").pointer("/quantization");
             let fault = Fault::new(FaultKind::QuantizedForAnotherLoader).at(at).with("scheme", scheme.summary.as_str());

@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 
+use super::work::Work;
 use super::{Document, Fault};
 
 /// Budget of a checkpoint, in bytes of memory at the peak of a check. The largest published models take half of it: some
@@ -24,11 +25,13 @@ const MODULE_BYTE: u64 = 32;
 #[derive(Debug)]
 pub(crate) struct Budget {
     left: u64,
+    /// The work that pickles may still cost.
+    pub(super) work: Work,
 }
 
 impl Default for Budget {
     fn default() -> Self {
-        Self { left: TOTAL }
+        Self { left: TOTAL, work: Work::default() }
     }
 }
 
@@ -42,7 +45,7 @@ impl Budget {
 
     /// What each of `count` files may take that are read at the same time: together they take no more than is left.
     pub(super) fn share(&self, count: usize) -> Self {
-        Self { left: self.left.checked_div(as_u64(count)).unwrap_or(0) }
+        Self { left: self.left.checked_div(as_u64(count)).unwrap_or(0), work: Work::default() }
     }
 
     /// Takes what was spent of a share; `false`, and nothing is taken, where the file needed more than its share or than is

@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::budget::Budget;
 use super::fault::Faults;
 use super::shard::header::other_format;
+use super::work::Work;
 use super::{Checkpoint, Fault, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Place, Shard, Source, SourceFile, adapter};
 
 mod beside;
@@ -144,10 +145,13 @@ fn read(name: &str, file: &SourceFile, budget: &mut Budget) -> Shard {
         pickle: Some(Box::default()),
         ..Shard::default()
     };
+    // The machine holds the work while the reader holds the rest of the budget.
+    let mut work = std::mem::take(&mut budget.work);
     let mut reader = PickleReader { shard, pickle: Pickle::default(), faults: Faults::default(), budget };
-    if let Err(problem) = reader.read(file) {
+    if let Err(problem) = reader.read(file, &mut work) {
         reader.problem(problem);
     }
+    reader.budget.work = work;
     let PickleReader { mut shard, pickle, faults, .. } = reader;
     shard.pickle = Some(Box::new(pickle));
     shard.faults = faults.into_vec();
@@ -178,7 +182,7 @@ struct PickleReader<'b> {
 }
 
 impl PickleReader<'_> {
-    fn read(&mut self, file: &SourceFile) -> Result<(), Problem> {
+    fn read(&mut self, file: &SourceFile, work: &mut Work) -> Result<(), Problem> {
         if file.is_empty() {
             self.fault(FaultKind::EmptyFile);
             return Ok(());
@@ -186,17 +190,17 @@ impl PickleReader<'_> {
         let head = file.bytes(0, file.len().min(4096))?;
         if head.starts_with(b"PK\x03\x04") {
             self.pickle.format = PickleFormat::Zip;
-            return zip::read(self, file);
+            return zip::read(self, file, work);
         }
         if head.starts_with(&legacy::MAGIC) {
             self.pickle.format = PickleFormat::Legacy;
-            return legacy::read(self, file);
+            return legacy::read(self, file, work);
         }
         if head.len() < legacy::MAGIC.len() && legacy::MAGIC.starts_with(&head) {
             return Err(Problem::Cut("the first pickle".to_owned(), None));
         }
         // Pickles of protocol 0 are text, so any file may be one.
-        let is_whole = legacy::read_plain(self, file)?;
+        let is_whole = legacy::read_plain(self, file, work)?;
         if is_whole || matches!(head.get(..2), Some([0x80, 2..=5])) {
             return Err(Problem::Other("a pickle that torch.save did not write".to_owned()));
         }

@@ -10,6 +10,7 @@ use super::card::{CARD, CARD_CAP, ModelCard};
 use super::contents::{self, Progress, ReadOptions};
 use super::git;
 use super::is_plain_file_name;
+use super::journal::{Distrust, Journal, StateFolder};
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP};
 use super::parallel;
@@ -17,7 +18,7 @@ use super::pickle::{is_pickle_name, may_be_pickle, starts_like_pickle};
 use super::tokenizer::is_vocabulary;
 use super::{
     Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Nested, OpenError, Place, PythonModule,
-    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Source, Vocabulary,
+    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Source, Vocabulary, escape,
 };
 
 /// Suffixes of unfinished downloads.
@@ -99,6 +100,31 @@ impl Checkpoint {
         self.contents = contents::read(&self.source, &mut self.shards, options, progress).into();
     }
 
+    /// Says whose the journal of an interrupted repair is: one that `user` wrote in this directory is a repair to finish, and
+    /// any other is reported with the reason for which it is not carried out. Called after opening a directory that a user named;
+    /// until then, and in memory, every journal is a stranger's.
+    pub fn recognise_journal(&mut self, user: &StateFolder) {
+        let Some(at) = self.faults.iter().position(|fault| fault.kind == FaultKind::ForeignJournal) else { return };
+        let Some(root) = self.source.directory() else { return };
+        let folder = root.join(REPAIR_FOLDER);
+        let read = if self.source.has_folder(REPAIR_FOLDER) {
+            Journal::read(&folder, REPAIR_JOURNAL)
+        } else {
+            Err(format!("{REPAIR_FOLDER} is not a directory"))
+        };
+        let why = match read {
+            Ok(None) => Some(Distrust::Unverified), // another run has just finished it
+            Ok(Some(journal)) => journal.distrust(&folder, || user.key(root)),
+            Err(reason) => Some(Distrust::Unusable(reason)),
+        };
+        if let Some(fault) = self.faults.get_mut(at) {
+            *fault = match why {
+                None => Fault::new(FaultKind::RepairInterrupted).at(Place::file(journal_name())),
+                Some(why) => foreign_journal(&why),
+            };
+        }
+    }
+
     /// Hashes the files whose hash a download or git recorded, and adds a fault for each that differs. Never fails, as
     /// [`Self::read_contents`], whose `progress` it has.
     pub fn check_hashes(&mut self, progress: &(dyn Fn(Progress<'_>) + Sync)) {
@@ -107,6 +133,18 @@ impl Checkpoint {
             shard.map_or(&mut self.faults, |shard| &mut shard.faults).push(fault);
         }
     }
+}
+
+/// The journal of an interrupted repair, as a file of its checkpoint.
+fn journal_name() -> String {
+    format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}")
+}
+
+/// The fault of a journal that no repair carries out.
+fn foreign_journal(why: &Distrust) -> Fault {
+    // A key of the document may stand in the reason.
+    let reason = escape(&why.to_string(), 400);
+    Fault::new(FaultKind::ForeignJournal).at(Place::file(journal_name())).with("reason", reason)
 }
 
 fn read(source: Source) -> Result<Checkpoint, OpenError> {
@@ -129,9 +167,8 @@ fn read(source: Source) -> Result<Checkpoint, OpenError> {
     reader.report_unread();
     reader.read_folders();
     let SourceReader { mut checkpoint, vocabularies, vocabulary_faults, mut budget, .. } = reader;
-    let journal = format!("{REPAIR_FOLDER}/{REPAIR_JOURNAL}");
-    if checkpoint.source.exists(&journal) {
-        checkpoint.faults.push(Fault::new(FaultKind::RepairInterrupted).at(Place::file(journal)));
+    if checkpoint.source.exists(&journal_name()) {
+        checkpoint.faults.push(foreign_journal(&Distrust::Unverified));
     }
     checkpoint.place_pickles();
     checkpoint.derive(vocabularies);

@@ -319,18 +319,27 @@ pub struct FixArgs {
     /// become hard links to the originals (on another file system, copies or, above 64 MiB, symbolic links)
     #[arg(long, value_name = "DIR")]
     pub output: Option<PathBuf>,
+    /// With --fix: also finish or roll back an interrupted repair that you did not begin in this directory, such as one in a
+    /// copy. Its journal decides which files are written, so know where the directory comes from
+    #[arg(long, conflicts_with_all = ["output", "diff"])]
+    pub adopt_journal: bool,
 }
 
 /// Arguments of `undo`.
 #[derive(Debug, Args)]
 #[command(
     arg(hidden_rules()),
-    after_help = "Exit codes:\n  0  the repair was undone\n  2  there is no repair to undo, or a file has changed since the repair"
+    after_help = "Exit codes:\n  0  the repair was undone\n  2  there is no repair to undo, it is not \
+yours, or a file has changed since the repair"
 )]
 pub struct UndoArgs {
     /// The checkpoint that `check --fix` repaired
     #[arg(value_name = "DIR", default_value = ".")]
     pub path: PathBuf,
+    /// Also undo a repair that you did not make in this directory, such as one in a copy. Its journal decides which files are
+    /// written, so know where the directory comes from
+    #[arg(long)]
+    pub adopt_journal: bool,
 }
 
 /// Arguments of `build-merged`.

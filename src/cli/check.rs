@@ -12,6 +12,7 @@ use super::progress::Meter;
 use super::settings::{Resolved, Typed, resolve};
 use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
+use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, ReadOptions, Source, parallel};
 use crate::knowledge::settings::Surroundings;
@@ -138,6 +139,7 @@ struct CheckRun<'a> {
 impl CheckRun<'_> {
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
         let mut checkpoint = Checkpoint::read(Source::open(dir)?.following(&self.followed))?;
+        checkpoint.recognise_journal(&StateFolder::of_user());
         checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
         if self.args.deep || self.args.stats {
             let meter = Meter::new("reading");

@@ -9,12 +9,13 @@ use super::args::FixArgs;
 use super::output;
 use super::progress::Meter;
 use crate::check::Outcome;
+use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, escape};
 use crate::report::model::{Fixed, Withdrawn};
 use crate::report::{diff, fixes};
 use crate::surgery::repair::{Repair, plan};
-use crate::surgery::{ApplyError, Leftover, Recovered, Recovery, RepairError, journal, overlay};
+use crate::surgery::{ApplyError, Leftover, Recovered, Recovery, RepairError, RepairWritten, Trust, journal, overlay};
 
 /// Judges a checkpoint on which fixes are tried.
 type CheckFn<'a> = &'a dyn Fn(&Arc<Checkpoint>) -> Outcome;
@@ -30,6 +31,9 @@ impl FixArgs {
         if self.output.is_some() && !self.writes() {
             bail!("--output requires --fix");
         }
+        if self.adopt_journal && !self.writes() {
+            bail!("--adopt-journal requires --fix");
+        }
         if self.output.is_some() && checkpoints > 1 {
             bail!("--output accepts one checkpoint, but {checkpoints} were found");
         }
@@ -40,19 +44,24 @@ impl FixArgs {
 /// Finishes or rolls back a repair that was interrupted, before the checkpoint is checked.
 pub fn recover(args: &FixArgs, dir: &Path) -> anyhow::Result<()> {
     if args.writes() && args.output.is_none() {
-        let Recovery { outcome, leftover } = journal::recover(dir)?;
-        let done = match outcome {
-            None => None,
-            Some(Recovered::Finished) => Some("finished"),
-            Some(Recovered::RolledBack) => Some("rolled back"),
-        };
-        if let Some(done) = done {
-            let dir = escape(&dir.display().to_string(), 300);
-            output::note(&format!("{dir}: {done} an interrupted repair"));
-        }
-        warn(leftover.as_ref());
+        let recovery = journal::recover(dir, &Trust { user: StateFolder::of_user(), adopts: args.adopt_journal })?;
+        show_recovery(dir, &recovery);
+        warn(recovery.leftover.as_ref());
     }
     Ok(())
+}
+
+/// Says what became of an interrupted repair, file by file. `undo` calls it, too.
+pub fn show_recovery(dir: &Path, recovery: &Recovery) {
+    let done = match recovery.outcome {
+        None => return,
+        Some(Recovered::Finished) => "finished",
+        Some(Recovered::RolledBack) => "rolled back",
+    };
+    output::note(&format!("{}: {done} an interrupted repair", escape(&dir.display().to_string(), 300)));
+    for (change, name) in &recovery.files {
+        output::note(&format!("  {} {}", change.verb(), escape(name, 200)));
+    }
 }
 
 /// Warns about temporary files that could not be removed.
@@ -109,7 +118,13 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         warn(copy.leftover.as_ref());
         return Ok(Some(out.clone()));
     }
-    warn(journal::write(repair, &progress).map_err(|error| name_interrupted(error, dir))?.as_ref());
+    let written = journal::write(repair, &StateFolder::of_user(), &progress);
+    let RepairWritten { leftover, unsigned } = written.map_err(|error| name_interrupted(error, dir))?;
+    warn(leftover.as_ref());
+    if let Some(why) = unsigned {
+        let text = format!("{}: only `undo --adopt-journal` undoes this repair: {why}", dir.display());
+        output::note(&output::safe(&text));
+    }
     Ok(Some(dir.to_owned()))
 }
 

@@ -4,14 +4,16 @@ use std::fmt::Write as _;
 
 use super::args::UndoArgs;
 use super::exit::CLEAN;
-use super::{output, signals};
+use super::{fix, output, signals};
 use crate::checkpoint::escape;
-use crate::surgery::journal;
+use crate::checkpoint::journal::StateFolder;
+use crate::surgery::{Trust, journal};
 
 /// Runs `undo`.
 pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {
     signals::install()?;
-    let undone = journal::undo(&args.path)?;
+    let undone = journal::undo(&args.path, &Trust { user: StateFolder::of_user(), adopts: args.adopt_journal })?;
+    fix::show_recovery(&args.path, &undone.recovery);
     let mut out = String::new();
     for (what, names) in [("restored", &undone.restored), ("removed", &undone.removed)] {
         for name in names {

@@ -3,6 +3,7 @@
 use std::fmt;
 
 use super::program::Program;
+use super::releases;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
@@ -125,11 +126,18 @@ impl<'de> Deserialize<'de> for Loader {
 /// The expected form, with the known versions; or that there is no such version.
 pub fn parse_requirement(text: &str) -> Result<String, String> {
     let version = parse_version(of_transformers(text))?;
-    if was_never_released(&version) {
-        return Err(format!("transformers {version} was never released: 4.57.6 is the last version before 5.0.0"));
+    if let Some(why) = releases::objection("transformers", &version) {
+        return Err(why);
+    }
+    // Nothing that is known of 4.47 says anything about these.
+    if version_numbers(&version).first().is_some_and(|major| *major < OLDEST_MAJOR) {
+        return Err(format!("transformers {version} is too old: loads are predicted from {OLDEST_MAJOR}.0 on"));
     }
     Ok(version)
 }
+
+/// The oldest major version for which a known loader may stand.
+const OLDEST_MAJOR: u64 = 4;
 
 /// What may be a version in a requirement on transformers.
 fn of_transformers(text: &str) -> &str {
@@ -147,16 +155,6 @@ fn parse_version(text: &str) -> Result<String, String> {
         "expected VERSION or transformers==VERSION; known versions are {}, others are predicted as the nearest one",
         known.join(", ")
     ))
-}
-
-/// Whether a version lies between the last one of transformers 4 and the first one of 5. Development builds were numbered
-/// there. Source: the tags of huggingface/transformers.
-fn was_never_released(version: &str) -> bool {
-    let minor = match version_numbers(version).as_slice() {
-        [4, minor, ..] => *minor,
-        _ => return false,
-    };
-    minor > 57 && !version.contains("dev")
 }
 
 /// The word for all known versions, where several can be named.
@@ -183,7 +181,8 @@ pub fn parse_program(text: &str) -> Result<String, String> {
         return Ok(text.to_owned());
     }
     if let Some(version) = text.strip_prefix(PEFT) {
-        return parse_version(version).map(|version| format!("{PEFT}{version}"));
+        let version = parse_version(version)?;
+        return releases::objection("peft", &version).map_or_else(|| Ok(format!("{PEFT}{version}")), Err);
     }
     let names = Program::ALL.map(Program::name).join(", ");
     parse_requirement_or_all(text).map_err(|error| match parse_version(of_transformers(text)) {
@@ -276,6 +275,8 @@ mod tests {
         for version in ["4.58", "transformers==4.99.1"] {
             assert!(parse_requirement(version).unwrap_err().contains("never released"), "{version}");
         }
+        assert!(parse_requirement("3.0").unwrap_err().contains("too old"));
+        assert!(parse_program("peft==0.13.9").unwrap_err().contains("never released"));
         for text in ["", "transformers==", "transformers", "torch==2.1", "4 57", "v4.57"] {
             assert!(parse_requirement_or_all(text).is_err(), "{text}");
         }

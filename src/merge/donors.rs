@@ -7,6 +7,7 @@ use super::error::PipelineError;
 use super::parts::DonorParts;
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
+use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::{Checkpoint, OpenError};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
@@ -23,8 +24,9 @@ pub(super) fn open(
     let mut snapshots = Vec::new();
     for (role, dir) in &request.donors {
         let seen = DonorSnapshot::record(dir);
-        let checkpoint = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error })?;
-        let checkpoint = checkpoint.without_pickles();
+        let open = Checkpoint::open(dir).map_err(|error| PipelineError::Donor { role: role.clone(), error });
+        let mut checkpoint = open?.without_pickles();
+        checkpoint.recognise_journal(&StateFolder::of_user());
         snapshots.push(seen?);
         for name in checkpoint.shards.keys() {
             // Other errors of a link are findings.

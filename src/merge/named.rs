@@ -1,12 +1,13 @@
 //! What the entries of a recipe name: the tensors of donors that a merge may change. Every other one keeps its bytes.
 
-use regex::Regex;
+use regex::{Regex, RegexBuilder};
 use regex_syntax::hir::Look;
 use regex_syntax::hir::literal::Extractor;
 use serde::{Deserialize, Serialize};
 
 use super::error::MergeError;
 use super::parts::PartOf;
+use crate::checkpoint::escape;
 use crate::surgery::plan::{Plan, PlannedTensor, TensorTransform};
 
 /// The tensors of a donor that an entry of the recipe names, and may change: those of a part, of a pattern, or of both.
@@ -49,6 +50,30 @@ pub(crate) struct Changeable {
     pub casts: Vec<AnnouncedCast>,
 }
 
+/// Largest compiled pattern of a recipe, in bytes, and most entries with one: together some 50 MB.
+const PATTERN: usize = 256 << 10;
+pub(super) const MAX_ENTRIES: usize = 200;
+/// Longest pattern of a recipe, and longest name that it is replaced by, in bytes.
+pub(super) const MAX_PATTERN: usize = 2_000;
+
+/// Compiles a pattern of a recipe or manifest.
+///
+/// # Errors
+/// Why it is none: it is no regular expression, or a large one.
+pub(super) fn pattern(text: &str) -> Result<Regex, String> {
+    if text.len() > MAX_PATTERN {
+        return Err(format!("has {} bytes, more than {MAX_PATTERN}", text.len()));
+    }
+    RegexBuilder::new(text).size_limit(PATTERN).build().map_err(|error| match error {
+        regex::Error::CompiledTooBig(_) => format!("needs more than {PATTERN} bytes when it is compiled"),
+        error => {
+            let error = error.to_string();
+            let cause = error.lines().last().unwrap_or_default().trim_start_matches("error: ");
+            format!("is not a regular expression: {cause}")
+        }
+    })
+}
+
 impl NamedTensors {
     /// The tensors of an entry with a part, or with names that start with `^` and literal text; `None` for an entry that names
     /// nothing.
@@ -74,7 +99,9 @@ impl NamedTensors {
             (None, Some(names)) if !starts_literally(names) => {
                 Some(format!("names tensors by {names:?}, which does not start with ^ and literal text"))
             }
-            (_, Some(names)) if Regex::new(names).is_err() => Some(format!("{names:?} is not a regular expression")),
+            (_, Some(names)) => {
+                pattern(names).err().map(|why| format!("names tensors by {:?}, which {why}", escape(names, 80)))
+            }
             _ => None,
         }
     }
@@ -96,8 +123,11 @@ impl<'c> Bounds<'c> {
             if let Some(fault) = named.fault() {
                 return Err(format!("\"changes\" of the {} donor {fault}", named.donor));
             }
-            Ok((named, named.names.as_deref().and_then(|names| Regex::new(names).ok())))
+            Ok((named, named.names.as_deref().and_then(|names| pattern(names).ok())))
         };
+        if changeable.named.len() > MAX_ENTRIES {
+            return Err(format!("\"changes\" has {} entries, more than {MAX_ENTRIES}", changeable.named.len()));
+        }
         let named = changeable.named.iter().map(entry).collect::<Result<_, _>>()?;
         Ok(Self { named, casts: &changeable.casts })
     }

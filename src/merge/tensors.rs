@@ -12,7 +12,7 @@ use super::dtypes;
 use super::error::MergeError;
 use super::explain;
 use super::fit::{Fit, StartedModules};
-use super::named::{AnnouncedCast, Bounds, Changeable, NamedTensors};
+use super::named::{AnnouncedCast, Bounds, Changeable, NamedTensors, pattern};
 use super::parts::PartOf;
 use super::run::count;
 use crate::checkpoint::{Dtype, Shard, Tensor};
@@ -346,7 +346,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         if !context.holds(spec.when.as_ref(), &spec.names)? {
             continue;
         }
-        let names = Regex::new(&spec.names)
+        let names = pattern(&spec.names)
             .map_err(|e| MergeError::Recipe(format!("{}: {}: {e}", context.recipe.recipe, spec.names)))?;
         let rename = spec
             .rename

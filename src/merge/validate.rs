@@ -12,10 +12,9 @@ pub(super) use processors::validate_processor;
 
 use std::collections::BTreeSet;
 
-use regex::Regex;
-
-use super::named::starts_literally;
+use super::named::{MAX_ENTRIES, MAX_PATTERN, pattern, starts_literally};
 use super::options;
+use crate::checkpoint::escape;
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{ANY, OptionKind, OptionSpec, Recipe, SeamTensor, TensorSpec};
 use crate::knowledge::source::{DataError, hint};
@@ -199,7 +198,15 @@ impl Validator<'_> {
     }
 
     fn tensors(&self) -> Result<(), DataError> {
+        if self.recipe.tensors.len() > MAX_ENTRIES {
+            let reason = format!("`tensors` has {} entries, more than {MAX_ENTRIES}", self.recipe.tensors.len());
+            return Err(DataError::about(self.path, self.text, "tensors", reason));
+        }
         for tensor in &self.recipe.tensors {
+            if let Some(long) = tensor.rename.as_ref().filter(|rename| rename.source().len() > MAX_PATTERN) {
+                let reason = format!("`as` has {} bytes, more than {MAX_PATTERN}", long.source().len());
+                return Err(self.wrong("as", long.source(), reason));
+            }
             self.role("from", &tensor.from)?;
             if let Some(role) = &tensor.into {
                 self.role("into", role)?;
@@ -210,10 +217,8 @@ impl Validator<'_> {
             }
             self.seam_tensor(tensor.meets.as_ref())?;
             self.named(tensor)?;
-            if let Err(error) = Regex::new(&tensor.names) {
-                let error = error.to_string();
-                let cause = error.lines().last().unwrap_or_default().trim_start_matches("error: ");
-                let reason = format!("`{}` is not a regular expression: {cause}", tensor.names);
+            if let Err(why) = pattern(&tensor.names) {
+                let reason = format!("`{}` {why}", escape(&tensor.names, 80));
                 return Err(self.wrong("names", &tensor.names, reason));
             }
         }
@@ -232,7 +237,7 @@ impl Validator<'_> {
     fn named(&self, tensor: &TensorSpec) -> Result<(), DataError> {
         let keys = [("fit", &tensor.fit), ("scale", &tensor.scale), ("slice", &tensor.slice)];
         let Some((key, Some(expression))) = keys.into_iter().find(|(_, value)| value.is_some()) else { return Ok(()) };
-        if tensor.part.is_some() || starts_literally(&tensor.names) || Regex::new(&tensor.names).is_err() {
+        if tensor.part.is_some() || starts_literally(&tensor.names) || pattern(&tensor.names).is_err() {
             return Ok(());
         }
         let own = |other: &&TensorSpec| {

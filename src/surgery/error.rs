@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::leftover::Leftover;
+use crate::checkpoint::journal::Distrust;
 
 /// Why a plan was not written. The target then does not exist, except with [`ApplyError::Unsynced`].
 #[derive(Debug, thiserror::Error)]
@@ -206,6 +207,24 @@ pub enum RepairError {
         path: PathBuf,
         /// The problem.
         reason: String,
+    },
+    /// The journal is not this user's, so it may have come with a download.
+    #[error("{path} was not carried out: {why}; delete {folder} if you do not know this repair, or add --adopt-journal if \
+             you know who began it", path = path.display(), folder = folder.display())]
+    ForeignJournal {
+        /// The journal.
+        path: PathBuf,
+        /// How that was found.
+        why: Distrust,
+        /// The folder with the journal, the new files and the originals.
+        folder: PathBuf,
+    },
+    /// A file that the journal does not account for would get a name in the checkpoint.
+    #[error("{path} is neither a new file nor an original of the repair, so it was not put into place; delete it if you do \
+             not need it, or add --adopt-journal to put it into place", path = path.display())]
+    Unaccounted {
+        /// The file, in the folder of the journal.
+        path: PathBuf,
     },
     /// Replacing the files failed, and so did restoring the originals.
     #[error("{error}; the repair is incomplete: remove the cause, then run `ckpt-doctor undo` or `check --fix`")]

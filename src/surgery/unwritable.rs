@@ -57,24 +57,26 @@ pub fn overlay(_: &Repair, _: &Path, _: &(dyn Fn(u64) + Sync)) -> Result<Repaire
 pub mod journal {
     use std::path::Path;
 
-    use super::{ApplyError, Leftover, Repair, RepairError};
-    use crate::surgery::outcome::{Recovery, Undone};
+    use super::{ApplyError, Repair, RepairError};
+    use crate::checkpoint::journal::StateFolder;
+    use crate::surgery::outcome::{Recovery, RepairWritten, Undone};
+    use crate::surgery::trust::Trust;
 
     /// # Errors
     /// Always.
-    pub fn recover(_: &Path) -> Result<Recovery, RepairError> {
+    pub fn recover(_: &Path, _: &Trust) -> Result<Recovery, RepairError> {
         Err(ApplyError::NeedsUnix.into())
     }
 
     /// # Errors
     /// Always.
-    pub fn undo(_: &Path) -> Result<Undone, RepairError> {
+    pub fn undo(_: &Path, _: &Trust) -> Result<Undone, RepairError> {
         Err(ApplyError::NeedsUnix.into())
     }
 
     /// # Errors
     /// Always.
-    pub fn write(_: &Repair, _: &(dyn Fn(u64) + Sync)) -> Result<Option<Leftover>, RepairError> {
+    pub fn write(_: &Repair, _: &StateFolder, _: &(dyn Fn(u64) + Sync)) -> Result<RepairWritten, RepairError> {
         Err(ApplyError::NeedsUnix.into())
     }
 }

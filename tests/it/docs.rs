@@ -58,7 +58,9 @@ fn matches(shown: &[&str], real: &[&str]) -> bool {
 fn run(command: &str, place: &Path) -> (String, String) {
     let program = Path::new(env!("CARGO_BIN_EXE_ckpt-doctor")).parent().unwrap().to_owned();
     let path = env::join_paths([program].into_iter().chain(env::split_paths(&env::var_os("PATH").unwrap()))).unwrap();
-    let ran = Command::new("sh").args(["-c", command]).current_dir(place).env("PATH", path).output().unwrap();
+    let mut shell = Command::new("sh");
+    shell.args(["-c", command]).current_dir(place).env("PATH", path).env("XDG_STATE_HOME", crate::support::state());
+    let ran = shell.output().unwrap();
     (String::from_utf8(ran.stdout).unwrap(), String::from_utf8(ran.stderr).unwrap())
 }
 

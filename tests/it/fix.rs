@@ -2,6 +2,7 @@
 
 mod cli;
 mod edits;
+mod foreign;
 mod journal;
 mod named;
 mod sarif;
@@ -82,10 +83,14 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
         };
     }
     let fixed = codes(repair.fixed.iter().map(|f| &f.code));
-    match ckpt_doctor::surgery::journal::write(&repair, &|_| {}) {
+    match ckpt_doctor::surgery::journal::write(&repair, &crate::support::user(), &|_| {}) {
         // FIFOs and links in a fixture are not repaired.
         Err(RepairError::Linked { .. }) => return Ok(Some(format!("{fixed} (linked)"))),
-        other => assert!(other.map_err(|e| format!("writing: {e}"))?.is_none(), "every temporary file is removed"),
+        other => {
+            let written = other.map_err(|e| format!("writing: {e}"))?;
+            assert!(written.leftover.is_none(), "every temporary file is removed");
+            assert_eq!(written.unsigned, None);
+        }
     }
     let (after, again) = planned(dir, deep, knowledge);
     if without_fixes(&after.findings) != without_fixes(&repair.outcome.findings) {
@@ -100,7 +105,7 @@ fn repaired(dir: &Path, deep: bool, knowledge: &Knowledge) -> Result<Option<Stri
     if let Some(left) = after.findings.iter().find(|f| is_automatic(f)) {
         return Err(format!("{} remains: {}", left.code, left.message));
     }
-    ckpt_doctor::surgery::journal::undo(dir).map_err(|e| format!("undo: {e}"))?;
+    ckpt_doctor::surgery::journal::undo(dir, &crate::support::own()).map_err(|e| format!("undo: {e}"))?;
     if seen(dir) != before {
         return Err("undo has not restored everything".to_owned());
     }

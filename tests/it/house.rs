@@ -283,6 +283,20 @@ fn no_source_allows_panics_or_unsafe_code() {
     }
 }
 
+/// A program that a test runs never uses the state of whoever runs the tests.
+#[test]
+fn every_run_of_the_program_has_a_state_of_its_own() {
+    let mut wrong = Vec::new();
+    for path in files(&project().join("tests/it"), ".rs") {
+        let text = fs::read_to_string(&path).expect("text");
+        if text.contains(concat!("CARGO_BIN_EXE", "_ckpt-doctor")) && !text.contains(r#"env("XDG_STATE_HOME","#) {
+            wrong
+                .push(format!("{}: use support::program(), or set XDG_STATE_HOME to support::state()", path.display()));
+        }
+    }
+    none(&wrong);
+}
+
 /// Fixtures are text, and small.
 #[test]
 fn fixtures_are_small() {

@@ -15,7 +15,7 @@ mod writing;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 use std::time::SystemTime;
 
 use serde_json::Value;
@@ -26,7 +26,7 @@ fn donor(name: &str) -> PathBuf {
 }
 
 fn doctor(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).output().unwrap()
+    crate::support::program().args(args).output().unwrap()
 }
 
 fn text(output: &Output) -> String {

@@ -10,7 +10,6 @@ mod page;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::{Mutex, OnceLock};
 
 use ckpt_doctor::check::Safety;
@@ -132,7 +131,7 @@ fn problems() -> Vec<Problem> {
 
 /// Runs `check` on a directory; returns its findings.
 fn check(dir: &Path, case: &Rebuilt, more: &[&str]) -> Vec<Value> {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    let mut command = crate::support::program();
     command.args(["check", "--isolated", "--output-format", "json"]).args(more).arg(dir);
     command.args(case.loaders.iter().flat_map(|loader| ["--for", loader]));
     if case.deep {

@@ -16,10 +16,12 @@ pub mod weights;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::{Outcome, Safety, check, check_for, unused_suppressions};
+use ckpt_doctor::checkpoint::journal::StateFolder;
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, ReadOptions};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
@@ -27,6 +29,7 @@ use ckpt_doctor::knowledge::settings::{Chain, SettingsSource};
 use ckpt_doctor::knowledge::{Knowledge, Library, source};
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{self, Style};
+use ckpt_doctor::surgery::Trust;
 use serde::Deserialize;
 
 pub use base::{BASES, copy};
@@ -131,6 +134,33 @@ pub fn project() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
+/// The value of `XDG_STATE_HOME` for every run of the program in a test: no test reads or writes the state of whoever runs it.
+pub fn state() -> &'static Path {
+    static STATE: OnceLock<PathBuf> = OnceLock::new();
+    STATE.get_or_init(|| {
+        let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
+        fs::create_dir_all(&state).expect("a folder");
+        state
+    })
+}
+
+/// The program of this build, with [`state`].
+pub fn program() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    command.env("XDG_STATE_HOME", state());
+    command
+}
+
+/// The user of [`program`], for tests that call the library.
+pub fn user() -> StateFolder {
+    StateFolder::at(state().join("ckpt-doctor"))
+}
+
+/// The journals of this user alone are carried out.
+pub fn own() -> Trust {
+    Trust { user: user(), adopts: false }
+}
+
 /// Files with this ending below a folder, sorted.
 pub fn files(folder: &Path, ending: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
@@ -174,6 +204,7 @@ pub fn knowledge() -> Knowledge {
 /// Reads a directory; a git work tree around it is trusted.
 fn read(dir: &Path) -> Checkpoint {
     let mut checkpoint = Checkpoint::open(dir).expect("a directory");
+    checkpoint.recognise_journal(&user());
     checkpoint.expect_lfs_pointers(&|top| Some(top) == dir.parent());
     checkpoint
 }

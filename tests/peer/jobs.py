@@ -179,18 +179,12 @@ class Undo(Repair):
     husk = frozenset({".gitignore", "lock", "undo"})
     race_codes = ([0, 2],)
 
-    def lay(self):
-        super().lay()
-        self.as_fixed()
-
-    def as_fixed(self):
-        """Makes the repaired checkpoint the start."""
+    def reset(self):
+        """Repairs the checkpoint anew: in a copy of a repaired one, the journal is not carried out."""
+        super().reset()
         done = subprocess.run(Repair.argv(self), capture_output=True, text=True)
         if done.returncode != 0:
             raise Broken(f"the repair to undo: {done.stdout}{done.stderr}")
-        self.start = self.place / "fixed"
-        subprocess.run(["cp", "-a", str(self.model), str(self.start)], check=True)
-        self.old, self.old_kept = self.target(), self.names_kept()
 
     def argv(self):
         return [PROGRAM, "undo", str(self.model)]
@@ -240,7 +234,6 @@ class Unedit(Undo):
 
     def lay(self):
         Edit.lay(self)
-        self.as_fixed()
 
 
 class Overlay(Build):

@@ -25,17 +25,21 @@ from pathlib import Path
 
 import mergers
 import plants
+import state as user_state
 import traced
-from plants import SECRET, SETTINGS, Site
+from plants import PLANTED, SECRET, SETTINGS, Site
 
 # Files that any process opens: its libraries, the limits of the system, the time zone. glibc reads `overcommit_memory` before
 # it gives memory of a thread back (`check_may_shrink_heap` in sysdeps/unix/sysv/linux/malloc-sysdep.h).
 SYSTEM = (
     "/etc/ld.so.cache", "/etc/ld.so.preload", "/lib/", "/lib64/", "/usr/lib/", "/usr/lib64/", "/usr/local/lib/", "/etc/localtime",
     "/usr/share/zoneinfo/", "/sys/fs/cgroup/", "/sys/devices/system/cpu/", "/dev/null", "/proc/sys/vm/overcommit_memory",
+    "/dev/urandom",
 )  # fmt: skip
 # Blobs of any model in a hub cache: a name that is a hash says what the file contains.
 BLOB = re.compile(r"/models--[^/]+/blobs/([0-9a-f]{40}|[0-9a-f]{64})$")
+# The folder with the key of the user, which tells their journals from those of a download.
+STATE = os.path.realpath(user_state.FOLDER)
 # Below /proc/PID of the process itself.
 OF_ITSELF = ("maps", "cgroup", "mountinfo", "status")
 FORMATS = ("full", "concise", "json", "jsonl", "markdown", "sarif", "github", "gitlab", "junit")
@@ -76,7 +80,8 @@ def ends_well(job, outcome, _):
 
 
 def writes_inside(job, outcome, _):
-    """`check` writes nothing; a repair writes in the checkpoint, or in --output; a merge writes its target and `.NAME.partial`."""
+    """`check` writes nothing; a repair writes in the checkpoint and the key of the user, or in --output; a merge writes its target
+    and `.NAME.partial`."""
     for event in outcome.events:
         if not event.writes or event.real == "/dev/null":
             continue
@@ -96,7 +101,7 @@ def writes_inside(job, outcome, _):
 
 def reads_inside(job, outcome, _):
     """Nothing is read but the given paths, blobs of a hub cache, shards that a link leads to (their names and shapes, see
-    `keeps_secrets`), and the files that any process opens. `.gitattributes` of the work tree and settings of the working
+    `keeps_secrets`), the key of the user, and the files that any process opens. `.gitattributes` of the work tree and settings of the working
     directory are the only files above."""
     for event in outcome.events:
         linked = event.call in ("link", "linkat")
@@ -106,7 +111,7 @@ def reads_inside(job, outcome, _):
         case = next((case for case in job.reads if inside(path, [case])), None)
         allowed = job.reads[case] if case else []
         above = [str(job.cwd), *allowed, *job.writes]
-        if inside(real, allowed) or inside(real, job.writes) or of_the_system(real) or BLOB.search(real):
+        if inside(real, allowed) or inside(real, [*job.writes, STATE]) or of_the_system(real) or BLOB.search(real):
             continue
         if (case or inside(path, job.writes)) and not linked and path.endswith(".safetensors") and os.path.islink(path):
             continue
@@ -177,6 +182,13 @@ def is_original(job, link):
     return same and job.arguments[0] != "build-merged"
 
 
+def carries_nothing_out(job, outcome, _):
+    """No file of a journal that came with a checkpoint is put into place."""
+    for result in job.results:
+        for path in Path(result).glob(PLANTED) if os.path.isdir(result) else []:
+            yield f"put into place: {str(path)!r}"
+
+
 def leaves_outside(job, outcome, changed):
     """Files outside keep their bytes, times, modes and number of links, and none appears."""
     for path in changed:
@@ -211,6 +223,7 @@ LAWS = (
     settings_from_here,
     starts_nothing,
     keeps_secrets,
+    carries_nothing_out,
     leaves_outside,
     switches_nothing_on,
 )
@@ -285,7 +298,8 @@ class Group:
         if self.kind == "undo":
             job.first = ["check", "--fix", "--unsafe-fixes", *job.arguments[1:]]
         if self.kind in ("fix", "undo"):
-            job.writes = job.results = [os.path.realpath(case.real) for case in made]
+            job.results = [os.path.realpath(case.real) for case in made]
+            job.writes = [*job.results, STATE]
         elif self.kind == "output":
             out = batch / "out"
             job.arguments[1:1] = ["--output", str(out)]

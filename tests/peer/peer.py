@@ -12,6 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+import state  # noqa: F401
+
 ROOT = Path(__file__).resolve().parents[2]
 DONORS = ROOT / "fixtures" / "donors"
 SHARED = ROOT.parent / "shared"  # additional data, if it exists

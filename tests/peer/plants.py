@@ -5,6 +5,7 @@ a seed repeats a case.
 """
 
 import copy
+import hashlib
 import json
 import os
 import shutil
@@ -14,6 +15,8 @@ from pathlib import Path
 from peer import DONORS, INDEX
 
 SETTINGS = "ckpt-doctor.json5"
+# A file that only a planted journal would put into place.
+PLANTED = "planted.py"
 # In every file outside, and in the environment of every run.
 SECRET = "hf_k9QzTr5vWm"
 
@@ -424,7 +427,8 @@ def attributes(site, tree):
 
 
 def journal(site, tree):
-    """The remains of a repair that never was: a journal that names files outside, or folders that are links."""
+    """The remains of a repair that never was: a journal that names files outside, folders that are links, or a journal without a
+    fault but its author."""
     rng, secret = site.rng, site.secrets / "secret.txt"
     relative = os.path.relpath(secret, site.folder)
     name = rng.choice(
@@ -434,10 +438,14 @@ def journal(site, tree):
         [None, {"len": 2, "mtime": [1, 1], "mode": 0o100644}, {"len": 2**63, "mtime": [-1, 2**40], "mode": 0o104777}]
     )
     files = [{"name": name, "old": old, "new": {"len": 2, "sha256": "0" * 64}}]
-    text = as_json(
-        {"version": 1, "kind": rng.choice(["undo", "repair"]), "number": rng.choice([0, 1, 1, 2**32 - 1]), "files": files}
-    )
-    inner = {"undo": {"1.json": text, "1": {"config.json": b"{}", "0": b"{}"}}, "new": {"config.json": b"{}", "0": b"{}"}}
+    more = rng.choice([{}, {}, {"kind": "repair"}, {"authenticator": "0" * 64, "folder": {"inode": 1}}])
+    if rng.random() < 0.5:
+        sha256 = hashlib.sha256(b"{}").hexdigest()
+        files = [{"name": PLANTED, "old": None, "new": {"len": 2, "sha256": sha256}}]
+    version, number = rng.choice([1, 2, 3]), rng.choice([0, 1, 1, 2**32 - 1])
+    text = as_json({"version": version, "number": number, "files": files, **more})
+    staged = {"config.json": b"{}", "0": b"{}", PLANTED: b"{}"}
+    inner = {"undo": {"1.json": text, "1": {"config.json": b"{}", "0": b"{}", PLANTED: b"{}"}}, "new": staged}
     if rng.random() < 0.5:
         inner["journal.json"] = text
     away = Link(str(site.secrets))

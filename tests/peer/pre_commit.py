@@ -20,6 +20,8 @@ from pathlib import Path
 
 import yaml
 
+import state  # noqa: F401
+
 DOCTOR = Path(os.environ["CKPT_DOCTOR"]).resolve()
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:{}\nsize 5000000\n"
 GIT = ["git", "-c", "user.name=CI", "-c", "user.email=ci@example.invalid", "-c", "init.defaultBranch=main"]

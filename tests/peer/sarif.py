@@ -18,6 +18,8 @@ from pathlib import Path
 
 from jsonschema import Draft7Validator
 
+import state  # noqa: F401
+
 PROJECT = Path(__file__).resolve().parents[2]
 DOCTOR = Path(os.environ["CKPT_DOCTOR"]).resolve()
 CRATE = '[package]\nname = "schema"\nversion = "0.0.0"\n[dependencies]\nserde-sarif = "=0.8.0"\n[workspace]\n'

@@ -1,48 +1,66 @@
 //! Which modules an adapter's config means, and with what rank.
 
-use fancy_regex::Regex;
+use std::cell::{Cell, RefCell};
+use std::collections::HashSet;
+
 use serde_json::Value;
 
-/// Longest regular expression of a config that is compiled.
-const PATTERN_CAP: usize = 2_000;
+use crate::check::config_pattern::{COMPARISON, ConfigPattern, allowance};
+use crate::checkpoint::adapter::CONFIG;
+use crate::checkpoint::work::{Work, WorkExceeded};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 
-/// `target_modules`, `r`, `rank_pattern` and the rest, as far as names and shapes follow from them.
+/// `target_modules`, `r`, `rank_pattern` and the rest, as far as names and shapes follow from them, within the work that the
+/// size of the adapter allows. After that, nothing follows.
 pub(super) struct Targets<'c> {
     modules: Modules<'c>,
     /// `target_parameters`: the ends of names of parameters, whose module gets the matrices.
     parameters: Vec<&'c str>,
     /// Patterns and the rank they give, in the config's order; `None` when one cannot be compiled here.
-    ranks: Vec<(Option<Regex>, Option<u64>)>,
+    ranks: Vec<(Option<ConfigPattern>, Option<u64>)>,
     rank: Option<u64>,
     /// Whether weights are split into length and direction.
     pub(super) dora: bool,
     /// `modules_to_save`.
     pub(super) saved: Vec<&'c str>,
+    work: RefCell<Work>,
+    exceeded: Cell<bool>,
 }
 
 enum Modules<'c> {
     /// Ends of names.
-    Named(Vec<&'c str>),
+    Named(HashSet<&'c str>),
     /// A regular expression for the whole name.
-    Regex(Regex),
+    Pattern(ConfigPattern),
     /// `all-linear`, or something that cannot be matched here.
     Any,
 }
 
 impl<'c> Targets<'c> {
-    pub(super) fn from_config(config: &'c Value) -> Self {
+    pub(super) fn from_config(config: &'c Value, checkpoint: &Checkpoint) -> Self {
         let list = |key: &str| -> Vec<&'c str> {
             config.get(key).and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_str).collect()
         };
+        let mut work = allowance(checkpoint, checkpoint.document(CONFIG));
+        let mut exceeded = false;
+        let mut compiled = |text: &str| {
+            if exceeded {
+                return None;
+            }
+            ConfigPattern::compile(text, &mut work).unwrap_or_else(|WorkExceeded| {
+                exceeded = true;
+                None
+            })
+        };
         let modules = match config.get("target_modules") {
             Some(Value::String(word)) if word != "all-linear" => {
-                compiled(&format!("^(?:{word})$")).map_or(Modules::Any, Modules::Regex)
+                compiled(&format!("(?:{word})$")).map_or(Modules::Any, Modules::Pattern)
             }
-            Some(Value::Array(_)) => Modules::Named(list("target_modules")),
+            Some(Value::Array(_)) => Modules::Named(list("target_modules").into_iter().collect()),
             _ => Modules::Any,
         };
         let ranks = config.get("rank_pattern").and_then(Value::as_object).into_iter().flatten();
-        let ranks = ranks.map(|(key, rank)| (compiled(&format!(r"^(?:.*\.)?(?:{key})$")), rank.as_u64())).collect();
+        let ranks = ranks.map(|(key, rank)| (compiled(&format!(r"(?:.*\.)?(?:{key})$")), rank.as_u64())).collect();
         Self {
             modules,
             parameters: list("target_parameters"),
@@ -51,23 +69,49 @@ impl<'c> Targets<'c> {
             rank: config.get("r").map_or(Some(8), Value::as_u64),
             dora: config.get("use_dora") == Some(&Value::Bool(true)),
             saved: list("modules_to_save"),
+            work: RefCell::new(work),
+            exceeded: Cell::new(exceeded),
         }
+    }
+
+    /// The fault of lists and patterns that would cost more to compare than the size of the adapter explains.
+    pub(super) fn excess(&self) -> Option<Fault> {
+        self.exceeded.get().then(|| Fault::new(FaultKind::PatternsNotCompared).at(Place::file(CONFIG)))
+    }
+
+    /// Pays for `count` comparisons of `units` each; whether they may be made.
+    pub(super) fn affords(&self, count: usize, units: usize) -> bool {
+        let units = COMPARISON.saturating_add(u64::try_from(units).unwrap_or(u64::MAX));
+        let paid = !self.exceeded.get() && self.work.borrow_mut().spend(count, units).is_ok();
+        self.exceeded.set(!paid);
+        paid
+    }
+
+    /// Whether a pattern matches; `None` when that cannot be said here.
+    fn matches(&self, pattern: &ConfigPattern, name: &str) -> Option<bool> {
+        let found = pattern.matches(name, &mut self.work.borrow_mut());
+        if found.is_err() {
+            self.exceeded.set(true);
+        }
+        found.ok().flatten()
     }
 
     /// Whether the config may mean this module; no only when it certainly does not. Versions of PEFT replace some modules by
     /// parameters when they open an adapter, so none is ruled out beside parameters.
     pub(super) fn may_cover(&self, module: &str) -> bool {
-        !self.parameters.is_empty() || self.may_name(module)
+        !self.parameters.is_empty() || self.may_name(module) != Some(false)
     }
 
-    /// Whether `target_modules` may mean this module.
-    fn may_name(&self, module: &str) -> bool {
+    /// Whether `target_modules` means this module; `None` when that cannot be said here.
+    fn may_name(&self, module: &str) -> Option<bool> {
         match &self.modules {
-            Modules::Named(names) => names
-                .iter()
-                .any(|name| module.strip_suffix(name).is_some_and(|before| before.is_empty() || before.ends_with('.'))),
-            Modules::Regex(regex) => regex.is_match(module).unwrap_or(true),
-            Modules::Any => true,
+            Modules::Named(names) => {
+                let mut ends = module.match_indices('.').filter_map(|(dot, _)| module.get(dot.saturating_add(1)..));
+                self.affords(1, module.len().saturating_mul(4))
+                    .then(|| names.contains(module) || ends.any(|end| names.contains(end)))
+            }
+            Modules::Pattern(pattern) => self.matches(pattern, module),
+            Modules::Any => None,
         }
     }
 
@@ -78,7 +122,7 @@ impl<'c> Targets<'c> {
 
     /// Whether `target_modules` certainly means this module.
     fn names(&self, module: &str) -> bool {
-        !matches!(self.modules, Modules::Any) && self.may_name(module)
+        self.may_name(module) == Some(true)
     }
 
     /// Whether all modules have the same rank: not with matrices of parameters, which have a rank for each expert.
@@ -97,7 +141,9 @@ impl<'c> Targets<'c> {
     ) -> impl Iterator<Item = (String, Option<u64>)> + use<'t, 'c> {
         let holder = module.split(".base_layer").next().unwrap_or(module);
         let is_named = self.names(module);
-        self.parameters.iter().filter_map(move |target| {
+        let longest = self.parameters.iter().map(|target| target.len()).max().unwrap_or(0);
+        let count = if self.affords(self.parameters.len(), longest) { self.parameters.len() } else { 0 };
+        self.parameters.iter().take(count).filter_map(move |target| {
             let (place, leaf) = target.rsplit_once('.').unwrap_or(("", target));
             let before = holder.strip_suffix(place)?;
             let is_meant = if place.is_empty() { !is_named } else { before.is_empty() || before.ends_with('.') };
@@ -110,14 +156,10 @@ impl<'c> Targets<'c> {
     /// The rank of a module, when it follows from the config.
     pub(super) fn rank(&self, module: &str) -> Option<u64> {
         for (pattern, rank) in &self.ranks {
-            if pattern.as_ref()?.is_match(module).ok()? {
+            if self.matches(pattern.as_ref()?, module)? {
                 return *rank;
             }
         }
-        self.rank
+        self.rank.filter(|_| !self.exceeded.get())
     }
-}
-
-fn compiled(pattern: &str) -> Option<Regex> {
-    (pattern.len() <= PATTERN_CAP).then(|| Regex::new(pattern).ok()).flatten()
 }

@@ -91,8 +91,7 @@ impl ModuleShapes<'_> {
         let fits = (best.wrong > 0).then(|| self.fitting_parameter(&found, &classes, &values, false)).flatten();
         let mut required: BTreeMap<Vec<&str>, Vec<bool>> = BTreeMap::new();
         let judged = found.into_iter().zip(classes).zip(best.shapes).map(|((module, class), (plain, shapes))| {
-            let state =
-                if self.skipped.covers(module.name).is_some() { ModuleState::Skipped } else { ModuleState::Quantised };
+            let state = if self.skipped.covers(module.name) { ModuleState::Skipped } else { ModuleState::Quantised };
             let held = module.endings(scheme);
             let required = required.entry(held).or_insert_with_key(|held| self.applied.required(held)).clone();
             QuantizedModule { module, state, plain, of_class: class.is_some(), shapes, required }

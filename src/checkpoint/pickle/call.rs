@@ -3,8 +3,15 @@
 //! Source: `torch/_utils.py` and `torch/serialization.py` of torch 2.15.0.
 
 use super::element::Element;
-use super::machine::{Machine, Stop, StorageIds};
+use super::machine::{CALL, Machine, Stop, StorageIds, VALUE};
 use super::value::{DictKind, StorageRef, TensorRef, Value};
+
+/// Maximum number of arguments of a call that is modelled, and of fields of a persistent id.
+const MAX_ARGUMENTS: usize = 8;
+/// Maximum number of dimensions, of which torch iterates over no more. Source: `MAX_DIMS` in `aten/src/ATen/TensorIterator.h`.
+const MAX_DIMENSIONS: usize = 64;
+/// Work of a tensor and of a storage for the readers, who look at each several times.
+const VIEW: u64 = 600;
 
 /// What is known of an imported attribute.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,14 +62,18 @@ impl Machine<'_> {
         let (Value::Global(id), Value::Tuple(tuple)) = (function, arguments) else {
             return Ok(self.unmodelled_call(function, arguments));
         };
-        let items = self.heap.tuple(tuple).to_vec();
+        self.work.spend(1, CALL)?;
+        let items: Vec<Value> = self.heap.tuple(tuple).iter().take(MAX_ARGUMENTS.saturating_add(1)).copied().collect();
         let result = match (self.known(id), items.as_slice()) {
-            (Known::OrderedDict, []) => Some(self.heap.add_dict(DictKind::Ordered, Vec::new())),
+            (Known::OrderedDict, []) => Some(self.heap.add_dict(DictKind::Ordered)),
             (Known::OrderedDict, [Value::List(pairs)]) if !is_new => self.ordered(*pairs)?,
             _ if is_new => None,
             (Known::Getattr, [Value::Global(class), Value::Text(name)]) => return self.member(id, *class, *name),
             (Known::Layout, [Value::Text(_)]) => Some(Value::Object),
-            (Known::Size, [Value::Tuple(sizes)]) => self.heap.counts(*sizes).map(|_| Value::Tuple(*sizes)),
+            (Known::Size, [Value::Tuple(sizes)]) => {
+                self.work.spend(self.heap.tuple(*sizes).len(), VALUE)?;
+                self.heap.counts(*sizes).map(|_| Value::Tuple(*sizes))
+            }
             (Known::Rebuild, [storage, offset, shape, strides]) => {
                 self.tensor([*storage, *offset, *shape, *strides], None)?
             }
@@ -110,8 +121,9 @@ impl Machine<'_> {
             if let Some(global) = self.globals.get_mut(id as usize) {
                 global.called = true;
             }
-            let path = self.path(id);
-            self.doubt(|| format!("it calls {path}"));
+            if self.doubt.is_none() {
+                self.doubt = Some(format!("it calls {}", self.path(id)));
+            }
         } else {
             self.doubt(|| "it calls a value that is no import".to_owned());
         }
@@ -120,6 +132,7 @@ impl Machine<'_> {
 
     /// A dict from a list of pairs.
     fn ordered(&mut self, pairs: u32) -> Result<Option<Value>, Stop> {
+        self.work.spend(self.heap.list(pairs).len(), VALUE)?;
         let pairs = self.heap.list(pairs).to_vec();
         let mut items = Vec::with_capacity(pairs.len().saturating_mul(2));
         for pair in pairs {
@@ -131,7 +144,7 @@ impl Machine<'_> {
             let [key, value] = pair else { return Ok(None) };
             items.extend([*key, *value]);
         }
-        let dict = self.heap.add_dict(DictKind::Ordered, Vec::new());
+        let dict = self.heap.add_dict(DictKind::Ordered);
         self.set_items(dict, &items)?;
         Ok(Some(dict))
     }
@@ -144,6 +157,10 @@ impl Machine<'_> {
         };
         let negative = Stop::Broken("a tensor has a negative size, stride or offset");
         let offset = u64::try_from(offset).map_err(|_| negative)?;
+        self.work.spend(1, VIEW)?;
+        if [shape, strides].iter().any(|list| self.heap.tuple(*list).len() > MAX_DIMENSIONS) {
+            return Err(Stop::TooLarge("dimensions"));
+        }
         let (Some(sizes), Some(steps)) = (self.heap.counts(shape), self.heap.counts(strides)) else {
             return Err(negative);
         };
@@ -200,7 +217,8 @@ impl Machine<'_> {
     pub(super) fn storage(&mut self, id: Value) -> Result<Value, Stop> {
         const OTHER: Stop = Stop::Broken("a persistent id names no storage");
         let (Value::Tuple(id), StorageIds::Zip | StorageIds::Legacy) = (id, self.ids) else { return Err(OTHER) };
-        let items = self.heap.tuple(id).to_vec();
+        self.work.spend(1, VIEW)?;
+        let items: Vec<Value> = self.heap.tuple(id).iter().take(MAX_ARGUMENTS).copied().collect();
         let (fields, view) = match (self.ids, items.as_slice()) {
             (StorageIds::Zip, [word, class, key, location, numel]) => {
                 ([word, class, key, location, numel], Value::None)
@@ -214,9 +232,10 @@ impl Machine<'_> {
         else {
             return Err(OTHER);
         };
-        if self.text(*word) != "storage" {
+        if self.slice(*word) != b"storage" {
             return Err(OTHER);
         }
+        self.short(*key)?;
         let element = match (self.known(*class), self.ids) {
             (Known::Storage(element), _) => element,
             (Known::Untyped, StorageIds::Zip) => Element::BYTES,

@@ -8,6 +8,7 @@ use super::storage::{Storages, Stored, claimed};
 use super::value::Value;
 use super::{PICKLE_CAP, PickleReader, Problem, beside, state_dict, zip};
 use crate::checkpoint::SourceFile;
+use crate::checkpoint::work::Work;
 
 /// The pickle of the magic number.
 pub(super) const MAGIC: [u8; 15] = *b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19\x2e";
@@ -27,10 +28,11 @@ pub(super) fn problem(stop: Stop, offset: u64, longer: Option<bool>) -> Problem 
 }
 
 /// Reads a file of this format into the reader's shard.
-pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(), Problem> {
+pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut Work) -> Result<(), Problem> {
     let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
     let longer = Some(file.len() > PICKLE_CAP);
-    let mut machine = Machine::new(&bytes, StorageIds::None);
+    work.grant(u64::try_from(bytes.len()).unwrap_or(u64::MAX));
+    let mut machine = Machine::new(&bytes, StorageIds::None, work);
     machine.at = MAGIC.len();
     let result = pickles(&mut machine);
     reader.record(&machine);
@@ -44,7 +46,7 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(
         reader.pickle.doubt = Some(doubt);
         return Ok(());
     }
-    let storages = storages(reader, file, &machine, keys)?;
+    let storages = storages(reader, file, &machine, keys, longer)?;
     if zip::has_end_record(file)? {
         reader.pickle.doubt = Some("an end record of a zip archive follows the tensors".to_owned());
     }
@@ -52,9 +54,10 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(
 }
 
 /// Reads a pickle of another program for what it imports. Returns whether it is a pickle to its end.
-pub(super) fn read_plain(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<bool, Problem> {
+pub(super) fn read_plain(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut Work) -> Result<bool, Problem> {
     let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
-    let mut machine = Machine::new(&bytes, StorageIds::None);
+    work.grant(u64::try_from(bytes.len()).unwrap_or(u64::MAX));
+    let mut machine = Machine::new(&bytes, StorageIds::None, work);
     let stop = machine.run().err();
     reader.record(&machine);
     reader.budget.spend(u64::try_from(machine.at).unwrap_or(u64::MAX));
@@ -81,6 +84,7 @@ fn storages(
     file: &SourceFile,
     machine: &Machine<'_>,
     keys: Value,
+    longer: Option<bool>,
 ) -> Result<Storages, Problem> {
     let malformed = |reason: &str| Problem::Malformed(reason.to_owned(), machine.offset);
     let keys = match keys {
@@ -95,6 +99,7 @@ fn storages(
     let mut sizes = Vec::with_capacity(keys.len());
     for key in keys {
         let Value::Text(key) = key else { return Err(malformed("the key of a storage is no string")) };
+        machine.short(*key).map_err(|stop| problem(stop, machine.offset, longer))?;
         let key = machine.text(*key);
         let bytes = claimed.remove(key).ok_or_else(|| malformed("the file has a storage that no tensor uses"))?;
         sizes.push((key, bytes));

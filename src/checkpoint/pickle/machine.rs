@@ -9,6 +9,7 @@ use super::PickleGlobal;
 use super::call::Known;
 use super::opcode;
 use super::value::{DictKind, Heap, Span, Value, number};
+use crate::checkpoint::work::{Work, WorkExceeded};
 
 /// Maximum number of values on the stack, and of marks.
 const MAX_STACK: usize = 1 << 20;
@@ -19,6 +20,13 @@ const MAX_VALUES: usize = 1 << 22;
 /// Maximum number of different attributes that a pickle imports; real ones import some twenty.
 const MAX_GLOBALS: usize = 1000;
 
+/// Maximum number of bytes of a name that is imported, or of the key of a storage; real ones have some forty.
+const MAX_NAME: usize = 256;
+/// Work of an opcode, of a call or an import besides its values, and of a value that is copied or looked at.
+const OPCODE: u64 = 16;
+pub(super) const CALL: u64 = 100;
+pub(super) const VALUE: u64 = 8;
+
 /// Why the machine stopped before the opcode STOP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Stop {
@@ -28,6 +36,12 @@ pub(super) enum Stop {
     Broken(&'static str),
     /// A limit is reached.
     TooLarge(&'static str),
+}
+
+impl From<WorkExceeded> for Stop {
+    fn from(_: WorkExceeded) -> Self {
+        Self::TooLarge("work")
+    }
 }
 
 /// The layout of the persistent ids of a container.
@@ -51,6 +65,7 @@ pub(super) struct Machine<'p> {
     marks: Vec<usize>,
     memo: HashMap<u32, Value>,
     pub(super) heap: Heap,
+    pub(super) work: &'p mut Work,
     pub(super) ids: StorageIds,
     pub(super) globals: Vec<PickleGlobal>,
     /// What is known of each global.
@@ -65,7 +80,8 @@ pub(super) struct Machine<'p> {
 }
 
 impl<'p> Machine<'p> {
-    pub(super) fn new(bytes: &'p [u8], ids: StorageIds) -> Self {
+    /// A machine for `bytes`, for which the caller has granted the work.
+    pub(super) fn new(bytes: &'p [u8], ids: StorageIds, work: &'p mut Work) -> Self {
         Self {
             bytes,
             at: 0,
@@ -73,6 +89,7 @@ impl<'p> Machine<'p> {
             marks: Vec::new(),
             memo: HashMap::new(),
             heap: Heap::default(),
+            work,
             ids,
             globals: Vec::new(),
             known: Vec::new(),
@@ -94,6 +111,7 @@ impl<'p> Machine<'p> {
         loop {
             self.offset = u64::try_from(self.at).unwrap_or(u64::MAX);
             let [op] = self.take::<1>()?;
+            self.work.spend(1, OPCODE)?;
             if let Some(first) = self.first_use.get_mut(usize::from(op)) {
                 first.get_or_insert(self.offset);
             }
@@ -122,7 +140,7 @@ impl<'p> Machine<'p> {
         std::str::from_utf8(self.slice(span)).unwrap_or_default()
     }
 
-    fn slice(&self, span: Span) -> &'p [u8] {
+    pub(super) fn slice(&self, span: Span) -> &'p [u8] {
         self.bytes.get(span.start as usize..span.end as usize).unwrap_or_default()
     }
 
@@ -237,7 +255,7 @@ impl<'p> Machine<'p> {
             }
             b')' => self.heap.add_tuple(&[]),
             b']' => self.heap.add_list(Vec::new()),
-            b'}' => self.heap.add_dict(DictKind::Plain, Vec::new()),
+            b'}' => self.heap.add_dict(DictKind::Plain),
             0x8f => Value::Set,
             _ => return self.string(op),
         };
@@ -361,7 +379,7 @@ impl<'p> Machine<'p> {
             }
             b'd' => {
                 let items = self.pop_mark()?;
-                let dict = self.heap.add_dict(DictKind::Plain, Vec::new());
+                let dict = self.heap.add_dict(DictKind::Plain);
                 self.set_items(dict, &items)?;
                 dict
             }
@@ -395,14 +413,7 @@ impl<'p> Machine<'p> {
 
     fn extend_list(&mut self, items: Vec<Value>) -> Result<(), Stop> {
         match self.top()? {
-            Value::List(id) => {
-                let list = self.heap.lists.get_mut(id as usize).ok_or(Stop::Broken("a list is missing"))?;
-                if list.len().saturating_add(items.len()) > MAX_VALUES {
-                    return Err(Stop::TooLarge("values"));
-                }
-                list.extend(items);
-                Ok(())
-            }
+            Value::List(id) => self.heap.extend_list(id, items).ok_or(Stop::Broken("a list is missing")),
             Value::Object => Ok(()),
             _ => Err(Stop::Broken("items are added to a value that is no list")),
         }
@@ -414,37 +425,40 @@ impl<'p> Machine<'p> {
         if !rest.is_empty() {
             return Err(Stop::Broken("a dict gets a key without a value"));
         }
-        if !pairs.iter().all(|[key, _]| self.is_hashable(*key, 0)) {
-            return Err(Stop::Broken("a dict gets a key that cannot be hashed"));
+        for [key, _] in pairs {
+            if !self.is_hashable(*key, 0)? {
+                return Err(Stop::Broken("a dict gets a key that cannot be hashed"));
+            }
         }
         match target {
-            Value::Dict(id) => {
-                let dict = self.heap.dicts.get_mut(id as usize).ok_or(Stop::Broken("a dict is missing"))?;
-                if dict.entries.len().saturating_add(pairs.len()) > MAX_VALUES {
-                    return Err(Stop::TooLarge("values"));
-                }
-                dict.entries.extend(pairs.iter().map(|[key, value]| (*key, *value)));
-                Ok(())
-            }
+            Value::Dict(id) => self.heap.set_items(id, pairs).ok_or(Stop::Broken("a dict is missing")),
             Value::Object => Ok(()),
             _ => Err(Stop::Broken("items are set of a value that is no dict")),
         }
     }
 
     /// Whether Python can hash a value. Deep tuples count as hashable, with a doubt.
-    fn is_hashable(&mut self, value: Value, depth: usize) -> bool {
+    fn is_hashable(&mut self, value: Value, depth: usize) -> Result<bool, Stop> {
+        self.work.spend(1, VALUE)?;
         match value {
-            Value::List(_) | Value::Dict(_) | Value::Set => false,
+            Value::List(_) | Value::Dict(_) | Value::Set => return Ok(false),
             Value::Tuple(id) => {
                 let items: Vec<Value> = self.heap.tuple(id).iter().take(17).copied().collect();
                 if depth > 4 || items.len() > 16 {
                     self.doubt(|| "a key of a dict is a large tuple".to_owned());
-                    return true;
+                    return Ok(true);
                 }
-                items.into_iter().all(|item| self.is_hashable(item, depth.saturating_add(1)))
+                for item in items {
+                    if !self.is_hashable(item, depth.saturating_add(1))? {
+                        return Ok(false);
+                    }
+                }
             }
-            _ => true,
+            // The readers of the dict hash and compare it a few times.
+            Value::Text(span) => self.work.spend(self.slice(span).len(), 4)?,
+            _ => {}
         }
+        Ok(true)
     }
 
     /// Executes an opcode that imports, calls or sets the state of an object.
@@ -497,10 +511,17 @@ impl<'p> Machine<'p> {
         self.push(value)
     }
 
+    /// The bytes of a name, which real pickles keep short.
+    pub(super) fn short(&self, name: Span) -> Result<&'p [u8], Stop> {
+        Some(self.slice(name)).filter(|name| name.len() <= MAX_NAME).ok_or(Stop::TooLarge("names"))
+    }
+
     /// Records what a pickle imports.
     fn import(&mut self, module: Span, name: Span) -> Result<Value, Stop> {
+        let (module, name) = (self.short(module)?, self.short(name)?);
+        self.work.spend(1, CALL)?;
         let utf8 = |bytes| std::str::from_utf8(bytes).map_err(|_| Stop::Broken("a string is not valid UTF-8"));
-        let (module, name) = (python3(utf8(self.slice(module))?), utf8(self.slice(name))?);
+        let (module, name) = (python3(utf8(module)?), utf8(name)?);
         self.global(module, name)
     }
 

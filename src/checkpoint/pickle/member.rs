@@ -12,8 +12,12 @@ const MAX_NAME: usize = 200;
 impl Machine<'_> {
     /// The member `name` of the global `class`, for a call of the global `getattr`.
     pub(super) fn member(&mut self, getattr: u32, class: u32, name: Span) -> Result<Value, Stop> {
-        let path = self.path(getattr);
-        self.doubt(|| format!("it calls {path}"));
+        if self.slice(name).len() > MAX_NAME {
+            return Ok(self.unmodelled_call(Value::Global(getattr), Value::None));
+        }
+        if self.doubt.is_none() {
+            self.doubt = Some(format!("it calls {}", self.path(getattr)));
+        }
         let text = self.text(name);
         let owner = self.globals.get(class as usize).filter(|owner| {
             let length = owner.module.len().saturating_add(owner.name.len()).saturating_add(text.len());

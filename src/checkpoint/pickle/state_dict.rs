@@ -1,16 +1,15 @@
 //! The tensors of the dict that a pickle leaves.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet, VecDeque};
 
 use super::machine::Machine;
 use super::storage::{Storages, room};
-use super::value::{TensorRef, Value};
+use super::value::{Span, TensorRef, Value};
 use super::{NestedTensors, PickleReader, Problem, at_tensor};
 use crate::checkpoint::text::escape;
 use crate::checkpoint::{Fault, FaultKind, Tensor};
 
-/// Maximum number of entries of dicts that are searched for nested tensors, and of levels.
-const SEARCHED: usize = 200_000;
+/// Maximum number of levels of dicts that are searched for nested tensors.
 const LEVELS: usize = 3;
 /// Maximum number of keys that are kept of those without a tensor.
 const KEYS: usize = 32;
@@ -208,34 +207,47 @@ fn check_unnamed(
     Ok(())
 }
 
-/// The dict below the top that has the most tensors.
+/// A dict on the way to nested tensors: its number, the one that holds it by its place in the list, and its key there.
+struct Level {
+    dict: u32,
+    holder: Option<(usize, Span)>,
+    depth: usize,
+}
+
+/// The dict below the top that has the most tensors; of two with equally many, the one that is found first, level by level.
 fn nested(machine: &Machine<'_>, dict: u32) -> Option<NestedTensors> {
-    let mut best: Option<NestedTensors> = None;
-    let mut open: Vec<(u32, String, usize)> = vec![(dict, String::new(), 0)];
-    let mut left = SEARCHED;
-    let keys: Vec<String> =
-        last_values(machine, dict).iter().filter_map(|(name, _)| Some(escape((*name)?, 80))).take(KEYS).collect();
-    while let Some((id, path, level)) = open.pop() {
+    let mut best: Option<(usize, u64, Span)> = None;
+    let mut levels = vec![Level { dict, holder: None, depth: 0 }];
+    // A dict that several keys hold is searched once.
+    let mut seen = HashSet::from([dict]);
+    let mut open = VecDeque::from([0]);
+    while let Some(at) = open.pop_front() {
+        let Some(Level { dict, depth, .. }) = levels.get(at) else { break };
+        let (dict, depth) = (*dict, *depth);
         let (mut count, mut first) = (0_u64, None);
-        for (key, value) in machine.heap.dict(id) {
-            left = left.saturating_sub(1);
-            let Value::Text(span) = key else { continue };
-            let name = machine.text(*span);
+        for (key, value) in machine.heap.dict(dict) {
+            let Value::Text(key) = key else { continue };
             match value {
                 Value::Tensor(_) => {
                     count = count.saturating_add(1);
-                    first.get_or_insert(name);
+                    first.get_or_insert(*key);
                 }
-                Value::Dict(inner) if level < LEVELS && left > 0 && name.len() <= 200 => {
-                    let path = if path.is_empty() { name.to_owned() } else { format!("{path}/{name}") };
-                    open.push((*inner, path, level.saturating_add(1)));
+                Value::Dict(inner) if depth < LEVELS && machine.slice(*key).len() <= 200 && seen.insert(*inner) => {
+                    open.push_back(levels.len());
+                    levels.push(Level { dict: *inner, holder: Some((at, *key)), depth: depth.saturating_add(1) });
                 }
                 _ => {}
             }
         }
-        if let Some(first) = first.filter(|_| best.as_ref().is_none_or(|best| count > best.count)) {
-            best = Some(NestedTensors { key: path, count, first: first.to_owned(), keys: keys.clone() });
+        if let Some(first) = first.filter(|_| best.is_none_or(|(_, most, _)| count > most)) {
+            best = Some((at, count, first));
         }
     }
-    best
+    let (at, count, first) = best?;
+    let holders = std::iter::successors(levels.get(at), |level| levels.get(level.holder?.0));
+    let mut path: Vec<&str> = holders.filter_map(|level| Some(machine.text(level.holder?.1))).collect();
+    path.reverse();
+    let keys =
+        last_values(machine, dict).iter().filter_map(|(name, _)| Some(escape((*name)?, 80))).take(KEYS).collect();
+    Some(NestedTensors { key: path.join("/"), count, first: machine.text(first).to_owned(), keys })
 }

@@ -76,8 +76,10 @@ pub(super) struct TensorRef {
 pub(super) struct Heap {
     tuples: Vec<(u32, u32)>,
     items: Vec<Value>,
-    pub(super) lists: Vec<Vec<Value>>,
+    lists: Vec<Vec<Value>>,
     pub(super) dicts: Vec<Dict>,
+    /// Number of values in lists and dicts.
+    held: usize,
     pub(super) storages: Vec<StorageRef>,
     pub(super) tensors: Vec<TensorRef>,
 }
@@ -96,12 +98,29 @@ impl Heap {
     }
 
     pub(super) fn add_list(&mut self, items: Vec<Value>) -> Value {
+        self.held = self.held.saturating_add(items.len());
         self.lists.push(items);
         Value::List(number(self.lists.len().saturating_sub(1)))
     }
 
-    pub(super) fn add_dict(&mut self, kind: DictKind, entries: Vec<(Value, Value)>) -> Value {
-        self.dicts.push(Dict { kind, entries });
+    /// Adds items to a list; `None` when there is no such list.
+    pub(super) fn extend_list(&mut self, list: u32, items: Vec<Value>) -> Option<()> {
+        let list = self.lists.get_mut(list as usize)?;
+        self.held = self.held.saturating_add(items.len());
+        list.extend(items);
+        Some(())
+    }
+
+    /// Adds entries to a dict; `None` when there is no such dict.
+    pub(super) fn set_items(&mut self, dict: u32, pairs: &[[Value; 2]]) -> Option<()> {
+        let dict = self.dicts.get_mut(dict as usize)?;
+        self.held = self.held.saturating_add(pairs.len().saturating_mul(2));
+        dict.entries.extend(pairs.iter().map(|[key, value]| (*key, *value)));
+        Some(())
+    }
+
+    pub(super) fn add_dict(&mut self, kind: DictKind) -> Value {
+        self.dicts.push(Dict { kind, entries: Vec::new() });
         Value::Dict(number(self.dicts.len().saturating_sub(1)))
     }
 
@@ -137,9 +156,11 @@ impl Heap {
         self.tuple(tuple).iter().map(count).collect()
     }
 
-    /// Number of values that are kept.
+    /// The memory of what is kept, in values of 16 bytes.
     pub(super) fn size(&self) -> usize {
         let containers = self.tuples.len().saturating_add(self.lists.len()).saturating_add(self.dicts.len());
-        self.items.len().saturating_add(containers.saturating_mul(2))
+        let views = self.storages.len().saturating_add(self.tensors.len());
+        let values = self.items.len().saturating_add(self.held);
+        values.saturating_add(containers.saturating_mul(2)).saturating_add(views.saturating_mul(4))
     }
 }

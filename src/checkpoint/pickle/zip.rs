@@ -9,6 +9,7 @@ use super::machine::{Machine, StorageIds};
 use super::storage::{Storages, Stored, claimed};
 use super::{PICKLE_CAP, PickleReader, Problem, beside, legacy, state_dict};
 use crate::checkpoint::SourceFile;
+use crate::checkpoint::work::Work;
 
 /// Maximum number of bytes of the directory of an archive; 100 000 members take some 10 MB.
 const DIRECTORY_CAP: u64 = 32 << 20;
@@ -64,7 +65,7 @@ fn malformed(reason: &str, offset: u64) -> Problem {
 }
 
 /// Reads an archive into the reader's shard.
-pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(), Problem> {
+pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut Work) -> Result<(), Problem> {
     let archive = Archive::read(file)?;
     if archive.member("constants.pkl").is_some() {
         return Err(Problem::Other("a TorchScript archive".to_owned()));
@@ -89,7 +90,8 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile) -> Result<(
         return Ok(());
     }
     let bytes = file.bytes(range.begin, range.bytes)?;
-    let mut machine = Machine::new(&bytes, StorageIds::Zip);
+    work.grant(range.bytes);
+    let mut machine = Machine::new(&bytes, StorageIds::Zip, work);
     let result = machine.run();
     reader.record(&machine);
     if archive.has_twins {

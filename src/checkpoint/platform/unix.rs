@@ -83,6 +83,15 @@ pub(crate) fn is_own(path: &Path) -> bool {
     path.symlink_metadata().is_ok_and(|metadata| metadata.uid() == user)
 }
 
+/// Why a file is not one that the user of this process alone can read and write; `None` when it is.
+pub(crate) fn why_not_private(metadata: &Metadata) -> Option<String> {
+    if metadata.uid() != rustix::process::geteuid().as_raw() {
+        return Some("belongs to another user".to_owned());
+    }
+    let mode = metadata.mode() & 0o7777;
+    (mode & 0o077 != 0).then(|| format!("can be read or written by other users (its mode is {mode:04o}, not 0600)"))
+}
+
 /// The path without links.
 ///
 /// # Errors

@@ -99,6 +99,11 @@ pub(crate) const fn is_own(_: &Path) -> bool {
     true
 }
 
+/// Why a file is not one that the user of this process alone can read and write: the standard library does not tell.
+pub(crate) fn why_not_private(_: &Metadata) -> Option<String> {
+    Some("may be open to other users, which this system does not tell".to_owned())
+}
+
 /// The path without links, in the case in which its folders are stored.
 ///
 /// # Errors

@@ -14,7 +14,7 @@ fn donor(name: &str) -> PathBuf {
 }
 
 fn doctor(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).output().unwrap()
+    crate::support::program().args(args).output().unwrap()
 }
 
 fn report(args: &[&str]) -> (Option<i32>, Value) {
@@ -131,8 +131,7 @@ fn paths_that_cannot_be_checked_do_not_lose_the_other_reports() {
         "--output-format",
     ];
     let run = |format: &str| {
-        let output =
-            Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).arg(format).current_dir(root).output().unwrap();
+        let output = crate::support::program().args(args).arg(format).current_dir(root).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{format}");
         (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap())
     };
@@ -487,7 +486,7 @@ fn a_shard_that_is_cut_off_during_the_read_is_a_finding() {
     let shard = [&header.len().to_le_bytes()[..], header.as_bytes(), &vec![1; LEN]].concat();
     let reason = (0..200).find_map(|_| {
         fs::write(&path, &shard).unwrap();
-        let mut check = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+        let mut check = crate::support::program();
         check.args(["check", "--deep", "--fail-on", "warning", "--output-format", "json"]).arg(dir.path());
         let mut check = check.stdout(std::process::Stdio::piped()).spawn().unwrap();
         let maps = format!("/proc/{}/maps", check.id());

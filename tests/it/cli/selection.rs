@@ -22,7 +22,7 @@ fn zoo() -> TempDir {
 
 /// Runs the program in `dir`.
 fn doctor(dir: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).current_dir(dir).args(args).output().unwrap()
+    crate::support::program().current_dir(dir).args(args).output().unwrap()
 }
 
 /// Both output streams and the exit code.

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -12,7 +12,7 @@ use tempfile::TempDir;
 use crate::support::project;
 
 fn doctor(dir: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).current_dir(dir).env_remove("COLUMNS").output().unwrap()
+    crate::support::program().args(args).current_dir(dir).env_remove("COLUMNS").output().unwrap()
 }
 
 #[test]

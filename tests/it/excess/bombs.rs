@@ -67,6 +67,7 @@ fn refused(args: &[&str], file: &Path, last: &Path) {
     let mut shell = Command::new("/bin/sh");
     let script = "ulimit -c 0; ulimit -v 524288; ulimit -t 60; exec \"$0\" \"$@\"";
     shell.args(["-c", script, env!("CARGO_BIN_EXE_ckpt-doctor")]).args(args).arg(file);
+    shell.env("XDG_STATE_HOME", crate::support::state());
     if !last.as_os_str().is_empty() {
         shell.arg(last);
     }

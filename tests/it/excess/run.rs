@@ -52,6 +52,7 @@ fn program_within(program: &std::ffi::OsStr, dir: &Path, options: &[&str]) -> Ru
         .args(options)
         .arg(dir)
         .arg(format!("--report=json={}", report.display()))
+        .env("XDG_STATE_HOME", crate::support::state())
         .output()
         .unwrap();
     let bytes = std::fs::read(&report).unwrap_or_default();

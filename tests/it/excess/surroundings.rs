@@ -13,7 +13,7 @@ const SURROUNDINGS: [(&str, &str); 10] = [
     ("ulimit -s 64", ""),
     ("ulimit -n 16", ""),
     ("ulimit -s 64; ulimit -n 16", ""),
-    ("unset HOME TERM LANG PATH", ""),
+    ("unset HOME XDG_STATE_HOME TERM LANG PATH", ""),
     ("export TERM=dumb", ""),
     (":", "<&-"),
     (":", ">&-"),
@@ -53,6 +53,7 @@ fn run(dir: &Path, before: &str, redirected: &str, command: &[&str]) -> Option<i
         .args(["-c", &script, env!("CARGO_BIN_EXE_ckpt-doctor")])
         .args(command)
         .current_dir(dir)
+        .env("XDG_STATE_HOME", crate::support::state())
         .output();
     shell.unwrap().status.code()
 }

@@ -1,7 +1,6 @@
 //! `check --fix` and `undo` from the outside.
 
 use std::path::Path;
-use std::process::Command;
 
 use serde_json::Value;
 use tempfile::TempDir;
@@ -26,8 +25,7 @@ fn broken() -> TempDir {
 
 /// Runs the program in `room`; returns its exit code and output.
 fn doctor(room: &Path, args: &[&str]) -> (i32, String) {
-    let program = env!("CARGO_BIN_EXE_ckpt-doctor");
-    let output = Command::new(program).args(args).current_dir(room).output().expect("it runs");
+    let output = support::program().args(args).current_dir(room).output().expect("it runs");
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("text");
     (output.status.code().expect("a code"), text(output.stdout) + &text(output.stderr))
 }

@@ -8,8 +8,9 @@ use std::sync::Arc;
 
 use ckpt_doctor::check::check;
 use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::checkpoint::journal::{InodeIdentity, Journal};
 use ckpt_doctor::surgery::repair::{Content, Repair, plan};
-use ckpt_doctor::surgery::{Recovered, RepairError, journal, overlay};
+use ckpt_doctor::surgery::{Change, Recovered, RepairError, Trust, journal, overlay};
 use tempfile::TempDir;
 
 use super::seen;
@@ -39,18 +40,32 @@ fn contents(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     seen(dir).into_iter().filter(|(name, _)| !name.starts_with('.')).map(|(name, seen)| (name, seen.3)).collect()
 }
 
+/// Writes a changed journal with a new authenticator, as if the repair had been begun in the folder of the journal.
+fn sign_again(path: &Path, change: impl FnOnce(&mut Journal)) {
+    let folder = path.ancestors().find(|folder| folder.ends_with(".ckpt-doctor")).expect("a folder");
+    let mut journal: Journal = serde_json::from_slice(&fs::read(path).expect("a journal")).expect("a journal");
+    journal.folder = Some(InodeIdentity::of(folder).expect("a folder"));
+    change(&mut journal);
+    let key = journal::key(&support::user(), folder).expect("a key");
+    fs::write(path, serde_json::to_vec(&journal.signed(&key)).expect("JSON")).expect("a journal");
+}
+
+fn adopting() -> Trust {
+    Trust { adopts: true, ..support::own() }
+}
+
 /// Every state that a killed run can leave, and the result of the recovery.
 #[test]
 fn an_interrupted_repair_is_finished_or_rolled_back() {
     let (_room, dir) = broken();
     let before = contents(&dir);
     let repair = repair(&dir);
-    journal::write(&repair, &|_| {}).expect("written");
+    journal::write(&repair, &support::user(), &|_| {}).expect("written");
     let after = contents(&dir);
     assert_ne!(before, after);
     let folder = dir.join(".ckpt-doctor");
     let filed = fs::read(folder.join("undo/1.json")).expect("a journal");
-    journal::undo(&dir).expect("undone");
+    journal::undo(&dir, &support::own()).expect("undone");
     assert_eq!(contents(&dir), before);
     assert!(!folder.exists());
 
@@ -67,6 +82,7 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
             }
             if (1..7).contains(&step) {
                 fs::write(folder.join("journal.json"), &filed).expect("a journal");
+                sign_again(&folder.join("journal.json"), |_| {});
             }
             if (2..7).contains(&step) {
                 fs::create_dir_all(folder.join("undo/1")).expect("a folder");
@@ -92,9 +108,20 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
                 fs::write(&cut, "{").expect("a file");
             }
 
-            let found = check(&Arc::new(Checkpoint::open(&dir).expect("open")), &support::knowledge()).findings;
+            let found = support::look(&dir, false, &support::knowledge()).findings;
+            assert!(found.iter().all(|f| f.code != "FIL015"), "{found:?}");
             assert_eq!(found.iter().any(|f| f.code == "FIL010"), (1..5).contains(&step), "step {step}");
-            let recovered = journal::recover(&dir).expect("recovered").outcome;
+            let recovery = journal::recover(&dir, &support::own()).expect("recovered");
+            let recovered = recovery.outcome;
+            let listed: Vec<_> = recovery.files.iter().map(|(change, name)| (*change, name.as_str())).collect();
+            match recovered {
+                Some(Recovered::Finished) => assert_eq!(
+                    listed,
+                    [(Change::Replaced, "config.json"), (Change::Added, "model.safetensors.index.json")]
+                ),
+                Some(Recovered::RolledBack) if step == 3 => assert_eq!(listed, [(Change::Restored, "config.json")]),
+                _ => assert_eq!(listed, []),
+            }
             let (outcome, files) = match step {
                 1..=3 if damaged => (Some(Recovered::RolledBack), &before),
                 1..=4 => (Some(Recovered::Finished), &after),
@@ -103,7 +130,7 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
             };
             assert_eq!((recovered, &contents(&dir)), (outcome, files), "step {step}, damaged: {damaged}");
             if files == &after {
-                journal::undo(&dir).expect("undone");
+                journal::undo(&dir, &support::own()).expect("undone");
             }
             assert_eq!(contents(&dir), before, "step {step}");
             assert!(!folder.exists(), "step {step}: the folder is left behind");
@@ -120,7 +147,7 @@ fn an_interrupted_undo_is_finished() {
     let (kept, config, index) = (folder.join("undo/1"), "config.json", "model.safetensors.index.json");
     for step in 0..=4 {
         for exchanged in [false, true] {
-            journal::write(&repair(&dir), &|_| {}).expect("written");
+            journal::write(&repair(&dir), &support::user(), &|_| {}).expect("written");
             let after = contents(&dir);
             // 0: the journal is current again. 1: the original restored. 2: the added file removed. 3: the originals
             // removed. 4: the journal removed.
@@ -143,7 +170,7 @@ fn an_interrupted_undo_is_finished() {
             if step >= 4 {
                 fs::remove_file(folder.join("journal.json")).expect("removed");
             }
-            let recovered = journal::recover(&dir).expect("recovered").outcome;
+            let recovered = journal::recover(&dir, &support::own()).expect("recovered").outcome;
             let (outcome, files) = match step {
                 0 => (Some(Recovered::Finished), &after),
                 1..=3 => (Some(Recovered::RolledBack), &before),
@@ -151,7 +178,7 @@ fn an_interrupted_undo_is_finished() {
             };
             assert_eq!((recovered, &contents(&dir)), (outcome, files), "step {step}, {exchanged}");
             if step == 0 {
-                journal::undo(&dir).expect("undone");
+                journal::undo(&dir, &support::own()).expect("undone");
             }
             assert_eq!(contents(&dir), before, "step {step}, {exchanged}");
             assert!(!folder.exists(), "step {step}, {exchanged}: the folder is left behind");
@@ -164,21 +191,26 @@ fn without_metadata() -> (TempDir, PathBuf, PathBuf) {
     let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");
     let dir = support::made("llama-sharded", "[]", room.path());
     let path = dir.join("model-00001-of-00002.safetensors");
-    let bytes = fs::read(&path).expect("a shard");
+    drop_metadata(&path);
+    (room, dir, path)
+}
+
+/// Replaces the metadata of a shard by spaces, so that the header that has them again is written in place.
+pub(super) fn drop_metadata(path: &Path) {
+    let bytes = fs::read(path).expect("a shard");
     let at = 8 + usize::try_from(u64::from_le_bytes(bytes[..8].try_into().expect("eight bytes"))).expect("a length");
     let text = std::str::from_utf8(&bytes[8..at]).expect("text");
     let bare = text.replace(r#""__metadata__":{"format":"pt"},"#, "");
     assert_ne!(bare, text);
-    fs::write(&path, [&bytes[..8], format!("{bare:width$}", width = text.len()).as_bytes(), &bytes[at..]].concat())
+    fs::write(path, [&bytes[..8], format!("{bare:width$}", width = text.len()).as_bytes(), &bytes[at..]].concat())
         .expect("a shard");
-    (room, dir, path)
 }
 
 fn fix(dir: &Path) {
     let knowledge = support::knowledge();
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
     let repair = plan(&checkpoint, check(&checkpoint, &knowledge), false, &|c| check(c, &knowledge));
-    journal::write(&repair, &|_| {}).expect("written");
+    journal::write(&repair, &support::user(), &|_| {}).expect("written");
 }
 
 #[test]
@@ -192,7 +224,7 @@ fn a_header_is_edited_in_place() {
     let (old, new) = (&before[name].3, &after[name].3);
     assert!(old.len() == new.len() && old != new);
     assert!(fs::metadata(folder.join("undo/1").join(name)).expect("both headers").len() < old.len() as u64);
-    journal::undo(&dir).expect("undone");
+    journal::undo(&dir, &support::own()).expect("undone");
     assert_eq!(seen(&dir), before);
 
     // Each state that a killed repair or undo can leave: the journal is current, and the shard has the old header, the new
@@ -202,9 +234,9 @@ fn a_header_is_edited_in_place() {
         fix(&dir);
         fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
         fs::write(&path, bytes).expect("a shard");
-        assert_eq!(journal::recover(&dir).expect("recovered").outcome, Some(outcome));
+        assert_eq!(journal::recover(&dir, &support::own()).expect("recovered").outcome, Some(outcome));
         if outcome == Recovered::Finished {
-            journal::undo(&dir).expect("undone");
+            journal::undo(&dir, &support::own()).expect("undone");
         }
         assert_eq!((&contents(&dir)[name], folder.exists()), (old, false));
     }
@@ -217,10 +249,13 @@ fn a_header_is_edited_in_place() {
         if is_replaced {
             fs::write(dir.join("new"), &saved).expect("a file");
             fs::rename(dir.join("new"), &path).expect("a rename");
-            assert_eq!(journal::recover(&dir).expect("recovered").outcome, Some(Recovered::RolledBack));
+            assert_eq!(
+                journal::recover(&dir, &support::own()).expect("recovered").outcome,
+                Some(Recovered::RolledBack)
+            );
         } else {
             fs::write(&path, &saved).expect("a file");
-            let error = journal::recover(&dir).expect_err("refused");
+            let error = journal::recover(&dir, &support::own()).expect_err("refused");
             assert!(matches!(error, RepairError::ChangedSinceRepair { .. }), "{error}");
         }
         assert_eq!(contents(&dir)[name], saved);
@@ -238,17 +273,23 @@ fn headers_that_do_not_fit_the_journal_are_not_written() {
     let (journal, headers) = (folder.join("undo/1.json"), fs::read(&kept).expect("both headers"));
     let text = fs::read_to_string(&journal).expect("a journal");
     let after = contents(&dir);
-    let harms: [(&str, &dyn Fn()); 4] = [
+    let mut others = headers.clone();
+    others[20] ^= 1;
+    let harms: [(&str, &dyn Fn()); 6] = [
         ("changed since", &|| fs::write(&kept, &headers[1..]).expect("a file")),
         ("changed since", &|| fs::remove_file(&kept).expect("removed")),
-        ("changed since", &|| {
+        ("the two headers", &|| fs::write(&kept, &others).expect("a file")),
+        ("not that of your key", &|| {
             fs::write(&journal, text.replace(r#""old_len": "#, r#""old_len": 9"#)).expect("a journal");
         }),
-        ("version 3", &|| fs::write(&journal, text.replace(r#""version": 2"#, r#""version": 3"#)).expect("a journal")),
+        ("changed since", &|| {
+            sign_again(&journal, |journal| journal.files[0].header.as_mut().expect("an edit").old_len += 8);
+        }),
+        ("version 4", &|| fs::write(&journal, text.replace(r#""version": 3"#, r#""version": 4"#)).expect("a journal")),
     ];
     for (word, harm) in harms {
         harm();
-        let error = journal::undo(&dir).expect_err("refused").to_string();
+        let error = journal::undo(&dir, &support::own()).expect_err("refused").to_string();
         assert!(error.contains(word), "{error}");
         assert_eq!(contents(&dir), after);
         fs::write(&kept, &headers).expect("a file");
@@ -256,7 +297,7 @@ fn headers_that_do_not_fit_the_journal_are_not_written() {
     }
     fs::rename(&journal, folder.join("journal.json")).expect("a rename");
     fs::write(&kept, &headers[1..]).expect("a file");
-    let error = journal::recover(&dir).expect_err("refused");
+    let error = journal::recover(&dir, &support::own()).expect_err("refused");
     assert!(matches!(error, RepairError::UnusableJournal { .. }), "{error}");
     assert_eq!(contents(&dir), after);
 }
@@ -264,14 +305,21 @@ fn headers_that_do_not_fit_the_journal_are_not_written() {
 /// Another program saved a file between the link to the original and the exchange, and the run was killed before it could
 /// exchange the files back.
 #[test]
-fn a_file_saved_during_an_interrupted_repair_is_returned() {
+fn a_file_saved_during_an_interrupted_repair_is_returned_to_those_who_vouch_for_it() {
     let (_room, dir) = broken();
-    journal::write(&repair(&dir), &|_| {}).expect("written");
+    journal::write(&repair(&dir), &support::user(), &|_| {}).expect("written");
     let folder = dir.join(".ckpt-doctor");
     fs::rename(folder.join("undo/1.json"), folder.join("journal.json")).expect("a rename");
     fs::create_dir(folder.join("new")).expect("a folder");
     fs::write(folder.join("new/config.json"), "saved").expect("a file");
-    assert_eq!(journal::recover(&dir).expect("recovered").outcome, Some(Recovered::RolledBack));
+    let after = contents(&dir);
+    // Somebody else may have put it there.
+    let error = journal::recover(&dir, &support::own()).expect_err("refused");
+    assert!(matches!(&error, RepairError::Unaccounted { path } if path.ends_with("new/config.json")), "{error}");
+    assert_eq!(contents(&dir), after);
+    let recovery = journal::recover(&dir, &adopting()).expect("recovered");
+    assert_eq!(recovery.outcome, Some(Recovered::RolledBack));
+    assert_eq!(recovery.files[0], (Change::Returned, "config.json".to_owned()));
     assert_eq!(fs::read_to_string(dir.join("config.json")).expect("a file"), "saved");
     assert!(!folder.exists());
 }
@@ -291,36 +339,41 @@ fn an_empty_folder_is_removed_by_the_next_run() {
                 None => fs::write(folder.join(name), "").expect("a file"),
             }
         }
-        assert_eq!(journal::recover(&dir).expect("recovered").outcome, None);
+        assert_eq!(journal::recover(&dir, &support::own()).expect("recovered").outcome, None);
         assert!(!folder.exists(), "{names:?}");
     }
     fs::create_dir(&folder).expect("a folder");
     fs::write(folder.join("notes"), "mine").expect("a file");
-    journal::recover(&dir).expect("recovered");
+    journal::recover(&dir, &support::own()).expect("recovered");
     assert_eq!(seen(&folder).into_keys().collect::<Vec<_>>(), ["notes"]);
 }
 
-/// Repairs of ckpt-doctor 0.1 before headers were edited in place.
+/// Repairs of ckpt-doctor 0.1 before headers were edited in place, and before journals had an authenticator.
 #[test]
-fn a_repair_with_a_journal_of_version_1_is_undone() {
+fn a_repair_with_an_old_journal_is_undone_for_those_who_vouch_for_it() {
     let (_room, dir) = broken();
     let before = contents(&dir);
-    journal::write(&repair(&dir), &|_| {}).expect("written");
+    journal::write(&repair(&dir), &support::user(), &|_| {}).expect("written");
     let path = dir.join(".ckpt-doctor/undo/1.json");
-    let text = fs::read_to_string(&path).expect("a journal");
-    assert!(text.contains(r#""version": 2"#) && !text.contains("header"), "{text}");
-    fs::write(&path, text.replace(r#""version": 2"#, r#""version": 1"#)).expect("a journal");
-    journal::undo(&dir).expect("undone");
+    let mut journal: Journal = serde_json::from_slice(&fs::read(&path).expect("a journal")).expect("a journal");
+    (journal.version, journal.folder, journal.authenticator) = (1, None, None);
+    journal.files.iter_mut().filter_map(|file| file.old.as_mut()).for_each(|old| old.identity = None);
+    let text = serde_json::to_string(&journal).expect("JSON");
+    assert!(!text.contains("header") && !text.contains("identity"), "{text}");
+    fs::write(&path, text).expect("a journal");
+    let error = journal::undo(&dir, &support::own()).expect_err("refused");
+    assert!(matches!(error, RepairError::ForeignJournal { .. }), "{error}");
+    journal::undo(&dir, &adopting()).expect("undone");
     assert_eq!(contents(&dir), before);
 }
 
 #[test]
 fn files_changed_after_a_repair_are_not_restored() {
     let (_room, dir) = broken();
-    journal::write(&repair(&dir), &|_| {}).expect("written");
+    journal::write(&repair(&dir), &support::user(), &|_| {}).expect("written");
     fs::write(dir.join("config.json"), "{}").expect("a file");
     let now = contents(&dir);
-    let error = journal::undo(&dir).expect_err("refused");
+    let error = journal::undo(&dir, &support::own()).expect_err("refused");
     assert!(matches!(&error, RepairError::ChangedSinceRepair { path, .. } if path.ends_with("config.json")), "{error}");
     assert!(error.to_string().contains(".ckpt-doctor/undo/1"), "{error}");
     assert_eq!(contents(&dir), now);
@@ -332,7 +385,7 @@ fn a_file_that_changes_during_planning_stops_the_repair() {
     let repair = repair(&dir);
     fs::write(dir.join("config.json"), "{}").expect("a file");
     let now = contents(&dir);
-    assert!(matches!(journal::write(&repair, &|_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
+    assert!(matches!(journal::write(&repair, &support::user(), &|_| {}), Err(RepairError::ChangedWhilePlanned { .. })));
     assert_eq!(contents(&dir), now);
     assert!(!dir.join(".ckpt-doctor").exists());
 }
@@ -345,7 +398,7 @@ fn an_edit_that_changes_nothing_is_an_error_of_the_program() {
     repair.changes.retain(|change| change.name == "config.json");
     let text = fs::read_to_string(dir.join("config.json")).expect("text");
     repair.changes[0].new = Content::Text(text.into());
-    assert!(matches!(journal::write(&repair, &|_| {}), Err(RepairError::ChangesNothing { .. })));
+    assert!(matches!(journal::write(&repair, &support::user(), &|_| {}), Err(RepairError::ChangesNothing { .. })));
     assert_eq!(contents(&dir), before);
 }
 
@@ -354,7 +407,7 @@ fn mode_is_kept_and_the_last_repair_is_undone_first() {
     let (_room, dir) = broken();
     fs::set_permissions(dir.join("config.json"), PermissionsExt::from_mode(0o640)).expect("a mode");
     let before = seen(&dir);
-    journal::write(&repair(&dir), &|_| {}).expect("written");
+    journal::write(&repair(&dir), &support::user(), &|_| {}).expect("written");
     assert_eq!(fs::metadata(dir.join("config.json")).expect("a file").mode() & 0o7777, 0o640);
     assert_eq!(fs::read_to_string(dir.join(".ckpt-doctor/.gitignore")).expect("a file").lines().last(), Some("*"));
     let between = contents(&dir);
@@ -363,13 +416,13 @@ fn mode_is_kept_and_the_last_repair_is_undone_first() {
     let knowledge = support::knowledge();
     let checkpoint = Arc::new(Checkpoint::open(&dir).expect("a directory"));
     let second = plan(&checkpoint, check(&checkpoint, &knowledge), false, &|c| check(c, &knowledge));
-    journal::write(&second, &|_| {}).expect("written");
+    journal::write(&second, &support::user(), &|_| {}).expect("written");
     assert_eq!(contents(&dir), between);
-    assert_eq!(journal::undo(&dir).expect("undone").left, 1);
+    assert_eq!(journal::undo(&dir, &support::own()).expect("undone").left, 1);
     fs::write(dir.join("config.json"), &text).expect("a file");
-    assert_eq!(journal::undo(&dir).expect("undone").left, 0);
+    assert_eq!(journal::undo(&dir, &support::own()).expect("undone").left, 0);
     assert_eq!(seen(&dir), before);
-    assert!(matches!(journal::undo(&dir), Err(RepairError::NothingToUndo { .. })));
+    assert!(matches!(journal::undo(&dir, &support::own()), Err(RepairError::NothingToUndo { .. })));
 }
 
 #[test]
@@ -382,7 +435,7 @@ fn links_are_never_written_through() {
     symlink(&blob, dir.join("config.json")).expect("a link");
     let bytes = fs::read(&blob).expect("a file");
     let repair = repair(&dir);
-    let error = journal::write(&repair, &|_| {}).expect_err("refused");
+    let error = journal::write(&repair, &support::user(), &|_| {}).expect_err("refused");
     assert!(error.to_string().contains("--fix --output DIR"), "{error}");
     assert!(!dir.join(".ckpt-doctor").exists());
     let out = room.path().join("repaired");

@@ -127,6 +127,7 @@ fn run(args: &[&OsStr], checkpoints: u64, out: &Path, report: &Path, programs: &
         .arg("--report")
         .arg(format!("json={}", report.display()))
         .env("PATH", programs)
+        .env("XDG_STATE_HOME", crate::support::state())
         .stdin(Stdio::null())
         .stdout(output.try_clone().unwrap())
         .stderr(output)

@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 use serde_json::Value;
 use tempfile::TempDir;
@@ -50,7 +50,7 @@ fn make(draw: &mut Draw, dir: &Path) {
 }
 
 fn doctor(cwd: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).current_dir(cwd).args(args).output().unwrap()
+    crate::support::program().current_dir(cwd).args(args).output().unwrap()
 }
 
 /// The report without what names the settings.

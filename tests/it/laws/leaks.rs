@@ -3,7 +3,6 @@
 use std::fs;
 use std::os::unix::fs::{MetadataExt as _, symlink};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use serde_json::Value;
 use tempfile::TempDir;
@@ -90,7 +89,7 @@ fn plant(draw: &mut Draw, dir: &Path, outside: &Path) -> Vec<PathBuf> {
 
 /// Runs the program; its output and every file below `results` must be free of the secret.
 fn run(args: &[&str], results: &[&Path], context: &str) {
-    let output = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).output().unwrap();
+    let output = support::program().args(args).output().unwrap();
     let said = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
     assert!(output.status.code().is_some_and(|code| code <= 2), "{context}: {args:?}: {:?}: {said}", output.status);
     assert!(!said.contains(SECRET), "{context}: {args:?} says {said}");

@@ -145,6 +145,7 @@ fn check(room: &Path) -> Result<Value, String> {
     let output = Command::new("/bin/sh")
         .args(["-c", &script, env!("CARGO_BIN_EXE_ckpt-doctor"), "check", "--isolated", "--output-format", "json"])
         .arg(room)
+        .env("XDG_STATE_HOME", crate::support::state())
         .output()
         .unwrap();
     serde_json::from_slice(&output.stdout)

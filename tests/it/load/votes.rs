@@ -3,7 +3,6 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use ckpt_doctor::check::inspect::{Inspection, inspect};
 use ckpt_doctor::check::load::LoadReport;
@@ -148,8 +147,7 @@ fn donor(name: &str) -> PathBuf {
 }
 
 fn doctor(dir: &Path, args: &[&str]) -> String {
-    let run =
-        Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).current_dir(dir).arg("inspect").args(args).output().unwrap();
+    let run = crate::support::program().current_dir(dir).arg("inspect").args(args).output().unwrap();
     assert_eq!(run.status.code(), Some(0), "{}", String::from_utf8_lossy(&run.stderr));
     String::from_utf8(run.stdout).unwrap()
 }

@@ -123,6 +123,10 @@ fn names() -> Vec<(&'static str, Value)> {
         ("name twice", json!({ "let": [{ "name": "a", "is": "1" }, { "name": "a", "is": "2" }] })),
         ("name before its definition", json!({ "let": [{ "name": "a", "is": "b" }, { "name": "b", "is": "2" }] })),
         ("regular expression", json!({ "tensors": [{ "from": "from", "names": "^(model" }] })),
+        ("large regular expression", tensors("names", json!("^a(\\pL{50}){50}"))),
+        ("long regular expression", tensors("names", json!("a".repeat(2_001)))),
+        ("long name in the result", tensors("as", json!("$1".repeat(1_001)))),
+        ("very many entries", json!({ "tensors": vec![json!({ "from": "from", "names": "." }); 201] })),
         (
             "treatment",
             json!({ "tensors": [{ "from": "from", "names": "^lm_head", "fit": "opt.rows == 'grow' ? 'grow-row' : 'copy'" }] }),

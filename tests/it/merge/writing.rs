@@ -17,7 +17,7 @@ use super::{copy, donor, json, names, text, tiny};
 /// A merge of the donors in `work`; the fixtures replace missing ones.
 fn merge(work: &Path, out: &Path) -> Command {
     let place = |name: &str| if work.join(name).exists() { work.join(name) } else { donor(name) };
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    let mut command = crate::support::program();
     command.arg("build-merged").arg("--vision").arg(place("spatialvla-tiny"));
     command.arg("--language").arg(place("llava3d-tiny")).arg("--out").arg(out).current_dir(work);
     command
@@ -86,7 +86,7 @@ fn a_donor_inside_the_staging_directory_is_refused() {
     fs::create_dir(&staging).unwrap();
     fs::write(staging.join("ckpt-doctor-owner"), "process 1").unwrap();
     copy(&donor("spatialvla-tiny"), &staging.join("content"));
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    let mut command = crate::support::program();
     command.arg("build-merged").arg("--vision").arg(staging.join("content"));
     command.arg("--language").arg(donor("llava3d-tiny")).arg("--out").arg(work.path().join("out"));
     let run = command.output().unwrap();

@@ -1,13 +1,12 @@
 //! `packaging/data/share/`: the completions and manual pages that packages install.
 
 use std::collections::BTreeSet;
-use std::process::Command;
 
 use super::fresh;
 use crate::support::{files, project};
 
 fn printed(args: &[&str]) -> String {
-    let output = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).output().expect("the program");
+    let output = crate::support::program().args(args).output().expect("the program");
     assert!(output.status.success(), "{args:?}: {output:?}");
     String::from_utf8(output.stdout).expect("text")
 }

@@ -49,7 +49,7 @@ fn cases() -> Vec<Case> {
     };
     vec![
         case("empty directory", &[], &|_| {}),
-        case("a repair that was killed", &[FaultKind::RepairInterrupted], &|root| {
+        case("a repair that was killed", &[FaultKind::ForeignJournal], &|root| {
             fs::create_dir(root.join(".ckpt-doctor")).unwrap();
             fs::write(root.join(".ckpt-doctor/journal.json"), "{}").unwrap();
         }),

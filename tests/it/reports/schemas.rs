@@ -46,7 +46,7 @@ fn holds(validator: &Validator, value: &Value) {
 
 /// The program's JSON output.
 fn printed(dir: &Path, args: &[&str]) -> Value {
-    let output = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor")).args(args).current_dir(dir).output().unwrap();
+    let output = crate::support::program().args(args).current_dir(dir).output().unwrap();
     serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{args:?}: {e}: {output:?}"))
 }
 

@@ -74,7 +74,7 @@ fn round_trip(code: &str, left: &[String], dir: &Path, knowledge: &Knowledge) ->
         return Err(format!("{code} is silent{}", shown(&broken.findings)));
     }
     let repair = plan(&checkpoint, broken, true, &|c| check(c, knowledge));
-    journal::write(&repair, &|_| {}).map_err(|e| format!("writing: {e}"))?;
+    journal::write(&repair, &crate::support::user(), &|_| {}).map_err(|e| format!("writing: {e}"))?;
     let (_, repaired) = looked(dir, knowledge);
     let loud =
         |f: &Finding| f.severity > Severity::Info && !(f.severity == Severity::Warning && left.contains(&f.code));
@@ -84,7 +84,7 @@ fn round_trip(code: &str, left: &[String], dir: &Path, knowledge: &Knowledge) ->
     if files(dir) == before {
         return Err("nothing was written".to_owned());
     }
-    journal::undo(dir).map_err(|e| format!("undo: {e}"))?;
+    journal::undo(dir, &crate::support::own()).map_err(|e| format!("undo: {e}"))?;
     if files(dir) != before {
         return Err("undo has not restored every byte".to_owned());
     }

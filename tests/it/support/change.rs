@@ -20,6 +20,17 @@ mod special {
         use rustix::fs::{CWD, FileType, Mode, mknodat};
         Ok(mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?)
     }
+
+    /// The journal of a repair without files that the user of the tests began in the checkpoint `dir`.
+    pub fn journal(dir: &std::path::Path) -> std::io::Result<()> {
+        use ckpt_doctor::checkpoint::journal::{InodeIdentity, Journal, VERSION};
+        let folder = dir.join(".ckpt-doctor");
+        std::fs::create_dir(&folder)?;
+        let key = ckpt_doctor::surgery::journal::key(&crate::support::user(), dir).map_err(std::io::Error::other)?;
+        let at = Some(InodeIdentity::of(&folder)?);
+        let journal = Journal { version: VERSION, number: 1, folder: at, files: Vec::new(), authenticator: None };
+        std::fs::write(folder.join("journal.json"), serde_json::to_vec(&journal.signed(&key))?)
+    }
 }
 
 /// Windows has no FIFOs.
@@ -28,6 +39,10 @@ mod special {
     pub use std::os::windows::fs::symlink_file as symlink;
 
     pub fn fifo(_: &std::path::Path) -> std::io::Result<()> {
+        Err(std::io::ErrorKind::Unsupported.into())
+    }
+
+    pub fn journal(_: &std::path::Path) -> std::io::Result<()> {
         Err(std::io::ErrorKind::Unsupported.into())
     }
 }
@@ -66,6 +81,8 @@ pub enum Change {
     Fifo(String),
     /// Creates a symbolic link.
     Link { file: String, to: String },
+    /// Begins a repair as the user of the tests, and leaves its journal.
+    OwnJournal,
     /// Creates a folder.
     Folder(String),
     /// Renames the checkpoint's directory.
@@ -224,6 +241,7 @@ fn apply(change: &Change, dir: &Path) -> std::io::Result<()> {
             let _ = fs::remove_file(at(file));
             special::symlink(to, at(file))
         }
+        Change::OwnJournal => special::journal(dir),
         Change::Folder(name) => fs::create_dir(at(name)),
         Change::Directory(_) => Ok(()),
         Change::Header { .. }

@@ -5,11 +5,11 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::record::Journal;
-use crate::checkpoint::open::{JSON_CAP, OpenError, read_own};
-use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL, is_plain_file_name};
+use crate::checkpoint::journal::{InodeIdentity, Journal};
+use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::leftover::Leftover;
+use crate::surgery::trust::Trust;
 use crate::surgery::writers::lock::{self, Lock, LockFile};
 use crate::surgery::writers::system::{self, create, look, retry, sync_dir, with_figures};
 
@@ -27,9 +27,6 @@ const DRAFT: &str = "journal.json.part";
 
 /// The lock file; contains the process of the run.
 const LOCK: &str = "lock";
-
-/// Version of the journal format. Version 1 had no edits of headers.
-pub(super) const VERSION: u32 = 2;
 
 /// What an ended run left in the folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -154,24 +151,50 @@ impl Folder {
         Self::read_journal(&self.journal())
     }
 
+    /// The journal of the latest finished repair; `None` when there is none.
+    pub(super) fn latest(&self) -> Result<Option<Journal>, RepairError> {
+        let Some(number) = self.numbers()?.pop() else { return Ok(None) };
+        let path = self.done(number);
+        match Self::read_journal(&path)? {
+            Some(journal) if journal.number != number => {
+                let reason = format!("it is the journal of repair {}", journal.number);
+                Err(RepairError::UnusableJournal { path, reason })
+            }
+            journal => Ok(journal),
+        }
+    }
+
     /// Reads a journal; `None` when the file is missing.
-    pub(super) fn read_journal(path: &Path) -> Result<Option<Journal>, RepairError> {
-        let unusable = |reason: String| RepairError::UnusableJournal { path: path.to_owned(), reason };
+    fn read_journal(path: &Path) -> Result<Option<Journal>, RepairError> {
         let (folder, name) = (path.parent().unwrap_or(path), path.file_name().unwrap_or_default());
-        // A download may have a journal that is a link.
-        let bytes = match read_own(folder, &[], &name.to_string_lossy(), JSON_CAP) {
-            Err(OpenError::NotFound { .. }) => return Ok(None),
-            other => other.map_err(|e| unusable(e.to_string()))?,
+        let unusable = |reason| RepairError::UnusableJournal { path: path.to_owned(), reason };
+        Journal::read(folder, &name.to_string_lossy()).map_err(unusable)
+    }
+
+    /// Refuses a journal, read from `path`, that this run must not carry out.
+    pub(super) fn admit(&self, journal: &Journal, path: PathBuf, trust: &Trust) -> Result<(), RepairError> {
+        if trust.adopts {
+            return Ok(());
+        }
+        match journal.distrust(&self.path, || trust.user.key(&self.root)) {
+            None => Ok(()),
+            Some(why) => Err(RepairError::ForeignJournal { path, why, folder: self.path.clone() }),
+        }
+    }
+
+    /// What a journal records of this folder.
+    pub(super) fn identity(&self) -> Result<InodeIdentity, RepairError> {
+        Ok(InodeIdentity::of(&self.path).map_err(io_at(&self.path, "reading metadata"))?)
+    }
+
+    /// The number of the next repair.
+    pub(super) fn next_number(&self) -> Result<u32, RepairError> {
+        let latest = self.numbers()?.pop().unwrap_or_default();
+        let unusable = || RepairError::UnusableJournal {
+            path: self.done(latest),
+            reason: "no further repair can have a higher number; delete it".to_owned(),
         };
-        let journal: Journal = serde_json::from_slice(&bytes).map_err(|e| unusable(e.to_string()))?;
-        if !(1..=VERSION).contains(&journal.version) {
-            return Err(unusable(format!("version {} is unknown", journal.version)));
-        }
-        // The checkpoint may come from elsewhere: nothing outside it may be changed.
-        match journal.files.iter().find(|f| !is_plain_file_name(&f.name) || f.name.starts_with('.')) {
-            Some(file) => Err(unusable(format!("{:?} is not a plain file name", file.name))),
-            None => Ok(Some(journal)),
-        }
+        latest.checked_add(1).ok_or_else(unusable)
     }
 
     /// Writes the journal; from here on the next run would finish the repair.

@@ -14,8 +14,10 @@ use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use rustix::fs::OFlags;
+use sha2::{Digest as _, Sha256};
 
-use super::record::HeaderEdit;
+use crate::checkpoint::hex;
+use crate::checkpoint::journal::HeaderEdit;
 use crate::checkpoint::open::{Identity, open_regular};
 use crate::checkpoint::shard::MAX_HEADER;
 use crate::surgery::align::BLOCK;
@@ -92,6 +94,9 @@ impl Headers {
             return Ok(None);
         }
         let mut old = open_regular(path, len).and_then(|opened| opened.read_all(path)).map_err(io::Error::other)?;
+        if edit.sha256.as_ref().is_some_and(|sha256| *sha256 != hex(&Sha256::digest(&old))) {
+            return Ok(None);
+        }
         let at = usize::try_from(edit.old_len).unwrap_or(usize::MAX);
         let new = if old.len() as u64 == len { old.split_off(at) } else { return Ok(None) };
         Ok(Some(Self { old, new, file_len }))
@@ -99,7 +104,9 @@ impl Headers {
 
     /// The record in the journal.
     pub(super) fn record(&self, inode: u64) -> HeaderEdit {
-        HeaderEdit { old_len: self.old.len() as u64, new_len: self.new.len() as u64, inode }
+        let sha256 = Sha256::new().chain_update(&self.old).chain_update(&self.new).finalize();
+        let (old_len, new_len) = (self.old.len() as u64, self.new.len() as u64);
+        HeaderEdit { old_len, new_len, inode, sha256: Some(hex(&sha256)) }
     }
 
     /// The header after the edit.
@@ -478,7 +485,7 @@ mod tests {
         let (edit, len) = (headers.record(1), headers.file_len);
         assert_eq!(Headers::read(&kept, &edit, len).unwrap(), Some(headers));
         for (old_len, new_len) in [(edit.new_len, edit.old_len), (edit.old_len, edit.new_len + 1), (0, u64::MAX)] {
-            assert_eq!(Headers::read(&kept, &HeaderEdit { old_len, new_len, ..edit }, len).unwrap(), None);
+            assert_eq!(Headers::read(&kept, &HeaderEdit { old_len, new_len, ..edit.clone() }, len).unwrap(), None);
         }
         assert!(Headers::read(&kept, &HeaderEdit { old_len: 1, new_len: 2, ..edit }, len).is_err(), "a larger file");
     }

@@ -11,12 +11,13 @@ use sha2::{Digest, Sha256};
 use super::exchange::{Taken, exchange, keep, rename_new, take_away};
 use super::folder::{Folder, remove_file, remove_tree};
 use super::header::{Headers, State};
-use super::record::{HeaderEdit, Journal, JournaledFile, NewFile, OldFile};
 use super::write::copy_owner_and_mode;
 use crate::checkpoint::hex;
+use crate::checkpoint::journal::{HeaderEdit, InodeIdentity, Journal, JournaledFile, NewFile, OldFile};
 use crate::checkpoint::open::{Identity, open_regular};
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
+use crate::surgery::outcome::Change;
 use crate::surgery::writers::system::{look, remove_folder, retry, sync_dir};
 
 /// What the staging folder holds under the name of a file.
@@ -46,15 +47,39 @@ enum StepBack {
     Header(Headers),
 }
 
+impl StepBack {
+    /// What it does to the file.
+    const fn change(&self) -> Change {
+        match self {
+            Self::Exchange(_) | Self::MoveBack | Self::Header(_) => Change::Restored,
+            Self::TakeAway(_) => Change::Removed,
+            Self::Displaced => Change::Returned,
+        }
+    }
+}
+
 /// A journal and its folder.
 pub(super) struct Replay<'a> {
     folder: &'a Folder,
     journal: &'a Journal,
+    /// Whether files in the folder that the journal does not account for are put into place too: another program may have saved
+    /// them, or somebody else may have put them there.
+    adopts: bool,
 }
 
 impl<'a> Replay<'a> {
-    pub(super) const fn new(folder: &'a Folder, journal: &'a Journal) -> Self {
-        Self { folder, journal }
+    pub(super) const fn new(folder: &'a Folder, journal: &'a Journal, adopts: bool) -> Self {
+        Self { folder, journal, adopts }
+    }
+
+    /// What the repair does to each file.
+    pub(super) fn files(&self) -> Vec<(Change, String)> {
+        let change = |entry: &JournaledFile| match (&entry.header, &entry.old) {
+            (Some(_), _) => Change::Edited,
+            (None, Some(_)) => Change::Replaced,
+            (None, None) => Change::Added,
+        };
+        self.journal.files.iter().map(|entry| (change(entry), entry.name.clone())).collect()
     }
 
     fn target(&self, entry: &JournaledFile) -> PathBuf {
@@ -122,7 +147,7 @@ impl<'a> Replay<'a> {
             let Some(edit) = &entry.header else { continue };
             let Some(headers) = self.headers(entry, edit)? else { continue };
             let target = self.target(entry);
-            let is_expected = |m: &Metadata| Some(OldFile::from_metadata(m)) == entry.old && m.ino() == edit.inode;
+            let is_expected = |m: &Metadata| entry.old.as_ref().is_some_and(|old| old.is(m)) && m.ino() == edit.inode;
             match headers.apply(&target, is_expected).map_err(io_at(&target, "editing the header"))? {
                 // Another program may have given the name to another file meanwhile.
                 Some(true) if self.has_new_header(entry, edit)? => {}
@@ -145,7 +170,7 @@ impl<'a> Replay<'a> {
             }
             let ready = match self.staged_file(entry)? {
                 Staged::New => match (look(&target)?, &entry.old) {
-                    (Some(is), Some(was)) => OldFile::from_metadata(&is) == *was,
+                    (Some(is), Some(was)) => was.is(&is),
                     (None, Some(_)) => look(&self.original(entry))?.is_some(),
                     (there, None) => there.is_none(),
                 },
@@ -212,15 +237,17 @@ impl<'a> Replay<'a> {
     }
 
     /// Restores the originals that a repair has replaced, and removes its files. Files that another program has saved
-    /// before they were replaced stay.
+    /// before they were replaced stay. Returns the files that were put back.
     ///
     /// `undo` calls this for a finished repair.
-    pub(super) fn roll_back(&self) -> Result<(), RepairError> {
+    pub(super) fn roll_back(&self) -> Result<Vec<(Change, String)>, RepairError> {
         let mut back = Vec::new();
         for entry in &self.journal.files {
             back.extend(self.step_back(entry)?.map(|step| (entry, step)));
         }
+        let mut files = Vec::new();
         for (entry, step) in back {
+            files.push((step.change(), entry.name.clone()));
             let (target, original) = (self.target(entry), self.original(entry));
             let taken = match step {
                 StepBack::Exchange(new) => exchange(&original, &target, &new),
@@ -237,7 +264,8 @@ impl<'a> Replay<'a> {
             }
         }
         sync_dir(&self.folder.root)?;
-        self.forget()
+        self.forget()?;
+        Ok(files)
     }
 
     /// Restores the header of a shard, and the time of its last change.
@@ -266,7 +294,7 @@ impl<'a> Replay<'a> {
         }
         let staged = self.staged_file(entry)?;
         let new = entry.new.identity(&target)?;
-        Ok(match (staged, look(&original)?, look(&target)?) {
+        let step = match (staged, look(&original)?, look(&target)?) {
             (Staged::Other, _, Some(_)) if new.is_some() => Some(StepBack::Displaced),
             (_, Some(_), None) if entry.new.identity(&original)?.is_some() => None,
             (_, Some(_), None) => Some(StepBack::MoveBack),
@@ -282,7 +310,24 @@ impl<'a> Replay<'a> {
                 (Some(_), Some(_)) => return Err(self.changed_since(original)),
                 (None, _) => None,
             },
-        })
+        };
+        match step {
+            Some(StepBack::Displaced) if !self.adopts => Err(RepairError::Unaccounted { path: self.staged(entry) }),
+            Some(StepBack::Exchange(_) | StepBack::MoveBack) if !self.is_original(entry)? => {
+                Err(RepairError::Unaccounted { path: self.original(entry) })
+            }
+            step => Ok(step),
+        }
+    }
+
+    /// Whether the kept original is the file that the journal recorded, and not one that somebody put there.
+    fn is_original(&self, entry: &JournaledFile) -> Result<bool, RepairError> {
+        let kept = look(&self.original(entry))?;
+        let is_same = |old: &OldFile, kept: &Metadata| {
+            old.is(kept) && old.identity.is_none_or(|was| InodeIdentity::from_metadata(kept).is(was))
+        };
+        let is_recorded = |old: &OldFile| kept.is_some_and(|kept| is_same(old, &kept));
+        Ok(self.adopts || entry.old.as_ref().is_some_and(is_recorded))
     }
 
     fn changed_since(&self, path: PathBuf) -> RepairError {
@@ -294,7 +339,8 @@ impl<'a> Replay<'a> {
         for entry in &self.journal.files {
             let kept = look(&self.original(entry))?.map(|m| m.len());
             let expected = entry.header.as_ref().map(HeaderEdit::kept_len).or(entry.old.as_ref().map(|old| old.len));
-            if kept != expected {
+            let is_recorded = entry.header.is_some() || entry.old.is_none() || self.is_original(entry)?;
+            if kept != expected || !is_recorded {
                 return Ok(Some(self.original(entry)));
             }
             let is_new = match &entry.header {
@@ -326,7 +372,17 @@ fn is_same(a: &Metadata, b: &Metadata) -> bool {
 
 impl OldFile {
     pub(super) fn from_metadata(metadata: &Metadata) -> Self {
-        Self { len: metadata.len(), mtime: (metadata.mtime(), metadata.mtime_nsec()), mode: metadata.mode() & 0o7777 }
+        Self {
+            len: metadata.len(),
+            mtime: (metadata.mtime(), metadata.mtime_nsec()),
+            mode: metadata.mode() & 0o7777,
+            identity: Some(InodeIdentity::from_metadata(metadata)),
+        }
+    }
+
+    /// Whether a file has the length, time and mode of this one. Its identity is another one in a copied directory.
+    fn is(&self, metadata: &Metadata) -> bool {
+        Self { identity: self.identity, ..Self::from_metadata(metadata) } == *self
     }
 }
 

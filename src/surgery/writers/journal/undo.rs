@@ -3,49 +3,49 @@
 use std::path::Path;
 
 use super::folder::Folder;
-use super::record::{Journal, JournaledFile};
 use super::recover::recover_in;
 use super::replay::Replay;
+use crate::checkpoint::journal::{Journal, JournaledFile};
 use crate::surgery::error::RepairError;
-use crate::surgery::outcome::{Recovered, Undone};
+use crate::surgery::outcome::{Recovered, Recovery, Undone};
 use crate::surgery::stop::interrupted;
+use crate::surgery::trust::Trust;
 
 /// Undoes the latest repair of a checkpoint. An interrupted repair is finished or rolled back first.
 ///
 /// # Errors
-/// [`RepairError::NothingToUndo`] without a repair, [`RepairError::ChangedSinceRepair`] when a file changed after the
-/// repair; then no file is changed.
-pub fn undo(root: &Path) -> Result<Undone, RepairError> {
+/// [`RepairError::NothingToUndo`] without a repair, [`RepairError::ForeignJournal`] for a journal that `trust` does not cover,
+/// [`RepairError::ChangedSinceRepair`] when a file changed after the repair; then no file is changed.
+pub fn undo(root: &Path, trust: &Trust) -> Result<Undone, RepairError> {
     let Some(folder) = Folder::open(root)? else { return Err(RepairError::NothingToUndo { path: root.to_owned() }) };
     let pending = folder.pending()?;
-    let (recovered, _) = recover_in(&folder)?;
+    let recovery = recover_in(&folder, trust)?;
     if let Some(journal) = pending
-        && recovered == Some(Recovered::RolledBack)
+        && recovery.outcome == Some(Recovered::RolledBack)
     {
         // The recovery has undone an interrupted repair, or finished an interrupted undo: this is the requested one.
-        return Ok(undone(&folder, &journal));
+        return Ok(undone(&folder, &journal, Recovery::default()));
     }
-    let numbers = folder.numbers()?;
-    let read = numbers.last().map(|number| Folder::read_journal(&folder.done(*number))).transpose()?.flatten();
-    let Some(journal) = read else {
+    let Some(journal) = folder.latest()? else {
         let leftover = folder.tidy();
         let error = RepairError::NothingToUndo { path: root.to_owned() };
         return Err(error.with_leftover(leftover));
     };
-    let replay = Replay::new(&folder, &journal);
+    folder.admit(&journal, folder.done(journal.number), trust)?;
+    let replay = Replay::new(&folder, &journal, trust.adopts);
     if let Some(path) = replay.changed()? {
         return Err(RepairError::ChangedSinceRepair { path, originals: folder.originals(journal.number) });
     }
     interrupted()?;
     folder.reopen(journal.number)?;
     replay.roll_back().map_err(|error| RepairError::Unfinished { error: Box::new(error) })?;
-    Ok(undone(&folder, &journal))
+    Ok(undone(&folder, &journal, recovery))
 }
 
-fn undone(folder: &Folder, journal: &Journal) -> Undone {
+fn undone(folder: &Folder, journal: &Journal, recovery: Recovery) -> Undone {
     let left = folder.numbers().map_or(0, |numbers| numbers.len());
     let leftover = folder.tidy();
     let (restored, removed): (Vec<_>, Vec<_>) = journal.files.iter().partition(|f| f.old.is_some());
     let names = |entries: Vec<&JournaledFile>| entries.into_iter().map(|f| f.name.clone()).collect();
-    Undone { restored: names(restored), removed: names(removed), left, leftover }
+    Undone { recovery, restored: names(restored), removed: names(removed), left, leftover }
 }

@@ -4,13 +4,15 @@ use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
-use super::folder::{Folder, VERSION};
+use super::folder::Folder;
 use super::header::Headers;
-use super::record::{Journal, JournaledFile, NewFile, OldFile};
+use super::key::key;
 use super::replay::Replay;
+use crate::checkpoint::journal::{Journal, JournaledFile, Key, NewFile, OldFile, StateFolder, VERSION};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
+use crate::surgery::outcome::RepairWritten;
 use crate::surgery::repair::{Change, Content, Repair};
 use crate::surgery::stop::interrupted;
 use crate::surgery::writers::changes::{check_unchanged, explain_error, space, write_content};
@@ -19,13 +21,16 @@ use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
 
 /// Replaces the changed files of a repair, all of them or none.
 ///
-/// `progress` receives the bytes written, from several threads.
-/// Call [`super::recover`] before the checkpoint is opened. Returns the files that
-/// could not be removed afterwards.
+/// `user` has the key that signs the journal, or gets one. `progress` receives the bytes written, from several threads.
+/// Call [`super::recover`] before the checkpoint is opened.
 ///
 /// # Errors
 /// A [`RepairError`]; then the checkpoint is unchanged, except with [`RepairError::Unfinished`].
-pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<Leftover>, RepairError> {
+pub fn write(
+    repair: &Repair,
+    user: &StateFolder,
+    progress: &(dyn Fn(u64) + Sync),
+) -> Result<RepairWritten, RepairError> {
     let root = repair.directory()?;
     for change in &repair.changes {
         let path = root.join(&change.name);
@@ -36,8 +41,9 @@ pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<
     }
     let mut steps: Vec<Step<'_>> = repair.changes.iter().map(|change| Step::new(repair, change)).collect();
     let folder = Folder::create(root).map_err(|error| explain_error(error, root, &sizes(root, &steps)))?;
+    let key = key(user, root);
     let written = loop {
-        match attempt(repair, &steps, &folder, progress) {
+        match attempt(repair, &steps, &folder, key.as_ref().ok(), progress) {
             // The second attempt edits nothing in place, so it is the last one.
             Ok(Attempt::NotInPlace) => steps.iter_mut().for_each(|step| step.headers = None),
             Ok(Attempt::Written(leftover)) => break Ok(leftover),
@@ -45,7 +51,7 @@ pub fn write(repair: &Repair, progress: &(dyn Fn(u64) + Sync)) -> Result<Option<
         }
     };
     match written {
-        Ok(leftover) => Ok(leftover.or(folder.tidy())),
+        Ok(leftover) => Ok(RepairWritten { leftover: leftover.or(folder.tidy()), unsigned: key.err() }),
         Err(error) => Err(explain_error(error, root, &sizes(root, &steps)).with_leftover(folder.tidy())),
     }
 }
@@ -93,20 +99,26 @@ fn attempt(
     repair: &Repair,
     steps: &[Step<'_>],
     folder: &Folder,
+    key: Option<&Key>,
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<Attempt, RepairError> {
     let journal = stage(repair, steps, folder, progress)?;
+    let journal = match key {
+        Some(key) => journal.signed(key),
+        None => journal,
+    };
     folder.begin(&journal)?;
-    let replay = Replay::new(folder, &journal);
+    // This run has written the journal and what it names.
+    let replay = Replay::new(folder, &journal, true);
     let undo = || folder.reopen(journal.number).and_then(|()| replay.roll_back());
     let unfinished = |error| RepairError::Unfinished { error: Box::new(error) };
     let finished = match replay.edit_headers() {
-        Ok(false) => return replay.roll_back().map(|()| Attempt::NotInPlace).map_err(unfinished),
+        Ok(false) => return replay.roll_back().map(|_| Attempt::NotInPlace).map_err(unfinished),
         Ok(true) => replay.finish(),
         Err(error) => Err(error),
     };
     finished.map(Attempt::Written).map_err(|error| match undo() {
-        Ok(()) => error,
+        Ok(_) => error,
         Err(_) => unfinished(error),
     })
 }
@@ -127,7 +139,7 @@ fn stage(
     // One more block each for the journal and for the folder of new files, and two for the originals.
     let sizes: Vec<u64> = sizes(root, steps).into_iter().chain([1; 4]).collect();
     check_space(root, &sizes)?;
-    let number = folder.numbers()?.last().map_or(1, |n| n.saturating_add(1));
+    let number = folder.next_number()?;
     let (staging, originals) = (folder.staged(), folder.originals(number));
     folder.folder(&staging)?;
     if steps.iter().any(|step| step.headers.is_some()) {
@@ -161,7 +173,7 @@ fn stage(
     }
     donor.unchanged()?;
     interrupted()?;
-    Ok(Journal { version: VERSION, number, files })
+    Ok(Journal { version: VERSION, number, folder: Some(folder.identity()?), files, authenticator: None })
 }
 
 /// Gives a new file the owner and the mode of the original, and syncs it.

@@ -82,6 +82,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l unsafe
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l diff -d 'Show the changes that the fixes would make, and write nothing'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l fix-only -d 'Apply the fixes as --fix does, but neither report the remaining findings nor fail because of them'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l exit-non-zero-on-fix -d 'Exit with 1 if anything was fixed, even if no finding remains'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l adopt-journal -d 'With --fix: also finish or roll back an interrupted repair that you did not begin in this directory, such as one in a copy. Its journal decides which files are written, so know where the directory comes from'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l statistics -d 'Count the findings of each rule instead of showing them (formats full, concise and json)'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s q -l quiet -d 'Print findings only: neither the table, checkpoints without findings nor the summary (formats full and concise)'
@@ -89,6 +90,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s v -l v
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -l rules -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -l adopt-journal -d 'Also undo a repair that you did not make in this directory, such as one in a copy. Its journal decides which files are written, so know where the directory comes from'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -s h -l help -d 'Print help'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l recipe -d 'Name of a recipe (see `ckpt-doctor recipes`), or a JSON5 file' -r
