@@ -22,6 +22,10 @@ pub fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge) -> Vec<Fault> {
         // transformers loads what it opens with weights_only=True; other pickles have other readers.
         let is_of_torch = shard.faults.iter().all(|fault| fault.kind != FaultKind::NotATorchFile);
         if !is_of_torch || !checkpoint.shards.contains_key(&shard.name) {
+            let is_unknown = |global: &&PickleGlobal| !knowledge.pickles.is_written(&shard.name, global);
+            let unknown: Vec<_> = others.into_iter().filter(is_unknown).collect();
+            let fault = imports(FaultKind::PickleGlobalUnknown, shard, &unknown);
+            faults.extend(fault.map(|fault| fault.with("content", knowledge.pickles.content(&shard.name))));
             continue;
         }
         let refused: Vec<_> = others.into_iter().filter(|global| !knowledge.pickles.accepts_import(global)).collect();

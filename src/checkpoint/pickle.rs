@@ -12,10 +12,12 @@ use super::shard::header::other_format;
 use super::work::Work;
 use super::{Checkpoint, Fault, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Place, Shard, Source, SourceFile, adapter};
 
+mod beside;
 mod call;
 mod element;
 mod legacy;
 mod machine;
+mod member;
 mod opcode;
 mod ranges;
 mod state_dict;
@@ -42,7 +44,7 @@ pub enum PickleFormat {
 }
 
 /// A module's attribute that a pickle imports.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct PickleGlobal {
     /// Module, under its name in Python 3.
     pub module: String,
@@ -52,6 +54,18 @@ pub struct PickleGlobal {
     pub offset: u64,
     /// Whether the pickle calls it.
     pub called: bool,
+    /// How often the pickle puts it on the stack.
+    pub uses: u64,
+    /// How often it is `builtins.getattr`, called for a member of an imported class, which is a global of its own.
+    pub members: u64,
+}
+
+impl PickleGlobal {
+    /// Whether it is `builtins.getattr` and has no other use than to name members of imported classes.
+    #[must_use]
+    pub const fn only_names_members(&self) -> bool {
+        self.members > 0 && self.members == self.uses
+    }
 }
 
 /// The tensors that are in a dict under one key of the state dict.
@@ -68,7 +82,7 @@ pub struct NestedTensors {
 }
 
 /// What a pickle has besides tensors; of a [`Shard`] that is a pickle.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Pickle {
     /// The container.
     pub format: PickleFormat,
@@ -84,6 +98,8 @@ pub struct Pickle {
     pub others: Vec<String>,
     /// The first construct that is not modelled. Then the load of the file is not predicted.
     pub doubt: Option<String>,
+    /// The fault of a file that may import more than was read of it, for one that no loader opens.
+    pub unread: Option<Fault>,
 }
 
 impl Shard {
@@ -234,7 +250,7 @@ pub(super) fn is_pickle_name(name: &str) -> bool {
     let is_weights = |start: &&str| name.starts_with(*start);
     match name.rsplit_once('.') {
         Some((_, "bin")) => ["pytorch_model", "adapter_model"].iter().any(is_weights),
-        Some((_, "pt" | "pth" | "pkl" | "ckpt")) => true,
+        Some((_, "pt" | "pth" | "pkl" | "pickle" | "ckpt" | "joblib")) => true,
         _ => false,
     }
 }
@@ -278,8 +294,7 @@ impl Checkpoint {
             }
         }
         for (name, pickle) in &mut self.pickles {
-            let is_state = is_training_state(name);
-            pickle.faults.retain(|fault| fault.kind == FaultKind::PickleCutShort && !is_state);
+            beside::keep_faults(pickle, is_training_state(name));
             pickle.tensors.clear();
             pickle.unread = true;
         }

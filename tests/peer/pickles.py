@@ -2,7 +2,8 @@
 mutated files.
 
 For a file that torch opens: names, dtypes, shapes, strides, offsets and digests of the bytes. For a mutated file: what the
-reader calls whole, torch opens, with the same tensors.
+reader calls whole, torch opens, with the same tensors. For an odd container, opened as transformers does: also, what has a
+fault, torch refuses; where the reader is in doubt, either may be.
 
     cargo build --example read_pickles
     python tests/peer/pickles.py target/debug/examples/read_pickles [--dicts 300] [--mutations 3000] [--seed 1]
@@ -16,10 +17,13 @@ import json
 import pathlib
 import random
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
 import warnings
+import zipfile
+import zlib
 
 import torch
 
@@ -204,6 +208,84 @@ def compare_mutated(name, data, found):
     ]
 
 
+def archive(members, disks=(0, 0), comment=b"", attributes=(), compressed=(), parts=(), count=None):
+    """A zip archive with fields that torch does not write; `attributes` and others have names of members without the folder."""
+    out, directory = bytearray(), bytearray()
+    for name, data in members:
+        short = name.partition("/")[2]
+        method, packed = (8, zlib.compress(data, wbits=-15)) if short in compressed else (0, data)
+        head = struct.pack("<HHHHIIIHH", 0, method, 0, 0, zlib.crc32(data), len(packed), len(data), len(name), 0)
+        part, attribute = int(short in parts), 0x10 * (short in attributes)
+        directory += b"PK\1\2\x14\0\x14\0" + head + struct.pack("<HHHII", 0, part, 0, attribute, len(out)) + name.encode()
+        out += b"PK\3\4\x14\0" + head + name.encode() + packed
+    count = len(members) if count is None else count
+    sizes = struct.pack("<HHHHIIH", *disks, count, count, len(directory), len(out), len(comment))
+    return bytes(out + directory + b"PK\5\6" + sizes + comment)
+
+
+def odd():
+    """Containers that torch does not write, by name."""
+    state = {"a": torch.arange(6, dtype=torch.float32).reshape(2, 3), "b": torch.ones(4)}
+    sound, legacy = zipfile.ZipFile(io.BytesIO(saved(state, False))), saved(state, True)
+    members = [(name, sound.read(name)) for name in sound.namelist()]
+    folder = members[0][0].partition("/")[0]
+    made = {"plain": archive(members), "an older file with an end record": legacy + b"PK\5\6" + bytes(18)}
+    made["an older file with an archive"] = legacy + archive(members)
+    made["an older file with the start of an end record"] = legacy + b"PK\5\6" + bytes(10)
+    for disks in [(0xFFFF, 0), (0, 0xFFFF), (0xFFFF, 0xFFFF), (1, 0), (0, 1), (1, 1), (2, 2)]:
+        made[f"parts {disks}"] = archive(members, disks)
+    made["all of part 1"] = archive(members, (1, 1), parts=[name.partition("/")[2] for name, _ in members])
+    made["too many members"] = archive(members, count=0xFFFF)
+    for name in ["data/0", "data.pkl", "DATA/0", "DATA.pkl", "version", "VERSION", "x", "byteorder"]:
+        made[f"twice {name}"] = archive([*members, (f"{folder}/{name}", bytes(24)), (f"{folder}/{name}", bytes(24))])
+        made[f"{name} of zeros at the start"] = archive([(f"{folder}/{name}", bytes(24)), *members])
+    for name in [name.partition("/")[2] for name, _ in members]:
+        made[f"compressed {name}"] = archive(members, compressed=[name])
+        made[f"folder {name}"] = archive(members, attributes=[name])
+        made[f"part 1 {name}"] = archive(members, parts=[name])
+        renamed = [(f"{folder}/{name.upper()}" if old == f"{folder}/{name}" else old, data) for old, data in members]
+        made[f"capitals {name}"] = archive(renamed)
+    for comment in [b"PK\5\6", b"xxPK\5\6yy", b"PK\5\6" + bytes(18), b"hello"]:
+        made[f"comment {comment}"] = archive(members, comment=comment)
+    for behind in [b"PK\5\6", bytes(30), bytes(4000), bytes(4096), bytes(65_000), bytes(65_535), bytes(66_000), bytes(80_000)]:
+        made[f"{len(behind)} bytes behind it, {behind[:4]}"] = archive(members) + behind
+    made["another folder"] = archive([*members, ("other/x", b"")])
+    return made
+
+
+def opened_by_transformers(path):
+    """What torch reads for transformers, which asks for a map of what Python takes for a zip archive."""
+    options = {"mmap": True} if zipfile.is_zipfile(path) else {}
+    try:
+        return torch.load(path, weights_only=True, map_location="cpu", **options), None
+    except Exception as error:  # whatever torch raises
+        return None, f"{type(error).__name__}: {str(error)[:200]}"
+
+
+def compare_odd(dump, folder):
+    """The differences for odd containers, and how many of them are whole, have a fault, or are in doubt."""
+    problems, counts, made = [], collections.Counter(), odd()
+    found = read(dump, folder, [(f"{n}.bin", data) for n, data in enumerate(made.values())])
+    for n, (name, data) in enumerate(made.items()):
+        path, said = folder / "odd.bin", found[f"{n}.bin"]
+        path.write_bytes(data)
+        value, error = opened_by_transformers(path)
+        if said["whole"]:
+            counts["whole"] += 1
+            if error or said["tensors"] != expected(value):
+                problems.append(f"{name}: called whole, but torch: {error or expected(value)}")
+        elif said["doubt"]:
+            counts["doubt"] += 1
+            if said["faults"]:
+                problems.append(f"{name}: in doubt, and {said['faults']}")
+        else:
+            counts["fault"] += 1
+            if not error:
+                problems.append(f"{name}: {said['faults']}, but torch opens it")
+        path.unlink()
+    return problems, counts
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("dump")
@@ -234,10 +316,13 @@ def main():
                 if differences:
                     pathlib.Path(tempfile.gettempdir(), f"pickle-{args.seed}-{name}").write_bytes(data)
                 problems += differences
+        odd_problems, counts = compare_odd(args.dump, folder)
+        problems += odd_problems
     print(f"{len(sound)} state dicts, half in each format; {len(files)} mutated files, {whole} of them whole")
+    print(f"odd containers: {dict(counts)}")
     for problem in problems[:40]:
         print(problem)
-    if whole == 0 or len(sound) < 2 * args.dicts:
+    if whole == 0 or min(counts[kind] for kind in ("whole", "fault", "doubt")) == 0 or len(sound) < 2 * args.dicts:
         sys.exit("too few files were compared")
     sys.exit(1 if problems else 0)
 

@@ -79,7 +79,7 @@ def integer(value):
 GLOBALS = [
     ("collections", "OrderedDict"), ("torch", "Size"), ("torch._utils", "_rebuild_tensor_v2"), ("torch._utils", "_rebuild_tensor"),
     ("torch._utils", "_rebuild_tensor_v3"), ("torch._utils", "_rebuild_parameter"), ("torch", "FloatStorage"), ("torch", "float32"),
-    ("os", "system"), ("torch.storage", "UntypedStorage"), ("torch.serialization", "_get_layout"), ("builtins", "list"),
+    ("os", "system"), ("torch.storage", "UntypedStorage"), ("torch.serialization", "_get_layout"), ("builtins", "list"), ("builtins", "getattr"),
 ]  # fmt: skip
 
 
@@ -151,6 +151,7 @@ def snippet(p):
         lambda: b"(" + p.any() + p.get("FloatStorage") + text("0") + p.any() + integer(1) + b"tQ0",
         lambda: p.get("hooks") + p.any() + b"b0",
         lambda: p.any() + p.any() + b"b0",
+        lambda: p.get("getattr") + p.any() + p.get("text") + b"\x86R0",
         lambda: p.any() + p.any() + b"\x810",
         lambda: p.any() + p.any() + p.any() + b"\x920",
         lambda: b"(" + p.any() * 3 + b"o0",

@@ -128,6 +128,8 @@ fault_kinds! {
         PartialDownload = "partial-download" { of: Text },
         PatternsNotCompared = "patterns-not-compared" {},
         PickleCutShort = "pickle-cut-short" { what: Text, missing: OrNull(&Integer), file_len: Integer, zip: Flag },
+        PickleImportsSkipped = "pickle-imports-skipped" { reason: Text, offset: Integer },
+        PickleImportsUnread = "pickle-imports-unread" { reason: Text, offset: Integer },
         PickleMalformed = "pickle-malformed" { reason: Text, offset: Integer },
         PickleNested = "pickle-nested" { key: Text, tensors: Integer, first: Text, keys: List(&Text) },
         PickleNotAStateDict = "pickle-not-a-state-dict" { what: Text },
@@ -268,6 +270,9 @@ fault_kinds! {
         },
         PickleGlobalRefused = "pickle-global-refused" {
             imports: List(&Text), count: Integer, import: Text, offset: Integer, called: Flag,
+        },
+        PickleGlobalUnknown = "pickle-global-unknown" {
+            imports: List(&Text), count: Integer, import: Text, offset: Integer, called: Flag, content: Text,
         },
         PickleOpcodeRefused = "pickle-opcode-refused" { opcodes: List(&Text), offset: Integer },
         PickleWeights = "pickle-weights" { tensors: Integer, read: Flag, reason?: Text, strided?: Integer },

@@ -30,6 +30,8 @@ pub(super) enum Known {
     Size,
     /// `torch.serialization._get_layout`, whose result only sparse tensors have.
     Layout,
+    /// `builtins.getattr`.
+    Getattr,
     /// Anything else.
     Other,
 }
@@ -45,6 +47,7 @@ impl Known {
             ("torch._utils", "_rebuild_parameter") => Some(Self::RebuildParameter),
             ("torch", "Size") => Some(Self::Size),
             ("torch.serialization", "_get_layout") => Some(Self::Layout),
+            ("builtins", "getattr") => Some(Self::Getattr),
             ("torch" | "torch.cuda", name) if name.ends_with("Storage") => Element::of_storage(name).map(Self::Storage),
             ("torch", name) => Element::of_dtype(name).map(Self::Dtype),
             _ => None,
@@ -65,6 +68,7 @@ impl Machine<'_> {
             (Known::OrderedDict, []) => Some(self.heap.add_dict(DictKind::Ordered)),
             (Known::OrderedDict, [Value::List(pairs)]) if !is_new => self.ordered(*pairs)?,
             _ if is_new => None,
+            (Known::Getattr, [Value::Global(class), Value::Text(name)]) => return self.member(id, *class, *name),
             (Known::Layout, [Value::Text(_)]) => Some(Value::Object),
             (Known::Size, [Value::Tuple(sizes)]) => {
                 self.work.spend(self.heap.tuple(*sizes).len(), VALUE)?;

@@ -6,7 +6,7 @@
 use super::machine::{Machine, Stop, StorageIds};
 use super::storage::{Storages, Stored, claimed};
 use super::value::Value;
-use super::{PICKLE_CAP, PickleReader, Problem, state_dict};
+use super::{PICKLE_CAP, PickleReader, Problem, beside, state_dict, zip};
 use crate::checkpoint::SourceFile;
 use crate::checkpoint::work::Work;
 
@@ -37,6 +37,9 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
     let result = pickles(&mut machine);
     reader.record(&machine);
     reader.budget.spend(u64::try_from(machine.at).unwrap_or(u64::MAX));
+    if let Err(stop) = result {
+        reader.pickle.unread = beside::unread(&reader.shard.name, &machine, stop, file.len() > PICKLE_CAP);
+    }
     let (value, keys) = result.map_err(|stop| problem(stop, machine.offset, longer))?;
     if let Some(doubt) = machine.doubt.take() {
         // The storages lie one after another, and the length of one is unknown.
@@ -44,6 +47,9 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
         return Ok(());
     }
     let storages = storages(reader, file, &machine, keys, longer)?;
+    if zip::has_end_record(file)? {
+        reader.pickle.doubt = Some("an end record of a zip archive follows the tensors".to_owned());
+    }
     state_dict::read(reader, &mut machine, value, &storages)
 }
 
@@ -52,10 +58,12 @@ pub(super) fn read_plain(reader: &mut PickleReader<'_>, file: &SourceFile, work:
     let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
     work.grant(u64::try_from(bytes.len()).unwrap_or(u64::MAX));
     let mut machine = Machine::new(&bytes, StorageIds::None, work);
-    let is_whole = machine.run().is_ok();
+    let stop = machine.run().err();
     reader.record(&machine);
     reader.budget.spend(u64::try_from(machine.at).unwrap_or(u64::MAX));
-    Ok(is_whole)
+    let longer = file.len() > PICKLE_CAP;
+    reader.pickle.unread = stop.and_then(|stop| beside::unread(&reader.shard.name, &machine, stop, longer));
+    Ok(stop.is_none())
 }
 
 /// The state dict and the list of keys.

@@ -197,6 +197,11 @@ impl<'p> Machine<'p> {
             return Err(Stop::TooLarge("stack"));
         }
         self.stack.push(value);
+        if let Value::Global(id) = value
+            && let Some(global) = self.globals.get_mut(id as usize)
+        {
+            global.uses = global.uses.saturating_add(1);
+        }
         Ok(())
     }
 
@@ -211,10 +216,9 @@ impl<'p> Machine<'p> {
         self.stack.pop().ok_or(Stop::Broken("the stack is empty"))
     }
 
-    fn top(&mut self) -> Result<Value, Stop> {
-        let value = self.pop()?;
-        self.push(value)?;
-        Ok(value)
+    fn top(&self) -> Result<Value, Stop> {
+        let top = if self.stack.len() > self.floor() { self.stack.last() } else { None };
+        top.copied().ok_or(Stop::Broken("the stack is empty"))
     }
 
     fn pop_mark(&mut self) -> Result<Vec<Value>, Stop> {
@@ -518,6 +522,11 @@ impl<'p> Machine<'p> {
         self.work.spend(1, CALL)?;
         let utf8 = |bytes| std::str::from_utf8(bytes).map_err(|_| Stop::Broken("a string is not valid UTF-8"));
         let (module, name) = (python3(utf8(module)?), utf8(name)?);
+        self.global(module, name)
+    }
+
+    /// The attribute of a module, which is recorded at its first use.
+    pub(super) fn global(&mut self, module: &str, name: &str) -> Result<Value, Stop> {
         let key = (module.to_owned(), name.to_owned());
         if let Some(id) = self.names.get(&key) {
             return Ok(Value::Global(*id));
@@ -526,8 +535,9 @@ impl<'p> Machine<'p> {
             return Err(Stop::TooLarge("imports"));
         }
         let id = number(self.globals.len());
-        let global =
-            PickleGlobal { module: module.to_owned(), name: name.to_owned(), offset: self.offset, called: false };
+        let (module_name, attribute) = (module.to_owned(), name.to_owned());
+        let offset = self.offset;
+        let global = PickleGlobal { module: module_name, name: attribute, offset, ..PickleGlobal::default() };
         self.globals.push(global);
         self.known.push(Known::new(module, name));
         self.names.insert(key, id);

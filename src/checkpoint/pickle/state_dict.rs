@@ -117,7 +117,7 @@ fn add(reader: &mut PickleReader<'_>, machine: &Machine<'_>, storages: &Storages
     let (Some(layout), Some(dtype)) = (entry, tensor.element.dtype) else {
         if tensor.element.dtype.is_none() {
             reader.pickle.doubt.get_or_insert_with(|| format!("{} has elements of an unusual type", escape(name, 80)));
-        } else if reader.faults.is_empty() {
+        } else if reader.faults.is_empty() && reader.pickle.doubt.is_none() {
             reader.storage_fault("", Some(name), 0, None);
         }
         reader.shard.unreadable.push(name.to_owned());

@@ -3,11 +3,11 @@
 //! Only the directory at the end of the archive is believed; nothing is ever inflated. Format: APPNOTE.TXT 6.3.10. What
 //! torch requires: `caffe2/serialize/inline_container.cc` of torch 2.15.0.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 use super::machine::{Machine, StorageIds};
 use super::storage::{Storages, Stored, claimed};
-use super::{PICKLE_CAP, PickleReader, Problem, legacy, state_dict};
+use super::{PICKLE_CAP, PickleReader, Problem, beside, legacy, state_dict};
 use crate::checkpoint::SourceFile;
 use crate::checkpoint::work::Work;
 
@@ -16,6 +16,9 @@ const DIRECTORY_CAP: u64 = 32 << 20;
 /// Bytes of the end record without its comment, and of the longest comment.
 const END: u64 = 22;
 const MAX_COMMENT: u64 = 65_535;
+/// Size of the blocks in which torch searches the end record from the end of the file; the last one starts before the longest
+/// comment. Beyond the first one it fails for some lengths of the file.
+const BLOCK: u64 = 4096;
 /// Maximum number of bytes of a member that holds a number or a word.
 const WORD_CAP: u64 = 64;
 
@@ -28,6 +31,8 @@ struct Member {
     /// By the attribute of DOS; torch reads nothing of one.
     is_folder: bool,
     is_stored: bool,
+    /// Number of the part of the archive that it is in: 0 or 1.
+    disk: u16,
     bytes: u64,
     packed: u64,
     /// Start of its local header.
@@ -38,10 +43,22 @@ struct Member {
 struct Archive {
     /// The folder in which all members are.
     folder: String,
+    /// Members by their name in lower case: torch finds them without regard to case.
     members: HashMap<String, Member>,
     /// Start of the directory: members end before it.
     directory: u64,
+    /// What torch opens and never writes, so that the load is not predicted.
+    doubt: Option<&'static str>,
+    /// Whether two members have one name.
+    has_twins: bool,
 }
+
+/// Members that hold a number or a word.
+const WORDS: [&str; 6] =
+    ["version", ".data/version", ".format_version", ".data/serialization_id", ".storage_alignment", "byteorder"];
+
+/// The doubt about an archive of which torch may read either of two members.
+const TWINS: &str = "two members of the archive have one name";
 
 fn malformed(reason: &str, offset: u64) -> Problem {
     Problem::Malformed(reason.to_owned(), offset)
@@ -55,11 +72,16 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
     }
     let member =
         archive.member("data.pkl").ok_or_else(|| Problem::Other("a zip archive without data.pkl".to_owned()))?;
+    reader.pickle.doubt = archive.doubt.map(str::to_owned);
+    if archive.has_twins {
+        reader.pickle.unread = Some(beside::hidden(&reader.shard.name, TWINS));
+    }
     if !member.is_stored {
-        reader.pickle.doubt = Some("its members are compressed".to_owned());
         return Ok(());
     }
-    archive.check_version(file)?;
+    if archive.doubt.is_none() {
+        archive.check_version(file)?;
+    }
     let range = archive.range(file, member)?;
     if range.bytes > PICKLE_CAP {
         return Err(Problem::TooLarge("bytes"));
@@ -72,6 +94,13 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
     let mut machine = Machine::new(&bytes, StorageIds::Zip, work);
     let result = machine.run();
     reader.record(&machine);
+    if archive.has_twins {
+        // Which of them torch reads is unknown.
+        return Ok(());
+    }
+    if let Err(stop) = result {
+        reader.pickle.unread = beside::unread(&reader.shard.name, &machine, stop, false);
+    }
     let value = result.map_err(|stop| legacy::problem(stop, machine.offset, None))?;
     let storages = storages(reader, file, &archive, &machine)?;
     state_dict::read(reader, &mut machine, value, &storages)
@@ -91,10 +120,12 @@ fn storages(
             reader.storage_fault(&key, None, bytes, None);
             continue;
         };
+        if !member.is_stored || member.is_folder {
+            // The archive has a doubt.
+            continue;
+        }
         let range = archive.range(file, member)?;
-        if !member.is_stored {
-            reader.pickle.doubt.get_or_insert_with(|| "its members are compressed".to_owned());
-        } else if member.bytes == bytes {
+        if member.bytes == bytes {
             ranges.push((member.header, range.begin.saturating_add(range.bytes)));
             storages.by_key.insert(key, range);
         } else {
@@ -117,8 +148,13 @@ impl Archive {
         }
         let bytes = file.bytes(end.directory, end.bytes)?;
         let mut fields = Fields { bytes: &bytes, at: 0, base: end.directory };
-        let mut archive = Self { folder: String::new(), members: HashMap::new(), directory: end.directory };
-        let mut folded = HashSet::new();
+        let mut archive = Self {
+            folder: String::new(),
+            members: HashMap::new(),
+            directory: end.directory,
+            doubt: end.doubt,
+            has_twins: false,
+        };
         for number in 0..end.members {
             let offset = fields.offset();
             let (name, member) = fields.member()?;
@@ -133,17 +169,37 @@ impl Archive {
             if member.header.saturating_add(30).saturating_add(member.packed) > end.directory {
                 return Err(malformed("a member of the archive lies outside of it", offset));
             }
-            // torch finds members without regard to case.
-            if !folded.insert(name.to_ascii_lowercase()) {
-                return Err(malformed("two members of the archive have one name", offset));
-            }
-            archive.members.insert(name, member);
+            archive.add(&name, member);
         }
         Ok(archive)
     }
 
+    /// Keeps a member, and notes what is unusual about it.
+    fn add(&mut self, name: &str, member: Member) {
+        let folded = name.to_ascii_lowercase();
+        let inside = folded.get(self.folder.len().saturating_add(1)..).unwrap_or_default();
+        let is_storage = inside.starts_with("data/");
+        let is_read = is_storage || inside == "data.pkl" || WORDS.contains(&inside);
+        let doubt = if is_read && !member.is_stored {
+            Some("its members are compressed")
+        } else if is_read && name.get(self.folder.len().saturating_add(1)..) != Some(inside) {
+            Some("names of its members have other letters in upper case than torch writes")
+        } else if (is_storage || inside == ".format_version") && member.is_folder {
+            Some("a member that is read has the attribute of a folder")
+        } else if member.disk == 1 {
+            Some("a member names another part of the archive")
+        } else {
+            None
+        };
+        if self.members.insert(folded, member).is_some() {
+            self.has_twins = true;
+            self.doubt = self.doubt.or(Some(TWINS));
+        }
+        self.doubt = self.doubt.or(doubt);
+    }
+
     fn member(&self, name: &str) -> Option<Member> {
-        self.members.get(&format!("{}/{name}", self.folder)).copied()
+        self.members.get(&format!("{}/{name}", self.folder).to_ascii_lowercase()).copied()
     }
 
     /// The bytes of a member, which its local header precedes.
@@ -169,8 +225,12 @@ impl Archive {
     /// The content of a member that is a word; `None` when it is missing.
     fn word(&self, file: &SourceFile, name: &str) -> Result<Option<Vec<u8>>, Problem> {
         let Some(member) = self.member(name) else { return Ok(None) };
+        if !member.is_stored {
+            // The archive has a doubt.
+            return Ok(None);
+        }
         let range = self.range(file, member)?;
-        if !member.is_stored || range.bytes > WORD_CAP {
+        if range.bytes > WORD_CAP {
             return Err(malformed("a member of the archive that states a number has another content", member.header));
         }
         file.bytes(range.begin, range.bytes).map(Some)
@@ -214,32 +274,58 @@ struct EndRecord {
     /// Start and length of the directory.
     directory: u64,
     bytes: u64,
+    doubt: Option<&'static str>,
+}
+
+/// Whether Python's `zipfile.is_zipfile` finds an end record, for which transformers asks torch to map a file, and torch
+/// refuses those of the old format. Some versions of Python look at the directory, too.
+///
+/// Source: `load_state_dict` in `modeling_utils.py` of transformers 4.47, 4.57 and 5.23; `_EndRecData` in `Lib/zipfile` of
+/// `CPython` 3.11 to 3.13.
+pub(super) fn has_end_record(file: &SourceFile) -> Result<bool, Problem> {
+    let len = file.len().min(END.saturating_add(MAX_COMMENT));
+    let tail = file.bytes(file.len().saturating_sub(len), len)?;
+    let at = memchr::memmem::rfind(&tail, b"PK\x05\x06");
+    Ok(at.and_then(|at| tail.get(at..)).is_some_and(|record| record.first_chunk::<22>().is_some()))
 }
 
 impl EndRecord {
     /// Searches the end record from the end of the file.
     fn find(file: &SourceFile) -> Result<Self, Problem> {
         let cut = || Problem::Cut("the directory at the end of the archive".to_owned(), None);
-        let tail_len = file.len().min(END.saturating_add(MAX_COMMENT));
+        let tail_len = file.len().min(END.saturating_add(MAX_COMMENT).saturating_add(BLOCK));
         let start = file.len().saturating_sub(tail_len);
         let tail = file.bytes(start, tail_len)?;
-        let at = memchr::memmem::rfind(&tail, b"PK\x05\x06").ok_or_else(cut)?;
+        // A record has 22 bytes; torch passes over a later signature.
+        let complete = tail.get(..tail.len().saturating_sub(18)).unwrap_or_default();
+        let at = memchr::memmem::rfind(complete, b"PK\x05\x06").ok_or_else(cut)?;
         let record = tail.get(at..).and_then(<[u8]>::first_chunk::<22>).ok_or_else(cut)?;
         let position = start.saturating_add(u64::try_from(at).unwrap_or(u64::MAX));
         let fields = Fields { bytes: record, at: 0, base: position };
+        let is_far = file.len().saturating_sub(position) > BLOCK;
+        let disks = (fields.peek_u16(4), fields.peek_u16(6));
+        let doubt = match disks {
+            _ if is_far => Some("its end record is far from its end"),
+            (1, 1) => Some("its end record calls it a part of an archive"),
+            _ => None,
+        };
         let narrow = Self {
             members: u64::from(fields.peek_u16(10)),
             directory: u64::from(fields.peek_u32(16)),
             bytes: u64::from(fields.peek_u32(12)),
+            doubt,
         };
-        let is_alone = [4, 6].into_iter().all(|at| matches!(fields.peek_u16(at), 0 | u16::MAX));
+        let wide = Self::wide(file, position)?;
+        let is_alone = match disks {
+            (0, 0) | (1, 1) => true,
+            // Then torch reads the numbers of the 64-bit record.
+            (0 | u16::MAX, 0 | u16::MAX) => wide.is_some(),
+            _ => false,
+        };
         if !is_alone || fields.peek_u16(8) != fields.peek_u16(10) {
             return Err(malformed("the archive is a part of several", position));
         }
-        let (end, limit) = match Self::wide(file, position)? {
-            Some(wide) => wide,
-            None => (narrow, position),
-        };
+        let (end, limit) = wide.map_or((narrow, position), |(wide, limit)| (Self { doubt, ..wide }, limit));
         let is_inside = end.directory.checked_add(end.bytes).is_some_and(|stop| stop <= limit);
         if !is_inside || end.members.saturating_mul(46) > end.bytes {
             return Err(malformed("the directory of the archive is not where its end record says", position));
@@ -270,7 +356,12 @@ impl EndRecord {
         if !is_alone || fields.peek_u64(4) < 44 {
             return Err(malformed("the archive is a part of several", record_at));
         }
-        let end = Self { members: fields.peek_u64(32), directory: fields.peek_u64(48), bytes: fields.peek_u64(40) };
+        let end = Self {
+            members: fields.peek_u64(32),
+            directory: fields.peek_u64(48),
+            bytes: fields.peek_u64(40),
+            doubt: None,
+        };
         Ok(Some((end, record_at)))
     }
 }
@@ -319,8 +410,8 @@ impl<'b> Fields<'b> {
         if !head.bytes.starts_with(b"PK\x01\x02") {
             return Err(malformed("the directory of the archive has another entry", offset));
         }
-        let (flags, method) = (head.peek_u16(8), head.peek_u16(10));
-        if flags & REFUSED_FLAGS != 0 || head.peek_u16(34) != 0 {
+        let (flags, method, disk) = (head.peek_u16(8), head.peek_u16(10), head.peek_u16(34));
+        if flags & REFUSED_FLAGS != 0 || disk > 1 {
             return Err(malformed("a member of the archive is encrypted, a patch, or in another archive", offset));
         }
         let name = self.take(usize::from(head.peek_u16(28)))?;
@@ -335,7 +426,7 @@ impl<'b> Fields<'b> {
         }
         let name = std::str::from_utf8(name).map_err(|_| malformed("a name in the archive is not UTF-8", offset))?;
         let name = name.to_owned();
-        Ok((name, Member { is_folder, is_stored, bytes, packed, header }))
+        Ok((name, Member { is_folder, is_stored, disk, bytes, packed, header }))
     }
 }
 
