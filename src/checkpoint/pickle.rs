@@ -249,7 +249,7 @@ fn what_is(head: &[u8]) -> Option<String> {
 pub(super) fn is_pickle_name(name: &str) -> bool {
     let is_weights = |start: &&str| name.starts_with(*start);
     match name.rsplit_once('.') {
-        Some((_, "bin")) => ["pytorch_model", "adapter_model"].iter().any(is_weights),
+        Some((_, "bin")) => ["pytorch_model", "adapter_model"].iter().any(is_weights) || is_training_state(name),
         Some((_, "pt" | "pth" | "pkl" | "pickle" | "ckpt" | "joblib")) => true,
         _ => false,
     }

@@ -126,7 +126,6 @@ fault_kinds! {
         OddTensorName = "odd-tensor-name" { reason: Text, bytes: Integer },
         OffsetsOutOfOrder = "offsets-out-of-order" { begin: Integer, end: Integer },
         PartialDownload = "partial-download" { of: Text },
-        PatternsNotCompared = "patterns-not-compared" {},
         PickleCutShort = "pickle-cut-short" { what: Text, missing: OrNull(&Integer), file_len: Integer, zip: Flag },
         PickleImportsSkipped = "pickle-imports-skipped" { reason: Text, offset: Integer },
         PickleImportsUnread = "pickle-imports-unread" { reason: Text, offset: Integer },
@@ -265,6 +264,7 @@ fault_kinds! {
         NoTensors = "no-tensors" { shards: Integer },
         NoWeights = "no-weights" { model: Flag, unread?: List(&Text), foreign?: List(&Text) },
         OwnModuleAsPackage = "own-module-as-package" { module: Text, packages: List(&Text) },
+        PatternsNotCompared = "patterns-not-compared" {},
         PickleGlobalHarmful = "pickle-global-harmful" {
             imports: List(&Text), count: Integer, import: Text, offset: Integer, called: Flag,
         },

@@ -17,6 +17,8 @@ use tempfile::TempDir;
 
 use super::shards::file;
 use super::{Case, hold, open_with};
+use crate::support::change::own_journal;
+use crate::support::user;
 
 fn fifo(path: &Path) {
     let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
@@ -36,7 +38,8 @@ fn cases() -> Vec<Case> {
         let root = dir.path().join("repo/snapshots/main");
         fs::create_dir_all(&root).unwrap();
         build(&root);
-        let checkpoint = Checkpoint::open(&root).unwrap();
+        let mut checkpoint = Checkpoint::open(&root).unwrap();
+        checkpoint.recognise_journal(&user());
         Case::new(label, expected, checkpoint.all_faults().cloned().collect())
     };
     let at = |name: &'static str, make: &'static dyn Fn(&Path)| move |root: &Path| make(&root.join(name));
@@ -49,7 +52,14 @@ fn cases() -> Vec<Case> {
     };
     vec![
         case("empty directory", &[], &|_| {}),
-        case("a repair that was killed", &[FaultKind::ForeignJournal], &|root| {
+        case("a repair that was killed", &[FaultKind::RepairInterrupted], &|root| own_journal(root).unwrap()),
+        case("a pickle that the reader does not follow", &[FaultKind::PickleImportsUnread], &|root| {
+            fs::write(root.join("vocab.pkl"), b"(0cposix\nsystem\n(S'true'\ntR.").unwrap();
+        }),
+        case("arrays of joblib", &[FaultKind::PickleImportsSkipped], &|root| {
+            fs::write(root.join("x.joblib"), b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n)R}b\x09\xff\xff").unwrap();
+        }),
+        case("a repair of a stranger", &[FaultKind::ForeignJournal], &|root| {
             fs::create_dir(root.join(".ckpt-doctor")).unwrap();
             fs::write(root.join(".ckpt-doctor/journal.json"), "{}").unwrap();
         }),

@@ -47,6 +47,8 @@ mod special {
     }
 }
 
+pub use special::journal as own_journal;
+
 /// One change. Changes of tensors keep shards and index consistent; changes of headers and bytes do not.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
