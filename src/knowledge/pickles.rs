@@ -148,7 +148,7 @@ mod tests {
         assert!(pickles.accepts_opcode("REDUCE") && !pickles.accepts_opcode("STACK_GLOBAL"));
     }
 
-    /// What tests/peer/training_files.py found in files of torch 2.15.0, numpy 2.4.6, accelerate 1.15.0 and transformers 4.47.0,
+    /// What `tests/peer/training_files.py` found in files of torch 2.15.0, numpy 2.4.6, accelerate 1.15.0 and transformers 4.47.0,
     /// 4.57.6 and 5.23.0, by file.
     const RECORDED: [(&str, &[&str]); 9] = [
         ("optimizer.pt", &["collections.OrderedDict", "torch._utils._rebuild_tensor_v2", "torch.FloatStorage"]),
@@ -199,7 +199,7 @@ mod tests {
         // Only members of classes have a dot in their name.
         let parts: Vec<&str> = path.split('.').collect();
         let is_class = |part: &&str| part.starts_with(|c: char| c.is_ascii_uppercase());
-        let at = parts.iter().position(|part| is_class(&part)).unwrap_or(parts.len() - 1);
+        let at = parts.iter().position(is_class).unwrap_or(parts.len().saturating_sub(1));
         PickleGlobal { module: parts[..at].join("."), name: parts[at..].join("."), ..PickleGlobal::default() }
     }
 
