@@ -75,6 +75,7 @@ pub fn main() -> ExitCode {
 }
 
 fn run() -> ExitCode {
+    signals::fail_at_file_size_limit();
     if let Some(name) = file_as_option(std::env::args_os().skip(1), Path::exists) {
         let name = output::safe(&name.to_string_lossy());
         output::note(&format!("error: {name} is also the name of a file; write -- before file names"));

@@ -13,8 +13,14 @@ use crate::surgery::stop_on;
 /// The signal that should stop the program; 0 before a signal arrived.
 static SIGNAL: LazyLock<Arc<AtomicUsize>> = LazyLock::new(Arc::default);
 
-/// Installs handlers: the writers stop and clean up on a signal, and report a file size limit (`ulimit -f`) as an
-/// error.
+/// Makes a write above the file size limit (`ulimit -f`) fail with an error. By default SIGXFSZ kills the process without a
+/// word. Called first by every command: a report or redirected output is written by those that write nothing else, too.
+pub fn fail_at_file_size_limit() {
+    // Without the handler the program works as far as the limit lets it.
+    drop(flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false))));
+}
+
+/// Installs the handlers of the writers, which stop and clean up on a signal.
 pub fn install() -> anyhow::Result<()> {
     stop_on(Arc::clone(&SIGNAL));
     let ignored = ignored();
@@ -25,8 +31,6 @@ pub fn install() -> anyhow::Result<()> {
             flag::register_usize(signal, Arc::clone(&SIGNAL), number).context("setting up signals")?;
         }
     }
-    // By default SIGXFSZ kills the process; with a handler, the write fails with an error instead.
-    flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false))).context("setting up signals")?;
     Ok(())
 }
 

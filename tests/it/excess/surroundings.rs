@@ -9,10 +9,12 @@ use super::shape::Excess;
 use crate::support::Draw;
 
 /// What a shell does before it starts the program, and redirections.
-const SURROUNDINGS: [(&str, &str); 10] = [
+const SURROUNDINGS: [(&str, &str); 12] = [
     ("ulimit -s 64", ""),
     ("ulimit -n 16", ""),
     ("ulimit -s 64; ulimit -n 16", ""),
+    ("ulimit -f 0", "> report.txt"),
+    ("ulimit -f 0", "2> errors.txt"),
     ("unset HOME XDG_STATE_HOME TERM LANG PATH", ""),
     ("export TERM=dumb", ""),
     (":", "<&-"),
