@@ -197,7 +197,8 @@ fn untargeted(
     let is_plain = narrowed.iter().all(|key| config.get(key).is_none_or(Value::is_null));
     if let Some(Value::Array(named)) = config.get("target_modules").filter(|_| is_plain) {
         let names = left_out.iter().map(|(name, _)| Value::from(**name));
-        fault = fault.with("targets", named.iter().cloned().chain(names).collect::<Vec<_>>());
+        let named = named.iter().filter(|name| name.is_string()).cloned();
+        fault = fault.with("targets", named.chain(names).collect::<Vec<_>>());
     }
     faults.push(fault);
 }
