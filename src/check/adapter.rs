@@ -195,10 +195,10 @@ fn untargeted(
     fault.places = left_out.iter().filter_map(|(_, m)| Some(Place::tensor(&*m.values().next()?.name))).collect();
     let narrowed = ["exclude_modules", "layers_to_transform", "layers_pattern"];
     let is_plain = narrowed.iter().all(|key| config.get(key).is_none_or(Value::is_null));
-    if let Some(Value::Array(named)) = config.get("target_modules").filter(|_| is_plain) {
+    let targets = config.get("target_modules").and_then(Value::as_array);
+    if let Some(named) = targets.filter(|named| is_plain && named.iter().all(Value::is_string)) {
         let names = left_out.iter().map(|(name, _)| Value::from(**name));
-        let named = named.iter().filter(|name| name.is_string()).cloned();
-        fault = fault.with("targets", named.chain(names).collect::<Vec<_>>());
+        fault = fault.with("targets", named.iter().cloned().chain(names).collect::<Vec<_>>());
     }
     faults.push(fault);
 }
