@@ -11,7 +11,7 @@ import signal
 import subprocess
 from pathlib import Path
 
-import state  # noqa: F401
+import state as _  # noqa: F401
 
 PROGRAM = os.environ.get("CKPT_DOCTOR", "ckpt-doctor")
 LINE = re.compile(r"(\d+) +(\w+)\((.*)")

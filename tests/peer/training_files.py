@@ -71,7 +71,9 @@ class Files:
 
 def optimizers(files):
     """The state of each optimizer of torch after a step."""
-    names = [name for name, kind in vars(torch.optim).items() if inspect.isclass(kind) and issubclass(kind, torch.optim.Optimizer)]
+    names = [
+        name for name, kind in vars(torch.optim).items() if inspect.isclass(kind) and issubclass(kind, torch.optim.Optimizer)
+    ]
     made = set()
     for name in names:
         for options in ({}, {"amsgrad": True}, {"momentum": 0.9}, {"foreach": True}, {"lr": torch.tensor(0.1)}):
@@ -118,7 +120,13 @@ def schedulers(files):
     files.save("scheduler.pt", lr_scheduler.ChainedScheduler(two).state_dict())
     files.save("scheduler.pt", swa_utils.SWALR(one, 0.05).state_dict())
     for kind in trainer_utils.SchedulerType:
-        for extra in ({}, {"num_cycles": 2}, {"min_lr": 0.01}, {"num_stable_steps": 3, "num_decay_steps": 2}, {"num_decay_steps": 2}):
+        for extra in (
+            {},
+            {"num_cycles": 2},
+            {"min_lr": 0.01},
+            {"num_stable_steps": 3, "num_decay_steps": 2},
+            {"num_decay_steps": 2},
+        ):
             try:
                 scheduler = get_scheduler(kind, optimizer(), 1, 10, scheduler_specific_kwargs=extra)
             except (TypeError, ValueError):
@@ -191,7 +199,14 @@ def trained(files):
     )
     data = [{"input_ids": torch.arange(6), "labels": torch.arange(6)} for _ in range(4)]
     known = inspect.signature(transformers.TrainingArguments.__init__).parameters
-    options = {"max_steps": 1, "save_steps": 1, "save_strategy": "steps", "report_to": [], "use_cpu": True, "disable_tqdm": True}
+    options = {
+        "max_steps": 1,
+        "save_steps": 1,
+        "save_strategy": "steps",
+        "report_to": [],
+        "use_cpu": True,
+        "disable_tqdm": True,
+    }
     options = {key: value for key, value in {**options, "save_safetensors": False}.items() if key in known}
     with tempfile.TemporaryDirectory() as out:
         made = transformers.TrainingArguments(out, **options)
@@ -224,7 +239,16 @@ DANGEROUS = [
     ("torch.utils.data.datapipes.utils.decoder", "basichandlers"), ("yaml", "unsafe_load"), ("some.library", "function"),
     ("transformers.dynamic_module_utils", "get_class_in_module"), ("transformers", "TrainingArguments"),
 ]  # fmt: skip
-NAMES = ["optimizer.pt", "scheduler.pt", "scaler.pt", "rng_state_0.pth", "training_args.bin", "vocab.pkl", "last.ckpt", "a.joblib"]
+NAMES = [
+    "optimizer.pt",
+    "scheduler.pt",
+    "scaler.pt",
+    "rng_state_0.pth",
+    "training_args.bin",
+    "vocab.pkl",
+    "last.ckpt",
+    "a.joblib",
+]
 
 
 def findings(folders):

@@ -93,7 +93,10 @@ def large_values(p, budget):
     p.keep("three")
     p.emit(text("storage"))
     p.keep("storage-word")
-    size = lambda: drawn_size(rng, max(10, budget // 6))
+
+    def size():
+        return drawn_size(rng, max(10, budget // 6))
+
     p.emit(text("a" * size()))
     p.keep("text")
     p.emit(text("é" * (size() // 2 + 1)))
@@ -123,7 +126,17 @@ def large_values(p, budget):
     p.keep("empty")
     p.emit(p.get("OrderedDict"), b")R")
     p.keep("hooks")
-    p.emit(p.get("_rebuild_tensor_v2"), b"(", p.get("a-storage"), integer(0), p.get("empty"), p.get("empty"), b"\x89", p.get("hooks"), b"tR")
+    p.emit(
+        p.get("_rebuild_tensor_v2"),
+        b"(",
+        p.get("a-storage"),
+        integer(0),
+        p.get("empty"),
+        p.get("empty"),
+        b"\x89",
+        p.get("hooks"),
+        b"tR",
+    )
     p.keep("a-tensor")
 
 
@@ -131,7 +144,9 @@ def snippet(p):
     """Opcodes that use values of the memo, and leave the stack as it was."""
     rng = p.rng
     shape = p.any() if rng.random() < 0.5 else p.get("tuple")
-    tensor = b"(" + p.get("a-storage") + integer(0) + shape + rng.choice([shape, p.get("empty")]) + b"\x89" + p.get("hooks") + b"t"
+    tensor = (
+        b"(" + p.get("a-storage") + integer(0) + shape + rng.choice([shape, p.get("empty")]) + b"\x89" + p.get("hooks") + b"t"
+    )
     return rng.choice([
         lambda: p.any() + p.any() + b"R0",
         lambda: p.any() + b"(" + p.any() * rng.choice([1, 2, 6]) + b"tR0",
@@ -243,29 +258,62 @@ def write_patterns(rng, directory, budget):
     patterns = table(rng, count)
     names, shape = drawn_size(rng, 20_000), [2]
     stem = rng.choice(["model.layers.{}.mlp.down_proj", "a" * 60 + "{}", "ab" * 30 + ".{}", "{}"])
-    endings = rng.choice([["weight"], ["weight", "weight_scale"], ["lora_A.weight", "lora_B.weight"], ["weight_packed", "weight_scale", "weight_shape"]])
+    endings = rng.choice(
+        [
+            ["weight"],
+            ["weight", "weight_scale"],
+            ["lora_A.weight", "lora_B.weight"],
+            ["weight_packed", "weight_scale", "weight_shape"],
+        ]
+    )
     tensors = {f"{stem.format(i)}.{end}": ("F32", shape) for i in range(names) for end in endings}
     config = dict(LLAMA)
     if rng.random() < 0.35:
         weights = "adapter_model.safetensors"
         tensors = {f"base_model.model.{name}": tensor for name, tensor in tensors.items()}
         adapter = {"peft_type": "LORA", "r": 8, "base_model_name_or_path": "x/y", "target_modules": ["down_proj"]}
-        key = rng.choice(["rank_pattern", "alpha_pattern", "target_modules", "regex", "target_parameters", "modules_to_save", "exclude_modules"])
+        key = rng.choice(
+            [
+                "rank_pattern",
+                "alpha_pattern",
+                "target_modules",
+                "regex",
+                "target_parameters",
+                "modules_to_save",
+                "exclude_modules",
+            ]
+        )
         if key.endswith("_pattern"):
             adapter[key] = {pattern.removeprefix("re:"): 4 for pattern in patterns}
         elif key == "regex":
-            adapter["target_modules"] = "|".join(pattern.removeprefix("re:") for pattern in patterns[: rng.choice([1, 10, 100])])
+            adapter["target_modules"] = "|".join(
+                pattern.removeprefix("re:") for pattern in patterns[: rng.choice([1, 10, 100])]
+            )
         else:
             adapter[key] = patterns
         (directory / "adapter_config.json").write_text(json.dumps(adapter))
     else:
         weights = "model.safetensors"
         method = rng.choice(["compressed-tensors", "fp8", "bitsandbytes", "gptq", "awq", "fbgemm_fp8", "quark", "modelopt"])
-        quantisation = {"quant_method": method, "bits": 4, "group_size": 128, "weight_block_size": [128, 128], "load_in_4bit": True}
-        for key in rng.sample(["ignore", "modules_to_not_convert", "llm_int8_skip_modules", "exclude", "dynamic", "modules_in_block_to_quantize"], 2):
+        quantisation = {
+            "quant_method": method,
+            "bits": 4,
+            "group_size": 128,
+            "weight_block_size": [128, 128],
+            "load_in_4bit": True,
+        }
+        for key in rng.sample(
+            ["ignore", "modules_to_not_convert", "llm_int8_skip_modules", "exclude", "dynamic", "modules_in_block_to_quantize"],
+            2,
+        ):
             quantisation[key] = {p: {} for p in patterns} if key == "dynamic" else patterns
         if method == "compressed-tensors":
-            quantisation["config_groups"] = {"g": {"targets": rng.choice([["Linear"], patterns]), "weights": {"num_bits": 4, "type": "int", "group_size": 128}}}
+            quantisation["config_groups"] = {
+                "g": {
+                    "targets": rng.choice([["Linear"], patterns]),
+                    "weights": {"num_bits": 4, "type": "int", "group_size": 128},
+                }
+            }
             quantisation["format"] = "pack-quantized"
         config["quantization_config"] = quantisation
         for key in rng.sample(["_keys_to_ignore_on_load_missing", "tie_weights_keys", "base_model_tp_plan", "layer_types"], 1):
@@ -290,8 +338,28 @@ BINARY = ["+", "-", "*", "/", "//", "%", "**", "~", "==", "<", "in", "not in", "
 
 def expression(rng, depth):
     if depth <= 0:
-        return rng.choice(["a", "b", "n.a", "n.b", "messages", "messages[0]", "bos_token", "loop.index0", "'x'", "'%s'", "[1]", "{}", "i", *NUMBERS])
-    e = lambda: expression(rng, depth - 1)
+        return rng.choice(
+            [
+                "a",
+                "b",
+                "n.a",
+                "n.b",
+                "messages",
+                "messages[0]",
+                "bos_token",
+                "loop.index0",
+                "'x'",
+                "'%s'",
+                "[1]",
+                "{}",
+                "i",
+                *NUMBERS,
+            ]
+        )
+
+    def e():
+        return expression(rng, depth - 1)
+
     return rng.choice([
         lambda: f"{e()}|{fill(rng, rng.choice(FILTERS), depth)}",
         lambda: f"({e()}).{fill(rng, rng.choice(METHODS), depth)}",
@@ -316,8 +384,12 @@ def fill(rng, pattern, depth):
 
 
 def statement(rng, depth):
-    e = lambda: expression(rng, rng.randint(0, 3))
-    inner = lambda: "".join(statement(rng, depth - 1) for _ in range(rng.randint(1, 2))) if depth > 0 else "{{ a }}"
+    def e():
+        return expression(rng, rng.randint(0, 3))
+
+    def inner():
+        return "".join(statement(rng, depth - 1) for _ in range(rng.randint(1, 2))) if depth > 0 else "{{ a }}"
+
     return rng.choice([
         lambda: f"{{{{ {e()} }}}}",
         lambda: f"{{% set {rng.choice('ab')} = {e()} %}}",
