@@ -184,7 +184,7 @@ impl Archive {
             Some("its members are compressed")
         } else if is_read && name.get(self.folder.len().saturating_add(1)..) != Some(inside) {
             Some("names of its members have other letters in upper case than torch writes")
-        } else if (is_storage || inside == ".format_version") && member.is_folder {
+        } else if (is_storage || [".format_version", ".data/serialization_id"].contains(&inside)) && member.is_folder {
             Some("a member that is read has the attribute of a folder")
         } else if member.disk == 1 {
             Some("a member names another part of the archive")
