@@ -23,7 +23,7 @@ pub mod written;
 pub use error::{ApplyError, RepairError};
 pub use leftover::Leftover;
 #[cfg(feature = "internals")]
-pub use outcome::Change;
+pub use outcome::FileChange;
 pub use outcome::{Recovered, Recovery, RepairWritten, Target};
 pub use stop::stop_on;
 pub use trust::Trust;

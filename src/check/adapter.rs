@@ -123,7 +123,9 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
         }
     }
     let targets = Targets::from_config(config, checkpoint);
-    if let Some(cut) = names_cut(&targets, &whole).filter(|_| modules.is_empty()) {
+    // A part of the names would be renamed alone where not all were compared.
+    let cut = names_cut(&targets, &whole).filter(|_| modules.is_empty() && targets.excess().is_none());
+    if let Some(cut) = cut {
         faults.push(cut);
         return;
     }

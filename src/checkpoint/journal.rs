@@ -152,7 +152,7 @@ fn created(metadata: &Metadata) -> Option<(u64, u32)> {
 
 /// Why a journal is not carried out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Distrust {
+pub enum JournalDistrust {
     /// Nobody asked; the journal of a checkpoint in memory, or of one that a caller opened without a key.
     #[error("it was not verified who wrote it")]
     Unverified,
@@ -206,21 +206,21 @@ impl Journal {
     /// Why this user did not write this journal in this folder `.ckpt-doctor`; `None` when they did.
     ///
     /// `key` is called for a journal with an authenticator, and reads the key of the user.
-    pub fn distrust(&self, folder: &Path, key: impl FnOnce() -> Result<Key, NoKey>) -> Option<Distrust> {
+    pub fn distrust(&self, folder: &Path, key: impl FnOnce() -> Result<Key, NoKey>) -> Option<JournalDistrust> {
         let (Some(stated), Some(recorded)) = (&self.authenticator, self.folder) else {
-            return Some(Distrust::Unsigned);
+            return Some(JournalDistrust::Unsigned);
         };
         let key = match key() {
             Ok(key) => key,
-            Err(why) => return Some(Distrust::NoKey(why)),
+            Err(why) => return Some(JournalDistrust::NoKey(why)),
         };
         // Hashes are compared in constant time.
         let stated = blake3::Hash::from_hex(stated).ok();
         if stated.is_none() || self.authenticate(&key) != stated {
-            return Some(Distrust::OtherKey);
+            return Some(JournalDistrust::OtherKey);
         }
         let is_here = InodeIdentity::of(folder).is_ok_and(|folder| folder.is(recorded));
-        (!is_here).then_some(Distrust::OtherFolder)
+        (!is_here).then_some(JournalDistrust::OtherFolder)
     }
 
     /// The keyed hash of the whole document without its authenticator: what is parsed is what is authenticated, and the parser

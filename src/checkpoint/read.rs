@@ -10,7 +10,7 @@ use super::card::{CARD, CARD_CAP, ModelCard};
 use super::contents::{self, Progress, ReadOptions};
 use super::git;
 use super::is_plain_file_name;
-use super::journal::{Distrust, Journal, StateFolder};
+use super::journal::{Journal, JournalDistrust, StateFolder};
 use super::lfs::MAX_POINTER;
 use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP};
 use super::parallel;
@@ -113,9 +113,9 @@ impl Checkpoint {
             Err(format!("{REPAIR_FOLDER} is not a directory"))
         };
         let why = match read {
-            Ok(None) => Some(Distrust::Unverified), // another run has just finished it
+            Ok(None) => Some(JournalDistrust::Unverified), // another run has just finished it
             Ok(Some(journal)) => journal.distrust(&folder, || user.key(root)),
-            Err(reason) => Some(Distrust::Unusable(reason)),
+            Err(reason) => Some(JournalDistrust::Unusable(reason)),
         };
         if let Some(fault) = self.faults.get_mut(at) {
             *fault = match why {
@@ -141,7 +141,7 @@ fn journal_name() -> String {
 }
 
 /// The fault of a journal that no repair carries out.
-fn foreign_journal(why: &Distrust) -> Fault {
+fn foreign_journal(why: &JournalDistrust) -> Fault {
     // A key of the document may stand in the reason.
     let reason = escape(&why.to_string(), 400);
     Fault::new(FaultKind::ForeignJournal).at(Place::file(journal_name())).with("reason", reason)
@@ -168,7 +168,7 @@ fn read(source: Source) -> Result<Checkpoint, OpenError> {
     reader.read_folders();
     let SourceReader { mut checkpoint, vocabularies, vocabulary_faults, mut budget, .. } = reader;
     if checkpoint.source.exists(&journal_name()) {
-        checkpoint.faults.push(foreign_journal(&Distrust::Unverified));
+        checkpoint.faults.push(foreign_journal(&JournalDistrust::Unverified));
     }
     checkpoint.place_pickles();
     checkpoint.derive(vocabularies);

@@ -27,8 +27,10 @@ impl Default for Work {
 
 impl Work {
     /// What `bytes` bytes may cost.
-    pub(crate) const fn for_bytes(bytes: u64) -> Self {
-        Self { left: BASE.saturating_add(bytes.saturating_mul(PER_BYTE)) }
+    pub(crate) fn for_bytes(bytes: u64) -> Self {
+        let mut work = Self::default();
+        work.grant(bytes);
+        work
     }
 
     /// Adds what `bytes` more bytes may cost. Called by readers before they look at them.

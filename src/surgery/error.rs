@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::leftover::Leftover;
-use crate::checkpoint::journal::Distrust;
+use crate::checkpoint::journal::JournalDistrust;
 
 /// Why a plan was not written. The target then does not exist, except with [`ApplyError::Unsynced`].
 #[derive(Debug, thiserror::Error)]
@@ -215,7 +215,7 @@ pub enum RepairError {
         /// The journal.
         path: PathBuf,
         /// How that was found.
-        why: Distrust,
+        why: JournalDistrust,
         /// The folder with the journal, the new files and the originals.
         folder: PathBuf,
     },

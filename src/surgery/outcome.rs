@@ -34,7 +34,7 @@ pub enum Recovered {
 
 /// What a repair, or the way back from it, did to a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Change {
+pub enum FileChange {
     /// A new file took the place of the old one.
     Replaced,
     /// The header of a shard was edited in place.
@@ -49,7 +49,7 @@ pub enum Change {
     Returned,
 }
 
-impl Change {
+impl FileChange {
     /// The verb before the name of the file.
     #[must_use]
     pub const fn verb(self) -> &'static str {
@@ -79,7 +79,7 @@ pub struct Recovery {
     /// What happened to an interrupted repair or undo; `None` when there was none.
     pub outcome: Option<Recovered>,
     /// Of a finished one all its files, of one that was rolled back those that were put back.
-    pub files: Vec<(Change, String)>,
+    pub files: Vec<(FileChange, String)>,
     /// Files that could not be removed.
     pub leftover: Option<Leftover>,
 }

@@ -8,7 +8,8 @@ use super::value::{DictKind, StorageRef, TensorRef, Value};
 
 /// Maximum number of arguments of a call that is modelled, and of fields of a persistent id.
 const MAX_ARGUMENTS: usize = 8;
-/// Maximum number of dimensions, of which torch iterates over no more. Source: `MAX_DIMS` in `aten/src/ATen/TensorIterator.h`.
+/// Maximum number of dimensions; most functions of torch take no more. Source: `dim_bitset_size` in
+/// `ATen/WrapDimUtilsMulti.h` of torch 2.15.0.
 const MAX_DIMENSIONS: usize = 64;
 /// Work of a tensor and of a storage for the readers, who look at each several times.
 const VIEW: u64 = 600;

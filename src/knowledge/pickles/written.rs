@@ -12,7 +12,7 @@ use crate::knowledge::statistics::Pattern;
 #[serde(deny_unknown_fields)]
 pub(super) struct Written {
     /// Imports by the library that writes them.
-    groups: BTreeMap<String, Group>,
+    groups: BTreeMap<String, ImportGroup>,
     /// Kinds of files; the first that fits decides.
     files: Vec<FileKind>,
 }
@@ -20,7 +20,7 @@ pub(super) struct Written {
 /// Imports of one library.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct Group {
+struct ImportGroup {
     /// Modules with attributes, joined.
     imports: BTreeSet<String>,
     /// Classes that may be imported with their members.
@@ -64,7 +64,7 @@ impl Written {
     }
 }
 
-impl Group {
+impl ImportGroup {
     fn has(&self, PickleGlobal { module, name, .. }: &PickleGlobal) -> bool {
         let path = format!("{module}.{name}");
         let is_member = || {

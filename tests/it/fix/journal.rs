@@ -10,7 +10,7 @@ use ckpt_doctor::check::check;
 use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::checkpoint::journal::{InodeIdentity, Journal};
 use ckpt_doctor::surgery::repair::{Content, Repair, plan};
-use ckpt_doctor::surgery::{Change, Recovered, RepairError, Trust, journal, overlay};
+use ckpt_doctor::surgery::{FileChange, Recovered, RepairError, Trust, journal, overlay};
 use tempfile::TempDir;
 
 use super::seen;
@@ -117,9 +117,9 @@ fn an_interrupted_repair_is_finished_or_rolled_back() {
             match recovered {
                 Some(Recovered::Finished) => assert_eq!(
                     listed,
-                    [(Change::Replaced, "config.json"), (Change::Added, "model.safetensors.index.json")]
+                    [(FileChange::Replaced, "config.json"), (FileChange::Added, "model.safetensors.index.json")]
                 ),
-                Some(Recovered::RolledBack) if step == 3 => assert_eq!(listed, [(Change::Restored, "config.json")]),
+                Some(Recovered::RolledBack) if step == 3 => assert_eq!(listed, [(FileChange::Restored, "config.json")]),
                 _ => assert_eq!(listed, []),
             }
             let (outcome, files) = match step {
@@ -319,7 +319,7 @@ fn a_file_saved_during_an_interrupted_repair_is_returned_to_those_who_vouch_for_
     assert_eq!(contents(&dir), after);
     let recovery = journal::recover(&dir, &adopting()).expect("recovered");
     assert_eq!(recovery.outcome, Some(Recovered::RolledBack));
-    assert_eq!(recovery.files[0], (Change::Returned, "config.json".to_owned()));
+    assert_eq!(recovery.files[0], (FileChange::Returned, "config.json".to_owned()));
     assert_eq!(fs::read_to_string(dir.join("config.json")).expect("a file"), "saved");
     assert!(!folder.exists());
 }

@@ -17,7 +17,7 @@ use crate::checkpoint::journal::{HeaderEdit, InodeIdentity, Journal, JournaledFi
 use crate::checkpoint::open::{Identity, open_regular};
 use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::leftover::Leftover;
-use crate::surgery::outcome::Change;
+use crate::surgery::outcome::FileChange;
 use crate::surgery::writers::system::{look, remove_folder, retry, sync_dir};
 
 /// What the staging folder holds under the name of a file.
@@ -49,11 +49,11 @@ enum StepBack {
 
 impl StepBack {
     /// What it does to the file.
-    const fn change(&self) -> Change {
+    const fn change(&self) -> FileChange {
         match self {
-            Self::Exchange(_) | Self::MoveBack | Self::Header(_) => Change::Restored,
-            Self::TakeAway(_) => Change::Removed,
-            Self::Displaced => Change::Returned,
+            Self::Exchange(_) | Self::MoveBack | Self::Header(_) => FileChange::Restored,
+            Self::TakeAway(_) => FileChange::Removed,
+            Self::Displaced => FileChange::Returned,
         }
     }
 }
@@ -73,11 +73,11 @@ impl<'a> Replay<'a> {
     }
 
     /// What the repair does to each file.
-    pub(super) fn files(&self) -> Vec<(Change, String)> {
+    pub(super) fn files(&self) -> Vec<(FileChange, String)> {
         let change = |entry: &JournaledFile| match (&entry.header, &entry.old) {
-            (Some(_), _) => Change::Edited,
-            (None, Some(_)) => Change::Replaced,
-            (None, None) => Change::Added,
+            (Some(_), _) => FileChange::Edited,
+            (None, Some(_)) => FileChange::Replaced,
+            (None, None) => FileChange::Added,
         };
         self.journal.files.iter().map(|entry| (change(entry), entry.name.clone())).collect()
     }
@@ -240,7 +240,7 @@ impl<'a> Replay<'a> {
     /// before they were replaced stay. Returns the files that were put back.
     ///
     /// `undo` calls this for a finished repair.
-    pub(super) fn roll_back(&self) -> Result<Vec<(Change, String)>, RepairError> {
+    pub(super) fn roll_back(&self) -> Result<Vec<(FileChange, String)>, RepairError> {
         let mut back = Vec::new();
         for entry in &self.journal.files {
             back.extend(self.step_back(entry)?.map(|step| (entry, step)));
