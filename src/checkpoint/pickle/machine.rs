@@ -439,16 +439,17 @@ impl<'p> Machine<'p> {
 
     /// Whether Python can hash a value. Deep tuples count as hashable, with a doubt.
     fn is_hashable(&mut self, value: Value, depth: usize) -> Result<bool, Stop> {
-        self.work.spend(1, VALUE)?;
+        self.work.spend(2, VALUE)?;
         match value {
             Value::List(_) | Value::Dict(_) | Value::Set => return Ok(false),
             Value::Tuple(id) => {
-                let items: Vec<Value> = self.heap.tuple(id).iter().take(17).copied().collect();
-                if depth > 4 || items.len() > 16 {
+                let len = self.heap.tuple(id).len();
+                if depth > 4 || len > 16 {
                     self.doubt(|| "a key of a dict is a large tuple".to_owned());
                     return Ok(true);
                 }
-                for item in items {
+                for at in 0..len {
+                    let item = self.heap.tuple(id).get(at).copied().unwrap_or(Value::None);
                     if !self.is_hashable(item, depth.saturating_add(1))? {
                         return Ok(false);
                     }
