@@ -16,7 +16,6 @@ answer is added to the verdicts that changed, where the directory has weights.
 
 import argparse
 import fnmatch
-import gc
 import hashlib
 import json
 import os
@@ -40,6 +39,7 @@ BETWEEN = ("4.57.3",)
 PROGRAMS = ("peft==0.13.2", "vllm", "mlx-lm", "llama.cpp")
 SECONDS = 60  # that one run may take
 BYTES = 4 << 30  # of address space that one run may take
+WORKER_BYTES = 8 << 30  # of address space that a real loader may take for one directory
 LARGE = 1 << 22  # of a larger file only the size counts
 UNKNOWN = "not-predicted"
 BUILT = {"cases": ("CKPT_DOCTOR_CASES", "rules::each_case"), "reported": ("CKPT_DOCTOR_REPORTED", "reported::")}
@@ -338,16 +338,35 @@ def open_all(names, out):
 
     quiet()
     told = {"version": transformers.__version__}
+    openers = {
+        "model": open_model,
+        "tokenizer": transformers.AutoTokenizer.from_pretrained,
+        "processor": transformers.AutoProcessor.from_pretrained,
+        "generation": transformers.GenerationConfig.from_pretrained,
+    }
     for name in json.loads(Path(names).read_text()):
-        openers = {
-            "model": open_model,
-            "tokenizer": transformers.AutoTokenizer.from_pretrained,
-            "processor": transformers.AutoProcessor.from_pretrained,
-            "generation": transformers.GenerationConfig.from_pretrained,
-        }
-        told[name] = {what: attempt(opener, name) for what, opener in openers.items()}
-        gc.collect()
+        told[name] = in_child(lambda path=name: {what: attempt(opener, path) for what, opener in openers.items()})
     Path(out).write_text(json.dumps(told))
+
+
+def in_child(work):
+    """What `work` returns in a forked child under bounds of memory and time, or how the child died, for each object."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reader)
+        resource.setrlimit(resource.RLIMIT_AS, (WORKER_BYTES, WORKER_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (2 * SECONDS, 2 * SECONDS))
+        with os.fdopen(writer, "w") as file:
+            file.write(json.dumps(work()))
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as file:
+        text = file.read()
+    _, status = os.waitpid(child, 0)
+    if status:
+        return dict.fromkeys(("model", "tokenizer", "processor", "generation"), f"ended with {os.waitstatus_to_exitcode(status)}")
+    return json.loads(text)
 
 
 def attempt(opener, path):
