@@ -365,7 +365,9 @@ def in_child(work):
         text = file.read()
     _, status = os.waitpid(child, 0)
     if status:
-        return dict.fromkeys(("model", "tokenizer", "processor", "generation"), f"ended with {os.waitstatus_to_exitcode(status)}")
+        return dict.fromkeys(
+            ("model", "tokenizer", "processor", "generation"), f"ended with {os.waitstatus_to_exitcode(status)}"
+        )
     return json.loads(text)
 
 

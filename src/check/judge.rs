@@ -15,6 +15,7 @@ mod integers;
 mod predict;
 #[cfg(test)]
 mod tests;
+mod unscaled;
 
 use std::cell::RefCell;
 
@@ -107,9 +108,14 @@ pub fn judge(
     let loads = explain::explain(&inputs, predict::predict(&inputs, classes));
     let votes = explain::distinct_votes(&loads);
     faults.extend(faults::faults(&inputs, &loads, &votes));
+    let unscaled = unscaled::unscaled(&inputs, &loads);
+    faults.extend(unscaled.fault);
     let config = loads.first().map_or(Value::Null, |load| load.prediction.expected.config.clone());
-    let loads: Vec<LoadReport> =
+    let mut loads: Vec<LoadReport> =
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();
+    for (loader, reason) in unscaled.undecided {
+        loads.iter_mut().filter(|load| load.loader == loader).for_each(|load| load.undecided = Some(reason.clone()));
+    }
     faults.extend(faults::undeclared_scheme(&inputs, &loads));
     Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
 }

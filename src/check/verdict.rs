@@ -285,7 +285,10 @@ fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
     let silent = report.silent.iter().filter(|silent| silent.reason != SilentReason::TiedOver).count();
     let [missing, ..] = report.lengths();
     match (missing, silent) {
-        (0, 0) if report.unbuilt.is_empty() => (LoadVerdict::Loads, None),
+        (0, 0) if report.unbuilt.is_empty() => match &report.undecided {
+            Some(why) => (LoadVerdict::NotPredicted, Some(why.clone())),
+            None => (LoadVerdict::Loads, None),
+        },
         (0, 0) => {
             (LoadVerdict::LoadsWrong, Some("stored layers of the model are ignored: its class builds fewer".to_owned()))
         }

@@ -4,7 +4,7 @@ use super::Inputs;
 use super::explain::ExplainedLoad;
 use crate::check::index;
 use crate::check::load::Stored;
-use crate::checkpoint::{Checkpoint, Dtype, Fault, FaultKind, Place};
+use crate::checkpoint::{Checkpoint, Dtype, Fault, FaultKind, Place, Tensor};
 use crate::knowledge::{Expected, Loader};
 
 /// Names in one finding.
@@ -37,23 +37,30 @@ pub(super) fn fault(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<
 
 /// Weights and biases of the class that are stored as integers. Buffers have other names, or masks of more dimensions.
 fn integers<'c>(checkpoint: &'c Checkpoint, stored: &Stored, expected: &Expected) -> Vec<(&'c str, Dtype)> {
+    let is_parameter =
+        |name: &str, shape: &[u64]| name.ends_with("weight") || (name.ends_with("bias") && shape.len() == 1);
+    let found = loaded(checkpoint, stored, expected).filter(|tensor| tensor.dtype.is_integer());
+    found.filter(|tensor| is_parameter(&tensor.name, &tensor.shape)).map(|t| (t.name.as_str(), t.dtype)).collect()
+}
+
+/// Stored tensors of the names that the class has, with its prefix or without. Called for the types that a loader keeps.
+pub(super) fn loaded<'c>(
+    checkpoint: &'c Checkpoint,
+    stored: &Stored,
+    expected: &Expected,
+) -> impl Iterator<Item = &'c Tensor> {
     let prefix = format!("{}.", expected.base_model_prefix);
-    let is_expected = |name: &str| {
+    let is_expected = move |name: &str| {
         let other = name.strip_prefix(&prefix).map_or_else(|| format!("{prefix}{name}"), str::to_owned);
         expected.tensors.contains_key(name) || expected.tensors.contains_key(&other)
     };
-    let is_parameter =
-        |name: &str, shape: &[u64]| name.ends_with("weight") || (name.ends_with("bias") && shape.len() == 1);
-    let tensors = index::opened_tensors(checkpoint).filter(|tensor| tensor.dtype.is_integer());
-    let loaded = tensors.filter(|tensor| stored.shape(&tensor.name).is_some());
-    let found = loaded.filter(|tensor| is_parameter(&tensor.name, &tensor.shape) && is_expected(&tensor.name));
-    found.map(|tensor| (tensor.name.as_str(), tensor.dtype)).collect()
+    index::opened_tensors(checkpoint).filter(move |t| stored.shape(&t.name).is_some() && is_expected(&t.name))
 }
 
 /// Whether the loader makes parameters of the stored tensors instead of copying their values: 4.47.0 does where the first
 /// tensor of the class has the dtype of the model, which is float32 unless the caller asks for another
 /// (`check_support_param_buffer_assignment`); 4.57.6 always does.
-fn assigns(checkpoint: &Checkpoint, expected: &Expected) -> bool {
+pub(super) fn assigns(checkpoint: &Checkpoint, expected: &Expected) -> bool {
     let first = expected.tensors.keys().find_map(|name| index::opened_tensor(checkpoint, name));
     expected.loader != Loader::V4_47_0 || first.is_some_and(|(_, tensor)| tensor.dtype == Dtype::F32)
 }

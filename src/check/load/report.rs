@@ -30,6 +30,9 @@ pub struct LoadReport {
     /// The names that a long list leaves out; missing where every list is whole.
     #[serde(skip_serializing_if = "Unlisted::is_none")]
     pub unlisted: Unlisted,
+    /// Why the lists do not decide whether the loaded values are right: a report without a name is then no proof of a load.
+    #[serde(skip)]
+    pub undecided: Option<String>,
 }
 
 /// Names that are counted and not listed, by list.
@@ -95,8 +98,18 @@ impl LoadReport {
     #[must_use]
     pub(crate) fn agrees(&self, other: &Self) -> bool {
         // What is not built follows from the names that are not used.
-        let Self { loader: _, stands_for: _, missing, unexpected, unbuilt: _, mismatched, silent, raises, unlisted } =
-            self;
+        let Self {
+            loader: _,
+            stands_for: _,
+            missing,
+            unexpected,
+            unbuilt: _,
+            mismatched,
+            silent,
+            raises,
+            unlisted,
+            undecided: _,
+        } = self;
         (missing, unexpected, mismatched) == (&other.missing, &other.unexpected, &other.mismatched)
             && (silent, raises, unlisted) == (&other.silent, &other.raises, &other.unlisted)
     }

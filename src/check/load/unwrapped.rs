@@ -55,6 +55,8 @@ impl Unwrapped {
             None => stored.names().map(|name| (name.to_owned(), name.to_owned())).collect(),
         };
         let of_known = known.as_ref().map(|one| one.parts.clone()).unwrap_or_default();
+        let exact = |stored: &Stored| stored.names().filter(|name| expected.tensors.contains_key(*name)).count();
+        let placed = exact(known.as_ref().map_or(stored, |one| &one.stored));
         let tried = prefixes(&bare).into_iter().filter_map(|prefix| {
             let names =
                 bare.iter().map(|(old, name)| (old.clone(), name.strip_prefix(&*prefix).unwrap_or(name).to_owned()));
@@ -64,11 +66,10 @@ impl Unwrapped {
             // Where it does not bring most tensors to their place, another prefix may stand in its place, which is searched later.
             (one.report.missing.len() <= base.missing.len() / 2 || one.report.is_whole()).then_some(one)
         });
-        let tried = tried.filter(|one| gain(base, &one.report) > 0);
+        // A prefix of the class's own, such as `model.`, is no wrapper's.
+        let tried = tried.filter(|one| gain(base, &one.report) > 0 && exact(&one.stored) >= placed);
         // Of two that help as much, the one with more names of the class; then the shorter prefix, which comes first.
-        let is_of_class = |name: &&str| expected.tensors.contains_key(*name);
-        let exact = |one: &Self| one.stored.names().filter(is_of_class).count();
-        tried.min_by_key(|one| (size(&one.report), std::cmp::Reverse(exact(one)))).or(known)
+        tried.min_by_key(|one| (size(&one.report), std::cmp::Reverse(exact(&one.stored)))).or(known)
     }
 
     /// Without the parts of known wrappers.

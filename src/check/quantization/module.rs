@@ -57,7 +57,8 @@ impl StoredModule<'_> {
 /// The modules of a scheme among these tensors, by name.
 ///
 /// A module is recognised by its first tensor, which holds the values. If that tensor keeps its plain name, another one
-/// must be stored too. `plain` returns whether a class has a tensor of that name, which is then not a scale.
+/// must be stored too, or its type must be an 8-bit float. `plain` returns whether a class has a tensor of that name, which is
+/// then not a scale.
 pub(super) fn group<'c>(
     scheme: &Scheme,
     tensors: &TensorLookup<'c>,
@@ -75,9 +76,26 @@ pub(super) fn group<'c>(
             names.insert(module);
         }
     }
+    names.extend(eight_bit_floats(scheme, tensors, &endings));
     let held = |module: &str, ending: &str| tensors.0.get(format!("{module}{ending}").as_str()).copied();
     let module = |name| StoredModule { name, held: scheme.endings().map(|ending| held(name, ending)).collect() };
     names.into_iter().map(module).filter(|m| m.held.first().is_some_and(Option::is_some)).collect()
+}
+
+/// Modules whose values have the plain name and an 8-bit float of the scheme as their type: without a scale they are incomplete.
+fn eight_bit_floats<'c>(
+    scheme: &Scheme,
+    tensors: &TensorLookup<'c>,
+    others: &[(usize, &str)],
+) -> impl Iterator<Item = &'c str> {
+    let values = scheme.tensors.first().filter(|part| part.name == scheme.plain);
+    let is_other = |name: &str| others.iter().any(|(_, ending)| name.ends_with(ending));
+    let is_of_scheme = move |dtype: Dtype| {
+        let stated = values.is_some_and(|part| part.dtypes.iter().any(|name| name == dtype.name()));
+        stated && dtype.is_eight_bit_float()
+    };
+    let found = tensors.0.iter().filter(move |(name, held)| held.dtype.is_some_and(is_of_scheme) && !is_other(name));
+    found.filter_map(|(name, _)| name.strip_suffix(scheme.plain.as_str()))
 }
 
 /// Modules that are stored plainly although others of their kind are quantised and the config does not leave them out.

@@ -228,6 +228,7 @@ fault_kinds! {
         DirectoryRecognised = "directory-recognised" {
             is: Text, signs: List(&Text), command?: Text, has_config?: Flag, program?: Text,
         },
+        EightBitFloats = "eight-bit-floats" { count: Integer, dtype: Text, kept: List(&Text) },
         EmptyTensors = "empty-tensors" { count: Integer, names: List(&Text), under?: Text },
         IndexEntryNotAShard = "index-entry-not-a-shard" { named: Text, tensors: Integer, pickle: Flag },
         IndexKeyNowhere = "index-key-nowhere" { said: Text },

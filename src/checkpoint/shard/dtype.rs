@@ -44,6 +44,12 @@ impl Dtype {
         )
     }
 
+    /// Whether weights of it need a scale to reach the values of most models: numbers of eight bits with a sign.
+    #[must_use]
+    pub const fn is_eight_bit_float(self) -> bool {
+        matches!(self, Self::F8_E5M2 | Self::F8_E4M3 | Self::F8_E4M3FNUZ | Self::F8_E5M2FNUZ)
+    }
+
     /// All element types, in the alignment order of the format (narrowest first).
     pub const ALL: [Self; 22] = [
         Self::BOOL,
