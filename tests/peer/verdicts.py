@@ -294,6 +294,7 @@ ROWS = {
     "embedding-of-more-rows": ("llama", lambda d: d.tensors(resized(EMBED, 70))),
     "head-of-fewer-rows": ("llama", lambda d: d.tensors(resized(HEAD, 60))),
     "prefix-module": ("llama", lambda d: d.tensors(renamed("", "module."))),
+    "prefix-and-fewer-rows": ("llama", lambda d: (d.tensors(resized(EMBED, 60)), d.tensors(renamed("", "module.")))),
     "prefix-compiled": ("llama", lambda d: d.tensors(renamed("", "_orig_mod."))),
     "prefix-stripped": ("llama", lambda d: d.tensors(renamed("model.", ""))),
     "layer-renamed": ("llama", lambda d: d.tensors(renamed("model.layers.1.", "model.layers.7."))),
@@ -307,6 +308,10 @@ ROWS = {
     "eight-bit-floats-without-scales": (
         "llama",
         lambda d: (d.tensors(as_floats("F8_E4M3", "up_proj")), d.config(quantization_config=FP8)),
+    ),
+    "eight-bit-floats-of-static-scheme": (
+        "llama",
+        lambda d: d.config(quantization_config=FP8 | {"activation_scheme": "static"}),
     ),
     "t5-shared-missing": ("t5", lambda d: d.tensors(dropped("shared.weight"))),
     "tied-embedding-missing": ("tied", lambda d: d.tensors(dropped(EMBED))),

@@ -10,8 +10,8 @@ use crate::check::load::{self, Judged, LoadReport, Stored};
 use crate::check::votes::{self, Vote};
 use crate::check::{quantization, size};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, pointer};
+use crate::knowledge::Loader;
 use crate::knowledge::quantization::DeclaredScheme;
-use crate::knowledge::{Expected, Loader};
 
 /// Faults of the loads: prefixes, quantised modules, the size in the index, tensors, and config values that the stored
 /// tensors contradict.
@@ -72,19 +72,22 @@ fn plain<'l>(inputs: &Inputs<'_>, loads: &'l [ExplainedLoad<'_>]) -> impl Iterat
 /// Faults of the tensors: for a leading loader all of them; for another one, that the checkpoint does not load there.
 fn tensors(loads: &[ExplainedLoad<'_>], stored: &Stored) -> Vec<Fault> {
     // Loaders that agree have their faults reported once.
-    let mut distinct: Vec<(&LoadReport, &Expected, Vec<&'static str>)> = Vec::new();
+    let mut distinct: Vec<(&LoadReport, &Prediction<'_>, Vec<&'static str>)> = Vec::new();
     for load in loads.iter().filter(|load| load.prediction.target.leads) {
         let Some(report) = load.unexplained() else { continue };
-        match distinct.iter_mut().find(|(one, ..)| one.agrees(report)) {
+        match distinct.iter_mut().find(|(one, prediction, _)| {
+            one.agrees(report) && compares_shapes(prediction) == compares_shapes(&load.prediction)
+        }) {
             Some((.., loaders)) => loaders.push(load.loader()),
-            None => distinct.push((report, &load.prediction.expected, vec![load.loader()])),
+            None => distinct.push((report, &load.prediction, vec![load.loader()])),
         }
     }
     let under = |report: &LoadReport| (distinct.len() > 1).then(|| format!("transformers {}", report.version()));
     let mut faults = Vec::new();
-    for (report, expected, loaders) in &distinct {
-        let own = load::faults(report, expected, under(report).as_deref());
-        faults.extend(own.into_iter().map(|fault| Fault { loaders: loaders.clone(), ..fault }));
+    for (report, prediction, loaders) in &distinct {
+        let own = load::faults(report, &prediction.expected, under(report).as_deref());
+        let own = own.into_iter().map(|fault| if compares_shapes(prediction) { fault } else { hidden_by_names(fault) });
+        faults.extend(own.map(|fault| Fault { loaders: loaders.clone(), ..fault }));
     }
     let judged = |leads: bool| {
         let predictions = loads.iter().map(|load| &load.prediction).filter(move |one| one.target.leads == leads);
@@ -95,6 +98,17 @@ fn tensors(loads: &[ExplainedLoad<'_>], stored: &Stored) -> Vec<Fault> {
         faults.extend(differences.fold(Vec::new(), with_difference));
     }
     faults
+}
+
+/// Whether the load itself meets a tensor of another shape than the class has: under another name it finds none.
+fn compares_shapes(prediction: &Prediction<'_>) -> bool {
+    prediction.report.as_ref().is_some_and(|report| !report.mismatched.is_empty())
+}
+
+/// Marks a shape that only a load under the right names would meet.
+fn hidden_by_names(fault: Fault) -> Fault {
+    let is_shape = matches!(fault.kind, FaultKind::MismatchedTensor | FaultKind::EmptyTensors);
+    if is_shape { fault.with("unmet", true) } else { fault }
 }
 
 /// Adds a difference between two loaders; versions that differ in the same way are one fault.

@@ -229,7 +229,7 @@ fault_kinds! {
             is: Text, signs: List(&Text), command?: Text, has_config?: Flag, program?: Text,
         },
         EightBitFloats = "eight-bit-floats" { count: Integer, dtype: Text, kept: List(&Text) },
-        EmptyTensors = "empty-tensors" { count: Integer, names: List(&Text), under?: Text },
+        EmptyTensors = "empty-tensors" { count: Integer, names: List(&Text), under?: Text, unmet?: Flag },
         IndexEntryNotAShard = "index-entry-not-a-shard" { named: Text, tensors: Integer, pickle: Flag },
         IndexKeyNowhere = "index-key-nowhere" { said: Text },
         IndexMissing = "index-missing" { shards: Integer, index: Text },
@@ -245,7 +245,7 @@ fault_kinds! {
         },
         MergesArePairs = "merges-are-pairs" {},
         MismatchedTensor = "mismatched-tensor" {
-            tensor: Text, stored: List(&Integer), expected: List(&Integer), under?: Text,
+            tensor: Text, stored: List(&Integer), expected: List(&Integer), under?: Text, unmet?: Flag,
         },
         MissingTensors = "missing-tensors" { count: Integer, names: List(&Text), under?: Text },
         ModelTypeMissing = "model-type-missing" { directory: Text, class?: Text, of_class?: Text, guess?: Text },
