@@ -7,7 +7,7 @@ use anyhow::{Context, bail};
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
-use crate::check::inspect::inspect;
+use crate::check::inspect::{InspectedTensor, inspect, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
@@ -37,13 +37,25 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         };
         Checkpoint::open(dir).with_context(|| dir.display().to_string())?
     };
-    let inspection = inspect(&checkpoint, &library::with(rules)?);
+    let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob.as_deref())).transpose()?;
     let name = shown(path);
-    output::print(&match args.output_format {
-        InspectFormat::Full => report::full(&name, &inspection, output::style(args.color)),
-        InspectFormat::Json => report::json(&name, &inspection),
+    let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?));
+    output::print(&match (args.output_format, listed) {
+        (InspectFormat::Full, Some(listed)) => report::tensors(&listed),
+        (InspectFormat::Full, None) => report::full(&name, &inspection(rules)?, args.depth, output::style(args.color)),
+        (InspectFormat::Json, listed) => report::json(&name, &inspection(rules)?, listed.as_deref()),
     })?;
     Ok(CLEAN)
+}
+
+/// The tensors that match a pattern; fails if there is none.
+fn list(checkpoint: &Checkpoint, path: &Path, pattern: Option<&str>) -> anyhow::Result<Vec<InspectedTensor>> {
+    let listed = tensors(checkpoint, pattern);
+    if let Some(pattern) = pattern.filter(|_| listed.is_empty()) {
+        let count = checkpoint.tensors().count();
+        bail!("{}: none of {count} tensors matches `{pattern}`", path.display());
+    }
+    Ok(listed)
 }
 
 /// Opens a shard as a checkpoint of its own, if it has no config and no index beside it.
