@@ -142,8 +142,8 @@ pub struct InspectArgs {
     #[arg(long, value_name = "N", conflicts_with = "tensors")]
     pub depth: Option<usize>,
     /// List the tensors, or those whose names match GLOB (`*` is any text): shape, dtype, bytes, and place in the files
-    #[arg(long, value_name = "GLOB", num_args = 0..=1, require_equals = true)]
-    pub tensors: Option<Option<String>>,
+    #[arg(long, value_name = "GLOB", num_args = 0..=1, require_equals = true, default_missing_value = "*")]
+    pub tensors: Option<String>,
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,

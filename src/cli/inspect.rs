@@ -37,7 +37,7 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         };
         Checkpoint::open(dir).with_context(|| dir.display().to_string())?
     };
-    let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob.as_deref())).transpose()?;
+    let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
     let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?));
     output::print(&match (args.output_format, listed) {
@@ -48,10 +48,15 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     Ok(CLEAN)
 }
 
-/// The tensors that match a pattern; fails if there is none.
-fn list(checkpoint: &Checkpoint, path: &Path, pattern: Option<&str>) -> anyhow::Result<Vec<InspectedTensor>> {
+/// The tensors that match a pattern; fails if there is none, unless the pattern matches all. Names the files of which tensors
+/// are missing.
+fn list(checkpoint: &Checkpoint, path: &Path, pattern: &str) -> anyhow::Result<Vec<InspectedTensor>> {
+    let partial = |shard: &&Shard| shard.unread || shard.further > 0 || !shard.unreadable.is_empty();
+    for shard in checkpoint.shards.values().filter(partial) {
+        output::note(&output::safe(&format!("note: {}: not all tensors could be read", shard.name)));
+    }
     let listed = tensors(checkpoint, pattern);
-    if let Some(pattern) = pattern.filter(|_| listed.is_empty()) {
+    if listed.is_empty() && pattern != "*" {
         let count = checkpoint.tensors().count();
         bail!("{}: none of {count} tensors matches `{pattern}`", path.display());
     }

@@ -38,13 +38,13 @@ impl InspectedTensor {
     }
 }
 
-/// The stored tensors whose names match `pattern`, in which `*` is any text and `?` one character. All of them without one.
+/// The stored tensors whose names match `pattern`, in which `*` is any text and `?` one character.
 ///
 /// The program calls it for `inspect --tensors`. They are in the order of their names, with numbers by value.
 #[must_use]
-pub fn tensors(checkpoint: &Checkpoint, pattern: Option<&str>) -> Vec<InspectedTensor> {
-    let matching = |tensor: &Tensor| pattern.is_none_or(|pattern| glob(&tensor.name, pattern));
-    let mut found: Vec<(&Shard, &Tensor)> = checkpoint.tensors().filter(|(_, tensor)| matching(tensor)).collect();
+pub fn tensors(checkpoint: &Checkpoint, pattern: &str) -> Vec<InspectedTensor> {
+    let matching = checkpoint.tensors().filter(|(_, tensor)| glob(&tensor.name, pattern));
+    let mut found: Vec<(&Shard, &Tensor)> = matching.collect();
     found.sort_by(|(_, a), (_, b)| in_order(&a.name, &b.name));
     found.into_iter().map(|(shard, tensor)| InspectedTensor::new(shard, tensor)).collect()
 }

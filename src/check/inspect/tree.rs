@@ -148,11 +148,11 @@ mod tests {
     use super::{InspectedModule, Tensor, in_order, tree};
     use crate::checkpoint::Dtype;
 
-    fn lines(modules: &[InspectedModule], indent: usize, out: &mut Vec<String>) {
+    fn lines(modules: &[InspectedModule], indent: &str, out: &mut Vec<String>) {
         for one in modules {
             let last = one.last.as_deref().map(|last| format!(" to {last} ({})", one.repeats)).unwrap_or_default();
-            out.push(format!("{}{}{last}: {}", " ".repeat(indent), one.name, one.amount.tensors));
-            lines(&one.modules, indent + 1, out);
+            out.push(format!("{indent}{}{last}: {}", one.name, one.amount.tensors));
+            lines(&one.modules, &format!("{indent} "), out);
         }
     }
 
@@ -169,7 +169,7 @@ mod tests {
         let mut sorted: Vec<&Tensor> = tensors.iter().collect();
         sorted.sort_by(|a, b| in_order(&a.name, &b.name));
         let mut out = Vec::new();
-        lines(&tree(&sorted), 0, &mut out);
+        lines(&tree(&sorted), "", &mut out);
         out
     }
 
@@ -234,7 +234,7 @@ mod tests {
         let deep = "a.".repeat(9000);
         let names: Vec<String> = (0..9000).step_by(2).map(|n| format!("{}w", &deep[..n])).collect();
         let names: Vec<&str> = names.iter().map(String::as_str).collect();
-        let deepest = shown(&names).iter().map(|line| line.len() - line.trim_start().len()).max();
+        let deepest = shown(&names).iter().map(|line| line.bytes().take_while(|c| *c == b' ').count()).max();
         assert!(deepest <= Some(super::PARTS), "{deepest:?}");
     }
 }

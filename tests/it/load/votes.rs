@@ -236,6 +236,17 @@ fn offsets_count_from_the_start_of_the_file() {
 }
 
 #[test]
+fn a_list_that_lacks_tensors_says_so() {
+    let work = TempDir::new().unwrap();
+    fs::write(work.path().join("x.safetensors"), b"\x20\0\0\0\0\0\0\0{\"a\": {").unwrap();
+    let args = ["inspect", "--tensors", "x.safetensors"];
+    let run = crate::support::program().current_dir(work.path()).args(args).output().unwrap();
+    assert_eq!(run.status.code(), Some(0));
+    let said = String::from_utf8(run.stderr).unwrap();
+    assert_eq!(said, "note: x.safetensors: not all tensors could be read\n");
+}
+
+#[test]
 fn a_pattern_without_a_match_is_an_error() {
     let args = ["inspect", "--tensors=nothing.*"];
     let run = crate::support::program().current_dir(donor("llava3d-tiny")).args(args).output().unwrap();
