@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use self::columns::{Align, columns};
+use self::columns::{Align, WIDTH, columns};
 use super::Style;
 use super::format::{and, bytes, more, name, plural, scaled, sentence, shape};
 use super::json::pretty;
@@ -48,7 +48,8 @@ pub fn tensors(list: &[InspectedTensor]) -> String {
     let rows: Vec<[String; 6]> = list.iter().map(row).collect();
     let mut out = String::new();
     let header = ["name", "shape", "dtype", "bytes", "offset", "file"];
-    columns(&mut out, header, [Align::Left, Align::Left, Align::Left, Align::Right, Align::Right, Align::Left], &rows);
+    let alignment = [Align::Left, Align::Left, Align::Left, Align::Right, Align::Right, Align::Left];
+    columns(&mut out, header, alignment, &rows, WIDTH);
     out
 }
 

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::super::Style;
 use super::super::format::{bytes, more, name};
-use super::columns::{Align, columns};
+use super::columns::{Align, WIDTH, columns};
 use super::count;
 use crate::check::inspect::InspectedModule;
 
@@ -12,6 +12,8 @@ use crate::check::inspect::InspectedModule;
 const LEVELS: usize = 3;
 /// Lines beyond which fewer levels are printed when the user names none.
 const LINES: usize = 40;
+/// Columns that the figures take, beside the names.
+const FIGURES: usize = 36;
 
 /// Appends the tree with as many levels as the user names, and 0 for all. Without a number, long lists of siblings are cut.
 pub(super) fn render(out: &mut String, modules: &[InspectedModule], levels: Option<usize>, style: Style) {
@@ -26,8 +28,9 @@ pub(super) fn render(out: &mut String, modules: &[InspectedModule], levels: Opti
     let mut rows = Vec::new();
     let all = Cut { levels, cap };
     all.collect(&mut rows, modules, "", 1);
+    let limit = style.width.map_or(WIDTH, |width| width.saturating_sub(FIGURES));
     out.push('\n');
-    columns(out, ["  modules", "tensors", "parameters", "bytes"], ALIGNMENT, &rows);
+    columns(out, ["  modules", "tensors", "parameters", "bytes"], ALIGNMENT, &rows, limit);
     if all.hides(modules, 1) {
         let _ok = writeln!(out, "  further levels: --depth {}", levels.saturating_add(1));
     }
