@@ -1,5 +1,8 @@
 //! The summary of a checkpoint: amounts, and the class and config values that its tensors imply.
 
+mod tensors;
+mod tree;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
@@ -10,6 +13,9 @@ use super::votes::{self, Fit, Votes, vote};
 use crate::checkpoint::{Checkpoint, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
 use crate::knowledge::{Architecture, Library, Loader};
+
+pub use self::tensors::{InspectedTensor, tensors};
+pub use self::tree::InspectedModule;
 
 /// Classes that are named beside the best.
 const CANDIDATES: usize = 8;
@@ -34,6 +40,8 @@ pub struct Inspection {
     pub dtypes: BTreeMap<String, Amount>,
     /// Tensors by the outer parts of their names.
     pub modules: BTreeMap<String, Amount>,
+    /// The tree of modules, complete; consecutive numbered modules with the same tensors are one.
+    pub tree: Vec<InspectedModule>,
     /// The identity that config.json declares; null without a config.json.
     pub config: Option<ConfigSummary>,
     /// Classes that match the tensor names, best first; the class of the config is first if it is known.
@@ -64,6 +72,12 @@ impl Amount {
         let elements = tensor.shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d));
         self.parameters = self.parameters.saturating_add(elements);
         self.bytes = self.bytes.saturating_add(tensor.len());
+    }
+
+    const fn merge(&mut self, other: Self) {
+        self.tensors = self.tensors.saturating_add(other.tensors);
+        self.parameters = self.parameters.saturating_add(other.parameters);
+        self.bytes = self.bytes.saturating_add(other.bytes);
     }
 }
 
@@ -130,6 +144,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         tensors,
         dtypes,
         modules: modules(checkpoint, tensors),
+        tree: tree::of(checkpoint),
         config: checkpoint.config().map(config_summary),
         classes: Vec::new(),
         votes: None,

@@ -138,6 +138,12 @@ pub struct InspectArgs {
     /// A checkpoint directory, with or without a config.json, or a .safetensors file
     #[arg(value_name = "PATH", default_value = ".")]
     pub path: PathBuf,
+    /// Print the tree of modules to N levels, 0 for all; without it, as many as stay short. JSON has all
+    #[arg(long, value_name = "N", conflicts_with = "tensors")]
+    pub depth: Option<usize>,
+    /// List the tensors, or those whose names match GLOB (`*` is any text): shape, dtype, bytes, and place in the files
+    #[arg(long, value_name = "GLOB", num_args = 0..=1, require_equals = true, default_missing_value = "*")]
+    pub tensors: Option<String>,
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,

@@ -7,7 +7,7 @@ use anyhow::{Context, bail};
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
-use crate::check::inspect::inspect;
+use crate::check::inspect::{InspectedTensor, inspect, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
@@ -37,13 +37,30 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         };
         Checkpoint::open(dir).with_context(|| dir.display().to_string())?
     };
-    let inspection = inspect(&checkpoint, &library::with(rules)?);
+    let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
-    output::print(&match args.output_format {
-        InspectFormat::Full => report::full(&name, &inspection, output::style(args.color)),
-        InspectFormat::Json => report::json(&name, &inspection),
+    let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?));
+    output::print(&match (args.output_format, listed) {
+        (InspectFormat::Full, Some(listed)) => report::tensors(&listed),
+        (InspectFormat::Full, None) => report::full(&name, &inspection(rules)?, args.depth, output::style(args.color)),
+        (InspectFormat::Json, listed) => report::json(&name, &inspection(rules)?, listed.as_deref()),
     })?;
     Ok(CLEAN)
+}
+
+/// The tensors that match a pattern; fails if there is none, unless the pattern matches all. Names the files of which tensors
+/// are missing.
+fn list(checkpoint: &Checkpoint, path: &Path, pattern: &str) -> anyhow::Result<Vec<InspectedTensor>> {
+    let partial = |shard: &&Shard| shard.unread || shard.further > 0 || !shard.unreadable.is_empty();
+    for shard in checkpoint.shards.values().filter(partial) {
+        output::note(&output::safe(&format!("note: {}: not all tensors could be read", shard.name)));
+    }
+    let listed = tensors(checkpoint, pattern);
+    if listed.is_empty() && pattern != "*" {
+        let count = checkpoint.tensors().count();
+        bail!("{}: none of {count} tensors matches `{pattern}`", path.display());
+    }
+    Ok(listed)
 }
 
 /// Opens a shard as a checkpoint of its own, if it has no config and no index beside it.

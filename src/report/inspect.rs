@@ -1,16 +1,20 @@
 //! Renders the result of `inspect`, for people or as JSON.
 
+mod columns;
+mod tree;
+
 use std::fmt::Write as _;
 
 use serde::Serialize;
 
+use self::columns::{Align, WIDTH, columns};
 use super::Style;
-use super::format::{and, bytes, more, name, plural, scaled, sentence};
+use super::format::{and, bytes, more, name, plural, scaled, sentence, shape};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
-use crate::check::inspect::{Amount, ClassCandidate, Inspection};
+use crate::check::inspect::{Amount, ClassCandidate, InspectedTensor, Inspection};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
@@ -21,17 +25,37 @@ pub(crate) struct InspectDocument<'a> {
     path: &'a str,
     #[serde(flatten)]
     inspection: &'a Inspection,
+    /// The tensors, with `--tensors`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tensor_list: Option<&'a [InspectedTensor]>,
 }
 
-/// A complete inspection as JSON (`schema` 1).
+/// A complete inspection as JSON (`schema` 1), with a list of tensors if there is one.
 #[must_use]
-pub fn json(path: &str, inspection: &Inspection) -> String {
-    pretty(&InspectDocument { schema: 1, tool: ToolInfo::this(), path, inspection })
+pub fn json(path: &str, inspection: &Inspection, tensor_list: Option<&[InspectedTensor]>) -> String {
+    pretty(&InspectDocument { schema: 1, tool: ToolInfo::this(), path, inspection, tensor_list })
 }
 
-/// An inspection for a terminal.
+/// A list of tensors for a terminal, one per line.
+///
+/// The program calls it for `inspect --tensors`. Nothing is cut to the width of the terminal: programs read these lines too.
 #[must_use]
-pub fn full(path: &str, inspection: &Inspection, style: Style) -> String {
+pub fn tensors(list: &[InspectedTensor]) -> String {
+    let row = |t: &InspectedTensor| {
+        let offset = t.offset.map(|n| n.to_string()).unwrap_or_default();
+        [name(&t.name), shape(&t.shape), t.dtype.to_owned(), t.bytes.to_string(), offset, name(&t.file)]
+    };
+    let rows: Vec<[String; 6]> = list.iter().map(row).collect();
+    let mut out = String::new();
+    let header = ["name", "shape", "dtype", "bytes", "offset", "file"];
+    let alignment = [Align::Left, Align::Left, Align::Left, Align::Right, Align::Right, Align::Left];
+    columns(&mut out, header, alignment, &rows, WIDTH);
+    out
+}
+
+/// An inspection for a terminal, with `levels` of the tree of modules; without a number, with as many as stay short.
+#[must_use]
+pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: Style) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
     let all = inspection.tensors;
@@ -45,7 +69,7 @@ pub fn full(path: &str, inspection: &Inspection, style: Style) -> String {
         bytes(all.bytes)
     );
     amounts(&mut out, "dtypes", &inspection.dtypes, style);
-    amounts(&mut out, "modules", &inspection.modules, style);
+    tree::render(&mut out, &inspection.tree, levels, style);
     files(&mut out, inspection, style);
     class(&mut out, inspection, style);
     if let Some(votes) = &inspection.votes {

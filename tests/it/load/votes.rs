@@ -197,6 +197,65 @@ fn inspect_summarises_a_checkpoint() {
 }
 
 #[test]
+fn modules_are_a_tree_with_repeats_folded() {
+    for depth in ["0", "1"] {
+        let shown = doctor(&donor("spatialvla-tiny"), &["--depth", depth]);
+        let tree = shown.split("\n\n").find(|section| section.starts_with("  modules")).unwrap();
+        snapshot!(format!("inspect-depth-{depth}"), tree);
+    }
+}
+
+#[test]
+fn tensors_are_listed_with_their_places() {
+    let dir = donor("llava3d-tiny");
+    snapshot!("inspect-tensors-full", doctor(&dir, &["--tensors=model.layers.*.?_proj*"]));
+    assert_eq!(doctor(&dir, &["--tensors"]).lines().count(), 77);
+    let shown = doctor(&dir, &["--tensors=*norm.weight", "--output-format", "json"]);
+    let shown: Value = serde_json::from_str(&shown).unwrap();
+    snapshot!("inspect-tensors-json", serde_json::to_string_pretty(&shown["tensor_list"]).unwrap());
+    let plain = doctor(&dir, &["--output-format", "json"]);
+    assert!(!plain.contains("tensor_list"), "{plain}");
+}
+
+/// The bytes at the offset of a tensor are those of the tensor.
+#[test]
+fn offsets_count_from_the_start_of_the_file() {
+    let work = TempDir::new().unwrap();
+    let header = json!({ "l.10.w": { "dtype": "U8", "shape": [4], "data_offsets": [0, 4] },
+        "l.9.w": { "dtype": "U8", "shape": [4], "data_offsets": [4, 8] } });
+    let header = header.to_string();
+    let mut bytes = u64::try_from(header.len()).unwrap().to_le_bytes().to_vec();
+    bytes.extend(header.as_bytes());
+    bytes.extend(b"last1st.");
+    fs::write(work.path().join("x.safetensors"), &bytes).unwrap();
+    let shown = doctor(work.path(), &["x.safetensors", "--tensors", "--output-format", "json"]);
+    let shown: Value = serde_json::from_str(&shown).unwrap();
+    let first = &shown["tensor_list"][0];
+    let offset = usize::try_from(first["offset"].as_u64().unwrap()).unwrap();
+    assert_eq!((&first["name"], bytes.get(offset..)), (&json!("l.9.w"), Some(&b"1st."[..])));
+}
+
+#[test]
+fn a_list_that_lacks_tensors_says_so() {
+    let work = TempDir::new().unwrap();
+    fs::write(work.path().join("x.safetensors"), b"\x20\0\0\0\0\0\0\0{\"a\": {").unwrap();
+    let args = ["inspect", "--tensors", "x.safetensors"];
+    let run = crate::support::program().current_dir(work.path()).args(args).output().unwrap();
+    assert_eq!(run.status.code(), Some(0));
+    let said = String::from_utf8(run.stderr).unwrap();
+    assert_eq!(said, "note: x.safetensors: not all tensors could be read\n");
+}
+
+#[test]
+fn a_pattern_without_a_match_is_an_error() {
+    let args = ["inspect", "--tensors=nothing.*"];
+    let run = crate::support::program().current_dir(donor("llava3d-tiny")).args(args).output().unwrap();
+    assert_eq!((run.status.code(), run.stdout.len()), (Some(2), 0));
+    let said = String::from_utf8(run.stderr).unwrap();
+    assert!(said.contains("none of 76 tensors matches `nothing.*`"), "{said}");
+}
+
+#[test]
 fn a_shard_alone_and_a_shard_of_a_checkpoint() {
     let work = TempDir::new().unwrap();
     let shard = "model-00001-of-00002.safetensors";
@@ -219,7 +278,9 @@ fn hostile_names_are_escaped() {
     bytes.extend([0; 4]);
     fs::write(work.path().join("x.safetensors"), bytes).unwrap();
     for format in ["full", "json"] {
-        let shown = doctor(work.path(), &["x.safetensors", "--output-format", format]);
-        assert!(!shown.contains(['\u{1b}', '\u{202e}']), "{shown}");
+        for more in [&[][..], &["--depth=0"], &["--tensors"]] {
+            let shown = doctor(work.path(), &[&["x.safetensors", "--output-format", format], more].concat());
+            assert!(!shown.contains(['\u{1b}', '\u{202e}']), "{shown}");
+        }
     }
 }

@@ -119,6 +119,7 @@ fn inspections_follow_their_schema() {
     let shard = "fixtures/donors/llava3d-tiny/model-00001-of-00002.safetensors";
     for path in ["fixtures/donors/llava3d-tiny", "fixtures/donors/spatialvla-tiny", "fixtures/bases/llama", shard] {
         holds(&inspect, &printed(project(), &["inspect", path, "--output-format", "json"]));
+        holds(&inspect, &printed(project(), &["inspect", path, "--tensors", "--output-format", "json"]));
     }
     let room = TempDir::new().unwrap();
     fs::copy(project().join(shard), room.path().join("model.safetensors")).unwrap();

@@ -219,6 +219,8 @@ never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -l rules -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -s V -l version -d 'Print version'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l depth -d 'Print the tree of modules to N levels, 0 for all; without it, as many as stay short. JSON has all' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l tensors -d 'List the tensors, or those whose names match GLOB (`*` is any text): shape, dtype, bytes, and place in the files' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
