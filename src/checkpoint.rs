@@ -42,7 +42,7 @@ pub mod text;
 pub mod tokenizer;
 pub(crate) mod work;
 
-pub use contents::{Progress, ReadOptions, TensorContents, TensorStats};
+pub use contents::{HashedFiles, Progress, ReadOptions, TensorContents, TensorStats};
 pub use digest::HashAlgorithm;
 pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
 pub use document::Document;

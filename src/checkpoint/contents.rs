@@ -16,6 +16,7 @@ mod pieces;
 mod read;
 mod tally;
 
+pub use hashes::HashedFiles;
 use pieces::{Piece, each_piece};
 pub(super) use read::read;
 pub use read::{Progress, ReadOptions, TensorContents, TensorStats};

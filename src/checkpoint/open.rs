@@ -3,6 +3,7 @@
 //! A plain `open` would block for ever on a FIFO named like a config, and a sparse "config" of six gigabytes would fill
 //! the memory. [`open_regular`] refuses both.
 
+use std::ffi::OsStr;
 use std::fs::{File, Metadata};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -201,7 +202,7 @@ pub fn real_target(root: &Path, followed: &[PathBuf], path: &Path) -> Result<Opt
     // Devices and pipes have a clearer error of their own.
     let is_file = std::fs::metadata(&real).is_ok_and(|metadata| metadata.is_file());
     let is_inside = real.starts_with(&root) || followed.iter().any(|directory| real.starts_with(directory));
-    if is_inside || is_blob(&root, &real) || !is_file {
+    if is_inside || is_blob(&root, &real) || is_shared_blob(&real) || !is_file {
         return Ok(Some(real));
     }
     let target = std::fs::read_link(path).map_err(io)?;
@@ -217,6 +218,23 @@ fn is_blob(root: &Path, real: &Path) -> bool {
     let is_hash = matches!(name.len(), 40 | 64) && name.bytes().all(|b| b.is_ascii_hexdigit());
     let folder = repository.file_name().map(|name| name.to_string_lossy()).unwrap_or_default();
     is_hash && (root.starts_with(repository) || folder.starts_with("models--"))
+}
+
+/// The file that marks the store of blobs for all repositories of a hub cache. Source: `utils/_shared_blobs.py` in
+/// huggingface_hub 2.4.0.
+const STORE_MARKER: &str = ".huggingface-shared-blobs";
+
+/// Whether a path is a blob for all repositories of a hub cache, `blobs/4d/4d7a…`, to which the blob of a repository links. It
+/// is named by the Xet hash of its content. Source: as [`STORE_MARKER`].
+fn is_shared_blob(real: &Path) -> bool {
+    let name = real.file_name().map(|name| name.to_string_lossy()).unwrap_or_default();
+    let is_hash = name.len() == 64 && name.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
+    let prefix = real
+        .parent()
+        .filter(|dir| is_hash && dir.file_name().is_some_and(|p| Some(p) == name.get(..2).map(OsStr::new)));
+    let Some(store) = prefix.and_then(Path::parent) else { return false };
+    let is_marked = || std::fs::symlink_metadata(store.join(STORE_MARKER)).is_ok_and(|marker| marker.is_file());
+    store.file_name() == Some("blobs".as_ref()) && is_marked()
 }
 
 /// Opens `path`, which errors call `shown`; a link is refused unless `follow`.

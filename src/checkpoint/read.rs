@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::adapter::AdapterBase;
 use super::budget::{Budget, text_cost};
 use super::card::{CARD, CARD_CAP, ModelCard};
-use super::contents::{self, Progress, ReadOptions};
+use super::contents::{self, HashedFiles, Progress, ReadOptions};
 use super::git;
 use super::is_plain_file_name;
 use super::journal::{Journal, JournalDistrust, StateFolder};
@@ -125,13 +125,15 @@ impl Checkpoint {
         }
     }
 
-    /// Hashes the files whose hash a download or git recorded, and adds a fault for each that differs. Never fails, as
-    /// [`Self::read_contents`], whose `progress` it has.
-    pub fn check_hashes(&mut self, progress: &(dyn Fn(Progress<'_>) + Sync)) {
-        for fault in contents::hashes::check(self, progress) {
+    /// Hashes the files whose hash a download or git recorded, adds a fault for each that differs, and returns how many files
+    /// were compared. Never fails, as [`Self::read_contents`], whose `progress` it has.
+    pub fn check_hashes(&mut self, progress: &(dyn Fn(Progress<'_>) + Sync)) -> HashedFiles {
+        let (faults, hashed) = contents::hashes::check(self, progress);
+        for fault in faults {
             let shard = fault.places.first().and_then(|place| self.shards.get_mut(place.file.as_deref()?));
             shard.map_or(&mut self.faults, |shard| &mut shard.faults).push(fault);
         }
+        hashed
     }
 }
 

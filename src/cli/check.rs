@@ -14,7 +14,7 @@ use super::{baseline, fix, output, signals, skipped};
 use crate::check::{Outcome, check_for, unused_suppressions};
 use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
-use crate::checkpoint::{Checkpoint, ReadOptions, Source, parallel};
+use crate::checkpoint::{Checkpoint, HashedFiles, ReadOptions, Source, parallel};
 use crate::knowledge::settings::Surroundings;
 use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, UncheckedPath, Withdrawn};
 use crate::report::{Report, fixes};
@@ -148,7 +148,9 @@ impl CheckRun<'_> {
         }
         if self.args.hash {
             let meter = Meter::new("hashing");
-            checkpoint.check_hashes(&|read| meter.add(read.file, read.bytes, read.total));
+            let hashed = checkpoint.check_hashes(&|read| meter.add(read.file, read.bytes, read.total));
+            drop(meter);
+            note_hashed(dir, hashed);
         }
         Ok(Arc::new(checkpoint))
     }
@@ -185,6 +187,14 @@ impl CheckRun<'_> {
             .map_or_else(|| check_by(self.by)(&checkpoint), |outcome| tried(&checkpoint, outcome, &judge_by(self.by)));
         Ok(Checked { dir, checkpoint, outcome, repaired: (fixed, withdrawn) })
     }
+}
+
+/// Tells how many files were compared with recorded hashes: without a record, a changed file is not found.
+fn note_hashed(dir: &Path, hashed: HashedFiles) {
+    let HashedFiles { compared, others } = hashed;
+    let files = if compared == 1 { "file" } else { "files" };
+    let text = format!("{}: {compared} {files} compared with recorded hashes, {others} not", shown(dir));
+    output::note(&output::safe(&format!("note: {text}")));
 }
 
 /// Adds a finding for each suppression that suppressed nothing.

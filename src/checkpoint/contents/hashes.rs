@@ -52,13 +52,35 @@ enum Since {
     Same(u32, u32),
 }
 
+/// How many files were compared with recorded hashes. `check --hash` prints it: agreement says nothing of a file without a record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HashedFiles {
+    /// Files whose hash was computed, equal to the recorded one or not.
+    pub compared: usize,
+    /// Other regular files: their hash is not recorded, or they could not be read.
+    pub others: usize,
+}
+
+/// What came of a file whose hash is recorded.
+enum HashMatch {
+    Equal,
+    Differs(Fault),
+    /// It could not be read whole.
+    Unread(Option<Fault>),
+}
+
 /// Hashes the files of a checkpoint of which a record states the hash, and returns a fault for each that differs or cannot
 /// be read. Called for `check --hash`; `progress` is called by every thread, after each read.
-pub(in crate::checkpoint) fn check(checkpoint: &Checkpoint, progress: &(dyn Fn(Progress<'_>) + Sync)) -> Vec<Fault> {
+pub(in crate::checkpoint) fn check(
+    checkpoint: &Checkpoint,
+    progress: &(dyn Fn(Progress<'_>) + Sync),
+) -> (Vec<Fault>, HashedFiles) {
     let files = &checkpoint.source;
     let records = Records::new(files);
     let regular = checkpoint.entries.iter().filter(|(_, entry)| entry.kind == EntryKind::Regular);
+    let mut all: usize = 0;
     let mut stated: Vec<Stated<'_>> = regular
+        .inspect(|_| all = all.saturating_add(1))
         .filter(|(_, entry)| entry.lfs.is_none())
         .filter_map(|(name, entry)| {
             let is_weights = checkpoint.shards.contains_key(name) || checkpoint.pickles.contains_key(name);
@@ -78,9 +100,11 @@ pub(in crate::checkpoint) fn check(checkpoint: &Checkpoint, progress: &(dyn Fn(P
             compare(files, file, buffer, zeros, &read)
         },
     );
-    let mut faults: Vec<Fault> = compared.into_iter().flatten().collect();
+    let unread = compared.iter().filter(|one| matches!(one, HashMatch::Unread(_))).count();
+    let compared_files = compared.len().saturating_sub(unread);
+    let mut faults: Vec<Fault> = compared.into_iter().filter_map(HashMatch::fault).collect();
     faults.sort_by_cached_key(|fault| fault.places.first().and_then(|place| place.file.clone()));
-    faults
+    (faults, HashedFiles { compared: compared_files, others: all.saturating_sub(compared_files) })
 }
 
 /// The records beside the files of a checkpoint.
@@ -113,12 +137,17 @@ impl Records {
     }
 }
 
-/// The hash in the name of a blob of the hub cache: SHA-256 of large files, git hashes of others.
+/// The hash in the name of a blob of the hub cache: SHA-256 of large files, git hashes of others. A blob for all repositories,
+/// `blobs/4d/4d7a…`, has the Xet hash as its name, which is not computed here.
 fn blob(entry: &Entry) -> Option<Record> {
     let mut parts = entry.link.as_deref()?.rsplit('/');
     let name = parts.next()?;
     let record = record(name)?;
-    let is_blob = matches!(record, Record::Sha256(_)) || parts.next() == Some("blobs");
+    let folder = parts.next();
+    let is_blob = match record {
+        Record::Sha256(_) => folder.is_none() || folder != name.get(..2),
+        _ => folder == Some("blobs"),
+    };
     is_blob.then_some(record)
 }
 
@@ -143,14 +172,24 @@ fn download(files: &Source, name: &str) -> Option<(Record, f64)> {
     Some((record, time)).filter(|_| time.is_finite())
 }
 
-/// The fault of a file that differs from its record, or that cannot be read.
-fn compare(files: &Source, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, read: &dyn Fn(u64)) -> Option<Fault> {
+impl HashMatch {
+    fn fault(self) -> Option<Fault> {
+        match self {
+            Self::Equal => None,
+            Self::Differs(fault) => Some(fault),
+            Self::Unread(fault) => fault,
+        }
+    }
+}
+
+/// Compares a file with its record.
+fn compare(files: &Source, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, read: &dyn Fn(u64)) -> HashMatch {
     let fault = |kind| Fault::new(kind).at(Place::file(file.name));
-    let unread = |reason: &str| Some(fault(FaultKind::ContentsUnread).with("reason", reason));
+    let unread = |reason: &str| HashMatch::Unread(Some(fault(FaultKind::ContentsUnread).with("reason", reason)));
     let opened = match files.open_own(file.name, u64::MAX) {
         Ok(opened) => opened,
         // What a link outside the checkpoint leads to is no part of it.
-        Err(OpenError::Outside { .. }) => return None,
+        Err(OpenError::Outside { .. }) => return HashMatch::Unread(None),
         Err(error) => return unread(&error.to_string()),
     };
     let size = opened.len();
@@ -171,7 +210,7 @@ fn compare(files: &Source, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, rea
         }
     };
     if found == *stated {
-        return None;
+        return HashMatch::Equal;
     }
     let is_edited = match (&file.since, opened.modified()) {
         (None, _) | (_, None) => false,
@@ -184,7 +223,7 @@ fn compare(files: &Source, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, rea
     };
     let kind = if is_edited { FaultKind::ContentEdited } else { FaultKind::ContentHashDiffers };
     let fault = fault(kind).with("algorithm", algorithm).with("source", file.source);
-    Some(fault.with("stated", stated.as_str()).with("found", found))
+    HashMatch::Differs(fault.with("stated", stated.as_str()).with("found", found))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "seconds since 1970 have 31 bits")]
@@ -264,7 +303,7 @@ mod tests {
         let kinds = || {
             let mut checkpoint = Checkpoint::open(dir.path()).unwrap();
             checkpoint.shards.entry(NAME.to_owned()).or_default();
-            check(&checkpoint, &|_| {}).into_iter().map(|fault| fault.kind).collect::<Vec<_>>()
+            check(&checkpoint, &|_| {}).0.into_iter().map(|fault| fault.kind).collect::<Vec<_>>()
         };
         assert_eq!(kinds(), []);
         let time = fs::metadata(&file).unwrap().modified().unwrap();

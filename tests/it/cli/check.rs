@@ -231,6 +231,25 @@ fn severities_can_be_hidden_without_changing_the_exit_code() {
     }
 }
 
+/// Without a word, `--hash` would look like a proof for files whose hash nobody recorded.
+#[cfg(unix)]
+#[test]
+fn hashes_are_counted_with_the_files_that_have_none() {
+    let work = TempDir::new().unwrap();
+    let dir = work.path().join("models--org--name/snapshots/0123456789abcdef0123456789abcdef01234567");
+    make_base("llama", &dir);
+    let blobs = dir.join("../../blobs");
+    fs::create_dir(&blobs).unwrap();
+    // Of an empty file, as git names it.
+    let blob = "e69de29bb2d1d6434b8b29ae775ad8c2e48c5391";
+    fs::write(blobs.join(blob), "").unwrap();
+    std::os::unix::fs::symlink(format!("../../blobs/{blob}"), dir.join("notes.txt")).unwrap();
+    let others = fs::read_dir(&dir).unwrap().count() - 1;
+    let output = doctor(&["check", dir.to_str().unwrap(), "--isolated", "--hash"]);
+    let notes = String::from_utf8(output.stderr).unwrap();
+    assert!(notes.ends_with(&format!(": 1 file compared with recorded hashes, {others} not\n")), "{notes}");
+}
+
 #[test]
 fn exit_codes_follow_fail_on() {
     let vision = donor("spatialvla-tiny");

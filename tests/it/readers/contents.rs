@@ -46,6 +46,22 @@ fn cases() -> Vec<Case> {
         write(&dir.join("blobs").join(&blob), &[1; 64]);
         std::os::unix::fs::symlink(format!("blobs/{blob}"), dir.join(NAME)).unwrap();
     };
+    // The blob of the repository links to one for all repositories, which has another hash as its name.
+    let shared = |dir: &Path| {
+        let (own, of_all) = ("4d7a".repeat(16), "ab12".repeat(16));
+        fs::create_dir_all(dir.join("cache/blobs/ab")).unwrap();
+        fs::create_dir_all(dir.join("blobs")).unwrap();
+        write(&dir.join("cache/blobs/ab").join(&of_all), &[1; 64]);
+        std::os::unix::fs::symlink(format!("../cache/blobs/ab/{of_all}"), dir.join("blobs").join(&own)).unwrap();
+        std::os::unix::fs::symlink(format!("blobs/{own}"), dir.join(NAME)).unwrap();
+    };
+    // A link past the blob of the repository: its name is no SHA-256.
+    let past = |dir: &Path| {
+        let of_all = "ab12".repeat(16);
+        fs::create_dir_all(dir.join("blobs/ab")).unwrap();
+        write(&dir.join("blobs/ab").join(&of_all), &[1; 64]);
+        std::os::unix::fs::symlink(format!("blobs/ab/{of_all}"), dir.join(NAME)).unwrap();
+    };
     let recorded = |dir: &Path| {
         let records = dir.join(".cache/huggingface/download");
         fs::create_dir_all(&records).unwrap();
@@ -68,6 +84,8 @@ fn cases() -> Vec<Case> {
             &[FaultKind::ContentHashDiffers],
             faults(cached, |_| ()),
         ),
+        Case::new("content that differs, in a cache for all", &[FaultKind::ContentHashDiffers], faults(shared, |_| ())),
+        Case::new("a name that is another hash", &[], faults(past, |_| ())),
         Case::new("content that was written after its download", &[FaultKind::ContentEdited], faults(recorded, |_| ())),
     ]
 }

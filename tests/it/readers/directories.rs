@@ -50,6 +50,20 @@ fn cases() -> Vec<Case> {
         fs::write(blobs.join("0123456789abcdef0123456789abcdef01234567"), "{}").unwrap();
         symlink("../../blobs/0123456789abcdef0123456789abcdef01234567", root.join("config.json")).unwrap();
     };
+    let store = |marker: bool| {
+        move |root: &Path| {
+            let store = root.join("../../../blobs");
+            fs::create_dir_all(store.join("4d")).unwrap();
+            fs::create_dir_all(root.join("../../blobs")).unwrap();
+            if marker {
+                fs::write(store.join(".huggingface-shared-blobs"), "1\n").unwrap();
+            }
+            let (hash, own) = ("4d7a".repeat(16), "0123456789abcdef0123456789abcdef01234567");
+            fs::write(store.join("4d").join(&hash), "{}").unwrap();
+            symlink(format!("../../blobs/4d/{hash}"), root.join("../../blobs").join(own)).unwrap();
+            symlink(format!("../../blobs/{own}"), root.join("config.json")).unwrap();
+        }
+    };
     vec![
         case("empty directory", &[], &|_| {}),
         case("a repair that was killed", &[FaultKind::RepairInterrupted], &|root| own_journal(root).unwrap()),
@@ -64,6 +78,8 @@ fn cases() -> Vec<Case> {
             fs::write(root.join(".ckpt-doctor/journal.json"), "{}").unwrap();
         }),
         case("hub cache", &[], &blob),
+        case("blob for all repositories of a hub cache", &[], &store(true)),
+        case("the same without the marker of the cache", &[FaultKind::LinkNotFollowed], &store(false)),
         case("inner link", &[], &|root| {
             fs::write(root.join("a.json"), "{}").unwrap();
             symlink("a.json", root.join("config.json")).unwrap();
