@@ -109,14 +109,19 @@ pub fn judge(
     let votes = explain::distinct_votes(&loads);
     faults.extend(faults::faults(&inputs, &loads, &votes));
     let unscaled = unscaled::unscaled(&inputs, &loads);
-    faults.extend(unscaled.fault);
     let config = loads.first().map_or(Value::Null, |load| load.prediction.expected.config.clone());
     let mut loads: Vec<LoadReport> =
         loads.into_iter().filter_map(|load| predict::completed(&inputs, load.prediction)).collect();
-    for (loader, reason) in unscaled.undecided {
-        loads.iter_mut().filter(|load| load.loader == loader).for_each(|load| load.undecided = Some(reason.clone()));
+    if let Some(fault) = faults::undeclared_scheme(&inputs, &loads) {
+        faults.push(fault);
+    } else {
+        // No scales are stored that nothing reads, so the values themselves are in question.
+        faults.extend(unscaled.fault);
+        for (loader, reason) in unscaled.undecided {
+            let read = loads.iter_mut().find(|load| load.loader == loader);
+            read.into_iter().for_each(|load| load.undecided = Some(reason.clone()));
+        }
     }
-    faults.extend(faults::undeclared_scheme(&inputs, &loads));
     Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
 }
 

@@ -1,12 +1,10 @@
-//! Weights that are stored as 8-bit floats without a scale, under a config that declares no quantisation.
+//! Weights that are stored as 8-bit floats, where the loader reads no quantisation from the config.
 
 use super::Inputs;
 use super::explain::ExplainedLoad;
 use super::integers::{assigns, loaded};
 use crate::check::index;
-use crate::check::quantization::signature;
 use crate::checkpoint::{Fault, FaultKind, Place, Tensor};
-use crate::knowledge::Loader;
 use crate::knowledge::quantization::DeclaredScheme;
 
 /// Names in one finding.
@@ -33,10 +31,6 @@ pub(super) fn unscaled(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Unsc
     if !index::opened_tensors(inputs.checkpoint).any(|tensor| tensor.dtype.is_eight_bit_float()) {
         return found;
     }
-    // Scales without a quantization_config are a fault of their own.
-    if signature(&inputs.knowledge.schemes, inputs.stored.names()).is_some() {
-        return found;
-    }
     for load in loads {
         let expected = &load.prediction.expected;
         if !matches!(inputs.scheme_of(expected.loader), DeclaredScheme::Plain) {
@@ -45,7 +39,7 @@ pub(super) fn unscaled(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Unsc
         let weights = loaded(inputs.checkpoint, inputs.stored, expected);
         let weights: Vec<&Tensor> = weights.filter(|tensor| tensor.dtype.is_eight_bit_float()).collect();
         let Some(first) = weights.first() else { continue };
-        if expected.loader != Loader::V5_23_0 && assigns(inputs.checkpoint, expected) {
+        if expected.loader.major() < 5 && assigns(inputs.checkpoint, expected) {
             kept.push(load.loader());
         } else {
             let Tensor { name, dtype, .. } = first;

@@ -145,7 +145,7 @@ fn blob(entry: &Entry) -> Option<Record> {
     let record = record(name)?;
     let folder = parts.next();
     let is_blob = match record {
-        Record::Sha256(_) => folder.is_none() || folder != name.get(..2),
+        Record::Sha256(_) => folder != name.get(..2),
         _ => folder == Some("blobs"),
     };
     is_blob.then_some(record)
