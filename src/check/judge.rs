@@ -118,8 +118,9 @@ pub fn judge(
         // No scales are stored that nothing reads, so the values themselves are in question.
         faults.extend(unscaled.fault);
         for (loader, reason) in unscaled.undecided {
-            let read = loads.iter_mut().find(|load| load.loader == loader);
-            read.into_iter().for_each(|load| load.undecided = Some(reason.clone()));
+            for load in loads.iter_mut().filter(|load| load.loader == loader) {
+                load.undecided = Some(reason.clone());
+            }
         }
     }
     Judgement { architecture, config, loads, targets, unpredicted, faults, votes }
