@@ -47,3 +47,5 @@ mod reported;
 mod reports;
 #[cfg(unix)]
 mod rules;
+#[cfg(unix)]
+mod yesterday;
