@@ -21,6 +21,7 @@ pub mod load;
 mod model_type;
 mod module_imports;
 pub mod modules;
+pub mod observe;
 mod outcome;
 mod pickles;
 mod policy;
@@ -38,6 +39,7 @@ mod tokenizer_json;
 pub mod tokens;
 pub mod variables;
 pub mod verdict;
+mod view;
 pub mod votes;
 
 pub use crate::knowledge::rule::Safety;

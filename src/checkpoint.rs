@@ -20,6 +20,7 @@ pub mod document;
 mod entry;
 pub mod fault;
 mod file_name;
+pub mod files;
 mod git;
 pub(crate) mod glob;
 pub mod index;
@@ -53,12 +54,12 @@ pub use fault::FaultSource;
 pub use fault::{Fault, FaultKind, Place};
 pub use file_name::FileName;
 pub use glob::FilePattern;
-pub use index::{INDEX_NAME, Index, PICKLE_INDEX_NAME};
+pub use index::Index;
 pub use lfs::LfsPointer;
 pub use module::PythonModule;
 pub use nested::Nested;
-pub use open::{OpenError, is_plain_file_name, open_regular};
-pub use pickle::{PICKLE_NAME, PickleGlobal};
+pub use open::{NotRead, OpenError, is_plain_file_name, open_regular};
+pub use pickle::PickleGlobal;
 pub use shard::{Dtype, Shard, Tensor, byte_len};
 pub use source::{MemoryFiles, Source, SourceFile};
 #[cfg(feature = "internals")]
@@ -176,7 +177,7 @@ impl Checkpoint {
         for (name, vocabulary) in kept {
             vocabularies.entry(name.clone()).or_insert_with(|| Arc::clone(vocabulary));
         }
-        let indexed = documents.iter().any(|d| Index::is_index(&d.name) || d.name == PICKLE_INDEX_NAME);
+        let indexed = documents.iter().any(|d| Index::is_index(&d.name) || d.name == files::PICKLE_INDEX);
         for document in documents {
             entry(&document.name, len(&document.text));
             next.documents.insert(document.name.clone(), document);
@@ -203,11 +204,11 @@ impl Checkpoint {
     fn derive(&mut self, vocabularies: BTreeMap<String, Arc<Vocabulary>>) {
         let files = tokenizer::VOCABULARY_FILES.into_iter().filter(|f| self.has_file(f)).map(str::to_owned).collect();
         self.tokenizer = Tokenizer::new(&self.documents, vocabularies, files);
-        let name = if self.documents.contains_key(INDEX_NAME) {
-            Some(INDEX_NAME.to_owned())
+        let name = if self.documents.contains_key(files::INDEX) {
+            Some(files::INDEX.to_owned())
         } else {
             let only_pickles = self.shards.values().all(Shard::is_pickle);
-            let pickles = || self.documents.keys().find(|name| *name == PICKLE_INDEX_NAME && only_pickles);
+            let pickles = || self.documents.keys().find(|name| *name == files::PICKLE_INDEX && only_pickles);
             self.documents.keys().find(|name| Index::is_index(name)).or_else(pickles).cloned()
         };
         if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
@@ -220,7 +221,7 @@ impl Checkpoint {
     /// The value of `config.json`.
     #[must_use]
     pub fn config(&self) -> Option<&Value> {
-        self.documents.get("config.json")?.value.as_ref()
+        self.documents.get(files::CONFIG)?.value.as_ref()
     }
 
     /// Whether files were left out because the checkpoint is too large: then nothing that is absent is missing.
@@ -241,7 +242,7 @@ impl Checkpoint {
     pub fn text(&self, file: &str) -> Option<&Arc<str>> {
         let document = || self.document(file)?.text.as_ref();
         let module = || self.modules.get(file)?.text.as_ref();
-        let card = || self.card.as_ref().filter(|_| file == card::CARD).map(|card| &card.text);
+        let card = || self.card.as_ref().filter(|_| file == files::CARD).map(|card| &card.text);
         document().or_else(module).or_else(card)
     }
 

@@ -64,7 +64,7 @@ use crate::surgery::{Target, apply, check_target, claim_target};
 pub(crate) const REPORT: FileName = FileName::constant("merge-report.md");
 
 /// File name of the model card in the merged directory.
-pub(crate) const CARD: FileName = FileName::constant("README.md");
+pub(crate) const CARD: FileName = FileName::constant(crate::checkpoint::files::CARD);
 
 /// Runs a merge; `progress` receives the bytes written so far and their total, from several threads.
 ///

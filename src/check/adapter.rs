@@ -10,12 +10,13 @@ mod formats;
 mod keys;
 mod targets;
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
 use super::card::{base_on_hub, is_path};
-use crate::checkpoint::adapter::{Adapter, AdapterBase, CONFIG, PREFIX, WEIGHTS};
+use crate::checkpoint::adapter::{Adapter, AdapterBase, PREFIX, WEIGHTS};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
 use crate::knowledge::Table;
 use crate::knowledge::peft::PeftKeys;
@@ -31,11 +32,11 @@ pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[Stri
     let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return formats::faults(checkpoint) };
     let mut faults = Vec::new();
     if let Some((key, library)) = adapter.config().and_then(other_library) {
-        let at = Place::file(CONFIG).pointer(format!("/{key}"));
+        let at = Place::file(files::ADAPTER_CONFIG).pointer(format!("/{key}"));
         return vec![Fault::new(FaultKind::AdapterTypeUnchecked).at(at).with("peft_type", library)];
     }
     if adapter.file().is_none() {
-        faults.push(Fault::new(FaultKind::AdapterWeightsMissing).at(Place::file(CONFIG)));
+        faults.push(Fault::new(FaultKind::AdapterWeightsMissing).at(Place::file(files::ADAPTER_CONFIG)));
     }
     // A config that is not an object has a fault of its own.
     let Some(config) = adapter.config() else { return faults };
@@ -44,14 +45,14 @@ pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[Stri
     faults.extend(beside_model(checkpoint, base, adapter.file().is_some()));
     faults.extend(config::faults(config, table, versions));
     if is_path(base) && checkpoint.base.is_none() {
-        let at = Place::file(CONFIG).pointer("/base_model_name_or_path");
+        let at = Place::file(files::ADAPTER_CONFIG).pointer("/base_model_name_or_path");
         let fault = Fault::new(FaultKind::AdapterBaseIsAPath).at(at).with("base", base);
         let of_card = base_on_hub(checkpoint).into_iter();
         faults.push(of_card.fold(fault, |fault, id| fault.with("of_card", id)));
     }
     let kind = text("peft_type").unwrap_or_default();
     if kind != "LORA" {
-        let at = Place::file(CONFIG).pointer("/peft_type");
+        let at = Place::file(files::ADAPTER_CONFIG).pointer("/peft_type");
         if kind.is_empty() {
             faults.push(Fault::new(FaultKind::AdapterTypeMissing).at(at));
         } else if table.of_type(kind).is_some() {
@@ -60,11 +61,12 @@ pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[Stri
         return faults;
     }
     let base = if base.is_empty() { "a base model it does not name" } else { base };
-    let about = Fault::new(FaultKind::AdapterOfAModel).at(Place::file(CONFIG).pointer("/base_model_name_or_path"));
+    let about = Fault::new(FaultKind::AdapterOfAModel)
+        .at(Place::file(files::ADAPTER_CONFIG).pointer("/base_model_name_or_path"));
     faults.push(about.with("base", base).with("rank", config.get("r").cloned().unwrap_or_default()));
     let rank = config.get("r");
     if rank.is_some_and(|r| r.as_u64().is_none_or(|r| r == 0)) {
-        let at = Place::file(CONFIG).pointer("/r");
+        let at = Place::file(files::ADAPTER_CONFIG).pointer("/r");
         faults.push(Fault::new(FaultKind::AdapterRankUnusable).at(at).with("rank", rank.cloned().unwrap_or_default()));
     }
     if let Some(tensors) = adapter.tensors() {
@@ -77,7 +79,7 @@ pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[Stri
 /// is the directory itself is meant to be there.
 fn beside_model(checkpoint: &Checkpoint, base: &str, has_weights: bool) -> Option<Fault> {
     let is_weights = |name: &String| {
-        name == "model.safetensors"
+        name == files::WEIGHTS
             || name.starts_with("model-") && name.ends_with(".safetensors")
             || name.starts_with("pytorch_model")
     };
@@ -85,7 +87,7 @@ fn beside_model(checkpoint: &Checkpoint, base: &str, has_weights: bool) -> Optio
     let is_own =
         !base.is_empty() && base.split('/').all(|part| part == "." || part.is_empty()) && !base.starts_with('/');
     let base = if base.is_empty() { "the model that it names" } else { base };
-    let fault = Fault::new(FaultKind::AdapterBesideModel).at(Place::file(CONFIG));
+    let fault = Fault::new(FaultKind::AdapterBesideModel).at(Place::file(files::ADAPTER_CONFIG));
     (is_model && !is_own).then(|| fault.with("base", base).with("weights", has_weights))
 }
 
@@ -154,7 +156,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
         !targets.affords(whole.len(), 100) || whole.keys().any(|name| name.starts_with(&first) || name.contains(&inner))
     };
     if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
-        let at = Place::file(CONFIG).pointer("/modules_to_save");
+        let at = Place::file(files::ADAPTER_CONFIG).pointer("/modules_to_save");
         faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.clone()));
     }
     faults.extend(targets.excess());

@@ -4,20 +4,20 @@
 //! Source: `AutoTokenizer.from_pretrained` and `TokenizersBackend.convert_to_native_format` of transformers 5.23.0. A class
 //! without a constructor of its own, and every class of transformers 4, opens tokenizer.json as it is.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
 use serde_json::Value;
 
-use super::class_names::{TOKENIZER, has_code};
-use super::model_type::{Asked, CAP};
+use super::class_names::has_code;
+use super::model_type::CAP;
+use super::view::Asked;
 use crate::checkpoint::tokenizer::content;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::classes::ClassKind;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::tokenizers::{BuiltTokenizer, BuiltTokenizers};
-
-const FILE: &str = "tokenizer.json";
 
 /// Classes that open tokenizer.json as it is.
 const GENERIC: [&str; 4] = ["TokenizersBackend", "PythonBackend", "PreTrainedTokenizer", "MistralCommonBackend"];
@@ -34,7 +34,7 @@ type Around<'v> = (Vec<&'v str>, Vec<&'v str>);
 /// Faults of tokenizer.json in the hands of such a class. Called by the engine with the targets of the run.
 pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>) -> Vec<Fault> {
     let mut faults = Vec::new();
-    if checkpoint.tokenizer.source.as_deref() != Some(FILE) {
+    if checkpoint.tokenizer.source.as_deref() != Some(files::TOKENIZER) {
         return faults;
     }
     for target in asked.targets {
@@ -62,13 +62,15 @@ fn class_of<'k>(
 ) -> Option<(&'k str, &'k BuiltTokenizer)> {
     let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
     let plain = |name: &'k str| name.strip_suffix("Fast").unwrap_or(name);
-    let path = text("config.json", "/_name_or_path").unwrap_or_default().to_lowercase();
+    let path = text(files::CONFIG, "/_name_or_path").unwrap_or_default().to_lowercase();
     let is_as_is = built.as_is.iter().any(|pattern| pattern.is_match(&path));
-    if is_as_is || has_code(checkpoint, &[TOKENIZER], &[ClassKind::Tokenizer.auto()]) {
+    if is_as_is || has_code(checkpoint, &[files::TOKENIZER_CONFIG], &[ClassKind::Tokenizer.auto()]) {
         return None;
     }
-    let named = text(TOKENIZER, "/tokenizer_class").or_else(|| text("config.json", "/tokenizer_class")).map(plain);
-    let model_type = text("config.json", "/model_type");
+    let named = text(files::TOKENIZER_CONFIG, "/tokenizer_class")
+        .or_else(|| text(files::CONFIG, "/tokenizer_class"))
+        .map(plain);
+    let model_type = text(files::CONFIG, "/model_type");
     let is_overruled = model_type.is_some_and(|model_type| built.overruled.contains(model_type));
     let own = model_type.and_then(|t| knowledge.classes.class_of(version, ClassKind::Tokenizer, t)).map(plain);
     // Without a named class the one of the config's class is opened.
@@ -95,21 +97,21 @@ fn has_byte_level(checkpoint: &Checkpoint) -> bool {
             || depth < MAX_DEPTH
                 && inner.filter_map(Value::as_array).flatten().any(|part| is_byte_level(part, depth.saturating_add(1)))
     }
-    let Some(document) = checkpoint.document(FILE) else { return false };
+    let Some(document) = checkpoint.document(files::TOKENIZER) else { return false };
     let parts = ["/pre_tokenizer", "/decoder", "/post_processor", "/normalizer"];
     parts.into_iter().filter_map(|pointer| document.get(pointer)).any(|part| is_byte_level(part, 0))
 }
 
 /// The fault of a model of another type than the class builds.
 fn other_model(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fault> {
-    let document = checkpoint.document(FILE)?;
+    let document = checkpoint.document(files::TOKENIZER)?;
     let stored = document.get("/model/type")?.as_str()?;
     let is_alike = |name: &str| OF_WORDS.contains(&name);
     if stored == class.model || (is_alike(stored) && is_alike(&class.model)) {
         return None;
     }
     let fault = Fault::new(FaultKind::TokenizerModelOfOtherType)
-        .at(Place::file(FILE).pointer("/model/type"))
+        .at(Place::file(files::TOKENIZER).pointer("/model/type"))
         .with("type", escape(stored, CAP))
         .with("model", class.model.as_str());
     Some(match class.raises.get(stored) {
@@ -129,13 +131,14 @@ fn dropped_tokens(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fau
     let added = tokenizer.tokenizer_json_added.as_deref()?;
     let dropped: Vec<_> = added.iter().enumerate().filter(|(_, token)| is_dropped(&token.content)).collect();
     let (at, first) = dropped.first()?;
-    let fault = Fault::new(FaultKind::AddedTokensDropped).at(Place::file(FILE).pointer(format!("/added_tokens/{at}")));
+    let fault = Fault::new(FaultKind::AddedTokensDropped)
+        .at(Place::file(files::TOKENIZER).pointer(format!("/added_tokens/{at}")));
     Some(fault.with("token", escape(&first.content, CAP)).with("count", dropped.len()))
 }
 
 /// Every special token that the class adds: those that `tokenizer_config.json` names, and its own.
 fn special_values<'v>(checkpoint: &'v Checkpoint, class: &'v BuiltTokenizer) -> Vec<&'v str> {
-    let config = checkpoint.document(TOKENIZER).and_then(|document| document.get("")?.as_object());
+    let config = checkpoint.document(files::TOKENIZER_CONFIG).and_then(|document| document.get("")?.as_object());
     let own = class.special.iter().filter(|(name, _)| config.is_none_or(|config| !config.contains_key(*name)));
     let mut values: Vec<&str> = own.map(|(_, token)| token.as_str()).collect();
     for (key, value) in config.into_iter().flatten() {
@@ -151,11 +154,13 @@ fn special_values<'v>(checkpoint: &'v Checkpoint, class: &'v BuiltTokenizer) -> 
 
 /// The fault of a post-processor that the class replaces by one that writes other tokens.
 fn other_around(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fault> {
-    let config = |key: &str| checkpoint.document(TOKENIZER)?.get(&format!("/{key}")).filter(|value| !value.is_null());
+    let config = |key: &str| {
+        checkpoint.document(files::TOKENIZER_CONFIG)?.get(&format!("/{key}")).filter(|value| !value.is_null())
+    };
     if class.settings.iter().any(|key| config(key).is_some()) {
         return None;
     }
-    let part = checkpoint.document(FILE)?.get("/post_processor").unwrap_or(&Value::Null);
+    let part = checkpoint.document(files::TOKENIZER)?.get("/post_processor").unwrap_or(&Value::Null);
     let [before, after] = if part.is_null() { &class.without } else { class.around.as_ref()? };
     let own = (tokens(checkpoint, class, before)?, tokens(checkpoint, class, after)?);
     let stored = around(part, 0)?;
@@ -166,7 +171,8 @@ fn other_around(checkpoint: &Checkpoint, class: &BuiltTokenizer) -> Option<Fault
         let tokens = before.iter().copied().chain(["text"]).chain(after.iter().copied());
         escape(&tokens.collect::<Vec<_>>().join(" "), CAP)
     };
-    let fault = Fault::new(FaultKind::PostProcessorReplaced).at(Place::file(FILE).pointer("/post_processor"));
+    let fault =
+        Fault::new(FaultKind::PostProcessorReplaced).at(Place::file(files::TOKENIZER).pointer("/post_processor"));
     Some(fault.with("stored", shown(&stored)).with("own", shown(&own)))
 }
 

@@ -1,7 +1,7 @@
 //! What a model card says of the base model.
 
 use super::model_type::CAP;
-use crate::checkpoint::card::CARD;
+use crate::checkpoint::files;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 
 /// Faults of the model card. Called by the engine.
@@ -9,7 +9,7 @@ pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     let Some(card) = &checkpoint.card else { return Vec::new() };
     let first = card.base_models.iter().find(|(name, _)| is_path(name) && !name.contains("://"));
     let fault = |(name, span): &(String, std::ops::Range<usize>)| {
-        let fault = Fault::new(FaultKind::CardBaseIsAPath).at(Place::file(CARD).span(span.clone()));
+        let fault = Fault::new(FaultKind::CardBaseIsAPath).at(Place::file(files::CARD).span(span.clone()));
         fault.with("base", escape(name, CAP))
     };
     first.map(fault).into_iter().collect()

@@ -3,25 +3,18 @@
 //! Source: `from_pretrained` of `AutoTokenizer`, `AutoProcessor` and the Auto classes of its parts, in 4.47.0, 4.57.6 and
 //! 5.23.0. A class that `auto_map` leads to is code of a repository.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::load::Target;
-use super::model_type::{Asked, CAP, has_code as has_config_code};
+use super::model_type::{CAP, has_code as has_config_code};
+use super::view::Asked;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::classes::ClassKind::{
     self, FeatureExtractor, ImageProcessor, Processor, Tokenizer, VideoProcessor,
 };
 use crate::knowledge::names::NameKind;
-
-/// The settings of an image processor or a feature extractor.
-pub(super) const PREPROCESSOR: &str = "preprocessor_config.json";
-/// The settings of a processor, and since transformers 5 of its parts.
-pub(super) const PROCESSOR: &str = "processor_config.json";
-/// The settings of a video processor.
-const VIDEO: &str = "video_preprocessor_config.json";
-/// The settings of a tokenizer.
-pub(super) const TOKENIZER: &str = "tokenizer_config.json";
 
 /// Names in which transformers 5 saves a tokenizer that has no class of its own.
 const BACKENDS: [&str; 2] = ["TokenizersBackend", "TokenizersBackendFast"];
@@ -46,27 +39,37 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
 /// The class names of a checkpoint, at the places that take precedence.
 fn names(checkpoint: &Checkpoint) -> Vec<Named<'_>> {
     let mut found = Vec::new();
-    if !has_code(checkpoint, &[TOKENIZER, "config.json"], &[Tokenizer.auto()]) {
-        found.extend([TOKENIZER, "config.json"].into_iter().find_map(|file| class_at(checkpoint, Tokenizer, file, "")));
+    if !has_code(checkpoint, &[files::TOKENIZER_CONFIG, files::CONFIG], &[Tokenizer.auto()]) {
+        found.extend(
+            [files::TOKENIZER_CONFIG, files::CONFIG]
+                .into_iter()
+                .find_map(|file| class_at(checkpoint, Tokenizer, file, "")),
+        );
     }
-    let files = [PREPROCESSOR, PROCESSOR, VIDEO, TOKENIZER, "config.json"];
+    let files = [
+        files::PREPROCESSOR_CONFIG,
+        files::PROCESSOR_CONFIG,
+        files::VIDEO_PREPROCESSOR_CONFIG,
+        files::TOKENIZER_CONFIG,
+        files::CONFIG,
+    ];
     let parts = [Processor, ImageProcessor, VideoProcessor, FeatureExtractor];
     let has_processor = files.iter().take(3).any(|file| checkpoint.has_file(file));
     if !has_processor || has_code(checkpoint, &files, &parts.map(ClassKind::auto)) {
         return found;
     }
-    let mut order = [PROCESSOR, PREPROCESSOR, TOKENIZER].into_iter();
+    let mut order = [files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG, files::TOKENIZER_CONFIG].into_iter();
     found.extend(order.find_map(|file| class_at(checkpoint, Processor, file, "")));
     for (kind, file, parent) in [
-        (ImageProcessor, PREPROCESSOR, "/image_processor"),
-        (VideoProcessor, VIDEO, "/video_processor"),
-        (FeatureExtractor, PREPROCESSOR, "/feature_extractor"),
+        (ImageProcessor, files::PREPROCESSOR_CONFIG, "/image_processor"),
+        (VideoProcessor, files::VIDEO_PREPROCESSOR_CONFIG, "/video_processor"),
+        (FeatureExtractor, files::PREPROCESSOR_CONFIG, "/feature_extractor"),
     ] {
-        let nested = || class_at(checkpoint, kind, PROCESSOR, parent);
+        let nested = || class_at(checkpoint, kind, files::PROCESSOR_CONFIG, parent);
         let own = if checkpoint.has_file(file) { class_at(checkpoint, kind, file, "") } else { nested() };
         // A file with both names is opened as an image processor.
-        let is_image =
-            kind == FeatureExtractor && found.iter().any(|n| n.kind == ImageProcessor && n.file == PREPROCESSOR);
+        let is_image = kind == FeatureExtractor
+            && found.iter().any(|n| n.kind == ImageProcessor && n.file == files::PREPROCESSOR_CONFIG);
         found.extend(own.filter(|_| !is_image));
     }
     found
@@ -93,8 +96,10 @@ pub(super) fn has_code(checkpoint: &Checkpoint, files: &[&str], auto: &[&str]) -
 fn unknown(checkpoint: &Checkpoint, knowledge: &Knowledge, named: &Named<'_>, asked: &Asked<'_>) -> Option<Fault> {
     let Named { kind, name, .. } = *named;
     let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
-    let model_type = text("config.json", "/model_type");
-    let processor = [PROCESSOR, PREPROCESSOR, TOKENIZER].into_iter().find_map(|file| text(file, "/processor_class"));
+    let model_type = text(files::CONFIG, "/model_type");
+    let processor = [files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG, files::TOKENIZER_CONFIG]
+        .into_iter()
+        .find_map(|file| text(file, "/processor_class"));
     // Code of a repository may open its files without the Auto classes.
     let of_code = checkpoint.config().is_some_and(has_config_code);
     let lacking: Vec<&Target> = asked
@@ -115,7 +120,7 @@ fn unknown(checkpoint: &Checkpoint, knowledge: &Knowledge, named: &Named<'_>, as
         })
         // transformers 5 opens an unknown tokenizer as TokenizersBackend, and 4.47 knows no nested parts.
         .filter(|target| kind != Tokenizer || target.loader.major() < 5)
-        .filter(|target| named.file != PROCESSOR || kind == Processor || target.loader.release() >= 457)
+        .filter(|target| named.file != files::PROCESSOR_CONFIG || kind == Processor || target.loader.release() >= 457)
         .collect();
     if lacking.is_empty() {
         return None;
@@ -161,7 +166,7 @@ fn right<'k>(
     let classes = &knowledge.classes;
     let cased = classes.in_other_case(named.kind, named.name);
     match named.kind {
-        Tokenizer if BACKENDS.contains(&named.name) => Some(FAST).filter(|_| checkpoint.has_file("tokenizer.json")),
+        Tokenizer if BACKENDS.contains(&named.name) => Some(FAST).filter(|_| checkpoint.has_file(files::TOKENIZER)),
         Tokenizer => cased,
         _ => cased.or_else(|| classes.of_model_type(named.kind, model_type?)).filter(|right| *right != named.name),
     }

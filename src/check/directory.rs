@@ -1,26 +1,19 @@
 //! What a directory is, when it is no checkpoint of transformers.
 
-use serde_json::{Value, json};
+use crate::checkpoint::files;
+use serde_json::Value;
 
 use super::model_type::is_of_transformers;
+use super::view::{ExplainingFacts, Observation, VersionsView};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Scope;
 use crate::knowledge::directories::Directories;
 
-/// Adds the fault that tells the kind of the directory, removes those that the kind explains, and binds `program`: the program
-/// that opens it. Called by the engine with the scope of the checkpoint and all its faults.
-pub(super) fn recognise(
-    checkpoint: &Checkpoint,
-    directories: &Directories,
-    scope: &mut Scope<'_>,
-    faults: &mut Vec<Fault>,
-) {
-    let fault = fault(checkpoint, directories, scope);
-    scope.bind("program", &json!(fault.as_ref().map_or("", program)));
-    if let Some(fault) = fault {
-        explain(checkpoint, faults, &fault);
-        faults.push(fault);
-    }
+/// The fault that tells the kind of the directory, which explains others.
+pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
+    let directory = fault(view.checkpoint, &view.knowledge.directories, view.scope);
+    let facts = ExplainingFacts { directory: directory.clone(), ..ExplainingFacts::default() };
+    Observation { faults: directory.into_iter().collect(), facts }
 }
 
 /// The fault that tells the kind of a directory; `None` for a checkpoint of transformers and for an unknown kind.
@@ -34,30 +27,28 @@ fn fault(checkpoint: &Checkpoint, directories: &Directories, scope: &Scope<'_>) 
     let fault = kind.help.iter().fold(fault, |fault, help| fault.with("command", help.render(scope)));
     Some(match &kind.opened_by {
         Some(program) => fault.with("program", program.as_str()),
-        None => fault.with("has_config", checkpoint.has_file("config.json")),
+        None => fault.with("has_config", checkpoint.has_file(files::CONFIG)),
     })
 }
 
 /// The program that opens the directory; empty when none does.
-fn program(directory: &Fault) -> &str {
+pub(super) fn program(directory: &Fault) -> &str {
     directory.detail.get("program").and_then(Value::as_str).unwrap_or_default()
 }
 
-/// Removes the faults that a directory has because of its kind: its weights are missing, or are files of the training run;
+/// Removes a fault that a directory has because of its kind: its weights are missing, or are files of the training run;
 /// for another library, that transformers knows neither its class nor its files.
-fn explain(checkpoint: &Checkpoint, faults: &mut Vec<Fault>, directory: &Fault) {
-    if !program(directory).is_empty() {
-        let is_foreign = |kind| matches!(kind, FaultKind::NoWeights | FaultKind::UnknownArchitecture);
-        faults.retain(|fault| is_of_transformers(checkpoint) || !is_foreign(fault.kind));
-        return;
-    }
-    let signs: Vec<&str> = directory.places.iter().filter_map(|place| place.file.as_deref()).collect();
-    let is_sign = |fault: &Fault| fault.places.iter().any(|p| p.file.as_deref().is_some_and(|f| signs.contains(&f)));
-    faults.retain(|fault| match fault.kind {
-        FaultKind::NoWeights => false,
-        FaultKind::PickleWeights => !is_sign(fault),
-        _ => true,
-    });
+pub(super) fn explain(checkpoint: &Checkpoint, facts: &ExplainingFacts, fault: Fault) -> Option<Fault> {
+    let Some(directory) = &facts.directory else { return Some(fault) };
+    let is_sign = |file: &str| directory.places.iter().any(|place| place.file.as_deref() == Some(file));
+    let is_explained = match (fault.kind, program(directory)) {
+        (FaultKind::NoWeights, "") => true,
+        (FaultKind::PickleWeights, "") => fault.places.iter().filter_map(|p| p.file.as_deref()).any(is_sign),
+        (_, "") => false,
+        (FaultKind::NoWeights | FaultKind::UnknownArchitecture, _) => !is_of_transformers(checkpoint),
+        _ => false,
+    };
+    (!is_explained).then_some(fault)
 }
 
 /// Whether an entry lies in the directory itself.

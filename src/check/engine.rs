@@ -1,5 +1,6 @@
 //! Runs rules over a checkpoint.
 
+use crate::checkpoint::files;
 use std::cell::RefCell;
 use std::collections::BTreeSet;
 use std::rc::Rc;
@@ -11,20 +12,16 @@ use super::bounded::bounded;
 use super::evaluate::{Context, has_faults, pinpoint, run_rules};
 use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
-use super::model_type::Asked;
+use super::observe::{RunOrder, explain, observe_files, observe_versions};
 use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
+use super::variables::{self, declared};
 use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
-use super::{
-    adapter, built_tokenizer, card, class_names, directory, finite, index, inspect, judge, model_type, module_imports,
-    modules, pickles, policy, processor, programs, refusals, robots, ropes, statistics, templates, tokenizer_json,
-    tokens,
-    variables::{self, declared},
-};
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
+use super::view::{Asked, FilesView, VersionsView};
+use super::{directory, index, inspect, judge, policy, processor, robots, tokens};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
-use crate::knowledge::processor::Processor;
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Check, Rule};
 use crate::knowledge::{Expression, Knowledge, Loader, Scope};
@@ -41,9 +38,20 @@ pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
 /// all rules, and that of a run for it alone: a loader does the same whatever else a run is asked for.
 #[must_use]
 pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
+    check_in_order(checkpoint, knowledge, versions, RunOrder::OfTable)
+}
+
+/// As [`check_for`], with the observers in this order, which changes nothing. Tests draw it.
+#[must_use]
+pub fn check_in_order(
+    checkpoint: &Arc<Checkpoint>,
+    knowledge: &Knowledge,
+    versions: &[String],
+    order: RunOrder,
+) -> Outcome {
     let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
     let programs = knowledge.asked_programs(&programs);
-    let run = CheckFacts::new(checkpoint, knowledge, &peft, &programs);
+    let run = CheckFacts::new(checkpoint, knowledge, &peft, &programs, order);
     let reading = run.read(&versions, Purpose::Findings);
     let mut outcome = reading.outcome.clone();
     let rules = &knowledge.rules;
@@ -51,7 +59,7 @@ pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: 
     let off = rules.unselected.iter();
     outcome.skipped.extend(off.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
-    outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+    outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
     let verdicts = run.verdicts(&reading, &outcome, &versions);
     outcome.findings.iter_mut().for_each(|finding| finding.effects.retain(|effect| is_borne_out(effect, &verdicts)));
     outcome.findings.iter_mut().for_each(|finding| defer_fix(finding, &verdicts));
@@ -69,6 +77,7 @@ struct CheckFacts<'a> {
     stored: Stored,
     /// Rows of the largest token embedding, which every token id must stay below; `None` without one.
     rows: Option<u64>,
+    order: RunOrder,
     /// Faults that do not depend on versions of transformers.
     faults: Vec<Fault>,
     /// What explains the predicted loads, for the readings of the run.
@@ -157,11 +166,11 @@ impl<'a> CheckFacts<'a> {
         knowledge: &'a Knowledge,
         peft: &[String],
         programs: &'a [AskedProgram<'a>],
+        order: RunOrder,
     ) -> Self {
-        let mut faults = faults_of_files(checkpoint, knowledge, programs);
-        faults.extend(adapter::faults(checkpoint, &knowledge.peft, peft));
         let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
-        faults.extend(tokens::faults(checkpoint, rows));
+        let view = FilesView { checkpoint, knowledge, programs, peft, rows };
+        let faults = observe_files(&view, order);
         let stored = Stored::of(checkpoint);
         Self {
             checkpoint,
@@ -169,6 +178,7 @@ impl<'a> CheckFacts<'a> {
             programs,
             stored,
             rows,
+            order,
             faults,
             causes: judge::Causes::default(),
             opened: RefCell::default(),
@@ -181,7 +191,7 @@ impl<'a> CheckFacts<'a> {
         if let Some(known) = self.opened.borrow().iter().find(is_same) {
             return known.tokenizer.clone();
         }
-        let config = self.checkpoint.document("processor_config.json").and_then(|d| d.value.as_ref());
+        let config = self.checkpoint.document(files::PROCESSOR_CONFIG).and_then(|d| d.value.as_ref());
         let open = |processor| {
             let config = config.unwrap_or(&Value::Null);
             tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, version).ok().flatten()
@@ -211,8 +221,7 @@ impl<'a> CheckFacts<'a> {
             Purpose::Findings => with_likely_class(fault, knowledge, stored),
             Purpose::Verdicts => fault,
         };
-        let mut faults: Vec<Fault> =
-            self.faults.iter().cloned().chain(judged.faults.into_iter().map(with_class)).collect();
+        let of_loads: Vec<Fault> = judged.faults.into_iter().map(with_class).collect();
         let mut outcome = Outcome {
             architecture: judged.architecture,
             loads: judged.loads,
@@ -233,18 +242,26 @@ impl<'a> CheckFacts<'a> {
         scope.bind("missing_attributes", &processor::missing_attributes(checkpoint, of_class));
         scope.bind("placeholders", &processor::placeholders(checkpoint, of_class, opened.as_deref()));
         variables::bind_loads(&mut scope, checkpoint, &outcome.loads);
-        faults = faults.into_iter().map(|fault| finite::under_users(fault, &outcome.loads)).collect();
-        outcome.loads.iter_mut().for_each(LoadReport::shorten);
         scope.bind("programs", &self.programs.iter().map(|asked| asked.program.name()).collect());
         let targets = load::of_run(config, versions, judged.targets);
+        let view = VersionsView {
+            checkpoint,
+            knowledge,
+            asked: Asked { targets: &targets, named: !versions.is_empty() },
+            loads: &outcome.loads,
+            of_loads: &of_loads,
+            filled: &outcome.config,
+            model: &model,
+            of_class,
+            scope: &scope,
+        };
+        let observed = observe_versions(&view, self.order);
+        let faults = self.faults.iter().cloned().chain(observed.faults);
+        let faults = explain(faults, &observed.facts, &view, self.order);
+        let program = observed.facts.directory.as_ref().map_or("", directory::program);
+        scope.bind("program", &program.into());
+        outcome.loads.iter_mut().for_each(LoadReport::shorten);
         let context = Context::new(checkpoint, targets, self.programs, &outcome.loads);
-        let asked = Asked { targets: &context.targets, named: !versions.is_empty() };
-        let unknown: Vec<Place> = faults.iter().filter_map(model_type::place_of_part).collect();
-        faults.extend(model_type::faults(checkpoint, knowledge, &asked, &unknown));
-        directory::recognise(checkpoint, &knowledge.directories, &mut scope, &mut faults);
-        let refused = refusals::faults(checkpoint, knowledge, &asked, &mut faults, &outcome.config);
-        faults.extend(refused);
-        faults.extend(faults_of_versions(checkpoint, knowledge, &asked, of_class, &model));
         LoaderView { context, scope, faults, opened, unpredicted: judged.unpredicted, outcome }
     }
 
@@ -293,7 +310,7 @@ impl<'a> CheckFacts<'a> {
         let rules = self.knowledge.rules.all().filter(|rule| !rule.effects.is_empty());
         let rules = rules.filter(|rule| !unmet.covers(rule, reading, &differing));
         run_rules(rules, context, faults, scope, &mut outcome);
-        outcome.findings.sort_by(|a, b| order(a).cmp(&order(b)));
+        outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
         verdicts(self.checkpoint, context, programs, faults, &outcome, unpredicted)
     }
 }
@@ -324,37 +341,6 @@ fn with_shown_causes(mut object: ObjectVerdict, shown: &BTreeSet<&str>) -> Objec
         object.findings.retain(|code| shown.contains(code.as_str()));
     }
     object
-}
-
-/// Faults that do not depend on the class or on versions of transformers.
-fn faults_of_files(checkpoint: &Checkpoint, knowledge: &Knowledge, programs: &[AskedProgram<'_>]) -> Vec<Fault> {
-    let mut faults: Vec<Fault> = checkpoint.all_faults().cloned().collect();
-    faults.extend(index::faults(checkpoint));
-    faults.extend(modules::faults(checkpoint));
-    faults.extend(statistics::faults(checkpoint, &knowledge.statistics));
-    faults.extend(programs::faults(checkpoint, programs));
-    faults.extend(card::faults(checkpoint));
-    faults.extend(pickles::faults(checkpoint, knowledge));
-    faults.extend(templates::faults(checkpoint));
-    faults.extend(tokenizer_json::faults(checkpoint, &knowledge.tokenizer_parts));
-    faults
-}
-
-/// Faults of files under some versions of transformers. `model` is config.json with the defaults of the class.
-fn faults_of_versions(
-    checkpoint: &Checkpoint,
-    knowledge: &Knowledge,
-    asked: &Asked<'_>,
-    of_class: Option<&Processor>,
-    model: &Value,
-) -> Vec<Fault> {
-    let mut faults = class_names::faults(checkpoint, knowledge, asked);
-    faults.extend(module_imports::faults(checkpoint, asked));
-    faults.extend(tokenizer_json::paired_merges(checkpoint, asked));
-    faults.extend(built_tokenizer::faults(checkpoint, knowledge, asked));
-    faults.extend(ropes::faults(checkpoint, knowledge, asked.targets));
-    faults.extend(processor::faults(checkpoint, knowledge, asked, of_class, model));
-    faults
 }
 
 /// What each loader does with each object, by the findings of all rules and the predicted loads.
@@ -407,7 +393,8 @@ fn with_likely_class(fault: Fault, knowledge: &Knowledge, stored: &Stored) -> Fa
     fault.with("likely", likely.class()).with("likely_type", likely.model_type())
 }
 
-fn order(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
+/// By which findings are sorted.
+fn position(f: &Finding) -> (Option<&str>, usize, &str, Option<&str>, &str) {
     let place = f.locations.first();
     (
         place.and_then(|l| l.file.as_deref()),

@@ -6,9 +6,9 @@ use serde_json::{Map, Value, json};
 
 use super::finding::{Finding, FindingEffect, Location, Skipped};
 use super::fix::{self, Bench, Edit, FixHint, Site};
-use super::index;
 use super::load::{LoadReport, Target};
 use super::outcome::Outcome;
+use super::robots;
 use super::variables::{self, declared};
 use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place, pointer};
@@ -53,7 +53,7 @@ impl<'a> Context<'a> {
 
     /// The object that reads a file; `None` for a file that no loader opens, and for weights beside those that it opens.
     fn object_reading(&self, file: &str) -> Option<Object> {
-        let is_left = |object: Object| object == Object::Model && index::is_set_aside(self.bench.checkpoint, file);
+        let is_left = |object: Object| object == Object::Model && robots::is_set_aside(self.bench.checkpoint, file);
         Object::reading(file).filter(|object| !is_left(*object))
     }
 }
@@ -334,7 +334,7 @@ fn finding(
     fix: Option<FixHint>,
 ) -> Finding {
     let file = locations.first().and_then(|location| location.file.as_deref());
-    let is_set_aside = file.is_some_and(|file| index::is_set_aside(context.bench.checkpoint, file));
+    let is_set_aside = file.is_some_and(|file| robots::is_set_aside(context.bench.checkpoint, file));
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),

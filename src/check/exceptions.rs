@@ -3,16 +3,17 @@
 //! Source: transformers 4.47.0, 4.57.6 and 5.23.0; `tests/peer/verdicts.py` compares them.
 
 use crate::checkpoint::Checkpoint;
+use crate::checkpoint::files;
 
 /// Documents that `PretrainedConfig` and its kind read, which turn any error into an `OSError`.
 const CONFIGS: [&str; 4] =
-    ["config.json", "generation_config.json", "processor_config.json", "preprocessor_config.json"];
+    [files::CONFIG, files::GENERATION_CONFIG, files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG];
 
 /// The exception for a document that is no JSON, with the reason in the words of Python's parser.
 pub(super) fn unparsed(file: &str, reason: &str) -> String {
     match file {
         _ if CONFIGS.contains(&file) => invalid_config(file),
-        "tokenizer.json" => "Exception: the tokenizers library cannot parse tokenizer.json".to_owned(),
+        files::TOKENIZER => "Exception: the tokenizers library cannot parse tokenizer.json".to_owned(),
         _ => format!("json.decoder.JSONDecodeError: {reason}"),
     }
 }
@@ -21,7 +22,7 @@ pub(super) fn unparsed(file: &str, reason: &str) -> String {
 pub(super) fn undecoded(file: &str) -> String {
     match file {
         _ if CONFIGS.contains(&file) => invalid_config(file),
-        "tokenizer.json" => "Exception: stream did not contain valid UTF-8".to_owned(),
+        files::TOKENIZER => "Exception: stream did not contain valid UTF-8".to_owned(),
         _ => format!("UnicodeDecodeError: 'utf-8' codec can't decode {file}"),
     }
 }
@@ -47,7 +48,7 @@ pub(super) fn python_type(found: &str) -> &'static str {
 /// Whether a loader parses the file. The tokenizer takes special and added tokens from `tokenizer_config.json` where this
 /// has `added_tokens_decoder`, and does not open the older files then.
 pub(super) fn is_parsed(checkpoint: &Checkpoint, file: &str) -> bool {
-    let is_older = matches!(file, "special_tokens_map.json" | "added_tokens.json");
-    let config = checkpoint.document("tokenizer_config.json");
+    let is_older = matches!(file, files::SPECIAL_TOKENS | files::ADDED_TOKENS);
+    let config = checkpoint.document(files::TOKENIZER_CONFIG);
     !(is_older && config.is_some_and(|config| config.get("/added_tokens_decoder").is_some()))
 }

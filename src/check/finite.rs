@@ -1,11 +1,9 @@
 //! Which loaders give NaN or infinity to the model: those whose class has the tensor.
 
 use super::load::LoadReport;
+use crate::checkpoint::files::Object;
 use crate::checkpoint::{Fault, FaultKind};
 use crate::knowledge::Loader;
-
-/// Start of the names of files that PEFT reads in place of a class.
-const ADAPTER: &str = "adapter_model.";
 
 /// Limits the fault of a weight that is not finite to the loaders that use the tensor, and says in `used` whether any does.
 /// Called by the engine for each fault; `loads` are the whole reports. An adapter is used by every loader.
@@ -14,7 +12,7 @@ pub(super) fn under_users(fault: Fault, loads: &[LoadReport]) -> Fault {
         return fault;
     }
     let place = fault.places.first();
-    if place.and_then(|place| place.file.as_deref()).is_some_and(|file| file.starts_with(ADAPTER)) {
+    if place.and_then(|place| place.file.as_deref()).and_then(Object::reading) == Some(Object::Adapter) {
         return fault.with("used", true);
     }
     let tensor = place.and_then(|place| place.tensor.clone()).unwrap_or_default();

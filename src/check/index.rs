@@ -1,5 +1,6 @@
 //! The index against the shards, and the shards against each other.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use indexmap::IndexMap;
@@ -7,19 +8,20 @@ use serde_json::Value;
 use unicode_normalization::UnicodeNormalization as _;
 
 use super::model_type::is_model;
-use super::robots;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::pickle::is_training_state;
-use crate::checkpoint::{Checkpoint, Fault, FaultKind, INDEX_NAME, Index, PICKLE_NAME, Place, Shard, Tensor, pointer};
+use crate::checkpoint::{Checkpoint, Fault, FaultKind, Index, Place, Shard, Tensor, pointer};
 use crate::knowledge::rule::Object;
-
-/// The file that a loader prefers to an index.
-const SINGLE: &str = "model.safetensors";
 
 /// The file that the loader opens in place of the shards of an index, if it exists.
 pub(super) fn single(checkpoint: &Checkpoint) -> Option<&'static str> {
-    let of_pickles = || checkpoint.index.as_ref().is_none_or(Index::is_of_pickles) && checkpoint.has_file(PICKLE_NAME);
-    if checkpoint.has_file(SINGLE) { Some(SINGLE) } else { of_pickles().then_some(PICKLE_NAME) }
+    let of_pickles =
+        || checkpoint.index.as_ref().is_none_or(Index::is_of_pickles) && checkpoint.has_file(files::PICKLED_WEIGHTS);
+    if checkpoint.has_file(files::WEIGHTS) {
+        Some(files::WEIGHTS)
+    } else {
+        of_pickles().then_some(files::PICKLED_WEIGHTS)
+    }
 }
 
 /// Whether a shard's entries can be taken at their word: the header was read to its end.
@@ -118,7 +120,7 @@ fn no_tensors(checkpoint: &Checkpoint) -> Option<Fault> {
 
 /// The fault of an index that lists no tensor.
 fn empty_map(checkpoint: &Checkpoint) -> Option<Fault> {
-    let name = checkpoint.index.as_ref().map_or(INDEX_NAME, |index| index.document.as_str());
+    let name = checkpoint.index.as_ref().map_or(files::INDEX, |index| index.document.as_str());
     let map = checkpoint.document(name)?.get("/weight_map")?.as_object()?;
     let place = Place::file(name).pointer("/weight_map");
     map.is_empty().then(|| Fault::new(FaultKind::WeightMapMalformed).at(place).with("found", "an empty object"))
@@ -154,7 +156,7 @@ pub(super) fn shard_names(checkpoint: &Checkpoint) -> Vec<&str> {
         .shards
         .keys()
         .map(String::as_str)
-        .filter(|n| !n.starts_with("adapter_") && *n != "training_args.safetensors")
+        .filter(|n| !n.starts_with("adapter_") && *n != files::TRAINING_ARGUMENTS)
         .collect()
 }
 
@@ -331,7 +333,7 @@ impl<'c> IndexComparison<'c> {
             let held = self.checkpoint.shards.get(name).into_iter().flat_map(|shard| &shard.tensors);
             let twice = held.filter(is_mapped).count();
             let kind = match name {
-                SINGLE | PICKLE_NAME => FaultKind::SingleFileBesideIndex,
+                files::WEIGHTS | files::PICKLED_WEIGHTS => FaultKind::SingleFileBesideIndex,
                 _ if twice > 0 || numbered(name).is_some() => FaultKind::StrayShard,
                 _ => return None,
             };
@@ -371,7 +373,7 @@ pub(super) fn numbered(name: &str) -> Option<(&str, u32, u32)> {
 /// Faults of a checkpoint that has no index.
 fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
     let names = shard_names(checkpoint);
-    if names.contains(&SINGLE) || names.contains(&PICKLE_NAME) {
+    if names.contains(&files::WEIGHTS) || names.contains(&files::PICKLED_WEIGHTS) {
         return Vec::new();
     }
     let numbers: Vec<(&str, u32, u32)> = names.iter().filter_map(|n| numbered(n)).collect();
@@ -380,7 +382,7 @@ fn without_index(checkpoint: &Checkpoint) -> Vec<Fault> {
         let ending = if names.iter().all(|name| name.ends_with(".bin")) { "bin" } else { "safetensors" };
         return missing_index((prefix, ending), count, numbers.len(), &present);
     }
-    if names.is_empty() && checkpoint.has_file("config.json") {
+    if names.is_empty() && checkpoint.has_file(files::CONFIG) {
         return weights_elsewhere(checkpoint).into_iter().collect();
     }
     unread_weights(checkpoint, &names).into_iter().collect()
@@ -410,12 +412,6 @@ pub(super) fn opened_shards(checkpoint: &Checkpoint) -> impl Iterator<Item = &Sh
 /// Tensors in two shards whose bytes are compared.
 const COMPARED: usize = 1_000;
 
-/// Whether a file holds weights that no loader opens, because it opens others.
-pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {
-    let is_opened = || opened_shards(checkpoint).any(|shard| shard.name == name);
-    checkpoint.shards.contains_key(name) && !is_opened() && !robots::names_state(checkpoint, name)
-}
-
 /// The tensors of [`opened_shards`], by shard name and then in header order.
 pub(super) fn opened_tensors(checkpoint: &Checkpoint) -> impl Iterator<Item = &Tensor> {
     opened_shards(checkpoint).flat_map(|shard| &shard.tensors)
@@ -433,7 +429,7 @@ pub(super) fn opened_tensor<'c>(checkpoint: &'c Checkpoint, name: &str) -> Optio
 
 /// For a model whose shards all have names that no loader reads: no weights, with these names.
 fn unread_weights(checkpoint: &Checkpoint, names: &[&str]) -> Option<Fault> {
-    let is_read = |name: &&str| matches!(*name, "pytorch_model.bin" | "pytorch_model.bin.index.json");
+    let is_read = |name: &&str| matches!(*name, files::PICKLED_WEIGHTS | files::PICKLE_INDEX);
     let has_pickle = checkpoint.entries.keys().any(|name| is_read(&name.as_str()));
     if !is_model(checkpoint) || has_pickle || names.is_empty() {
         return None;

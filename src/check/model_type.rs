@@ -3,13 +3,14 @@
 //! Source: `AutoConfig.from_pretrained` of transformers 4.47.0, 4.57.6 and 5.23.0. Code of the directory
 //! (`auto_map.AutoConfig`) is preferred to the mapping.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::load::Target;
-use crate::checkpoint::adapter;
+use super::view::{Asked, VersionsView};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
-use crate::knowledge::names::{LoaderNames, NameKind};
+use crate::knowledge::names::NameKind;
 
 /// Characters of a value that a message shows.
 pub(super) const CAP: usize = 80;
@@ -34,7 +35,7 @@ pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {
 /// Whether modules.json says that sentence-transformers reads this directory itself as a table of embeddings. Source:
 /// sentence-transformers 6.2.0, `models/StaticEmbedding.py`.
 fn is_table(checkpoint: &Checkpoint) -> bool {
-    let modules = checkpoint.document("modules.json").and_then(|file| file.value.as_ref()?.as_array());
+    let modules = checkpoint.document(files::MODULES).and_then(|file| file.value.as_ref()?.as_array());
     modules.into_iter().flatten().any(|module| {
         let text = |key: &str| module.get(key).and_then(Value::as_str).unwrap_or_default();
         matches!(text("path"), "" | "." | "./") && text("type").ends_with(".StaticEmbedding")
@@ -43,51 +44,32 @@ fn is_table(checkpoint: &Checkpoint) -> bool {
 
 /// Whether transformers opens the directory as a model; adapters and other libraries have names of their own for weights.
 pub(super) fn is_model(checkpoint: &Checkpoint) -> bool {
-    is_of_transformers(checkpoint) && !checkpoint.has_file(adapter::CONFIG)
-}
-
-/// The targets of a run.
-#[derive(Clone, Copy)]
-pub(super) struct Asked<'t> {
-    pub(super) targets: &'t [Target],
-    /// Whether the user named them.
-    pub(super) named: bool,
-}
-
-impl<'t> Asked<'t> {
-    /// The targets that do not know a name. The version that config.json states is no evidence against a name that it
-    /// uses and a known version has: models are published with the version of a development build.
-    pub(super) fn lacking(self, names: &LoaderNames, kind: NameKind, name: &str) -> Vec<&'t Target> {
-        let is_stated = |target: &Target| target.leads && !self.named || target.version().contains("dev");
-        let lacks = |target: &&Target| {
-            names.lacks(target.version(), kind, name) && !(is_stated(target) && names.contains(kind, name))
-        };
-        self.targets.iter().filter(lacks).collect()
-    }
+    is_of_transformers(checkpoint) && !checkpoint.has_file(files::ADAPTER_CONFIG)
 }
 
 /// The place of the `model_type` that a class selects a part by, of the fault that the part is unknown.
-pub(super) fn place_of_part(fault: &Fault) -> Option<Place> {
+fn place_of_part(fault: &Fault) -> Option<Place> {
     let is_part = fault.kind == FaultKind::UnknownArchitecture && fault.detail.contains_key("part");
     let is_type = |place: &&Place| place.pointer.as_ref().is_some_and(|pointer| pointer.ends_with("/model_type"));
     fault.places.first().filter(|_| is_part).filter(is_type).cloned()
 }
 
-/// Faults of `model_type`, each under the loaders that raise. Called by the engine with the targets of the run, and the
-/// places of the types of parts that no description has.
-pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>, parts: &[Place]) -> Vec<Fault> {
+/// Faults of `model_type`, and of the types of parts that no description has, each under the loaders that raise.
+pub(super) fn faults(view: &VersionsView<'_>) -> Vec<Fault> {
+    let VersionsView { checkpoint, knowledge, asked, of_loads, .. } = *view;
+    let asked = &asked;
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
         return Vec::new();
     };
     // Names in a document of another encoding are not those that a loader would read.
-    let document = checkpoint.document("config.json");
+    let document = checkpoint.document(files::CONFIG);
     let is_encoded = |f: &Fault| matches!(f.kind, FaultKind::WrongEncoding | FaultKind::InvalidUtf8);
     if document.is_some_and(|document| document.faults.iter().any(is_encoded)) {
         return Vec::new();
     }
     let class = config.pointer("/architectures/0").and_then(Value::as_str);
     let of_class = class.and_then(|class| knowledge.library.model_type_of(class));
-    let place = Place::file("config.json").pointer("/model_type");
+    let place = Place::file(files::CONFIG).pointer("/model_type");
     let fault = match config.get("model_type") {
         Some(value) => unknown(knowledge, value, place, asked),
         None => missing(checkpoint, knowledge, of_class, asked.targets),
@@ -96,11 +78,11 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
         (Some(class), Some(model_type)) => fault.with("class", escape(class, CAP)).with("of_class", model_type),
         _ => fault,
     };
-    let of_part = |place: &Place| {
+    let of_part = |place: Place| {
         let value = config.pointer(place.pointer.as_deref()?)?;
-        Some(unknown(knowledge, value, place.clone(), asked)?.with("part", true))
+        Some(unknown(knowledge, value, place, asked)?.with("part", true))
     };
-    let faults = fault.into_iter().map(with_class).chain(parts.iter().filter_map(of_part));
+    let faults = fault.into_iter().map(with_class).chain(of_loads.iter().filter_map(place_of_part).filter_map(of_part));
     faults.chain(class_of_whole(knowledge, config)).collect()
 }
 
@@ -110,7 +92,7 @@ fn class_of_whole(knowledge: &Knowledge, config: &Value) -> Option<Fault> {
     let model_type = config.get("model_type")?.as_str()?;
     let classes =
         knowledge.text_types.of(model_type).filter(|classes| classes.whole.iter().any(|name| name == class))?;
-    let fault = Fault::new(FaultKind::ClassOfWholeModel).at(Place::file("config.json").pointer("/architectures/0"));
+    let fault = Fault::new(FaultKind::ClassOfWholeModel).at(Place::file(files::CONFIG).pointer("/architectures/0"));
     Some(fault.with("class", class).with("model_type", model_type).with("own", classes.own.as_str()))
 }
 
@@ -163,7 +145,7 @@ fn missing(
     if raising.is_empty() {
         return None;
     }
-    let fault = Fault::new(FaultKind::ModelTypeMissing).at(Place::file("config.json")).with("directory", directory);
+    let fault = Fault::new(FaultKind::ModelTypeMissing).at(Place::file(files::CONFIG)).with("directory", directory);
     let fault = guess.into_iter().fold(fault, |fault, guess| fault.with("guess", guess));
     Some(fault.under_all(raising))
 }

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use super::load::Target;
-use super::model_type::Asked;
 use super::modules;
+use super::view::Asked;
 use crate::checkpoint::module::Import;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, PythonModule};
 use crate::knowledge::modules::LoaderModules;

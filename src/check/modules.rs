@@ -1,5 +1,6 @@
 //! `auto_map`: whether the module of each entry exists, has the class, and can import what it needs.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
@@ -40,7 +41,7 @@ pub fn local_class(target: &str) -> Option<(&str, &str)> {
 
 /// Documents whose `auto_map` a loader reads.
 const DOCUMENTS: [&str; 4] =
-    ["config.json", "processor_config.json", "preprocessor_config.json", "tokenizer_config.json"];
+    [files::CONFIG, files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG, files::TOKENIZER_CONFIG];
 
 /// Most `auto_map` entries that are looked at; a class needs a handful.
 const MAX_ENTRIES: usize = 1_000;

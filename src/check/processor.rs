@@ -1,14 +1,16 @@
 //! The files of a processor against the model: values that follow from config.json, the file of the image processor, and
 //! the tokens that stand for images.
 
+use crate::checkpoint::files;
 use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use super::class_names::{PREPROCESSOR, PROCESSOR, TOKENIZER, has_code};
+use super::class_names::has_code;
 use super::load::Target;
-use super::model_type::{Asked, is_model};
+use super::model_type::is_model;
 use super::tokens::OpenedTokenizer;
+use super::view::{Asked, VersionsView};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::classes::ClassKind;
 use crate::knowledge::loader::version_numbers;
@@ -16,18 +18,12 @@ use crate::knowledge::names::NameKind;
 use crate::knowledge::processor::{Placeholder, Processor, ReadValue};
 use crate::knowledge::{Knowledge, Scope};
 
-/// Parts of a processor whose settings transformers 5 writes into [`PROCESSOR`].
+/// Parts of a processor whose settings transformers 5 writes into [`files::PROCESSOR_CONFIG`].
 const PARTS: [&str; 3] = ["image_processor", "feature_extractor", "video_processor"];
 
-/// Faults of the processor's files, each under the loaders that have it. Called by the engine with the targets of the run,
-/// the processor of the architecture, and config.json with the defaults of the class.
-pub(super) fn faults(
-    checkpoint: &Checkpoint,
-    knowledge: &Knowledge,
-    asked: &Asked<'_>,
-    processor: Option<&Processor>,
-    model: &Value,
-) -> Vec<Fault> {
+/// Faults of the processor's files, each under the loaders that have it.
+pub(super) fn faults(view: &VersionsView<'_>) -> Vec<Fault> {
+    let VersionsView { checkpoint, knowledge, ref asked, of_class: processor, model, .. } = *view;
     // Weights alone, without a tokenizer, are no directory that a processor is opened from.
     if !is_model(checkpoint) || checkpoint.tokenizer.files.is_empty() || is_code(checkpoint) {
         return Vec::new();
@@ -41,7 +37,11 @@ pub(super) fn faults(
 /// Whether the processor is code beside the weights or in another repository.
 fn is_code(checkpoint: &Checkpoint) -> bool {
     let auto = [ClassKind::Processor, ClassKind::ImageProcessor, ClassKind::FeatureExtractor].map(ClassKind::auto);
-    has_code(checkpoint, &["config.json", PROCESSOR, PREPROCESSOR, TOKENIZER], &auto)
+    has_code(
+        checkpoint,
+        &[files::CONFIG, files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG, files::TOKENIZER_CONFIG],
+        &auto,
+    )
 }
 
 fn value<'c>(checkpoint: &'c Checkpoint, file: &str, pointer: &str) -> Option<&'c Value> {
@@ -50,18 +50,20 @@ fn value<'c>(checkpoint: &'c Checkpoint, file: &str, pointer: &str) -> Option<&'
 
 /// The part whose settings stand in `processor_config.json`.
 fn nested_part(checkpoint: &Checkpoint) -> Option<&'static str> {
-    PARTS.into_iter().find(|part| value(checkpoint, PROCESSOR, &format!("/{part}")).is_some_and(Value::is_object))
+    PARTS
+        .into_iter()
+        .find(|part| value(checkpoint, files::PROCESSOR_CONFIG, &format!("/{part}")).is_some_and(Value::is_object))
 }
 
 /// The fault of a class that takes images or sound without the file of its image processor or feature extractor.
 ///
 /// Source: `AutoProcessor`, `AutoImageProcessor` and `AutoFeatureExtractor` of transformers 4.47.0, 4.57.6 and 5.23.0, run.
 fn missing_file(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>) -> Option<Fault> {
-    let class = value(checkpoint, "config.json", "/architectures/0")?.as_str()?;
-    let model_type = value(checkpoint, "config.json", "/model_type")?.as_str()?;
+    let class = value(checkpoint, files::CONFIG, "/architectures/0")?.as_str()?;
+    let model_type = value(checkpoint, files::CONFIG, "/model_type")?.as_str()?;
     // Other heads, and towers alone, are used without a processor.
     let is_of_processor = ["ForConditionalGeneration", "ForCTC"].iter().any(|end| class.ends_with(end));
-    if checkpoint.entries.contains_key(PREPROCESSOR) || !is_of_processor {
+    if checkpoint.entries.contains_key(files::PREPROCESSOR_CONFIG) || !is_of_processor {
         return None;
     }
     let nested = nested_part(checkpoint);
@@ -72,18 +74,21 @@ fn missing_file(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_
     let raises = |target: &&Target| nested.is_none() || version_numbers(target.version()) < vec![4, 57];
     let targets: Vec<&Target> = asked.targets.iter().filter(has_processor).filter(raises).collect();
     let fault = Fault::new(FaultKind::ProcessorFileMissing)
-        .at(nested.map_or_else(|| Place::file(PREPROCESSOR), |part| Place::file(PROCESSOR).pointer(format!("/{part}"))))
+        .at(nested.map_or_else(
+            || Place::file(files::PREPROCESSOR_CONFIG),
+            |part| Place::file(files::PROCESSOR_CONFIG).pointer(format!("/{part}")),
+        ))
         .with("class", class)
         .with("nested", nested)
-        .with("has_processor_config", checkpoint.entries.contains_key(PROCESSOR))
+        .with("has_processor_config", checkpoint.entries.contains_key(files::PROCESSOR_CONFIG))
         .with("content", nested.and_then(|part| with_class(checkpoint, part)));
     (!targets.is_empty()).then(|| fault.under_all(targets.into_iter().map(|target| target.loader.version())))
 }
 
 /// The settings of a nested part as `preprocessor_config.json` holds them, with the class of the processor.
 fn with_class(checkpoint: &Checkpoint, part: &str) -> Option<Value> {
-    let mut settings = value(checkpoint, PROCESSOR, &format!("/{part}"))?.clone();
-    let class = value(checkpoint, PROCESSOR, "/processor_class")?.clone();
+    let mut settings = value(checkpoint, files::PROCESSOR_CONFIG, &format!("/{part}"))?.clone();
+    let class = value(checkpoint, files::PROCESSOR_CONFIG, "/processor_class")?.clone();
     settings.as_object_mut()?.insert("processor_class".to_owned(), class);
     Some(settings)
 }
@@ -101,7 +106,7 @@ struct Misfit {
 /// Values of the processor's files that do not fit the model: one fault for the missing ones of each file, and one for each
 /// other value.
 fn values(checkpoint: &Checkpoint, targets: &[Target], processor: &Processor, model: &Value) -> Vec<Fault> {
-    let named = [PROCESSOR, PREPROCESSOR, TOKENIZER]
+    let named = [files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG, files::TOKENIZER_CONFIG]
         .into_iter()
         .find_map(|file| value(checkpoint, file, "/processor_class")?.as_str());
     if processor.class.as_deref().zip(named).is_some_and(|(class, named)| class != named) {
@@ -137,15 +142,17 @@ impl<'c> Settings<'c> {
     /// `None` when the settings of the image processor are in two files, or in none.
     fn new(checkpoint: &'c Checkpoint) -> Option<Self> {
         let nested = nested_part(checkpoint).filter(|part| *part != "video_processor");
-        let images = match (checkpoint.entries.contains_key(PREPROCESSOR), nested) {
-            (true, None) => (PREPROCESSOR, String::new()),
-            (false, Some(part)) => (PROCESSOR, format!("/{part}")),
+        let images = match (checkpoint.entries.contains_key(files::PREPROCESSOR_CONFIG), nested) {
+            (true, None) => (files::PREPROCESSOR_CONFIG, String::new()),
+            (false, Some(part)) => (files::PROCESSOR_CONFIG, format!("/{part}")),
             _ => return None,
         };
         let settings = Self { checkpoint, images };
         // A document that cannot be read has a fault of its own.
         let is_read = |file: &str| checkpoint.document(file).is_none_or(|document| document.value.is_some());
-        let is_complete = is_read(PROCESSOR) && is_read(PREPROCESSOR) && settings.image_processor().is_some();
+        let is_complete = is_read(files::PROCESSOR_CONFIG)
+            && is_read(files::PREPROCESSOR_CONFIG)
+            && settings.image_processor().is_some();
         is_complete.then_some(settings)
     }
 
@@ -156,7 +163,7 @@ impl<'c> Settings<'c> {
     /// File and pointer at which a value of the file is read.
     fn place(&self, file: &str, at: &str) -> (String, String) {
         match file {
-            PREPROCESSOR => (self.images.0.to_owned(), format!("{}{at}", self.images.1)),
+            files::PREPROCESSOR_CONFIG => (self.images.0.to_owned(), format!("{}{at}", self.images.1)),
             _ => (file.to_owned(), at.to_owned()),
         }
     }
@@ -165,7 +172,7 @@ impl<'c> Settings<'c> {
         let mut scope = Scope::new();
         scope.bind("model", model);
         scope.bind("preprocessor", self.image_processor().unwrap_or(&Value::Null));
-        scope.bind("processor", value(self.checkpoint, PROCESSOR, "").unwrap_or(&json!({})));
+        scope.bind("processor", value(self.checkpoint, files::PROCESSOR_CONFIG, "").unwrap_or(&json!({})));
         for item in &processor.facts {
             // An entry that needs a value that the config lacks is not judged.
             if let Ok(value) = item.is.eval(&scope) {
@@ -234,14 +241,14 @@ impl Misfit {
 /// tokenizer does not have, with the text of each token.
 pub(super) fn missing_attributes(checkpoint: &Checkpoint, processor: Option<&Processor>) -> Value {
     // A list, as transformers 5 writes it, has a rule of its own.
-    let extra = value(checkpoint, TOKENIZER, "/extra_special_tokens");
-    if extra.is_some_and(|extra| !extra.is_object()) || checkpoint.document(TOKENIZER).is_none() {
+    let extra = value(checkpoint, files::TOKENIZER_CONFIG, "/extra_special_tokens");
+    if extra.is_some_and(|extra| !extra.is_object()) || checkpoint.document(files::TOKENIZER_CONFIG).is_none() {
         return Value::Array(Vec::new());
     }
     let is_missing = |name: &str| extra.is_none_or(|extra| extra.get(name).is_none());
     let missing = processor.iter().flat_map(|one| &one.attributes).filter(|(name, _)| is_missing(name));
     // transformers 5 also takes attributes from the keys of the document itself.
-    let at_top = |name: &str| value(checkpoint, TOKENIZER, &format!("/{name}")).is_some();
+    let at_top = |name: &str| value(checkpoint, files::TOKENIZER_CONFIG, &format!("/{name}")).is_some();
     missing.map(|(name, content)| json!({ "name": name, "content": content, "at_top": at_top(name) })).collect()
 }
 
@@ -253,10 +260,14 @@ pub(super) fn placeholders(
     opened: Option<&OpenedTokenizer>,
 ) -> Value {
     let of_config = |placeholder: &Placeholder| {
-        let key = placeholder.keys.iter().find(|key| value(checkpoint, "config.json", &format!("/{key}")).is_some())?;
-        let id = value(checkpoint, "config.json", &format!("/{key}"))?.as_i64()?;
+        let key = placeholder.keys.iter().find(|key| value(checkpoint, files::CONFIG, &format!("/{key}")).is_some())?;
+        let id = value(checkpoint, files::CONFIG, &format!("/{key}"))?.as_i64()?;
         let content = placeholder.named_by.as_ref().and_then(|name| {
-            let places = [(TOKENIZER, "/"), (TOKENIZER, "/extra_special_tokens/"), (PROCESSOR, "/")];
+            let places = [
+                (files::TOKENIZER_CONFIG, "/"),
+                (files::TOKENIZER_CONFIG, "/extra_special_tokens/"),
+                (files::PROCESSOR_CONFIG, "/"),
+            ];
             places.into_iter().find_map(|(file, start)| value(checkpoint, file, &format!("{start}{name}"))?.as_str())
         });
         let content = content.unwrap_or(&placeholder.content);

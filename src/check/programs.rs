@@ -1,5 +1,6 @@
 //! What programs other than transformers read of a checkpoint, where it differs.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::model_type::{CAP, is_of_transformers};
@@ -25,9 +26,7 @@ fn fault(kind: FaultKind, asked: &AskedProgram<'_>) -> Fault {
 fn files(checkpoint: &Checkpoint, asked: &AskedProgram<'_>) -> Option<Fault> {
     let named = |name: &str, start: &str, end: &str| name.starts_with(start) && name.ends_with(end);
     let shards = checkpoint.shards.keys().map(String::as_str);
-    let has_index = ["model.safetensors.index.json", "pytorch_model.bin.index.json"]
-        .into_iter()
-        .any(|index| checkpoint.entries.contains_key(index));
+    let has_index = [files::INDEX, files::PICKLE_INDEX].into_iter().any(|index| checkpoint.entries.contains_key(index));
     let (read, others): (Vec<&str>, Vec<&str>) = match asked.program {
         Program::MlxLm => shards.partition(|name| named(name, "model", ".safetensors")),
         Program::LlamaCpp => shards.partition(|name| {
@@ -50,7 +49,7 @@ fn files(checkpoint: &Checkpoint, asked: &AskedProgram<'_>) -> Option<Fault> {
 fn model_type(checkpoint: &Checkpoint, asked: &AskedProgram<'_>) -> Option<Fault> {
     let known = asked.facts.model_types.as_ref()?;
     let model_type = checkpoint.config()?.get("model_type").and_then(Value::as_str)?;
-    let place = Place::file("config.json").pointer("/model_type");
+    let place = Place::file(files::CONFIG).pointer("/model_type");
     let fault = || fault(FaultKind::ProgramLacksModelType, asked).with("model_type", model_type).at(place);
     (!known.contains(model_type)).then(fault)
 }
@@ -65,11 +64,11 @@ fn class(checkpoint: &Checkpoint, asked: &AskedProgram<'_>) -> Option<Fault> {
     let places = ["/text_config/architectures/0", "/architectures/0"];
     let mut names = places.into_iter().filter_map(|pointer| Some((pointer, config.pointer(pointer)?.as_str()?)));
     let Some((pointer, first)) = names.next() else {
-        let place = Place::file("config.json");
+        let place = Place::file(files::CONFIG);
         return is_of_transformers(checkpoint)
             .then(|| fault(FaultKind::ProgramLacksClass, asked).with("class", Value::Null).at(place));
     };
     let is_known = known.contains(first) || names.any(|(_, name)| known.contains(name));
-    let place = Place::file("config.json").pointer(pointer);
+    let place = Place::file(files::CONFIG).pointer(pointer);
     (!is_known).then(|| fault(FaultKind::ProgramLacksClass, asked).with("class", escape(first, CAP)).at(place))
 }

@@ -9,6 +9,7 @@ mod module;
 mod shapes;
 mod skipped;
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::load::Stored;
@@ -161,16 +162,16 @@ impl<'a> Quantised<'a> {
         let scheme = self.applied.scheme();
         let mut faults = Vec::new();
         if self.skipped.is_exceeded() {
-            let at = Place::file("config.json").pointer(self.applied.pointer());
+            let at = Place::file(files::CONFIG).pointer(self.applied.pointer());
             return vec![Fault::new(FaultKind::PatternsNotCompared).at(at)];
         }
         if let Some(program) = &scheme.loaded_by {
-            let at = Place::file("config.json").pointer("/quantization");
+            let at = Place::file(files::CONFIG).pointer("/quantization");
             let fault = Fault::new(FaultKind::QuantizedForAnotherLoader).at(at).with("scheme", scheme.summary.as_str());
             faults.push(fault.with("program", program.as_str()));
         }
         if self.modules.is_empty() && self.has_weights && !scheme.plain_too {
-            let at = Place::file("config.json").pointer(self.applied.pointer());
+            let at = Place::file(files::CONFIG).pointer(self.applied.pointer());
             faults.push(
                 Fault::new(FaultKind::QuantizedConfigPlainTensors).at(at).with("scheme", scheme.summary.as_str()),
             );

@@ -1,11 +1,13 @@
 //! Values of config.json that a loader refuses: it raises while it builds the config or the class.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Map, Value};
 
 use super::load::Target;
-use super::model_type::{Asked, CAP, has_code, is_model, short};
+use super::model_type::{CAP, has_code, is_model, short};
+use super::view::{Asked, ExplainingFacts, Observation, VersionsView};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
@@ -31,18 +33,12 @@ struct Rejection {
     similar: Option<String>,
 }
 
-/// Faults of refused values, each under the loaders that raise. Called by the engine with the targets of the run, and the
-/// faults of the loads: where a class cannot be built, the value is reported there, for all loaders. `filled` is the config
-/// with the defaults of the class; null when no class was built.
-pub(super) fn faults(
-    checkpoint: &Checkpoint,
-    knowledge: &Knowledge,
-    asked: &Asked<'_>,
-    of_loads: &mut Vec<Fault>,
-    filled: &Value,
-) -> Vec<Fault> {
+/// Faults of refused values, each under the loaders that raise; the refused values explain faults of others. Where a class cannot
+/// be built, the value is reported by the fault of its load, for all loaders.
+pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
+    let VersionsView { checkpoint, knowledge, asked, of_loads, filled, .. } = *view;
     let Some(config) = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config)) else {
-        return Vec::new();
+        return Observation::default();
     };
     let mut faults: Vec<Fault> = Vec::new();
     let mut refused_keys: BTreeSet<String> = BTreeSet::new();
@@ -68,11 +64,16 @@ pub(super) fn faults(
             rejection.fault().join(&mut faults, loader);
         }
     }
-    // A class is not known with a value that it refuses: then nothing else is to be said of it.
-    let is_refused = |place: &Place| place.pointer.as_ref().is_some_and(|pointer| refused_keys.contains(pointer));
-    of_loads.retain(|fault| fault.kind != FaultKind::UnknownArchitecture || !fault.places.iter().any(is_refused));
-    faults.extend(quantisation(knowledge, config, asked));
-    faults
+    faults.extend(quantisation(knowledge, config, &asked));
+    Observation { faults, facts: ExplainingFacts { refused: refused_keys, ..ExplainingFacts::default() } }
+}
+
+/// Removes the fault that a class is unknown, where it refuses a value: it is not known with that value, and nothing else is to
+/// be said of it.
+pub(super) fn explain(facts: &ExplainingFacts, fault: Fault) -> Option<Fault> {
+    let is_refused = |place: &Place| place.pointer.as_ref().is_some_and(|pointer| facts.refused.contains(pointer));
+    let is_explained = fault.kind == FaultKind::UnknownArchitecture && fault.places.iter().any(is_refused);
+    (!is_explained).then_some(fault)
 }
 
 /// What a class refuses with its parts. The class was tried with parts of the model types that it builds where none is named;
@@ -98,7 +99,7 @@ impl Rejection {
     fn fault(self) -> Fault {
         let key = self.pointer.trim_start_matches('/').replace('/', ".");
         let fault = Fault::new(FaultKind::ValueRefused)
-            .at(Place::file("config.json").pointer(self.pointer))
+            .at(Place::file(files::CONFIG).pointer(self.pointer))
             .with("key", key)
             .with("value", short(&self.value))
             .with("because", self.because)
@@ -200,7 +201,7 @@ fn sub_configs(config: &Value) -> impl Iterator<Item = String> {
 
 /// Whether config.json has NaN or an infinity at a pointer, which Python reads and strict JSON has no value for.
 fn is_non_finite(checkpoint: &Checkpoint, pointer: &str) -> bool {
-    let faults = checkpoint.document("config.json").into_iter().flat_map(|document| &document.faults);
+    let faults = checkpoint.document(files::CONFIG).into_iter().flat_map(|document| &document.faults);
     let mut places = faults.filter(|fault| fault.kind == FaultKind::NonFiniteNumber).flat_map(|fault| &fault.places);
     places.any(|place| place.pointer.as_deref() == Some(pointer))
 }
@@ -328,7 +329,7 @@ fn quantisation(knowledge: &Knowledge, config: &Value, asked: &Asked<'_>) -> Opt
     if is_set("load_in_8bit") || is_set("load_in_4bit") || is_other {
         return None;
     }
-    let place = Place::file("config.json").pointer(pointer);
+    let place = Place::file(files::CONFIG).pointer(pointer);
     let method = block.get("quant_method").and_then(Value::as_str);
     let mut raising: Vec<&Target> = asked.targets.iter().collect();
     if let Some(method) = method {

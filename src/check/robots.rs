@@ -6,6 +6,7 @@
 //! Sources: `lerobot/common/policies/normalize.py` of 0.1 to 0.3, `lerobot/processor/normalize_processor.py` and `pipeline.py` of
 //! 0.4 to 0.6.
 
+use crate::checkpoint::files;
 use serde_json::{Value, json};
 
 use super::index;
@@ -13,7 +14,7 @@ use crate::checkpoint::{Checkpoint, Shard};
 
 /// The documents of the steps, with the registered name of the step that normalises or un-normalises.
 const PIPELINES: [(&str, &str); 2] =
-    [("policy_preprocessor.json", "normalizer_processor"), ("policy_postprocessor.json", "unnormalizer_processor")];
+    [(files::POLICY_PREPROCESSOR, "normalizer_processor"), (files::POLICY_POSTPROCESSOR, "unnormalizer_processor")];
 
 /// Whether a step of a policy names this file, in which its statistics are.
 pub(super) fn names_state(checkpoint: &Checkpoint, file: &str) -> bool {
@@ -40,6 +41,12 @@ impl Layout {
             Self::Missing => "missing",
         }
     }
+}
+
+/// Whether a file holds weights that no loader opens, because it opens others.
+pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {
+    let is_opened = || index::opened_shards(checkpoint).any(|shard| shard.name == name);
+    checkpoint.shards.contains_key(name) && !is_opened() && !names_state(checkpoint, name)
 }
 
 /// The variable `robot` of rules: `layout`, and `features` with `name`, `input`, `mode`, `width`, `document`, `state_file`, `state_read`,

@@ -4,6 +4,7 @@
 //! `rope_theta`, `rope_scaling` and others beside it, and take the defaults of the class without a warning when they are
 //! missing. Source: `convert_rope_params_to_dict` of transformers 5.23.0, and the config classes of 4.47.0 and 4.57.6.
 
+use crate::checkpoint::files;
 use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
@@ -83,7 +84,7 @@ fn unread(
     }
     let first = values.first()?.clone();
     let fault = Fault::new(FaultKind::RopeParametersUnread)
-        .at(Place::file("config.json").pointer(format!("{at}/rope_parameters")))
+        .at(Place::file(files::CONFIG).pointer(format!("{at}/rope_parameters")))
         .with("given", values.iter().any(|value| value.get("given") == Some(&Value::Bool(true))))
         .with("unwritable", is_unwritable)
         .with("at", at.replace('/', "."))

@@ -3,6 +3,7 @@
 //! Without shards, only `metadata.total_size` depends on shapes. A config value that changes no name (the number of
 //! key-value heads, the vocabulary) affects nothing else. Git LFS pointers state sizes too, less exactly.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
@@ -76,7 +77,7 @@ pub fn fault(
     let mut likely: Vec<&(String, Value)> = values.iter().collect();
     likely.sort_by_key(rank);
     let mut named = likely.into_iter().map(said);
-    fault.places.extend(values.iter().map(|(pointer, _)| Place::file("config.json").pointer(pointer)));
+    fault.places.extend(values.iter().map(|(pointer, _)| Place::file(files::CONFIG).pointer(pointer)));
     if let Some(first) = named.next() {
         fault = fault.with("value", first);
     }

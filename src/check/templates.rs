@@ -4,6 +4,7 @@
 //! [`render`] bounds its steps, memory and output. An error of rendering proves nothing, because templates refuse
 //! conversations on purpose, and the engine lacks parts of Jinja2.
 
+use crate::checkpoint::files;
 use serde_json::{Map, Value};
 
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
@@ -41,7 +42,7 @@ fn templates(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
     let texts = checkpoint.texts.iter();
     let own = texts.map(|(file, text)| Template { text, file, pointer: None, is_default: true });
     let mut found: Vec<Template<'_>> = own.collect();
-    for file in ["tokenizer_config.json", "chat_template.json", "processor_config.json"] {
+    for file in [files::TOKENIZER_CONFIG, files::CHAT_TEMPLATE_JSON, files::PROCESSOR_CONFIG] {
         let Some(value) = checkpoint.document(file).and_then(|document| document.get("/chat_template")) else {
             continue;
         };
@@ -100,7 +101,7 @@ fn end_of_turn(checkpoint: &Checkpoint, rendered: &Rendered, place: Place) -> Op
         let value = checkpoint.document(file)?.get("/eos_token_id").filter(|value| !value.is_null())?;
         Some((file, ids(value)?))
     };
-    let (file, ids) = eos("generation_config.json").or_else(|| eos("config.json"))?;
+    let (file, ids) = eos(files::GENERATION_CONFIG).or_else(|| eos(files::CONFIG))?;
     // GEN002 compares the id of the tokenizer's end-of-sequence token.
     let of_tokenizer = tokenizer.special_tokens.iter().find(|(name, _)| name == "eos_token");
     let agrees = of_tokenizer.is_none_or(|(_, eos)| tokenizer.id_of(eos).is_none_or(|id| ids.contains(&id)));

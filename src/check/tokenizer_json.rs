@@ -2,16 +2,16 @@
 //!
 //! Source: tokenizers 0.19 to 0.22, with the Python packages of transformers 4.47.0, 4.57.6 and 5.23.0.
 
+use crate::checkpoint::files;
 use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use super::model_type::{Asked, CAP};
+use super::model_type::CAP;
+use super::view::Asked;
 use crate::checkpoint::{Checkpoint, Document, Fault, FaultKind, Place, Tokenizer, escape, has_paired_merges};
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::tokenizer_parts::TokenizerPart;
-
-const FILE: &str = "tokenizer.json";
 
 /// Version of transformers whose `tokenizers`, 0.20, is the first that reads merges as pairs.
 const READS_PAIRS: [u64; 2] = [4, 45];
@@ -21,7 +21,7 @@ const MAX_DEPTH: usize = 8;
 
 /// The file, unless the tokenizer is built from another one.
 fn document(checkpoint: &Checkpoint) -> Option<&Document> {
-    checkpoint.document(FILE).filter(|_| checkpoint.tokenizer.source.as_deref() == Some(FILE))
+    checkpoint.document(files::TOKENIZER).filter(|_| checkpoint.tokenizer.source.as_deref() == Some(files::TOKENIZER))
 }
 
 /// The fault of merges that older versions do not read. Called by the engine with the targets of the run.
@@ -31,7 +31,7 @@ pub(super) fn paired_merges(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Optio
         asked.targets.iter().filter(|target| version_numbers(target.version()).as_slice() < READS_PAIRS.as_slice());
     let old: Vec<&'static str> = old.map(|target| target.loader.version()).collect();
     let is_fault = !old.is_empty() && has_paired_merges(document);
-    let fault = Fault::new(FaultKind::MergesArePairs).at(Place::file(FILE).pointer("/model/merges"));
+    let fault = Fault::new(FaultKind::MergesArePairs).at(Place::file(files::TOKENIZER).pointer("/model/merges"));
     is_fault.then(|| fault.under_all(old))
 }
 
@@ -60,7 +60,7 @@ pub(super) fn faults(checkpoint: &Checkpoint, parts: &[TokenizerPart]) -> Vec<Fa
 /// Adds faults of types that no version of the library has, in a part and in the parts of a sequence.
 fn unknown_types(value: &Value, part: &TokenizerPart, pointer: &str, depth: usize, faults: &mut Vec<Fault>) {
     if let Some(name) = value.get("type").and_then(Value::as_str).filter(|name| !part.types.contains(*name)) {
-        let fault = Fault::new(FaultKind::TokenizerPartUnknown).at(Place::file(FILE).pointer(pointer));
+        let fault = Fault::new(FaultKind::TokenizerPartUnknown).at(Place::file(files::TOKENIZER).pointer(pointer));
         faults.push(fault.with("part", part.pointer.trim_start_matches('/')).with("type", escape(name, CAP)));
     }
     let Some(list) = part.list.as_deref().filter(|_| depth < MAX_DEPTH) else { return };
@@ -100,7 +100,8 @@ fn moved(added: &[Value], given: &BTreeMap<&str, u64>) -> Option<Fault> {
     };
     let all: Vec<(usize, String, u64, u64)> = added.iter().enumerate().filter_map(differs).collect();
     let (i, content, stated, id) = all.first()?;
-    let fault = Fault::new(FaultKind::AddedTokenMoved).at(Place::file(FILE).pointer(format!("/added_tokens/{i}/id")));
+    let fault = Fault::new(FaultKind::AddedTokenMoved)
+        .at(Place::file(files::TOKENIZER).pointer(format!("/added_tokens/{i}/id")));
     Some(fault.with("token", escape(content, CAP)).with("stated", *stated).with("given", *id).with("count", all.len()))
 }
 
@@ -109,7 +110,7 @@ fn wrong_ids(part: &Value, pointer: &str, id_of: &dyn Fn(&str) -> Option<u64>, d
     let mut compare = |token: &Value, id: &Value, at: String| {
         let (Some(token), Some(written)) = (token.as_str(), id.as_u64()) else { return };
         if let Some(own) = id_of(token).filter(|own| *own != written) {
-            let fault = Fault::new(FaultKind::PostProcessorIdWrong).at(Place::file(FILE).pointer(at));
+            let fault = Fault::new(FaultKind::PostProcessorIdWrong).at(Place::file(files::TOKENIZER).pointer(at));
             faults.push(fault.with("token", escape(token, CAP)).with("written", written).with("own", own));
         }
     };

@@ -1,5 +1,6 @@
 //! Token ids: the ids of a tokenizer after its processor is opened, and whether the files agree on them.
 
+use crate::checkpoint::files;
 use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
@@ -112,7 +113,7 @@ pub fn faults(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
     let stated = tokenizer.stated();
     let mut faults: Vec<Fault> = rows.and_then(|rows| tokens_above(tokenizer, &stated, rows)).into_iter().collect();
     // A slow tokenizer numbers added tokens one after another: a hole shifts all that follow.
-    let base = tokenizer.first_added().filter(|_| !checkpoint.has_file("tokenizer.json"));
+    let base = tokenizer.first_added().filter(|_| !checkpoint.has_file(files::TOKENIZER));
     faults.extend(base.and_then(|base| first_hole(tokenizer, &stated, base)));
     let mut by_content: BTreeMap<&str, u64> = BTreeMap::new();
     for (id, token) in &stated {
@@ -125,7 +126,7 @@ pub fn faults(checkpoint: &Checkpoint, rows: Option<u64>) -> Vec<Fault> {
         if let Some(decoder_id) = by_content.get(added.content.as_str()).filter(|d| **d != added.id) {
             faults.push(
                 Fault::new(FaultKind::AddedTokensDisagree)
-                    .at(Place::file("added_tokens.json").pointer(pointer::join("", &added.content)))
+                    .at(Place::file(files::ADDED_TOKENS).pointer(pointer::join("", &added.content)))
                     .with("token", added.content.as_str())
                     .with("id", added.id)
                     .with("decoder_id", *decoder_id),

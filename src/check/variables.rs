@@ -1,5 +1,6 @@
 //! The variables and functions of a checkpoint for the expressions of rules. [`declared`] lists all of them.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -24,12 +25,12 @@ const BULKY: [&str; 3] = ["added_tokens_decoder", "additional_special_tokens", "
 
 /// Documents by the name expressions use.
 const DOCUMENTS: [(&str, &str); 6] = [
-    ("config", "config.json"),
-    ("generation", "generation_config.json"),
-    ("processor", "processor_config.json"),
-    ("preprocessor", "preprocessor_config.json"),
-    ("tokenizer_config", "tokenizer_config.json"),
-    ("special_tokens", "special_tokens_map.json"),
+    ("config", files::CONFIG),
+    ("generation", files::GENERATION_CONFIG),
+    ("processor", files::PROCESSOR_CONFIG),
+    ("preprocessor", files::PREPROCESSOR_CONFIG),
+    ("tokenizer_config", files::TOKENIZER_CONFIG),
+    ("special_tokens", files::SPECIAL_TOKENS),
 ];
 
 /// The first document that an expression reads and that is missing or invalid.
@@ -193,8 +194,8 @@ fn tokenizer(checkpoint: &Checkpoint) -> Value {
         "base": t.base().map(Vocabulary::len),
         "class": t.tokenizer_class,
         "source": t.source,
-        "json_base": entries("tokenizer.json"),
-        "model_base": entries("tokenizer.model"),
+        "json_base": entries(files::TOKENIZER),
+        "model_base": entries(files::TOKENIZER_MODEL),
         "bos": special("bos_token"),
         "eos": special("eos_token"),
         "pad": special("pad_token"),

@@ -3,6 +3,7 @@
 //! A verdict is the worst of the effects of the findings and of the predicted load report. It is never better than what
 //! was read: an object that nothing judges is not predicted.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
 use serde::Serialize;
@@ -10,7 +11,7 @@ use serde::Serialize;
 use super::finding::{Finding, FindingEffect};
 use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
-use crate::checkpoint::{Checkpoint, FaultKind, adapter};
+use crate::checkpoint::{Checkpoint, NotRead};
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
 
@@ -163,16 +164,18 @@ impl Basis<'_> {
         self.checkpoint.shards.values().any(|shard| shard.is_sound() || !shard.tensors.is_empty())
     }
 
-    /// The first file beside config.json that transformers opens for a model and that was not read: it is a link out of the
-    /// directory.
-    fn unread(&self) -> Option<&str> {
+    /// The first file beside config.json that transformers opens for a model and that was not read, and why. Of a file that the
+    /// loader cannot read either, findings tell what it does.
+    fn unread(&self) -> Option<(&str, NotRead)> {
         let index = self.checkpoint.index.iter().map(|index| index.document.as_str());
-        let documents = index.chain([adapter::CONFIG, "generation_config.json"]);
-        let documents = documents.filter_map(|name| self.checkpoint.document(name)).map(|document| &document.faults);
+        let documents = index.chain([files::ADAPTER_CONFIG, files::GENERATION_CONFIG]);
+        let documents = documents.filter_map(|name| self.checkpoint.document(name));
+        let documents = documents.map(|document| (document.name.as_str(), document.not_read));
         let shards = self.checkpoint.shards.values();
-        let opened = shards.filter(|shard| index::is_opened(self.checkpoint, &shard.name)).map(|shard| &shard.faults);
-        let mut faults = documents.chain(opened).flatten().filter(|fault| fault.kind == FaultKind::LinkNotFollowed);
-        faults.next()?.places.first()?.file.as_deref()
+        let opened = shards.filter(|shard| index::is_opened(self.checkpoint, &shard.name));
+        let opened = opened.map(|shard| (shard.name.as_str(), shard.not_read));
+        let mut unread = documents.chain(opened).filter_map(|(name, not_read)| Some((name, not_read?)));
+        unread.find(|(_, not_read)| *not_read != NotRead::Unreadable)
     }
 
     /// A pickle with a construct that is not modelled, and the construct.
@@ -236,8 +239,8 @@ impl Basis<'_> {
         if let Some((shard, doubt)) = self.doubt() {
             return (LoadVerdict::NotPredicted, Some(format!("{shard} was not understood: {doubt}")));
         }
-        if let Some(file) = self.unread() {
-            let why = format!("{file} is a link out of the directory, and was not read");
+        if let Some((file, not_read)) = self.unread() {
+            let why = format!("{file} {}, and was not read", not_read.words());
             return (LoadVerdict::NotPredicted, Some(why));
         }
         match self.report(loader) {
@@ -304,7 +307,7 @@ fn of_report(report: &LoadReport) -> (LoadVerdict, Option<String>) {
 fn offered(checkpoint: &Checkpoint) -> Vec<Object> {
     let is_of = |name: &str, object: Object| match object {
         // Code and other weights lie beside adapters, too.
-        Object::Model => name == "config.json" || checkpoint.index.is_some() || index::is_opened(checkpoint, name),
+        Object::Model => name == files::CONFIG || checkpoint.index.is_some() || index::is_opened(checkpoint, name),
         _ => Object::reading(name) == Some(object),
     };
     let has = |object: Object| checkpoint.entries.keys().any(|name| is_of(name, object));

@@ -1,5 +1,6 @@
 //! A PEFT adapter: a small set of weights that changes another model, and its config.
 
+use super::files;
 use std::collections::BTreeMap;
 use std::path::{Component, Path};
 
@@ -8,11 +9,8 @@ use serde_json::Value;
 use super::budget::Budget;
 use super::{Checkpoint, Document, Dtype, Shard, Source, Tensor, is_plain_file_name};
 
-/// The document that marks an adapter directory. Source: `CONFIG_NAME` in peft/utils/constants.py.
-pub const CONFIG: &str = "adapter_config.json";
-
 /// The weights files of an adapter. Source: `SAFETENSORS_WEIGHTS_NAME` and `WEIGHTS_NAME` in peft/utils/constants.py.
-pub const WEIGHTS: [&str; 2] = ["adapter_model.safetensors", "adapter_model.bin"];
+pub const WEIGHTS: [&str; 2] = [files::ADAPTER_WEIGHTS, files::PICKLED_ADAPTER];
 
 /// Prefix of every tensor name: PEFT's two wrappers around the model.
 pub const PREFIX: &str = "base_model.model.";
@@ -28,7 +26,7 @@ impl<'c> Adapter<'c> {
     /// The adapter in this directory; `None` without `adapter_config.json`.
     #[must_use]
     pub fn from_checkpoint(checkpoint: &'c Checkpoint) -> Option<Self> {
-        Some(Self { checkpoint, document: checkpoint.document(CONFIG)? })
+        Some(Self { checkpoint, document: checkpoint.document(files::ADAPTER_CONFIG)? })
     }
 
     /// The adapter config; `None` unless it is a JSON object.
@@ -64,11 +62,12 @@ impl AdapterBase {
     /// Reads the shard headers of the base model that `adapter_config.json` names by a relative path of at most four parts;
     /// `None` when there is no `config.json`. No other file there is opened, and no path from the root is tried.
     pub(super) fn read(checkpoint: &Checkpoint, budget: &mut Budget) -> Option<Self> {
-        let base = checkpoint.document(CONFIG)?.get("/base_model_name_or_path")?.as_str().map(Path::new)?;
+        let base =
+            checkpoint.document(files::ADAPTER_CONFIG)?.get("/base_model_name_or_path")?.as_str().map(Path::new)?;
         let is_near = |c: Component<'_>| matches!(c, Component::ParentDir | Component::CurDir | Component::Normal(_));
         let is_relative = base.starts_with("..") || base.starts_with(".");
         let is_allowed = is_relative && base.components().all(is_near) && base.components().count() <= 4;
-        let place = checkpoint.source.join(base).filter(|place| is_allowed && place.exists("config.json"))?;
+        let place = checkpoint.source.join(base).filter(|place| is_allowed && place.exists(files::CONFIG))?;
         Some(Self { shapes: shapes(&place, budget) })
     }
 

@@ -3,9 +3,6 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-/// The file of a model card.
-pub const CARD: &str = "README.md";
-
 /// Bytes of README.md that are read. The Hub reads more, but its metadata is never longer in practice.
 pub(super) const CARD_CAP: u64 = 1 << 20;
 

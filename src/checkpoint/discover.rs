@@ -1,5 +1,6 @@
 //! Finds the checkpoints for a path given by the user, and names the weights beside them that are not read.
 
+use super::files;
 use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -77,7 +78,7 @@ impl Found {
         let recognised = recognise(&names);
         let is_checkpoint = match inside {
             0 => recognised.is_some() || names.iter().any(|name| marks_checkpoint(name)),
-            levels => names.iter().any(|name| marks_checkpoint(name) && (levels == 1 || name != "config.json")),
+            levels => names.iter().any(|name| marks_checkpoint(name) && (levels == 1 || name != files::CONFIG)),
         };
         if is_checkpoint {
             self.checkpoints.push(dir.to_owned());
@@ -156,9 +157,9 @@ pub fn is_checkpoint(dir: &Path) -> bool {
 /// Whether a file of this name makes its directory a checkpoint.
 fn marks_checkpoint(name: &str) -> bool {
     !name.starts_with('.')
-        && (name == "config.json"
-            || name == "adapter_config.json"
+        && (name == files::CONFIG
+            || name == files::ADAPTER_CONFIG
             || name.ends_with(".safetensors")
             || name.ends_with(".safetensors.index.json")
-            || name == "pytorch_model.bin.index.json")
+            || name == files::PICKLE_INDEX)
 }

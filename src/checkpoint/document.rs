@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::Fault;
+use super::{Fault, NotRead, OpenError};
 
 pub mod edit;
 mod encoding;
@@ -31,6 +31,8 @@ pub struct Document {
     /// Byte ranges of the vocabulary and the merges, which `value` has empty because [`super::Tokenizer`] holds them in
     /// less space. They were parsed: their faults are in `faults`.
     pub left_out: Vec<Range<usize>>,
+    /// Why nothing was read of it; `None` when it was.
+    pub not_read: Option<NotRead>,
     /// Faults of the document.
     pub faults: Vec<Fault>,
 }
@@ -50,10 +52,17 @@ impl Document {
         Self { name: name.into(), text: Some(text.into()), value: Some(value), ..Self::default() }
     }
 
-    /// A document that could not be read at all.
+    /// A document that could not be opened or read.
     #[must_use]
-    pub fn unread(name: impl Into<String>, fault: Fault) -> Self {
-        Self { name: name.into(), faults: vec![fault], ..Self::default() }
+    pub fn unread(name: impl Into<String>, error: &OpenError) -> Self {
+        let name = name.into();
+        Self { faults: vec![error.fault(&name)], not_read: Some(error.not_read()), name, ..Self::default() }
+    }
+
+    /// A document that was not opened because files before it took the budget.
+    #[must_use]
+    pub(super) fn over_budget(name: impl Into<String>) -> Self {
+        Self { name: name.into(), not_read: Some(NotRead::OverBudget), ..Self::default() }
     }
 
     /// The value at a JSON pointer.

@@ -1,5 +1,6 @@
 //! Names of files to be written.
 
+use super::files;
 use std::borrow::Cow;
 use std::fmt;
 use std::ops::Deref;
@@ -45,7 +46,7 @@ impl FileName {
     /// Source: `split_state_dict_into_shards_factory` in `huggingface_hub`.
     pub(crate) fn shard(number: usize, count: usize) -> Self {
         if count == 1 {
-            Self::constant("model.safetensors")
+            Self::constant(files::WEIGHTS)
         } else {
             Self(Cow::Owned(format!("model-{number:05}-of-{count:05}.safetensors")))
         }

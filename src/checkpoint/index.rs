@@ -1,5 +1,6 @@
 //! The index of a sharded checkpoint: a map from tensors to shards.
 
+use super::files;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
 
@@ -10,11 +11,6 @@ use super::open::is_plain_file_name;
 use super::pointer;
 use super::text::escape;
 use super::{Document, Fault, FaultKind, Place};
-
-/// The index name that transformers tries first.
-pub const INDEX_NAME: &str = "model.safetensors.index.json";
-/// The index of pickled shards, which transformers uses when no safetensors file and no `pytorch_model.bin` exists.
-pub const PICKLE_INDEX_NAME: &str = "pytorch_model.bin.index.json";
 
 /// Content of `*.safetensors.index.json`.
 #[derive(Debug, Clone, Default)]
@@ -45,7 +41,7 @@ impl Index {
     /// Whether its shards are pickle files.
     #[must_use]
     pub fn is_of_pickles(&self) -> bool {
-        self.document == PICKLE_INDEX_NAME
+        self.document == files::PICKLE_INDEX
     }
 
     /// Reads the index that `document` holds.

@@ -67,7 +67,7 @@ impl Nested {
                 budget.spend(u64::try_from(bytes.len()).unwrap_or(u64::MAX));
                 Document::parse(path, &bytes)
             }
-            Err(error) => Document::unread(path, error.fault(path)),
+            Err(error) => Document::unread(path, &error),
         };
         budget.spend_values(&document);
         self.documents.insert(path.to_owned(), document);

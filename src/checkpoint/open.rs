@@ -116,7 +116,49 @@ pub enum OpenError {
     },
 }
 
+/// Why nothing was read of a file. Its reader adds a fault; verdicts ask for this state, because a load of the file is then
+/// unknown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NotRead {
+    /// Files before it took the budget of the checkpoint.
+    OverBudget,
+    /// It is larger than any file of its kind that is read.
+    TooLarge,
+    /// It is a link out of the directory.
+    Outside,
+    /// It cannot be opened or read, or is not a file. The loader fails, too.
+    Unreadable,
+}
+
+impl NotRead {
+    /// Says of the file why it was not read: `is a link out of the directory`.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::OverBudget => "is beyond the size of a checkpoint that is read whole",
+            Self::TooLarge => "is too large",
+            Self::Outside => "is a link out of the directory",
+            Self::Unreadable => "is unreadable",
+        }
+    }
+}
+
 impl OpenError {
+    /// The state of a file that this error kept from being read.
+    #[must_use]
+    pub const fn not_read(&self) -> NotRead {
+        match self {
+            Self::TooLarge { .. } => NotRead::TooLarge,
+            Self::Outside { .. } => NotRead::Outside,
+            Self::NotFound { .. }
+            | Self::NotRegular { .. }
+            | Self::NotADirectory { .. }
+            | Self::DanglingLink { .. }
+            | Self::SymlinkLoop { .. }
+            | Self::Io { .. } => NotRead::Unreadable,
+        }
+    }
+
     /// The error as a fault of the file `name`.
     #[must_use]
     pub fn fault(&self, name: &str) -> Fault {

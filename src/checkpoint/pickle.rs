@@ -4,13 +4,14 @@
 //! out of constants; it imports and calls nothing. What a pickle asks to import is recorded by name. The reader accepts no
 //! more than `torch.load(weights_only=True)`: what it does not model is a [`Pickle::doubt`], never a guess.
 
+use super::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::budget::Budget;
 use super::fault::Faults;
 use super::shard::header::other_format;
 use super::work::Work;
-use super::{Checkpoint, Fault, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Place, Shard, Source, SourceFile, adapter};
+use super::{Checkpoint, Fault, FaultKind, Place, Shard, Source, SourceFile, adapter};
 
 mod beside;
 mod call;
@@ -24,9 +25,6 @@ mod state_dict;
 mod storage;
 mod value;
 mod zip;
-
-/// The pickle that transformers opens when there is no safetensors file, before it looks for an index.
-pub const PICKLE_NAME: &str = "pytorch_model.bin";
 
 /// Maximum number of bytes of one pickle, without the tensors. 100 000 tensors take some 15 MB.
 const PICKLE_CAP: u64 = 32 << 20;
@@ -119,13 +117,13 @@ impl Shard {
     pub(super) fn read_pickle(source: &Source, name: &str, budget: &mut Budget) -> Self {
         match source.open_regular(name, u64::MAX) {
             Ok(file) => read(name, &file, budget),
-            Err(error) => Self { pickle: Some(Box::default()), ..Self::unread(name, error.fault(name)) },
+            Err(error) => Self { pickle: Some(Box::default()), ..Self::unopened(name, &error) },
         }
     }
 
     /// A pickle that is not read because the checkpoint is too large.
     pub(super) fn unopened_pickle(name: &str) -> Self {
-        Self { name: name.to_owned(), unread: true, pickle: Some(Box::default()), ..Self::default() }
+        Self { pickle: Some(Box::default()), ..Self::over_budget(name) }
     }
 
     /// Reads a pickle that is in memory.
@@ -171,6 +169,21 @@ enum Problem {
     Other(String),
     /// Reading failed.
     Io(String),
+}
+
+impl Problem {
+    /// The problem of a machine that stopped at `offset`. `longer` is whether the file has more bytes than were given to it;
+    /// `None` for a member of an archive, which is whole.
+    fn of(stop: machine::Stop, offset: u64, longer: Option<bool>) -> Self {
+        use machine::Stop;
+        match (stop, longer) {
+            (Stop::TooLarge(what), _) => Self::TooLarge(what),
+            (Stop::Broken(reason), _) => Self::Malformed(reason.to_owned(), offset),
+            (Stop::End, Some(true)) => Self::TooLarge("bytes"),
+            (Stop::End, Some(false)) => Self::Cut("the pickle".to_owned(), None),
+            (Stop::End, None) => Self::Malformed("the pickle ends early".to_owned(), offset),
+        }
+    }
 }
 
 /// State of reading one file.
@@ -274,14 +287,14 @@ impl Checkpoint {
     /// `load_peft_weights` of PEFT 0.19.
     pub(super) fn place_pickles(&mut self) {
         let mut opened: BTreeSet<String> = BTreeSet::new();
-        if self.has_file(adapter::CONFIG) && !self.has_file(adapter::WEIGHTS[0]) {
+        if self.has_file(files::ADAPTER_CONFIG) && !self.has_file(adapter::WEIGHTS[0]) {
             opened.insert(adapter::WEIGHTS[1].to_owned());
         }
-        let map = self.documents.get(PICKLE_INDEX_NAME).and_then(|document| document.get("/weight_map"));
-        if self.has_file("model.safetensors") || self.has_file(INDEX_NAME) {
+        let map = self.documents.get(files::PICKLE_INDEX).and_then(|document| document.get("/weight_map"));
+        if self.has_file(files::WEIGHTS) || self.has_file(files::INDEX) {
             // transformers opens these, and no pickle.
-        } else if self.has_file(PICKLE_NAME) {
-            opened.insert(PICKLE_NAME.to_owned());
+        } else if self.has_file(files::PICKLED_WEIGHTS) {
+            opened.insert(files::PICKLED_WEIGHTS.to_owned());
         } else if let Some(map) = map.and_then(serde_json::Value::as_object) {
             opened.extend(map.values().filter_map(|file| file.as_str().map(str::to_owned)));
         } else {

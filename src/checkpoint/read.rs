@@ -6,16 +6,15 @@ use std::sync::Arc;
 
 use super::adapter::AdapterBase;
 use super::budget::{Budget, text_cost};
-use super::card::{CARD, CARD_CAP, ModelCard};
+use super::card::ModelCard;
 use super::contents::{self, HashedFiles, Progress, ReadOptions};
+use super::files::{self, FileContent, KnownFile};
 use super::git;
 use super::is_plain_file_name;
 use super::journal::{Journal, JournalDistrust, StateFolder};
 use super::lfs::MAX_POINTER;
-use super::open::{JSON_CAP, MODULE_CAP, TOKENIZER_CAP};
 use super::parallel;
 use super::pickle::{is_pickle_name, may_be_pickle, starts_like_pickle};
-use super::tokenizer::is_vocabulary;
 use super::{
     Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Nested, OpenError, Place, PythonModule,
     REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Source, Vocabulary, escape,
@@ -24,26 +23,6 @@ use super::{
 /// Suffixes of unfinished downloads.
 const UNFINISHED: [&str; 5] = [".incomplete", ".aria2", ".part", ".crdownload", ".download"];
 
-/// Documents read by their full name; `*config.json` and `*.index.json` are read as well.
-const DOCUMENTS: [&str; 10] = [
-    "added_tokens.json",
-    "chat_template.json",
-    "special_tokens_map.json",
-    "tokenizer.json",
-    "vocab.json",
-    "dataset_statistics.json",
-    "model_index.json",
-    "modules.json",
-    "policy_preprocessor.json",
-    "policy_postprocessor.json",
-];
-
-/// Vocabulary files that are not JSON documents.
-const VOCABULARIES: [&str; 4] = ["tokenizer.model", "spiece.model", "sentencepiece.bpe.model", "vocab.txt"];
-
-/// Plain text files that a loader reads.
-const TEXTS: [&str; 1] = ["chat_template.jinja"];
-
 /// Whether the name is one of pickled weights.
 fn is_pickle(name: &str) -> bool {
     has_ending(name, "bin") && ["pytorch_model", "adapter_model", "model"].iter().any(|start| name.starts_with(start))
@@ -51,8 +30,8 @@ fn is_pickle(name: &str) -> bool {
 
 /// Whether a loader reads the file, and this program does not.
 fn is_unread(name: &str) -> bool {
-    let is_read = VOCABULARIES.contains(&name) || is_document(name);
-    is_pickle(name) || TEXTS.contains(&name) || is_vocabulary(name) && !is_read
+    let is_read_otherwise = || matches!(KnownFile::content_of(name), Some(FileContent::Text | FileContent::Presence));
+    is_pickle(name) || is_read_otherwise()
 }
 
 /// Whether the name has this extension; case-sensitive, like the loaders.
@@ -62,12 +41,13 @@ fn has_ending(name: &str, ending: &str) -> bool {
 
 /// Whether a file is read as a JSON document.
 pub(super) fn is_document(name: &str) -> bool {
-    DOCUMENTS.contains(&name) || name.ends_with("config.json") || name.ends_with(".index.json")
+    KnownFile::content_of(name) == Some(FileContent::Document)
 }
 
 /// Whether the content of the file is read, and may be quoted. Of a shard, names and shapes are read.
 fn is_content(name: &str) -> bool {
-    is_document(name) || has_ending(name, "py") || TEXTS.contains(&name) || VOCABULARIES.contains(&name)
+    use FileContent::{Document, Module, Text, Vocabulary};
+    matches!(KnownFile::content_of(name), Some(Document | Module | Text | Vocabulary))
 }
 
 impl Checkpoint {
@@ -210,10 +190,11 @@ struct Unread {
 impl SourceReader {
     /// Reads the content of this file if a loader would, and if enough of the budget is left.
     fn read_within_budget(&mut self, name: &str, entry: &Entry) {
-        let is_module = has_ending(name, "py");
+        let content = KnownFile::content_of(name);
+        let is_module = content == Some(FileContent::Module);
         let is_shard = name.ends_with(".safetensors") || self.is_pickle(name, entry);
-        let is_text = is_module || is_document(name) || TEXTS.contains(&name) || VOCABULARIES.contains(&name);
-        let cap = if is_module { MODULE_CAP } else { TOKENIZER_CAP };
+        let is_text = is_content(name);
+        let cap = content.map_or(0, FileContent::cap);
         if !is_text && !is_shard || entry.kind != EntryKind::Regular {
             return self.read_content(name, entry);
         }
@@ -236,8 +217,7 @@ impl SourceReader {
             let module = PythonModule { name: name.to_owned(), unread: true, ..PythonModule::default() };
             self.checkpoint.modules.insert(name.to_owned(), module);
         } else if !is_left && is_document(name) {
-            let document = Document { name: name.to_owned(), ..Document::default() };
-            self.checkpoint.documents.insert(name.to_owned(), document);
+            self.checkpoint.documents.insert(name.to_owned(), Document::over_budget(name));
         }
     }
 
@@ -289,7 +269,7 @@ impl SourceReader {
         let Self { checkpoint, budget, .. } = self;
         let is_real = |entry: &Entry| entry.kind == EntryKind::Directory && entry.link.is_none();
         let folders = checkpoint.entries.iter().filter(|(_, entry)| is_real(entry)).map(|(name, _)| name.clone());
-        let has_parts = ["model_index.json", "modules.json"].iter().any(|name| checkpoint.has_file(name));
+        let has_parts = [files::MODEL_INDEX, files::MODULES].iter().any(|name| checkpoint.has_file(name));
         checkpoint.nested = Nested::read(&checkpoint.source, folders.collect(), has_parts, budget);
     }
 
@@ -307,47 +287,51 @@ impl SourceReader {
     fn read_content(&mut self, name: &str, entry: &Entry) {
         let source = &self.checkpoint.source.clone();
         let is_shard = name.ends_with(".safetensors");
-        if entry.kind == EntryKind::Directory && !is_document(name) && !is_shard {
+        let read = |content: FileContent| source.read_own(name, content.cap());
+        match KnownFile::content_of(name) {
             // A folder is a checkpoint of its own, or unrelated.
-        } else if is_shard {
-            let shard = own_shard(source, name, self.read_shard(name));
-            self.checkpoint.shards.insert(name.to_owned(), shard);
-        } else if self.is_pickle(name, entry) {
-            let pickle = own_shard(source, name, Shard::read_pickle(source, name, &mut self.budget));
-            self.checkpoint.pickles.insert(name.to_owned(), pickle);
-        } else if is_document(name) {
-            let cap = if name.starts_with("tokenizer") || name == "vocab.json" { TOKENIZER_CAP } else { JSON_CAP };
-            let document = match source.read_own(name, cap) {
-                Ok(bytes) => Document::parse(name, &bytes),
-                Err(error) => Document::unread(name, error.fault(name)),
-            };
-            self.checkpoint.documents.insert(name.to_owned(), document);
-        } else if has_ending(name, "py") {
-            let module = match source.read_own(name, MODULE_CAP) {
-                Ok(bytes) => PythonModule::parse(name, &bytes),
-                Err(error) => PythonModule::unread(name, error.fault(name)),
-            };
-            self.checkpoint.modules.insert(name.to_owned(), module);
-        } else if TEXTS.contains(&name) && entry.lfs.is_none() {
-            match source.read_own(name, MODULE_CAP) {
+            content if entry.kind == EntryKind::Directory && content != Some(FileContent::Document) && !is_shard => {}
+            _ if is_shard => {
+                let shard = own_shard(source, name, self.read_shard(name));
+                self.checkpoint.shards.insert(name.to_owned(), shard);
+            }
+            _ if self.is_pickle(name, entry) => {
+                let pickle = own_shard(source, name, Shard::read_pickle(source, name, &mut self.budget));
+                self.checkpoint.pickles.insert(name.to_owned(), pickle);
+            }
+            Some(content @ FileContent::Document) => {
+                let document = match read(content) {
+                    Ok(bytes) => Document::parse(name, &bytes),
+                    Err(error) => Document::unread(name, &error),
+                };
+                self.checkpoint.documents.insert(name.to_owned(), document);
+            }
+            Some(content @ FileContent::Module) => {
+                let module = match read(content) {
+                    Ok(bytes) => PythonModule::parse(name, &bytes),
+                    Err(error) => PythonModule::unread(name, error.fault(name)),
+                };
+                self.checkpoint.modules.insert(name.to_owned(), module);
+            }
+            Some(content @ FileContent::Text) if entry.lfs.is_none() => match read(content) {
                 Ok(bytes) => {
                     self.checkpoint.texts.insert(name.to_owned(), String::from_utf8_lossy(&bytes).into());
                 }
                 Err(error) => self.checkpoint.faults.push(error.fault(name)),
+            },
+            Some(content @ FileContent::Card) if entry.lfs.is_none() => {
+                // Nothing loads it, so that it cannot be read is no fault.
+                let bytes = read(content).ok();
+                self.checkpoint.card = bytes.map(|bytes| ModelCard::parse(&String::from_utf8_lossy(&bytes)));
             }
-        } else if name == CARD && entry.lfs.is_none() {
-            // Nothing loads it, so that it cannot be read is no fault.
-            let bytes = source.read_own(name, CARD_CAP).ok();
-            self.checkpoint.card = bytes.map(|bytes| ModelCard::parse(&String::from_utf8_lossy(&bytes)));
-        } else if VOCABULARIES.contains(&name) {
-            match vocabulary(source, name) {
+            Some(FileContent::Vocabulary) => match vocabulary(source, name) {
                 Ok(vocabulary) => drop(self.vocabularies.insert(name.to_owned(), Arc::new(vocabulary))),
                 Err(fault) => self.vocabulary_faults.push(*fault),
+            },
+            _ if entry.kind == EntryKind::Broken => {
+                self.checkpoint.faults.extend(source.stat(name).err().map(|error| error.fault(name)));
             }
-        } else if entry.kind == EntryKind::Broken
-            && let Err(error) = source.stat(name)
-        {
-            self.checkpoint.faults.push(error.fault(name));
+            _ => {}
         }
     }
 
@@ -422,14 +406,14 @@ fn entry(source: &Source, name: &str, faults: &mut Vec<Fault>) -> Entry {
 fn own_shard(source: &Source, name: &str, shard: Shard) -> Shard {
     match source.check_link(name) {
         Err(error @ OpenError::Outside { .. }) if shard.tensors.is_empty() && !shard.is_sound() => {
-            Shard { pickle: shard.pickle.map(|_| Box::default()), ..Shard::unread(name, error.fault(name)) }
+            Shard { pickle: shard.pickle.map(|_| Box::default()), ..Shard::unopened(name, &error) }
         }
         _ => shard,
     }
 }
 
 fn vocabulary(source: &Source, name: &str) -> Result<Vocabulary, Box<Fault>> {
-    let bytes = source.read_own(name, TOKENIZER_CAP).map_err(|error| error.fault(name))?;
+    let bytes = source.read_own(name, FileContent::Vocabulary.cap()).map_err(|error| error.fault(name))?;
     let fault = |kind| Fault::new(kind).at(Place::file(name));
     if let Some(pointer) = LfsPointer::parse(&bytes) {
         return Err(fault(FaultKind::LfsPointer).with("oid", pointer.oid).with("size", pointer.size).into());

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use super::pickle::Pickle;
-use super::{Fault, Place};
+use super::{Fault, NotRead, OpenError, Place};
 
 mod dtype;
 mod entry;
@@ -65,6 +65,8 @@ pub struct Shard {
     pub metadata: Option<BTreeMap<String, String>>,
     /// The header could not be parsed to its end, so a tensor missing here may still exist.
     pub unread: bool,
+    /// Why nothing was read of the file; `None` when its header was at least begun.
+    pub not_read: Option<NotRead>,
     /// Names of entries in the header that are too malformed for `tensors`.
     pub unreadable: Vec<String>,
     /// Number of tensors that were counted and not read, because the checkpoint is too large.
@@ -93,10 +95,17 @@ impl Shard {
             && self.tensors.iter().all(|tensor| tensor.begin <= tensor.end && tensor.end <= region)
     }
 
-    /// A shard that could not be read at all.
+    /// A shard that could not be opened or read.
     #[must_use]
-    pub(crate) fn unread(name: impl Into<String>, fault: Fault) -> Self {
-        Self { name: name.into(), unread: true, faults: vec![fault], ..Self::default() }
+    pub(crate) fn unopened(name: &str, error: &OpenError) -> Self {
+        let faults = vec![error.fault(name)];
+        Self { name: name.to_owned(), unread: true, not_read: Some(error.not_read()), faults, ..Self::default() }
+    }
+
+    /// A shard of which nothing was read, or only the number of its tensors, because files before it took the budget.
+    #[must_use]
+    pub(crate) fn over_budget(name: &str) -> Self {
+        Self { name: name.to_owned(), unread: true, not_read: Some(NotRead::OverBudget), ..Self::default() }
     }
 
     /// Number of tensors that the header lists.

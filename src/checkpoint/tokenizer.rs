@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
+use super::files::{self, FileContent, KnownFile, Object};
 use super::{Document, Fault, FaultKind, Place, pointer};
 
 mod sentencepiece;
@@ -15,40 +16,21 @@ pub use vocabulary::{Vocabulary, has_paired_merges};
 /// Vocabulary files that are read, in the order in which a tokenizer takes its ids from them: M2M100 and `Speech2Text` take
 /// those of `vocab.json`, and use `sentencepiece.bpe.model` to split text.
 pub const VOCABULARY_FILES: [&str; 8] = [
-    "tokenizer.json",
-    "tokenizer.model",
-    "spiece.model",
-    "vocab.json",
-    "sentencepiece.bpe.model",
-    "vocab.txt",
-    "tekken.json",
-    "tiktoken.model",
+    files::TOKENIZER,
+    files::TOKENIZER_MODEL,
+    files::SPIECE_MODEL,
+    files::VOCAB_JSON,
+    files::BPE_MODEL,
+    files::VOCAB_TXT,
+    files::TEKKEN,
+    files::TIKTOKEN_MODEL,
 ];
-
-/// Other vocabulary files of tokenizers in transformers. Source: every `VOCAB_FILES_NAMES` of 4.47.0, 4.57.6 and 5.23.0.
-const OTHER_VOCABULARY_FILES: [&str; 11] = [
-    "bpe.codes",
-    "byte_maps.json",
-    "dict.txt",
-    "entity_vocab.json",
-    "merges.txt",
-    "prophetnet.tokenizer",
-    "target_vocab.json",
-    "vocab-src.json",
-    "vocab-tgt.json",
-    "artists.json",
-    "lyrics.json",
-];
-
-/// Endings of vocabulary files: `spm_char.model`, `source.spm`, `qwen.tiktoken`.
-const VOCABULARY_ENDINGS: [&str; 3] = [".model", ".spm", ".tiktoken"];
 
 /// Whether a file of this name is the vocabulary of a tokenizer, or a part of it.
 #[must_use]
 pub fn is_vocabulary(name: &str) -> bool {
-    VOCABULARY_FILES.contains(&name)
-        || OTHER_VOCABULARY_FILES.contains(&name)
-        || VOCABULARY_ENDINGS.iter().any(|ending| name.ends_with(ending))
+    let is_listed = |file: &KnownFile| (file.content, file.object) == (FileContent::Presence, Some(Object::Tokenizer));
+    VOCABULARY_FILES.contains(&name) || KnownFile::of(name).is_some_and(is_listed)
 }
 
 /// Special-token attributes in the order transformers adds them. Source: `SPECIAL_TOKENS_ATTRIBUTES` in 4.47.0.
@@ -135,8 +117,8 @@ impl Tokenizer {
         files: BTreeSet<String>,
     ) -> Self {
         let mut faults = Vec::new();
-        for name in ["tokenizer.json", "vocab.json"] {
-            let pointer = if name == "vocab.json" { "" } else { "/model/vocab" };
+        for name in [files::TOKENIZER, files::VOCAB_JSON] {
+            let pointer = if name == files::VOCAB_JSON { "" } else { "/model/vocab" };
             if !vocabularies.contains_key(name)
                 && let Some(document) = documents.get(name)
             {
@@ -151,25 +133,25 @@ impl Tokenizer {
             }
         }
         let get = |name: &str, pointer: &str| documents.get(name)?.get(pointer);
-        let config = "tokenizer_config.json";
+        let config = files::TOKENIZER_CONFIG;
         let decoder = get(config, "/added_tokens_decoder")
             .and_then(Value::as_object)
             .map(|map| map.iter().filter_map(|(id, token)| added(id.parse().ok()?, token)).collect::<Vec<_>>());
-        let json = get("added_tokens.json", "").and_then(Value::as_object).map(|map| {
+        let json = get(files::ADDED_TOKENS, "").and_then(Value::as_object).map(|map| {
             map.iter()
                 .filter_map(|(content, id)| Some(AddedToken { id: id.as_u64()?, content: content.clone() }))
                 .collect()
         });
-        let own = get("tokenizer.json", "/added_tokens")
+        let own = get(files::TOKENIZER, "/added_tokens")
             .and_then(Value::as_array)
             .map(|list| list.iter().filter_map(|token| added(token.get("id")?.as_u64()?, token)).collect());
-        let listed = get("tokenizer.json", "/added_tokens").and_then(Value::as_array);
+        let listed = get(files::TOKENIZER, "/added_tokens").and_then(Value::as_array);
         if let Some(at) = listed.and_then(|list| list.iter().position(|token| !has_valid_id(token))) {
-            let place = Place::file("tokenizer.json").pointer(format!("/added_tokens/{at}"));
+            let place = Place::file(files::TOKENIZER).pointer(format!("/added_tokens/{at}"));
             let reason = "the id of an added token is not a whole number from 0 to 4294967295";
             faults.push(Fault::new(FaultKind::VocabularyMalformed).at(place).with("reason", reason));
         }
-        let special_from = if decoder.is_some() { vec![config] } else { vec!["special_tokens_map.json", config] };
+        let special_from = if decoder.is_some() { vec![config] } else { vec![files::SPECIAL_TOKENS, config] };
         let mut tokenizer = Self {
             files,
             vocabularies,
@@ -180,7 +162,7 @@ impl Tokenizer {
             special_tokens: special_tokens(&special_from, &get),
             named_special: named_special(&special_from, &get),
             faults,
-            is_list: get("tokenizer.json", "/model/type").and_then(Value::as_str) == Some("Unigram"),
+            is_list: get(files::TOKENIZER, "/model/type").and_then(Value::as_str) == Some("Unigram"),
             ..Self::default()
         };
         let prefix = get(config, "/add_prefix_space").is_some_and(|v| !v.is_null());
@@ -196,7 +178,7 @@ impl Tokenizer {
         let rebuilt = prefix_space && (class.starts_with("Llama") || class.starts_with("T5"));
         let slow = VOCABULARY_FILES.into_iter().skip(1).find(|f| self.files.contains(*f));
         let source = match slow {
-            Some(slow) if rebuilt || !self.files.contains("tokenizer.json") => slow,
+            Some(slow) if rebuilt || !self.files.contains(files::TOKENIZER) => slow,
             _ => VOCABULARY_FILES.into_iter().find(|f| self.files.contains(*f))?,
         };
         Some(source.to_owned())
@@ -212,7 +194,7 @@ impl Tokenizer {
     /// classes of XLM-R, mBART and NLLB, which have `sentencepiece.bpe.model`, and Pegasus shift the ids of the file.
     #[must_use]
     pub fn first_added(&self) -> Option<u64> {
-        let is_shifted = self.source.as_deref() == Some("sentencepiece.bpe.model")
+        let is_shifted = self.source.as_deref() == Some(files::BPE_MODEL)
             || self.tokenizer_class.as_deref().is_some_and(|class| class.contains("Pegasus"));
         self.base().filter(|_| !is_shifted).map(Vocabulary::len)
     }
@@ -220,9 +202,9 @@ impl Tokenizer {
     /// The first list of added tokens, and its file.
     fn stating(&self) -> Option<(&'static str, &[AddedToken])> {
         let lists = [
-            ("tokenizer_config.json", &self.added_tokens_decoder),
-            ("added_tokens.json", &self.added_tokens_json),
-            ("tokenizer.json", &self.tokenizer_json_added),
+            (files::TOKENIZER_CONFIG, &self.added_tokens_decoder),
+            (files::ADDED_TOKENS, &self.added_tokens_json),
+            (files::TOKENIZER, &self.tokenizer_json_added),
         ];
         lists.into_iter().find_map(|(file, list)| Some((file, list.as_deref()?)))
     }
@@ -241,8 +223,8 @@ impl Tokenizer {
         let Some((file, list)) = self.stating() else { return Place::default() };
         let found = list.iter().enumerate().find(|(_, token)| token.id == id);
         let pointer = match (file, found) {
-            ("added_tokens.json", Some((_, token))) => pointer::join("", &token.content),
-            ("tokenizer.json", Some((at, _))) => format!("/added_tokens/{at}"),
+            (files::ADDED_TOKENS, Some((_, token))) => pointer::join("", &token.content),
+            (files::TOKENIZER, Some((at, _))) => format!("/added_tokens/{at}"),
             _ => format!("/added_tokens_decoder/{id}"),
         };
         Place::file(file).pointer(pointer)
@@ -272,7 +254,7 @@ impl Tokenizer {
     pub fn compare(&self, other: &Self) -> Comparison {
         let (Some(base), Some(other_base)) = (self.base(), other.base()) else { return Comparison::Unknown };
         // Classes for these files shift ids, so that they compare with each other alone.
-        let shifts = |one: &Self| matches!(one.source.as_deref(), Some("spiece.model" | "sentencepiece.bpe.model"));
+        let shifts = |one: &Self| matches!(one.source.as_deref(), Some(files::SPIECE_MODEL | files::BPE_MODEL));
         if self.source != other.source && (shifts(self) || shifts(other)) {
             return Comparison::Unknown;
         }
@@ -327,9 +309,9 @@ impl Tokenizer {
     pub fn adds_bos(&self, checkpoint: &super::Checkpoint) -> bool {
         let bos = self.special_tokens.iter().find(|(name, _)| name == "bos_token").map(|(_, token)| token.as_str());
         let get = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer);
-        match get("tokenizer_config.json", "/add_bos_token").and_then(Value::as_bool) {
+        match get(files::TOKENIZER_CONFIG, "/add_bos_token").and_then(Value::as_bool) {
             Some(adds) if self.has_bos_flag() => adds,
-            _ => get("tokenizer.json", "/post_processor").is_some_and(|part| begins_with(part, bos)),
+            _ => get(files::TOKENIZER, "/post_processor").is_some_and(|part| begins_with(part, bos)),
         }
     }
 
@@ -344,7 +326,7 @@ impl Tokenizer {
     /// Computes ids and length as transformers does on load: stated tokens first, then special ones.
     fn resolve(&mut self) {
         let base = self.base().cloned();
-        let fast = self.source.as_deref() == Some("tokenizer.json");
+        let fast = self.source.as_deref() == Some(files::TOKENIZER);
         let in_base = |token: &str| base.as_ref().is_some_and(|b| b.id_of(token).is_some());
         let base_len = base.as_ref().map_or(0, Vocabulary::len);
         let mut ids: BTreeMap<String, u64> = BTreeMap::new();
@@ -372,7 +354,7 @@ impl Tokenizer {
             }
         }
         // Tokenizer classes for these two files shift ids or add tokens of their own.
-        let known = !matches!(self.source.as_deref(), Some("spiece.model" | "sentencepiece.bpe.model"));
+        let known = !matches!(self.source.as_deref(), Some(files::SPIECE_MODEL | files::BPE_MODEL));
         let more = u64::try_from(length).unwrap_or(u64::MAX);
         self.length = base.filter(|_| known).map(|_| base_len.saturating_add(more));
         self.added = ids;

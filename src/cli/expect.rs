@@ -1,5 +1,6 @@
 //! `expect`: the tensors of a model class, from its config alone.
 
+use crate::checkpoint::files;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::{BufRead as _, BufReader, Read as _};
@@ -70,7 +71,7 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 
 /// Reads a config.json, or the one in a directory.
 fn one(path: &Path) -> anyhow::Result<Input> {
-    let text = if path.is_dir() { read_own(path, &[], "config.json", JSON_CAP) } else { read_capped(path, JSON_CAP) };
+    let text = if path.is_dir() { read_own(path, &[], files::CONFIG, JSON_CAP) } else { read_capped(path, JSON_CAP) };
     let record = parse(&text?).map(|config| Record { config, class: None });
     Ok(Input { source: shown(path), record })
 }
@@ -103,7 +104,7 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Input) -> anyhow::Result<()>) 
 
 /// Parses a config as `check` does, with the extensions of Python's JSON.
 fn parse(bytes: &[u8]) -> Result<Value, String> {
-    let document = Document::parse("config.json", bytes);
+    let document = Document::parse(files::CONFIG, bytes);
     document.value.ok_or_else(|| {
         let kind = document.faults.first().map_or("not JSON", |f| f.kind.name());
         format!("the config cannot be read: {kind}")

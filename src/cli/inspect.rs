@@ -1,5 +1,6 @@
 //! `inspect`.
 
+use crate::checkpoint::files;
 use std::path::Path;
 
 use anyhow::{Context, bail};
@@ -70,7 +71,7 @@ fn alone(path: &Path) -> Option<Checkpoint> {
     }
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     let name = path.file_name()?.to_str()?;
-    if ["config.json", "model.safetensors.index.json"].iter().any(|beside| parent.join(beside).exists()) {
+    if [files::CONFIG, files::INDEX].iter().any(|beside| parent.join(beside).exists()) {
         return None;
     }
     let shards = vec![Shard::read(&parent.into(), name)];

@@ -4,6 +4,7 @@ use std::fmt;
 
 use super::program::Program;
 use super::releases;
+pub use super::releases::version_numbers;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
@@ -92,13 +93,6 @@ impl Loader {
     pub fn of_config(config: &Value) -> Self {
         config.get("transformers_version").and_then(Value::as_str).map_or(Self::NEWEST, Self::nearest)
     }
-}
-
-/// The leading numbers of a version, which order versions: 5, 0, 0 of `5.0.0rc1`.
-#[must_use]
-pub fn version_numbers(version: &str) -> Vec<u64> {
-    let digits = |part: &str| part.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default().parse().ok();
-    version.split('.').map_while(digits).collect()
 }
 
 impl fmt::Display for Loader {

@@ -1,6 +1,7 @@
 //! Parts of models: where the language model, the vision tower and the projector of a model class stand in its config and
 //! among its tensors.
 
+use crate::checkpoint::files;
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
@@ -125,7 +126,7 @@ pub struct Need {
 }
 
 fn config_json() -> FileName {
-    FileName::constant("config.json")
+    FileName::constant(files::CONFIG)
 }
 
 impl ModelParts {

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
-use super::loader::version_numbers;
 use super::source;
 
 /// By library, the last patch of each minor version. A test reads the file.
@@ -14,6 +13,13 @@ static RELEASES: LazyLock<Releases> = LazyLock::new(|| {
     source::parse_embedded(&format!("rules/{file}"), source::text(file).unwrap_or_default())
         .unwrap_or_else(|error| panic!("{error}"))
 });
+
+/// The leading numbers of a version, which order versions: 5, 0, 0 of `5.0.0rc1`.
+#[must_use]
+pub fn version_numbers(version: &str) -> Vec<u64> {
+    let digits = |part: &str| part.split(|c: char| !c.is_ascii_digit()).next().unwrap_or_default().parse().ok();
+    version.split('.').map_while(digits).collect()
+}
 
 /// Why nobody can have a version of a library: it was never released, and never will be. `None` for a version that may exist,
 /// such as a newer one, a development build, or a number that stands for many.

@@ -10,8 +10,9 @@ mod catalogue;
 mod effect;
 mod fix;
 
+pub use crate::checkpoint::files::Object;
 pub use catalogue::{Catalogue, example};
-pub use effect::{Consequence, Effect, Harm, LoaderRange, Object};
+pub use effect::{Consequence, Effect, Harm, LoaderRange};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template, compile_lazily};

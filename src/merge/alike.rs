@@ -3,6 +3,7 @@
 use super::context::Context;
 use super::error::MergeError;
 use super::parts::{PartOf, value_of};
+use crate::checkpoint::files;
 use crate::checkpoint::tokenizer::Comparison;
 use crate::checkpoint::{Tokenizer, escape};
 use crate::knowledge::recipe::{AlikeSpec, Exchange};
@@ -110,7 +111,7 @@ fn special_tokens(model: &Tokenizer, part: &Tokenizer) -> Option<String> {
 fn config_ids(place: PartOf<'_>, new: PartOf<'_>) -> Option<String> {
     ["bos_token_id", "eos_token_id"].into_iter().find_map(|key| {
         let id = |part: PartOf<'_>| {
-            let generation = value_of(&part.donor().checkpoint, "generation_config.json");
+            let generation = value_of(&part.donor().checkpoint, files::GENERATION_CONFIG);
             let places = [Some(part.config()), generation].into_iter().flatten();
             places.filter_map(|place| place.get(key)).find(|id| !id.is_null()).cloned()
         };

@@ -1,5 +1,6 @@
 //! The donors of a merge, and the scope in which the recipe's expressions are evaluated.
 
+use crate::checkpoint::files;
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -96,15 +97,15 @@ impl<'a> Context<'a> {
             scope.bind(&donor.role, &donor.config);
         }
         let stored = |donor: &Donor| {
-            let config = donor.checkpoint.document("config.json").and_then(|document| document.value.clone());
+            let config = donor.checkpoint.document(files::CONFIG).and_then(|document| document.value.clone());
             (donor.role.clone(), config.unwrap_or_default())
         };
         scope.bind("stored", &Value::Object(donors.iter().map(stored).collect()));
-        for (name, file) in [("processor", "processor_config.json"), ("preprocessor", "preprocessor_config.json")] {
+        for (name, file) in [("processor", files::PROCESSOR_CONFIG), ("preprocessor", files::PREPROCESSOR_CONFIG)] {
             scope.bind(name, &document(donors, file).unwrap_or_default());
         }
         let base = recipe.tokens.as_ref().and_then(|tokens| donors.iter().find(|donor| donor.role == tokens.base));
-        let tokenizer = base.and_then(|donor| value_of(&donor.checkpoint, "tokenizer_config.json"));
+        let tokenizer = base.and_then(|donor| value_of(&donor.checkpoint, files::TOKENIZER_CONFIG));
         scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
@@ -142,7 +143,7 @@ impl Context<'_> {
             let donor = self
                 .donor(&spec.base)
                 .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;
-            let config = document(self.donors, "processor_config.json").unwrap_or_default();
+            let config = document(self.donors, files::PROCESSOR_CONFIG).unwrap_or_default();
             let opened = open_tokenizer(&donor.checkpoint.tokenizer, &processor, &config, None)
                 .map_err(self.at(format!("processor {}", processor.processor)))?
                 .ok_or_else(|| {

@@ -1,5 +1,6 @@
 //! The JSON documents of a merge: copies of a donor's documents, edited ones, and new ones.
 
+use crate::checkpoint::files;
 use serde_json::{Map, Value, json};
 
 use super::context::Context;
@@ -236,7 +237,7 @@ fn part_config(context: &Context<'_>, edit: &PartEdit) -> Result<Vec<Change>, Me
 /// `transformers_version` of a model with a part that a newer version wrote: an older one may not know the part.
 fn newest_version(context: &Context<'_>, edit: &PartEdit, place: PartOf<'_>) -> Vec<Change> {
     let part =
-        context.donor(&edit.from).and_then(|donor| value_of(&donor.checkpoint, "config.json")?.get(VERSION)?.as_str());
+        context.donor(&edit.from).and_then(|donor| value_of(&donor.checkpoint, files::CONFIG)?.get(VERSION)?.as_str());
     let host = place.host().get(VERSION).and_then(Value::as_str);
     let is_newer = |part: &&str| host.is_some_and(|host| version_numbers(part) > version_numbers(host));
     part.filter(is_newer).map(|part| (format!("/{VERSION}"), Some(part.into()))).into_iter().collect()
@@ -265,7 +266,7 @@ fn added(context: &Context<'_>, tokens: &OpenedTokenizer, form: TokensForm) -> V
     match form {
         TokensForm::Decoder => {
             let stated =
-                base.and_then(|c| c.document("tokenizer_config.json")?.get("/added_tokens_decoder")?.as_object());
+                base.and_then(|c| c.document(files::TOKENIZER_CONFIG)?.get("/added_tokens_decoder")?.as_object());
             map.extend(stated.into_iter().flatten().map(|(k, v)| (k.clone(), v.clone())));
             for (id, token) in &tokens.new {
                 let entry = json!({
@@ -309,7 +310,7 @@ fn unambiguous(document: &Document, role: &str) -> Result<(), MergeError> {
 
 /// The config.json of a graft's donor.
 fn donor_config<'c>(context: &Context<'c>, graft: &GraftEdit) -> Option<&'c Document> {
-    context.donors.iter().find(|d| d.role == graft.from)?.checkpoint.document("config.json")
+    context.donors.iter().find(|d| d.role == graft.from)?.checkpoint.document(files::CONFIG)
 }
 
 fn grafted(context: &Context<'_>, graft: &GraftEdit) -> Result<Value, MergeError> {

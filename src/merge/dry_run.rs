@@ -1,5 +1,6 @@
 //! What a dry run says in addition: space, shards, the change of the config, and the plan itself.
 
+use crate::checkpoint::files;
 use std::path::Path;
 
 use serde::Serialize;
@@ -89,9 +90,9 @@ pub(super) fn facts(
 
 /// config.json of the result, and of the donor that the recipe takes it from.
 fn config_change(draft: &MergeDraft, recipe: &Recipe, donors: &[Donor]) -> Option<ConfigChange> {
-    let config = |name: &str| name == "config.json";
+    let config = |name: &str| name == files::CONFIG;
     let role = recipe.documents.iter().find(|spec| config(&spec.name))?.from.as_ref()?;
-    let host = donors.iter().find(|donor| donor.role == *role)?.checkpoint.document("config.json")?;
+    let host = donors.iter().find(|donor| donor.role == *role)?.checkpoint.document(files::CONFIG)?;
     let new = draft.documents.iter().find(|document| config(&document.name))?;
     Some(ConfigChange { donor: role.clone(), old: host.text.clone()?, new: new.text.clone()? })
 }

@@ -1,5 +1,6 @@
 //! Explains in words why an expression of a recipe cannot be evaluated with these donors.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::context::{Context, Donor};
@@ -41,7 +42,7 @@ fn missing_value(context: &Context<'_>, path: &[String]) -> Option<String> {
     let Some(donor) = context.donor(role) else {
         return Some(format!("no {role} donor is given, {}; pass --donor {role}=DIR", spec.what));
     };
-    let file = donor.checkpoint.document("config.json").and_then(|document| document.value.as_ref());
+    let file = donor.checkpoint.document(files::CONFIG).and_then(|document| document.value.as_ref());
     let mut here = if stored { file.unwrap_or(&Value::Null) } else { &donor.config };
     if here.is_null() && !keys.is_empty() {
         return Some(format!("the {role} donor has no readable config.json"));

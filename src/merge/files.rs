@@ -1,5 +1,6 @@
 //! The files of a merge: documents, copies, Python modules, templates and the index; `config.json` is written last.
 
+use crate::checkpoint::files;
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -13,13 +14,13 @@ use super::error::MergeError;
 use super::{CARD, REPORT, manifest, switches};
 use crate::check::modules::{entries, relative_modules};
 use crate::checkpoint::open::TOKENIZER_CAP;
-use crate::checkpoint::{Document, FileName, FilePattern, INDEX_NAME};
+use crate::checkpoint::{Document, FileName, FilePattern};
 use crate::knowledge::recipe::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
 use crate::report::model::MergedFile;
 use crate::surgery::plan::PlannedFile;
 
 /// Name of the index.
-const INDEX: FileName = FileName::constant(INDEX_NAME);
+const INDEX: FileName = FileName::constant(files::INDEX);
 
 pub(super) fn plan(
     context: &Context<'_>,
@@ -58,7 +59,7 @@ pub(super) fn plan(
     }
     // A loader starts at config.json. It is written last, so that an incomplete copy is not mistaken for a checkpoint.
     let (config, others): (Vec<MergedDocument>, Vec<MergedDocument>) =
-        documents.into_iter().partition(|b| &*b.name == "config.json");
+        documents.into_iter().partition(|b| &*b.name == files::CONFIG);
     for merged in others.into_iter().chain(config) {
         files.push(PlannedFile { name: merged.name, bytes: bytes_of(&merged.document), origin: merged.origin });
         draft.documents.push(merged.document);
@@ -146,7 +147,7 @@ fn copy_of(
     let read = donor.checkpoint.source.read_own(name, TOKENIZER_CAP);
     let bytes = read.map_err(|e| MergeError::Donor(format!("the {role} donor's {name}: {e}")))?;
     let mut stripped = None;
-    if name.to_ascii_lowercase().ends_with(".json") && &**name != "vocab.json" {
+    if name.to_ascii_lowercase().ends_with(".json") && &**name != files::VOCAB_JSON {
         let read = donor.checkpoint.documents.get(&**name);
         let read = read.filter(|d| d.text.as_deref().is_some_and(|text| text.as_bytes() == bytes));
         let document = read.map_or_else(|| Cow::Owned(Document::parse(&**name, &bytes)), Cow::Borrowed);

@@ -1,5 +1,6 @@
 //! The parts of donors: which of their tensors and configs a recipe means by `part: "language"`.
 
+use crate::checkpoint::files;
 use serde_json::{Map, Value, json};
 
 use super::context::{Context, Donor};
@@ -64,7 +65,7 @@ impl DonorParts {
 
 /// The part that a checkpoint is as a whole: a causal language model, or a class that `rules/parts/` gives a part alone.
 fn part_alone<'k>(checkpoint: &Checkpoint, knowledge: &'k Knowledge) -> Option<(&'k str, Own)> {
-    let config = value_of(checkpoint, "config.json")?;
+    let config = value_of(checkpoint, files::CONFIG)?;
     let written = config.get("architectures").and_then(|classes| classes.get(0)).and_then(Value::as_str);
     let is_alone = |part: &Part| written.is_some_and(|class| part.own.class.values().any(|own| own == class));
     let mut parts = knowledge.parts.iter().flat_map(|model| &model.parts);
@@ -115,7 +116,7 @@ impl<'a> PartOf<'a> {
 
     /// The config of the part as written; `None` for a part without one.
     pub(super) fn stored(self) -> Option<(&'a str, &'a Map<String, Value>)> {
-        let config = self.donor.checkpoint.document("config.json")?.value.as_ref()?;
+        let config = self.donor.checkpoint.document(files::CONFIG)?.value.as_ref()?;
         let at = self.part.pointer(config)?;
         Some((at, config.pointer(at)?.as_object()?))
     }
@@ -188,9 +189,9 @@ impl<'a> PartOf<'a> {
         scope.bind("at", &json!(at));
         scope.bind("part", new.config());
         scope.bind("host", self.host());
-        scope.bind("host_stored", value_of(&self.donor.checkpoint, "config.json").unwrap_or(&Value::Null));
+        scope.bind("host_stored", value_of(&self.donor.checkpoint, files::CONFIG).unwrap_or(&Value::Null));
         for (name, donor) in [("host_preprocessor", self.donor), ("part_preprocessor", new.donor)] {
-            scope.bind(name, value_of(&donor.checkpoint, "preprocessor_config.json").unwrap_or(&json!({})));
+            scope.bind(name, value_of(&donor.checkpoint, files::PREPROCESSOR_CONFIG).unwrap_or(&json!({})));
         }
         for item in &self.part.lets {
             let value = item.is.eval(&scope).map_err(context.at(format!("{} of the part {}", item.name, self.name)))?;
@@ -231,7 +232,7 @@ impl<'a> PartOf<'a> {
                 self.name
             ))
         };
-        let whole = self.donor.checkpoint.document("config.json").and_then(|d| d.value.as_ref());
+        let whole = self.donor.checkpoint.document(files::CONFIG).and_then(|d| d.value.as_ref());
         let loader = whole.map_or(Loader::NEWEST, Loader::of_config);
         let model_type = self.model_type().ok_or_else(none)?;
         let mapping = if self.name == "language" { "causal_lm" } else { "model" };
@@ -262,7 +263,7 @@ impl<'a> PartOf<'a> {
             own.insert("tie_word_embeddings".to_owned(), true.into());
         }
         let mut own = Value::Object(own);
-        switches::strip("config.json", &mut own);
+        switches::strip(files::CONFIG, &mut own);
         Ok(own.as_object().cloned().unwrap_or_default())
     }
 }

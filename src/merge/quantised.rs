@@ -1,5 +1,6 @@
 //! Quantised donors. Their weights are copied only into a result that has them where the donor has them.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
 use super::context::Donor;
@@ -11,7 +12,7 @@ use crate::knowledge::quantization::{Scheme, stated};
 use crate::knowledge::recipe::Recipe;
 
 /// Files that AutoGPTQ, AutoAWQ and `ModelOpt` write beside config.json.
-const BESIDE: [&str; 3] = ["quantize_config.json", "quant_config.json", "hf_quant_config.json"];
+const BESIDE: [&str; 3] = [files::QUANTIZE_CONFIG, files::QUANT_CONFIG, files::HF_QUANT_CONFIG];
 
 /// Words in the names of buffers of integers, which plain models store: masks, positions and indices of windows.
 const OF_BUFFERS: [&str; 4] = ["mask", "position", "index", ".attn.bias"];
@@ -42,7 +43,7 @@ pub(super) fn check(recipe: &Recipe, donors: &[Donor], schemes: &[Scheme]) -> Re
 
 /// What shows that the weights of a checkpoint are quantised.
 fn sign(checkpoint: &Checkpoint, schemes: &[Scheme]) -> Option<String> {
-    let config = checkpoint.document("config.json").and_then(|document| document.value.as_ref());
+    let config = checkpoint.document(files::CONFIG).and_then(|document| document.value.as_ref());
     if let Some((at, method)) = config.and_then(stated) {
         return Some(format!("config.json {at}: {method}"));
     }

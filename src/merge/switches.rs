@@ -1,5 +1,6 @@
 //! Removes keys that make a loader run code from the documents of a result, whichever edit brought them.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -11,7 +12,7 @@ use crate::checkpoint::{Document, FileName};
 use crate::knowledge::recipe::{AUTO_MAP, CODE_SWITCHES};
 
 /// Documents whose keys are tokens: a token may be spelled like a switch, and then has an integer.
-const TOKEN_MAPS: [&str; 2] = ["added_tokens.json", "vocab.json"];
+const TOKEN_MAPS: [&str; 2] = [files::ADDED_TOKENS, files::VOCAB_JSON];
 
 /// Names of removed keys.
 pub(super) type Removed = BTreeSet<&'static str>;

@@ -1,5 +1,6 @@
 //! The tensors of the result: their origin, transform and shape.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use regex::Regex;
@@ -137,7 +138,7 @@ pub(super) fn plan(
     draft.seams.extend(context.donors.iter().filter_map(|donor| quantised(donor, &taken)));
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
     let names = taken.iter().map(|t| t.name.as_str());
-    let config = documents.iter().find(|b| b.document.name == "config.json").and_then(|b| b.document.value.as_ref());
+    let config = documents.iter().find(|b| b.document.name == files::CONFIG).and_then(|b| b.document.value.as_ref());
     let mut expected = expected_shapes(&knowledge.library, config, names, &evidence);
     if let Some(place) = rules.iter().find_map(|rule| rule.into) {
         // The class of a newer version has other names than the checkpoint, which it renames when it loads.
@@ -322,7 +323,7 @@ fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft:
 
 /// The seam for a donor whose quantised weights would be cast in part: its scales belong to their type.
 fn quantised(donor: &Donor, taken: &[TakenTensor<'_>]) -> Option<Seam> {
-    let config = donor.checkpoint.document("config.json")?.value.as_ref()?;
+    let config = donor.checkpoint.document(files::CONFIG)?.value.as_ref()?;
     quantization::block(config)?;
     let cast = taken.iter().find(|t| t.donor.role == donor.role && t.dtype() != t.tensor.dtype)?;
     Some(Seam {

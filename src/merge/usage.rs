@@ -1,5 +1,6 @@
 //! The Python code that loads a result, from its documents.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::draft::MergeDraft;
@@ -18,7 +19,7 @@ const MODELS: [&str; 5] = [
 ];
 
 /// Documents in which `auto_map` may name a processor.
-const PROCESSOR_DOCUMENTS: [&str; 2] = ["processor_config.json", "preprocessor_config.json"];
+const PROCESSOR_DOCUMENTS: [&str; 2] = [files::PROCESSOR_CONFIG, files::PREPROCESSOR_CONFIG];
 
 /// How a result is loaded: its class and the class of its processor or tokenizer.
 #[derive(Debug, Clone, Default)]
@@ -42,17 +43,18 @@ impl Usage {
         let document = |name: &str| draft.documents.iter().find(|document| document.name == name);
         let has = |test: fn(&str) -> bool| draft.plan.files.iter().any(|file| test(&file.name));
         let processor = PROCESSOR_DOCUMENTS.iter().filter_map(|name| document(name)).collect::<Vec<_>>();
-        let tokenizer = has(|name| name.starts_with("tokenizer") || name == "vocab.json" || name == "spiece.model");
+        let tokenizer =
+            has(|name| name.starts_with("tokenizer") || name == files::VOCAB_JSON || name == files::SPIECE_MODEL);
         let coded = processor.iter().any(|document| auto_class(document, "AutoProcessor"));
         let processor = match (processor.is_empty(), tokenizer) {
             (false, _) => Some(Loaded { variable: "processor", class: "AutoProcessor".to_owned(), has_code: coded }),
             (true, true) => {
-                let coded = document("tokenizer_config.json").is_some_and(|d| auto_class(d, "AutoTokenizer"));
+                let coded = document(files::TOKENIZER_CONFIG).is_some_and(|d| auto_class(d, "AutoTokenizer"));
                 Some(Loaded { variable: "tokenizer", class: "AutoTokenizer".to_owned(), has_code: coded })
             }
             (true, false) => None,
         };
-        Self { model: document("config.json").and_then(model), processor }
+        Self { model: document(files::CONFIG).and_then(model), processor }
     }
 
     /// The statements that load the result from `dir`; empty without a known class.

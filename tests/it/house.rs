@@ -6,6 +6,7 @@ use std::path::Path;
 
 use crate::pages::catalogue;
 use crate::support::{cases, files, project, rules, texts};
+use ckpt_doctor::checkpoint::files::KnownFile;
 use ckpt_doctor::checkpoint::{Dtype, FaultKind};
 use ckpt_doctor::knowledge::processor::Processor;
 use ckpt_doctor::knowledge::quantization::Scheme;
@@ -259,6 +260,74 @@ fn without_tests(text: &str) -> String {
     code.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n")
 }
 
+/// Names of files have a meaning for many readers, so they are spelled in one place.
+#[test]
+fn no_source_spells_the_name_of_a_file_of_a_checkpoint() {
+    let literal = Regex::new(r#""([A-Za-z0-9][A-Za-z0-9_.-]*)""#).expect("a pattern");
+    let mut wrong = Vec::new();
+    let own = "src/checkpoint/files.rs";
+    for (path, text) in sources().into_iter().filter(|(path, _)| path != own && !path.ends_with("/tests.rs")) {
+        // `embedded` takes the name of a file in rules/.
+        let code = without_tests(&text).replace("embedded(\"modules.json\")", "");
+        for found in literal.captures_iter(&code).filter(|found| KnownFile::of(&found[1]).is_some()) {
+            wrong.push(format!("{path} spells {}, which {own} has a constant for", &found[1]));
+        }
+    }
+    none(&wrong);
+}
+
+/// Classes and model types that sources may spell, and why they are no knowledge of `rules/`.
+const SPELLED: [(&str, &[&str], &str); 10] = [
+    (
+        "src/check/built_tokenizer.rs",
+        &["TokenizersBackend", "PythonBackend", "PreTrainedTokenizer", "MistralCommonBackend", "LlamaTokenizer"],
+        "the steps of AutoTokenizer compare these names",
+    ),
+    ("src/check/class_names.rs", &["TokenizersBackend", "PreTrainedTokenizerFast"], "the name that a repair replaces"),
+    ("src/check/modules.rs", &["AutoProcessor"], "a key of auto_map"),
+    ("src/knowledge/architecture/resolve.rs", &["mamba"], "a type of layer, not a model type"),
+    (
+        "src/knowledge/classes.rs",
+        &["AutoTokenizer", "AutoImageProcessor", "AutoVideoProcessor", "AutoFeatureExtractor", "AutoProcessor"],
+        "the Auto class of each kind",
+    ),
+    ("src/merge/context.rs", &["opt"], "a variable of recipes"),
+    ("src/merge/tensors.rs", &["opt"], "a variable of recipes"),
+    ("src/merge/validate.rs", &["opt"], "a variable of recipes"),
+    ("src/merge/validate/expressions.rs", &["opt"], "a variable of recipes"),
+    ("src/merge/usage.rs", &["AutoProcessor", "AutoTokenizer"], "Python that a report prints"),
+];
+
+/// Names of classes and model types are knowledge, so they stand in `rules/`.
+#[test]
+fn no_source_spells_a_class_or_a_model_type() {
+    let classes: Value = serde_json::from_slice(&fs::read(project().join("rules/classes.json")).unwrap()).unwrap();
+    let mut names: BTreeSet<String> = BTreeSet::new();
+    for of_version in classes.as_object().unwrap().values() {
+        let kinds = of_version.as_object().unwrap().values().filter_map(Value::as_object);
+        names.extend(kinds.flat_map(|kind| kind.keys().cloned()));
+    }
+    let of_text = |text: &str| -> Value { source::parse("an architecture", text).unwrap_or_else(|e| panic!("{e}")) };
+    for (_, text) in texts("rules/architectures") {
+        let file = of_text(&text);
+        let types = file["model_types"].as_array().cloned().unwrap_or_default();
+        names.extend(types.iter().filter_map(|name| Some(name.as_str()?.to_owned())));
+    }
+    assert!(names.len() > 1500, "{} names", names.len());
+    let literal = Regex::new(r#""([A-Za-z0-9_.-]+)""#).expect("a pattern");
+    let mut spelled: BTreeSet<(String, String)> = BTreeSet::new();
+    for (path, text) in sources().into_iter().filter(|(path, _)| !path.ends_with("/tests.rs")) {
+        for found in literal.captures_iter(&without_tests(&text)).filter(|found| names.contains(&found[1])) {
+            spelled.insert((path.clone(), found[1].to_owned()));
+        }
+    }
+    let pairs = SPELLED.iter().flat_map(|(path, names, _)| names.iter().map(|name| ((*path).into(), (*name).into())));
+    let allowed: BTreeSet<(String, String)> = pairs.collect();
+    let new = spelled.difference(&allowed).map(|(path, name)| format!("{path} spells {name}: put it into rules/"));
+    let stale = allowed.difference(&spelled).map(|(path, name)| format!("{path} does not spell {name} any more"));
+    none(&new.chain(stale).collect::<Vec<_>>());
+}
+
 /// Clippy denies operations that can panic. No source allows them, and only the module that maps files has unsafe code.
 #[test]
 fn no_source_allows_panics_or_unsafe_code() {
@@ -319,7 +388,7 @@ fn every_built_in_repair_is_used_by_some_rule() {
 /// The README of the fixtures describes every folder.
 #[test]
 fn every_folder_of_fixtures_is_described() {
-    let known = ["bases", "donors", "recipes", "reported", "rules", "sound"];
+    let known = ["bases", "donors", "recipes", "reported", "rules", "sound", "yesterday"];
     let folders = fs::read_dir(project().join("fixtures")).expect("a folder").map(|e| e.expect("an entry").path());
     let unknown: Vec<String> = folders
         .filter(|p| p.is_dir())

@@ -7,6 +7,7 @@ mod exit;
 mod form;
 mod judgement;
 mod leaks;
+mod order;
 mod templates;
 mod verdicts;
 

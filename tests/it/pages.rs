@@ -1,6 +1,7 @@
-//! Generated pages and data: `rules/README.md`, `rules/examples.json`, `docs/rules.md`, the lists in `docs/decisions.md`,
+//! Generated pages and data: `rules/README.md`, `rules/examples.json`, `docs/rules.md`, `docs/files.md`, the lists in `docs/decisions.md`,
 //! and the completions and manual pages in `packaging/`. `CKPT_DOCTOR_WRITE=1 cargo test --test it pages::` writes them.
 
+mod files;
 mod key_tables;
 mod names;
 mod share;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use crate::checkpoint::adapter::CONFIG;
+use crate::checkpoint::files;
 use crate::checkpoint::{Fault, FaultKind, Place, escape, pointer};
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::peft::{PeftKey, PeftKeys};
@@ -53,7 +53,7 @@ pub(super) fn faults(config: &Value, table: &PeftKeys, versions: &[String]) -> V
 }
 
 fn at(key: &str) -> Place {
-    Place::file(CONFIG).pointer(format!("/{}", pointer::escape(key)))
+    Place::file(files::ADAPTER_CONFIG).pointer(format!("/{}", pointer::escape(key)))
 }
 
 /// A `peft_type` that a version lacks; with the type that differs from it in case alone.

@@ -1,6 +1,6 @@
 //! LoRA files that are not PEFT's, recognised by their tensor names.
 
-use crate::checkpoint::adapter::CONFIG;
+use crate::checkpoint::files;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
 
 /// A program whose LoRA files have names of their own.
@@ -28,7 +28,7 @@ const FORMATS: [Format; 3] = [
 
 /// One fault for each file that holds the LoRA of another program; the config of PEFT says what the directory is.
 pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let has_config = checkpoint.document(CONFIG).is_some();
+    let has_config = checkpoint.document(files::ADAPTER_CONFIG).is_some();
     let of_file = |(file, tensors): (&String, &[Tensor])| {
         let format = FORMATS.iter().find(|format| tensors.iter().any(|tensor| (format.is_of)(&tensor.name)))?;
         let count = tensors.iter().filter(|tensor| (format.is_of)(&tensor.name)).count();

@@ -6,7 +6,7 @@ use std::collections::HashSet;
 use serde_json::Value;
 
 use crate::check::config_pattern::{COMPARISON, ConfigPattern, allowance};
-use crate::checkpoint::adapter::CONFIG;
+use crate::checkpoint::files;
 use crate::checkpoint::work::{Work, WorkExceeded};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 
@@ -41,7 +41,7 @@ impl<'c> Targets<'c> {
         let list = |key: &str| -> Vec<&'c str> {
             config.get(key).and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_str).collect()
         };
-        let mut work = allowance(checkpoint, checkpoint.document(CONFIG));
+        let mut work = allowance(checkpoint, checkpoint.document(files::ADAPTER_CONFIG));
         let mut exceeded = false;
         let mut compiled = |text: &str| {
             if exceeded {
@@ -76,7 +76,7 @@ impl<'c> Targets<'c> {
 
     /// The fault of lists and patterns that would cost more to compare than the size of the adapter explains.
     pub(super) fn excess(&self) -> Option<Fault> {
-        self.exceeded.get().then(|| Fault::new(FaultKind::PatternsNotCompared).at(Place::file(CONFIG)))
+        self.exceeded.get().then(|| Fault::new(FaultKind::PatternsNotCompared).at(Place::file(files::ADAPTER_CONFIG)))
     }
 
     /// Pays for `count` comparisons of `units` each; whether they may be made.

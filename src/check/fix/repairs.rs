@@ -2,6 +2,7 @@
 //!
 //! Each returns its edits, or `None` when the checkpoint lacks what they need.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
 mod configs;
@@ -14,7 +15,7 @@ pub(super) use names::rename;
 
 use super::{Edit, Site};
 use crate::check::index::{by_tensor, numbered, readable, shard_names, similar};
-use crate::checkpoint::{Checkpoint, FaultKind, INDEX_NAME, PICKLE_INDEX_NAME, Shard};
+use crate::checkpoint::{Checkpoint, FaultKind, Shard};
 use crate::knowledge::rule::BuiltInRepair;
 
 /// The edits of a repair; `None` when the checkpoint lacks what they need.
@@ -78,8 +79,8 @@ fn family(checkpoint: &Checkpoint) -> Option<(String, Vec<String>)> {
     let complete = alike && usize::try_from(count).is_ok_and(|count| numbers.len() == count);
     let document = checkpoint.index.as_ref().map(|index| index.document.clone());
     let file = document.unwrap_or_else(|| match prefix {
-        "model" => INDEX_NAME.to_owned(),
-        "pytorch_model" if names.iter().all(|name| name.ends_with(".bin")) => PICKLE_INDEX_NAME.to_owned(),
+        "model" => files::INDEX.to_owned(),
+        "pytorch_model" if names.iter().all(|name| name.ends_with(".bin")) => files::PICKLE_INDEX.to_owned(),
         other => format!("{other}.safetensors.index.json"),
     });
     complete.then(|| (file, names.into_iter().map(str::to_owned).collect()))

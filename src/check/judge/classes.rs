@@ -1,5 +1,6 @@
 //! The first two stages: the targets of a checkpoint, and the class that each of them builds.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::Inputs;
@@ -149,7 +150,7 @@ fn unbuildable(built: &[BuiltClass<'_>]) -> Vec<Fault> {
     let (leading, others): (Vec<_>, Vec<_>) = built.iter().partition(|one| one.target.leads);
     for one in leading.into_iter().chain(others) {
         let fault = Fault::new(FaultKind::ConfigIncomputable)
-            .at(Place::file("config.json"))
+            .at(Place::file(files::CONFIG))
             .with("architecture", one.architecture.name())
             .under(one.target.loader.version());
         match (&one.class, faults.first_mut()) {
@@ -205,7 +206,7 @@ fn unknown_class(config: &Value, gap: Option<(String, String)>) -> Fault {
     let text = |pointer: &str| config.pointer(pointer).and_then(Value::as_str).unwrap_or("none");
     let (pointer, part) = gap.map_or(("/model_type".to_owned(), None), |(pointer, part)| (pointer, Some(part)));
     let fault = Fault::new(FaultKind::UnknownArchitecture)
-        .at(Place::file("config.json").pointer(pointer))
+        .at(Place::file(files::CONFIG).pointer(pointer))
         .with("model_type", text("/model_type"))
         .with("class", text("/architectures/0"));
     part.into_iter().fold(fault, |fault, part| fault.with("part", part))

@@ -1,13 +1,11 @@
 //! What the loader finds in a checkpoint: keys, and the tensors behind them.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
 
-use crate::checkpoint::{Checkpoint, PICKLE_NAME, Shard};
+use crate::checkpoint::{Checkpoint, Shard};
 use crate::knowledge::Evidence;
-
-/// The file a loader takes before it looks for an index.
-const SINGLE: &str = "model.safetensors";
 
 /// Whether a shard without an index is one of the model, and not of an adapter or another program, by its name.
 fn is_of_model(name: &str) -> bool {
@@ -49,7 +47,7 @@ impl Stored {
     #[must_use]
     pub fn new<'s>(index: Option<&BTreeMap<String, Arc<str>>>, shards: impl IntoIterator<Item = &'s Shard>) -> Self {
         let shards: BTreeMap<&str, &Shard> = shards.into_iter().map(|s| (s.name.as_str(), s)).collect();
-        match (shards.get(SINGLE).or_else(|| shards.get(PICKLE_NAME)), index) {
+        match (shards.get(files::WEIGHTS).or_else(|| shards.get(files::PICKLED_WEIGHTS)), index) {
             (Some(single), _) => Self::together(&[single]),
             (None, None) => {
                 let of_model: Vec<&Shard> = shards.into_values().filter(|s| is_of_model(&s.name)).collect();

@@ -1,5 +1,6 @@
 //! Compares the quantisation that config.json declares with the other documents and with the tensor names.
 
+use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
 use serde_json::Value;
@@ -9,7 +10,7 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::quantization::{Scheme, block};
 
 /// Documents that AutoGPTQ and AutoAWQ write beside config.json.
-const BESIDE: [&str; 2] = ["quantize_config.json", "quant_config.json"];
+const BESIDE: [&str; 2] = [files::QUANTIZE_CONFIG, files::QUANT_CONFIG];
 
 /// Parameters that decide shapes or the meaning of values, and how else they are spelled.
 const PARAMETERS: [(&str, &str); 6] = [
@@ -24,7 +25,7 @@ const PARAMETERS: [(&str, &str); 6] = [
 /// The fault of a config with an unknown scheme.
 pub(super) fn unknown(method: &str, config: &Value) -> Fault {
     let pointer = block(config).map_or("", |(pointer, _)| pointer);
-    Fault::new(FaultKind::UnknownQuantization).at(Place::file("config.json").pointer(pointer)).with("method", method)
+    Fault::new(FaultKind::UnknownQuantization).at(Place::file(files::CONFIG).pointer(pointer)).with("method", method)
 }
 
 /// Parameters that a separate file states otherwise than config.json does.
@@ -41,7 +42,7 @@ pub(super) fn disagreements(checkpoint: &Checkpoint) -> Vec<Fault> {
             if said != otherwise {
                 let fault = Fault::new(FaultKind::QuantizeConfigDisagrees)
                     .at(Place::file(name).pointer(format!("/{there}")))
-                    .at(Place::file("config.json").pointer(format!("{pointer}/{here}")));
+                    .at(Place::file(files::CONFIG).pointer(format!("{pointer}/{here}")));
                 faults.push(
                     fault
                         .with("parameter", key)

@@ -4,6 +4,7 @@
 //! regular expression at the start or a literal end, compressed-tensors whole names or `re:…`. So there are two
 //! questions here: what is left plain by all of them, and what may be by any.
 
+use crate::checkpoint::files;
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeSet, HashSet};
 
@@ -30,7 +31,7 @@ pub(super) struct SkippedModules<'a> {
 
 impl<'a> SkippedModules<'a> {
     pub(super) fn new(applied: &'a AppliedScheme<'_>, checkpoint: &Checkpoint) -> Self {
-        let mut work = allowance(checkpoint, checkpoint.document("config.json"));
+        let mut work = allowance(checkpoint, checkpoint.document(files::CONFIG));
         let mut exceeded = false;
         let (mut texts, mut expressions) = (Vec::new(), Vec::new());
         for pattern in applied.skipped() {

@@ -2,6 +2,7 @@
 //! a test compares every rule with them; the tables in `rules/README.md` are generated from them.
 
 use crate::checkpoint::fault::{ValueType, declared_keys};
+use crate::checkpoint::files;
 use crate::knowledge::Scope;
 
 use ValueType::{Any, Flag, Integer, List, Map, OrNull, Record, Text};
@@ -33,7 +34,7 @@ pub const VARIABLES: &[Variable] = &[
     variable("complete", Flag, "whether nothing suggests that a tensor was lost; `why` of IDX014 lists the signs"),
     variable("config", Any, "config.json; null when missing or unreadable, as the other documents"),
     variable("directory", Text, "the name of the directory"),
-    variable("generation", Any, "generation_config.json"),
+    variable("generation", Any, files::GENERATION_CONFIG),
     variable("groups_heads", Flag, "whether the class reads `num_key_value_heads`, or is unknown"),
     variable("has_weights", Flag, "whether the checkpoint has a tensor"),
     variable("loaders", List(&Text), "the versions of transformers to check for"),
@@ -59,8 +60,8 @@ pub const VARIABLES: &[Variable] = &[
         })),
         "tokens that stand for images or videos",
     ),
-    variable("preprocessor", Any, "preprocessor_config.json"),
-    variable("processor", Any, "processor_config.json"),
+    variable("preprocessor", Any, files::PREPROCESSOR_CONFIG),
+    variable("processor", Any, files::PROCESSOR_CONFIG),
     variable("processor_tokenizers", OrNull(&List(&Text)), "tokenizer classes that the module of the processor names"),
     variable(
         "program",
@@ -82,7 +83,7 @@ pub const VARIABLES: &[Variable] = &[
         "features of a policy of LeRobot, with the statistics that each needs and has; null for other configs",
     ),
     variable("rows", OrNull(&Integer), "rows of the token embedding"),
-    variable("special_tokens", Any, "special_tokens_map.json"),
+    variable("special_tokens", Any, files::SPECIAL_TOKENS),
     variable("text", Any, "the language-model part of `model`"),
     variable(
         "tokenizer",

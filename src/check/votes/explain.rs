@@ -1,5 +1,6 @@
 //! Load reports explained by votes: one wrong value of the config instead of a hundred tensors.
 
+use crate::checkpoint::files;
 use serde_json::Value;
 
 use super::run::run;
@@ -58,7 +59,7 @@ fn size(report: &LoadReport) -> usize {
 #[must_use]
 pub fn fault(vote: &Vote) -> Fault {
     let mut fault = Fault::new(FaultKind::ConfigOutvoted)
-        .at(Place::file("config.json").pointer(&*vote.pointer))
+        .at(Place::file(files::CONFIG).pointer(&*vote.pointer))
         .with("key", vote.pointer.trim_start_matches('/').replace('/', "."))
         .with("given", vote.given)
         .with("said", vote.config_value.clone())

@@ -1,5 +1,6 @@
 //! Parses a document in one pass, into a value and faults.
 
+use crate::checkpoint::files;
 use std::ops::Range;
 
 use serde_json::Value;
@@ -23,8 +24,8 @@ use duplicates::Duplicates;
 /// Pointers of containers whose members a value omits, because the tokenizer holds them in less space.
 fn to_omit(name: &str) -> Vec<&'static str> {
     match name {
-        "tokenizer.json" => vec!["/model/vocab", "/model/merges"],
-        "vocab.json" => vec![""],
+        files::TOKENIZER => vec!["/model/vocab", "/model/merges"],
+        files::VOCAB_JSON => vec![""],
         _ => Vec::new(),
     }
 }
@@ -53,14 +54,14 @@ fn parse(name: String, bytes: &[u8]) -> Document {
         && !value.is_object()
         && to_omit(&name) != [""]
         // The list of modules of sentence-transformers.
-        && name != "modules.json"
+        && name != files::MODULES
     {
         let found = kind_of(value);
         reader.faults.push(Fault::new(FaultKind::NotAnObject).at(Place::file(&*name)).with("found", found));
     }
     let DocumentReader { faults, left_out, .. } = reader;
     let text = verbatim.then(|| text.into());
-    Document { name, text, value, left_out, faults: faults.into_vec() }
+    Document { name, text, value, left_out, not_read: None, faults: faults.into_vec() }
 }
 
 /// Recognises files that are not JSON documents: empty, LFS pointers, NUL bytes, other formats.

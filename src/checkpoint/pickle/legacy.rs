@@ -15,18 +15,6 @@ pub(super) const MAGIC: [u8; 15] = *b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x
 /// The version of the format.
 const VERSION: Value = Value::Int(1001);
 
-/// The error of a machine that stopped at `offset`. `longer` is whether the file has more bytes than were given to it;
-/// `None` for a member of an archive, which is whole.
-pub(super) fn problem(stop: Stop, offset: u64, longer: Option<bool>) -> Problem {
-    match (stop, longer) {
-        (Stop::TooLarge(what), _) => Problem::TooLarge(what),
-        (Stop::Broken(reason), _) => Problem::Malformed(reason.to_owned(), offset),
-        (Stop::End, Some(true)) => Problem::TooLarge("bytes"),
-        (Stop::End, Some(false)) => Problem::Cut("the pickle".to_owned(), None),
-        (Stop::End, None) => Problem::Malformed("the pickle ends early".to_owned(), offset),
-    }
-}
-
 /// Reads a file of this format into the reader's shard.
 pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut Work) -> Result<(), Problem> {
     let bytes = file.bytes(0, file.len().min(PICKLE_CAP))?;
@@ -40,7 +28,7 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
     if let Err(stop) = result {
         reader.pickle.unread = beside::unread(&reader.shard.name, &machine, stop, file.len() > PICKLE_CAP);
     }
-    let (value, keys) = result.map_err(|stop| problem(stop, machine.offset, longer))?;
+    let (value, keys) = result.map_err(|stop| Problem::of(stop, machine.offset, longer))?;
     if let Some(doubt) = machine.doubt.take() {
         // The storages lie one after another, and the length of one is unknown.
         reader.pickle.doubt = Some(doubt);
@@ -99,7 +87,7 @@ fn storages(
     let mut sizes = Vec::with_capacity(keys.len());
     for key in keys {
         let Value::Text(key) = key else { return Err(malformed("the key of a storage is no string")) };
-        machine.short(*key).map_err(|stop| problem(stop, machine.offset, longer))?;
+        machine.short(*key).map_err(|stop| Problem::of(stop, machine.offset, longer))?;
         let key = machine.text(*key);
         let bytes = claimed.remove(key).ok_or_else(|| malformed("the file has a storage that no tensor uses"))?;
         sizes.push((key, bytes));

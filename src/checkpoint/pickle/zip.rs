@@ -7,7 +7,7 @@ use std::collections::HashMap;
 
 use super::machine::{Machine, StorageIds};
 use super::storage::{Storages, Stored, claimed};
-use super::{PICKLE_CAP, PickleReader, Problem, beside, legacy, state_dict};
+use super::{PICKLE_CAP, PickleReader, Problem, beside, state_dict};
 use crate::checkpoint::SourceFile;
 use crate::checkpoint::work::Work;
 
@@ -101,7 +101,7 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
     if let Err(stop) = result {
         reader.pickle.unread = beside::unread(&reader.shard.name, &machine, stop, false);
     }
-    let value = result.map_err(|stop| legacy::problem(stop, machine.offset, None))?;
+    let value = result.map_err(|stop| Problem::of(stop, machine.offset, None))?;
     let storages = storages(reader, file, &archive, &machine)?;
     state_dict::read(reader, &mut machine, value, &storages)
 }

@@ -30,8 +30,8 @@ impl Shard {
     }
 
     /// Counts the entries of a header, for a shard of `file_len` bytes that is not read because the checkpoint is too large.
-    pub(super) fn count_entries(name: impl Into<String>, file_len: u64, head: &[u8]) -> Self {
-        let shard = Self { name: name.into(), file_len, unread: true, ..Self::default() };
+    pub(super) fn count_entries(name: &str, file_len: u64, head: &[u8]) -> Self {
+        let shard = Self { file_len, ..Self::over_budget(name) };
         let further = frame(&shard, head).map_or(0, |(header, _)| count(header));
         Self { further, ..shard }
     }

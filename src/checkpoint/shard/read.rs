@@ -5,7 +5,7 @@ use super::{MAX_HEADER, Shard, Tensor};
 use crate::checkpoint::budget::Budget;
 use crate::checkpoint::platform::{next_data, next_hole};
 use crate::checkpoint::sniff::looks_like;
-use crate::checkpoint::{Fault, FaultKind, Place, Source, SourceFile};
+use crate::checkpoint::{Fault, FaultKind, NotRead, Place, Source, SourceFile};
 
 /// Enough bytes to recognise a file format, and to hold most small headers whole.
 const SAMPLE: u64 = 4096;
@@ -21,7 +21,7 @@ impl Shard {
     pub(crate) fn read_within(source: &Source, name: &str, budget: &mut Budget) -> Self {
         match source.open_regular(name, u64::MAX) {
             Ok(file) => read(name, &file, budget),
-            Err(error) => Self::unread(name, error.fault(name)),
+            Err(error) => Self::unopened(name, &error),
         }
     }
 
@@ -29,7 +29,7 @@ impl Shard {
     pub(crate) fn counted(source: &Source, name: &str) -> Self {
         match source.open_regular(name, u64::MAX).map(|file| (read_head(&file), file.len())) {
             Ok((Ok(head), size)) => Self::count_entries(name, size, &head),
-            _ => Self { name: name.to_owned(), unread: true, ..Self::default() },
+            _ => Self::over_budget(name),
         }
     }
 
@@ -44,7 +44,15 @@ fn read(name: &str, file: &SourceFile, budget: &mut Budget) -> Shard {
         Ok(head) => head,
         Err(error) => {
             let fault = Fault::new(FaultKind::UnreadableFile).at(Place::file(name)).with("reason", error.to_string());
-            return Shard { file_len: file.len(), ..Shard::unread(name, fault) };
+            let not_read = Some(NotRead::Unreadable);
+            return Shard {
+                name: name.to_owned(),
+                file_len: file.len(),
+                unread: true,
+                not_read,
+                faults: vec![fault],
+                ..Shard::default()
+            };
         }
     };
     budget.spend_header(head.len());

@@ -1,5 +1,6 @@
 //! A vocabulary in little memory: all tokens in one string, sorted.
 
+use crate::checkpoint::files;
 use std::borrow::Cow;
 
 use super::super::Document;
@@ -26,7 +27,7 @@ impl Vocabulary {
     /// # Errors
     /// The reason, when the bytes are neither.
     pub fn parse(name: &str, bytes: &[u8]) -> Result<Self, &'static str> {
-        if name == "vocab.txt" {
+        if name == files::VOCAB_TXT {
             let text = std::str::from_utf8(bytes).map_err(|_| "it is not UTF-8")?;
             return Self::collect(text.lines().zip(0..));
         }

@@ -1,77 +1,11 @@
 //! Effects of rules: what a loader does with a checkpoint that has the fault.
 
+use crate::checkpoint::files::Object;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::super::expression::{Expression, Template};
 use super::super::loader::version_numbers;
 use super::super::program::Program;
-use crate::checkpoint::tokenizer::is_vocabulary;
-
-/// What a loader opens from a checkpoint.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(rename_all = "lowercase")]
-pub enum Object {
-    /// The model class with its weights: `AutoModel.from_pretrained`.
-    Model,
-    /// `AutoTokenizer.from_pretrained`.
-    Tokenizer,
-    /// `AutoProcessor.from_pretrained`.
-    Processor,
-    /// `generate`, by `generation_config.json`.
-    Generation,
-    /// `PeftModel.from_pretrained`.
-    Adapter,
-}
-
-impl Object {
-    /// All objects.
-    pub const ALL: [Self; 5] = [Self::Model, Self::Tokenizer, Self::Processor, Self::Generation, Self::Adapter];
-
-    /// The word used in rule files and in output.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Model => "model",
-            Self::Tokenizer => "tokenizer",
-            Self::Processor => "processor",
-            Self::Generation => "generation",
-            Self::Adapter => "adapter",
-        }
-    }
-
-    /// The object whose class a Python module defines, by the names that transformers gives such modules.
-    fn importing(module: &str) -> Self {
-        match module {
-            _ if module.starts_with("tokenization") => Self::Tokenizer,
-            _ if module.starts_with("processing") || module.starts_with("image_processing") => Self::Processor,
-            _ => Self::Model,
-        }
-    }
-
-    /// The object that reads a file of a checkpoint; `None` for a file that no loader needs.
-    #[must_use]
-    pub fn reading(file: &str) -> Option<Self> {
-        const TOKENIZER: [&str; 3] = ["tokenizer_config.json", "special_tokens_map.json", "added_tokens.json"];
-        const PROCESSOR: [&str; 4] = [
-            "processor_config.json",
-            "preprocessor_config.json",
-            "video_preprocessor_config.json",
-            "chat_template.json",
-        ];
-        let is_weights = ["safetensors", "bin", "index.json"].iter().any(|end| file.ends_with(&format!(".{end}")));
-        match file {
-            "config.json" => Some(Self::Model),
-            "generation_config.json" => Some(Self::Generation),
-            "adapter_config.json" => Some(Self::Adapter),
-            _ if file.starts_with("adapter_model.") => Some(Self::Adapter),
-            _ if TOKENIZER.contains(&file) || is_vocabulary(file) => Some(Self::Tokenizer),
-            _ if PROCESSOR.contains(&file) => Some(Self::Processor),
-            _ if file.ends_with(".py") => Some(Self::importing(file)),
-            _ => is_weights.then_some(Self::Model),
-        }
-    }
-}
 
 /// Harm that makes a finding an error although every loader may open the checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -9,6 +9,7 @@ use super::super::format::{self, bytes, more, name, plural, sentence, shape, wra
 use super::super::model::{DryRun, MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
 use super::paint::Paint;
+use crate::checkpoint::files;
 
 pub fn render(out: &mut String, merge: &MergeReport, style: Style) {
     let paint = Paint(style.color);
@@ -59,7 +60,7 @@ fn planned(out: &mut String, dry_run: &DryRun, style: Style) {
     table(out, ["shard", "tensors", "size"], &rows, style);
     if let Some(change) = &dry_run.config {
         let before = format!("config.json of donor {}", name(&change.donor));
-        let _ok = writeln!(out, "\n{}", diff::texts(&before, "config.json", &change.old, &change.new));
+        let _ok = writeln!(out, "\n{}", diff::texts(&before, files::CONFIG, &change.old, &change.new));
     }
 }
 

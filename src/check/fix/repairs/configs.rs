@@ -1,5 +1,6 @@
 //! Repairs of config.json.
 
+use crate::checkpoint::files;
 use serde_json::{Map, Value};
 
 use crate::check::fix::Edit;
@@ -11,7 +12,7 @@ const OWN: [&str; 4] = ["model_type", "architectures", "_name_or_path", "transfo
 /// Moves the values of `text_config` to the top, where the config classes of older versions read them and newer ones look as
 /// well. Rotary parameters get the keys that older versions read. `None` when a value at the top is another one.
 pub(super) fn flatten_text_config(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
-    let file = || "config.json".to_owned();
+    let file = || files::CONFIG.to_owned();
     let config = checkpoint.config()?.as_object()?;
     let text = config.get("text_config")?.as_object()?;
     let mut moved: Map<String, Value> =

@@ -1,5 +1,6 @@
 //! Repairs of modules and of the `auto_map` that names them.
 
+use crate::checkpoint::files;
 use std::fmt::Write as _;
 
 use serde_json::Value;
@@ -78,5 +79,5 @@ pub(super) fn add_auto_class(site: &Site<'_>) -> Option<Vec<Edit>> {
         return None;
     }
     let value = format!("{}.{}", module.name.strip_suffix(".py")?, class.name).into();
-    Some(vec![Edit::Set { file: "config.json".to_owned(), pointer: format!("/auto_map/{key}"), value }])
+    Some(vec![Edit::Set { file: files::CONFIG.to_owned(), pointer: format!("/auto_map/{key}"), value }])
 }

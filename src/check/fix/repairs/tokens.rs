@@ -1,5 +1,6 @@
 //! Repairs of tokenizer files, where one of them proves what another lacks.
 
+use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Deserialize;
@@ -19,7 +20,7 @@ pub(super) fn join_merges(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
     struct Model {
         merges: Vec<[String; 2]>,
     }
-    let file = "tokenizer.json";
+    let file = files::TOKENIZER;
     let document: File = serde_json::from_str(checkpoint.document(file)?.text.as_deref()?).ok()?;
     let join = |pair: &[String; 2]| (!pair.iter().any(|piece| piece.contains(' '))).then(|| pair.join(" "));
     let value = document.model.merges.iter().map(join).collect::<Option<Vec<String>>>()?.into();
@@ -44,7 +45,7 @@ pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
     let edit = |id: u64| {
         let content = *proven.get(&id).filter(|content| !used.contains(**content))?;
         let value = entry(checkpoint, id, content);
-        let file = "tokenizer_config.json".to_owned();
+        let file = files::TOKENIZER_CONFIG.to_owned();
         Some(Edit::Set { file, pointer: format!("/added_tokens_decoder/{id}"), value })
     };
     holes.into_iter().map(edit).collect()
@@ -52,7 +53,7 @@ pub(super) fn fill_token_holes(checkpoint: &Checkpoint) -> Option<Vec<Edit>> {
 
 /// The entry as `save_pretrained` writes it; `tokenizer.json` has more of its fields than the other files.
 fn entry(checkpoint: &Checkpoint, id: u64, content: &str) -> Value {
-    let list = checkpoint.document("tokenizer.json").and_then(|d| d.get("/added_tokens")).and_then(Value::as_array);
+    let list = checkpoint.document(files::TOKENIZER).and_then(|d| d.get("/added_tokens")).and_then(Value::as_array);
     let full = list.into_iter().flatten().find(|token| token.get("id").and_then(Value::as_u64) == Some(id));
     let special = checkpoint.tokenizer.special_tokens.iter().any(|(_, token)| token == content);
     let flag = |name: &str, otherwise: bool| {

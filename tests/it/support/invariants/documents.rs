@@ -1,10 +1,11 @@
 //! JSON documents, the index and the tokenizer, compared with `serde_json`.
 
+use ckpt_doctor::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ckpt_doctor::checkpoint::document::Locator;
-use ckpt_doctor::checkpoint::{Document, FaultKind, INDEX_NAME, Index, Tokenizer, Vocabulary, is_plain_file_name};
+use ckpt_doctor::checkpoint::{Document, FaultKind, Index, Tokenizer, Vocabulary, is_plain_file_name};
 use serde_json::Value;
 
 /// Faults of valid strict JSON, each with its reason.
@@ -89,9 +90,9 @@ fn places_are_found_again(document: &Document) {
 
 /// The invariants of an index.
 pub fn index(bytes: &[u8]) {
-    let document = hold(INDEX_NAME, bytes);
+    let document = hold(files::INDEX, bytes);
     let index = Index::from_document(&document);
-    super::faults_are_placed(&index.faults, INDEX_NAME, document.text.as_deref());
+    super::faults_are_placed(&index.faults, files::INDEX, document.text.as_deref());
     assert_eq!(index.unread, !document.value.as_ref().is_some_and(Value::is_object));
     let stated = document.get("/weight_map").and_then(Value::as_object);
     for (tensor, file) in &index.weight_map {
