@@ -3,6 +3,7 @@
 mod blueprint;
 mod build;
 mod cause;
+mod conversion_rows;
 mod conversions;
 mod doubt;
 mod field_type;
@@ -16,7 +17,7 @@ use indexmap::IndexMap;
 use serde_json::Value;
 
 pub(crate) use blueprint::{Blueprint, Class};
-pub use conversions::Conversion;
+pub use conversion_rows::Conversion;
 pub use doubt::Doubt;
 #[cfg(test)]
 pub(crate) use field_type::FieldType;
@@ -26,6 +27,9 @@ use super::{Evidence, Library, Loader};
 
 /// Tensors an architecture may have; a config that asks for more is refused.
 pub const TENSOR_CAP: usize = 60_000;
+
+/// Depth of configs within configs, and of parts within parts.
+const DEPTH_CAP: usize = 8;
 
 /// A model class of the library, as one loader builds it.
 #[derive(Clone, Copy)]

@@ -7,7 +7,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 use serde_json::{Map, Value};
 
-use super::conversions::Rows;
+use super::conversion_rows::Rows;
 use super::field_type::FieldType;
 use super::member::Member;
 use crate::knowledge::ordered::ordered;

@@ -9,9 +9,9 @@ use super::cause::Origin;
 use super::conversions::{self, Module};
 use super::doubt::{Doubt, nulls, unread_keys};
 use super::member::{Kind, Member, Part, Tied};
-use super::refusal::{Refusal, UnknownPart};
-use super::resolve::{DEPTH_CAP, Resolver, at_path, evaluated, model_type, refused};
-use super::{Architecture, Evidence, Expected, ExpectedTensor, TENSOR_CAP};
+use super::refusal::{BuildResult, Refusal, UnknownPart};
+use super::resolve::{Resolver, at_path, evaluated, model_type, refused};
+use super::{Architecture, DEPTH_CAP, Evidence, Expected, ExpectedTensor, TENSOR_CAP};
 use crate::knowledge::{Expression, Loader, Scope, Template};
 
 /// Entries visited before a config is refused: repeats whose conditions are all false cost time too.
@@ -22,9 +22,7 @@ const NAME_CAP: usize = 1_000;
 /// Models within a model that conversions are looked up for; real ones have a few.
 const MODULE_CAP: usize = 1_000;
 
-pub(super) type Outcome<T> = Result<T, Refusal>;
-
-pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &Evidence) -> Outcome<Expected> {
+pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &Evidence) -> BuildResult<Expected> {
     let Value::Object(config) = config else { return Err(Refusal::impossible("the config is not an object")) };
     let Architecture { library, file, class, loader } = architecture;
     let written = own_config(file, loader, config);
@@ -169,7 +167,13 @@ struct Around<'a, 'l> {
 
 impl<'l> Builder<'l> {
     /// The entries of a class.
-    fn class(&mut self, file: &'l Blueprint, class: &'l Class, config: Config<'_>, place: Place<'_>) -> Outcome<()> {
+    fn class(
+        &mut self,
+        file: &'l Blueprint,
+        class: &'l Class,
+        config: Config<'_>,
+        place: Place<'_>,
+    ) -> BuildResult<()> {
         let model_type = model_type(config.map, file);
         // Without a name of its own it is the module around it: a class that only calls itself otherwise.
         if place.prefix.is_empty() == self.modules.is_empty() {
@@ -213,7 +217,7 @@ impl<'l> Builder<'l> {
         around: Around<'_, 'l>,
         scope: &Scope<'_>,
         place: Place<'_>,
-    ) -> Outcome<()> {
+    ) -> BuildResult<()> {
         members.iter().try_for_each(|(name, member)| self.repeat(name, member, &member.repeat, around, scope, place))
     }
 
@@ -225,7 +229,7 @@ impl<'l> Builder<'l> {
         around: Around<'_, 'l>,
         scope: &Scope<'_>,
         place: Place<'_>,
-    ) -> Outcome<()> {
+    ) -> BuildResult<()> {
         let Some(((index, count), inner)) = repeats.split_first() else {
             return self.member(name, member, member.when.as_ref(), around, scope, place);
         };
@@ -273,7 +277,7 @@ impl<'l> Builder<'l> {
         around: Around<'_, 'l>,
         scope: &Scope<'_>,
         place: Place<'_>,
-    ) -> Outcome<()> {
+    ) -> BuildResult<()> {
         self.steps = self.steps.saturating_add(1);
         if self.steps > STEP_CAP || self.expected.tensors.len() > TENSOR_CAP {
             return Err(self.too_many(format!("the config implies more than {TENSOR_CAP} tensors")));
@@ -333,7 +337,7 @@ impl<'l> Builder<'l> {
         around: Around<'_, 'l>,
         scope: &Scope<'_>,
         place: Place<'_>,
-    ) -> Outcome<()> {
+    ) -> BuildResult<()> {
         let depth = place.depth.saturating_add(1);
         if depth > DEPTH_CAP {
             return Err(Refusal::uncovered(format!("parts are nested more than {DEPTH_CAP} deep")));
@@ -374,7 +378,7 @@ impl<'l> Builder<'l> {
         part: &Part,
         config: &Map<String, Value>,
         around: &'l Blueprint,
-    ) -> Outcome<(&'l Blueprint, &'l Class)> {
+    ) -> BuildResult<(&'l Blueprint, &'l Class)> {
         let Resolver { library, loader, .. } = self.resolver;
         let key = part.config.as_ref().map_or_else(|| "model_type".to_owned(), |path| format!("{path}.model_type"));
         let model_type = || {
@@ -408,7 +412,7 @@ impl<'l> Builder<'l> {
         tied: Option<&Tied>,
         scope: &Scope<'_>,
         place: Place<'_>,
-    ) -> Outcome<()> {
+    ) -> BuildResult<()> {
         if place.leaves_out(&name) {
             return Ok(());
         }
@@ -431,14 +435,14 @@ impl<'l> Builder<'l> {
     }
 }
 
-fn bind_all(lets: &[(String, Expression)], scope: &mut Scope<'_>) -> Outcome<()> {
+fn bind_all(lets: &[(String, Expression)], scope: &mut Scope<'_>) -> BuildResult<()> {
     lets.iter().try_for_each(|(name, expression)| Ok(expression.bind(name, scope)?))
 }
 
-fn holds(condition: Option<&Expression>, scope: &Scope<'_>) -> Outcome<bool> {
+fn holds(condition: Option<&Expression>, scope: &Scope<'_>) -> BuildResult<bool> {
     condition.map_or(Ok(true), |c| Ok(c.eval_bool(scope)?))
 }
 
-fn dimensions(shape: &[Expression], scope: &Scope<'_>) -> Outcome<Vec<u64>> {
+fn dimensions(shape: &[Expression], scope: &Scope<'_>) -> BuildResult<Vec<u64>> {
     shape.iter().map(|d| Ok(d.eval_u64(scope)?)).collect()
 }

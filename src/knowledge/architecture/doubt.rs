@@ -4,8 +4,8 @@ use std::fmt;
 
 use serde_json::{Map, Value};
 
+use super::DEPTH_CAP;
 use super::blueprint::{Blueprint, ConfigClass};
-use super::resolve::DEPTH_CAP;
 use crate::knowledge::{Expression, Library, Loader};
 
 /// Keys that a class of any version calculates with, so that a version without types of fields raises on null as well.

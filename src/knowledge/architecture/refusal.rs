@@ -7,6 +7,9 @@ use serde_json::Value;
 use super::doubt::{Doubt, Setting};
 use crate::knowledge::EvalError;
 
+/// What building a class gives.
+pub(super) type BuildResult<T> = Result<T, Refusal>;
+
 /// Why a class cannot be built from a config: the config is at fault, or too little is known.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Refusal {

@@ -7,15 +7,11 @@ use serde_json::{Map, Value};
 use super::blueprint::{
     Alias, Blueprint, Computed, ComputedOtherwise, ConfigClass, EarlyAlias, Refuses, Requirement, SubConfig,
 };
-use super::build::Outcome;
 use super::cause::Origin;
 use super::doubt::Doubt;
-use super::refusal::{Refusal, UnknownPart};
-use super::{Evidence, Expected};
+use super::refusal::{BuildResult, Refusal, UnknownPart};
+use super::{DEPTH_CAP, Evidence, Expected};
 use crate::knowledge::{Expression, Library, Loader, Scope};
-
-/// Depth of configs within configs, and of parts within parts.
-pub(super) const DEPTH_CAP: usize = 8;
 
 /// What transformers 5 says of a value of another type than the field's.
 const FIELD: &str = "StrictDataclassFieldValidationError: Validation error";
@@ -50,7 +46,7 @@ impl Resolver<'_> {
         file: &Blueprint,
         mut config: Map<String, Value>,
         depth: usize,
-    ) -> Outcome<Map<String, Value>> {
+    ) -> BuildResult<Map<String, Value>> {
         if depth > DEPTH_CAP {
             return Err(Refusal::uncovered(format!("configs are nested more than {DEPTH_CAP} deep")));
         }
@@ -62,7 +58,7 @@ impl Resolver<'_> {
     }
 
     /// As [`Self::resolve`], in place; a failed expression is not explained yet.
-    fn fill_in(&self, file: &Blueprint, config: &mut Map<String, Value>, depth: usize) -> Outcome<()> {
+    fn fill_in(&self, file: &Blueprint, config: &mut Map<String, Value>, depth: usize) -> BuildResult<()> {
         let class = file.config(self.loader);
         typed(class, config)?;
         if self.loader.major() >= 5 {
@@ -129,7 +125,7 @@ impl Resolver<'_> {
         scope: &Scope<'_>,
         key: &str,
         depth: usize,
-    ) -> Outcome<Option<Map<String, Value>>> {
+    ) -> BuildResult<Option<Map<String, Value>>> {
         let mut sub = match (given, &spec.absent) {
             (Some(Value::Object(map)), _) => map.clone(),
             (None | Some(Value::Null), Some(absent)) => evaluated(absent, scope)?,
@@ -189,7 +185,7 @@ impl Resolver<'_> {
 }
 
 /// Refuses a config that does not meet what the file requires.
-fn required(file: &Blueprint, scope: &Scope<'_>) -> Outcome<()> {
+fn required(file: &Blueprint, scope: &Scope<'_>) -> BuildResult<()> {
     let (mut unmet, mut failed) = (Vec::new(), None);
     for Requirement { that, message } in &file.require {
         match that.eval_bool(scope) {
@@ -205,7 +201,7 @@ fn required(file: &Blueprint, scope: &Scope<'_>) -> Outcome<()> {
 }
 
 /// Refuses a value of another type than its field has.
-fn typed(class: &ConfigClass, config: &Map<String, Value>) -> Outcome<()> {
+fn typed(class: &ConfigClass, config: &Map<String, Value>) -> BuildResult<()> {
     for (told, keys) in &class.types {
         for key in keys.split(' ') {
             let names = class.aliases.iter().filter(|(_, k)| k.name() == key).map(|(alias, _)| alias.as_str());
@@ -261,7 +257,7 @@ fn is_true(value: &Value) -> bool {
 }
 
 /// Refuses a config with which the loader raises.
-pub(super) fn refused(refuses: &[Refuses], scope: &Scope<'_>) -> Outcome<()> {
+pub(super) fn refused(refuses: &[Refuses], scope: &Scope<'_>) -> BuildResult<()> {
     // A condition that cannot be asked of this config is none that it fulfils.
     match refuses.iter().find(|r| r.when.eval_bool(scope).unwrap_or(false)) {
         Some(r) => Err(Refusal::Raises(r.error.render(scope))),
@@ -275,7 +271,7 @@ fn compute(
     computed: &[(String, Computed)],
     given: &BTreeSet<String>,
     scope: &mut Scope<'_>,
-) -> Outcome<()> {
+) -> BuildResult<()> {
     // Binding a large config is dear: only what is evaluated next has to see what was computed last.
     let mut stale = false;
     for (key, how) in computed {
@@ -307,11 +303,11 @@ fn bind(scope: &mut Scope<'_>, config: &Map<String, Value>) {
 }
 
 /// A map of values, of which strings that start with `=` are expressions.
-pub(super) fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> Outcome<Map<String, Value>> {
+pub(super) fn evaluated(map: &Map<String, Value>, scope: &Scope<'_>) -> BuildResult<Map<String, Value>> {
     map.iter().map(|(k, v)| Ok((k.clone(), value(v, scope)?))).collect()
 }
 
-fn value(written: &Value, scope: &Scope<'_>) -> Outcome<Value> {
+fn value(written: &Value, scope: &Scope<'_>) -> BuildResult<Value> {
     Ok(match written {
         Value::String(s) => match s.strip_prefix('=') {
             Some(source) => Expression::parse(source)
@@ -325,7 +321,7 @@ fn value(written: &Value, scope: &Scope<'_>) -> Outcome<Value> {
 }
 
 /// The sub-config at a dotted path.
-pub(super) fn at_path<'c>(config: &'c Map<String, Value>, path: &str) -> Outcome<&'c Map<String, Value>> {
+pub(super) fn at_path<'c>(config: &'c Map<String, Value>, path: &str) -> BuildResult<&'c Map<String, Value>> {
     let mut at = config;
     for key in path.split('.') {
         at = match at.get(key) {
