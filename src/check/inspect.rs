@@ -25,8 +25,6 @@ const BUILT: usize = 40;
 const LIKELY: f64 = 0.95;
 /// Model types that are tried for a part.
 const PARTS: usize = 6;
-/// Share of the parameters beyond which a module is shown by its parts.
-const LARGE: (u64, u64) = (9, 10);
 
 /// The summary of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -38,8 +36,6 @@ pub struct Inspection {
     pub tensors: Amount,
     /// Tensors by element type.
     pub dtypes: BTreeMap<String, Amount>,
-    /// Tensors by the outer parts of their names.
-    pub modules: BTreeMap<String, Amount>,
     /// The tree of modules, complete; consecutive numbered modules with the same tensors are one.
     pub tree: Vec<InspectedModule>,
     /// The identity that config.json declares; null without a config.json.
@@ -143,7 +139,6 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         files: files.collect(),
         tensors,
         dtypes,
-        modules: modules(checkpoint, tensors),
         tree: tree::of(checkpoint),
         config: checkpoint.config().map(config_summary),
         classes: Vec::new(),
@@ -326,37 +321,4 @@ fn config_summary(config: &Value) -> ConfigSummary {
         transformers_version: text("/transformers_version"),
         quantization: text("/quantization_config/quant_method"),
     }
-}
-
-/// Tensors by the first part of their names; a part that holds nearly everything is shown by its own parts.
-fn modules(checkpoint: &Checkpoint, all: Amount) -> BTreeMap<String, Amount> {
-    let mut large: BTreeSet<String> = BTreeSet::new();
-    loop {
-        let mut modules: BTreeMap<String, Amount> = BTreeMap::new();
-        for (_, tensor) in checkpoint.tensors() {
-            modules.entry(module(&tensor.name, &large)).or_default().add(tensor);
-        }
-        let is_large = |amount: &Amount| {
-            u128::from(amount.parameters).saturating_mul(LARGE.1.into())
-                > u128::from(all.parameters).saturating_mul(LARGE.0.into())
-        };
-        let split =
-            modules.iter().find(|(name, amount)| is_large(amount) && amount.tensors > 1 && !large.contains(*name));
-        match split {
-            Some((name, _)) if large.len() < 4 => large.insert(name.clone()),
-            _ => return modules,
-        };
-    }
-}
-
-fn module(name: &str, large: &BTreeSet<String>) -> String {
-    let mut end = 0;
-    for part in name.split('.') {
-        let is_number = part.bytes().all(|b| b.is_ascii_digit());
-        if end > 0 && (is_number || !name.get(..end).is_some_and(|outer| large.contains(outer))) {
-            break;
-        }
-        end = if end == 0 { part.len() } else { end.saturating_add(1).saturating_add(part.len()) };
-    }
-    name.get(..end).unwrap_or(name).to_owned()
 }

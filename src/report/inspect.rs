@@ -33,7 +33,7 @@ pub(crate) struct InspectDocument<'a> {
 /// A complete inspection as JSON (`schema` 1), with a list of tensors if there is one.
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection, tensor_list: Option<&[InspectedTensor]>) -> String {
-    pretty(&InspectDocument { schema: 1, tool: ToolInfo::this(), path, inspection, tensor_list })
+    pretty(&InspectDocument { schema: 2, tool: ToolInfo::this(), path, inspection, tensor_list })
 }
 
 /// A list of tensors for a terminal, one per line.
