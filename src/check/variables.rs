@@ -52,6 +52,22 @@ pub fn scope(
     rows: Option<u64>,
 ) -> Scope<'static> {
     let mut scope = Scope::new();
+    bind_documents(&mut scope, checkpoint);
+    bind_model(&mut scope, architecture, model);
+    scope.bind("tokenizer", &tokenizer(checkpoint));
+    scope.bind("chat_templates", &templates::by_file(checkpoint));
+    scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
+    scope.bind("rows", &rows.map_or(Value::Null, Value::from));
+    scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
+    scope.bind("of_transformers", &json!(model_type::is_of_transformers(checkpoint)));
+    bind_directory(&mut scope, checkpoint);
+    add_tensor_functions(&mut scope, checkpoint);
+    add_file_functions(&mut scope, checkpoint);
+    add_loader_functions(&mut scope, checkpoint);
+    scope
+}
+
+fn bind_documents(scope: &mut Scope<'static>, checkpoint: &Checkpoint) {
     for (name, file) in DOCUMENTS {
         // Of two versions that a merge left in it neither is the document.
         let torn = |d: &&Document| d.faults.iter().any(|f| f.kind == FaultKind::MergeConflictMarker);
@@ -69,22 +85,28 @@ pub fn scope(
             None => scope.bind(name, &Value::Null),
         }
     }
+}
+
+/// The class, and its config with defaults: that of the whole model and of its language model.
+fn bind_model(scope: &mut Scope<'static>, architecture: Option<&str>, model: &Value) {
     scope.bind("arch", &json!(architecture.unwrap_or_default()));
     scope.bind("model", model);
     // A flat config of a class with parts has the key with the value null.
     let part = |key: &str| model.get(key).filter(|part| part.is_object());
     let text = part("text_config").or_else(|| part("llm_config")).unwrap_or(model);
     scope.bind("text", text);
-    scope.bind("tokenizer", &tokenizer(checkpoint));
-    scope.bind("chat_templates", &templates::by_file(checkpoint));
-    scope.bind("tokens", &opened.map_or(Value::Null, OpenedTokenizer::summary));
-    scope.bind("rows", &rows.map_or(Value::Null, Value::from));
-    scope.bind("processor_tokenizers", &json!(modules::processor_tokenizers(checkpoint)));
+}
+
+fn bind_directory(scope: &mut Scope<'static>, checkpoint: &Checkpoint) {
     let name = checkpoint.source.path().file_name().map(|n| n.to_string_lossy().into_owned());
     scope.bind("directory", &json!(name.unwrap_or_default()));
     let has_weights = index::opened_tensors(checkpoint).next().is_some();
     scope.bind("has_weights", &json!(has_weights));
     scope.bind("all_read", &json!(has_weights && index::all_read(checkpoint)));
+}
+
+/// Functions that look at tensors which a loader opens.
+fn add_tensor_functions(scope: &mut Scope<'static>, checkpoint: &Arc<Checkpoint>) {
     let here = Arc::clone(checkpoint);
     scope
         .function1("shape", move |name| index::opened_tensor(&here, name).map_or(Value::Null, |(_, t)| json!(t.shape)));
@@ -95,6 +117,10 @@ pub fn scope(
     let here = Arc::clone(checkpoint);
     scope
         .function1("has_tensor", move |prefix| json!(index::opened_tensors(&here).any(|t| t.name.starts_with(prefix))));
+}
+
+/// Functions that look at documents and names.
+fn add_file_functions(scope: &mut Scope<'static>, checkpoint: &Arc<Checkpoint>) {
     let here = Arc::clone(checkpoint);
     scope.function1("config_at", move |pointer| {
         here.config().and_then(|c| c.pointer(pointer)).cloned().unwrap_or_default()
@@ -114,13 +140,16 @@ pub fn scope(
         [Value::String(name)] => lists::listed(name).cloned().ok_or_else(|| format!("there is no list `{name}`")),
         _ => Err("listed(name) takes the name of a list".to_owned()),
     });
-    scope.bind("of_transformers", &json!(model_type::is_of_transformers(checkpoint)));
     let here = Arc::clone(checkpoint);
     scope.function1("is_opened", move |name| json!(index::is_opened(&here, name)));
     let here = Arc::clone(checkpoint);
     scope.function1("is_imported", move |file| json!(modules::is_imported(&here, file)));
     let here = Arc::clone(checkpoint);
     scope.function1("has_file", move |name| json!(here.has_file(name)));
+}
+
+/// Functions that tell what a loader does with a file, in its words.
+fn add_loader_functions(scope: &mut Scope<'static>, checkpoint: &Arc<Checkpoint>) {
     scope.function2("json_error", |file, reason| json!(exceptions::unparsed(file, reason)));
     scope.function1("utf8_error", |file| json!(exceptions::undecoded(file)));
     scope.function1("python_type", |found| json!(exceptions::python_type(found)));
@@ -128,7 +157,6 @@ pub fn scope(
     scope.function1("is_parsed", move |file| json!(exceptions::is_parsed(&here, file)));
     let here = Arc::clone(checkpoint);
     scope.function1("id_of", move |token| here.tokenizer.id_of(token).map_or(Value::Null, Value::from));
-    scope
 }
 
 /// Bytes of documents that the expressions of one check may get from `document`, for those of hostile size: a rule asks for one
