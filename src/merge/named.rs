@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 use super::error::MergeError;
 use super::parts::PartOf;
 use crate::checkpoint::escape;
-use crate::surgery::plan::{Plan, PlannedTensor, TensorTransform};
+use crate::surgery::expr::TensorTransform;
+use crate::surgery::plan::{Plan, PlannedTensor};
 
 /// The tensors of a donor that an entry of the recipe names, and may change: those of a part, of a pattern, or of both.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -152,18 +153,19 @@ impl<'c> Bounds<'c> {
         let Some(first) = strays.first() else { return Ok(()) };
         Err(MergeError::Recipe(format!(
             "{recipe}: {} of the {} donor would be changed ({}{}), and no entry that changes tensors names it by `part`, or by `names` that start with ^ and literal text; name what the entry is for",
-            first.source.from.name,
-            first.source.from.donor,
+            first.source.main().name,
+            first.source.main().donor,
             first.transform().name(),
             if strays.len() > 1 { format!(", and {} more", strays.len().saturating_sub(1)) } else { String::new() },
         )))
     }
 
     fn allow(&self, tensor: &PlannedTensor) -> bool {
-        let source = &tensor.source;
-        let from = &source.from;
-        let is_cast = tensor.dtype != from.dtype && source.fit != TensorTransform::Reinit;
-        let changes = source.fit != TensorTransform::Copy || source.scale.is_some() || from.slice.is_some();
+        let from = tensor.source.main();
+        let transform = tensor.transform();
+        let is_cast = tensor.dtype != from.dtype && transform != TensorTransform::Reinit;
+        let keeps = matches!(transform, TensorTransform::Copy | TensorTransform::Convert);
+        let changes = !keeps || tensor.source.scale().is_some() || from.slice.is_some();
         (!is_cast || self.casts_to(&from.donor, tensor.dtype.name()))
             && (!changes || self.name(&from.donor, &from.name))
     }

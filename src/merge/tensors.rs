@@ -21,7 +21,8 @@ use crate::knowledge::quantization;
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
+use crate::surgery::expr::{TensorExpr, TensorTransform};
+use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, into_shards};
 use crate::surgery::values::can_compute;
 
 /// A tensor spec with its parts evaluated once.
@@ -161,8 +162,11 @@ pub(super) fn plan(
                 .map(in_numbers)
                 .ok_or_else(|| UNKNOWN_VALUES.to_owned())
         });
-        match source(&taken, &shape, values) {
-            Ok(source) => tensors.push((position, planned(taken, shape, source, draft))),
+        match source(&taken, &shape, values).and_then(|source| PlannedTensor::new(taken.name.clone(), source)) {
+            Ok(planned) => {
+                record(&taken, &planned, draft);
+                tensors.push((position, planned));
+            }
             Err(why) => draft.seams.push(misfit(context, &taken, shape, &why)),
         }
     }
@@ -216,7 +220,7 @@ fn kept_modules(rules: &[TensorRule<'_>], taken: &[TakenTensor<'_>], started: &S
 
 /// A note for matrices that start with zeros: what they multiply has no effect at first.
 fn blind(draft: &MergeDraft) -> Option<String> {
-    let is_blind = |t: &&PlannedTensor| t.source.values == Some(NewValues::Zeros) && t.shape.len() > 1;
+    let is_blind = |t: &&PlannedTensor| t.source.values() == Some(NewValues::Zeros) && t.shape.len() > 1;
     let names: Vec<&str> = draft.plan.tensors().map(|(_, t)| t).filter(is_blind).map(|t| t.name.as_str()).collect();
     let (first, others) = names.split_first()?;
     let more = if others.is_empty() { String::new() } else { format!(", and {} more", others.len()) };
@@ -290,35 +294,32 @@ fn take<'a>(
     Ok((taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect()))
 }
 
-/// The planned tensor; if it is not a byte copy of the whole donor tensor, the draft lists it as changed.
-fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft: &mut MergeDraft) -> PlannedTensor {
-    let dtype = taken.dtype();
-    let TakenTensor { name, tensor, rule, .. } = taken;
-    let planned = PlannedTensor { name, dtype, shape, source };
+/// Lists a tensor that is not a byte copy of a whole donor tensor as changed, and one that must be trained.
+fn record(taken: &TakenTensor<'_>, planned: &PlannedTensor, draft: &mut MergeDraft) {
+    let tensor = taken.tensor;
     let transform = planned.transform();
     let has_new_values = match transform {
-        TensorTransform::Copy | TensorTransform::Convert => false,
+        TensorTransform::Copy | TensorTransform::Convert | TensorTransform::AddProduct => false,
         TensorTransform::GrowRows | TensorTransform::SampleRows | TensorTransform::Pad | TensorTransform::Reinit => {
             true
         }
     };
-    if has_new_values || rule.spec.train {
+    if has_new_values || taken.rule.spec.train {
         draft.train.insert(planned.name.clone());
     }
-    if transform != TensorTransform::Copy || planned.source.from.slice.is_some() {
+    if planned.copied().is_none_or(|from| from.slice.is_some()) {
         draft.changed.push(ChangedTensor {
             name: planned.name.clone(),
             transform,
             from: Some(tensor.shape.clone()),
             to: planned.shape.clone(),
-            scale: planned.source.scale,
-            values: planned.source.values.map(NewValues::words),
-            cast: (tensor.dtype != dtype && transform != TensorTransform::Reinit)
-                .then(|| Cast { from: tensor.dtype.name(), to: dtype.name() }),
+            scale: planned.source.scale(),
+            values: planned.source.values().map(NewValues::words),
+            cast: (tensor.dtype != planned.dtype && transform != TensorTransform::Reinit)
+                .then(|| Cast { from: tensor.dtype.name(), to: planned.dtype.name() }),
             losses: None,
         });
     }
-    planned
 }
 
 /// The seam for a donor whose quantised weights would be cast in part: its scales belong to their type.
@@ -454,29 +455,35 @@ fn source(
     taken: &TakenTensor<'_>,
     shape: &[u64],
     values: Option<Result<NewValues, String>>,
-) -> Result<TensorSource, String> {
+) -> Result<TensorExpr<TensorRef>, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
-    let from = TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, rule.slice)?;
+    let of = TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, rule.slice)?;
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);
     let changes = scale.is_some() || taken.dtype() != tensor.dtype;
-    let fits = from.shape == shape && !starts;
+    let fits = of.shape == shape && !starts;
     if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
-    let nests = nests(&from.shape, shape);
-    let fit = match rule.fit {
-        _ if fits => TensorTransform::Copy,
+    let nests = nests(&of.shape, shape);
+    let grows = nests && of.shape.iter().skip(1).eq(shape.iter().skip(1));
+    let rows = shape.first().copied().unwrap_or_default();
+    let (shape, dtype) = (shape.to_vec(), taken.dtype());
+    let fitted = match rule.fit {
+        _ if fits => TensorExpr::Stored(of),
         Fit::Copy => return Err(String::new()),
         Fit::Pad if !nests => return Err(CANNOT_SHRINK.to_owned()),
-        Fit::GrowRows | Fit::SampleRows if !nests || !from.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
-            return Err("only rows can be added".to_owned());
+        Fit::GrowRows | Fit::SampleRows if !grows => return Err("only rows can be added".to_owned()),
+        Fit::Pad => TensorExpr::Pad { of, shape },
+        Fit::GrowRows => TensorExpr::GrowRows { of, rows },
+        Fit::SampleRows => TensorExpr::SampleRows { of, rows },
+        // New values have the size that the class gives them.
+        Fit::Reinit | Fit::ReinitAlways => {
+            let values = values.transpose()?.ok_or(UNKNOWN_VALUES)?;
+            return Ok(TensorExpr::Initialise { values, dtype, shape, instead_of: of });
         }
-        fit => fit.transform(),
     };
-    let values = values.transpose()?;
-    // New values have the size that the class gives them.
-    Ok(TensorSource { from, fit, scale: scale.filter(|_| !starts), values })
+    Ok(fitted.converted(tensor.dtype, scale, dtype))
 }
 
 /// Why `reinit` does not help.
