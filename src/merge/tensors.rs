@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use regex::Regex;
 use serde_json::Value;
 
+use super::adapter::MergedAdapter;
 use super::context::{Context, Donor};
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
@@ -13,7 +14,7 @@ use super::dtypes;
 use super::error::MergeError;
 use super::explain;
 use super::fit::{Fit, StartedModules};
-use super::named::{AnnouncedCast, Bounds, Changeable, NamedTensors, pattern};
+use super::named::{AnnouncedCast, Bounds, Changeable, MergedRoles, NamedTensors, pattern};
 use super::parts::PartOf;
 use super::run::count;
 use crate::checkpoint::{Dtype, Shard, Tensor};
@@ -34,6 +35,7 @@ pub(super) struct TensorRule<'a> {
     pub(super) fit: Fit,
     scale: Option<f64>,
     dtype: Option<Dtype>,
+    adapter: Option<MergedAdapter>,
     /// The part that the tensors belong to, and the one whose place they take.
     part: Option<PartOf<'a>>,
     into: Option<PartOf<'a>>,
@@ -72,9 +74,32 @@ impl TensorRule<'_> {
         NamedTensors::of_entry(&self.spec.from, self.part, &self.spec.names).filter(|_| changes)
     }
 
-    /// The cast that the entry announces.
-    fn cast(&self) -> Option<AnnouncedCast> {
-        Some(AnnouncedCast { donor: self.spec.from.clone(), to: self.dtype?.name().to_owned() })
+    /// The casts that the entry announces.
+    fn casts(&self) -> impl Iterator<Item = AnnouncedCast> {
+        let own = self.dtype.map(|dtype| AnnouncedCast { donor: self.spec.from.clone(), to: dtype.name().to_owned() });
+        own.into_iter().chain(self.adapter.iter().flat_map(|adapter| adapter.casts.clone()))
+    }
+
+    /// The donor and the adapter that is merged into it.
+    fn merged(&self) -> Option<MergedRoles> {
+        Some(MergedRoles { base: self.spec.from.clone(), adapter: self.adapter.as_ref()?.role.clone() })
+    }
+
+    /// Fails unless the entry takes every tensor that its adapter changes.
+    fn takes_all(&self, taken: &[TakenTensor<'_>]) -> Result<(), MergeError> {
+        let Some(adapter) = &self.adapter else { return Ok(()) };
+        let own: BTreeSet<&str> = taken
+            .iter()
+            .filter(|taken| std::ptr::eq(taken.rule, self))
+            .map(|taken| taken.tensor.name.as_str())
+            .collect();
+        match adapter.names().find(|name| !own.contains(name)) {
+            None => Ok(()),
+            Some(left) => Err(MergeError::Recipe(format!(
+                "the {} donor changes {left}, which the entry with the adapter does not take",
+                adapter.role
+            ))),
+        }
     }
 
     /// Whether a donor tensor is meant.
@@ -135,6 +160,7 @@ pub(super) fn plan(
     if taken.is_empty() {
         return Err(nothing_taken(context, &rules));
     }
+    rules.iter().try_for_each(|rule| rule.takes_all(&taken))?;
     draft.dropped = dropped;
     draft.seams.extend(context.donors.iter().filter_map(|donor| quantised(donor, &taken)));
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
@@ -184,8 +210,12 @@ pub(super) fn plan(
 /// What the entries of the recipe may change with these donors and options.
 fn changeable(rules: &[TensorRule<'_>]) -> Changeable {
     let kept = || rules.iter().filter(|rule| rule.spec.drop.is_none());
-    let casts: BTreeSet<AnnouncedCast> = kept().filter_map(TensorRule::cast).collect();
-    Changeable { named: kept().filter_map(TensorRule::changeable).collect(), casts: casts.into_iter().collect() }
+    let casts: BTreeSet<AnnouncedCast> = kept().flat_map(TensorRule::casts).collect();
+    Changeable {
+        named: kept().filter_map(TensorRule::changeable).collect(),
+        casts: casts.into_iter().collect(),
+        merged: kept().filter_map(TensorRule::merged).collect(),
+    }
 }
 
 /// Fails when two tensors would have one name.
@@ -296,7 +326,7 @@ fn take<'a>(
 
 /// Lists a tensor that is not a byte copy of a whole donor tensor as changed, and one that must be trained.
 fn record(taken: &TakenTensor<'_>, planned: &PlannedTensor, draft: &mut MergeDraft) {
-    let tensor = taken.tensor;
+    let (tensor, from) = (taken.tensor, planned.source.main());
     let transform = planned.transform();
     let has_new_values = match transform {
         TensorTransform::Copy | TensorTransform::Convert | TensorTransform::AddProduct => false,
@@ -315,8 +345,8 @@ fn record(taken: &TakenTensor<'_>, planned: &PlannedTensor, draft: &mut MergeDra
             to: planned.shape.clone(),
             scale: planned.source.scale(),
             values: planned.source.values().map(NewValues::words),
-            cast: (tensor.dtype != planned.dtype && transform != TensorTransform::Reinit)
-                .then(|| Cast { from: tensor.dtype.name(), to: planned.dtype.name() }),
+            cast: (from.dtype != planned.dtype && transform != TensorTransform::Reinit)
+                .then(|| Cast { from: from.dtype.name(), to: planned.dtype.name() }),
             losses: None,
         });
     }
@@ -375,6 +405,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             spec,
             names,
             rename,
+            adapter: adapter(context, spec)?,
             part,
             into,
             slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
@@ -386,6 +417,23 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         out.push(rule);
     }
     Ok(out)
+}
+
+/// The adapter that an entry merges, with its tensors placed.
+fn adapter(context: &Context<'_>, spec: &TensorSpec) -> Result<Option<MergedAdapter>, MergeError> {
+    let Some(adapter) = &spec.adapter else { return Ok(None) };
+    let turned = adapter.turned.as_ref().map_or(Ok(Value::Null), |turned| turned.eval(&context.scope));
+    let turned = turned.map_err(context.at("turned"))?;
+    let turned = match turned {
+        Value::Null => Some(Vec::new()),
+        Value::Array(names) => names.into_iter().map(|name| name.as_str().map(str::to_owned)).collect(),
+        _ => None,
+    };
+    let turned = turned.ok_or_else(|| {
+        MergeError::Recipe(format!("{}: turned of an adapter is not a list of names", context.recipe.recipe))
+    })?;
+    let (Some(base), Some(donor)) = (context.donor(&spec.from), context.donor(&adapter.from)) else { return Ok(None) };
+    MergedAdapter::place(base, donor, turned, context.library).map(Some)
 }
 
 // Each parser takes the value of an expression, null when it is missing, and fails with what was expected.
@@ -457,6 +505,9 @@ fn source(
     values: Option<Result<NewValues, String>>,
 ) -> Result<TensorExpr<TensorRef>, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
+    if let Some(source) = rule.adapter.as_ref().and_then(|adapter| adapter.source(&tensor.name)) {
+        return Ok(source.clone());
+    }
     let of = TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, rule.slice)?;
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);

@@ -263,7 +263,7 @@ impl<'v> Run<'v> {
             let Some((shard, found)) = present.filter(|(_, t)| header_difference(t, tensor).is_none()) else {
                 continue;
             };
-            let named = self.bounds.as_ref().is_none_or(|bounds| tensor.is_allowed(bounds));
+            let named = self.bounds.as_ref().is_none_or(|bounds| bounds.name_source(&tensor.source));
             let needed = if named { tensor.source.sources() } else { vec![tensor.main()] };
             if let Some(other) = needed.iter().find(|source| !given.donors.contains_key(source.donor.as_str())) {
                 lacking.insert((other.donor.as_str(), tensor.name.as_str()));
@@ -290,7 +290,10 @@ impl<'v> Run<'v> {
         );
         for ((tensor, planned, ..), compared) in work.iter().zip(compared) {
             let (Some(planned), Some(compared)) = (planned, compared?) else {
-                let detail = format!("the donor has no {} that it could be made from", tensor.main().name);
+                let sources = tensor.source.sources().into_iter();
+                let lacking = sources.filter(|source| given.tensor(source, false).is_none()).map(|source| &source.name);
+                let name = lacking.chain([&tensor.main().name]).next().map_or("", String::as_str);
+                let detail = format!("the donor has no {name} that it could be made from");
                 part.differ(&tensor.name, DifferenceKind::Missing, Some(detail));
                 continue;
             };
@@ -312,9 +315,12 @@ impl<'v> Run<'v> {
     }
 }
 
+/// The tensors of a donor.
+type TensorsByName<'d> = BTreeMap<&'d str, (&'d Shard, &'d Tensor)>;
+
 /// The donors that were given, by role, with their tensors by name.
 struct Given<'d> {
-    donors: BTreeMap<&'d str, (&'d Path, BTreeMap<&'d str, (&'d Shard, &'d Tensor)>)>,
+    donors: BTreeMap<&'d str, (&'d Path, TensorsByName<'d>)>,
 }
 
 impl<'d> Given<'d> {

@@ -143,7 +143,7 @@ impl Write for Adder<'_> {
         }
         let left = self.sums.len().saturating_sub(self.used).saturating_mul(width);
         let part = bytes.get(..bytes.len().min(left)).unwrap_or_default();
-        self.add(part, part.len() / width)?;
+        self.add(part, part.len().checked_div(width).unwrap_or_default())?;
         Ok(part.len())
     }
 

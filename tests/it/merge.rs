@@ -1,5 +1,6 @@
 //! `build-merged` from the outside: what it writes, what it refuses, and unchanged donors.
 
+mod adapter;
 mod foreign;
 mod law;
 mod parts;

@@ -13,7 +13,7 @@ use crate::checkpoint::open::{JSON_CAP, read_own};
 use crate::checkpoint::{HashAlgorithm, is_plain_file_name};
 use crate::merge::manifest;
 use crate::merge::manifest::DonorTensor;
-use crate::merge::named::{Bounds, Changeable};
+use crate::merge::named::{Bounds, Changeable, Stray, is_changed};
 use crate::surgery::expr::{TensorExpr, TensorTransform};
 
 /// A recorded merge. Keys that not all versions have are optional.
@@ -67,7 +67,7 @@ pub(super) struct RecordedShard {
 
 /// A recorded tensor of the result.
 #[derive(Debug, Deserialize)]
-#[serde(try_from = "former::Entry")]
+#[serde(try_from = "former::TensorEntry")]
 pub(super) struct RecordedTensor {
     pub(super) name: String,
     pub(super) shard: String,
@@ -87,31 +87,23 @@ impl RecordedTensor {
 
     /// Whether it is more than the donor's whole tensor, cast or not.
     pub(super) fn is_changed(&self) -> bool {
-        let keeps = matches!(self.source.transform(), TensorTransform::Copy | TensorTransform::Convert);
-        !keeps || self.source.scale().is_some() || self.main().slice.is_some()
-    }
-
-    /// Whether it is one that the merge was allowed to change.
-    pub(super) fn is_allowed(&self, bounds: &Bounds<'_>) -> bool {
-        bounds.name(&self.main().donor, &self.main().name)
-    }
-
-    /// Whether its values were cast.
-    fn is_cast(&self) -> bool {
-        self.source.transform() != TensorTransform::Reinit && self.main().dtype != self.dtype
+        is_changed(&self.source)
     }
 
     /// Why the merge cannot have been allowed to make it; `None` when it was.
     pub(super) fn stray(&self, bounds: &Bounds<'_>) -> Option<String> {
         let DonorTensor { donor, name, .. } = self.main();
-        if self.is_changed() && !bounds.name(donor, name) {
-            let how = if self.source.scale().is_some() { "scaled" } else { self.source.transform().name() };
-            return Some(format!(
-                "is recorded as {how}, and nothing that the recipe names has {name} of the {donor} donor"
-            ));
-        }
-        (self.is_cast() && !bounds.casts_to(donor, &self.dtype)).then(|| {
-            format!("is recorded as cast to {}, and the recipe announces no such cast of the {donor} donor", self.dtype)
+        Some(match bounds.stray(&self.source, &self.dtype)? {
+            Stray::Changed => {
+                let transform = self.source.transform();
+                let is_scaled = self.source.scale().is_some() && transform != TensorTransform::AddProduct;
+                let how = if is_scaled { "scaled" } else { transform.name() };
+                format!("is recorded as {how}, and nothing that the recipe names has {name} of the {donor} donor")
+            }
+            Stray::Cast => format!(
+                "is recorded as cast to {}, and the recipe announces no such cast of the {donor} donor",
+                self.dtype
+            ),
         })
     }
 }

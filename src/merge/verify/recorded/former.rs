@@ -10,7 +10,7 @@ use crate::surgery::plan::{NewValues, RowSlice};
 
 /// An entry of any version.
 #[derive(Debug, Deserialize)]
-pub(super) struct Entry {
+pub(super) struct TensorEntry {
     name: String,
     shard: String,
     dtype: String,
@@ -23,22 +23,22 @@ pub(super) struct Entry {
     scale: Option<f64>,
     /// Version 4.
     values: Option<NewValues>,
-    source: Source,
+    source: EntrySource,
 }
 
 /// The source of a tensor.
 #[derive(Debug, Deserialize)]
-#[serde(untagged)]
-enum Source {
+#[serde(untagged, expecting = "its source is neither a tensor of a donor nor a known operation")]
+enum EntrySource {
     /// Before version 5: the only one.
-    One(One),
+    Only(OnlySource),
     /// Since version 5.
     Expression(TensorExpr<DonorTensor>),
 }
 
 /// The donor tensor of an entry before version 5.
 #[derive(Debug, Deserialize)]
-struct One {
+struct OnlySource {
     donor: String,
     name: String,
     /// Version 1 has none, and knew no casts.
@@ -49,18 +49,18 @@ struct One {
     digest: Option<String>,
 }
 
-impl TryFrom<Entry> for RecordedTensor {
+impl TryFrom<TensorEntry> for RecordedTensor {
     type Error = String;
 
-    fn try_from(entry: Entry) -> Result<Self, String> {
-        let Entry { name, shard, dtype, shape, digest, transform, scale, values, source } = entry;
+    fn try_from(entry: TensorEntry) -> Result<Self, String> {
+        let TensorEntry { name, shard, dtype, shape, digest, transform, scale, values, source } = entry;
         let source = match source {
-            Source::Expression(source) if source.transform() == transform => source,
-            Source::Expression(source) => {
+            EntrySource::Expression(source) if source.transform() == transform => source,
+            EntrySource::Expression(source) => {
                 let word = source.transform().name();
                 return Err(format!("{name:?} is recorded as {} and its source as {word}", transform.name()));
             }
-            Source::One(one) => {
+            EntrySource::Only(one) => {
                 let to = Dtype::from_name(&dtype).ok_or_else(|| format!("no element type {dtype:?}"))?;
                 let values = values.unwrap_or(NewValues::former(&shape));
                 one.expression(transform, (to, &shape), scale, values)
@@ -70,7 +70,7 @@ impl TryFrom<Entry> for RecordedTensor {
     }
 }
 
-impl One {
+impl OnlySource {
     /// The expression that an entry before version 5 means, for a result of this type and shape.
     fn expression(
         self,

@@ -101,7 +101,7 @@ fn case(random: &mut Draw) -> Case {
     match fit {
         Fit::Pad => wanted.iter_mut().for_each(|dim| *dim += random.below(4) as u64),
         Fit::GrowRows | Fit::SampleRows => wanted[0] += random.below(4) as u64,
-        _ => {}
+        Fit::Stored => {}
     }
     let len = byte_len(from, &shape).unwrap();
     let width = usize::try_from(from.bits() / 8).unwrap();
