@@ -63,6 +63,7 @@ const fn writer(command: &args::Command) -> Option<&'static str> {
         Command::BuildMerged(args) if !args.help && !args.print_recipe => Some("build-merged"),
         Command::Extract(_) => Some("extract"),
         Command::Insert(_) => Some("insert"),
+        Command::MergeAdapter(_) => Some("merge-adapter"),
         Command::Undo(_) => Some("undo"),
         _ => None,
     }
@@ -101,6 +102,7 @@ fn run() -> ExitCode {
         args::Command::Man(args) => generate::man(&args),
         args::Command::Extract(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
         args::Command::Insert(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
+        args::Command::MergeAdapter(args) => build_merged::run(&args.into_merge(), rules.as_deref()),
     };
     match result {
         Ok(code) => ExitCode::from(code),

@@ -78,7 +78,7 @@ pub use report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, Fixed, MergeReport, MergeStage, MergedFile, Report, Role, Seam,
     ShapedName, StageOutcome, Summary, ToolInfo, UncheckedPath, Verdict, Withdrawn,
 };
-pub use surgery::plan::TensorTransform;
+pub use surgery::expr::TensorTransform;
 
 /// Runs the program; for `src/main.rs`.
 #[cfg(feature = "cli")]

@@ -4,6 +4,7 @@
 //! nothing is written before the stage `write`. This stage combines checks, plans, writes and reports; it is the only
 //! one above `report`.
 
+mod adapter;
 mod alike;
 mod card;
 mod choice;

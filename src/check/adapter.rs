@@ -8,6 +8,7 @@ mod base;
 mod config;
 mod formats;
 mod keys;
+pub mod lora;
 mod targets;
 
 use crate::checkpoint::files;

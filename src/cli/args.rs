@@ -38,6 +38,8 @@ pub enum Command {
     Extract(ExtractArgs),
     /// Put a part into a model, such as a language model that was trained on text alone
     Insert(InsertArgs),
+    /// Merge a LoRA of PEFT into the model that it was trained on
+    MergeAdapter(MergeAdapterArgs),
     /// Compare a merged checkpoint with its manifest and, byte for byte, with its donors
     Verify(VerifyArgs),
     /// Summarise a checkpoint: tensors, model class, inferred config values
@@ -460,7 +462,22 @@ pub struct InsertArgs {
     pub write: PartWriteArgs,
 }
 
-/// What `extract` and `insert` have in common.
+/// Arguments of `merge-adapter`.
+#[derive(Debug, Args)]
+#[command(after_help = "This is `build-merged --recipe merge-adapter`.\n\nExit codes: those of build-merged")]
+pub struct MergeAdapterArgs {
+    /// The model that the adapter was trained on
+    #[arg(value_name = "BASE")]
+    pub base: PathBuf,
+    /// The adapter: a directory with `adapter_config.json` and `adapter_model.safetensors`
+    #[arg(value_name = "ADAPTER")]
+    pub adapter: PathBuf,
+    /// Output and report.
+    #[command(flatten)]
+    pub write: PartWriteArgs,
+}
+
+/// What `extract`, `insert` and `merge-adapter` have in common.
 #[derive(Debug, Args)]
 pub struct PartWriteArgs {
     /// Output directory; it must not exist, or be empty
@@ -482,7 +499,7 @@ impl ExtractArgs {
     #[must_use]
     pub fn into_merge(self) -> BuildMergedArgs {
         let donor = vec![("model".to_owned(), self.dir.display().to_string())];
-        self.write.into_merge("extract", self.part, donor)
+        self.write.into_merge("extract", Some(self.part), donor)
     }
 }
 
@@ -492,14 +509,24 @@ impl InsertArgs {
     pub fn into_merge(self) -> BuildMergedArgs {
         let dirs = [("model", self.dir), ("part", self.from)];
         let donor = dirs.map(|(role, dir)| (role.to_owned(), dir.display().to_string())).to_vec();
-        self.write.into_merge("insert", self.part, donor)
+        self.write.into_merge("insert", Some(self.part), donor)
+    }
+}
+
+impl MergeAdapterArgs {
+    /// The same as a merge.
+    #[must_use]
+    pub fn into_merge(self) -> BuildMergedArgs {
+        let dirs = [("base", self.base), ("adapter", self.adapter)];
+        let donor = dirs.map(|(role, dir)| (role.to_owned(), dir.display().to_string())).to_vec();
+        self.write.into_merge("merge-adapter", None, donor)
     }
 }
 
 impl PartWriteArgs {
-    fn into_merge(self, recipe: &str, part: String, donor: Vec<(String, String)>) -> BuildMergedArgs {
+    fn into_merge(self, recipe: &str, part: Option<String>, donor: Vec<(String, String)>) -> BuildMergedArgs {
         let mut set = self.set;
-        set.push(("part".to_owned(), part));
+        set.extend(part.map(|part| ("part".to_owned(), part)));
         BuildMergedArgs {
             file: None,
             recipe: Some(recipe.to_owned()),

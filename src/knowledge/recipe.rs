@@ -311,6 +311,9 @@ pub struct TensorSpec {
     /// Regular expression for tensor names of the donor; all when missing.
     #[serde(default)]
     pub names: String,
+    /// An adapter of PEFT that is merged into the tensors. Every tensor of the adapter must have a place in them.
+    #[serde(default)]
+    pub adapter: Option<AdapterSpec>,
     /// Name of the part of the donor that the tensors belong to, as `rules/parts/` describes it.
     #[serde(default)]
     pub part: Option<Template>,
@@ -354,6 +357,18 @@ pub struct TensorSpec {
     /// Options that avoid the mismatch.
     #[serde(default)]
     pub options: Vec<String>,
+}
+
+/// An adapter that is merged.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct AdapterSpec {
+    /// Role of the donor that is the adapter.
+    pub from: String,
+    /// Last parts of the names of modules whose weight is stored `[in, out]`: a list. None when missing.
+    #[serde(default)]
+    pub turned: Option<Expression>,
 }
 
 /// A note in the report.

@@ -24,7 +24,7 @@ pub(super) fn card(recipe: &Recipe, donors: &[Donor], digests: &BTreeMap<String,
             role: donor.role.clone(),
             base: hub.base().map(str::to_owned),
             revision: hub.revision,
-            tensors: plan.tensors().filter(|(_, tensor)| tensor.source.from.donor == donor.role).count(),
+            tensors: plan.tensors().filter(|(_, tensor)| tensor.source.main().donor == donor.role).count(),
             licence: licence(donor),
         }
     };

@@ -11,14 +11,14 @@ use super::error::PipelineError;
 use super::manifest::DonorTensor;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::{ConfigChange, DryRun, MergedFile, PlannedShardSize, ToolInfo};
+use crate::surgery::expr::{TensorExpr, TensorTransform};
 use crate::surgery::free_space;
-use crate::surgery::plan::{NewValues, TensorTransform};
 
 /// A plan as JSON: every tensor of the result with its shard and its source.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct PlanDocument {
-    /// Version of this contract: 1.
+    /// Version of this contract: 2.
     pub schema: u32,
     /// The program that made the plan.
     pub tool: ToolInfo,
@@ -42,16 +42,10 @@ pub(crate) struct TensorPlan {
     pub dtype: String,
     /// Shape in the result.
     pub shape: Vec<u64>,
-    /// How it is made.
+    /// How it is made, in one word.
     pub transform: TensorTransform,
-    /// Factor on all values.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub scale: Option<f64>,
-    /// The values that it starts again with, for `reinit`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub values: Option<NewValues>,
-    /// The donor tensor that it is made from, or that it replaces.
-    pub source: DonorTensor,
+    /// How it is made of tensors of donors.
+    pub source: TensorExpr<DonorTensor>,
 }
 
 /// A planned file.
@@ -105,13 +99,11 @@ pub(super) fn document(draft: &MergeDraft, recipe: &Recipe) -> PlanDocument {
         dtype: t.dtype.name().to_owned(),
         shape: t.shape.clone(),
         transform: t.transform(),
-        scale: t.source.scale,
-        values: t.source.values,
-        source: DonorTensor::new(&t.source.from, None),
+        source: t.source.map(&mut |from| DonorTensor::new(from, None)),
     });
     let file = |file: &MergedFile| PlannedFileOrigin { name: file.name.clone(), origin: file.origin.clone() };
     PlanDocument {
-        schema: 1,
+        schema: 2,
         tool: ToolInfo::this(),
         recipe: recipe.recipe.clone(),
         tensors: tensors.collect(),

@@ -3,7 +3,6 @@
 use std::collections::BTreeSet;
 
 use super::tensors::TakenTensor;
-use crate::surgery::plan::TensorTransform;
 
 /// A value of `fit`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,17 +35,6 @@ impl Fit {
             Self::Pad => "pad",
             Self::Reinit => "reinit",
             Self::ReinitAlways => "reinit-always",
-        }
-    }
-
-    /// How a tensor whose shape differs, or whose module starts again, is made.
-    pub(super) const fn transform(self) -> TensorTransform {
-        match self {
-            Self::Copy => TensorTransform::Copy,
-            Self::GrowRows => TensorTransform::GrowRows,
-            Self::SampleRows => TensorTransform::SampleRows,
-            Self::Pad => TensorTransform::Pad,
-            Self::Reinit | Self::ReinitAlways => TensorTransform::Reinit,
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use super::CARD;
@@ -18,7 +18,8 @@ use crate::knowledge::source;
 use crate::report::model::{ToolInfo, Training};
 use crate::surgery::ApplyError;
 use crate::surgery::donor::{digest_own, sha256};
-use crate::surgery::plan::{NewValues, Plan, PlannedFile, RowSlice, TensorRef, TensorTransform};
+use crate::surgery::expr::{TensorExpr, TensorTransform};
+use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorRef};
 use crate::surgery::written::WrittenShard;
 
 /// File name in the merged directory.
@@ -31,7 +32,7 @@ pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct Manifest {
-    /// Version of this contract: 4.
+    /// Version of this contract: 5.
     pub schema: u32,
     /// The program that made the merge.
     pub tool: ToolInfo,
@@ -129,20 +130,14 @@ pub(crate) struct TensorOrigin {
     /// Digest of its bytes; missing with the algorithm `none`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub digest: Option<String>,
-    /// How it was made.
+    /// How it was made, in one word.
     pub transform: TensorTransform,
-    /// Factor on all values.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub scale: Option<f64>,
-    /// The values that it starts again with, for `reinit`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub values: Option<NewValues>,
-    /// The donor tensor that it was made from, or that it replaces.
-    pub source: DonorTensor,
+    /// How it was made of tensors of donors.
+    pub source: TensorExpr<DonorTensor>,
 }
 
 /// A tensor of a donor.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub(crate) struct DonorTensor {
     /// Role of the donor.
@@ -225,7 +220,8 @@ pub(super) fn manifest(
     let others = others.map(|f| (f.name.to_string(), FileDigest { bytes: f.bytes.len() as u64, sha256: f.sha256() }));
     let digests = written.iter().flat_map(|shard| &shard.tensors);
     let tensors = merge.plan.tensors().zip(digests).map(|((shard, t), written)| {
-        let from = &t.source.from;
+        let mut digests = written.source_digests.iter().cloned();
+        let source = t.source.map(&mut |from| DonorTensor::new(from, digests.next().flatten()));
         TensorOrigin {
             name: t.name.clone(),
             shard: shard.name.to_string(),
@@ -233,13 +229,11 @@ pub(super) fn manifest(
             shape: t.shape.clone(),
             digest: written.digest.clone(),
             transform: t.transform(),
-            scale: t.source.scale,
-            values: t.source.values,
-            source: DonorTensor::new(from, written.source_digest.clone()),
+            source,
         }
     });
     Manifest {
-        schema: 4,
+        schema: 5,
         tool: ToolInfo::this(),
         recipe: recipe_digest(merge.recipe),
         options: run.record.options.clone(),

@@ -6,9 +6,12 @@ use regex_syntax::hir::literal::Extractor;
 use serde::{Deserialize, Serialize};
 
 use super::error::MergeError;
+use super::manifest::DonorTensor;
 use super::parts::PartOf;
+use crate::check::adapter::lora::module_of;
 use crate::checkpoint::escape;
-use crate::surgery::plan::{Plan, PlannedTensor, TensorTransform};
+use crate::surgery::expr::{TensorExpr, TensorTransform};
+use crate::surgery::plan::{Plan, PlannedTensor, TensorRef};
 
 /// The tensors of a donor that an entry of the recipe names, and may change: those of a part, of a pattern, or of both.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,6 +51,72 @@ pub(crate) struct Changeable {
     pub named: Vec<NamedTensors>,
     /// Types to which it may cast any tensor.
     pub casts: Vec<AnnouncedCast>,
+    /// Adapters that it may merge into the tensors of another donor.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub merged: Vec<MergedRoles>,
+}
+
+/// An adapter of PEFT and the model that it is merged into, by their roles.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct MergedRoles {
+    /// Role of the model.
+    pub base: String,
+    /// Role of the adapter.
+    pub adapter: String,
+}
+
+/// A donor's tensor, as a plan or a manifest names it.
+pub(super) trait OfDonor {
+    /// Role of the donor, and name of the tensor there.
+    fn key(&self) -> (&str, &str);
+    /// Its element type, as safetensors spells it.
+    fn dtype(&self) -> &str;
+    /// Whether it is some of the rows of a tensor.
+    fn is_slice(&self) -> bool;
+}
+
+impl OfDonor for TensorRef {
+    fn key(&self) -> (&str, &str) {
+        (&self.donor, &self.name)
+    }
+
+    fn dtype(&self) -> &str {
+        self.dtype.name()
+    }
+
+    fn is_slice(&self) -> bool {
+        self.slice.is_some()
+    }
+}
+
+impl OfDonor for DonorTensor {
+    fn key(&self) -> (&str, &str) {
+        (&self.donor, &self.name)
+    }
+
+    fn dtype(&self) -> &str {
+        &self.dtype
+    }
+
+    fn is_slice(&self) -> bool {
+        self.slice.is_some()
+    }
+}
+
+/// Whether an expression is more than a donor's whole tensor, cast or not.
+pub(super) fn is_changed<S: OfDonor>(source: &TensorExpr<S>) -> bool {
+    let keeps = matches!(source.transform(), TensorTransform::Copy | TensorTransform::Convert);
+    !keeps || source.scale().is_some() || source.main().is_slice()
+}
+
+/// What no entry of a recipe allows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Stray {
+    /// A change of a tensor that none names.
+    Changed,
+    /// A cast that none announces.
+    Cast,
 }
 
 /// Largest compiled pattern of a recipe, in bytes, and most entries with one: together some 50 MB.
@@ -111,6 +180,7 @@ impl NamedTensors {
 pub(super) struct Bounds<'c> {
     named: Vec<(&'c NamedTensors, Option<Regex>)>,
     casts: &'c [AnnouncedCast],
+    merged: &'c [MergedRoles],
 }
 
 impl<'c> Bounds<'c> {
@@ -129,11 +199,40 @@ impl<'c> Bounds<'c> {
             return Err(format!("\"changes\" has {} entries, more than {MAX_ENTRIES}", changeable.named.len()));
         }
         let named = changeable.named.iter().map(entry).collect::<Result<_, _>>()?;
-        Ok(Self { named, casts: &changeable.casts })
+        Ok(Self { named, casts: &changeable.casts, merged: &changeable.merged })
+    }
+
+    /// Whether an expression may change the tensor that it stands for. A product must be that of the module of an adapter that
+    /// the recipe merges.
+    pub(super) fn name_source<S: OfDonor>(&self, source: &TensorExpr<S>) -> bool {
+        let (donor, name) = source.main().key();
+        let TensorExpr::AddProduct { to, product } = source else { return self.name(donor, name) };
+        let is_of = |adapter: &str, of: &S| {
+            let (role, matrix) = of.key();
+            let inner = |module: &str| module.split_once('.').map(|(_, inner)| format!("{inner}.weight"));
+            let is_place =
+                |module: &str| name == format!("{module}.weight") || inner(module).is_some_and(|n| n == name);
+            role == adapter && !of.is_slice() && module_of(matrix).is_some_and(is_place)
+        };
+        let is_merged = |roles: &&MergedRoles| {
+            roles.base == donor
+                && [&product.left, &product.right].iter().all(|factor| is_of(&roles.adapter, factor.of()))
+        };
+        to.copied().is_some_and(|to| !to.is_slice()) && self.merged.iter().any(|roles| is_merged(&roles))
+    }
+
+    /// Why no entry of the recipe can have made a tensor of this type so; `None` when one can.
+    pub(super) fn stray<S: OfDonor>(&self, source: &TensorExpr<S>, dtype: &str) -> Option<Stray> {
+        let main = source.main();
+        let is_cast = main.dtype() != dtype && source.transform() != TensorTransform::Reinit;
+        if is_changed(source) && !self.name_source(source) {
+            return Some(Stray::Changed);
+        }
+        (is_cast && !self.casts_to(main.key().0, dtype)).then_some(Stray::Cast)
     }
 
     /// Whether a tensor of a donor may be changed.
-    pub(super) fn name(&self, donor: &str, tensor: &str) -> bool {
+    fn name(&self, donor: &str, tensor: &str) -> bool {
         let starts = |of: &[String]| of.iter().any(|start| tensor.starts_with(start.as_str()));
         self.named.iter().any(|(named, regex)| {
             let of_part = || named.part.is_none() || (starts(&named.starts) && !starts(&named.without));
@@ -142,30 +241,22 @@ impl<'c> Bounds<'c> {
     }
 
     /// Whether a cast was announced.
-    pub(super) fn casts_to(&self, donor: &str, dtype: &str) -> bool {
+    fn casts_to(&self, donor: &str, dtype: &str) -> bool {
         self.casts.iter().any(|cast| cast.donor == donor && cast.to == dtype)
     }
 
     /// Fails when a plan changes a tensor that no entry names.
     pub(super) fn hold(&self, recipe: &str, plan: &Plan) -> Result<(), MergeError> {
-        let strays: Vec<&PlannedTensor> = plan.tensors().map(|(_, t)| t).filter(|t| !self.allow(t)).collect();
+        let strays: Vec<&PlannedTensor> =
+            plan.tensors().map(|(_, t)| t).filter(|t| self.stray(&t.source, t.dtype.name()).is_some()).collect();
         let Some(first) = strays.first() else { return Ok(()) };
         Err(MergeError::Recipe(format!(
             "{recipe}: {} of the {} donor would be changed ({}{}), and no entry that changes tensors names it by `part`, or by `names` that start with ^ and literal text; name what the entry is for",
-            first.source.from.name,
-            first.source.from.donor,
+            first.source.main().name,
+            first.source.main().donor,
             first.transform().name(),
             if strays.len() > 1 { format!(", and {} more", strays.len().saturating_sub(1)) } else { String::new() },
         )))
-    }
-
-    fn allow(&self, tensor: &PlannedTensor) -> bool {
-        let source = &tensor.source;
-        let from = &source.from;
-        let is_cast = tensor.dtype != from.dtype && source.fit != TensorTransform::Reinit;
-        let changes = source.fit != TensorTransform::Copy || source.scale.is_some() || from.slice.is_some();
-        (!is_cast || self.casts_to(&from.donor, tensor.dtype.name()))
-            && (!changes || self.name(&from.donor, &from.name))
     }
 }
 

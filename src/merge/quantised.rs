@@ -24,7 +24,8 @@ const OF_BUFFERS: [&str; 4] = ["mask", "position", "index", ".attn.bias"];
 pub(super) fn check(recipe: &Recipe, donors: &[Donor], schemes: &[Scheme]) -> Result<(), MergeError> {
     let taken = || recipe.tensors.iter().filter(|spec| spec.drop.is_none());
     let given = |role: &&str| donors.iter().any(|donor| donor.role == *role);
-    let sources: BTreeSet<&str> = taken().map(|spec| spec.from.as_str()).filter(given).collect();
+    let of_adapters = taken().filter_map(|spec| Some(spec.adapter.as_ref()?.from.as_str()));
+    let sources: BTreeSet<&str> = taken().map(|spec| spec.from.as_str()).chain(of_adapters).filter(given).collect();
     let is_cut = |donor: &Donor| {
         let of_several = donor.parts.as_ref().is_some_and(|parts| DonorParts::names(parts).count() > 1);
         of_several && taken().any(|spec| spec.from == donor.role && (spec.alone || spec.into.is_some()))

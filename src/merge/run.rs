@@ -141,8 +141,10 @@ impl MergeRun {
         let overflows = |changed: &&ChangedTensor| changed.losses.is_some_and(|losses| losses.overflow > 0);
         let affected: Vec<&ChangedTensor> = self.record.changed.iter().filter(overflows).collect();
         if let Some(first) = affected.first() {
+            let has_option = self.record.options.contains_key("dtype");
+            let advice = if has_option { " Set dtype=bfloat16 or dtype=float32." } else { "" };
             self.record.notes.push(format!(
-                "{} values that became infinite because they are too large for the type, the first one {}: the model computes NaN. Set dtype=bfloat16 or dtype=float32.",
+                "{} values that became infinite because they are too large for the type, the first one {}: the model computes NaN.{advice}",
                 count(affected.len(), "tensor has", "tensors have"),
                 first.name,
             ));

@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use regex::Regex;
 use serde_json::Value;
 
+use super::adapter::MergedAdapter;
 use super::context::{Context, Donor};
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
@@ -13,7 +14,7 @@ use super::dtypes;
 use super::error::MergeError;
 use super::explain;
 use super::fit::{Fit, StartedModules};
-use super::named::{AnnouncedCast, Bounds, Changeable, NamedTensors, pattern};
+use super::named::{AnnouncedCast, Bounds, Changeable, MergedRoles, NamedTensors, pattern};
 use super::parts::PartOf;
 use super::run::count;
 use crate::checkpoint::{Dtype, Shard, Tensor};
@@ -21,7 +22,8 @@ use crate::knowledge::quantization;
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform, into_shards};
+use crate::surgery::expr::{TensorExpr, TensorTransform};
+use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, into_shards};
 use crate::surgery::values::can_compute;
 
 /// A tensor spec with its parts evaluated once.
@@ -33,6 +35,7 @@ pub(super) struct TensorRule<'a> {
     pub(super) fit: Fit,
     scale: Option<f64>,
     dtype: Option<Dtype>,
+    adapter: Option<MergedAdapter>,
     /// The part that the tensors belong to, and the one whose place they take.
     part: Option<PartOf<'a>>,
     into: Option<PartOf<'a>>,
@@ -71,9 +74,32 @@ impl TensorRule<'_> {
         NamedTensors::of_entry(&self.spec.from, self.part, &self.spec.names).filter(|_| changes)
     }
 
-    /// The cast that the entry announces.
-    fn cast(&self) -> Option<AnnouncedCast> {
-        Some(AnnouncedCast { donor: self.spec.from.clone(), to: self.dtype?.name().to_owned() })
+    /// The casts that the entry announces.
+    fn casts(&self) -> impl Iterator<Item = AnnouncedCast> {
+        let own = self.dtype.map(|dtype| AnnouncedCast { donor: self.spec.from.clone(), to: dtype.name().to_owned() });
+        own.into_iter().chain(self.adapter.iter().flat_map(|adapter| adapter.casts.clone()))
+    }
+
+    /// The donor and the adapter that is merged into it.
+    fn merged(&self) -> Option<MergedRoles> {
+        Some(MergedRoles { base: self.spec.from.clone(), adapter: self.adapter.as_ref()?.role.clone() })
+    }
+
+    /// Fails unless the entry takes every tensor that its adapter changes.
+    fn takes_all(&self, taken: &[TakenTensor<'_>]) -> Result<(), MergeError> {
+        let Some(adapter) = &self.adapter else { return Ok(()) };
+        let own: BTreeSet<&str> = taken
+            .iter()
+            .filter(|taken| std::ptr::eq(taken.rule, self))
+            .map(|taken| taken.tensor.name.as_str())
+            .collect();
+        match adapter.names().find(|name| !own.contains(name)) {
+            None => Ok(()),
+            Some(left) => Err(MergeError::Recipe(format!(
+                "the {} donor changes {left}, which the entry with the adapter does not take",
+                adapter.role
+            ))),
+        }
     }
 
     /// Whether a donor tensor is meant.
@@ -134,6 +160,7 @@ pub(super) fn plan(
     if taken.is_empty() {
         return Err(nothing_taken(context, &rules));
     }
+    rules.iter().try_for_each(|rule| rule.takes_all(&taken))?;
     draft.dropped = dropped;
     draft.seams.extend(context.donors.iter().filter_map(|donor| quantised(donor, &taken)));
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
@@ -161,8 +188,11 @@ pub(super) fn plan(
                 .map(in_numbers)
                 .ok_or_else(|| UNKNOWN_VALUES.to_owned())
         });
-        match source(&taken, &shape, values) {
-            Ok(source) => tensors.push((position, planned(taken, shape, source, draft))),
+        match source(&taken, &shape, values).and_then(|source| PlannedTensor::new(taken.name.clone(), source)) {
+            Ok(planned) => {
+                record(&taken, &planned, draft);
+                tensors.push((position, planned));
+            }
             Err(why) => draft.seams.push(misfit(context, &taken, shape, &why)),
         }
     }
@@ -180,8 +210,12 @@ pub(super) fn plan(
 /// What the entries of the recipe may change with these donors and options.
 fn changeable(rules: &[TensorRule<'_>]) -> Changeable {
     let kept = || rules.iter().filter(|rule| rule.spec.drop.is_none());
-    let casts: BTreeSet<AnnouncedCast> = kept().filter_map(TensorRule::cast).collect();
-    Changeable { named: kept().filter_map(TensorRule::changeable).collect(), casts: casts.into_iter().collect() }
+    let casts: BTreeSet<AnnouncedCast> = kept().flat_map(TensorRule::casts).collect();
+    Changeable {
+        named: kept().filter_map(TensorRule::changeable).collect(),
+        casts: casts.into_iter().collect(),
+        merged: kept().filter_map(TensorRule::merged).collect(),
+    }
 }
 
 /// Fails when two tensors would have one name.
@@ -216,7 +250,7 @@ fn kept_modules(rules: &[TensorRule<'_>], taken: &[TakenTensor<'_>], started: &S
 
 /// A note for matrices that start with zeros: what they multiply has no effect at first.
 fn blind(draft: &MergeDraft) -> Option<String> {
-    let is_blind = |t: &&PlannedTensor| t.source.values == Some(NewValues::Zeros) && t.shape.len() > 1;
+    let is_blind = |t: &&PlannedTensor| t.source.values() == Some(NewValues::Zeros) && t.shape.len() > 1;
     let names: Vec<&str> = draft.plan.tensors().map(|(_, t)| t).filter(is_blind).map(|t| t.name.as_str()).collect();
     let (first, others) = names.split_first()?;
     let more = if others.is_empty() { String::new() } else { format!(", and {} more", others.len()) };
@@ -290,35 +324,32 @@ fn take<'a>(
     Ok((taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect()))
 }
 
-/// The planned tensor; if it is not a byte copy of the whole donor tensor, the draft lists it as changed.
-fn planned(taken: TakenTensor<'_>, shape: Vec<u64>, source: TensorSource, draft: &mut MergeDraft) -> PlannedTensor {
-    let dtype = taken.dtype();
-    let TakenTensor { name, tensor, rule, .. } = taken;
-    let planned = PlannedTensor { name, dtype, shape, source };
+/// Lists a tensor that is not a byte copy of a whole donor tensor as changed, and one that must be trained.
+fn record(taken: &TakenTensor<'_>, planned: &PlannedTensor, draft: &mut MergeDraft) {
+    let (tensor, from) = (taken.tensor, planned.source.main());
     let transform = planned.transform();
     let has_new_values = match transform {
-        TensorTransform::Copy | TensorTransform::Convert => false,
+        TensorTransform::Copy | TensorTransform::Convert | TensorTransform::AddProduct => false,
         TensorTransform::GrowRows | TensorTransform::SampleRows | TensorTransform::Pad | TensorTransform::Reinit => {
             true
         }
     };
-    if has_new_values || rule.spec.train {
+    if has_new_values || taken.rule.spec.train {
         draft.train.insert(planned.name.clone());
     }
-    if transform != TensorTransform::Copy || planned.source.from.slice.is_some() {
+    if planned.copied().is_none_or(|from| from.slice.is_some()) {
         draft.changed.push(ChangedTensor {
             name: planned.name.clone(),
             transform,
             from: Some(tensor.shape.clone()),
             to: planned.shape.clone(),
-            scale: planned.source.scale,
-            values: planned.source.values.map(NewValues::words),
-            cast: (tensor.dtype != dtype && transform != TensorTransform::Reinit)
-                .then(|| Cast { from: tensor.dtype.name(), to: dtype.name() }),
+            scale: planned.source.scale(),
+            values: planned.source.values().map(NewValues::words),
+            cast: (from.dtype != planned.dtype && transform != TensorTransform::Reinit)
+                .then(|| Cast { from: from.dtype.name(), to: planned.dtype.name() }),
             losses: None,
         });
     }
-    planned
 }
 
 /// The seam for a donor whose quantised weights would be cast in part: its scales belong to their type.
@@ -374,6 +405,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             spec,
             names,
             rename,
+            adapter: adapter(context, spec)?,
             part,
             into,
             slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
@@ -385,6 +417,23 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         out.push(rule);
     }
     Ok(out)
+}
+
+/// The adapter that an entry merges, with its tensors placed.
+fn adapter(context: &Context<'_>, spec: &TensorSpec) -> Result<Option<MergedAdapter>, MergeError> {
+    let Some(adapter) = &spec.adapter else { return Ok(None) };
+    let turned = adapter.turned.as_ref().map_or(Ok(Value::Null), |turned| turned.eval(&context.scope));
+    let turned = turned.map_err(context.at("turned"))?;
+    let turned = match turned {
+        Value::Null => Some(Vec::new()),
+        Value::Array(names) => names.into_iter().map(|name| name.as_str().map(str::to_owned)).collect(),
+        _ => None,
+    };
+    let turned = turned.ok_or_else(|| {
+        MergeError::Recipe(format!("{}: turned of an adapter is not a list of names", context.recipe.recipe))
+    })?;
+    let (Some(base), Some(donor)) = (context.donor(&spec.from), context.donor(&adapter.from)) else { return Ok(None) };
+    MergedAdapter::place(base, donor, turned, context.library).map(Some)
 }
 
 // Each parser takes the value of an expression, null when it is missing, and fails with what was expected.
@@ -454,29 +503,38 @@ fn source(
     taken: &TakenTensor<'_>,
     shape: &[u64],
     values: Option<Result<NewValues, String>>,
-) -> Result<TensorSource, String> {
+) -> Result<TensorExpr<TensorRef>, String> {
     let TakenTensor { donor, shard, tensor, rule, .. } = taken;
-    let from = TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, rule.slice)?;
+    if let Some(source) = rule.adapter.as_ref().and_then(|adapter| adapter.source(&tensor.name)) {
+        return Ok(source.clone());
+    }
+    let of = TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, rule.slice)?;
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);
     let changes = scale.is_some() || taken.dtype() != tensor.dtype;
-    let fits = from.shape == shape && !starts;
+    let fits = of.shape == shape && !starts;
     if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
-    let nests = nests(&from.shape, shape);
-    let fit = match rule.fit {
-        _ if fits => TensorTransform::Copy,
+    let nests = nests(&of.shape, shape);
+    let grows = nests && of.shape.iter().skip(1).eq(shape.iter().skip(1));
+    let rows = shape.first().copied().unwrap_or_default();
+    let (shape, dtype) = (shape.to_vec(), taken.dtype());
+    let fitted = match rule.fit {
+        _ if fits => TensorExpr::Stored(of),
         Fit::Copy => return Err(String::new()),
         Fit::Pad if !nests => return Err(CANNOT_SHRINK.to_owned()),
-        Fit::GrowRows | Fit::SampleRows if !nests || !from.shape.iter().skip(1).eq(shape.iter().skip(1)) => {
-            return Err("only rows can be added".to_owned());
+        Fit::GrowRows | Fit::SampleRows if !grows => return Err("only rows can be added".to_owned()),
+        Fit::Pad => TensorExpr::Pad { of, shape },
+        Fit::GrowRows => TensorExpr::GrowRows { of, rows },
+        Fit::SampleRows => TensorExpr::SampleRows { of, rows },
+        // New values have the size that the class gives them.
+        Fit::Reinit | Fit::ReinitAlways => {
+            let values = values.transpose()?.ok_or(UNKNOWN_VALUES)?;
+            return Ok(TensorExpr::Initialise { values, dtype, shape, instead_of: of });
         }
-        fit => fit.transform(),
     };
-    let values = values.transpose()?;
-    // New values have the size that the class gives them.
-    Ok(TensorSource { from, fit, scale: scale.filter(|_| !starts), values })
+    Ok(fitted.converted(tensor.dtype, scale, dtype))
 }
 
 /// Why `reinit` does not help.

@@ -215,6 +215,14 @@ impl Validator<'_> {
                 let reason = "`into` and `alone` name the tensors of a part; add `part`";
                 return Err(self.wrong("from", &tensor.from, reason));
             }
+            if let Some(adapter) = &tensor.adapter {
+                self.role("from", &adapter.from)?;
+                let others = [&tensor.fit, &tensor.scale, &tensor.slice, &tensor.dtype];
+                if tensor.drop.is_some() || others.into_iter().any(Option::is_some) {
+                    let reason = "an entry with `adapter` has no `fit`, `scale`, `slice`, `dtype` and `drop`";
+                    return Err(self.wrong("from", &adapter.from, reason));
+                }
+            }
             self.seam_tensor(tensor.meets.as_ref())?;
             self.named(tensor)?;
             if let Err(why) = pattern(&tensor.names) {

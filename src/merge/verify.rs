@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use self::recorded::{Recorded, RecordedFile, RecordedShard, RecordedTensor};
-use super::manifest;
+use super::manifest::{self, DonorTensor};
 use super::named::Bounds;
 use super::run::count;
 use crate::checkpoint::contents::digests::{HashJob, hash};
@@ -16,7 +16,8 @@ use crate::knowledge::source::hint;
 use crate::report::verification::{DifferenceKind, Verification, VerifiedPart};
 use crate::surgery::ApplyError;
 use crate::surgery::compare::compare;
-use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform};
+use crate::surgery::expr::TensorExpr;
+use crate::surgery::plan::{PlannedTensor, TensorRef};
 
 /// Why a result could not be verified.
 #[derive(Debug, thiserror::Error)]
@@ -66,10 +67,12 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
         parts.push(run.files()?);
     }
     parts.push(run.tensors()?);
-    for (role, dir) in donors {
-        let donor = Checkpoint::open(dir)?;
-        parts.push(run.donor_files(role, &donor)?);
-        parts.push(run.recomputed(role, &donor)?);
+    let opened = donors.iter().map(|(role, dir)| Ok((role.as_str(), Checkpoint::open(dir)?)));
+    let opened: BTreeMap<&str, Checkpoint> = opened.collect::<Result<_, OpenError>>()?;
+    let given = Given::new(&opened);
+    for (role, donor) in &opened {
+        parts.push(run.donor_files(role, donor)?);
+        parts.push(run.recomputed(role, &given)?);
     }
     Ok(Verification::new(shown(dir), recorded.recipe(), recorded.schema, parts, run.unverified))
 }
@@ -249,25 +252,32 @@ impl<'v> Run<'v> {
         Ok(part)
     }
 
-    /// The tensors of the result that were made from a donor, recomputed and compared byte for byte.
-    fn recomputed(&mut self, role: &str, donor: &Checkpoint) -> Result<VerifiedPart, VerifyError> {
+    /// The tensors of the result that stand for those of a donor, recomputed and compared byte for byte.
+    fn recomputed(&mut self, role: &str, given: &Given<'_>) -> Result<VerifiedPart, VerifyError> {
         let mut part = VerifiedPart::new(&format!("tensors recomputed from donor {role}"));
-        let there: BTreeMap<&str, (&Shard, &Tensor)> =
-            donor.tensors().map(|(s, t)| (t.name.as_str(), (s, t))).collect();
         let mut work = Vec::new();
-        for tensor in self.recorded.tensors.iter().filter(|tensor| tensor.source.donor == role) {
+        let mut lacking = BTreeSet::new();
+        for tensor in self.recorded.tensors.iter().filter(|tensor| tensor.main().donor == role) {
             let present = self.present.get(&(tensor.shard.as_str(), tensor.name.as_str()));
             // Reported with the tensors of the result.
             let Some((shard, found)) = present.filter(|(_, t)| header_difference(t, tensor).is_none()) else {
                 continue;
             };
-            let from = there.get(tensor.source.name.as_str());
-            let named = self.bounds.as_ref().is_none_or(|bounds| bounds.name(role, &tensor.source.name));
-            let planned =
-                from.and_then(|(shard, from)| planned(tensor, named, found, role, donor.source.path(), shard, from));
-            let planned = planned.filter(|planned| shard.is_whole() && planned.is_possible());
+            let named = self.bounds.as_ref().is_none_or(|bounds| bounds.name_source(&tensor.source));
+            let needed = if named { tensor.source.sources() } else { vec![tensor.main()] };
+            if let Some(other) = needed.iter().find(|source| !given.donors.contains_key(source.donor.as_str())) {
+                lacking.insert((other.donor.as_str(), tensor.name.as_str()));
+                continue;
+            }
+            let planned = planned(tensor, named, found, given).filter(|_| shard.is_whole());
             let at = shard.data_start.saturating_add(found.begin);
             work.push((tensor, planned, self.result.source.path().join(&shard.name), at));
+        }
+        if let Some((other, first)) = lacking.first() {
+            let tensors = count(lacking.len(), "tensor was", "tensors were");
+            self.unverified.push(format!(
+                "{tensors} not made again, the first one {first}: they are also made from the donor {other}, which is not given"
+            ));
         }
         let hash = self.recorded.hash();
         let compared = parallel::map(
@@ -280,15 +290,18 @@ impl<'v> Run<'v> {
         );
         for ((tensor, planned, ..), compared) in work.iter().zip(compared) {
             let (Some(planned), Some(compared)) = (planned, compared?) else {
-                let detail = format!("the donor has no {} that it could be made from", tensor.source.name);
+                let sources = tensor.source.sources().into_iter();
+                let lacking = sources.filter(|source| given.tensor(source, false).is_none()).map(|source| &source.name);
+                let name = lacking.chain([&tensor.main().name]).next().map_or("", String::as_str);
+                let detail = format!("the donor has no {name} that it could be made from");
                 part.differ(&tensor.name, DifferenceKind::Missing, Some(detail));
                 continue;
             };
             // The digest of a copy is that of its source.
-            let copied = tensor.digest.as_ref().filter(|_| tensor.transform == TensorTransform::Copy);
-            let source = tensor.source.digest.as_ref().or(copied);
-            let is_other_donor =
-                source.is_some_and(|s| compared.source_digest.as_ref().is_some_and(|found| s != found));
+            let copied = tensor.digest.as_ref().filter(|_| tensor.source.copied().is_some());
+            let recorded = tensor.source.sources().into_iter().map(|source| source.digest.as_ref().or(copied));
+            let mut digests = recorded.zip(&compared.source_digests);
+            let is_other_donor = digests.any(|(was, found)| was.zip(found.as_ref()).is_some_and(|(a, b)| a != b));
             match compared.difference {
                 None => part.equal = part.equal.saturating_add(1),
                 Some(place) => {
@@ -299,6 +312,32 @@ impl<'v> Run<'v> {
             }
         }
         Ok(part)
+    }
+}
+
+/// The tensors of a donor.
+type TensorsByName<'d> = BTreeMap<&'d str, (&'d Shard, &'d Tensor)>;
+
+/// The donors that were given, by role, with their tensors by name.
+struct Given<'d> {
+    donors: BTreeMap<&'d str, (&'d Path, TensorsByName<'d>)>,
+}
+
+impl<'d> Given<'d> {
+    fn new(opened: &'d BTreeMap<&'d str, Checkpoint>) -> Self {
+        let tensors = |donor: &'d Checkpoint| donor.tensors().map(|(s, t)| (t.name.as_str(), (s, t))).collect();
+        let donors = opened.iter().map(|(role, donor)| (*role, (donor.source.path(), tensors(donor))));
+        Self { donors: donors.collect() }
+    }
+
+    /// A recorded tensor of a donor, or its whole tensor; `None` when the donor has none of that name and type.
+    fn tensor(&self, source: &DonorTensor, whole: bool) -> Option<TensorRef> {
+        let (root, tensors) = self.donors.get(source.donor.as_str())?;
+        let (shard, tensor) = tensors.get(source.name.as_str())?;
+        let rows = source.slice.filter(|_| !whole).and_then(|slice| Some([slice.first, *source.shape.first()?]));
+        let from = TensorRef::new(&source.donor, root, shard, tensor, rows).ok()?;
+        let is_recorded = Dtype::from_name(&source.dtype) == Some(from.dtype) && (whole || from.shape == source.shape);
+        (is_recorded && shard.is_whole()).then_some(from)
     }
 }
 
@@ -344,40 +383,20 @@ fn without_bounds(recorded: &Recorded) -> Option<String> {
         recorded.schema,
         count(changed.len(), "tensor is", "tensors are"),
         first.name,
-        first.transform.name(),
+        first.source.transform().name(),
     ))
 }
 
-/// The plan of a recorded tensor; `None` when the donor's tensor has another type or shape than the recorded one. One that is
-/// not `named` has the donor's values, whatever is recorded.
-fn planned(
-    recorded: &RecordedTensor,
-    named: bool,
-    result: &Tensor,
-    role: &str,
-    root: &Path,
-    shard: &Shard,
-    tensor: &Tensor,
-) -> Option<PlannedTensor> {
-    let source = &recorded.source;
-    // Version 1 knew no casts.
-    let dtype = source.dtype.as_deref().map_or(Some(result.dtype), Dtype::from_name)?;
-    let rows = source.slice.filter(|_| named).and_then(|slice| Some([slice.first, *source.shape.first()?]));
-    let from = TensorRef::new(role, root, shard, tensor, rows).ok()?;
-    if from.dtype != dtype || (named && from.shape != source.shape) || !shard.is_whole() {
-        return None;
-    }
-    let fit = match recorded.transform {
-        TensorTransform::Convert => TensorTransform::Copy,
-        _ if !named => TensorTransform::Copy,
-        fit => fit,
+/// The plan of a recorded tensor; `None` when a donor's tensor has another type or shape than the recorded one, or the tensor
+/// cannot be made from it. One that is not `named` has the donor's values, whatever is recorded.
+fn planned(recorded: &RecordedTensor, named: bool, result: &Tensor, given: &Given<'_>) -> Option<PlannedTensor> {
+    let source = if named {
+        recorded.source.try_map(&mut |of| given.tensor(of, false).ok_or(())).ok()?
+    } else {
+        let of = given.tensor(recorded.main(), true)?;
+        let from = of.dtype;
+        TensorExpr::Stored(of).converted(from, None, result.dtype)
     };
-    let former = NewValues::former(&result.shape);
-    let values = (fit == TensorTransform::Reinit).then(|| recorded.values.unwrap_or(former));
-    Some(PlannedTensor {
-        name: recorded.name.clone(),
-        dtype: result.dtype,
-        shape: result.shape.clone(),
-        source: TensorSource { from, fit, scale: recorded.scale.filter(|_| named), values },
-    })
+    let planned = PlannedTensor::new(recorded.name.clone(), source).ok()?;
+    (planned.dtype == result.dtype && planned.shape == result.shape).then_some(planned)
 }

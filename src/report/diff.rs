@@ -93,7 +93,7 @@ fn shard(out: &mut String, at: &str, repair: &Repair, new: &PlannedShard) {
     let renamed: Vec<(&str, &str)> = new
         .tensors
         .iter()
-        .map(|t| (t.source.from.name.as_str(), t.name.as_str()))
+        .map(|t| (t.source.main().name.as_str(), t.name.as_str()))
         .filter(|(before, after)| before != after)
         .collect();
     let before = collapse(renamed.iter().map(|(before, _)| *before));

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use serde::{Serialize, Serializer};
 
 use crate::surgery::convert::CastLosses;
-use crate::surgery::plan::TensorTransform;
+use crate::surgery::expr::TensorTransform;
 
 /// The record of a merge.
 #[derive(Debug, Clone, Default, Serialize)]

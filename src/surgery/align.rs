@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::Path;
 
-use super::plan::{PlannedTensor, TensorTransform};
+use super::plan::PlannedTensor;
 
 /// Size of a block in bytes: that of a page on most systems, and the default of mkfs.
 pub const BLOCK: u64 = 4096;
@@ -29,10 +29,9 @@ pub fn file_order(a: &PlannedTensor, b: &PlannedTensor) -> Ordering {
 
 /// What the order compares. Files by role and name: a path depends on where the donors are.
 fn place(tensor: &PlannedTensor) -> impl Ord {
-    let from = &tensor.source.from;
-    let is_copy = tensor.transform() == TensorTransform::Copy;
-    let source = is_copy.then(|| (from.donor.clone(), from.path.file_name().map(OsStr::to_owned), from.offset));
-    (Reverse(tensor.dtype), Reverse(is_copy), source, tensor.name.clone())
+    let copied = tensor.copied();
+    let source = copied.map(|from| (from.donor.clone(), from.path.file_name().map(OsStr::to_owned), from.offset));
+    (Reverse(tensor.dtype), Reverse(copied.is_some()), source, tensor.name.clone())
 }
 
 /// Tensors in an order in which those of one large file of a donor are adjacent, with the number of that file. `None`, and last,
@@ -44,16 +43,16 @@ fn place(tensor: &PlannedTensor) -> impl Ord {
 pub fn by_file(tensors: Vec<PlannedTensor>) -> Vec<(Option<usize>, PlannedTensor)> {
     // The place of the first tensor of each file, which is its number, and the bytes of all.
     let mut files: BTreeMap<&Path, (usize, u64)> = BTreeMap::new();
-    let copied = |t: &PlannedTensor| t.transform() == TensorTransform::Copy;
-    for (i, tensor) in tensors.iter().enumerate().filter(|(_, t)| copied(t)) {
-        let (_, bytes) = files.entry(&tensor.source.from.path).or_insert((i, 0));
+    for (i, tensor) in tensors.iter().enumerate() {
+        let Some(from) = tensor.copied() else { continue };
+        let (_, bytes) = files.entry(&from.path).or_insert((i, 0));
         *bytes = bytes.saturating_add(tensor.len());
     }
     files.retain(|_, (_, bytes)| *bytes >= LARGE);
     if files.len() < 2 {
         files.clear();
     }
-    let number = |t: &PlannedTensor| files.get(t.source.from.path.as_path()).filter(|_| copied(t)).map(|(i, _)| *i);
+    let number = |t: &PlannedTensor| files.get(t.copied()?.path.as_path()).map(|(i, _)| *i);
     let numbers: Vec<Option<usize>> = tensors.iter().map(number).collect();
     let mut numbered: Vec<(Option<usize>, PlannedTensor)> = numbers.into_iter().zip(tensors).collect();
     numbered.sort_by_key(|(file, _)| file.unwrap_or(usize::MAX));
@@ -126,8 +125,8 @@ pub fn residue(tensors: &[PlannedTensor]) -> Option<u64> {
     let mut open: Option<Run<'_>> = None;
     let mut at = 0_u64;
     for tensor in tensors {
-        let (from, len) = (&tensor.source.from, tensor.len());
-        if tensor.transform() == TensorTransform::Copy {
+        let len = tensor.len();
+        if let Some(from) = tensor.copied() {
             let run = Run { path: &from.path, from: from.offset, at, len };
             if !open.as_mut().is_some_and(|open| open.extend(run)) {
                 open.replace(run).into_iter().for_each(&mut add);
@@ -148,7 +147,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::Dtype;
-    use crate::surgery::plan::{PlannedShard, TensorRef, TensorSource, into_shards};
+    use crate::surgery::plan::{PlannedShard, TensorRef, into_shards};
 
     const MIB: u64 = 1 << 20;
 
@@ -164,8 +163,7 @@ mod tests {
             len,
             slice: None,
         };
-        let name = format!("{path} {offset}");
-        PlannedTensor { name, dtype: Dtype::U8, shape: vec![len], source: TensorSource::copy(from) }
+        PlannedTensor::copy(format!("{path} {offset}"), from)
     }
 
     /// The only shard of these tensors, and where its data starts.
@@ -202,16 +200,12 @@ mod tests {
         for tensors in [vec![tensor("x", 800, MIB / 2)], vec![tensor("x", 801, 3 * MIB)], Vec::new()] {
             assert_eq!(residue(&tensors), None);
         }
-        let mut made = tensor("x", 800, 3 * MIB);
-        made.source.fit = TensorTransform::Reinit;
-        assert_eq!(residue(&[made]), None);
+        assert_eq!(residue(&[tensor("x", 800, 3 * MIB).started()]), None);
     }
 
     #[test]
     fn copies_have_the_order_of_the_donor_and_come_before_others() {
-        let mut made = tensor("a", 0, 1);
-        made.source.fit = TensorTransform::Reinit;
-        let tensors = vec![made, tensor("y", 5, 1), tensor("x", 100, 1), tensor("x", 9, 1)];
+        let tensors = vec![tensor("a", 0, 1).started(), tensor("y", 5, 1), tensor("x", 100, 1), tensor("x", 9, 1)];
         let (shard, _) = shard(tensors);
         let names: Vec<&str> = shard.tensors.iter().map(|t| t.name.as_str()).collect();
         assert_eq!(names, ["x 9", "x 100", "y 5", "a 0"]);
@@ -220,8 +214,7 @@ mod tests {
     #[test]
     fn large_files_of_donors_have_shards_of_their_own() {
         let large = |path, offset| tensor(path, offset, LARGE);
-        let mut made = tensor("x", 1 << 40, 2 * MIB);
-        made.source.fit = TensorTransform::Reinit;
+        let made = tensor("x", 1 << 40, 2 * MIB).started();
         let tensors = vec![large("x", 800), tensor("z", 8, MIB), large("y", 16), made, large("x", 800 + LARGE)];
         let names = |shards: &[PlannedShard]| -> Vec<Vec<String>> {
             shards.iter().map(|s| s.tensors.iter().map(|t| t.name.clone()).collect()).collect()

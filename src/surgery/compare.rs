@@ -1,9 +1,9 @@
-//! Compares a tensor of a result with what its donor gives, byte for byte.
+//! Compares a tensor of a result with what its donors give, byte for byte.
 
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::donor::DonorFile;
+use super::donor::{DonorFile, OpenDonors};
 use super::error::ApplyError;
 use super::plan::PlannedTensor;
 use super::stream::{block, stream};
@@ -14,22 +14,22 @@ use crate::checkpoint::HashAlgorithm;
 pub struct Compared {
     /// Offset of the first byte that differs, from the start of the tensor; `None` when all are equal.
     pub difference: Option<u64>,
-    /// Digest of the donor's part; `None` if none of its bytes were read, or without an algorithm.
-    pub source_digest: Option<String>,
+    /// Digests of the donors' parts, in the order of the expression's sources; `None` for one of which no bytes were read, or
+    /// without an algorithm.
+    pub source_digests: Vec<Option<String>>,
 }
 
-/// Recomputes `tensor` from its donor, and compares it with the bytes from `at` on in the file `result`; `hash` is the
-/// algorithm of the donor's digest.
+/// Recomputes `tensor` from its donors, and compares it with the bytes from `at` on in the file `result`; `hash` is the
+/// algorithm of the donors' digests.
 ///
 /// # Errors
 /// [`ApplyError`] when a file cannot be opened or read.
 pub fn compare(tensor: &PlannedTensor, result: &Path, at: u64, hash: HashAlgorithm) -> Result<Compared, ApplyError> {
-    let donor = DonorFile::open(&tensor.source.from.path)?;
     let mut out =
         Comparison { file: DonorFile::open(result)?, start: at, len: 0, difference: None, buffer: Vec::new() };
-    let streamed = stream(&donor, tensor, hash, result, &mut out)?;
+    let streamed = stream(&mut OpenDonors::default(), tensor, hash, result, &mut out)?;
     let difference = out.difference.or_else(|| (out.len != tensor.len()).then_some(out.len));
-    Ok(Compared { difference, source_digest: streamed.source_digest })
+    Ok(Compared { difference, source_digests: streamed.source_digests })
 }
 
 /// Compares what is written to it with a range of a file.

@@ -99,6 +99,44 @@ impl DonorFile {
     }
 }
 
+/// Files of donors that stay open from tensor to tensor.
+///
+/// Adjacent tensors are usually in the same file.
+#[derive(Default)]
+pub(super) struct OpenDonors {
+    open: Vec<DonorFile>,
+}
+
+impl OpenDonors {
+    /// Number of files that stay open.
+    const KEPT: usize = 4;
+
+    /// The files at these paths, in their order, opened where they are not.
+    ///
+    /// # Errors
+    /// [`ApplyError::Changed`] when one can no longer be opened.
+    pub(super) fn files(&mut self, paths: &[&Path]) -> Result<Vec<&DonorFile>, ApplyError> {
+        if self.open.len().saturating_add(paths.len()) > Self::KEPT {
+            self.open.retain(|file| paths.contains(&file.path.as_path()));
+        }
+        for path in paths {
+            if !self.open.iter().any(|file| file.path == **path) {
+                self.open.push(DonorFile::open(path)?);
+            }
+        }
+        Ok(paths.iter().filter_map(|path| self.open.iter().find(|file| file.path == **path)).collect())
+    }
+
+    /// The file at this path, opened if it is not.
+    ///
+    /// # Errors
+    /// As [`Self::files`].
+    pub(super) fn file(&mut self, path: &Path) -> Result<&DonorFile, ApplyError> {
+        let gone = || ApplyError::Changed { path: path.to_owned(), reason: "became unreadable".to_owned() };
+        self.files(&[path])?.pop().ok_or_else(gone)
+    }
+}
+
 /// Size and SHA-256 of a small file of the donor with these files; `None` when a merge would not read it: it is missing, not a
 /// regular file, larger than a vocabulary, or a link out of the donor.
 ///

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::align::{self, BLOCK};
-use super::values::can_compute;
+use super::expr::{TensorExpr, TensorTransform};
 use crate::checkpoint::{Dtype, FileName, Shard, Tensor, byte_len};
 
 /// A checkpoint to be written.
@@ -54,7 +54,7 @@ pub fn format_pt() -> BTreeMap<String, String> {
     BTreeMap::from([("format".to_owned(), "pt".to_owned())])
 }
 
-/// A tensor of a planned shard.
+/// A tensor of a planned shard: type and shape are those of its expression.
 #[derive(Debug, Clone)]
 pub struct PlannedTensor {
     /// State-dict name.
@@ -63,12 +63,12 @@ pub struct PlannedTensor {
     pub dtype: Dtype,
     /// Shape in the result.
     pub shape: Vec<u64>,
-    /// Source of its bytes.
-    pub source: TensorSource,
+    /// How its values are made.
+    pub source: TensorExpr<TensorRef>,
 }
 
 /// A tensor of a donor, or some of its rows, with the byte range.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TensorRef {
     /// Donor role.
     pub donor: String,
@@ -97,20 +97,6 @@ pub struct RowSlice {
     pub first: u64,
     /// Number of rows of the whole tensor.
     pub of: u64,
-}
-
-/// Source of a tensor's bytes: rows of a donor tensor, fitted to the shape of the planned tensor, multiplied by a constant,
-/// and cast to its type.
-#[derive(Debug, Clone)]
-pub struct TensorSource {
-    /// The donor tensor that is used, or that [`TensorTransform::Reinit`] replaces.
-    pub from: TensorRef,
-    /// How it gets its shape: one of [`TensorTransform::FITS`].
-    pub fit: TensorTransform,
-    /// Factor on all values.
-    pub scale: Option<f64>,
-    /// The values that [`TensorTransform::Reinit`] writes; `None` for the others.
-    pub values: Option<NewValues>,
 }
 
 /// The values of a tensor that starts again, as its class gives them to a new model.
@@ -157,45 +143,6 @@ impl NewValues {
     }
 }
 
-/// How the bytes of a tensor are made from those of a donor. All values except [`Self::Copy`] and [`Self::Reinit`] may also
-/// be scaled and cast.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(rename_all = "kebab-case")]
-#[non_exhaustive]
-pub enum TensorTransform {
-    /// The donor's bytes as they are.
-    Copy,
-    /// The donor's values in their shape, scaled or cast.
-    Convert,
-    /// The donor's rows, then rows that hold their mean.
-    GrowRows,
-    /// The donor's rows, then seeded random rows with their mean and, times 1e-9, their covariance.
-    SampleRows,
-    /// The donor's values in the leading corner, zeros elsewhere.
-    Pad,
-    /// The values that the class gives to a new model; random ones are seeded with the name of the tensor.
-    Reinit,
-}
-
-impl TensorTransform {
-    /// The ways in which a tensor gets its shape.
-    pub const FITS: [Self; 5] = [Self::Copy, Self::GrowRows, Self::SampleRows, Self::Pad, Self::Reinit];
-
-    /// The name in recipes, options and reports.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Copy => "copy",
-            Self::Convert => "convert",
-            Self::GrowRows => "grow-rows",
-            Self::SampleRows => "sample-rows",
-            Self::Pad => "pad",
-            Self::Reinit => "reinit",
-        }
-    }
-}
-
 impl TensorRef {
     /// A tensor of a shard in `root`, or some of its rows: the index of the first one and their number.
     ///
@@ -232,45 +179,34 @@ impl TensorRef {
     }
 }
 
-impl TensorSource {
-    /// The bytes of a donor tensor, unchanged.
-    #[must_use]
-    pub const fn copy(from: TensorRef) -> Self {
-        Self { from, fit: TensorTransform::Copy, scale: None, values: None }
-    }
-}
-
 impl PlannedTensor {
-    /// Whether its transform can make its shape and type from its source.
-    #[must_use]
-    pub fn is_possible(&self) -> bool {
-        let (from, to) = (&self.source.from.shape, &self.shape);
-        let is_computed = self.transform() != TensorTransform::Copy;
-        let nests = from.len() == to.len() && from.iter().zip(to).all(|(have, want)| have <= want);
-        let fits = match self.source.fit {
-            TensorTransform::Copy | TensorTransform::Convert => from == to,
-            TensorTransform::Pad => nests,
-            TensorTransform::GrowRows | TensorTransform::SampleRows => {
-                nests && !to.is_empty() && from.iter().skip(1).eq(to.iter().skip(1))
-            }
-            TensorTransform::Reinit => self.source.values.is_some_and(NewValues::is_possible),
-        };
-        let types = !is_computed || (can_compute(self.dtype) && can_compute(self.source.from.dtype));
-        fits && types && self.source.scale.is_none_or(|scale| scale.is_finite() && scale != 0.0)
+    /// The tensor that an expression makes.
+    ///
+    /// # Errors
+    /// Why it cannot be made.
+    pub fn new(name: String, source: TensorExpr<TensorRef>) -> Result<Self, String> {
+        let (dtype, shape) = source.typed()?;
+        Ok(Self { name, dtype, shape, source })
     }
 
-    /// How its bytes are made.
+    /// A whole donor tensor, unchanged.
+    #[must_use]
+    pub fn copy(name: String, from: TensorRef) -> Self {
+        Self { name, dtype: from.dtype, shape: from.shape.clone(), source: TensorExpr::Stored(from) }
+    }
+
+    /// The bytes of a donor's file that are those of the tensor; `None` when it is computed.
+    #[must_use]
+    pub const fn copied(&self) -> Option<&TensorRef> {
+        self.source.copied()
+    }
+
+    /// How its bytes are made, in one word.
     #[must_use]
     pub fn transform(&self) -> TensorTransform {
-        let converts = self.source.scale.is_some() || self.dtype != self.source.from.dtype;
-        match self.source.fit {
-            TensorTransform::Copy if converts => TensorTransform::Convert,
-            fit => fit,
-        }
+        self.source.transform()
     }
-}
 
-impl PlannedTensor {
     /// Number of bytes in the result.
     ///
     /// Shapes of a plan come from checked headers and architectures with limits; an overflow is counted as the largest
@@ -278,6 +214,16 @@ impl PlannedTensor {
     #[must_use]
     pub(crate) fn len(&self) -> u64 {
         byte_len(self.dtype, &self.shape).unwrap_or(u64::MAX)
+    }
+}
+
+#[cfg(test)]
+impl PlannedTensor {
+    /// The tensor with zeros in place of its values.
+    pub(crate) fn started(self) -> Self {
+        let (values, dtype, shape) = (NewValues::Zeros, self.dtype, self.shape.clone());
+        let instead_of = self.source.main().clone();
+        Self { source: TensorExpr::Initialise { values, dtype, shape, instead_of }, ..self }
     }
 }
 

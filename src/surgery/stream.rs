@@ -1,10 +1,10 @@
-//! The bytes of a planned tensor, streamed from its donor.
+//! The bytes of a planned tensor, streamed from its donors.
 
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use super::convert::CastLosses;
-use super::donor::DonorFile;
+use super::donor::{DonorFile, OpenDonors};
 use super::error::{ApplyError, io_at};
 use super::plan::{PlannedTensor, TensorRef};
 use super::stop::interrupted;
@@ -20,85 +20,89 @@ const BLOCK: usize = 256 * 1024;
 pub(super) struct Streamed {
     /// Values of the donor that scaling and casting could not keep.
     pub(super) losses: CastLosses,
-    /// Digest of the donor's tensor; `None` if none of its bytes were read, or without an algorithm.
-    pub(super) source_digest: Option<String>,
+    /// Digests of the donors' tensors, in the order of the expression's sources; `None` for one of which no bytes were read, or
+    /// without an algorithm. Empty for a byte copy.
+    pub(super) source_digests: Vec<Option<String>>,
 }
 
 /// Writes the bytes of a planned tensor into `out`: a file of the result, or the comparison of a verification.
 ///
-/// `donor` is the open file of the tensor's source, which is hashed by `hash`; `path` names `out` in errors of writing.
+/// `donors` opens the files of the tensor's sources, which are hashed by `hash`; `path` names `out` in errors of writing.
 ///
 /// # Errors
-/// [`ApplyError::Changed`] when the donor is shorter than the source, [`ApplyError::Io`] for other errors of reading and
+/// [`ApplyError::Changed`] when a donor is shorter than a source, [`ApplyError::Io`] for other errors of reading and
 /// for errors of writing, and [`ApplyError::Interrupted`].
 pub(super) fn stream(
-    donor: &DonorFile,
+    donors: &mut OpenDonors,
     tensor: &PlannedTensor,
     hash: HashAlgorithm,
     path: &Path,
     out: &mut dyn Write,
 ) -> Result<Streamed, ApplyError> {
-    let from = &tensor.source.from;
+    let sources = tensor.source.sources();
+    let paths: Vec<&Path> = sources.iter().map(|from| from.path.as_path()).collect();
+    let source = |(from, donor)| SourceDigest { from, donor, hash: Hasher::new(hash), len: 0, is_read: false };
+    let mut sources: Vec<SourceDigest<'_>> = sources.into_iter().zip(donors.files(&paths)?).map(source).collect();
     let mut failed_read = None;
-    let mut digest =
-        SourceDigest { hash: (hash != HashAlgorithm::None).then(|| Hasher::new(hash)), len: 0, is_read: false };
     let result = {
         let mut writer = BufWriter::with_capacity(BLOCK, out);
-        let mut read = |at: u64, buf: &mut [u8]| {
-            if interrupted().is_err() {
+        let mut read = |from: &TensorRef, at: u64, buf: &mut [u8]| {
+            let source = sources.iter_mut().find(|source| std::ptr::eq(source.from, from));
+            let Some(source) = source.filter(|_| interrupted().is_ok()) else {
                 return Err(io::Error::from(io::ErrorKind::Other));
-            }
-            donor.read_at(buf, from.offset.saturating_add(at)).map_err(|e| {
+            };
+            source.donor.read_at(buf, from.offset.saturating_add(at)).map_err(|e| {
                 let kind = e.kind();
-                failed_read = Some(e);
+                failed_read = Some(source.donor.read_error(e));
                 io::Error::from(kind)
             })?;
-            digest.add(at, buf);
+            source.add(at, buf);
             Ok(())
         };
         let losses = transform::write(&mut read, tensor, &mut writer);
         losses.and_then(|losses| writer.flush().map(|()| losses))
     };
     interrupted()?;
-    if let Some(e) = failed_read {
-        return Err(donor.read_error(e));
+    if let Some(error) = failed_read {
+        return Err(error);
     }
     let losses = result.map_err(io_at(path, "writing"))?;
-    Ok(Streamed { losses, source_digest: digest.finish(donor, from)? })
+    let is_hashed = hash != HashAlgorithm::None;
+    let digests = sources.into_iter().map(|source| if is_hashed { source.finish() } else { Ok(None) });
+    Ok(Streamed { losses, source_digests: digests.collect::<Result<_, _>>()? })
 }
 
-/// The digest of a donor's tensor that a transform reads, usually once and in order.
-struct SourceDigest {
-    /// `None` without an algorithm.
-    hash: Option<Hasher>,
+/// A donor's tensor and the digest of what is read of it, usually once and in order.
+struct SourceDigest<'s> {
+    from: &'s TensorRef,
+    donor: &'s DonorFile,
+    hash: Hasher,
     /// Number of bytes in `hash`, from the start of the tensor.
     len: u64,
     is_read: bool,
 }
 
-impl SourceDigest {
+impl SourceDigest<'_> {
     /// Adds bytes read at an offset in the tensor, unless they are already included.
     fn add(&mut self, at: u64, bytes: &[u8]) {
         self.is_read = true;
-        if let Some(hash) = self.hash.as_mut().filter(|_| at == self.len) {
-            hash.update(bytes);
+        if at == self.len {
+            self.hash.update(bytes);
             self.len = self.len.saturating_add(bytes.len() as u64);
         }
     }
 
-    /// The digest, after the bytes that the transform left out are read.
-    fn finish(mut self, donor: &DonorFile, from: &TensorRef) -> Result<Option<String>, ApplyError> {
-        if !self.is_read || self.hash.is_none() {
-            return Ok(None);
-        }
+    /// The digest, after the bytes that the expression left out are read; `None` if it read none.
+    fn finish(mut self) -> Result<Option<String>, ApplyError> {
         let mut buffer = Vec::new();
-        while self.len < from.len {
+        while self.is_read && self.len < self.from.len {
             interrupted()?;
-            let block = block(&mut buffer, from.len.saturating_sub(self.len));
-            donor.read_at(block, from.offset.saturating_add(self.len)).map_err(|e| donor.read_error(e))?;
+            let block = block(&mut buffer, self.from.len.saturating_sub(self.len));
+            let at = self.from.offset.saturating_add(self.len);
+            self.donor.read_at(block, at).map_err(|e| self.donor.read_error(e))?;
             self.add(self.len, block);
         }
-        Ok(self.hash.and_then(Hasher::finish_hex))
+        Ok(self.hash.finish_hex().filter(|_| self.is_read))
     }
 }
 

@@ -1,6 +1,6 @@
-//! The bytes of a planned tensor: the donor's rows, fitted to the shape, scaled and cast.
+//! The bytes of a planned tensor: evaluates its expression, from its leaves into a chain of writers.
 //!
-//! Each function streams into a writer and keeps at most a few rows in memory.
+//! Each function streams into a writer and keeps at most a few rows in memory, and the factors of a product.
 
 use std::io::{self, Write};
 
@@ -10,7 +10,9 @@ use rand_distr::{Distribution, Normal, StandardNormal, Uniform};
 use sha2::{Digest, Sha256};
 
 use super::convert::{CastLosses, Converter};
-use super::plan::{NewValues, PlannedTensor, TensorTransform};
+use super::expr::TensorExpr;
+use super::plan::{NewValues, PlannedTensor, TensorRef};
+use super::product::Adder;
 use super::values::Codec;
 use crate::checkpoint::Dtype;
 
@@ -19,49 +21,72 @@ const SAMPLE_VARIANCE: f64 = 1e-9;
 /// Donor rows that a sampled row combines.
 const SAMPLE_TERMS: u32 = 64;
 
-/// Writes the bytes of a planned tensor; returns the values that its cast could not keep.
+/// Writes the bytes of a planned tensor; returns the values that its casts could not keep.
 ///
-/// `read` reads the part of the donor tensor that is used.
+/// `read` reads the parts of the donors' tensors that are used. The expression must have the type and the shape of the tensor.
 ///
 /// # Errors
-/// Errors of reading or writing.
+/// Errors of reading or writing; [`io::ErrorKind::InvalidInput`] for operands that do not fit.
 pub fn write(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<CastLosses> {
-    let source = &tensor.source;
-    if source.fit == TensorTransform::Reinit {
-        let values = source.values.unwrap_or(NewValues::former(&tensor.shape));
-        new_values(&tensor.name, tensor.dtype, &tensor.shape, values, out)?;
-        return Ok(CastLosses::default());
-    }
-    if tensor.dtype == source.from.dtype && source.scale.is_none() {
-        fit(read, tensor, out)?;
-        return Ok(CastLosses::default());
-    }
-    let mut converter = Converter::new(source.from.dtype, tensor.dtype, source.scale, out);
-    fit(read, tensor, &mut converter)?;
-    Ok(converter.losses())
+    let mut losses = CastLosses::default();
+    evaluate(read, &tensor.name, &tensor.source, &mut losses, out)?;
+    Ok(losses)
 }
 
-/// Writes the donor's values in the planned shape, in the donor's type.
-fn fit(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<()> {
-    let from = &tensor.source.from;
-    let to = &tensor.shape;
-    let rows = from.shape.first().copied().unwrap_or_default();
-    let table = Table {
-        dtype: from.dtype,
-        rows,
-        width: to.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d)),
-        more: to.first().copied().unwrap_or_default().saturating_sub(rows),
-    };
-    match tensor.source.fit {
-        TensorTransform::Pad => pad(read, from.dtype.bits() / 8, &from.shape, to, out),
-        TensorTransform::GrowRows => grow_rows(read, table, out),
-        TensorTransform::SampleRows => sample_rows(read, table, &tensor.name, out),
-        TensorTransform::Copy | TensorTransform::Convert | TensorTransform::Reinit => copy(read, 0, from.len, out),
+/// Writes the values of an expression of the tensor `name`, and adds to the losses.
+fn evaluate(
+    read: &mut ReadAt<'_>,
+    name: &str,
+    source: &TensorExpr<TensorRef>,
+    losses: &mut CastLosses,
+    out: &mut dyn Write,
+) -> io::Result<()> {
+    let mut of = |from: &TensorRef, at: u64, buffer: &mut [u8]| read(from, at, buffer);
+    match source {
+        TensorExpr::Stored(from) => copy(&mut |at, buffer| of(from, at, buffer), from.len, out),
+        TensorExpr::GrowRows { of: from, rows } => {
+            grow_rows(&mut |at, buffer| of(from, at, buffer), Table::of(from, *rows), out)
+        }
+        TensorExpr::SampleRows { of: from, rows } => {
+            sample_rows(&mut |at, buffer| of(from, at, buffer), Table::of(from, *rows), name, out)
+        }
+        TensorExpr::Pad { of: from, shape } => {
+            pad(&mut |at, buffer| of(from, at, buffer), from.dtype.bits() / 8, &from.shape, shape, out)
+        }
+        TensorExpr::Initialise { values, dtype, shape, .. } => new_values(name, *dtype, shape, *values, out),
+        TensorExpr::Cast { of, to } => convert(read, name, of, (None, *to), losses, out),
+        TensorExpr::Scale { of, by, to } => convert(read, name, of, (Some(*by), *to), losses, out),
+        TensorExpr::AddProduct { to, product } => {
+            let (dtype, shape) = to.typed().map_err(|reason| io::Error::new(io::ErrorKind::InvalidInput, reason))?;
+            let mut adder = Adder::new(read, product, dtype, &shape, out)?;
+            evaluate(read, name, to, losses, &mut adder)?;
+            losses.add(adder.losses());
+            Ok(())
+        }
     }
 }
 
-/// Reads bytes of the donor tensor: `read(offset within the tensor, buffer)`.
-pub type ReadAt<'a> = dyn FnMut(u64, &mut [u8]) -> io::Result<()> + 'a;
+/// Writes values multiplied by a constant, and cast.
+fn convert(
+    read: &mut ReadAt<'_>,
+    name: &str,
+    of: &TensorExpr<TensorRef>,
+    (scale, to): (Option<f64>, Dtype),
+    losses: &mut CastLosses,
+    out: &mut dyn Write,
+) -> io::Result<()> {
+    let (from, _) = of.typed().map_err(|reason| io::Error::new(io::ErrorKind::InvalidInput, reason))?;
+    let mut converter = Converter::new(from, to, scale, out);
+    evaluate(read, name, of, losses, &mut converter)?;
+    losses.add(converter.losses());
+    Ok(())
+}
+
+/// Reads bytes of a donor's tensor: `read(tensor, offset within the tensor, buffer)`.
+pub type ReadAt<'a> = dyn FnMut(&TensorRef, u64, &mut [u8]) -> io::Result<()> + 'a;
+
+/// Reads bytes of the only operand of an operation: `read(offset within the tensor, buffer)`.
+pub type ReadOperand<'a> = dyn FnMut(u64, &mut [u8]) -> io::Result<()> + 'a;
 
 /// Writes `count` zero bytes.
 fn zeros(out: &mut dyn Write, mut count: u64) -> io::Result<()> {
@@ -74,11 +99,13 @@ fn zeros(out: &mut dyn Write, mut count: u64) -> io::Result<()> {
     Ok(())
 }
 
+/// Copies the `len` bytes of a donor's tensor.
+fn copy(read: &mut ReadOperand<'_>, len: u64, out: &mut dyn Write) -> io::Result<()> {
+    copy_range(read, 0, len, out)
+}
+
 /// Copies `len` bytes from `offset` of the donor tensor.
-///
-/// # Errors
-/// Errors of reading or writing.
-pub fn copy(read: &mut ReadAt<'_>, mut offset: u64, mut len: u64, out: &mut dyn Write) -> io::Result<()> {
+fn copy_range(read: &mut ReadOperand<'_>, mut offset: u64, mut len: u64, out: &mut dyn Write) -> io::Result<()> {
     let mut block = vec![0_u8; usize::try_from(len).map_or(256 * 1024, |n| n.min(256 * 1024))];
     while len > 0 {
         let n = usize::try_from(len).map_or(block.len(), |c| c.min(block.len()));
@@ -98,9 +125,9 @@ pub fn copy(read: &mut ReadAt<'_>, mut offset: u64, mut len: u64, out: &mut dyn 
 ///
 /// # Errors
 /// Errors of reading or writing; [`io::ErrorKind::InvalidInput`] for shapes that do not nest.
-pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut dyn Write) -> io::Result<()> {
+pub fn pad(read: &mut ReadOperand<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut dyn Write) -> io::Result<()> {
     fn inner(
-        read: &mut ReadAt<'_>,
+        read: &mut ReadOperand<'_>,
         at: &mut u64,
         elem: u64,
         from: &[u64],
@@ -112,14 +139,14 @@ pub fn pad(read: &mut ReadAt<'_>, elem: u64, from: &[u64], to: &[u64], out: &mut
             // The remaining dimensions are equal: one range of bytes.
             _ if from == to => {
                 let len = stride(from);
-                copy(read, *at, len, out)?;
+                copy_range(read, *at, len, out)?;
                 *at = at.saturating_add(len);
                 Ok(())
             }
             (Some((f, from_rest)), Some((t, to_rest))) if f <= t && from_rest.len() == to_rest.len() => {
                 if from_rest == to_rest {
                     let len = stride(from);
-                    copy(read, *at, len, out)?;
+                    copy_range(read, *at, len, out)?;
                     *at = at.saturating_add(len);
                 } else {
                     for _ in 0..*f {
@@ -151,13 +178,20 @@ pub struct Table {
 }
 
 impl Table {
+    /// The rows of a donor, which get up to `rows`.
+    fn of(from: &TensorRef, rows: u64) -> Self {
+        let have = from.shape.first().copied().unwrap_or_default();
+        let width = from.shape.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d));
+        Self { dtype: from.dtype, rows: have, width, more: rows.saturating_sub(have) }
+    }
+
     /// Bytes of a row.
     fn row_len(self) -> io::Result<usize> {
         usize::try_from(self.width.saturating_mul(self.dtype.bits() / 8)).map_err(io::Error::other)
     }
 
     /// Copies the rows and returns their mean; zeros without rows.
-    fn copy_rows(self, read: &mut ReadAt<'_>, codec: &mut Codec, out: &mut dyn Write) -> io::Result<Vec<f64>> {
+    fn copy_rows(self, read: &mut ReadOperand<'_>, codec: &mut Codec, out: &mut dyn Write) -> io::Result<Vec<f64>> {
         let mut row = vec![0_u8; self.row_len()?];
         let mut mean = vec![0_f64; usize::try_from(self.width).map_err(io::Error::other)?];
         let mut at = 0_u64;
@@ -182,7 +216,7 @@ impl Table {
 ///
 /// # Errors
 /// Errors of reading or writing.
-pub fn grow_rows(read: &mut ReadAt<'_>, table: Table, out: &mut dyn Write) -> io::Result<()> {
+pub fn grow_rows(read: &mut ReadOperand<'_>, table: Table, out: &mut dyn Write) -> io::Result<()> {
     let mut codec = Codec::default();
     let mean = table.copy_rows(read, &mut codec, out)?;
     let mut row = Vec::new();
@@ -202,7 +236,7 @@ pub fn grow_rows(read: &mut ReadAt<'_>, table: Table, out: &mut dyn Write) -> io
 ///
 /// # Errors
 /// Errors of reading or writing.
-pub fn sample_rows(read: &mut ReadAt<'_>, table: Table, name: &str, out: &mut dyn Write) -> io::Result<()> {
+pub fn sample_rows(read: &mut ReadOperand<'_>, table: Table, name: &str, out: &mut dyn Write) -> io::Result<()> {
     let mut codec = Codec::default();
     let mean = table.copy_rows(read, &mut codec, out)?;
     let mut rng = seeded(name);

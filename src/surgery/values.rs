@@ -107,6 +107,26 @@ impl Codec {
         self.encode_f32(dtype, out);
     }
 
+    /// Decodes whole elements of a type of at most 32 bits.
+    pub(super) fn singles(&mut self, dtype: Dtype, bytes: &[u8]) -> &mut Vec<f32> {
+        self.decode_f32(dtype, bytes);
+        &mut self.f32
+    }
+
+    /// Appends the values of the last [`Self::singles`] to `out`, as a type of at most 32 bits.
+    pub(super) fn encode_singles(&mut self, dtype: Dtype, out: &mut Vec<u8>) {
+        self.encode_f32(dtype, out);
+    }
+
+    /// Rounds values to a type of at most 32 bits.
+    pub(super) fn round(&mut self, dtype: Dtype, values: &mut Vec<f32>) {
+        let mut bytes = Vec::new();
+        std::mem::swap(&mut self.f32, values);
+        self.encode_f32(dtype, &mut bytes);
+        self.decode_f32(dtype, &bytes);
+        std::mem::swap(&mut self.f32, values);
+    }
+
     /// Converts between two types of at most 32 bits.
     pub(super) fn cast(&mut self, from: Dtype, to: Dtype, bytes: &[u8], out: &mut Vec<u8>) {
         self.decode_f32(from, bytes);

@@ -3,7 +3,8 @@
 use sha2::{Digest as _, Sha256};
 
 use super::convert::CastLosses;
-use super::plan::{Plan, PlannedFile, PlannedTensor, TensorTransform};
+use super::expr::TensorExpr;
+use super::plan::{Plan, PlannedFile, PlannedTensor};
 use crate::checkpoint::{FileName, HashAlgorithm, hex, parallel};
 
 /// How [`super::apply()`] writes a plan. The bytes of the shards do not depend on it.
@@ -44,8 +45,9 @@ pub struct WrittenTensor {
     pub digest: Option<String>,
     /// Values of the donor that scaling and casting could not keep.
     pub losses: CastLosses,
-    /// Digest of the donor's tensor, if it was read and is not equal by the transform.
-    pub source_digest: Option<String>,
+    /// Digests of the donors' tensors, in the order of [`TensorExpr::sources`]; `None` for one that was not read, and empty for a
+    /// copy, which has the digest of its source.
+    pub source_digests: Vec<Option<String>>,
 }
 
 impl WrittenShard {
@@ -57,9 +59,10 @@ impl WrittenShard {
         let zeros = || "0".repeat(64);
         let digest = || (hash != HashAlgorithm::None).then(zeros);
         let tensor = |tensor: &PlannedTensor| {
-            let is_read = tensor.transform() != TensorTransform::Copy && tensor.source.fit != TensorTransform::Reinit;
-            let source_digest = digest().filter(|_| is_read);
-            WrittenTensor { digest: digest(), losses: CastLosses::default(), source_digest }
+            let is_read = !matches!(tensor.source, TensorExpr::Stored(_) | TensorExpr::Initialise { .. });
+            let sources = if is_read { tensor.source.sources() } else { Vec::new() };
+            let source_digests = sources.into_iter().map(|_| digest()).collect();
+            WrittenTensor { digest: digest(), losses: CastLosses::default(), source_digests }
         };
         let shards = plan.shards.iter();
         let expected = shards.map(|shard| Self {

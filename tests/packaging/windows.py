@@ -42,6 +42,7 @@ REFUSED = [
     ["undo", "model"],
     ["build-merged", "--vision", "model", "--language", "model", "--out", "out"],
     ["extract", "model", "--part", "language", "--out", "out"],
+    ["merge-adapter", "model", "adapter", "--out", "out"],
     ["insert", "model", "--part", "language", "--from", "model", "--out", "out"],
 ]
 

@@ -167,6 +167,16 @@ def read_tensors(directory):
     return {name: tensor for path in sorted(Path(directory).glob("*.safetensors")) for name, tensor in read_shard(path).items()}
 
 
+def stands_for(expression):
+    """The donor's tensor that an expression of a manifest stands for."""
+    ((word, content),) = expression.items()
+    if word in ("cast", "scale"):
+        return stands_for(content["of"])
+    if word == "add-product":
+        return stands_for(content["to"])
+    return content if word == "stored" else content["instead-of" if word == "initialise" else "of"]
+
+
 def tiny_sentencepiece(directory, name, vocab_size, **ids):
     """Trains a small sentencepiece model and returns its path."""
     import random

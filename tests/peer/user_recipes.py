@@ -8,7 +8,7 @@ is compared with the donor tensor that the manifest names.
 import json
 import shutil
 
-from peer import ROOT, Tally, doctor, quiet, read_tensors, workplace
+from peer import ROOT, Tally, doctor, quiet, read_tensors, stands_for, workplace
 
 RECIPES = ROOT / "fixtures" / "recipes"
 # Donor, folder of its documents, changes of its config.
@@ -64,7 +64,8 @@ def compare(tally, what, donors, out):
     read = {role: read_tensors(path) for role, path in donors.items()}
     equal = 0
     for entry in manifest["tensors"]:
-        source = read[entry["source"]["donor"]][entry["source"]["name"]]
+        of = stands_for(entry["source"])
+        source = read[of["donor"]][of["name"]]
         result = got.pop(entry["name"])
         if entry["transform"] == "copy":
             equal += tally.expect(result == source, f"{what}: {entry['name']} differs from the donor")

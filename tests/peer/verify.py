@@ -17,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 from blake3 import blake3
+from peer import stands_for
 from safetensors import safe_open
 
 PROGRAM = os.environ["CKPT_DOCTOR"]
@@ -79,8 +80,9 @@ def compare(out, manifest, draw):
             assert there["shards"][shard.name]["header_sha256"] == digest(header(shard.read_bytes()))
             for name, _, data in tensors(shard):
                 for t in manifest["tensors"]:
-                    if (t["source"]["donor"], t["source"]["name"]) == (role, name) and t["transform"] != "reinit":
-                        copied = t if t["transform"] == "copy" else t["source"]
+                    source = stands_for(t["source"])
+                    if (source["donor"], source["name"]) == (role, name) and t["transform"] != "reinit":
+                        copied = t if t["transform"] == "copy" else source
                         if manifest["hash"] != "blake3" or draw.random() < 0.2:
                             assert copied.get("digest") == by_algorithm(data), name
     return len(seen), len(files) + len(headers)

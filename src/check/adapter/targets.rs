@@ -19,6 +19,9 @@ pub(super) struct Targets<'c> {
     /// Patterns and the rank they give, in the config's order; `None` when one cannot be compiled here.
     ranks: Vec<(Option<ConfigPattern>, Option<u64>)>,
     rank: Option<u64>,
+    /// The same for `lora_alpha`.
+    alphas: Vec<(Option<ConfigPattern>, Option<f64>)>,
+    alpha: Option<f64>,
     /// Whether weights are split into length and direction.
     pub(super) dora: bool,
     /// `modules_to_save`.
@@ -59,14 +62,18 @@ impl<'c> Targets<'c> {
             Some(Value::Array(_)) => Modules::Named(list("target_modules").into_iter().collect()),
             _ => Modules::Any,
         };
-        let ranks = config.get("rank_pattern").and_then(Value::as_object).into_iter().flatten();
-        let ranks = ranks.map(|(key, rank)| (compiled(&format!(r"(?:.*\.)?(?:{key})$")), rank.as_u64())).collect();
+        let patterns = |key: &str| config.get(key).and_then(Value::as_object).into_iter().flatten();
+        let mut end_of_name = |key: &str| compiled(&format!(r"(?:.*\.)?(?:{key})$"));
+        let ranks = patterns("rank_pattern").map(|(key, rank)| (end_of_name(key), rank.as_u64())).collect();
+        let alphas = patterns("alpha_pattern").map(|(key, alpha)| (end_of_name(key), alpha.as_f64())).collect();
         Self {
             modules,
             parameters: list("target_parameters"),
             ranks,
-            // PEFT's default is 8.
+            // PEFT's default of both is 8.
             rank: config.get("r").map_or(Some(8), Value::as_u64),
+            alphas,
+            alpha: config.get("lora_alpha").map_or(Some(8.0), Value::as_f64),
             dora: config.get("use_dora") == Some(&Value::Bool(true)),
             saved: list("modules_to_save"),
             work: RefCell::new(work),
@@ -155,11 +162,26 @@ impl<'c> Targets<'c> {
 
     /// The rank of a module, when it follows from the config.
     pub(super) fn rank(&self, module: &str) -> Option<u64> {
-        for (pattern, rank) in &self.ranks {
+        self.of_pattern(&self.ranks, self.rank, module)
+    }
+
+    /// The `lora_alpha` of a module, when it follows from the config.
+    pub(super) fn alpha(&self, module: &str) -> Option<f64> {
+        self.of_pattern(&self.alphas, self.alpha, module)
+    }
+
+    /// The value of the first pattern that matches a module, or the one without a pattern.
+    fn of_pattern<T: Copy>(
+        &self,
+        patterns: &[(Option<ConfigPattern>, Option<T>)],
+        otherwise: Option<T>,
+        module: &str,
+    ) -> Option<T> {
+        for (pattern, value) in patterns {
             if self.matches(pattern.as_ref()?, module)? {
-                return *rank;
+                return *value;
             }
         }
-        self.rank.filter(|_| !self.exceeded.get())
+        otherwise.filter(|_| !self.exceeded.get())
     }
 }

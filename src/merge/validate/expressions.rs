@@ -91,6 +91,7 @@ impl Validator<'_> {
             some("dtype", tensor.dtype.as_ref())?;
             some("scale", tensor.scale.as_ref())?;
             some("slice", tensor.slice.as_ref())?;
+            some("turned", tensor.adapter.as_ref().and_then(|adapter| adapter.turned.as_ref()))?;
             tensor.rename.as_ref().map_or(Ok(()), |rename| template("as", rename))?;
             tensor.part.as_ref().map_or(Ok(()), |part| template("part", part))?;
         }

@@ -1,4 +1,6 @@
-//! Reads `merge-manifest.json` of versions 1 to 4. It is untrusted, like every file of a checkpoint.
+//! Reads `merge-manifest.json` of versions 1 to 5. It is untrusted, like every file of a checkpoint.
+
+mod former;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -10,8 +12,9 @@ use super::VerifyError;
 use crate::checkpoint::open::{JSON_CAP, read_own};
 use crate::checkpoint::{HashAlgorithm, is_plain_file_name};
 use crate::merge::manifest;
-use crate::merge::named::{Bounds, Changeable};
-use crate::surgery::plan::{NewValues, RowSlice, TensorTransform};
+use crate::merge::manifest::DonorTensor;
+use crate::merge::named::{Bounds, Changeable, Stray, is_changed};
+use crate::surgery::expr::{TensorExpr, TensorTransform};
 
 /// A recorded merge. Keys that not all versions have are optional.
 #[derive(Debug, Deserialize)]
@@ -64,56 +67,43 @@ pub(super) struct RecordedShard {
 
 /// A recorded tensor of the result.
 #[derive(Debug, Deserialize)]
+#[serde(try_from = "former::TensorEntry")]
 pub(super) struct RecordedTensor {
     pub(super) name: String,
     pub(super) shard: String,
     pub(super) dtype: String,
     pub(super) shape: Vec<u64>,
-    /// Version 2 calls it `sha256`, version 1 has none.
-    #[serde(alias = "sha256")]
+    /// Version 1 has none.
     pub(super) digest: Option<String>,
-    pub(super) transform: TensorTransform,
-    pub(super) scale: Option<f64>,
-    /// Since version 4.
-    pub(super) values: Option<NewValues>,
-    pub(super) source: RecordedSource,
-}
-
-/// The donor tensor of a recorded tensor.
-#[derive(Debug, Deserialize)]
-pub(super) struct RecordedSource {
-    pub(super) donor: String,
-    pub(super) name: String,
-    pub(super) dtype: Option<String>,
-    pub(super) shape: Vec<u64>,
-    pub(super) slice: Option<RowSlice>,
-    #[serde(alias = "sha256")]
-    pub(super) digest: Option<String>,
+    /// How it was made.
+    pub(super) source: TensorExpr<DonorTensor>,
 }
 
 impl RecordedTensor {
-    /// Whether it is more than the donor's whole tensor, cast or not.
-    pub(super) fn is_changed(&self) -> bool {
-        let keeps = matches!(self.transform, TensorTransform::Copy | TensorTransform::Convert);
-        !keeps || self.scale.is_some() || self.source.slice.is_some()
+    /// The donor's tensor that it stands for.
+    pub(super) fn main(&self) -> &DonorTensor {
+        self.source.main()
     }
 
-    /// Whether its values were cast; version 1 did not record the type of the source.
-    fn is_cast(&self) -> bool {
-        self.transform != TensorTransform::Reinit && self.source.dtype.as_ref().is_some_and(|from| *from != self.dtype)
+    /// Whether it is more than the donor's whole tensor, cast or not.
+    pub(super) fn is_changed(&self) -> bool {
+        is_changed(&self.source)
     }
 
     /// Why the merge cannot have been allowed to make it; `None` when it was.
     pub(super) fn stray(&self, bounds: &Bounds<'_>) -> Option<String> {
-        let RecordedSource { donor, name, .. } = &self.source;
-        if self.is_changed() && !bounds.name(donor, name) {
-            let how = if self.is_changed() && self.scale.is_some() { "scaled" } else { self.transform.name() };
-            return Some(format!(
-                "is recorded as {how}, and nothing that the recipe names has {name} of the {donor} donor"
-            ));
-        }
-        (self.is_cast() && !bounds.casts_to(donor, &self.dtype)).then(|| {
-            format!("is recorded as cast to {}, and the recipe announces no such cast of the {donor} donor", self.dtype)
+        let DonorTensor { donor, name, .. } = self.main();
+        Some(match bounds.stray(&self.source, &self.dtype)? {
+            Stray::Changed => {
+                let transform = self.source.transform();
+                let is_scaled = self.source.scale().is_some() && transform != TensorTransform::AddProduct;
+                let how = if is_scaled { "scaled" } else { transform.name() };
+                format!("is recorded as {how}, and nothing that the recipe names has {name} of the {donor} donor")
+            }
+            Stray::Cast => format!(
+                "is recorded as cast to {}, and the recipe announces no such cast of the {donor} donor",
+                self.dtype
+            ),
         })
     }
 }
@@ -134,10 +124,10 @@ impl Recorded {
         let damaged = |reason: String| wrong(format!("{reason}; the manifest is damaged"));
         let value: Value = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
         let schema = value.get("schema").and_then(Value::as_u64);
-        if !matches!(schema, Some(1..=4)) {
+        if !matches!(schema, Some(1..=5)) {
             let schema = value.get("schema").map_or_else(|| "missing".to_owned(), Value::to_string);
             return Err(wrong(format!(
-                "its schema is {schema}, and this version of ckpt-doctor reads 1 to 4; use a newer version"
+                "its schema is {schema}, and this version of ckpt-doctor reads 1 to 5; use a newer version"
             )));
         }
         let mut recorded: Self = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;

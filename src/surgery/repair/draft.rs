@@ -9,7 +9,7 @@ use crate::check::{Edit, renamed};
 use crate::checkpoint::open::TOKENIZER_CAP;
 use crate::checkpoint::shard::header::FORMATS;
 use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
-use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, TensorSource, format_pt};
+use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, format_pt};
 
 /// Result of applying the edits of one fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -287,11 +287,8 @@ impl RepairDraft {
         let path = self.original.source.path().join(file);
         let mut tensors: Vec<_> = shard.tensors.iter().collect();
         tensors.sort_by_key(|t| (t.begin, t.end));
-        let tensors = tensors.into_iter().map(|t| PlannedTensor {
-            name: t.name.clone(),
-            dtype: t.dtype,
-            shape: t.shape.clone(),
-            source: TensorSource::copy(TensorRef {
+        let tensors = tensors.into_iter().map(|t| {
+            let from = TensorRef {
                 donor: String::new(),
                 path: path.clone(),
                 name: t.name.clone(),
@@ -300,7 +297,8 @@ impl RepairDraft {
                 offset: shard.data_start.saturating_add(t.begin),
                 len: t.len(),
                 slice: None,
-            }),
+            };
+            PlannedTensor::copy(t.name.clone(), from)
         });
         let metadata = shard.metadata.clone().unwrap_or_default();
         Some(PlannedShard {

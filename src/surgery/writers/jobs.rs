@@ -1,7 +1,7 @@
 //! The work of writing a shard, cut into pieces that threads do in any order.
 
 use crate::surgery::align::Run;
-use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorTransform};
+use crate::surgery::plan::{PlannedShard, PlannedTensor};
 
 /// Maximum number of bytes of a job that copies; also the bytes copied between two checks for a signal.
 pub(super) const SLICE: u64 = 64 * 1024 * 1024;
@@ -33,15 +33,15 @@ pub(super) fn jobs(shard: &PlannedShard, header: u64, hashed: bool) -> Vec<Job<'
     let mut open: Option<Run<'_>> = None;
     let mut at = header;
     for (index, tensor) in shard.tensors.iter().enumerate() {
-        let (from, len) = (&tensor.source.from, tensor.len());
-        if hashed || tensor.transform() != TensorTransform::Copy {
-            cut(open.take(), &mut jobs);
-            jobs.push(Job::Tensor { index, tensor, at });
-        } else {
+        let len = tensor.len();
+        if let Some(from) = tensor.copied().filter(|_| !hashed) {
             let run = Run { path: &from.path, from: from.offset, at, len };
             if !open.as_mut().is_some_and(|open| open.extend(run)) {
                 cut(open.replace(run), &mut jobs);
             }
+        } else {
+            cut(open.take(), &mut jobs);
+            jobs.push(Job::Tensor { index, tensor, at });
         }
         at = at.saturating_add(len);
     }
@@ -67,7 +67,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::{TensorRef, TensorSource};
+    use crate::surgery::plan::TensorRef;
 
     /// A tensor of bytes at an offset of a donor's file.
     fn tensor(path: &str, offset: u64, len: u64) -> PlannedTensor {
@@ -81,7 +81,7 @@ mod tests {
             len,
             slice: None,
         };
-        PlannedTensor { name: "t".to_owned(), dtype: Dtype::U8, shape: vec![len], source: TensorSource::copy(from) }
+        PlannedTensor::copy("t".to_owned(), from)
     }
 
     fn shard(tensors: Vec<PlannedTensor>) -> PlannedShard {
@@ -121,9 +121,8 @@ mod tests {
         assert_eq!(runs(vec![tensor("x", 60, 5), tensor("x", 50, 10)]), ["x 60 100 5", "x 50 105 10"]);
         assert_eq!(runs(vec![tensor("x", 50, 10), tensor("y", 60, 5)]), ["x 50 100 10", "y 60 110 5"]);
         // A tensor that is made lies between the runs.
-        let mut made = tensor("x", 60, 5);
+        let mut made = tensor("x", 60, 5).started();
         made.shape = vec![7];
-        made.source.fit = TensorTransform::Reinit;
         assert_eq!(runs(vec![tensor("x", 50, 10), made, tensor("x", 65, 5)]), ["x 50 100 10", "x 65 117 5"]);
         assert_eq!(runs(vec![tensor("x", 0, 0)]), [""; 0]);
     }

@@ -9,9 +9,9 @@ use super::system::{KernelCopy, copy_in_kernel, read_ahead, write_back};
 use crate::checkpoint::HashAlgorithm;
 use crate::checkpoint::digest::Hasher;
 use crate::surgery::align::{BLOCK, Run};
-use crate::surgery::donor::DonorFile;
+use crate::surgery::donor::{DonorFile, OpenDonors};
 use crate::surgery::error::{ApplyError, io_at};
-use crate::surgery::plan::{PlannedTensor, TensorTransform};
+use crate::surgery::plan::PlannedTensor;
 use crate::surgery::stop::interrupted;
 use crate::surgery::stream::{Streamed, block, stream};
 use crate::surgery::written::WrittenTensor;
@@ -111,27 +111,26 @@ impl Out<'_> {
     /// Makes a tensor at an offset of the file, and its digest.
     pub(super) fn tensor(
         &self,
-        donor: &DonorFile,
+        donors: &mut OpenDonors,
         tensor: &PlannedTensor,
         at: u64,
         hash: HashAlgorithm,
         buffer: &mut Vec<u8>,
     ) -> Result<WrittenTensor, ApplyError> {
         let mut place = Place { out: self, at, left: tensor.len(), hasher: Hasher::new(hash) };
-        let streamed = if tensor.transform() == TensorTransform::Copy {
-            let from = &tensor.source.from;
+        let streamed = if let Some(from) = tensor.copied() {
             let run = Run { path: &from.path, from: from.offset, at, len: tensor.len() };
-            self.copy_hashed(donor, run, &mut place, buffer)?;
+            self.copy_hashed(donors.file(&from.path)?, run, &mut place, buffer)?;
             Streamed::default()
         } else {
-            stream(donor, tensor, hash, self.path, &mut place)?
+            stream(donors, tensor, hash, self.path, &mut place)?
         };
         if place.left > 0 {
             let error = io::Error::other(format!("{} is {} bytes too short", tensor.name, place.left));
             return Err(io_at(self.path, "writing")(error));
         }
-        let Streamed { losses, source_digest } = streamed;
-        Ok(WrittenTensor { digest: place.hasher.finish_hex(), losses, source_digest })
+        let Streamed { losses, source_digests } = streamed;
+        Ok(WrittenTensor { digest: place.hasher.finish_hex(), losses, source_digests })
     }
 }
 

@@ -18,7 +18,7 @@ use super::system::{KernelCopy, create, reserve};
 use super::verify::accepted_by_safetensors;
 use crate::checkpoint::open::open_regular;
 use crate::checkpoint::{HashAlgorithm, hex, parallel};
-use crate::surgery::donor::DonorFile;
+use crate::surgery::donor::OpenDonors;
 use crate::surgery::error::{ApplyError, io_at};
 use crate::surgery::plan::PlannedShard;
 use crate::surgery::stop::interrupted;
@@ -106,20 +106,8 @@ impl ShardFile<'_> {
 /// What one thread keeps from job to job.
 #[derive(Default)]
 struct Thread {
-    /// Adjacent tensors are usually in the same donor file, so it stays open.
-    donor: Option<DonorFile>,
+    donors: OpenDonors,
     buffer: Vec<u8>,
-}
-
-impl Thread {
-    /// The open file of a donor, and the buffer.
-    fn donor(&mut self, path: &Path) -> Result<(&DonorFile, &mut Vec<u8>), ApplyError> {
-        let donor = match self.donor.take() {
-            Some(open) if open.path == path => open,
-            _ => DonorFile::open(path)?,
-        };
-        Ok((self.donor.insert(donor), &mut self.buffer))
-    }
 }
 
 /// What all threads share.
@@ -144,13 +132,11 @@ impl Writers<'_> {
                 None
             }
             Job::Copy(run) => {
-                let (donor, buffer) = thread.donor(run.path)?;
-                out.copy(donor, run, buffer)?;
+                out.copy(thread.donors.file(run.path)?, run, &mut thread.buffer)?;
                 None
             }
             Job::Tensor { tensor, at, .. } => {
-                let (donor, buffer) = thread.donor(&tensor.source.from.path)?;
-                Some(out.tensor(donor, tensor, at, self.hash, buffer)?)
+                Some(out.tensor(&mut thread.donors, tensor, at, self.hash, &mut thread.buffer)?)
             }
         };
         if shard.left.fetch_sub(1, Ordering::AcqRel) == 1 {
@@ -194,7 +180,8 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, TensorSource, TensorTransform};
+    use crate::surgery::expr::{Factor, Product, TensorExpr};
+    use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef};
 
     /// Shards with tensors of every transform, from one donor's file.
     fn plans(donor: &Path) -> Vec<PlannedShard> {
@@ -210,12 +197,26 @@ mod tests {
                 len: rows * width * 4,
                 slice: None,
             };
-            let fit = TensorTransform::FITS[index % TensorTransform::FITS.len()];
-            let more = u64::from(fit != TensorTransform::Copy);
-            let dtype = if index % 3 == 2 { Dtype::BF16 } else { Dtype::F32 };
-            let values = (fit == TensorTransform::Reinit).then_some(NewValues::Normal(0.02));
-            let source = TensorSource { from, fit, scale: (index == 7).then_some(2.0), values };
-            PlannedTensor { name: format!("{shard}.{index}"), dtype, shape: vec![rows + more, width], source }
+            let (dtype, shape) = (from.dtype, vec![rows + 1, width]);
+            let scale = (index == 7).then_some(2.0);
+            let to = if index % 3 == 2 { Dtype::BF16 } else { dtype };
+            // Sixteen rows of the same place, which fit in the file.
+            let factor =
+                |shape: [u64; 2]| TensorRef { shape: shape.to_vec(), len: shape[0] * shape[1] * 4, ..from.clone() };
+            let source = match index % 6 {
+                0 => TensorExpr::Stored(from),
+                1 => TensorExpr::GrowRows { of: from, rows: rows + 1 },
+                2 => TensorExpr::SampleRows { of: from, rows: rows + 1 },
+                3 => TensorExpr::Pad { of: from, shape },
+                4 => TensorExpr::Initialise { values: NewValues::Normal(0.02), dtype: to, shape, instead_of: from },
+                _ => {
+                    let (left, right) = (Factor::Transposed(factor([16, rows])), Factor::Stored(factor([16, width])));
+                    let product = Product { left, right, scale: 1e-30, rounded: index % 4 == 1 };
+                    TensorExpr::AddProduct { to: Box::new(TensorExpr::Stored(from)), product }
+                }
+            };
+            let from = source.typed().unwrap().0;
+            PlannedTensor::new(format!("{shard}.{index}"), source.converted(from, scale, to)).unwrap()
         };
         let shard = |shard: usize| PlannedShard {
             name: FileName::shard(shard + 1, 3),
@@ -252,9 +253,11 @@ mod tests {
                 assert_eq!(safetensors::SafeTensors::deserialize(bytes).unwrap().len(), shard.tensors.len());
                 for (tensor, plan) in shard.tensors.iter().zip(&plans[0].tensors) {
                     assert_eq!(tensor.digest.is_some(), hash != HashAlgorithm::None);
-                    let is_read =
-                        plan.transform() != TensorTransform::Copy && plan.source.fit != TensorTransform::Reinit;
-                    assert_eq!(tensor.source_digest.is_some(), is_read && hash != HashAlgorithm::None);
+                    let is_started = matches!(plan.source, TensorExpr::Initialise { .. });
+                    let read = if plan.copied().is_some() { 0 } else { plan.source.sources().len() };
+                    assert_eq!(tensor.source_digests.len(), read);
+                    let is_digest = !is_started && hash != HashAlgorithm::None;
+                    assert!(tensor.source_digests.iter().all(|digest| digest.is_some() == is_digest));
                 }
             }
             let losses: Vec<_> = written.iter().flat_map(|s| &s.tensors).map(|t| t.losses).collect();

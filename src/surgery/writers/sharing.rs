@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::system::KernelCopy;
 use crate::surgery::align::Run;
-use crate::surgery::plan::{PlannedShard, TensorTransform};
+use crate::surgery::plan::PlannedShard;
 
 /// Whether new files in a directory can share blocks with donors.
 pub(super) struct Sharing {
@@ -34,12 +34,14 @@ impl Sharing {
         let mut at = shard.header().len() as u64;
         let mut shared = 0_u64;
         for tensor in &shard.tensors {
-            let (from, len) = (&tensor.source.from, tensor.len());
-            let path = from.path.as_path();
-            let is_here = || fs::metadata(path).is_ok_and(|m| m.dev() == dev);
-            if tensor.transform() == TensorTransform::Copy && *devices.entry(path).or_insert_with(is_here) {
-                let [_, whole, _] = Run { path, from: from.offset, at, len }.blocks();
-                shared = shared.saturating_add(whole.len);
+            let len = tensor.len();
+            if let Some(from) = tensor.copied() {
+                let path = from.path.as_path();
+                let is_here = || fs::metadata(path).is_ok_and(|m| m.dev() == dev);
+                if *devices.entry(path).or_insert_with(is_here) {
+                    let [_, whole, _] = Run { path, from: from.offset, at, len }.blocks();
+                    shared = shared.saturating_add(whole.len);
+                }
             }
             at = at.saturating_add(len);
         }

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::record::{digest, flip};
-use super::{copy, doctor, donor, merge, text, tiny};
+use super::{as_version_4, copy, doctor, donor, merge, text, tiny};
 
 /// Donors in the order of the merge, all options that change bytes, and a result.
 struct Room {
@@ -150,6 +150,22 @@ fn a_manifest_without_digests_of_tensors_is_read() {
     assert_eq!(room.verify(&given).status.code(), Some(1));
 }
 
+/// Version 4 had one source and one transform for each tensor.
+#[test]
+fn a_manifest_of_version_4_is_read() {
+    for options in [&["--set", "projector=reinit"][..], &["--set", "dtype=float32", "--set", "rows=sampled"], &[]] {
+        let room = Room::new(options);
+        room.manifest(as_version_4);
+        let given = donors();
+        let given: Vec<&str> = given.iter().map(String::as_str).collect();
+        let (code, shown) = room.shown(&given);
+        assert_eq!(code, Some(0), "{shown}");
+        assert!(shown.contains("manifest version 4"), "{shown}");
+        flip(&room.out, "multi_modal_projector.linear.weight");
+        assert_eq!(room.verify(&given).status.code(), Some(1));
+    }
+}
+
 /// Version 3 did not say what the recipe was allowed to change: that is what remains unverified.
 #[test]
 fn a_manifest_of_version_3_is_read() {
@@ -157,6 +173,7 @@ fn a_manifest_of_version_3_is_read() {
     let given: Vec<&str> = given.iter().map(String::as_str).collect();
     let room = Room::new(&["--set", "projector=reinit"]);
     let older = |manifest: &mut Value| {
+        as_version_4(manifest);
         manifest["schema"] = json!(3);
         manifest.as_object_mut().unwrap().remove("changes");
         for tensor in manifest["tensors"].as_array_mut().unwrap() {
@@ -189,7 +206,9 @@ fn what_no_entry_names_is_compared_with_the_donor_whatever_is_recorded() {
         let tensors = manifest["tensors"].as_array_mut().unwrap();
         let tensor = tensors.iter_mut().find(|tensor| tensor["name"] == name).unwrap();
         tensor["transform"] = json!("reinit");
-        tensor["values"] = json!("zeros");
+        let (dtype, shape, of) = (&tensor["dtype"], &tensor["shape"], &tensor["source"]["stored"]);
+        let started = json!({ "values": "zeros", "dtype": dtype, "shape": shape, "instead-of": of });
+        tensor["source"] = json!({ "initialise": started });
     };
     let manifest: Value = serde_json::from_slice(&fs::read(room.out.join("merge-manifest.json")).unwrap()).unwrap();
     let recorded = manifest["tensors"].as_array().unwrap().iter().find(|tensor| tensor["name"] == name).unwrap();
@@ -219,6 +238,7 @@ fn a_manifest_of_version_2_is_read() {
         .map(|(name, bytes)| (name, json!({ "bytes": bytes.len(), "sha256": digest(&bytes) })))
         .collect();
     room.manifest(|manifest| {
+        as_version_4(manifest);
         manifest["schema"] = json!(2);
         for key in ["hash", "shards", "changes"] {
             manifest.as_object_mut().unwrap().remove(key);
@@ -250,6 +270,7 @@ fn a_manifest_of_version_2_is_read() {
 fn a_manifest_of_version_1_is_read() {
     let room = Room::new(&[]);
     room.manifest(|manifest| {
+        as_version_4(manifest);
         manifest["schema"] = json!(1);
         manifest["recipe"] = manifest["recipe"]["name"].clone();
         for key in ["files", "shards", "hash", "training", "changes"] {
@@ -291,7 +312,7 @@ fn a_manifest_that_cannot_be_used_is_refused() {
     };
     let set =
         |pointer: &str, value: Value| room.manifest(|manifest| *manifest.pointer_mut(pointer).unwrap() = value.clone());
-    set("/schema", json!(5));
+    set("/schema", json!(6));
     refused("newer", &[]);
     set("/hash", json!("md5"));
     refused("algorithm", &[]);
@@ -313,6 +334,10 @@ fn a_manifest_that_cannot_be_used_is_refused() {
     refused("twice", &[]);
     set("/tensors/0/transform", json!("melt"));
     refused("transform", &[]);
+    set("/tensors/0/transform", json!("pad"));
+    refused("another transform", &[]);
+    set("/tensors/0/source", json!({ "melt": {} }));
+    refused("operation", &[]);
     room.edit("merge-manifest.json", |_| "[".repeat(100_000));
     refused("deep", &[]);
     room.edit("merge-manifest.json", |text| text[..text.len() / 2].to_owned());
@@ -335,21 +360,58 @@ fn a_hostile_manifest_is_bounded() {
     let grown = value["tensors"].as_array().unwrap().iter().position(|t| t["transform"] == "grow-rows").unwrap();
     let given = donors();
     let given: Vec<&str> = given.iter().map(String::as_str).collect();
-    let changes: [(&str, Value); 8] = [
-        ("/tensors/0/shape", huge.clone()),
-        ("/tensors/0/source/shape", huge),
-        ("/tensors/0/source/slice", json!({ "first": u64::MAX, "of": u64::MAX })),
-        ("/tensors/0/source/shape", json!([])),
-        ("/tensors/0/transform", json!("pad")),
-        ("/tensors/0/dtype", json!("I64")),
-        ("/tensors/0/source/dtype", json!("F4")),
-        ("/tensors/0/scale", json!(0.0)),
+    let of = |of: &Value| json!({ "stored": of });
+    let source = &value["tensors"][grown]["source"]["grow-rows"]["of"];
+    let product = |left: &str, right: &str, scale: Value| {
+        let product = json!({ "left": { left: source }, "right": { right: source }, "scale": scale });
+        json!({ "add-product": { "to": of(source), "product": product } })
+    };
+    let nested = json!({ "add-product": {
+        "to": product("stored", "transposed", json!(1)),
+        "product": product("stored", "transposed", json!(1))["add-product"]["product"],
+    } });
+    let set = |tensor: &mut Value, place: &str, value: &Value| *tensor.pointer_mut(place).unwrap() = value.clone();
+    let expressions = [
+        ("scale", json!({ "scale": { "of": of(source), "by": 0.0, "to": "BF16" } })),
+        ("cast", json!({ "cast": { "of": of(source), "to": "I64" } })),
+        ("pad", json!({ "pad": { "of": source, "shape": huge } })),
+        ("rows", json!({ "grow-rows": { "of": source, "rows": u64::MAX } })),
+        (
+            "values",
+            json!({ "initialise": {
+            "values": { "normal": -1.0 }, "dtype": "BF16", "shape": huge, "instead-of": source } }),
+        ),
+        ("product", product("stored", "stored", json!(1))),
+        ("no factor", product("stored", "transposed", json!("many"))),
+        ("two products", nested),
+    ];
+    let word = |expression: &Value| match super::operation(expression).0 {
+        "scale" | "cast" => json!("convert"),
+        "initialise" => json!("reinit"),
+        word => json!(word),
+    };
+    for (what, expression) in expressions {
+        room.manifest(|manifest| {
+            let tensor = &mut manifest["tensors"][grown];
+            tensor["transform"] = word(&expression);
+            set(tensor, "/source", &expression);
+        });
+        let run = room.verify(&given);
+        assert!(matches!(run.status.code(), Some(1 | 2)), "{what}: {}", text(&run));
+        fs::write(room.out.join("merge-manifest.json"), &original).unwrap();
+    }
+    let changes: [(&str, Value); 6] = [
+        ("/shape", huge.clone()),
+        ("/source/grow-rows/of/shape", huge.clone()),
+        ("/source/grow-rows/of/slice", json!({ "first": u64::MAX, "of": u64::MAX })),
+        ("/source/grow-rows/of/shape", json!([])),
+        ("/dtype", json!("I64")),
+        ("/source/grow-rows/of/dtype", json!("F4")),
     ];
     for (pointer, value) in changes {
-        let pointer = pointer.replacen('0', &grown.to_string(), 1);
         room.manifest(|manifest| {
             let (parent, key) = pointer.rsplit_once('/').unwrap();
-            manifest.pointer_mut(parent).unwrap()[key] = value.clone();
+            manifest["tensors"][grown].pointer_mut(parent).unwrap()[key] = value.clone();
         });
         let run = room.verify(&given);
         assert_eq!(run.status.code(), Some(1), "{pointer}: {}", text(&run));

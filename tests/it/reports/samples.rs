@@ -11,7 +11,7 @@ use ckpt_doctor::report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName,
     StageOutcome, Training, UncheckedPath,
 };
-use ckpt_doctor::surgery::plan::TensorTransform;
+use ckpt_doctor::surgery::expr::TensorTransform;
 use serde_json::{Map, Value, json};
 
 /// A checkpoint with these findings.

@@ -21,7 +21,7 @@ use crate::checkpoint::journal::HeaderEdit;
 use crate::checkpoint::open::{Identity, open_regular};
 use crate::checkpoint::shard::MAX_HEADER;
 use crate::surgery::align::BLOCK;
-use crate::surgery::plan::{PlannedShard, TensorTransform};
+use crate::surgery::plan::PlannedShard;
 use crate::surgery::writers::system::{collapse_range, custom, first_hole, insert_range, remove_file, retry};
 use crate::surgery::writers::verify::accepted_by_safetensors;
 
@@ -59,10 +59,7 @@ impl Headers {
         let metadata = file.metadata().ok().filter(|m| m.is_file() && m.nlink() == 1)?;
         let mut at = data_start;
         for tensor in &plan.tensors {
-            let from = &tensor.source.from;
-            if tensor.transform() != TensorTransform::Copy || from.path != path || from.offset != at {
-                return None;
-            }
+            let from = tensor.copied().filter(|from| from.path == path && from.offset == at)?;
             at = at.checked_add(from.len)?;
         }
         if at != metadata.len() {
@@ -265,7 +262,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::{PlannedTensor, TensorRef, TensorSource, format_pt};
+    use crate::surgery::plan::{PlannedTensor, TensorRef, format_pt};
 
     /// Number of bytes of the tensor: several blocks and a part of one.
     const LEN: usize = 5 * 4096 + 5;
@@ -283,8 +280,7 @@ mod tests {
             len: LEN as u64,
             slice: None,
         };
-        let source = TensorSource::copy(from);
-        let tensor = PlannedTensor { name: "a".to_owned(), dtype: Dtype::U8, shape: vec![LEN as u64], source };
+        let tensor = PlannedTensor::copy("a".to_owned(), from);
         let name = FileName::parse("model.safetensors").unwrap();
         PlannedShard { name, tensors: vec![tensor], metadata, data_start: Some(data_start) }
     }
@@ -461,7 +457,7 @@ mod tests {
         assert!(!of(&plan(&path, start + 8, format_pt())), "a gap");
         assert!(!of(&plan(&dir.path().join("other"), start, format_pt())), "of another file");
         let mut converted = good.clone();
-        converted.tensors[0].dtype = Dtype::I8;
+        converted.tensors[0] = converted.tensors[0].clone().started();
         assert!(!of(&converted));
         OpenOptions::new().append(true).open(&path).unwrap().write_all(b"more").unwrap();
         assert!(!of(&good), "bytes behind the tensors");

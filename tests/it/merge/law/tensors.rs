@@ -7,7 +7,8 @@ use std::path::PathBuf;
 
 use ckpt_doctor::checkpoint::{Dtype, byte_len};
 use ckpt_doctor::surgery::convert::CastLosses;
-use ckpt_doctor::surgery::plan::{PlannedTensor, TensorRef, TensorSource, TensorTransform};
+use ckpt_doctor::surgery::expr::{Factor, Product, TensorExpr};
+use ckpt_doctor::surgery::plan::{PlannedTensor, TensorRef};
 use ckpt_doctor::surgery::transform;
 
 use super::FEW;
@@ -70,18 +71,37 @@ fn nearest(dtype: Dtype, of: f64) -> u64 {
 /// A donor tensor with arbitrary bits, and a plan for it.
 struct Case {
     bytes: Vec<u8>,
+    from: TensorRef,
+    fit: Fit,
+    scale: Option<f64>,
     tensor: PlannedTensor,
+}
+
+/// How a tensor gets its shape.
+#[derive(Clone, Copy, PartialEq)]
+enum Fit {
+    Stored,
+    GrowRows,
+    SampleRows,
+    Pad,
+}
+
+/// A donor's tensor at the start of a file of its own.
+fn donor(path: &str, dtype: Dtype, shape: Vec<u64>) -> TensorRef {
+    let len = byte_len(dtype, &shape).unwrap();
+    let (donor, name) = ("a".to_owned(), "x".to_owned());
+    TensorRef { donor, path: PathBuf::from(path), name, dtype, shape, offset: 0, len, slice: None }
 }
 
 fn case(random: &mut Draw) -> Case {
     let (from, to) = (TYPES[random.below(4)], TYPES[random.below(4)]);
-    let fit = TensorTransform::FITS[random.below(4)];
+    let fit = [Fit::Stored, Fit::GrowRows, Fit::SampleRows, Fit::Pad][random.below(4)];
     let shape: Vec<u64> = (0..=random.below(3)).map(|_| random.below(6) as u64).collect();
     let mut wanted = shape.clone();
     match fit {
-        TensorTransform::Pad => wanted.iter_mut().for_each(|dim| *dim += random.below(4) as u64),
-        TensorTransform::GrowRows | TensorTransform::SampleRows => wanted[0] += random.below(4) as u64,
-        _ => {}
+        Fit::Pad => wanted.iter_mut().for_each(|dim| *dim += random.below(4) as u64),
+        Fit::GrowRows | Fit::SampleRows => wanted[0] += random.below(4) as u64,
+        Fit::Stored => {}
     }
     let len = byte_len(from, &shape).unwrap();
     let width = usize::try_from(from.bits() / 8).unwrap();
@@ -94,23 +114,22 @@ fn case(random: &mut Draw) -> Case {
         bytes.extend_from_slice(&bits.to_le_bytes()[..width]);
     }
     let scale = [None, Some(64.0), Some(1.0 / 3.0), Some(-2e6)][random.below(4)];
-    let from = TensorRef {
-        donor: "a".to_owned(),
-        path: PathBuf::new(),
-        name: "x".to_owned(),
-        dtype: from,
-        shape,
-        offset: 0,
-        len,
-        slice: None,
+    let from = donor("", from, shape);
+    let (of, rows) = (from.clone(), wanted[0]);
+    let fitted = match fit {
+        Fit::Stored => TensorExpr::Stored(of),
+        Fit::GrowRows => TensorExpr::GrowRows { of, rows },
+        Fit::SampleRows => TensorExpr::SampleRows { of, rows },
+        Fit::Pad => TensorExpr::Pad { of, shape: wanted.clone() },
     };
-    let source = TensorSource { from, fit, scale, values: None };
-    Case { bytes, tensor: PlannedTensor { name: "x".to_owned(), dtype: to, shape: wanted, source } }
+    let tensor = PlannedTensor::new("x".to_owned(), fitted.converted(from.dtype, scale, to)).unwrap();
+    assert_eq!((tensor.dtype, &tensor.shape), (to, &wanted));
+    Case { bytes, from, fit, scale, tensor }
 }
 
 /// The donor's bits in the planned shape, before scaling and casting; the rows that `sample-rows` adds are `None`.
 fn fitted(case: &Case) -> Vec<Option<u64>> {
-    let TensorSource { from, fit, .. } = &case.tensor.source;
+    let Case { from, fit, .. } = case;
     let width = usize::try_from(from.dtype.bits() / 8).unwrap();
     let bits: Vec<u64> =
         case.bytes.chunks(width).map(|c| c.iter().rev().fold(0, |n, b| n << 8 | u64::from(*b))).collect();
@@ -134,8 +153,8 @@ fn fitted(case: &Case) -> Vec<Option<u64>> {
     (0..total)
         .map(|place| match (index(place), fit) {
             (Some(at), _) => Some(bits[at]),
-            (None, TensorTransform::Pad) => Some(0),
-            (None, TensorTransform::SampleRows) => None,
+            (None, Fit::Pad) => Some(0),
+            (None, Fit::SampleRows) => None,
             (None, _) => {
                 let column = usize::try_from(place % row).unwrap();
                 let row = usize::try_from(row).unwrap();
@@ -158,8 +177,9 @@ fn planned_tensors_are_streamed_as_computed_at_once() {
     let mut random = Draw::new(7);
     for round in 0..FEW * 10 {
         let case = case(&mut random);
-        let Case { bytes, tensor } = &case;
-        let mut read = |at: u64, buffer: &mut [u8]| {
+        let Case { bytes, from, tensor, .. } = &case;
+        let scale = case.scale;
+        let mut read = |_: &TensorRef, at: u64, buffer: &mut [u8]| {
             let at = usize::try_from(at).unwrap();
             buffer.copy_from_slice(&bytes[at..][..buffer.len()]);
             Ok(())
@@ -169,15 +189,14 @@ fn planned_tensors_are_streamed_as_computed_at_once() {
         assert_eq!(Some(out.len() as u64), byte_len(tensor.dtype, &tensor.shape), "{round}: {tensor:?}");
         let width = usize::try_from(tensor.dtype.bits() / 8).unwrap();
         let got = out.chunks(width).map(|c| c.iter().rev().fold(0_u64, |n, b| n << 8 | u64::from(*b)));
-        let from = &tensor.source.from;
-        let copies = from.dtype == tensor.dtype && tensor.source.scale.is_none();
+        let copies = from.dtype == tensor.dtype && scale.is_none();
         let (mut want_losses, mut sampled) = (CastLosses::default(), false);
         for (place, (got, donor)) in got.zip(fitted(&case)).enumerate() {
             let Some(donor) = donor else {
                 sampled = true;
                 continue;
             };
-            let before = value(from.dtype, donor) * tensor.source.scale.unwrap_or(1.0);
+            let before = value(from.dtype, donor) * scale.unwrap_or(1.0);
             let what = format!("{round}: value {place} of {tensor:?}: {before:e} became {got:#x}");
             if before.is_nan() {
                 assert!(value(tensor.dtype, got).is_nan(), "{what}");
@@ -197,5 +216,69 @@ fn planned_tensors_are_streamed_as_computed_at_once() {
         if !sampled {
             assert_eq!(losses, want_losses, "{round}: {tensor:?}");
         }
+    }
+}
+
+/// Whatever the types and shapes of a matrix and of two factors, their sum and product is what a loop over all values gives.
+#[test]
+fn products_are_added_as_computed_at_once() {
+    let mut random = Draw::new(11);
+    for round in 0..FEW * 2 {
+        let (dtype, of) = (TYPES[random.below(3)], TYPES[random.below(4)]);
+        // Some rows are longer than the columns that are summed at a time.
+        let long = if round % 10 == 0 { 1500 } else { 12 };
+        let [rows, inner, columns] = [1 + random.below(4), 1 + random.below(9), 1 + random.below(long)];
+        let mut numbers = |count: usize, dtype: Dtype| -> Vec<u64> {
+            (0..count).map(|_| nearest(dtype, random.below(4001) as f64 / 1000.0 - 2.0)).collect()
+        };
+        let (base, left, right) =
+            (numbers(rows * columns, dtype), numbers(rows * inner, of), numbers(inner * columns, of));
+        let (is_left_turned, is_right_turned) = (round % 2 == 1, round % 3 == 1);
+        let scale = [1.0, 0.5, 1.0 / 3.0, 0.0][random.below(4)];
+        let rounded = random.below(2) == 1;
+        let turned = |values: &[u64], [rows, columns]: [usize; 2]| -> Vec<u64> {
+            (0..columns).flat_map(|column| (0..rows).map(move |row| values[row * columns + column])).collect()
+        };
+        let factor = |path: &str, values: &[u64], [rows, columns]: [usize; 2], is_turned: bool| {
+            let stored = if is_turned { turned(values, [rows, columns]) } else { values.to_vec() };
+            let shape = if is_turned { vec![columns as u64, rows as u64] } else { vec![rows as u64, columns as u64] };
+            let from = donor(path, of, shape);
+            (stored, if is_turned { Factor::Transposed(from) } else { Factor::Stored(from) })
+        };
+        let (left_stored, left_factor) = factor("left", &left, [rows, inner], is_left_turned);
+        let (right_stored, right_factor) = factor("right", &right, [inner, columns], is_right_turned);
+        let to = Box::new(TensorExpr::Stored(donor("base", dtype, vec![rows as u64, columns as u64])));
+        let product = Product { left: left_factor, right: right_factor, scale, rounded };
+        let tensor = PlannedTensor::new("x".to_owned(), TensorExpr::AddProduct { to, product }).unwrap();
+        let encoded = |dtype: Dtype, values: &[u64]| -> Vec<u8> {
+            let width = usize::try_from(dtype.bits() / 8).unwrap();
+            values.iter().flat_map(|bits| bits.to_le_bytes()[..width].to_vec()).collect()
+        };
+        let files = [
+            ("base", encoded(dtype, &base)),
+            ("left", encoded(of, &left_stored)),
+            ("right", encoded(of, &right_stored)),
+        ];
+        let mut read = |from: &TensorRef, at: u64, buffer: &mut [u8]| {
+            let (_, bytes) = files.iter().find(|(name, _)| from.path.to_str() == Some(name)).unwrap();
+            let at = usize::try_from(at).unwrap();
+            buffer.copy_from_slice(&bytes[at..][..buffer.len()]);
+            Ok(())
+        };
+        let mut out = Vec::new();
+        let losses = transform::write(&mut read, &tensor, &mut out).unwrap();
+        assert_eq!(losses, CastLosses::default(), "{round}");
+        let single = |of: f64| value(Dtype::F32, nearest(Dtype::F32, of));
+        let mut want = Vec::new();
+        for (place, base) in base.iter().enumerate() {
+            let (row, column) = (place / columns, place % columns);
+            let term =
+                |k: usize| single(value(of, left[row * inner + k])) * single(value(of, right[k * columns + column]));
+            let sum = (0..inner).fold(0.0, |sum, k| sum + term(k));
+            let delta = single(single(sum) * single(scale));
+            let delta = if rounded { value(dtype, nearest(dtype, delta)) } else { delta };
+            want.push(through_single(dtype, value(dtype, *base) + delta));
+        }
+        assert!(out == encoded(dtype, &want), "{round}: {tensor:?}");
     }
 }
