@@ -36,6 +36,7 @@ pub(crate) mod platform;
 pub(crate) mod pointer;
 mod read;
 mod scan;
+pub mod reserve;
 pub mod shard;
 mod sniff;
 pub mod source;
