@@ -47,4 +47,7 @@ pub use engine::{check, check_for};
 pub use finding::{Finding, Location, Severity};
 pub use fix::{Edit, FixHint, clamped, renamed};
 pub use outcome::Outcome;
-pub use suppressions::unused_suppressions;
+pub use suppressions::{SuppressionUse, suppression_uses, unused_suppressions};
+#[cfg(feature = "internals")]
+pub use templates::rendered_in_process;
+pub use templates::{RenderJob, Rendering, render_elsewhere};

@@ -35,12 +35,14 @@ pub mod pickle;
 pub(crate) mod platform;
 pub(crate) mod pointer;
 mod read;
+pub mod reserve;
 mod scan;
 pub mod shard;
 mod sniff;
 pub mod source;
 pub mod text;
 pub mod tokenizer;
+mod untold;
 pub(crate) mod work;
 
 pub use contents::{HashedFiles, Progress, ReadOptions, TensorContents, TensorStats};
@@ -68,6 +70,7 @@ pub use text::hex;
 pub(crate) use text::hex;
 pub use text::{escape, file_size, line_column};
 pub use tokenizer::{Tokenizer, Vocabulary, has_paired_merges};
+pub use untold::{telling_all, untold};
 
 /// Folder in a checkpoint with the journal and the saved originals of a repair.
 pub const REPAIR_FOLDER: &str = ".ckpt-doctor";

@@ -12,10 +12,12 @@ mod hints;
 mod init;
 mod inspect;
 mod library;
+mod look;
 mod output;
 mod paths;
 mod progress;
 mod recipes;
+mod renderer;
 mod rules;
 mod settings;
 #[cfg_attr(windows, path = "cli/signals_windows.rs")]
@@ -26,6 +28,8 @@ mod stack;
 mod system;
 mod undo;
 mod verify;
+#[cfg_attr(windows, path = "cli/workers_windows.rs")]
+mod workers;
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -33,6 +37,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
+use crate::check::render_elsewhere;
 use crate::merge::PipelineError;
 use crate::surgery::{ApplyError, CAN_WRITE, RepairError};
 
@@ -77,6 +82,15 @@ pub fn main() -> ExitCode {
 
 fn run() -> ExitCode {
     signals::fail_at_file_size_limit();
+    let mark = std::env::args_os().nth(1);
+    if mark.as_deref().is_some_and(|mark| mark == renderer::ARGUMENT) {
+        return ExitCode::from(renderer::main());
+    }
+    render_elsewhere(renderer::render);
+    if mark.as_deref().is_some_and(|mark| mark == workers::ARGUMENT) {
+        let args = std::env::args_os();
+        return ExitCode::from(workers::main(args.enumerate().filter(|(n, _)| *n != 1).map(|(_, arg)| arg)));
+    }
     if let Some(name) = file_as_option(std::env::args_os().skip(1), Path::exists) {
         let name = output::safe(&name.to_string_lossy());
         output::note(&format!("error: {name} is also the name of a file; write -- before file names"));

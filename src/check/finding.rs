@@ -2,14 +2,15 @@
 
 use std::ops::Range;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::fix::FixHint;
+use crate::checkpoint::untold;
 pub use crate::knowledge::rule::{Consequence, Object, Severity};
 
 /// Where a finding points: a file, a place in it, a tensor.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Location {
@@ -24,12 +25,13 @@ pub struct Location {
     /// Tensor name.
     pub tensor: Option<String>,
     /// Byte range in the file, for renderers that show the source.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub span: Option<Range<usize>>,
 }
 
 /// One finding of one rule.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Finding {
@@ -42,10 +44,10 @@ pub struct Finding {
     /// One sentence that names the cause, with figures.
     pub message: String,
     /// Further facts, one sentence each.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub details: Vec<String>,
     /// What loaders of the run do because of it, the leading ones first.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub effects: Vec<FindingEffect>,
     /// Places; empty if the finding concerns the whole checkpoint.
     pub locations: Vec<Location>,
@@ -54,10 +56,11 @@ pub struct Finding {
     /// The fix, or the manual step.
     pub fix: Option<FixHint>,
     /// Further findings of the rule that are counted and not listed, because one file or one checkpoint has too many.
-    #[serde(skip_serializing_if = "is_zero")]
+    #[serde(skip_serializing_if = "is_zero", default)]
     pub hidden: u64,
     /// Whether the rule is a note, which the header shows.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub note: bool,
 }
 
@@ -81,7 +84,7 @@ const fn is_zero(n: &u64) -> bool {
 }
 
 /// What one loader does with one object because of a finding.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct FindingEffect {
@@ -99,7 +102,7 @@ pub struct FindingEffect {
 }
 
 /// A finding that settings or a baseline accept.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Suppressed {
     /// The finding.
@@ -110,7 +113,7 @@ pub struct Suppressed {
 }
 
 /// The origin of a suppression.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Accepted {
     /// `ckpt-doctor.json5: suppress[0]`, or the name of a baseline.
@@ -121,7 +124,7 @@ pub struct Accepted {
 }
 
 /// A rule that was skipped for a checkpoint.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Skipped {
     /// Rule code.
     pub code: String,

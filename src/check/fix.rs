@@ -3,17 +3,17 @@
 use std::cell::OnceCell;
 use std::ops::Range;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Fault, Place};
+use crate::checkpoint::{Checkpoint, Fault, Place, untold};
 use crate::knowledge::rule::{EditSpec, Fix, Safety};
 use crate::knowledge::{Scope, Template, source};
 
 mod repairs;
 
 /// One change to a checkpoint. `check --fix` makes all edits of a fix, or none.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -121,7 +121,7 @@ pub fn renamed(prefixes: &[(String, String)], name: &str) -> Option<String> {
 }
 
 /// The resolved fix of a finding.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
 pub struct FixHint {
@@ -134,10 +134,11 @@ pub struct FixHint {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub help: Option<String>,
     /// The changes that `check --fix` makes.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub edits: Vec<Edit>,
     /// Whether it rests on the description of a class, so that only a complete load after it proves it.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub needs_whole_load: bool,
 }
 

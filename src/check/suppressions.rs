@@ -1,7 +1,8 @@
 //! Suppressions that suppressed nothing.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
 
 use super::evaluate;
 use super::finding::Finding;
@@ -10,33 +11,60 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::Knowledge;
 use crate::knowledge::settings::{Suppression, absolute};
 
+/// What became of one suppression in one checkpoint.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SuppressionUse {
+    /// Whether it suppressed a finding.
+    used: bool,
+    /// Whether it names this checkpoint or a file of it.
+    concerned: bool,
+    /// What is reported for this checkpoint if it suppressed nothing in any.
+    unused: Vec<Finding>,
+}
+
+/// The suppressions of the settings, in their order, as one checkpoint used them.
+#[must_use]
+pub fn suppression_uses(knowledge: &Knowledge, checkpoint: &Checkpoint, outcome: &Outcome) -> Vec<SuppressionUse> {
+    let of = |suppression: &Suppression| {
+        let used = outcome.suppressed.iter().any(|s| s.accepted.by == suppression.written);
+        let names = checkpoint.entries.keys().map(String::as_str);
+        let fault = || {
+            Fault::new(FaultKind::SuppressionUnused)
+                .with("rule", suppression.rule.as_str())
+                .with("path", suppression.path.as_deref().unwrap_or(""))
+                .with("written", suppression.written.as_str())
+                .with("reason", suppression.reason.as_str())
+        };
+        SuppressionUse {
+            used,
+            concerned: suppression.concerns(checkpoint.source.path(), names),
+            unused: if used { Vec::new() } else { evaluate::report(knowledge, checkpoint, &[fault()]) },
+        }
+    };
+    knowledge.policy.suppressions.iter().map(of).collect()
+}
+
 /// A finding for each suppression that suppressed nothing, with the index of the checkpoint to report it for.
 ///
-/// `looked` are the checkpoints under one settings file and `searched` the directories in which every checkpoint was
-/// checked. A suppression is passed over when its rules were not run, or when it may apply to a checkpoint elsewhere.
+/// `looked` are the checkpoints under one settings file, with the uses that [`suppression_uses`] found, and `searched` the
+/// directories in which every checkpoint was checked. A suppression is passed over when its rules were not run, or when it may
+/// apply to a checkpoint elsewhere.
 #[must_use]
 pub fn unused_suppressions(
     knowledge: &Knowledge,
-    looked: &[(Arc<Checkpoint>, &Outcome)],
+    looked: &[(&Path, &[SuppressionUse])],
     searched: &[PathBuf],
 ) -> Vec<(usize, Finding)> {
     let mut found = Vec::new();
-    for suppression in &knowledge.policy.suppressions {
+    for (number, suppression) in knowledge.policy.suppressions.iter().enumerate() {
         let asked = knowledge.rules.rules.iter().any(|r| suppression.codes.contains(&r.code));
-        let used = |outcome: &Outcome| outcome.suppressed.iter().any(|s| s.accepted.by == suppression.written);
-        let roots = looked.iter().map(|(checkpoint, _)| checkpoint.source.path());
-        if !asked || looked.iter().any(|(_, o)| used(o)) || !is_covered(suppression, roots, searched) {
+        let uses: Vec<&SuppressionUse> = looked.iter().filter_map(|(_, uses)| uses.get(number)).collect();
+        let roots = looked.iter().map(|(root, _)| *root);
+        if !asked || uses.iter().any(|one| one.used) || !is_covered(suppression, roots, searched) {
             continue;
         }
-        let concerned = |c: &Checkpoint| suppression.concerns(c.source.path(), c.entries.keys().map(String::as_str));
-        let at = looked.iter().position(|(checkpoint, _)| concerned(checkpoint)).unwrap_or(0);
-        let Some((checkpoint, _)) = looked.get(at) else { continue };
-        let fault = Fault::new(FaultKind::SuppressionUnused)
-            .with("rule", suppression.rule.as_str())
-            .with("path", suppression.path.as_deref().unwrap_or(""))
-            .with("written", suppression.written.as_str())
-            .with("reason", suppression.reason.as_str());
-        found.extend(evaluate::report(knowledge, checkpoint, &[fault]).into_iter().map(|finding| (at, finding)));
+        let at = uses.iter().position(|one| one.concerned).unwrap_or(0);
+        found.extend(uses.get(at).into_iter().flat_map(|one| &one.unused).map(|finding| (at, finding.clone())));
     }
     found
 }

@@ -1,18 +1,23 @@
 //! Chat templates: their syntax, the token that ends a turn, and the begin-of-sequence token that they write.
 //!
 //! A template is parsed and rendered as `apply_chat_template` of transformers does it, in a sandbox: it opens nothing, and
-//! [`render`] bounds its steps, memory and output. An error of rendering proves nothing, because templates refuse
-//! conversations on purpose, and the engine lacks parts of Jinja2.
+//! [`render`] bounds its steps, memory and output. One that uses more than an allow list of syntax, or whose values may grow, is
+//! rendered in a process under limits ([`elsewhere`]), or not at all. An error of rendering proves nothing, because templates
+//! refuse conversations on purpose, and the engine lacks parts of Jinja2.
 
 use crate::checkpoint::files;
 use serde_json::{Map, Value};
 
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 
+mod elsewhere;
 mod render;
 mod tame;
 
-use render::{Rendered, Rendering};
+use elsewhere::{Away, render_away};
+pub use elsewhere::{RenderJob, render_elsewhere};
+pub use render::Rendering;
+use render::{FUEL, MAX_TEXT, Rendered};
 
 /// Templates of one checkpoint that are read; published ones have at most three.
 const MAX_TEMPLATES: usize = 16;
@@ -68,27 +73,70 @@ pub(super) fn by_file(checkpoint: &Checkpoint) -> Value {
 
 /// Faults of chat templates. Called by the engine for each checkpoint.
 pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
-    let special: Vec<(&str, &str)> =
-        checkpoint.tokenizer.special_tokens.iter().map(|(name, token)| (name.as_str(), token.as_str())).collect();
+    let special = checkpoint.tokenizer.special_tokens.iter();
+    let special: Vec<(String, String)> = special.map(|(name, token)| (name.clone(), token.clone())).collect();
+    let templates = templates(checkpoint);
     let mut faults = Vec::new();
-    for template in templates(checkpoint) {
+    for (template, rendering) in templates.iter().zip(renderings(&templates, special)) {
         let place = template.place();
-        match Rendering::of(template.text, &special) {
-            Rendering::Invalid { line, reason } => {
+        let not_rendered = |kind, reason: String| Fault::new(kind).at(place.clone()).with("reason", reason);
+        match rendering {
+            Ok(Rendering::Invalid { line, reason }) => {
                 let fault = Fault::new(FaultKind::TemplateSyntax).at(place);
                 faults.push(fault.with("line", line).with("reason", escape(&reason, CAP)));
             }
-            Rendering::Done(rendered) => {
+            Ok(Rendering::Done(rendered)) => {
                 faults.extend(end_of_turn(checkpoint, &rendered, place.clone()));
                 faults.extend(second_begin(checkpoint, &rendered, place));
             }
-            Rendering::Refused(reason) => {
-                faults.push(Fault::new(FaultKind::TemplateNotRendered).at(place).with("reason", reason));
-            }
-            Rendering::Unknown => {}
+            Ok(Rendering::Refused(reason)) => faults.push(not_rendered(FaultKind::TemplateNotRendered, reason)),
+            Ok(Rendering::Unknown) => {}
+            Err(reason) => faults.push(not_rendered(FaultKind::TemplateNeedsProcess, reason)),
         }
     }
     faults
+}
+
+/// What became of each template, in their order; for one that needs a process where none can be had, the reason.
+fn renderings(templates: &[Template<'_>], special: Vec<(String, String)>) -> Vec<Result<Rendering, String>> {
+    let judged = templates.iter().map(|template| rendered_here(template.text, &special));
+    let (mut results, mut away) = (Vec::new(), Vec::new());
+    for (judged, template) in judged.zip(templates) {
+        match judged {
+            Ok(rendering) => results.push(Some(Ok(rendering))),
+            Err(why) => {
+                results.push(None);
+                away.push((template.text.to_owned(), why));
+            }
+        }
+    }
+    let mut away = render_away(away, special).into_iter();
+    results.into_iter().map(|known| known.or_else(|| away.next()).unwrap_or(Ok(Rendering::Unknown))).collect()
+}
+
+/// Renders a template of the allow list; for any other, why it needs a process of its own.
+fn rendered_here(text: &str, special: &[(String, String)]) -> Result<Rendering, Away> {
+    if text.len() > MAX_TEXT {
+        return Ok(Rendering::Refused(format!("it has {} bytes, more than {MAX_TEXT}", text.len())));
+    }
+    if let Some(cost) = tame::cost(text) {
+        return Err(Away::Costs(cost.reason().to_owned()));
+    }
+    if let Some(name) = tame::unknown_name(text) {
+        return Err(Away::Uses(escape(&name, CAP)));
+    }
+    match Rendering::of(text, special, FUEL) {
+        Rendering::Refused(reason) => Err(Away::Costs(reason)),
+        rendering => Ok(rendering),
+    }
+}
+
+/// What becomes of a template in this process; `None` for one that needs a process of its own. For the fuzz target.
+#[cfg(feature = "internals")]
+#[must_use]
+pub fn rendered_in_process(text: &str) -> Option<Rendering> {
+    let special = ["bos_token", "eos_token"].map(|name| (name.to_owned(), format!("<{name}>")));
+    rendered_here(text, &special).ok()
 }
 
 /// The fault of a template that ends turns with a token at which generation does not stop.

@@ -6,17 +6,17 @@
 use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::finding::{Finding, FindingEffect};
 use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
-use crate::checkpoint::{Checkpoint, NotRead};
+use crate::checkpoint::{Checkpoint, NotRead, untold};
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
 
 /// The answer of one loader, the worst last.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum LoadVerdict {
@@ -53,7 +53,7 @@ impl From<Consequence> for LoadVerdict {
 }
 
 /// What one loader does with one object of a checkpoint.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct ObjectVerdict {
@@ -65,12 +65,12 @@ pub struct ObjectVerdict {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub why: Option<String>,
     /// Codes of the findings that it rests on; also of suppressed ones, and of rules that were not selected.
-    #[serde(skip_serializing_if = "BTreeSet::is_empty")]
+    #[serde(skip_serializing_if = "BTreeSet::is_empty", default)]
     pub findings: BTreeSet<String>,
 }
 
 /// What one version of transformers does with a checkpoint.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct PredictedLoad {
@@ -80,7 +80,8 @@ pub struct PredictedLoad {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stands_for: Option<String>,
     /// Whether the checkpoint must load there: the user named the version, or it wrote config.json.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub leads: bool,
     /// The worst verdict of the objects. One that is not predicted counts only for the model, or when nothing else is
     /// offered.

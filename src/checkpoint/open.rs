@@ -322,7 +322,9 @@ impl Opened {
     /// # Errors
     /// When reading fails or the file has more bytes than the cap; `path` is used in the message.
     pub fn read_all(&self, path: &Path) -> Result<Vec<u8>, OpenError> {
-        let mut bytes = Vec::with_capacity(usize::try_from(self.identity.size).unwrap_or(0));
+        let mut bytes = Vec::new();
+        let reserved = bytes.try_reserve_exact(usize::try_from(self.identity.size).unwrap_or(usize::MAX));
+        reserved.map_err(|_| OpenError::from_io(path, std::io::ErrorKind::OutOfMemory.into()))?;
         let limit = self.cap.saturating_add(1);
         (&self.file).take(limit).read_to_end(&mut bytes).map_err(|source| OpenError::from_io(path, source))?;
         let size = u64::try_from(bytes.len()).unwrap_or(u64::MAX);

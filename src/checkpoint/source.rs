@@ -107,7 +107,7 @@ impl Source {
     ///
     /// # Errors
     /// When it is missing, is not a folder or cannot be opened.
-    pub(super) fn list(&self, folder: &str) -> std::io::Result<Entries> {
+    pub(crate) fn list(&self, folder: &str) -> std::io::Result<Entries> {
         Ok(match self {
             Self::Directory(LocalDirectory { path: root, .. }) if folder.is_empty() => Box::new(list(root)?),
             Self::Directory(LocalDirectory { path: root, .. }) => Box::new(list(&root.join(folder))?),

@@ -1,5 +1,6 @@
 //! Arguments of the command line, with their help texts.
 
+use std::num::NonZeroU8;
 use std::path::PathBuf;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser as _};
@@ -268,6 +269,9 @@ pub struct CheckArgs {
     /// not followed, except into the Hub cache
     #[arg(long, value_name = "DIR")]
     pub follow_links: Vec<PathBuf>,
+    /// Directories that are checked at once, each by a process of its own [default: one for each processor, at most 16]
+    #[arg(short, long, value_name = "N")]
+    pub jobs: Option<NonZeroU8>,
     /// Run only these rules: codes, prefixes of codes (JSN) or names, comma-separated
     #[arg(long, value_name = "RULE", value_delimiter = ',', help_heading = "Rule selection")]
     pub select: Vec<String>,

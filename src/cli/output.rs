@@ -3,6 +3,7 @@
 use std::fs;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 
@@ -10,9 +11,22 @@ use super::args::{Color, ReportArgs};
 use super::system;
 use crate::report::{Format, Report, Style, render, statistics};
 
+/// Whether [`note`] prints nothing.
+static SILENT: AtomicBool = AtomicBool::new(false);
+
 /// Prints a line to standard error. A failure (full disk, closed pipe) is ignored; `eprintln` would panic.
 pub fn note(line: &str) {
-    let _ = writeln!(std::io::stderr(), "{line}");
+    if !SILENT.load(Ordering::Relaxed) {
+        let _ = writeln!(std::io::stderr(), "{line}");
+    }
+}
+
+/// Runs `work` without its notes, which another process has printed. Called by a worker with the start of a run.
+pub fn silently<T>(work: impl FnOnce() -> T) -> T {
+    SILENT.store(true, Ordering::Relaxed);
+    let result = work();
+    SILENT.store(false, Ordering::Relaxed);
+    result
 }
 
 /// Prints the report or its statistics, and writes the files of `--report`, which are never `quiet`.

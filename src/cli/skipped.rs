@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::output;
-use crate::check::Outcome;
+use crate::check::finding::Skipped;
 use crate::checkpoint::escape;
 use crate::knowledge::rule::RuleSet;
 
@@ -12,18 +12,13 @@ use crate::knowledge::rule::RuleSet;
 const REASON: usize = 100;
 
 /// Prints why each skipped rule was skipped; rules with the same reason share a line.
-pub fn print(dir: &Path, outcome: &Outcome, rules: &RuleSet) {
+pub fn print(dir: &Path, skips: &[Skipped], rules: &RuleSet) {
     let mut reasons: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    for skipped in &outcome.skipped {
+    for skipped in skips {
         reasons.entry(&skipped.why).or_default().push(&skipped.code);
     }
     let all: Vec<&str> = rules.all().map(|rule| rule.code.as_str()).collect();
-    output::note(&output::safe(&format!(
-        "{}: {} of {} rules were skipped",
-        dir.display(),
-        outcome.skipped.len(),
-        all.len()
-    )));
+    output::note(&output::safe(&format!("{}: {} of {} rules were skipped", dir.display(), skips.len(), all.len())));
     for (why, codes) in reasons {
         output::note(&format!("  {}: {}", escape(why, REASON), named(codes, &all).join(", ")));
     }

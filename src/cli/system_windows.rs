@@ -1,5 +1,9 @@
 //! What the command line asks the system, on Windows.
 
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
+
 /// Width of the terminal at standard output, in columns; `None` when it does not tell.
 pub fn columns() -> Option<usize> {
     let (terminal_size::Width(width), _) = terminal_size::terminal_size_of(std::io::stdout())?;
@@ -14,4 +18,19 @@ pub fn shows_color() -> bool {
 /// Bytes of the stack of the main thread: what linkers reserve.
 pub const fn stack() -> Option<u64> {
     Some(1 << 20)
+}
+
+/// The file of this program, to start it again.
+pub fn program() -> io::Result<PathBuf> {
+    std::env::current_exe()
+}
+
+/// Fails: limits of a process need a job object, which the standard library cannot make.
+pub fn limit(_seconds: u64, _memory: u64) -> io::Result<()> {
+    Err(io::ErrorKind::Unsupported.into())
+}
+
+/// Time of a processor that this process has taken: unknown, and nothing limits it.
+pub const fn taken() -> Option<Duration> {
+    None
 }

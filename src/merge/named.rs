@@ -1,6 +1,9 @@
 //! What the entries of a recipe name: the tensors of donors that a merge may change. Every other one keeps its bytes.
 
+use std::cell::RefCell;
+
 use regex::{Regex, RegexBuilder};
+use regex_automata::nfa::thompson;
 use regex_syntax::hir::Look;
 use regex_syntax::hir::literal::Extractor;
 use serde::{Deserialize, Serialize};
@@ -10,6 +13,7 @@ use super::manifest::DonorTensor;
 use super::parts::PartOf;
 use crate::check::adapter::lora::module_of;
 use crate::checkpoint::escape;
+use crate::checkpoint::work::Work;
 use crate::surgery::expr::{TensorExpr, TensorTransform};
 use crate::surgery::plan::{Plan, PlannedTensor, TensorRef};
 
@@ -125,6 +129,9 @@ pub(super) const MAX_ENTRIES: usize = 200;
 /// Longest pattern of a recipe, and longest name that it is replaced by, in bytes.
 pub(super) const MAX_PATTERN: usize = 2_000;
 
+/// Work of a comparison with a donor's role or the start of a name.
+const COMPARISON: u64 = 20;
+
 /// Compiles a pattern of a recipe or manifest.
 ///
 /// # Errors
@@ -178,9 +185,24 @@ impl NamedTensors {
 
 /// [`Changeable`] with its expressions parsed.
 pub(super) struct Bounds<'c> {
-    named: Vec<(&'c NamedTensors, Option<Regex>)>,
+    named: Vec<(&'c NamedTensors, Option<Pattern>)>,
     casts: &'c [AnnouncedCast],
     merged: &'c [MergedRoles],
+    /// What comparisons may cost, for bounds that a stranger wrote.
+    work: Option<RefCell<Work>>,
+}
+
+/// An expression, and the most states that a search of it may be in at one byte.
+struct Pattern {
+    regex: Regex,
+    states: u64,
+}
+
+impl Pattern {
+    fn new(text: &str) -> Option<Self> {
+        let states = thompson::NFA::compiler().build(text).map_or(PATTERN, |nfa| nfa.states().len());
+        Some(Self { regex: pattern(text).ok()?, states: u64::try_from(states).unwrap_or(u64::MAX) })
+    }
 }
 
 impl<'c> Bounds<'c> {
@@ -193,13 +215,28 @@ impl<'c> Bounds<'c> {
             if let Some(fault) = named.fault() {
                 return Err(format!("\"changes\" of the {} donor {fault}", named.donor));
             }
-            Ok((named, named.names.as_deref().and_then(|names| pattern(names).ok())))
+            Ok((named, named.names.as_deref().and_then(Pattern::new)))
         };
         if changeable.named.len() > MAX_ENTRIES {
             return Err(format!("\"changes\" has {} entries, more than {MAX_ENTRIES}", changeable.named.len()));
         }
         let named = changeable.named.iter().map(entry).collect::<Result<_, _>>()?;
-        Ok(Self { named, casts: &changeable.casts, merged: &changeable.merged })
+        Ok(Self { named, casts: &changeable.casts, merged: &changeable.merged, work: None })
+    }
+
+    /// The same bounds, whose comparisons may cost what `bytes` bytes may. Called by `verify` with those of a manifest.
+    pub(super) fn paid_by(self, bytes: u64) -> Self {
+        Self { work: Some(RefCell::new(Work::for_bytes(bytes))), ..self }
+    }
+
+    /// Whether comparisons cost more than they may. From then on, everything counts as allowed.
+    pub(super) fn is_exceeded(&self) -> bool {
+        !self.pay(1, 1)
+    }
+
+    /// Pays for `count` comparisons of `units` each; false when more is asked for than is left.
+    fn pay(&self, count: usize, units: u64) -> bool {
+        self.work.as_ref().is_none_or(|work| work.borrow_mut().spend(count, units).is_ok())
     }
 
     /// Whether an expression may change the tensor that it stands for. A product must be that of the module of an adapter that
@@ -218,6 +255,9 @@ impl<'c> Bounds<'c> {
             roles.base == donor
                 && [&product.left, &product.right].iter().all(|factor| is_of(&roles.adapter, factor.of()))
         };
+        if !self.pay(self.merged.len(), COMPARISON) {
+            return true;
+        }
         to.copied().is_some_and(|to| !to.is_slice()) && self.merged.iter().any(|roles| is_merged(&roles))
     }
 
@@ -234,15 +274,22 @@ impl<'c> Bounds<'c> {
     /// Whether a tensor of a donor may be changed.
     fn name(&self, donor: &str, tensor: &str) -> bool {
         let starts = |of: &[String]| of.iter().any(|start| tensor.starts_with(start.as_str()));
-        self.named.iter().any(|(named, regex)| {
-            let of_part = || named.part.is_none() || (starts(&named.starts) && !starts(&named.without));
-            named.donor == donor && of_part() && regex.as_ref().is_none_or(|regex| regex.is_match(tensor))
+        self.named.iter().any(|(named, pattern)| {
+            let of_part = || {
+                let list = named.starts.len().saturating_add(named.without.len());
+                named.part.is_none()
+                    || !self.pay(list, COMPARISON)
+                    || (starts(&named.starts) && !starts(&named.without))
+            };
+            let has_name =
+                |pattern: &Pattern| !self.pay(tensor.len(), pattern.states) || pattern.regex.is_match(tensor);
+            !self.pay(1, COMPARISON) || named.donor == donor && of_part() && pattern.as_ref().is_none_or(has_name)
         })
     }
 
     /// Whether a cast was announced.
     fn casts_to(&self, donor: &str, dtype: &str) -> bool {
-        self.casts.iter().any(|cast| cast.donor == donor && cast.to == dtype)
+        !self.pay(self.casts.len(), COMPARISON) || self.casts.iter().any(|cast| cast.donor == donor && cast.to == dtype)
     }
 
     /// Fails when a plan changes a tensor that no entry names.
@@ -270,6 +317,29 @@ pub(super) fn starts_literally(names: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Patterns with hundreds of states, or a million starts of names for each tensor.
+    #[test]
+    fn bounds_of_a_stranger_cost_what_their_bytes_may() {
+        let named = |starts: usize, names: &str| NamedTensors {
+            donor: "vision".to_owned(),
+            part: (starts > 0).then(|| "projector".to_owned()),
+            starts: vec!["x".to_owned(); starts],
+            without: Vec::new(),
+            names: (!names.is_empty()).then(|| names.to_owned()),
+        };
+        for (entry, entries, is_exceeded) in [
+            (named(0, "^m(?:[a-z]{40}){10}x"), 200, true),
+            (named(1_000_000, ""), 1, true),
+            (named(1, "^model\\.layers\\.[0-9]+\\.mlp"), 20, false),
+        ] {
+            let changeable = Changeable { named: vec![entry; entries], casts: Vec::new(), merged: Vec::new() };
+            let names: Vec<String> = (0..2_000).map(|i| format!("model.layers.{i}.self_attn.q_proj.weight")).collect();
+            let bounds = Bounds::new(&changeable).expect("bounds").paid_by(100 * 2_000);
+            let allowed = names.iter().filter(|name| bounds.name("vision", name)).count();
+            assert_eq!((bounds.is_exceeded(), allowed > 0), (is_exceeded, is_exceeded));
+        }
+    }
 
     #[test]
     fn a_pattern_names_tensors_when_it_starts_with_literal_text() {

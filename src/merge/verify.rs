@@ -61,6 +61,7 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
         path: dir.join(&*manifest::NAME),
         reason: format!("{reason}; the manifest is damaged"),
     })?;
+    let bounds = bounds.map(|bounds| bounds.paid_by(recorded.bytes_of_names()));
     let mut run = Run::new(&result, &recorded, bounds);
     let mut parts = Vec::new();
     if recorded.schema >= 2 {
@@ -74,8 +75,15 @@ pub fn verify(dir: &Path, donors: &BTreeMap<String, PathBuf>) -> Result<Verifica
         parts.push(run.donor_files(role, donor)?);
         parts.push(run.recomputed(role, &given)?);
     }
+    if run.bounds.as_ref().is_some_and(Bounds::is_exceeded) {
+        run.unverified
+            .push("\"changes\" of the manifest take too long to compare with the names of its tensors".to_owned());
+    }
     Ok(Verification::new(shown(dir), recorded.recipe(), recorded.schema, parts, run.unverified))
 }
+
+/// Hidden entries that tools put beside a result: git, huggingface_hub, this program and the Finder of macOS. No loader reads one.
+const OF_TOOLS: [&str; 6] = [".cache", ".ckpt-doctor", ".DS_Store", ".git", ".gitattributes", ".gitignore"];
 
 struct Run<'v> {
     result: &'v Checkpoint,
@@ -116,10 +124,14 @@ impl<'v> Run<'v> {
         compare_headers(result, &recorded.shards, own, &mut part);
         for (name, entry) in &result.entries {
             let is_recorded = recorded.files.contains_key(name) || recorded.shards.contains_key(name);
-            // Hidden files belong to other tools, such as git.
-            if !is_recorded && **name != *manifest::NAME && !name.starts_with('.') {
+            if !is_recorded && **name != *manifest::NAME {
                 let detail = (entry.kind != EntryKind::Regular).then(|| format!("a {}", entry.kind));
                 part.differ(name, DifferenceKind::Extra, detail);
+            }
+        }
+        for name in hidden(&result.source)? {
+            if !recorded.files.contains_key(&name) {
+                part.differ(&name, DifferenceKind::Extra, Some("hidden".to_owned()));
             }
         }
         Ok(part)
@@ -372,6 +384,14 @@ fn header_difference(found: &Tensor, recorded: &RecordedTensor) -> Option<String
         let (is, was) = ((found.dtype, &found.shape), (&recorded.dtype, &recorded.shape));
         format!("is {} {:?}, recorded is {} {:?}", is.0, is.1, was.0, was.1)
     })
+}
+
+/// The hidden entries of a directory that are not of [`OF_TOOLS`]. A checkpoint does not list them.
+fn hidden(source: &Source) -> Result<BTreeSet<String>, OpenError> {
+    let io = |error| OpenError::from_io(source.path(), error);
+    let names = source.list("").map_err(io)?.map(|entry| entry.map(|entry| entry.name.to_string_lossy().into_owned()));
+    let is_hidden = |name: &String| name.starts_with('.') && !OF_TOOLS.contains(&name.as_str());
+    names.filter(|name| name.as_ref().map_or(true, is_hidden)).collect::<Result<_, _>>().map_err(io)
 }
 
 /// What a manifest before version 4 leaves open: it does not say which tensors the recipe was allowed to change.

@@ -63,6 +63,15 @@ impl CheckpointReport {
         self.overrides.is_some() || !self.suppressed.is_empty()
     }
 
+    /// Adds a finding that the run made, which points into no document.
+    #[cfg_attr(not(feature = "cli"), allow(dead_code, reason = "only the program looks for unused suppressions"))]
+    pub(crate) fn add(&mut self, finding: Finding) {
+        self.findings.push(finding);
+        self.findings = by_severity(&self.findings);
+        self.counts = Counts::new(&self.findings);
+        self.verdict = self.counts.verdict();
+    }
+
     /// Removes findings below this severity; they stay in `counts`. Returns their number.
     pub(crate) fn hide_below(&mut self, least: Severity) -> usize {
         let all = self.findings.iter().map(Finding::count).fold(0, usize::saturating_add);

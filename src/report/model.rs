@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 pub use super::merge::{
     Cast, ChangedTensor, ConfigChange, Dropped, DryRun, MergeReport, MergeStage, MergedFile, PlannedShardSize, Role,
@@ -12,7 +12,7 @@ pub use super::merge::{
 use crate::check::finding::Suppressed;
 use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
-use crate::checkpoint::TensorContents;
+use crate::checkpoint::{TensorContents, untold};
 use crate::knowledge::Knowledge;
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
@@ -105,14 +105,14 @@ impl ToolInfo {
 }
 
 /// The report of one checkpoint.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct CheckpointReport {
     /// The path, as the user wrote it.
     pub path: String,
     /// Its role in a merge: `donor vision`, `planned`, `written`; missing for `check`.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none", skip_deserializing)]
     pub role: Option<Role>,
     /// The class that config.json names: the first of `architectures`, or `_class_name` of diffusers.
     pub class: Option<String>,
@@ -137,30 +137,32 @@ pub struct CheckpointReport {
     /// Findings, sorted by severity (errors first), file, place and code.
     pub findings: Vec<Finding>,
     /// Findings that settings or a baseline accept; `counts` does not include them.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub suppressed: Vec<Suppressed>,
     /// Will it load? One entry for each version of transformers of the run, those that the checkpoint must load with first.
     pub loads: Vec<PredictedLoad>,
     /// What each tensor contains, with `--deep`: by file, then in the order of the bytes. Tensors that could not be read are
     /// missing, and so are those that share the bytes of another.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub contents: Vec<TensorContents>,
     /// Findings whose fixes were applied; `findings` has the remaining ones.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub fixed: Vec<Fixed>,
     /// Fixes that were tried and rolled back.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub withdrawn: Vec<Withdrawn>,
     /// The fix options of the run, for renderers that offer fixes.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub fixing: Option<Fixing>,
     /// Text of the documents findings point into, by file name; for renderers that show source.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub sources: BTreeMap<String, Arc<str>>,
 }
 
 /// The verdict over one checkpoint, or over all of a run: clean, or the worst severity of its findings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
@@ -201,7 +203,7 @@ impl From<Severity> for Verdict {
 }
 
 /// Changes to the rules by a settings file and by options; a verdict under them differs from the one without.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Overrides {
@@ -230,7 +232,7 @@ impl Overrides {
 }
 
 /// Fix options of the run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fixing {
     /// Whether unsafe fixes count as well.
     pub unsafe_fixes: bool,
@@ -239,7 +241,7 @@ pub struct Fixing {
 }
 
 /// The number of findings of each severity.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Counts {
     /// Errors.

@@ -132,11 +132,13 @@ pub enum RepairError {
         error: io::Error,
     },
     /// A new file could not be given the owner of the original.
-    #[error("{path} is owned by another user, and its replacement cannot be given that owner ({error}); \
+    #[error("{path} is owned by another {whose}, and its replacement cannot be given that owner ({error}); \
              `--fix --output DIR` makes a repaired copy", path = path.display())]
     Owner {
-        /// The file.
+        /// The original.
         path: PathBuf,
+        /// `user` or `group`.
+        whose: &'static str,
         /// The system's error.
         error: io::Error,
     },

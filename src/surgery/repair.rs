@@ -11,17 +11,17 @@ mod unused;
 use std::path::Path;
 use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::error::RepairError;
 use super::plan::PlannedShard;
 use crate::check::{Edit, Outcome, Safety};
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, untold};
 
 pub use planner::{plan, tried};
 
 /// A finding whose fix was applied.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
 pub struct Fixed {
@@ -40,7 +40,7 @@ pub struct Fixed {
 }
 
 /// A fix that was tried and rolled back.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
 pub struct Withdrawn {
@@ -51,7 +51,8 @@ pub struct Withdrawn {
     /// Why it was rolled back.
     pub reason: String,
     /// Its edits.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub edits: Vec<Edit>,
 }
 

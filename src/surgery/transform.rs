@@ -15,6 +15,7 @@ use super::plan::{NewValues, PlannedTensor, TensorRef};
 use super::product::Adder;
 use super::values::Codec;
 use crate::checkpoint::Dtype;
+use crate::checkpoint::reserve::reserved;
 
 /// Factor on the covariance of sampled rows. Source: `_init_added_embeddings_weights_with_mean` in transformers 4.47 to 5.23.
 const SAMPLE_VARIANCE: f64 = 1e-9;
@@ -192,8 +193,8 @@ impl Table {
 
     /// Copies the rows and returns their mean; zeros without rows.
     fn copy_rows(self, read: &mut ReadOperand<'_>, codec: &mut Codec, out: &mut dyn Write) -> io::Result<Vec<f64>> {
-        let mut row = vec![0_u8; self.row_len()?];
-        let mut mean = vec![0_f64; usize::try_from(self.width).map_err(io::Error::other)?];
+        let mut row: Vec<u8> = reserved(self.row_len()?)?;
+        let mut mean: Vec<f64> = reserved(usize::try_from(self.width).map_err(io::Error::other)?)?;
         let mut at = 0_u64;
         for _ in 0..self.rows {
             read(at, &mut row)?;
@@ -241,7 +242,7 @@ pub fn sample_rows(read: &mut ReadOperand<'_>, table: Table, name: &str, out: &m
     let mean = table.copy_rows(read, &mut codec, out)?;
     let mut rng = seeded(name);
     let factor = (SAMPLE_VARIANCE / f64::from(SAMPLE_TERMS)).sqrt();
-    let mut donor_row = vec![0_u8; table.row_len()?];
+    let mut donor_row: Vec<u8> = reserved(table.row_len()?)?;
     let mut row = Vec::new();
     for _ in 0..table.more {
         let mut values = mean.clone();

@@ -5,5 +5,9 @@ mod check;
 mod expect;
 #[cfg(unix)]
 mod selection;
+#[cfg(target_os = "linux")]
+mod templates;
 #[cfg(unix)]
 mod usage;
+#[cfg(unix)]
+mod workers;

@@ -6,6 +6,7 @@
 //! test build.
 
 mod bombs;
+mod limits;
 mod run;
 mod shape;
 mod surroundings;

@@ -68,6 +68,12 @@ fn each_case_is_reported_by_its_rule() {
 }
 
 #[test]
+fn reports_arrive_as_workers_send_them() {
+    let lost = failures(|t| t.lost.clone());
+    assert!(lost.is_empty(), "{}", lost.join("\n"));
+}
+
+#[test]
 fn no_rule_reports_the_base_of_its_case() {
     let wrong = failures(|t| {
         let code = t.case.code.as_ref()?;

@@ -20,9 +20,9 @@ use std::process::Command;
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Outcome, Safety, check, check_for, unused_suppressions};
+use ckpt_doctor::check::{Outcome, Safety, check, check_for, suppression_uses, unused_suppressions};
 use ckpt_doctor::checkpoint::journal::StateFolder;
-use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, ReadOptions};
+use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, ReadOptions, telling_all};
 use ckpt_doctor::knowledge::rule::RuleSet;
 use ckpt_doctor::knowledge::selection::Choice;
 use ckpt_doctor::knowledge::settings::{Chain, SettingsSource};
@@ -110,6 +110,8 @@ pub struct Tried {
     pub kinds: BTreeSet<FaultKind>,
     /// The first finding of the case's own rule, as `check` prints it.
     pub example: String,
+    /// Where the report differs from what a worker would send of it.
+    pub lost: Option<String>,
 }
 
 impl Tried {
@@ -218,7 +220,8 @@ fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> 
         Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(read(dir));
     let mut outcome = check(&checkpoint, &knowledge);
-    let unused = unused_suppressions(&knowledge, &[(Arc::clone(&checkpoint), &outcome)], &[above.to_owned()]);
+    let uses = suppression_uses(&knowledge, &checkpoint, &outcome);
+    let unused = unused_suppressions(&knowledge, &[(checkpoint.source.path(), &uses)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
     (checkpoint, outcome)
 }
@@ -292,6 +295,16 @@ fn example(code: &str, checkpoint: &Checkpoint, outcome: &Outcome) -> Option<Str
     let report = CheckpointReport::new("model", None, checkpoint, outcome);
     let text = report::render_finding(finding, &report, Style { width: Some(100), ..Style::default() });
     Some(text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n"))
+}
+
+/// The first line in which a report differs once it was sent by a worker.
+fn lost(report: &CheckpointReport) -> Option<String> {
+    let text = telling_all(|| serde_json::to_string(report)).expect("JSON");
+    let received: CheckpointReport = serde_json::from_str(&text).expect("the report");
+    let (sent, received) = (format!("{report:#?}"), format!("{received:#?}"));
+    let pair = sent.lines().zip(received.lines()).find(|(one, other)| one != other);
+    pair.map(|(one, other)| format!("{one} / {other}"))
+        .or_else(|| (sent.len() != received.len()).then(|| "length".to_owned()))
 }
 
 /// A defect in one of the two models.
@@ -414,7 +427,8 @@ fn try_all() -> Vec<Tried> {
         };
         let kinds = take_kinds(&mut outcome);
         let example = case.code.as_ref().and_then(|code| example(code, &checkpoint, &outcome)).unwrap_or_default();
-        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds, example }
+        let lost = lost(&CheckpointReport::new("model", None, &checkpoint, &outcome));
+        Tried { case: case.clone(), outcome, before: before[case.base.as_str()].clone(), kinds, example, lost }
     });
     tried.into_iter().map(|(_, tried)| tried).collect()
 }

@@ -1,7 +1,7 @@
 """The law of work: whatever the bytes of a checkpoint, `check` ends by itself, in bounded time and memory.
 
 Draws inputs that make a little text cost much: pickles that use large values again and again, tables of patterns over many
-names, chat templates. For each, the program must end without a signal, with at most 2 s of a processor and one more for each
+names, chat templates, documents with long or nested values under keys that rules read. For each, the program must end without a signal, with at most 2 s of a processor and one more for each
 10 MB of input, and at most 512 MiB of memory.
 
     CKPT_DOCTOR=target/release/ckpt-doctor python tests/peer/work.py [--count 300] [--seed 1] [--kind pickles]
@@ -412,10 +412,74 @@ def write_template(rng, directory, _):
     (directory / "tokenizer_config.json").write_text(json.dumps({"chat_template": template, "bos_token": "<s>"}))
 
 
+# Documents
+
+# Keys of documents that rules and loaders read, with the documents that have them.
+KEYS = {
+    "config.json": [
+        "architectures", "auto_map", "bos_token_id", "eos_token_id", "hidden_act", "hidden_size", "id2label", "label2id", "layer_types",
+        "model_type", "num_hidden_layers", "pad_token_id", "quantization_config", "rope_parameters", "rope_scaling", "text_config",
+        "torch_dtype", "transformers_version", "vision_config",
+    ],
+    "generation_config.json": ["bad_words_ids", "eos_token_id", "suppress_tokens", "transformers_version"],
+    "model.safetensors.index.json": ["metadata", "weight_map"],
+    "preprocessor_config.json": ["auto_map", "image_processor_type", "size"],
+    "processor_config.json": ["auto_map", "chat_template", "processor_class"],
+    "special_tokens_map.json": ["additional_special_tokens", "bos_token", "eos_token"],
+    "tokenizer.json": ["added_tokens", "model", "normalizer", "post_processor", "pre_tokenizer"],
+    "tokenizer_config.json": ["added_tokens_decoder", "auto_map", "bos_token", "chat_template", "extra_special_tokens", "tokenizer_class"],
+}  # fmt: skip
+
+WORDS = [
+    "model.layers.0.mlp.weight",
+    "LlamaForCausalLM",
+    "llama",
+    "<s>",
+    "content",
+    "a",
+    "",
+    "\u202e",
+    "x" * 300,
+    "custom.Class",
+    "0",
+    "vocab",
+]
+
+
+def value(rng, room):
+    """A JSON value of about `room` bytes, as text: flat and long, nested, or one text repeated."""
+    word = json.dumps(rng.choice(WORDS))
+    count = max(1, room // 12)
+    if room < 40:
+        return word
+    return rng.choice([
+        lambda: json.dumps("".join(rng.choice("aé<|>{}/.%") for _ in range(20)) * max(1, room // 20)),
+        lambda: "[" + ",".join([word] * max(1, room // (len(word) + 1))) + "]",
+        lambda: "[" + ",".join(str(rng.randrange(-10, 10**9)) for _ in range(count)) + "]",
+        lambda: "{" + ",".join(f'"{i}":{word}' for i in range(max(1, room // (len(word) + 8)))) + "}",
+        lambda: "{" + ",".join(f'"model.layers.{i}.w":"model-{i % 999:05}.safetensors"' for i in range(max(1, room // 50))) + "}",
+        lambda: "{" + ",".join(f"{word}:{i}" for i in range(max(1, room // (len(word) + 8)))) + "}",
+        lambda: "[" * min(120, count) + value(rng, room // 2) + "]" * min(120, count),
+        lambda: "[" + ",".join(value(rng, room // 8) for _ in range(6)) + "]",
+        lambda: "{" + ",".join(f'"k{i}":{value(rng, room // 8)}' for i in range(6)) + "}",
+        lambda: "[" + ",".join(['{"content":"<s>","id":1}'] * max(1, room // 26)) + "]",
+        lambda: rng.choice(["1" * min(room, 4000), "1e" + "9" * 20, "-0.0", "null", "true", "1" + "0" * 30]),
+    ])()  # fmt: skip
+
+
+def write_documents(rng, directory, budget):
+    (directory / "config.json").write_text(json.dumps(LLAMA))
+    for file in rng.sample(list(KEYS), rng.randint(1, 3)):
+        first = json.dumps(LLAMA)[1:-1] + "," if file == "config.json" else ""
+        keys = rng.sample(KEYS[file], min(len(KEYS[file]), rng.randint(1, 3)))
+        members = ",".join(f'"{key}":{value(rng, drawn_size(rng, max(10, budget // 8)))}' for key in keys)
+        (directory / file).write_text("{" + first + members + "}")
+
+
 # The law
 
-KINDS = {"pickles": write_pickle, "patterns": write_patterns, "templates": write_template}
-SHARES = {"pickles": 3, "patterns": 2, "templates": 5}
+KINDS = {"pickles": write_pickle, "patterns": write_patterns, "templates": write_template, "documents": write_documents}
+SHARES = {"pickles": 3, "patterns": 2, "templates": 4, "documents": 1}
 
 
 def limited():

@@ -1,24 +1,28 @@
 //! The load report: the lists a loader would print, and the tensors it would load wrong without a message.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+
+use crate::checkpoint::untold;
 
 /// Lists of what a loader would say of the state dict; names are spelled as it spells them.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct LoadReport {
     /// Version of transformers that was read for this prediction: `4.47.0`.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub loader: String,
     /// The version that was asked for, or that config.json names, when this one stands for it.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub stands_for: Option<String>,
     /// Expected by the model class, not provided: newly initialised.
     pub missing: Vec<String>,
     /// Provided, not part of the model: ignored.
     pub unexpected: Vec<String>,
     /// Those of `unexpected` that lie in layers of the model behind the last that the class builds: it computes without them.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub unbuilt: Vec<String>,
     /// In both, with different shapes: the load raises.
     pub mismatched: Vec<Mismatch>,
@@ -28,15 +32,16 @@ pub struct LoadReport {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub raises: Option<String>,
     /// The names that a long list leaves out; missing where every list is whole.
-    #[serde(skip_serializing_if = "Unlisted::is_none")]
+    #[serde(skip_serializing_if = "Unlisted::is_none", default)]
     pub unlisted: Unlisted,
     /// Why the lists do not decide whether the loaded values are right: a report without a name is then no proof of a load.
-    #[serde(skip)]
+    #[serde(skip_serializing_if = "untold", default)]
+    #[cfg_attr(test, schemars(skip))]
     pub undecided: Option<String>,
 }
 
 /// Names that are counted and not listed, by list.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Unlisted {
@@ -145,7 +150,7 @@ impl LoadReport {
 }
 
 /// A tensor whose stored shape is not the expected one.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Mismatch {
     /// State-dict name.
@@ -157,7 +162,7 @@ pub struct Mismatch {
 }
 
 /// A tensor that loads wrong without any message.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Silent {
@@ -171,7 +176,7 @@ pub struct Silent {
 }
 
 /// Why a tensor loads wrong without any message. Ordered by name, as reports list them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]

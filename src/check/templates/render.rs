@@ -1,4 +1,6 @@
-//! Renders a chat template in a sandbox with bounded work.
+//! Renders a chat template in a sandbox.
+
+use serde::{Deserialize, Serialize};
 
 use minijinja::syntax::SyntaxConfig;
 use minijinja::value::{Kwargs, Rest};
@@ -7,14 +9,18 @@ use minijinja_contrib::pycompat;
 use regex::Regex;
 use std::sync::LazyLock;
 
-use super::tame;
-
 /// Longest template that is parsed, in bytes: the parser counts columns in 16 bits. Those of published models have at most
 /// some 30 000.
-const MAX_TEXT: usize = 60_000;
+pub(super) const MAX_TEXT: usize = 60_000;
 
-/// Work that one rendering may do: instructions, or 64 bytes of data each. Real templates take a few thousand.
-const FUEL: u64 = 60_000;
+/// Work that one rendering may do in this process: instructions, or 64 bytes of data each. Real templates take a few thousand.
+pub(super) const FUEL: u64 = 60_000;
+
+/// Work that one rendering may do in a process of its own.
+pub(super) const MUCH_FUEL: u64 = 400_000;
+
+/// Longest text of a conversation of two messages, in bytes.
+const MAX_RENDERED: usize = 256 << 10;
 
 /// Longest string that a method of Python is applied to: the engine charges for their results only when they exist.
 const MAX_STRING: usize = 64 << 10;
@@ -55,9 +61,15 @@ static GENERATION: LazyLock<Option<Regex>> =
     LazyLock::new(|| Regex::new(r"\{%([-+]?)\s*(end)?generation\s*([-+]?)%\}").ok());
 
 /// What became of a template.
-pub(super) enum Rendering {
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Rendering {
     /// It is not Jinja; the line, and the reason.
-    Invalid { line: usize, reason: String },
+    Invalid {
+        /// From 1.
+        line: usize,
+        /// The words of the parser.
+        reason: String,
+    },
     /// Text of a short conversation.
     Done(Rendered),
     /// It would cost too much, and why.
@@ -67,7 +79,8 @@ pub(super) enum Rendering {
 }
 
 /// A user's question and the assistant's answer as text.
-pub(super) struct Rendered {
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Rendered {
     /// All of it.
     pub(super) text: String,
     /// What follows the answer.
@@ -75,16 +88,11 @@ pub(super) struct Rendered {
 }
 
 impl Rendering {
-    /// Renders a template for one turn of each side, with these special tokens.
-    pub(super) fn of(text: &str, special: &[(&str, &str)]) -> Self {
-        if text.len() > MAX_TEXT {
-            return Self::Refused(format!("it has {} bytes, more than {MAX_TEXT}", text.len()));
-        }
-        if let Some(cost) = tame::cost(text) {
-            return Self::Refused(cost.reason().to_owned());
-        }
+    /// Renders a template for one turn of each side, with these special tokens. Called with [`FUEL`] for a template of the allow
+    /// list, and in a process under limits with [`MUCH_FUEL`] for any other.
+    pub(super) fn of(text: &str, special: &[(String, String)], fuel: u64) -> Self {
         let plain = without_generation(text);
-        let Some(environment) = environment() else { return Self::Unknown };
+        let Some(environment) = environment(fuel) else { return Self::Unknown };
         let template = match environment.template_from_str(&plain) {
             Ok(template) => template,
             Err(error) => return Self::of_error(&error),
@@ -96,12 +104,15 @@ impl Rendering {
         let mut refused = None;
         for content in contents {
             match template.render(variables(content, special)) {
+                Ok(text) if text.len() > MAX_RENDERED => {
+                    refused = refused.or_else(|| Some(format!("it writes {} bytes for two messages", text.len())));
+                }
                 Ok(text) => {
                     if let Some((_, after)) = text.split_once(ASSISTANT).filter(|(before, _)| before.contains(USER)) {
                         return Self::Done(Rendered { after_assistant: after.to_owned(), text });
                     }
                 }
-                Err(error) => refused = refused.or_else(|| excess(&error)),
+                Err(error) => refused = refused.or_else(|| excess(&error, fuel)),
             }
         }
         refused.map_or(Self::Unknown, Self::Refused)
@@ -117,10 +128,10 @@ impl Rendering {
 }
 
 /// What a rendering would have cost, if that is why it stopped.
-fn excess(error: &Error) -> Option<String> {
+fn excess(error: &Error, fuel: u64) -> Option<String> {
     let own = error.detail().and_then(|detail| detail.strip_prefix(COSTLY)).map(str::to_owned);
     let is_long = error.kind() == ErrorKind::OutOfFuel;
-    own.or_else(|| is_long.then(|| format!("a conversation of two messages takes more than {FUEL} steps")))
+    own.or_else(|| is_long.then(|| format!("a conversation of two messages takes more than {fuel} steps")))
 }
 
 /// The filter `tojson`, with indents that text has.
@@ -137,19 +148,21 @@ fn tojson(value: &Value, indent: Option<Value>, options: Kwargs) -> Result<Value
 }
 
 /// The variables that `apply_chat_template` passes.
-fn variables(content: &dyn Fn(&str) -> Value, special: &[(&str, &str)]) -> Value {
+fn variables(content: &dyn Fn(&str) -> Value, special: &[(String, String)]) -> Value {
     let message = |role: &str, text: &str| context! { role => role, content => content(text) };
     let messages = vec![message("user", USER), message("assistant", ASSISTANT)];
     let fixed = context! { messages => messages, add_generation_prompt => false };
-    let tokens = Value::from_pairs(special.iter().map(|(name, token)| (Value::from(*name), Value::from(*token))));
+    let tokens = Value::from_pairs(
+        special.iter().map(|(name, token)| (Value::from(name.as_str()), Value::from(token.as_str()))),
+    );
     context! { ..fixed, ..tokens }
 }
 
 /// The environment of transformers: blocks take their lines with them, and break and continue are known.
-fn environment() -> Option<Environment<'static>> {
+fn environment(fuel: u64) -> Option<Environment<'static>> {
     let mut environment = Environment::new();
     environment.set_syntax(SyntaxConfig::builder().trim_blocks(true).lstrip_blocks(true).build().ok()?);
-    environment.set_fuel(Some(FUEL));
+    environment.set_fuel(Some(fuel));
     environment.set_recursion_limit(MAX_DEPTH);
     environment.set_auto_escape_callback(|_| minijinja::AutoEscape::None);
     environment.set_unknown_method_callback(method);

@@ -1,7 +1,10 @@
-//! Refuses templates whose cost the engine does not bound: it charges for strings, but builds sums of lists for free once
-//! they are nested deeply, and its parser recurses over chains of operators.
+//! Finds templates whose cost the engine does not bound: it charges for strings, but builds sums of lists for free once
+//! they are nested deeply, and its parser recurses over chains of operators. [`unknown_name`] is the allow list beside this.
 
+mod known;
 mod nesting;
+
+pub(super) use known::unknown_name;
 
 use nesting::Nesting;
 
@@ -14,7 +17,7 @@ const MAX_SUMS: usize = 20;
 /// Tags that continue a condition: the parser recurses over them.
 const MAX_BRANCHES: usize = 300;
 
-/// Why a template is not rendered.
+/// Why a template is not rendered in this process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Cost {
     /// One tag has too many operators.
@@ -51,24 +54,12 @@ const MAX_REPEATED: u64 = 100_000;
 /// Words that are operators.
 const WORDS: [&str; 7] = ["if", "else", "and", "or", "not", "in", "is"];
 
-/// Why a template may not be given to the engine; `None` if it may.
+/// Why a template may not be given to the engine in this process; `None` if nothing speaks against it.
 pub(super) fn cost(text: &str) -> Option<Cost> {
-    let mut rest = text;
     let mut nesting = Nesting::default();
     let mut repeated = 1_u64;
     let (mut depth, mut in_macro, mut sums, mut branches) = (0_usize, 0_usize, 0_usize, 0_usize);
-    while let Some(at) = rest.find('{') {
-        let (_, opened) = rest.split_at(at);
-        let Some(end) = close_of(opened) else {
-            rest = opened.get(1..).unwrap_or_default();
-            continue;
-        };
-        let (found, after) = opened.split_at(end);
-        rest = after;
-        if found.starts_with("{#") {
-            continue;
-        }
-        let tag = Tag::of(found);
+    for tag in tags(text) {
         nesting.add(tag.word, &tag.expression, depth > 0 || in_macro > 0);
         match tag.word {
             // Its body is called with other lists.
@@ -95,6 +86,25 @@ pub(super) fn cost(text: &str) -> Option<Cost> {
         }
     }
     nesting.is_excessive().then_some(Cost::Nesting)
+}
+
+/// The tags of a template, without its comments.
+fn tags(text: &str) -> impl Iterator<Item = Tag<'_>> {
+    let mut rest = text;
+    std::iter::from_fn(move || {
+        loop {
+            let (_, opened) = rest.split_at(rest.find('{')?);
+            let Some(end) = close_of(opened) else {
+                rest = opened.get(1..).unwrap_or_default();
+                continue;
+            };
+            let (found, after) = opened.split_at(end);
+            rest = after;
+            if !found.starts_with("{#") {
+                return Some(Tag::of(found));
+            }
+        }
+    })
 }
 
 /// Where a tag that begins here ends; `None` for a brace that begins none, or one without an end, which does not parse.
@@ -138,7 +148,7 @@ impl Quotes {
 
 /// Figures of one tag.
 struct Tag<'t> {
-    /// Its first word.
+    /// The first word of a statement; empty for an expression.
     word: &'t str,
     operators: usize,
     /// Additions without a literal beside them.

@@ -7,13 +7,13 @@ use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::CHUNK;
 use super::pieces::{Piece, WINDOW, each_piece};
 use super::tally::{BLOCK, Sums, Tally, as_u64};
 use crate::checkpoint::shard::tail::zero_tail;
-use crate::checkpoint::{Fault, FaultKind, Shard, Source, SourceFile, Tensor, parallel};
+use crate::checkpoint::{Dtype, Fault, FaultKind, Shard, Source, SourceFile, Tensor, parallel};
 
 /// Bytes of a part: a few milliseconds of work.
 const PART: u64 = WINDOW as u64;
@@ -42,8 +42,11 @@ pub struct Progress<'a> {
     pub total: u64,
 }
 
+/// The name of an element type in the format. `serde` would borrow a reference that is written here.
+type DtypeName = &'static str;
+
 /// What one tensor contains.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
 pub struct TensorContents {
@@ -52,7 +55,8 @@ pub struct TensorContents {
     /// Name of the tensor.
     pub tensor: String,
     /// Element type.
-    pub dtype: &'static str,
+    #[serde(deserialize_with = "Dtype::read_name")]
+    pub dtype: DtypeName,
     /// Elements; a complex number counts as two.
     pub elements: u64,
     /// Elements that are NaN.
@@ -69,7 +73,7 @@ pub struct TensorContents {
 }
 
 /// Statistics over the finite elements of one tensor. Those that have no finite value are null.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[non_exhaustive]
 pub struct TensorStats {

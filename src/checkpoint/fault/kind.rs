@@ -336,6 +336,7 @@ fault_kinds! {
         },
         StrayShard = "stray-shard" { index: Text, twice: Integer },
         SuppressionUnused = "suppression-unused" { rule: Text, path: Text, written: Text, reason: Text },
+        TemplateNeedsProcess = "template-needs-process" { reason: Text },
         TemplateNotRendered = "template-not-rendered" { reason: Text },
         TemplateSyntax = "template-syntax" { line: Integer, reason: Text },
         TensorInTwoShards = "tensor-in-two-shards" { other: Text, mapped: Text, taken: Text, differs: OrNull(&Flag) },

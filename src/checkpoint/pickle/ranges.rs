@@ -2,6 +2,7 @@
 
 use super::Problem;
 use crate::checkpoint::SourceFile;
+use crate::checkpoint::reserve::reserved;
 
 impl SourceFile {
     /// The bytes of a range, which the caller has bounded.
@@ -11,8 +12,9 @@ impl SourceFile {
     pub(super) fn bytes(&self, at: u64, len: u64) -> Result<Vec<u8>, Problem> {
         let short = || Problem::Malformed("a range lies outside the file".to_owned(), at);
         at.checked_add(len).filter(|end| *end <= self.len()).ok_or_else(short)?;
-        let mut buffer = vec![0; usize::try_from(len).map_err(|_| short())?];
-        self.read_exact_at(&mut buffer, at).map_err(|error| Problem::Io(error.to_string()))?;
+        let io = |error: std::io::Error| Problem::Io(error.to_string());
+        let mut buffer = reserved(usize::try_from(len).map_err(|_| short())?).map_err(io)?;
+        self.read_exact_at(&mut buffer, at).map_err(io)?;
         Ok(buffer)
     }
 

@@ -105,6 +105,12 @@ impl Dtype {
         Self::ALL.into_iter().find(|d| d.name() == name)
     }
 
+    /// Reads the name of an element type; for `serde(deserialize_with)`.
+    pub(crate) fn read_name<'de, D: Deserializer<'de>>(deserializer: D) -> Result<&'static str, D::Error> {
+        let name: String = Deserialize::deserialize(deserializer)?;
+        Self::from_name(&name).map(Self::name).ok_or_else(|| serde::de::Error::custom("no element type"))
+    }
+
     /// The name in the format.
     #[must_use]
     pub const fn name(self) -> &'static str {

@@ -4,6 +4,7 @@ use super::tail::zero_tail;
 use super::{MAX_HEADER, Shard, Tensor};
 use crate::checkpoint::budget::Budget;
 use crate::checkpoint::platform::{next_data, next_hole};
+use crate::checkpoint::reserve::grown;
 use crate::checkpoint::sniff::looks_like;
 use crate::checkpoint::{Fault, FaultKind, NotRead, Place, Source, SourceFile};
 
@@ -114,7 +115,7 @@ fn read_head(file: &SourceFile) -> std::io::Result<Vec<u8>> {
         return Ok(head);
     }
     let read = head.len();
-    head.resize(usize::try_from(end).unwrap_or(0).max(read), 0);
+    grown(&mut head, usize::try_from(end).unwrap_or(usize::MAX))?;
     if let Some(rest) = head.get_mut(read..) {
         file.read_exact_at(rest, u64::try_from(read).unwrap_or(u64::MAX))?;
     }

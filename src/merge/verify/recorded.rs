@@ -165,6 +165,15 @@ impl Recorded {
         self.changes.as_ref().map(Bounds::new)
     }
 
+    /// Bytes of the names of tensors in the donors, with some for each tensor: what its bounds are compared with.
+    pub(super) fn bytes_of_names(&self) -> u64 {
+        let bytes = self
+            .tensors
+            .iter()
+            .fold(0_usize, |sum, t| sum.saturating_add(t.source.main().name.len()).saturating_add(64));
+        u64::try_from(bytes).unwrap_or(u64::MAX)
+    }
+
     /// Algorithm of the digests of tensors.
     pub(super) fn hash(&self) -> HashAlgorithm {
         self.hash.unwrap_or(HashAlgorithm::Sha256)

@@ -41,6 +41,10 @@ pub(super) fn sync_dir(path: &Path) -> Result<(), ApplyError> {
 ///
 /// The directories that this program creates contain no others, so another one in them is an error.
 pub(super) fn remove_folder(path: &Path) -> io::Result<()> {
+    // An empty or missing folder needs no descriptor, of which a run that failed may have none left.
+    if remove_dir(path).is_ok() {
+        return Ok(());
+    }
     let mut listing = match list_real(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
         other => other?,

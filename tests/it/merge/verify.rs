@@ -85,6 +85,7 @@ fn what_differs_is_named() {
     fs::remove_file(room.out.join("generation_config.json")).unwrap();
     fs::write(room.out.join("notes.txt"), "mine").unwrap();
     fs::write(room.out.join(".gitattributes"), "mine").unwrap();
+    fs::write(room.out.join(".evil.py"), "mine").unwrap();
     let language = room.work.path().join("language");
     copy(&donor("llava3d-tiny"), &language);
     flip(&language, "model.embed_tokens.weight");

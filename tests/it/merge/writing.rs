@@ -57,6 +57,23 @@ fn numbers_are_written_as_the_donors_spell_them() {
 }
 
 #[test]
+fn a_merge_with_few_descriptors_leaves_nothing_behind() {
+    let mut ends = std::collections::BTreeSet::new();
+    for descriptors in 4..12 {
+        let work = TempDir::new().unwrap();
+        let plain = merge(work.path(), Path::new("out"));
+        let mut command = Command::new("/bin/sh");
+        command.arg("-c").arg(format!("ulimit -n {descriptors}; exec \"$0\" \"$@\""));
+        command.arg(plain.get_program()).args(plain.get_args()).env("XDG_STATE_HOME", crate::support::state());
+        let run = command.current_dir(work.path()).output().unwrap();
+        let expected: &[&str] = if run.status.code() == Some(0) { &["out"] } else { &[] };
+        assert_eq!(names(work.path()), expected, "{descriptors}: {}", text(&run));
+        ends.insert(run.status.code());
+    }
+    assert_eq!(ends.into_iter().collect::<Vec<_>>(), [Some(0), Some(2)]);
+}
+
+#[test]
 fn a_link_to_a_donor_is_detected() {
     let work = TempDir::new().unwrap();
     copy(&donor("spatialvla-tiny"), &work.path().join("spatialvla-tiny"));

@@ -19,6 +19,7 @@ use sha2::{Digest as _, Sha256};
 use crate::checkpoint::hex;
 use crate::checkpoint::journal::HeaderEdit;
 use crate::checkpoint::open::{Identity, open_regular};
+use crate::checkpoint::reserve::reserved;
 use crate::checkpoint::shard::MAX_HEADER;
 use crate::surgery::align::BLOCK;
 use crate::surgery::plan::PlannedShard;
@@ -65,7 +66,7 @@ impl Headers {
         if at != metadata.len() {
             return None;
         }
-        let mut old = vec![0; usize::try_from(data_start).ok()?];
+        let mut old = reserved(usize::try_from(data_start).ok()?).ok()?;
         file.read_exact_at(&mut old, 0).ok()?;
         let headers = Self { old, new: plan.header(), file_len: metadata.len() };
         let is_in_place = match headers.inserted()? {
@@ -233,7 +234,7 @@ fn open(path: &Path) -> io::Result<File> {
 
 /// The first `len` bytes of a file, without the range `skipped`: offset and length.
 fn read(file: &File, len: usize, skipped: Option<(u64, u64)>) -> io::Result<Vec<u8>> {
-    let mut bytes = vec![0; len];
+    let mut bytes: Vec<u8> = reserved(len)?;
     let (hole, gap) = skipped.unwrap_or((u64::MAX, 0));
     let (head, tail) = bytes.split_at_mut(usize::try_from(hole).unwrap_or(usize::MAX).min(len));
     file.read_exact_at(head, 0)?;

@@ -277,7 +277,7 @@ impl<'a> Replay<'a> {
         }
         self.folder.folder(&self.folder.staged())?;
         headers.copy(&target, &copy, mtime).map_err(io_at(&copy, "writing"))?;
-        copy_owner_and_mode(&copy, &fs::metadata(&target).map_err(io_at(&target, "reading metadata"))?)?;
+        copy_owner_and_mode(&copy, &target, &fs::metadata(&target).map_err(io_at(&target, "reading metadata"))?)?;
         Ok(retry(|| fs::rename(&copy, &target)).map_err(io_at(&target, "restoring"))?)
     }
 

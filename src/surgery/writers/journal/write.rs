@@ -162,7 +162,7 @@ fn stage(
         }
         write_content(&path, &change.new, progress)?;
         if let Some(old) = &old {
-            copy_owner_and_mode(&path, old)?;
+            copy_owner_and_mode(&path, &target, old)?;
         }
         let old = old.as_ref().map(OldFile::from_metadata);
         files.push(JournaledFile { name, old, new: NewFile::hash(&path)?, header: None });
@@ -176,12 +176,14 @@ fn stage(
     Ok(Journal { version: VERSION, number, folder: Some(folder.identity()?), files, authenticator: None })
 }
 
-/// Gives a new file the owner and the mode of the original, and syncs it.
-pub(super) fn copy_owner_and_mode(path: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
+/// Gives a new file the owner and the mode of the `original`, whose metadata is `old`, and syncs it.
+pub(super) fn copy_owner_and_mode(path: &Path, original: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
     let new = fs::metadata(path).map_err(io_at(path, "reading metadata"))?;
     if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
-        retry(|| std::os::unix::fs::chown(path, Some(old.uid()), Some(old.gid())))
-            .map_err(|error| RepairError::Owner { path: path.to_owned(), error })?;
+        retry(|| std::os::unix::fs::chown(path, Some(old.uid()), Some(old.gid()))).map_err(|error| {
+            let whose = if new.uid() == old.uid() { "group" } else { "user" };
+            RepairError::Owner { path: original.to_owned(), whose, error }
+        })?;
     }
     // After the owner, because changing the owner may clear mode bits.
     retry(|| fs::set_permissions(path, Permissions::from_mode(old.mode() & 0o7777)))

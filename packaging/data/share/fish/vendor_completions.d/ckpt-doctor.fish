@@ -46,6 +46,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "man" -d 'Pr
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "help" -d 'Print this message or the help of the given subcommand(s)'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l for -d 'Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm, mlx-lm and llama.cpp for what is known of them; may be repeated [default: the version that wrote config.json, and the newest known of each major version]' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l follow-links -d 'Read files through symbolic links that lead into this directory; may be repeated. Other links out of a checkpoint are not followed, except into the Hub cache' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s j -l jobs -d 'Directories that are checked at once, each by a process of its own [default: one for each processor, at most 16]' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l select -d 'Run only these rules: codes, prefixes of codes (JSN) or names, comma-separated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l extend-select -d 'Run these rules in addition to those that the settings select' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l ignore -d 'Skip these rules; if --select and --ignore both match a rule, the longer selector wins' -r

@@ -1,0 +1,149 @@
+//! Checks the directories of a zoo in workers: the program, started again with [`ARGUMENT`] and the arguments of the run.
+//!
+//! A worker reads the directories of the run and then numbers of those to check, and answers each with the report. One that is
+//! ended, by its own abort or by the kernel, costs the report of the directory that it was at, and no other.
+
+use std::ffi::{OsStr, OsString};
+use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
+use std::os::unix::ffi::{OsStrExt as _, OsStringExt as _};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+use clap::Parser as _;
+
+use super::args::{Cli, Command as Subcommand};
+use super::exit::{CLEAN, FAILED};
+use super::look::{CheckRun, Looked, Stop};
+use super::{output, system};
+use crate::checkpoint::{parallel, telling_all};
+
+/// The first argument of a worker. Like its standard input, it is no interface.
+pub const ARGUMENT: &str = "--check-in-worker";
+
+/// Bytes on standard error that are read of a worker that ended: more than a pipe holds.
+const LAST_WORDS: u64 = 1 << 20;
+
+/// Checks the directories in this many workers; the results in their order. Where no worker can be started, a directory is
+/// checked in this process.
+pub fn look(run: &CheckRun<'_>, dirs: &[PathBuf], workers: usize) -> Vec<Result<Looked, Stop>> {
+    let numbers: Vec<usize> = (0..dirs.len()).collect();
+    parallel::map(
+        workers,
+        &numbers,
+        || None,
+        |worker, number| {
+            let Some(dir) = dirs.get(*number) else { return Err(Stop::Directory(String::new())) };
+            let Some(mut live) = worker.take().or_else(|| Worker::start(run, dirs).ok()) else { return run.look(dir) };
+            match live.look(*number) {
+                Ok(looked) => {
+                    *worker = Some(live);
+                    looked
+                }
+                Err(_) => Err(Stop::Directory(live.cause_of_death())),
+            }
+        },
+    )
+}
+
+/// A process that checks directories, one after another.
+struct Worker {
+    child: Child,
+    /// Closed to end it.
+    input: Option<ChildStdin>,
+    output: BufReader<ChildStdout>,
+}
+
+impl Worker {
+    fn start(run: &CheckRun<'_>, dirs: &[PathBuf]) -> io::Result<Self> {
+        let mut command = Command::new(system::program()?);
+        command.arg(ARGUMENT).args(std::env::args_os().skip(1)).stdin(Stdio::piped()).stdout(Stdio::piped());
+        // Only runs that take long show their progress, and these have one worker. Others write nothing there before they end.
+        command.env("RUST_BACKTRACE", "0");
+        let mut child = command.stderr(if run.is_long() { Stdio::inherit() } else { Stdio::piped() }).spawn()?;
+        let (Some(input), Some(output)) = (child.stdin.take(), child.stdout.take()) else {
+            return Err(io::ErrorKind::BrokenPipe.into());
+        };
+        let mut worker = Self { child, input: Some(input), output: BufReader::new(output) };
+        let mut list: Vec<u8> = dirs.iter().flat_map(|dir| [dir.as_os_str().as_bytes(), b"\0"].concat()).collect();
+        list.push(0);
+        worker.tell(&list)?;
+        Ok(worker)
+    }
+
+    fn tell(&mut self, bytes: &[u8]) -> io::Result<()> {
+        let input = self.input.as_mut().ok_or(io::ErrorKind::BrokenPipe)?;
+        input.write_all(bytes).and_then(|()| input.flush())
+    }
+
+    /// Has a directory checked. An error says that the process has ended.
+    fn look(&mut self, number: usize) -> io::Result<Result<Looked, Stop>> {
+        self.tell(format!("{number}\n").as_bytes())?;
+        let mut line = Vec::new();
+        self.output.read_until(b'\n', &mut line)?;
+        Ok(serde_json::from_slice(&line)?)
+    }
+
+    /// Why a process that does not answer has ended.
+    fn cause_of_death(mut self) -> String {
+        self.input = None;
+        let ended = self.child.wait().map_or_else(|error| error.to_string(), system::ended);
+        let mut words = Vec::new();
+        let _read = self.child.stderr.take().map(|error| error.take(LAST_WORDS).read_to_end(&mut words));
+        let words = String::from_utf8_lossy(&words).into_owned();
+        // Of a panic, the place and the message.
+        let lines = words.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with("note:"));
+        let said = lines.take(2).collect::<Vec<_>>().join(" ");
+        let said = if said.is_empty() { said } else { format!(": {}", output::safe(&said)) };
+        format!("the process that checked it ended with {ended}{said}")
+    }
+}
+
+impl Drop for Worker {
+    fn drop(&mut self) {
+        self.input = None;
+        let _status = self.child.wait();
+    }
+}
+
+/// The worker itself.
+pub fn main(args: impl Iterator<Item = OsString>) -> u8 {
+    match serve(args) {
+        Ok(()) => CLEAN,
+        Err(error) => {
+            output::note(&super::causes(&error));
+            FAILED
+        }
+    }
+}
+
+fn serve(args: impl Iterator<Item = OsString>) -> anyhow::Result<()> {
+    let Cli { command: Subcommand::Check(args), rules } = Cli::try_parse_from(args)? else {
+        anyhow::bail!("only check has workers");
+    };
+    let mut input = io::stdin().lock();
+    let mut dirs = Vec::new();
+    loop {
+        let mut path = Vec::new();
+        input.read_until(0, &mut path)?;
+        path.pop();
+        if path.is_empty() {
+            break;
+        }
+        dirs.push(PathBuf::from(OsString::from_vec(path)));
+    }
+    // The notes on the settings are those of the run.
+    let run = output::silently(|| CheckRun::new(&args, rules.as_deref(), &dirs))?;
+    let mut line = String::new();
+    while input.read_line(&mut line)? > 0 {
+        let number: usize = line.trim().parse()?;
+        let dir = dirs.get(number).map_or_else(|| Path::new(OsStr::new("")), PathBuf::as_path);
+        let looked = run.look(dir);
+        let mut answer = telling_all(|| serde_json::to_vec(&looked))?;
+        answer.push(b'\n');
+        let mut out = io::stdout().lock();
+        out.write_all(&answer)?;
+        out.flush()?;
+        line.clear();
+    }
+    Ok(())
+}
