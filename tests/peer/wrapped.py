@@ -300,8 +300,11 @@ def opened(cls, folder):
     # The LLaVAs of 4.47 do not run without an image; the language model in them is a whole one there.
     inside = getattr(model, "language_model", None)
     speaker = inside if hasattr(inside, "lm_head") else model
-    with torch.no_grad():
-        logits = speaker(input_ids=ids, attention_mask=torch.ones_like(ids), **more).logits
+    try:
+        with torch.no_grad():
+            logits = speaker(input_ids=ids, attention_mask=torch.ones_like(ids), **more).logits
+    except Exception as error:  # a config that loads, and whose forward fails
+        return None, f"forward raises {type(error).__name__}: {error}"[:160]
     return (model.state_dict(), logits), ""
 
 
