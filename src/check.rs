@@ -13,6 +13,8 @@ mod exceptions;
 pub mod finding;
 mod finite;
 pub mod fix;
+#[cfg(feature = "cli")]
+pub mod foreseen;
 pub mod index;
 pub mod inspect;
 pub mod judge;

@@ -55,12 +55,17 @@ pub fn check_in_order(
     let reading = run.read(&versions, Purpose::Findings);
     let mut outcome = reading.outcome.clone();
     let rules = &knowledge.rules;
-    run_rules(&rules.rules, &reading.context, &reading.faults, &reading.scope, &mut outcome);
+    let served = run.served();
+    let of_reading = rules.rules.iter().filter(|rule| served.is_none() || !is_of_programs(rule));
+    run_rules(of_reading, &reading.context, &reading.faults, &reading.scope, &mut outcome);
+    if let Some(LoaderView { context, faults, scope, .. }) = &served {
+        run_rules(rules.rules.iter().filter(|rule| is_of_programs(rule)), context, faults, scope, &mut outcome);
+    }
     let off = rules.unselected.iter();
     outcome.skipped.extend(off.map(|r| Skipped { code: r.code.clone(), why: "not selected".to_owned() }));
     pinpoint(checkpoint, &mut outcome.findings);
     outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
-    let verdicts = run.verdicts(&reading, &outcome, &versions);
+    let verdicts = run.verdicts(&reading, served.as_ref(), &outcome, &versions);
     outcome.findings.iter_mut().for_each(|finding| finding.effects.retain(|effect| is_borne_out(effect, &verdicts)));
     outcome.findings.iter_mut().for_each(|finding| defer_fix(finding, &verdicts));
     outcome.verdicts = verdicts;
@@ -265,12 +270,31 @@ impl<'a> CheckFacts<'a> {
         LoaderView { context, scope, faults, opened, unpredicted: judged.unpredicted, outcome }
     }
 
-    /// The verdicts of a run that was read as `reading`, each as that of a run for the loader alone. `outcome` has the findings
-    /// of the selected rules; `named` are the versions of transformers that the user named.
-    fn verdicts(&self, reading: &LoaderView<'_>, outcome: &Outcome, named: &[String]) -> Vec<PredictedLoad> {
+    /// The checkpoint as programs other than transformers are judged by; `None` when the run asks for none.
+    ///
+    /// They have classes of their own, without the renames of older versions of transformers, so the newest class stands for
+    /// them, whatever versions the run names; or another one where the newest version does not have it.
+    fn served(&self) -> Option<LoaderView<'a>> {
+        (!self.programs.is_empty()).then(|| {
+            let newest = self.read(&[Loader::NEWEST.version().to_owned()], Purpose::Verdicts);
+            if newest.outcome.loads.is_empty() { self.read(&[], Purpose::Verdicts) } else { newest }
+        })
+    }
+
+    /// The verdicts of a run that was read as `reading`, each as that of a run for the loader alone, and those on programs by
+    /// `served`. `outcome` has the findings of the selected rules; `named` are the versions of transformers that the user named.
+    fn verdicts(
+        &self,
+        reading: &LoaderView<'_>,
+        served: Option<&LoaderView<'_>>,
+        outcome: &Outcome,
+        named: &[String],
+    ) -> Vec<PredictedLoad> {
         let shown: BTreeSet<&str> = outcome.findings.iter().map(|finding| finding.code.as_str()).collect();
         let stopped: BTreeSet<&str> = outcome.unusable.iter().map(|skipped| skipped.code.as_str()).collect();
-        let run = self.knowledge.rules.rules.iter().map(|rule| rule.code.as_str());
+        // Rules of programs were run in another reading.
+        let run = self.knowledge.rules.rules.iter().filter(|rule| !is_of_programs(rule));
+        let run = run.map(|rule| rule.code.as_str());
         let rules = run.filter(|code| !shown.contains(code) && !stopped.contains(code)).collect();
         let unmet = Unmet { reading, rules };
         let targets = &reading.context.targets;
@@ -292,10 +316,8 @@ impl<'a> CheckFacts<'a> {
             })
         };
         let mut loads: Vec<PredictedLoad> = targets.iter().filter_map(alone).collect();
-        if !self.programs.is_empty() {
-            // Another program is judged as in a run that names no version of transformers.
-            let again = if named.is_empty() { None } else { Some(self.read(&[], Purpose::Verdicts)) };
-            let all = self.judged(again.as_ref().unwrap_or(reading), &unmet, self.programs);
+        if let Some(served) = served {
+            let all = self.judged(served, &unmet, self.programs);
             loads.extend(all.into_iter().filter(|load| is_program(&load.loader)));
         }
         loads
@@ -313,6 +335,11 @@ impl<'a> CheckFacts<'a> {
         outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
         verdicts(self.checkpoint, context, programs, faults, &outcome, unpredicted)
     }
+}
+
+/// Whether a rule tells only what programs other than transformers do.
+fn is_of_programs(rule: &Rule) -> bool {
+    !rule.effects.is_empty() && rule.effects.iter().all(|effect| effect.program.is_some())
 }
 
 /// Whether a verdict is as bad as an effect that a finding states. Causes are searched under the leading loaders, and another

@@ -109,13 +109,13 @@ pub fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
     }
 }
 
-/// The fault of shards that were read and hold no tensor between them.
+/// The fault of shards that a loader opens, were read, and hold no tensor between them.
 fn no_tensors(checkpoint: &Checkpoint) -> Option<Fault> {
-    let mut shards = checkpoint.shards.values();
-    let first = shards.clone().next()?;
-    let is_empty = shards.all(|shard| shard.is_sound() && shard.tensors.is_empty());
+    let shards: Vec<&Shard> = opened_shards(checkpoint).collect();
+    let first = shards.first()?;
+    let is_empty = shards.iter().all(|shard| shard.is_sound() && shard.tensors.is_empty());
     let fault = Fault::new(FaultKind::NoTensors).at(Place::file(&*first.name));
-    is_empty.then(|| fault.with("shards", checkpoint.shards.len()))
+    is_empty.then(|| fault.with("shards", shards.len()))
 }
 
 /// The fault of an index that lists no tensor.

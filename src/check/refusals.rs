@@ -45,7 +45,7 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     for target in asked.targets {
         let loader = target.loader.version();
         let configs = Configs { written: config, filled };
-        let class = config.pointer("/architectures/0").and_then(Value::as_str);
+        let class = knowledge.library.named_class(config).or_else(|| auto_class(knowledge, config, target));
         let refused = class.map(|class| refusals(knowledge, config, target, class)).unwrap_or_default();
         let mut found = of_class(knowledge, &configs, &refused, target.version());
         found.extend(dtype(knowledge, config, target.version()));
@@ -74,6 +74,12 @@ pub(super) fn explain(facts: &ExplainingFacts, fault: Fault) -> Option<Fault> {
     let is_refused = |place: &Place| place.pointer.as_ref().is_some_and(|pointer| facts.refused.contains(pointer));
     let is_explained = fault.kind == FaultKind::UnknownArchitecture && fault.places.iter().any(is_refused);
     (!is_explained).then_some(fault)
+}
+
+/// The class that `AutoModel` builds where config.json names none.
+fn auto_class<'k>(knowledge: &'k Knowledge, config: &Value, target: &Target) -> Option<&'k str> {
+    let model_type = config.get("model_type").and_then(Value::as_str)?;
+    knowledge.library.auto_class(model_type, "model", target.loader)
 }
 
 /// What a class refuses with its parts. The class was tried with parts of the model types that it builds where none is named;

@@ -197,8 +197,13 @@ impl Basis<'_> {
         let (mut verdict, mut why) = self.alone(object, loader);
         // The exception that ends the predicted load is exact; of anything else, a finding tells more.
         let is_exact = object == Object::Model && self.report(loader).is_some_and(|report| report.raises.is_some());
-        if let Some((_, worst)) =
-            effects().rev().max_by_key(|(_, effect)| (LoadVerdict::from(effect.outcome), !ends_the_load(&effect.text)))
+        // Of weights that were not read, it is not known that they load at all.
+        let is_unread = object == Object::Model && self.unread().is_some();
+        let counts = |effect: &FindingEffect| !is_unread || effect.outcome == Consequence::Raises;
+        if let Some((_, worst)) = effects()
+            .rev()
+            .filter(|(_, effect)| counts(effect))
+            .max_by_key(|(_, effect)| (LoadVerdict::from(effect.outcome), !ends_the_load(&effect.text)))
             && !is_exact
             && LoadVerdict::from(worst.outcome) >= verdict
         {

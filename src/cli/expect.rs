@@ -13,10 +13,13 @@ use serde_json::{Map, Value, json};
 use super::args::{ExpectArgs, ExpectFormat};
 use super::exit::{CLEAN, FINDINGS};
 use super::{library, output};
+use crate::check::foreseen::verdict_on_config;
+use crate::check::verdict::LoadVerdict;
 use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped, read_own};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Document, escape};
-use crate::knowledge::{Expected, Library, Loader};
+use crate::knowledge::quantization::block;
+use crate::knowledge::{Expected, Knowledge, Loader};
 
 /// One line of `@FILE`; other keys are ignored.
 #[derive(Deserialize)]
@@ -30,6 +33,8 @@ struct Record {
 struct Input {
     source: String,
     record: Result<Record, String>,
+    /// The bytes of the config, where they are a file of their own.
+    bytes: Option<Vec<u8>>,
 }
 
 /// The expected tensors of a config, or the reason for the failure.
@@ -42,11 +47,13 @@ struct Answer {
 
 /// Runs `expect`.
 pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let library = library::with(rules)?;
+    let mut knowledge = library::knowledge(library::rules(rules)?, rules)?;
+    // A config is judged, not a directory.
+    knowledge.policy.metadata_only = true;
     let mut failed = false;
     let mut list = Vec::new();
     let mut answer = |input: Input| -> anyhow::Result<()> {
-        let answer = build(&library, input, args.target.as_deref());
+        let answer = build(&knowledge, input, args.target.as_deref());
         failed |= answer.expected.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),
@@ -72,8 +79,9 @@ pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 /// Reads a config.json, or the one in a directory.
 fn one(path: &Path) -> anyhow::Result<Input> {
     let text = if path.is_dir() { read_own(path, &[], files::CONFIG, JSON_CAP) } else { read_capped(path, JSON_CAP) };
-    let record = parse(&text?).map(|config| Record { config, class: None });
-    Ok(Input { source: shown(path), record })
+    let bytes = text?;
+    let record = parse(&bytes).map(|config| Record { config, class: None });
+    Ok(Input { source: shown(path), record, bytes: Some(bytes) })
 }
 
 /// Reads the configs of a JSONL file one at a time, because such a file may be larger than memory.
@@ -95,7 +103,7 @@ fn each_line(path: &Path, answer: &mut impl FnMut(Input) -> anyhow::Result<()>) 
                     serde_json::from_value(parse(&line)?)
                         .map_err(|_| format!("not a JSON object with a \"config\": {strict}"))
                 });
-                answer(Input { source, record })?;
+                answer(Input { source, record, bytes: None })?;
             }
         }
     }
@@ -112,8 +120,9 @@ fn parse(bytes: &[u8]) -> Result<Value, String> {
 }
 
 /// `version`: the value of `--for`; without it, the version that wrote the config, or the newest.
-fn build(library: &Library, input: Input, version: Option<&str>) -> Answer {
-    let Input { source, record } = input;
+fn build(knowledge: &Knowledge, input: Input, version: Option<&str>) -> Answer {
+    let Input { source, record, bytes } = input;
+    let library = &knowledge.library;
     let wrote = record.as_ref().ok().and_then(|r| r.config.get("transformers_version")).and_then(Value::as_str);
     let version = version.or(wrote).unwrap_or_else(|| Loader::NEWEST.version()).to_owned();
     let mut answer = Answer { source, loader: version.clone(), expected: Err(String::new()) };
@@ -139,9 +148,27 @@ fn build(library: &Library, input: Input, version: Option<&str>) -> Answer {
         };
         let (loader, architecture) = found.ok_or_else(unknown)?;
         loader.version().clone_into(&mut answer.loader);
-        architecture.expect(&config).map_err(|refusal| format!("{}: {refusal}", architecture.class()))
+        let expected = architecture.expect(&config);
+        let expected = expected.map_err(|refusal| format!("{}: {refusal}", architecture.class()))?;
+        // A class that is named is built from any part of a config, and code of a checkpoint lies in other files than the config.
+        if class.is_none() && config.get("auto_map").is_none() && architecture.has_auto() {
+            agreed(knowledge, &bytes.unwrap_or_else(|| config.to_string().into_bytes()), &expected, &version)?;
+        }
+        Ok(expected)
     });
     answer
+}
+
+/// Fails where `check` says that a checkpoint with this config and exactly these tensors raises, or that nothing is known of it.
+fn agreed(knowledge: &Knowledge, config: &[u8], expected: &Expected, version: &str) -> Result<(), String> {
+    let is_quantised = |config: &Value| block(config).is_some();
+    match verdict_on_config(knowledge, config, expected, version) {
+        (LoadVerdict::Raises, why) => Err(format!("{}: raises {}", expected.class, why.unwrap_or_default())),
+        (LoadVerdict::NotPredicted, why) if expected.doubts.is_empty() && !is_quantised(&expected.config) => {
+            Err(format!("{}: not predicted: {}", expected.class, why.unwrap_or_default()))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Maximum length of a text from a checkpoint in a line of output, in characters.

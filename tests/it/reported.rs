@@ -18,7 +18,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use crate::support::change::{Change, apply_all};
-use crate::support::{files, knowledge, project, texts};
+use crate::support::{Case, files, knowledge, project, texts};
 
 /// How many threads report the problem.
 #[derive(Debug, Clone, Copy, Deserialize, PartialEq, Eq, PartialOrd, Ord)]
@@ -127,6 +127,26 @@ fn problems() -> Vec<Problem> {
         problem
     };
     texts("fixtures/reported").into_iter().map(parse).collect()
+}
+
+/// The control and the defect of every problem, as cases: inputs of the laws.
+pub(crate) fn directories() -> Vec<Case> {
+    let of_problem = |problem: Problem| {
+        let Rebuilt { base, sound, changes, loaders, deep, .. } = problem.case?;
+        let both = [("control", sound.clone()), ("defect", [sound, changes].concat())];
+        let case = move |(kind, changes)| Case {
+            name: format!("reported/{} {kind}", problem.name),
+            code: None,
+            base: base.clone(),
+            changes,
+            deep,
+            loaders: loaders.clone(),
+            settings: None,
+            expect: None,
+        };
+        Some(both.map(case))
+    };
+    problems().into_iter().filter_map(of_problem).flatten().collect()
 }
 
 /// Runs `check` on a directory; returns its findings.

@@ -313,6 +313,14 @@ ROWS = {
         "llama",
         lambda d: d.config(quantization_config=FP8 | {"activation_scheme": "static"}),
     ),
+    "eight-bit-floats-of-no-scheme": (
+        "llama",
+        lambda d: d.config(quantization_config=FP8 | {"activation_scheme": None}),
+    ),
+    "eight-bit-floats-of-a-scheme-in-capitals": (
+        "llama",
+        lambda d: d.config(quantization_config=FP8 | {"activation_scheme": "STATIC"}),
+    ),
     "t5-shared-missing": ("t5", lambda d: d.tensors(dropped("shared.weight"))),
     "tied-embedding-missing": ("tied", lambda d: d.tensors(dropped(EMBED))),
     "llava-projector-missing": ("llava", lambda d: d.tensors(lambda t: {n: v for n, v in t.items() if "projector" not in n})),
@@ -353,6 +361,7 @@ ROWS = {
     "size-is-a-string": ("llama", lambda d: d.config(hidden_size="32")),
     "size-is-null": ("llama", lambda d: d.text("config.json", '"hidden_size": 32', '"hidden_size": null')),
     "heads-do-not-divide": ("llama", lambda d: d.config(num_attention_heads=5, head_dim=None)),
+    "heads-do-not-divide-and-no-class": ("bert", lambda d: d.config(num_attention_heads=5, architectures=None)),
     "heads-are-zero": ("llama", lambda d: d.config(num_attention_heads=0, head_dim=None)),
     "rope-type-unknown": (
         "llama",

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
-"""Models that were saved with a wrapper, or without their head: what `check --fix` makes of them, against the undamaged model.
+"""Models that were saved with a wrapper, without their head or with another config: what `check --fix` makes of them, against the
+undamaged model.
 
     wrapped.py FOLDER... [--cells N | --full] [--seed S] [--list]
 
 Each FOLDER has one version of transformers, for the Python that runs this. Small models of 22 classes, 8 of them with a vision
 tower, are saved by their real class, tied and untied. Copies of them are damaged: every name gets the prefix of a wrapper, some
-get a part in the middle, or the head is gone. `check --for V --fix` repairs each, then `--fix --unsafe-fixes`; the loader of
-that version opens what comes out. A checkpoint that the program calls good (exit 0, and the model loads) has the logits (within
-CLOSE) and every tensor of the original; anything else is a failure. What the program does not call good is counted as refused.
+get a part in the middle, the head is gone, or a value of config.json is another one or gone. `check --for V --fix` repairs each,
+then `--fix --unsafe-fixes`; the loader of that version opens what comes out. A checkpoint that the program calls good (exit 0, and the model loads) has the logits (within
+CLOSE), every tensor and every id of the original; anything else is a failure. What the program does not call good is counted as refused.
 """
 
 import argparse
@@ -160,12 +161,85 @@ WRAPPERS = {
 }
 
 HEADS = ("lm_head.weight", "score.weight", "classifier.weight", "embed_out.weight", "cls.predictions.decoder.weight")
-DAMAGES = [*WRAPPERS, "lost head", "lost head, compiled", "other class"]
+
+# Names of one value in the configs of the classes.
+NAMES = {
+    "layers": ("num_hidden_layers", "n_layer", "num_layers"),
+    "heads": ("num_attention_heads", "n_head", "num_heads"),
+    "groups": ("num_key_value_heads",),
+    "width": ("hidden_size", "n_embd", "d_model"),
+    "inner": ("intermediate_size", "ffn_dim", "d_ff"),
+    "rows": ("vocab_size",),
+    "activation": ("hidden_act", "hidden_activation", "activation_function"),
+}
+
+
+def scaled(value, change):
+    """Another number in the config of the language model; `None` for a class that has none there."""
+
+    def change_value(config):
+        inside = config.get("text_config", config)
+        key = next((key for key in NAMES[value] if isinstance(inside.get(key), int)), None)
+        if key is None:
+            return None
+        inside[key] = change(inside[key])
+        return config
+
+    return change_value
+
+
+def misspelt_activation(config):
+    inside = config.get("text_config", config)
+    key = next((key for key in NAMES["activation"] if isinstance(inside.get(key), str)), None)
+    if key is None:
+        return None
+    inside[key] += "x"
+    return config
+
+
+def other_tie(config):
+    """The key that the version saved, at each place that has it."""
+    places = [place for place in (config, config.get("text_config", {})) if "tie_word_embeddings" in place]
+    for place in places:
+        place["tie_word_embeddings"] = not place["tie_word_embeddings"]
+    return config if places else None
+
+
+def without(key):
+    return lambda config: config if config.pop(key, None) is not None else None
+
+
+# Damage of config.json alone, that the tensors or the loaders contradict.
+CONFIGS = {
+    "one layer more": scaled("layers", lambda n: n + 1),
+    "one layer fewer": scaled("layers", lambda n: n - 1),
+    "twice the heads": scaled("heads", lambda n: 2 * n),
+    "half of the heads": scaled("heads", lambda n: n // 2),
+    "other groups of heads": scaled("groups", lambda n: 2 * n),
+    "twice the width": scaled("width", lambda n: 2 * n),
+    "wider inside": scaled("inner", lambda n: n + 16),
+    "more rows": scaled("rows", lambda n: n + 4),
+    "fewer rows": scaled("rows", lambda n: n - 4),
+    "other tie": other_tie,
+    "misspelt activation": misspelt_activation,
+    "no model type": without("model_type"),
+    "no class": without("architectures"),
+    "misspelt class": lambda config: {**config, "architectures": [name[:-1] for name in config["architectures"]]},
+    "misspelt dtype": lambda config: {**config, "dtype": "bfloat61", "torch_dtype": "bfloat61"},
+    "declared quantised": lambda config: {
+        **config,
+        "quantization_config": {"quant_method": "gptq", "bits": 4, "group_size": 128},
+    },
+}
+DAMAGES = [*WRAPPERS, "lost head", "lost head, compiled", "other class", *CONFIGS]
 
 
 def damaged(kind, tensors, config):
     """The tensors and the config with this damage; `None` where it does not apply."""
     tensors = dict(tensors)
+    if kind in CONFIGS:
+        config = CONFIGS[kind](json.loads(json.dumps(config)))
+        return config and (tensors, config)
     if kind.startswith("lost head"):
         heads = [name for name in tensors if name.endswith(HEADS)]
         if not heads:
@@ -226,8 +300,11 @@ def opened(cls, folder):
     # The LLaVAs of 4.47 do not run without an image; the language model in them is a whole one there.
     inside = getattr(model, "language_model", None)
     speaker = inside if hasattr(inside, "lm_head") else model
-    with torch.no_grad():
-        logits = speaker(input_ids=ids, attention_mask=torch.ones_like(ids), **more).logits
+    try:
+        with torch.no_grad():
+            logits = speaker(input_ids=ids, attention_mask=torch.ones_like(ids), **more).logits
+    except Exception as error:  # a config that loads, and whose forward fails
+        return None, f"forward raises {type(error).__name__}: {error}"[:160]
     return (model.state_dict(), logits), ""
 
 
@@ -244,6 +321,17 @@ def apart(one, other):
     far = (logits - wanted).abs().max().item() if logits.shape == wanted.shape else float("inf")
     wrong = [n for n, tensor in others.items() if n not in tensors or not torch.equal(tensors[n], tensor)]
     return far, wrong
+
+
+def ids(folder):
+    """The ids of special tokens in the documents of a folder, which no fix of the weights or of config.json changes."""
+    found = {}
+    for name in ("config.json", "generation_config.json"):
+        document = json.loads((folder / name).read_text()) if (folder / name).exists() else {}
+        places = {name: document, f"{name} text_config": document.get("text_config", {})}
+        for place, values in places.items():
+            found.update({(place, key): value for key, value in values.items() if key.endswith("token_id")})
+    return found
 
 
 def repaired(folder, version, unsafe):
@@ -271,7 +359,8 @@ def told_of(cls, folder, version, unsafe, sound):
     """One repair and its result: equal, refused, or wrong."""
     code, verdict, fixed, left = repaired(folder, version, unsafe)
     model, why = opened(cls, folder)
-    far, wrong = apart(model, sound) if model else (float("inf"), [why])
+    far, wrong = apart(model, sound[:2]) if model else (float("inf"), [why])
+    wrong += sorted(" ".join(place) for place, value in sound[2].items() if ids(folder).get(place) != value)
     is_good = code == 0 and verdict == "loads"
     is_equal = far <= CLOSE and not wrong
     result = "equal" if is_equal and is_good else "unsaid" if is_equal else "WRONG" if is_good else "refused"
@@ -297,7 +386,7 @@ def worker(_, work, cells):
         base = work / f"{name}-{tied}"
         if (name, tied) not in made:
             cls = make(name, tied, base)
-            made[name, tied] = (cls, opened(cls, base)[0]) if cls else (None, None)
+            made[name, tied] = (cls, (*opened(cls, base)[0], ids(base))) if cls else (None, None)
         cls, sound = made[name, tied]
         if cls is None:
             continue

@@ -1,12 +1,17 @@
 //! The exit code follows the verdict of the loaders that the user named, known or between two known ones, in every format.
 
+use std::path::Path;
+use std::sync::atomic::Ordering;
+
 use ckpt_doctor::check::verdict::{LoadVerdict, PredictedLoad};
 use ckpt_doctor::check::{Outcome, Severity};
 use ckpt_doctor::checkpoint::Checkpoint;
+use ckpt_doctor::knowledge::Knowledge;
 use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{self, Format, Report, Style};
 use serde_json::Value;
 
+use super::verdicts::COMPARED;
 use crate::support::{Case, knowledge, on_cases, open};
 
 /// Values of `--for`: none, each known version, and versions that a known one stands for.
@@ -43,23 +48,26 @@ fn broken(checkpoint: &Checkpoint, outcome: &Outcome, named: bool, formats: bool
     broken
 }
 
+/// Law *exit*: what is wrong with the answers for one directory, by the versions that are named.
+pub(super) fn exit(case: &Case, made: &Path, knowledge: &Knowledge) -> Vec<String> {
+    let mut all = Vec::new();
+    for (number, version) in NAMED.iter().enumerate() {
+        let named: Vec<String> = [version].iter().filter(|v| !v.is_empty()).map(|v| (**v).to_owned()).collect();
+        let (checkpoint, outcome) = open(made, case.deep, &named, knowledge);
+        COMPARED.fetch_add(outcome.verdicts.len(), Ordering::Relaxed);
+        let formats = case.name.len() % NAMED.len() == number;
+        let wrong = broken(&checkpoint, &outcome, !named.is_empty(), formats);
+        all.extend(wrong.into_iter().map(|why| format!("{} --for {version:?}: {why}", case.name)));
+    }
+    all
+}
+
 #[test]
 fn the_exit_code_follows_the_loaders_that_were_named() {
     let knowledge = knowledge();
     // An adapter is judged by versions of PEFT.
-    let look = |case: &Case, made: &std::path::Path| -> Vec<String> {
-        let mut all = Vec::new();
-        for (number, version) in NAMED.iter().enumerate() {
-            let named: Vec<String> = [version].iter().filter(|v| !v.is_empty()).map(|v| (**v).to_owned()).collect();
-            let (checkpoint, outcome) = open(made, case.deep, &named, &knowledge);
-            let formats = case.name.len() % NAMED.len() == number;
-            let wrong = broken(&checkpoint, &outcome, !named.is_empty(), formats);
-            all.extend(wrong.into_iter().map(|why| format!("{} --for {version:?}: {why}", case.name)));
-        }
-        all
-    };
     let wanted = |name: &str| !name.starts_with("ADP");
-    let tried = on_cases(&knowledge, wanted, |_, case, made| look(case, made));
+    let tried = on_cases(&knowledge, wanted, |_, case, made| exit(case, made, &knowledge));
     let broken: Vec<String> = tried.into_iter().flat_map(|(_, broken)| broken).collect();
     assert!(broken.is_empty(), "{} broken:\n{}", broken.len(), broken.join("\n"));
 }
@@ -83,4 +91,41 @@ fn a_version_between_is_judged_as_the_one_that_stands_for_it() {
     // Without a name, a load that is near to the writer's version alone is a warning, as before.
     let (_, outcome) = open(room.path(), false, &[], &knowledge);
     assert!(outcome.findings.iter().any(|finding| finding.severity == Severity::Error));
+}
+
+/// A program is judged alike whichever versions of transformers are named, and raises exactly where a finding says so.
+#[test]
+fn what_a_program_refuses_is_its_verdict() {
+    let knowledge = knowledge();
+    let wanted = |name: &str| {
+        ["ARC009/", "ARC018/", "IDX009/", "IDX010/", "SRV003/", "sound/quantized", "base/"]
+            .iter()
+            .any(|start| name.starts_with(start))
+    };
+    let look = |case: &Case, made: &Path| -> (usize, Vec<String>) {
+        let (mut raising, mut broken) = (0, Vec::new());
+        for program in ["vllm", "mlx-lm"] {
+            let mut verdicts = Vec::new();
+            for named in ["", "4.47.0", "5.23.0", "all"] {
+                let named = [named].into_iter().filter(|named| !named.is_empty()).map(ToOwned::to_owned);
+                let named: Vec<String> = named.chain([program.to_owned()]).collect();
+                let (_, outcome) = open(made, case.deep, &named, &knowledge);
+                let load = outcome.verdicts.iter().find(|load| load.loader.starts_with(program)).unwrap();
+                let is_told = outcome.findings.iter().any(|finding| finding.code == "SRV003");
+                if is_told && load.verdict != LoadVerdict::Raises {
+                    broken.push(format!("{} --for {named:?}: SRV003, and {:?}", case.name, load.verdict));
+                }
+                raising += usize::from(is_told);
+                verdicts.push(load.verdict);
+            }
+            if verdicts.iter().any(|verdict| *verdict != verdicts[0]) {
+                broken.push(format!("{} {program}: {verdicts:?}", case.name));
+            }
+        }
+        (raising, broken)
+    };
+    let tried = on_cases(&knowledge, wanted, |_, case, made| look(case, made));
+    assert!(tried.iter().any(|(case, (raising, _))| case.name.starts_with("ARC009/") && *raising > 0));
+    let broken: Vec<String> = tried.into_iter().flat_map(|(_, (_, broken))| broken).collect();
+    assert!(broken.is_empty(), "{} broken:\n{}", broken.len(), broken.join("\n"));
 }

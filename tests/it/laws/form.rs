@@ -16,7 +16,7 @@ use ckpt_doctor::knowledge::Knowledge;
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 
-use super::verdicts::holds;
+use super::verdicts::{COMPARED, holds};
 use crate::support::change::Change;
 use crate::support::weights::{Shard, Weights, join, split};
 use crate::support::{Case, Draw, knowledge, open};
@@ -58,7 +58,9 @@ impl Answer {
         };
         let name = directory.file_name().unwrap().to_string_lossy().into_owned();
         let unnamed = |text: String| text.replace(&format!(" in {name}"), " in DIRECTORY");
-        let mut findings: Vec<String> = outcome.findings.iter().map(finding).collect();
+        // A message may tell the command that opens the directory.
+        let in_command = |text: String| text.replace(&format!("--model-path {name} "), "--model-path DIRECTORY ");
+        let mut findings: Vec<String> = outcome.findings.iter().map(finding).map(in_command).collect();
         findings.sort();
         let loads = outcome.verdicts.iter();
         Self { verdicts: loads.clone().flat_map(verdict).chain(loads.map(lists)).map(unnamed).collect(), findings }
@@ -86,7 +88,7 @@ fn sorted(list: &[impl Debug]) -> Vec<String> {
 }
 
 /// Copies a directory with its folders; false when it has something that is neither file nor folder.
-fn copy_whole(from: &Path, to: &Path) -> bool {
+pub(super) fn copy_whole(from: &Path, to: &Path) -> bool {
     fs::create_dir_all(to).unwrap();
     fs::read_dir(from).unwrap().map(|entry| entry.unwrap()).all(|entry| {
         let (kind, target) = (entry.file_type().unwrap(), to.join(entry.file_name()));
@@ -144,7 +146,7 @@ fn plain_documents(checkpoint: &Checkpoint) -> Vec<(String, Value)> {
 }
 
 /// Whether the header and data of every shard are as safetensors writes them.
-fn has_plain_shards(checkpoint: &Checkpoint) -> bool {
+pub(super) fn has_plain_shards(checkpoint: &Checkpoint) -> bool {
     let is_plain =
         |shard: &checkpoint::Shard| !shard.is_pickle() && shard.faults.is_empty() && shard.metadata.is_some();
     !checkpoint.shards.is_empty() && checkpoint.shards.values().all(is_plain)
@@ -236,7 +238,8 @@ const EXCEPTED: [&str; 3] = ["FIL011", "SAF023", "SAF025"];
 /// Whether the name and place of the directory are what the case is about: it was renamed, or lies in a work tree.
 fn is_of_a_place(case: &Case) -> bool {
     let is_placed = |change: &Change| match change {
-        Change::Directory(_) => true,
+        // The signature of a journal is of its folder.
+        Change::Directory(_) | Change::OwnJournal => true,
         Change::Write { file, .. } => file.starts_with(".."),
         _ => false,
     };
@@ -271,64 +274,106 @@ fn changed(
     }
 }
 
-/// Tries a form on every case. `is_own` is true of a finding that the form may add: its code, and whether it is information.
-fn keeps(with_places: bool, is_own: impl Fn(&Knowledge, &str, bool) -> bool + Sync, form: Form<'_>) {
-    let (knowledge, tried) = (knowledge(), AtomicUsize::new(0));
-    let look = |case: &Case, made: &Path| -> Vec<String> {
+/// A form, and what it may change.
+struct Kept<'f> {
+    /// Whether messages, reasons and places stay as they are, too.
+    with_places: bool,
+    /// True of a finding that the form may add: its code, and whether it is information.
+    is_own: &'f (dyn Fn(&Knowledge, &str, bool) -> bool + Sync),
+    form: Form<'f>,
+}
+
+impl Kept<'_> {
+    /// What differs between the answers for a case and for its other form; `None` when it cannot have it.
+    fn differing(&self, case: &Case, made: &Path, knowledge: &Knowledge) -> Option<Vec<String>> {
         let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
-        let (checkpoint, before) = open(made, case.deep, &case.loaders, &knowledge);
+        let (checkpoint, before) = open(made, case.deep, &case.loaders, knowledge);
         let mut draw = Draw::new(case.name.bytes().map(u64::from).sum());
         let is_excepted = is_of_a_place(case) || EXCEPTED.iter().any(|code| case.code.as_deref() == Some(code));
-        let made_again = if is_excepted { None } else { form(made, room.path(), &checkpoint, &mut draw) };
-        let Some(dir) = made_again else { return Vec::new() };
-        tried.fetch_add(1, Ordering::Relaxed);
-        let (_, after) = open(&dir, case.deep, &case.loaders, &knowledge);
+        let dir = if is_excepted { None } else { (self.form)(made, room.path(), &checkpoint, &mut draw) }?;
+        let (_, after) = open(&dir, case.deep, &case.loaders, knowledge);
+        COMPARED.fetch_add(after.verdicts.len(), Ordering::Relaxed);
         let [before, mut after] =
-            [(before, made), (after, &dir)].map(|(outcome, dir)| Answer::new(&outcome, dir, with_places));
+            [(before, made), (after, &dir)].map(|(outcome, dir)| Answer::new(&outcome, dir, self.with_places));
         after.findings.retain(|finding| {
             let (code, rest) = finding.split_once(' ').unwrap();
-            before.findings.contains(finding) || !is_own(&knowledge, code, rest.starts_with("Info"))
+            before.findings.contains(finding) || !(self.is_own)(knowledge, code, rest.starts_with("Info"))
         });
-        before.differences(&after).into_iter().map(|why| format!("{}: {why}", case.name)).collect()
+        Some(before.differences(&after).into_iter().map(|why| format!("{}: {why}", case.name)).collect())
+    }
+
+    /// Tries the form on every case.
+    fn holds(&self) {
+        let (knowledge, tried) = (knowledge(), AtomicUsize::new(0));
+        let look = |case: &Case, made: &Path| -> Vec<String> {
+            let differing = self.differing(case, made, &knowledge);
+            tried.fetch_add(usize::from(differing.is_some()), Ordering::Relaxed);
+            differing.unwrap_or_default()
+        };
+        holds(PART, look, &knowledge);
+        // Some cases are links, FIFOs or damaged shards.
+        let tried = tried.into_inner();
+        assert!(tried * PART > 200, "{tried} cases have this form");
+    }
+}
+
+/// Law *form*: what differs between a case and a drawn form of it, named.
+pub(super) fn form(case: &Case, made: &Path, knowledge: &Knowledge, draw: &mut Draw) -> Vec<String> {
+    let number = draw.below(6);
+    let (name, differing) = match number {
+        0 => ("respelled", keeps(true, &changed(respell)).differing(case, made, knowledge)),
+        1 => ("reordered", keeps(true, &changed(reorder)).differing(case, made, knowledge)),
+        2 => ("resharded", keeps(false, &changed(reshard)).differing(case, made, knowledge)),
+        3 => ("renamed", keeps(true, &renamed).differing(case, made, knowledge)),
+        4 => {
+            ("in the cache", keeps(true, &|made, room, _, _| as_hub_cache(made, room)).differing(case, made, knowledge))
+        }
+        _ => {
+            let form = Kept { with_places: true, is_own: &is_info_or_harm, form: &changed(add_unopened) };
+            ("with a file", form.differing(case, made, knowledge))
+        }
     };
-    holds(PART, look, &knowledge);
-    // Some cases are links, FIFOs or damaged shards.
-    let tried = tried.into_inner();
-    assert!(tried * PART > 200, "{tried} cases have this form");
+    differing.unwrap_or_default().into_iter().map(|why| format!("{name}: {why}")).collect()
 }
 
 /// One case of so many is tried in a plain `cargo test`.
 const PART: usize = 20;
 
-const NONE: fn(&Knowledge, &str, bool) -> bool = |_, _, _| false;
+/// A form that adds no finding.
+fn keeps<'f>(with_places: bool, form: Form<'f>) -> Kept<'f> {
+    Kept { with_places, is_own: &|_, _, _| false, form }
+}
+
+/// The directory under another name.
+fn renamed(made: &Path, room: &Path, _: &Checkpoint, _: &mut Draw) -> Option<PathBuf> {
+    let dir = room.join("another-name");
+    copy_whole(made, &dir).then_some(dir)
+}
 
 #[test]
 fn order_and_spelling_of_json_decide_nothing() {
-    keeps(true, NONE, &changed(respell));
+    keeps(true, &changed(respell)).holds();
 }
 
 #[test]
 fn the_order_of_tensors_decides_nothing() {
-    keeps(true, NONE, &changed(reorder));
+    keeps(true, &changed(reorder)).holds();
 }
 
 #[test]
 fn the_number_of_shards_decides_nothing() {
-    keeps(false, NONE, &changed(reshard));
+    keeps(false, &changed(reshard)).holds();
 }
 
 #[test]
 fn the_name_of_the_directory_decides_nothing() {
-    keeps(true, NONE, &|made, room, _, _| {
-        let dir = room.join("another-name");
-        copy_whole(made, &dir).then_some(dir)
-    });
+    keeps(true, &renamed).holds();
 }
 
 #[cfg(unix)]
 #[test]
 fn links_of_the_hub_cache_decide_nothing() {
-    keeps(true, NONE, &|made, room, _, _| as_hub_cache(made, room));
+    keeps(true, &|made, room, _, _| as_hub_cache(made, room)).holds();
 }
 
 /// Adds a file that no loader opens.
@@ -353,10 +398,13 @@ fn add_unopened(dir: &Path, checkpoint: &Checkpoint, draw: &mut Draw) -> bool {
     !path.exists() && fs::write(path, bytes).is_ok()
 }
 
+/// Whether a finding is information, or of a rule with a harm.
+fn is_info_or_harm(knowledge: &Knowledge, code: &str, is_info: bool) -> bool {
+    is_info || knowledge.rules.all().any(|rule| rule.code == code && rule.harm.is_some())
+}
+
 /// It may have a finding of its own, of a harm or of severity info.
 #[test]
 fn a_file_that_no_loader_opens_decides_nothing() {
-    let is_harm =
-        |knowledge: &Knowledge, code: &str| knowledge.rules.all().any(|rule| rule.code == code && rule.harm.is_some());
-    keeps(true, |knowledge, code, is_info| is_info || is_harm(knowledge, code), &changed(add_unopened));
+    Kept { with_places: true, is_own: &is_info_or_harm, form: &changed(add_unopened) }.holds();
 }

@@ -5,7 +5,8 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use crate::checkpoint::journal::{InodeIdentity, Journal};
+use super::key::key;
+use crate::checkpoint::journal::{InodeIdentity, Journal, VERSION};
 use crate::checkpoint::{REPAIR_FOLDER, REPAIR_JOURNAL};
 use crate::surgery::error::{ApplyError, RepairError, io_at};
 use crate::surgery::leftover::Leftover;
@@ -199,24 +200,39 @@ impl Folder {
 
     /// Writes the journal; from here on the next run would finish the repair.
     pub(super) fn begin(&self, journal: &Journal) -> Result<(), RepairError> {
-        let path = self.journal();
-        let draft = self.path.join(DRAFT);
         let text = serde_json::to_vec_pretty(journal).unwrap_or_default();
-        remove_file(&draft)?;
-        let write = || -> Result<(), ApplyError> {
-            let mut file = create(&draft)?;
-            file.write_all(&text).map_err(io_at(&draft, "writing"))?;
-            file.sync_all().map_err(io_at(&draft, "syncing"))?;
-            retry(|| fs::rename(&draft, &path)).map_err(io_at(&path, "publishing"))?;
-            sync_dir(&self.path)?;
-            sync_dir(&self.root)
-        };
-        write().map_err(|error| {
+        self.publish(&text).map_err(|error| {
             // Nothing has changed yet. If the journal cannot be removed, the next run finishes the repair.
-            let _ = system::remove_file(&path);
-            let _ = system::remove_file(&draft);
+            let _ = system::remove_file(&self.journal());
+            let _ = system::remove_file(&self.path.join(DRAFT));
             with_figures(error, &self.root, &[text.len() as u64]).into()
         })
+    }
+
+    /// A pending journal as the user's own, where they adopt it from somebody else: `undo` of the repair then needs no option.
+    /// It stays as it is where it cannot be written.
+    pub(super) fn adopted(&self, journal: Journal, trust: &Trust) -> Journal {
+        let is_own = || journal.distrust(&self.path, || trust.user.key(&self.root)).is_none();
+        if !trust.adopts || is_own() {
+            return journal;
+        }
+        let (Ok(key), Ok(here)) = (key(&trust.user, &self.root), self.identity()) else { return journal };
+        let own = Journal { version: VERSION, folder: Some(here), ..journal.clone() }.signed(&key);
+        let text = serde_json::to_vec_pretty(&own).unwrap_or_default();
+        // A rename puts one of two whole journals in place.
+        if self.publish(&text).is_ok() { own } else { journal }
+    }
+
+    /// Replaces the journal at once.
+    fn publish(&self, text: &[u8]) -> Result<(), ApplyError> {
+        let (path, draft) = (self.journal(), self.path.join(DRAFT));
+        system::remove_file(&draft).map_err(io_at(&draft, "removing"))?;
+        let mut file = create(&draft)?;
+        file.write_all(text).map_err(io_at(&draft, "writing"))?;
+        file.sync_all().map_err(io_at(&draft, "syncing"))?;
+        retry(|| fs::rename(&draft, &path)).map_err(io_at(&path, "publishing"))?;
+        sync_dir(&self.path)?;
+        sync_dir(&self.root)
     }
 
     /// Creates and syncs a folder inside this one.

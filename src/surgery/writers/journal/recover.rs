@@ -38,6 +38,7 @@ pub(super) fn recover_in(folder: &Folder, trust: &Trust) -> Result<Recovery, Rep
         return Ok(Recovery::default());
     };
     folder.admit(&journal, folder.journal(), trust)?;
+    let journal = folder.adopted(journal, trust);
     let replay = Replay::new(folder, &journal, trust.adopts);
     if replay.can_finish()? {
         let leftover = replay.finish()?;

@@ -1,12 +1,13 @@
 //! `undo`: restores the files before the latest repair, byte for byte.
 
+use std::fs;
 use std::path::Path;
 
 use super::folder::Folder;
 use super::recover::recover_in;
 use super::replay::Replay;
 use crate::checkpoint::journal::{Journal, JournaledFile};
-use crate::surgery::error::RepairError;
+use crate::surgery::error::{RepairError, io_at};
 use crate::surgery::outcome::{Recovered, Recovery, Undone};
 use crate::surgery::stop::interrupted;
 use crate::surgery::trust::Trust;
@@ -14,10 +15,13 @@ use crate::surgery::trust::Trust;
 /// Undoes the latest repair of a checkpoint. An interrupted repair is finished or rolled back first.
 ///
 /// # Errors
-/// [`RepairError::NothingToUndo`] without a repair, [`RepairError::ForeignJournal`] for a journal that `trust` does not cover,
+/// An I/O error for a directory that cannot be opened, [`RepairError::NothingToUndo`] without a repair, [`RepairError::ForeignJournal`] for a journal that `trust` does not cover,
 /// [`RepairError::ChangedSinceRepair`] when a file changed after the repair; then no file is changed.
 pub fn undo(root: &Path, trust: &Trust) -> Result<Undone, RepairError> {
-    let Some(folder) = Folder::open(root)? else { return Err(RepairError::NothingToUndo { path: root.to_owned() }) };
+    let Some(folder) = Folder::open(root)? else {
+        fs::metadata(root).map_err(io_at(root, "opening"))?;
+        return Err(RepairError::NothingToUndo { path: root.to_owned() });
+    };
     let pending = folder.pending()?;
     let recovery = recover_in(&folder, trust)?;
     if let Some(journal) = pending
