@@ -340,7 +340,7 @@ pub(super) fn form(case: &Case, made: &Path, knowledge: &Knowledge, draw: &mut D
 const PART: usize = 20;
 
 /// A form that adds no finding.
-fn keeps<'f>(with_places: bool, form: Form<'f>) -> Kept<'f> {
+fn keeps(with_places: bool, form: Form<'_>) -> Kept<'_> {
     Kept { with_places, is_own: &|_, _, _| false, form }
 }
 
