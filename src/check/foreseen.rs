@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::engine::check_for;
 use super::verdict::LoadVerdict;
-use crate::checkpoint::{Checkpoint, Document, Dtype, Parts, Shard, Tensor};
+use crate::checkpoint::{Checkpoint, Document, Dtype, Parts, Shard, Tensor, files};
 use crate::knowledge::quantization::block;
 use crate::knowledge::rule::Object;
 use crate::knowledge::{Expected, Knowledge};
@@ -20,7 +20,7 @@ pub fn verdict_on_config(
     expected: &Expected,
     version: &str,
 ) -> (LoadVerdict, Option<String>) {
-    let document = Document::parse("config.json", config);
+    let document = Document::parse(files::CONFIG, config);
     let is_quantised = document.value.as_ref().is_some_and(|config| block(config).is_some());
     let shards = if is_quantised { Vec::new() } else { vec![shard(expected)] };
     let parts = Parts { documents: vec![document], shards, ..Parts::default() };
@@ -43,6 +43,6 @@ fn shard(expected: &Expected) -> Shard {
     };
     let tensors = stored.map(tensor).collect();
     let metadata = Some([("format".to_owned(), "pt".to_owned())].into());
-    let name = "model.safetensors".to_owned();
+    let name = files::WEIGHTS.to_owned();
     Shard { name, file_len: end.saturating_add(8), data_start: 8, tensors, metadata, ..Shard::default() }
 }

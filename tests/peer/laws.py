@@ -40,6 +40,8 @@ SYSTEM = (
 BLOB = re.compile(r"/models--[^/]+/blobs/([0-9a-f]{40}|[0-9a-f]{64})$")
 # The folder with the key of the user, which tells their journals from those of a download.
 STATE = os.path.realpath(user_state.FOLDER)
+# The program of the process itself, which it starts again.
+ITSELF = "/proc/self/exe"
 # Below /proc/PID of the process itself.
 OF_ITSELF = ("maps", "cgroup", "mountinfo", "status")
 FORMATS = ("full", "concise", "json", "jsonl", "markdown", "sarif", "github", "gitlab", "junit")
@@ -150,10 +152,11 @@ def settings_from_here(job, outcome, _):
 
 
 def starts_nothing(job, outcome, _):
-    """A run starts no program and connects to nothing."""
+    """A run starts no program but itself, to render templates and to check a zoo, and connects to nothing."""
     started = [event for event in outcome.events if event.call in traced.STARTS]
     for event in started[1:]:  # the first one is the program itself
-        yield f"{event.call} {event.paths}"
+        if event.call != "execve" or event.paths[0] != ITSELF:
+            yield f"{event.call} {event.paths}"
 
 
 def keeps_secrets(job, outcome, _):
