@@ -1,6 +1,7 @@
 //! Turns faults and conditions into findings, one rule at a time.
 
-use std::collections::BTreeMap;
+use std::cell::OnceCell;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Map, Value, json};
 
@@ -37,6 +38,8 @@ pub(super) struct Context<'a> {
     pub(super) programs: &'a [AskedProgram<'a>],
     /// Whether the load fails under a version that its own loader predicts.
     fails_for_certain: bool,
+    /// What [`robots::set_aside`] returns.
+    set_aside: OnceCell<BTreeSet<String>>,
 }
 
 impl<'a> Context<'a> {
@@ -48,13 +51,17 @@ impl<'a> Context<'a> {
     ) -> Self {
         let is_certain = |version: &str| targets.iter().any(|t| t.loader.version() == version && t.is_certain());
         let fails_for_certain = loads.iter().any(|load| !load.is_whole() && is_certain(&load.loader));
-        Self { bench: Bench::new(checkpoint), targets, programs, fails_for_certain }
+        Self { bench: Bench::new(checkpoint), targets, programs, fails_for_certain, set_aside: OnceCell::new() }
     }
 
     /// The object that reads a file; `None` for a file that no loader opens, and for weights beside those that it opens.
     fn object_reading(&self, file: &str) -> Option<Object> {
-        let is_left = |object: Object| object == Object::Model && robots::is_set_aside(self.bench.checkpoint, file);
-        Object::reading(file).filter(|object| !is_left(*object))
+        Object::reading(file).filter(|object| *object != Object::Model || !self.is_set_aside(file))
+    }
+
+    /// Whether a file holds weights that no loader opens, because it opens others.
+    fn is_set_aside(&self, file: &str) -> bool {
+        self.set_aside.get_or_init(|| robots::set_aside(self.bench.checkpoint)).contains(file)
     }
 }
 
@@ -98,8 +105,13 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
     let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(named);
     // Without a loader: these faults concern no load.
-    let context =
-        Context { bench: Bench::new(checkpoint), targets: Vec::new(), programs: &[], fails_for_certain: false };
+    let context = Context {
+        bench: Bench::new(checkpoint),
+        targets: Vec::new(),
+        programs: &[],
+        fails_for_certain: false,
+        set_aside: OnceCell::new(),
+    };
     let mut findings: Vec<Finding> =
         rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);
@@ -334,7 +346,7 @@ fn finding(
     fix: Option<FixHint>,
 ) -> Finding {
     let file = locations.first().and_then(|location| location.file.as_deref());
-    let is_set_aside = file.is_some_and(|file| robots::is_set_aside(context.bench.checkpoint, file));
+    let is_set_aside = file.is_some_and(|file| context.is_set_aside(file));
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),

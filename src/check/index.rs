@@ -404,9 +404,18 @@ pub(super) fn is_opened(checkpoint: &Checkpoint, name: &str) -> bool {
 /// The shards that transformers or PEFT opens. All of them when nothing tells which: no index, and none of a name that they open;
 /// then another library may open any.
 pub(super) fn opened_shards(checkpoint: &Checkpoint) -> impl Iterator<Item = &Shard> {
-    let opens = |name: &str| is_opened(checkpoint, name) || Object::reading(name) == Some(Object::Adapter);
-    let is_told = checkpoint.index.is_some() || checkpoint.shards.keys().any(|name| opens(name));
-    checkpoint.shards.values().filter(move |shard| !is_told || opens(&shard.name))
+    let is_told = tells_opened(checkpoint);
+    checkpoint.shards.values().filter(move |shard| !is_told || opens(checkpoint, &shard.name))
+}
+
+/// Whether the names tell which shards are opened.
+fn tells_opened(checkpoint: &Checkpoint) -> bool {
+    checkpoint.index.is_some() || checkpoint.shards.keys().any(|name| opens(checkpoint, name))
+}
+
+/// Whether transformers or PEFT opens a file of this name.
+fn opens(checkpoint: &Checkpoint, name: &str) -> bool {
+    is_opened(checkpoint, name) || Object::reading(name) == Some(Object::Adapter)
 }
 
 /// Tensors in two shards whose bytes are compared.
@@ -420,7 +429,7 @@ pub(super) fn opened_tensors(checkpoint: &Checkpoint) -> impl Iterator<Item = &T
 /// The tensor of this name in [`opened_shards`]: that of the shard that the index maps it to, otherwise the first.
 pub(super) fn opened_tensor<'c>(checkpoint: &'c Checkpoint, name: &str) -> Option<(&'c Shard, &'c Tensor)> {
     let (shard, tensor) = checkpoint.tensor(name)?;
-    if opened_shards(checkpoint).any(|opened| opened.name == shard.name) {
+    if opens(checkpoint, &shard.name) || !tells_opened(checkpoint) {
         return Some((shard, tensor));
     }
     let in_shard = |shard: &'c Shard| Some((shard, shard.tensors.iter().find(|tensor| tensor.name == name)?));

@@ -6,6 +6,8 @@
 //! Sources: `lerobot/common/policies/normalize.py` of 0.1 to 0.3, `lerobot/processor/normalize_processor.py` and `pipeline.py` of
 //! 0.4 to 0.6.
 
+use std::collections::BTreeSet;
+
 use crate::checkpoint::files;
 use serde_json::{Value, json};
 
@@ -43,10 +45,11 @@ impl Layout {
     }
 }
 
-/// Whether a file holds weights that no loader opens, because it opens others.
-pub(super) fn is_set_aside(checkpoint: &Checkpoint, name: &str) -> bool {
-    let is_opened = || index::opened_shards(checkpoint).any(|shard| shard.name == name);
-    checkpoint.shards.contains_key(name) && !is_opened() && !names_state(checkpoint, name)
+/// The names of files whose weights no loader opens, because it opens others.
+pub(super) fn set_aside(checkpoint: &Checkpoint) -> BTreeSet<String> {
+    let opened: BTreeSet<&str> = index::opened_shards(checkpoint).map(|shard| shard.name.as_str()).collect();
+    let is_left = |name: &&String| !opened.contains(name.as_str()) && !names_state(checkpoint, name);
+    checkpoint.shards.keys().filter(is_left).cloned().collect()
 }
 
 /// The variable `robot` of rules: `layout`, and `features` with `name`, `input`, `mode`, `width`, `document`, `state_file`, `state_read`,
