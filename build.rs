@@ -72,7 +72,9 @@ fn convert(folder: &Path, to: &Path, heads: &mut BTreeMap<String, Value>) -> io:
                 let head = ["code", "name", "applies", "when", "let", "check"];
                 let head = head.into_iter().filter_map(|key| Some((key.to_owned(), value.get(key)?.clone())));
                 let path = path.to_string_lossy().replace('\\', "/");
-                let head: Map<String, Value> = head.chain([("path".to_owned(), path.into())]).collect();
+                let derived = [("path", path.as_str()), ("affects", affected(&value))];
+                let derived = derived.map(|(key, text)| (key.to_owned(), text.into()));
+                let head: Map<String, Value> = head.chain(derived).collect();
                 let code = value.get("code").and_then(Value::as_str).unwrap_or_default().to_owned();
                 heads.insert(code, Value::Object(head));
             }
@@ -81,4 +83,14 @@ fn convert(folder: &Path, to: &Path, heads: &mut BTreeMap<String, Value>) -> io:
         }
     }
     Ok(())
+}
+
+/// The name of the `Affected` of a rule.
+fn affected(rule: &Value) -> &'static str {
+    let effects = rule.get("effects").and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+    match effects {
+        [] => "nothing",
+        _ if effects.iter().all(|effect| effect.get("program").is_some()) => "programs",
+        _ => "transformers",
+    }
 }

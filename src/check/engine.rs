@@ -23,7 +23,7 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
 use crate::knowledge::program::AskedProgram;
-use crate::knowledge::rule::{Check, Rule};
+use crate::knowledge::rule::{Affected, Check, Rule};
 use crate::knowledge::{Expression, Knowledge, Loader, Scope};
 
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest of each major version.
@@ -329,7 +329,7 @@ impl<'a> CheckFacts<'a> {
         let differing = reading.differences(unmet.reading);
         let mut outcome = outcome.clone();
         // A rule without effects says nothing of a load.
-        let rules = self.knowledge.rules.all().filter(|rule| !rule.effects.is_empty());
+        let rules = self.knowledge.rules.all().filter(|rule| rule.affects != Affected::Nothing);
         let rules = rules.filter(|rule| !unmet.covers(rule, reading, &differing));
         run_rules(rules, context, faults, scope, &mut outcome);
         outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
@@ -339,7 +339,7 @@ impl<'a> CheckFacts<'a> {
 
 /// Whether a rule tells only what programs other than transformers do.
 fn is_of_programs(rule: &Rule) -> bool {
-    !rule.effects.is_empty() && rule.effects.iter().all(|effect| effect.program.is_some())
+    rule.affects == Affected::Programs
 }
 
 /// Whether a verdict is as bad as an effect that a finding states. Causes are searched under the leading loaders, and another

@@ -12,7 +12,7 @@ mod fix;
 
 pub use crate::checkpoint::files::Object;
 pub use catalogue::{Catalogue, example};
-pub use effect::{Consequence, Effect, Harm, LoaderRange};
+pub use effect::{Affected, Consequence, Effect, Harm, LoaderRange};
 pub use fix::{BuiltInRepair, EditSpec, Fix, Safety};
 
 use super::expression::{Expression, Template, compile_lazily};
@@ -126,6 +126,9 @@ pub struct Rule {
     pub lets: Vec<(String, Expression)>,
     /// As [`RuleFile::check`].
     pub check: Check,
+    /// What the effects are about.
+    #[serde(default)]
+    pub affects: Affected,
     /// Path of the file, for a rule from `--rules`.
     #[serde(skip)]
     pub origin: Option<String>,
@@ -181,6 +184,7 @@ impl From<RuleFile> for Rule {
             when: file.when.clone(),
             lets: file.lets.clone(),
             check: file.check.clone(),
+            affects: Affected::by(&file.effects),
             origin: None,
             regraded: None,
             path: String::new(),
@@ -210,7 +214,7 @@ impl Rule {
     /// The highest severity that a finding of this rule can have.
     #[must_use]
     pub fn highest_severity(&self) -> Severity {
-        let any = !self.effects.is_empty();
+        let any = self.affects != Affected::Nothing;
         self.severity_given(any, any)
     }
 }
@@ -390,6 +394,7 @@ mod tests {
             assert_eq!((&rule.code, &rule.name, &rule.applies), (&file.code, &file.name, &file.applies));
             let conditions = format!("{:?} {:?} {:?}", rule.when, rule.lets, rule.check);
             assert_eq!(conditions, format!("{:?} {:?} {:?}", file.when, file.lets, file.check));
+            assert_eq!(rule.affects, Affected::by(&file.effects));
             assert_eq!(file.check_text(), Ok(()), "{}", rule.path);
             assert!(words.insert(&rule.code) && words.insert(&rule.name), "{} is used twice", rule.code);
         }

@@ -69,6 +69,31 @@ pub struct Effect {
     pub text: Template,
 }
 
+/// Whose loads the effects of a rule are about.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Affected {
+    /// None: the rule has no effects.
+    #[default]
+    Nothing,
+    /// Only those of programs other than transformers.
+    Programs,
+    /// Those of transformers, and perhaps of others.
+    Transformers,
+}
+
+impl Affected {
+    /// What these effects are about.
+    #[must_use]
+    pub fn by(effects: &[Effect]) -> Self {
+        match effects {
+            [] => Self::Nothing,
+            _ if effects.iter().all(|effect| effect.program.is_some()) => Self::Programs,
+            _ => Self::Transformers,
+        }
+    }
+}
+
 impl Effect {
     /// Whether a version of transformers has the effect.
     #[must_use]
