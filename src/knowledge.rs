@@ -50,6 +50,7 @@ use classes::ClassNames;
 use directories::Directories;
 use embeddings::TokenEmbedding;
 use initial::InitialValues;
+use modules::LoaderModules;
 use names::LoaderNames;
 use parts::ModelParts;
 use peft::PeftKeys;
@@ -105,6 +106,8 @@ pub struct Knowledge {
     pub names: Table<LoaderNames>,
     /// Tokenizer and processor classes that transformers opens by name.
     pub classes: Table<ClassNames>,
+    /// Modules and names that versions of transformers lack.
+    pub modules: Table<LoaderModules>,
     /// Keys of adapter configs by version of PEFT.
     pub peft: Table<PeftKeys>,
     /// Other programs that load checkpoints.
@@ -168,6 +171,7 @@ impl Knowledge {
         LazyLock::force(&self.scheme_places);
         LazyLock::force(&self.names);
         LazyLock::force(&self.classes);
+        LazyLock::force(&self.modules);
         LazyLock::force(&self.peft);
         LazyLock::force(&self.programs);
         LazyLock::force(&self.ropes);
@@ -205,6 +209,7 @@ impl Knowledge {
             scheme_places: table!(quantization::Places::embedded),
             names: table!(LoaderNames::embedded),
             classes: table!(ClassNames::embedded),
+            modules: table!(LoaderModules::embedded),
             peft: table!(PeftKeys::embedded),
             programs: table!(Programs::embedded),
             refusals: Refusals::embedded(),

@@ -22,6 +22,7 @@ use super::{directory, index, inspect, judge, policy, processor, robots, tokens}
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
+use crate::knowledge::processor::OpensWith;
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Affected, Check, Rule};
 use crate::knowledge::{Expression, Knowledge, Loader, Scope};
@@ -85,16 +86,17 @@ struct CheckFacts<'a> {
     order: RunOrder,
     /// Faults that do not depend on versions of transformers.
     faults: Vec<Fault>,
-    /// What explains the predicted loads, for the readings of the run.
-    causes: judge::Causes,
+    /// What the readings of the run share of their predicted loads.
+    memo: judge::Memo,
     /// The tokenizer as the processor of a class opens it in a version, for those that were asked for.
-    opened: RefCell<Vec<OpenedBy>>,
+    opened: RefCell<Vec<OpenedBy<'a>>>,
 }
 
-/// A tokenizer as the processor of a class opens it in a version of transformers; `None` when its ids are not known.
-struct OpenedBy {
+/// A tokenizer as the processor of a class opens it; `None` when its ids are not known.
+struct OpenedBy<'a> {
     class: String,
-    version: Option<&'static str>,
+    /// The tokenizer class of the processor of a version of transformers; `None` for that of the tokenizer itself.
+    with: Option<&'a OpensWith>,
     tokenizer: Option<Rc<OpenedTokenizer>>,
 }
 
@@ -185,14 +187,18 @@ impl<'a> CheckFacts<'a> {
             rows,
             order,
             faults,
-            causes: judge::Causes::default(),
+            memo: judge::Memo::default(),
             opened: RefCell::default(),
         }
     }
 
     /// The tokenizer as the processor of this class opens it in a version; several readings of a run ask for the same.
     fn opened(&self, class: &str, version: Option<&'static str>) -> Option<Rc<OpenedTokenizer>> {
-        let is_same = |one: &&OpenedBy| one.class == class && one.version == version;
+        let processor = self.knowledge.processor_of(class);
+        let with = version.and_then(|version| processor?.opens_with(version));
+        let is_same = |one: &&OpenedBy<'_>| {
+            one.class == class && one.with.map(std::ptr::from_ref) == with.map(std::ptr::from_ref)
+        };
         if let Some(known) = self.opened.borrow().iter().find(is_same) {
             return known.tokenizer.clone();
         }
@@ -201,8 +207,8 @@ impl<'a> CheckFacts<'a> {
             let config = config.unwrap_or(&Value::Null);
             tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, version).ok().flatten()
         };
-        let tokenizer = self.knowledge.processor_of(class).and_then(open).map(Rc::new);
-        self.opened.borrow_mut().push(OpenedBy { class: class.to_owned(), version, tokenizer: tokenizer.clone() });
+        let tokenizer = processor.and_then(open).map(Rc::new);
+        self.opened.borrow_mut().push(OpenedBy { class: class.to_owned(), with, tokenizer: tokenizer.clone() });
         tokenizer
     }
 
@@ -221,7 +227,7 @@ impl<'a> CheckFacts<'a> {
     fn read(&self, versions: &[String], purpose: Purpose) -> LoaderView<'a> {
         let Self { checkpoint, knowledge, stored, .. } = self;
         let config = checkpoint.config();
-        let judged = judge::judge(checkpoint, knowledge, versions, stored, &self.causes);
+        let judged = judge::judge(checkpoint, knowledge, versions, stored, &self.memo);
         let with_class = |fault| match purpose {
             Purpose::Findings => with_likely_class(fault, knowledge, stored),
             Purpose::Verdicts => fault,

@@ -23,10 +23,10 @@ use serde_json::Value;
 
 use explain::FoundCauses;
 
-use super::load::{LoadReport, Stored, Target};
+use super::load::{self, LoadReport, Stored, Target};
 use super::votes::Vote;
 use crate::checkpoint::{Checkpoint, Fault};
-use crate::knowledge::{Knowledge, Loader};
+use crate::knowledge::{Architecture, Expected, Knowledge, Loader, Refusal};
 
 use crate::knowledge::quantization::{DeclaredScheme, declared_scheme, scheme_read};
 
@@ -62,13 +62,19 @@ struct Inputs<'a> {
     scheme: DeclaredScheme<'a>,
     /// The scheme that each loader reads.
     read: Vec<(Loader, DeclaredScheme<'a>)>,
-    causes: &'a Causes,
+    memo: &'a Memo,
 }
 
-/// The causes that were found for the targets of a checkpoint. A run judges several lists of versions, and the causes for one of
-/// them are the same in each.
+/// What was found for the targets of a checkpoint. A run judges several lists of versions, and what is found for one of them is
+/// the same in each.
 #[derive(Debug, Default)]
-pub struct Causes(RefCell<Vec<(CauseKey, FoundCauses)>>);
+pub struct Memo {
+    causes: RefCell<Vec<(CauseKey, FoundCauses)>>,
+    classes: RefCell<Vec<(ClassKey, Result<Expected, Refusal>)>>,
+}
+
+/// The loader, the architecture and the class.
+type ClassKey = (Loader, String, String);
 
 /// The loader, the version that it stands for, and the class.
 type CauseKey = (Loader, Option<String>, String);
@@ -77,6 +83,17 @@ impl<'a> Inputs<'a> {
     /// The scheme that a loader reads.
     fn scheme_of(&self, loader: Loader) -> &DeclaredScheme<'a> {
         self.read.iter().find(|(one, _)| *one == loader).map_or(&self.scheme, |(_, scheme)| scheme)
+    }
+
+    /// As [`load::build`].
+    fn build(&self, architecture: Architecture<'_>) -> Result<Expected, Refusal> {
+        let key = (architecture.loader(), architecture.name().to_owned(), architecture.class().to_owned());
+        let known = self.memo.classes.borrow().iter().find(|(of, _)| *of == key).map(|(_, class)| class.clone());
+        known.unwrap_or_else(|| {
+            let class = load::build(architecture, self.config, self.stored);
+            self.memo.classes.borrow_mut().push((key, class.clone()));
+            class
+        })
     }
 
     fn is_plain(&self) -> bool {
@@ -93,12 +110,12 @@ pub fn judge(
     knowledge: &Knowledge,
     versions: &[String],
     stored: &Stored,
-    causes: &Causes,
+    memo: &Memo,
 ) -> Judgement {
     let Some(config) = checkpoint.config().filter(|_| !checkpoint.is_partial()) else { return Judgement::default() };
     let scheme = declared_scheme(config, &knowledge.schemes);
     let read = schemes_read(config, knowledge);
-    let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme, read, causes };
+    let inputs = Inputs { checkpoint, knowledge, config, stored, versions, scheme, read, memo };
     let targets = classes::resolve_targets(&inputs);
     let architecture = targets.first().map(|target| target.architecture.name().to_owned());
     let classes = classes::build_classes(&inputs, targets);

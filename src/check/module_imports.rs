@@ -7,10 +7,11 @@ use super::modules;
 use super::view::Asked;
 use crate::checkpoint::module::Import;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, PythonModule};
+use crate::knowledge::Knowledge;
 use crate::knowledge::modules::LoaderModules;
 
 /// Faults of imports from transformers that fail under versions of the run. Called by the engine.
-pub(super) fn faults(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Vec<Fault> {
+pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Asked<'_>) -> Vec<Fault> {
     let of_transformers = |import: &&Import| import.package == "transformers" && !import.guarded && !import.nested;
     let imported = modules::imported(checkpoint);
     let imports = imported.iter().flat_map(|module| {
@@ -21,18 +22,17 @@ pub(super) fn faults(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Vec<Fault> {
     if imports.is_empty() {
         return Vec::new();
     }
-    // A test parses the file.
-    let known = LoaderModules::embedded().unwrap_or_default();
-    imports.into_iter().filter_map(|(module, import)| fault(&known, module, import, asked)).collect()
+    imports.into_iter().filter_map(|(module, import)| fault(&knowledge.modules, module, import, asked)).collect()
 }
 
 /// The fault of one import statement.
 fn fault(known: &LoaderModules, module: &PythonModule, import: &Import, asked: &Asked<'_>) -> Option<Fault> {
     let path = import.module.as_str();
     let missing = |target: &Target| -> Option<BTreeSet<&str>> {
+        let gone = known.of(target.version());
         let names = import.names.iter().map(String::as_str);
-        let lacking = names.filter(|name| known.lacks(target.version(), path, name)).collect::<BTreeSet<_>>();
-        (known.lacks_module(target.version(), path) || !lacking.is_empty()).then_some(lacking)
+        let lacking = names.filter(|name| gone.has_name(path, name)).collect::<BTreeSet<_>>();
+        (gone.has_module(path) || !lacking.is_empty()).then_some(lacking)
     };
     let lacking: Vec<(&Target, BTreeSet<&str>)> =
         asked.targets.iter().filter_map(|target| Some((target, missing(target)?))).collect();
@@ -44,7 +44,7 @@ fn fault(known: &LoaderModules, module: &PythonModule, import: &Import, asked: &
         .with("module", module.name.as_str())
         .with("from", path)
         .with("names", names.into_iter().collect::<Vec<_>>())
-        .with("whole", known.lacks_module(first.version(), path))
+        .with("whole", known.of(first.version()).has_module(path))
         .with("versions", versions);
     Some(fault.under_all(lacking.iter().map(|(target, _)| target.loader.version())))
 }

@@ -43,7 +43,7 @@ const OF_VERSIONS: &[VersionsObserver] = &[
     directory::observe,
     refusals::observe,
     |view| class_names::faults(view.checkpoint, view.knowledge, &view.asked).into(),
-    |view| module_imports::faults(view.checkpoint, &view.asked).into(),
+    |view| module_imports::faults(view.checkpoint, view.knowledge, &view.asked).into(),
     |view| tokenizer_json::paired_merges(view.checkpoint, &view.asked).into(),
     |view| built_tokenizer::faults(view.checkpoint, view.knowledge, &view.asked).into(),
     |view| ropes::faults(view.checkpoint, view.knowledge, view.asked.targets).into(),

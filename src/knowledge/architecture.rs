@@ -57,6 +57,11 @@ impl<'l> Architecture<'l> {
         &self.class.name
     }
 
+    /// The loader that builds it.
+    pub(crate) const fn loader(&self) -> Loader {
+        self.loader
+    }
+
     /// The `model_type` of its config; `None` where it has none of its own.
     #[must_use]
     pub fn model_type(&self) -> Option<&'l str> {

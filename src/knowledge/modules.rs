@@ -25,9 +25,19 @@ impl Lacking {
     }
 
     fn lacks(&self, module: &str, name: &str) -> bool {
-        !self.has_module(module)
-            || self.names.get(module).is_some_and(|names| names.split(' ').any(|other| other == name))
+        !self.has_module(module) || self.names.get(module).is_some_and(|names| has_word(names, name))
     }
+}
+
+/// Whether a text of words with blanks between them has a word.
+fn has_word(text: &str, word: &str) -> bool {
+    let is_edge = |byte: Option<&u8>| byte.is_none_or(|byte| *byte == b' ');
+    let bytes = text.as_bytes();
+    let mut found = text.match_indices(word);
+    found.any(|(at, _)| {
+        is_edge(at.checked_sub(1).and_then(|before| bytes.get(before)))
+            && is_edge(at.checked_add(word.len()).and_then(|after| bytes.get(after)))
+    })
 }
 
 /// `rules/modules.json`: what each version of transformers lacks; `tools/loader_modules.py` writes it.
@@ -45,18 +55,29 @@ impl LoaderModules {
         Ok(Self { versions: ByVersion::embedded("modules.json")? })
     }
 
-    /// Whether `version` certainly lacks a name of a module, or with an empty name the module: it is a known version that
-    /// does, or is between two that do.
+    /// What this version certainly lacks.
     #[must_use]
-    pub fn lacks(&self, version: &str, module: &str, name: &str) -> bool {
+    pub fn of(&self, version: &str) -> LackingModules<'_> {
         let (newer, older) = self.versions.around(version);
-        [newer, older].into_iter().all(|around| around.is_some_and(|lists| lists.lacks(module, name)))
+        LackingModules(newer.zip(older))
+    }
+}
+
+/// What a version certainly lacks: it is a known version that does, or is between two that do.
+#[derive(Debug, Clone, Copy)]
+pub struct LackingModules<'k>(Option<(&'k Lacking, &'k Lacking)>);
+
+impl LackingModules<'_> {
+    /// Whether it lacks the module.
+    #[must_use]
+    pub fn has_module(&self, module: &str) -> bool {
+        self.0.is_some_and(|(newer, older)| !newer.has_module(module) && !older.has_module(module))
     }
 
-    /// Whether `version` certainly lacks the module.
+    /// Whether it lacks a name of a module, or the module.
     #[must_use]
-    pub fn lacks_module(&self, version: &str, module: &str) -> bool {
-        self.lacks(version, module, "")
+    pub fn has_name(&self, module: &str, name: &str) -> bool {
+        self.0.is_some_and(|(newer, older)| newer.lacks(module, name) && older.lacks(module, name))
     }
 }
 
@@ -68,17 +89,19 @@ mod tests {
     fn modules_and_names_depend_on_the_version() {
         let modules = LoaderModules::embedded().unwrap();
         let processing = "transformers.models.paligemma.processing_paligemma";
-        assert!(modules.lacks("5.23.0", processing, "make_batched_images"));
-        assert!(!modules.lacks("4.47.0", processing, "make_batched_images"));
-        assert!(!modules.lacks("5.23.0", processing, "PaliGemmaProcessor"));
-        assert!(modules.lacks_module("4.47.0", "transformers.models.gemma3.modeling_gemma3"));
-        assert!(!modules.lacks_module("5.23.0", "transformers.models.gemma3.modeling_gemma3"));
+        assert!(modules.of("5.23.0").has_name(processing, "make_batched_images"));
+        assert!(!modules.of("4.47.0").has_name(processing, "make_batched_images"));
+        assert!(!modules.of("5.23.0").has_name(processing, "PaliGemmaProcessor"));
+        assert!(modules.of("4.47.0").has_module("transformers.models.gemma3.modeling_gemma3"));
+        assert!(!modules.of("5.23.0").has_module("transformers.models.gemma3.modeling_gemma3"));
         assert!(
-            modules.lacks("4.47.0", "transformers", "Gemma3Config")
-                && !modules.lacks("4.57.6", "transformers", "Gemma3Config")
+            modules.of("4.47.0").has_name("transformers", "Gemma3Config")
+                && !modules.of("4.57.6").has_name("transformers", "Gemma3Config")
         );
+        assert!(has_word("one two", "one") && has_word("one two", "two") && has_word("ones one", "one"));
+        assert!(!has_word("ones two", "one") && !has_word("one twos", "two"));
         // Nothing is known of versions outside those of the file.
-        assert!(!modules.lacks("99.0.0", processing, "make_batched_images"));
-        assert!(!modules.lacks("4.20.0", "transformers", "Gemma3Config"));
+        assert!(!modules.of("99.0.0").has_name(processing, "make_batched_images"));
+        assert!(!modules.of("4.20.0").has_name("transformers", "Gemma3Config"));
     }
 }

@@ -68,14 +68,14 @@ fn with_flat_config(inputs: &Inputs<'_>, architecture: &Architecture<'_>) -> Res
     if architecture.misses_text_config(inputs.config) {
         return Err(Refusal::Raises(NESTED.to_owned()));
     }
-    load::build(*architecture, inputs.config, inputs.stored)
+    inputs.build(*architecture)
 }
 
 /// The class of this config class whose tensors are stored, where config.json names none: an encoder of T5, for one. Without
 /// such a class, the one that `model_type` stands for.
 fn with_fitting_class<'a>(inputs: &Inputs<'_>, one: TargetClass<'a>) -> TargetClass<'a> {
     let fits = |architecture: &Architecture<'_>| {
-        let class = load::build(*architecture, inputs.config, inputs.stored);
+        let class = inputs.build(*architecture);
         class.is_ok_and(|class| load::predict(&class, inputs.stored).is_whole())
     };
     if fits(&one.architecture) {

@@ -49,10 +49,10 @@ fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> Explained
         return ExplainedLoad { prediction, prefixes: Vec::new(), explanation: None };
     };
     let key = (target.loader, target.stands_for.clone(), architecture.name().to_owned());
-    let known = inputs.causes.0.borrow().iter().find(|(of, _)| *of == key).map(|(_, causes)| causes.clone());
+    let known = inputs.memo.causes.borrow().iter().find(|(of, _)| *of == key).map(|(_, causes)| causes.clone());
     let causes = known.unwrap_or_else(|| {
         let found = search(inputs, &prediction, report);
-        inputs.causes.0.borrow_mut().push((key, found.clone()));
+        inputs.memo.causes.borrow_mut().push((key, found.clone()));
         found
     });
     let (prefixes, explanation) = causes;

@@ -18,7 +18,7 @@ struct Case {
     config: Value,
     stored: Stored,
     versions: Vec<String>,
-    causes: Causes,
+    memo: Memo,
 }
 
 impl Case {
@@ -33,7 +33,7 @@ impl Case {
             config,
             stored,
             versions: Vec::new(),
-            causes: Causes::default(),
+            memo: Memo::default(),
         }
     }
 
@@ -64,7 +64,7 @@ impl Case {
             versions: &self.versions,
             scheme,
             read: schemes_read(&self.config, &self.knowledge),
-            causes: &self.causes,
+            memo: &self.memo,
         }
     }
 }
