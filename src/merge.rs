@@ -10,6 +10,7 @@ mod card;
 mod choice;
 mod context;
 mod documents;
+mod donor_tensor;
 mod donors;
 mod draft;
 pub(crate) mod dry_run;
@@ -31,7 +32,9 @@ mod quantised;
 mod recipe_file;
 mod record;
 mod run;
+mod seams;
 mod switches;
+mod taken;
 mod tensors;
 mod training;
 mod usage;
@@ -52,7 +55,7 @@ pub use validate::validate;
 #[cfg(feature = "cli")]
 pub use verify::verify;
 
-use record::Recorded;
+use manifest::Recorded;
 use run::count;
 
 use crate::checkpoint::{Checkpoint, FileName};

@@ -16,6 +16,7 @@ use super::{Checkpoint, Fault, FaultKind, Place, Shard, Source, SourceFile, adap
 mod beside;
 mod call;
 mod element;
+mod known;
 mod legacy;
 mod machine;
 mod member;

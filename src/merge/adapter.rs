@@ -4,15 +4,15 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::context::Donor;
 use super::error::MergeError;
 use super::named::AnnouncedCast;
+use super::parts::Donor;
 use crate::check::adapter::lora::{Lora, LoraModule, lora};
 use crate::checkpoint::adapter::Adapter;
 use crate::checkpoint::{Shard, Tensor, files};
 use crate::knowledge::{ExpectedTensor, Library, Loader};
 use crate::surgery::expr::{Factor, Product, TensorExpr};
-use crate::surgery::plan::TensorRef;
+use crate::surgery::tensor_ref::TensorRef;
 
 /// What an adapter makes of the tensors of its base model.
 pub(super) struct MergedAdapter {

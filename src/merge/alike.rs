@@ -19,7 +19,7 @@ const TOKEN_CAP: usize = 40;
 pub(super) fn check(context: &Context<'_>) -> Result<Option<String>, MergeError> {
     let Some(spec) = &context.recipe.alike else { return Ok(None) };
     let name = spec.part.try_render(&context.scope).map_err(context.at("part"))?;
-    let (place, new) = (PartOf::get(context, &spec.into, &name)?, PartOf::get(context, &spec.from, &name)?);
+    let (place, new) = (context.part(&spec.into, &name)?, context.part(&spec.from, &name)?);
     let kind = place.model_type().zip(new.model_type()).filter(|(one, other)| one != other);
     let mut differences: Vec<String> =
         kind.into_iter().map(|(one, other)| format!("its model type is {other}, not {one}")).collect();

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::context::Donor;
 use super::manifest::DonorDigests;
+use super::parts::Donor;
 use super::{CARD, hub::HubOrigin};
 use crate::knowledge::recipe::Recipe;
 use crate::report::card::{Card, CardDonor, Licence};

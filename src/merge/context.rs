@@ -8,30 +8,15 @@ use std::sync::Arc;
 use serde_json::{Map, Value, json};
 
 use super::error::MergeError;
-use super::parts::{DonorParts, PartOf, value_of};
-use super::{explain, functions, options};
+use super::options::{self, Options};
+use super::parts::{Donor, DonorParts, PartOf, value_of};
+use super::{explain, functions};
 use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor, TokenSpec};
 use crate::knowledge::{EvalError, Expression, Knowledge, Library, Scope};
 use crate::report::model::ShapedName;
-
-/// Options with their values, by name.
-pub type Options = BTreeMap<String, String>;
-
-/// A donor in its role.
-#[derive(Debug, Clone)]
-pub struct Donor {
-    /// Role in the recipe.
-    pub role: String,
-    /// The donor's checkpoint.
-    pub checkpoint: Arc<Checkpoint>,
-    /// The config with defaults of the class filled in; null for a directory without a checkpoint.
-    pub config: Value,
-    /// The parts of its model; `None` when none are known of its architecture.
-    pub(super) parts: Option<DonorParts>,
-}
 
 /// The donors, and the scope for expressions of the recipe.
 pub(super) struct Context<'a> {
@@ -50,11 +35,47 @@ impl<'a> Context<'a> {
 
     pub(super) fn at(&self, place: impl Into<String>) -> impl FnOnce(EvalError) -> MergeError {
         let (recipe, place) = (self.recipe.recipe.clone(), place.into());
-        move |error| MergeError::Expression { recipe, place, cause: explain::cause(self, &error) }
+        move |error| MergeError::Expression {
+            recipe,
+            place,
+            cause: explain::cause(self.recipe, self.donors, &self.scope, &error),
+        }
     }
 
     pub(super) fn holds(&self, when: Option<&Expression>, place: &str) -> Result<bool, MergeError> {
         when.map_or(Ok(true), |w| w.eval_bool(&self.scope)).map_err(self.at(place))
+    }
+
+    /// The part of a donor, with an error that names the parts that it has.
+    pub(super) fn part(&self, role: &str, name: &str) -> Result<PartOf<'a>, MergeError> {
+        let Some(donor) = self.donor(role) else {
+            return Err(MergeError::Recipe(format!("{}: no {role} donor is given", self.recipe.recipe)));
+        };
+        PartOf::find(donor, name).ok_or_else(|| {
+            let names: Vec<&str> = donor.parts.iter().flat_map(DonorParts::names).collect();
+            let has = if names.is_empty() { "none is known of its architecture".to_owned() } else { names.join(", ") };
+            MergeError::Donor(format!("the {role} donor has no part {name}; its parts: {has}"))
+        })
+    }
+
+    /// Variables of [`crate::knowledge::parts::Follow`] and [`crate::knowledge::parts::Need`], for a place in a model and the
+    /// part `new` that comes to stand there.
+    pub(super) fn of_place(&self, place: PartOf<'_>, new: PartOf<'_>) -> Result<Scope<'_>, MergeError> {
+        let mut scope = self.scope.child();
+        let at = place.stored().map_or("", |(at, _)| at);
+        let host = place.donor();
+        scope.bind("at", &json!(at));
+        scope.bind("part", new.config());
+        scope.bind("host", place.host());
+        scope.bind("host_stored", value_of(&host.checkpoint, files::CONFIG).unwrap_or(&Value::Null));
+        for (name, donor) in [("host_preprocessor", host), ("part_preprocessor", new.donor())] {
+            scope.bind(name, value_of(&donor.checkpoint, files::PREPROCESSOR_CONFIG).unwrap_or(&json!({})));
+        }
+        for item in &place.part.lets {
+            let value = item.is.eval(&scope).map_err(self.at(format!("{} of the part {}", item.name, place.name)))?;
+            scope.bind(&item.name, &value);
+        }
+        Ok(scope)
     }
 
     /// Name and shape of a donor tensor; `None` when the donor has no such tensor.

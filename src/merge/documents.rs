@@ -57,7 +57,7 @@ fn plan_document(
         // The recipe writes its own, so the omission of a donor's needs no note.
         removed.remove(AUTO_MAP);
     }
-    switches::record(&spec.name, &removed, draft);
+    draft.note_removed(&spec.name, &removed);
     let same = source.filter(|d| d.value.as_ref() == Some(&value));
     if let Some(d) = source.filter(|d| !d.left_out.is_empty() && same.is_none()) {
         // The value omits the vocabulary, so writing it would lose the vocabulary.
@@ -203,9 +203,9 @@ fn changes(context: &Context<'_>, spec: &DocumentSpec, edit: &DocumentEdit) -> R
 /// The config of a part where the part stands in the model, or as the config of a model of its own.
 fn part_config(context: &Context<'_>, edit: &PartEdit) -> Result<Vec<Change>, MergeError> {
     let name = edit.part.try_render(&context.scope).map_err(context.at("part"))?;
-    let own = PartOf::get(context, &edit.from, &name)?.own_config(context.library)?;
+    let own = context.part(&edit.from, &name)?.own_config(context.library)?;
     let Some(into) = &edit.into else { return Ok(vec![(String::new(), Some(Value::Object(own)))]) };
-    let place = PartOf::get(context, into, &name)?;
+    let place = context.part(into, &name)?;
     let (at, _) = place
         .stored()
         .ok_or_else(|| MergeError::Donor(format!("the part {name} of the {into} donor has no config to replace")))?;
@@ -246,8 +246,8 @@ fn newest_version(context: &Context<'_>, edit: &PartEdit, place: PartOf<'_>) -> 
 /// What follows in a document from the part that comes to stand in a model.
 fn followed(context: &Context<'_>, spec: &DocumentSpec, edit: &FollowEdit) -> Result<Vec<Change>, MergeError> {
     let name = edit.part.try_render(&context.scope).map_err(context.at("part"))?;
-    let place = PartOf::get(context, &edit.into, &name)?;
-    let scope = place.scope(context, PartOf::get(context, &edit.from, &name)?)?;
+    let place = context.part(&edit.into, &name)?;
+    let scope = context.of_place(place, context.part(&edit.from, &name)?)?;
     let mut values = Vec::new();
     for follow in place.part.follows.iter().filter(|follow| follow.document == spec.name) {
         let error = || context.at(format!("{}{} of {}", spec.name, follow.at.source(), place.name));

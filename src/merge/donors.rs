@@ -2,9 +2,8 @@
 
 use std::sync::Arc;
 
-use super::context::Donor;
 use super::error::PipelineError;
-use super::parts::DonorParts;
+use super::parts::{Donor, DonorParts};
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun, count};
 use crate::check::{Finding, Severity, check};
 use crate::checkpoint::journal::StateFolder;

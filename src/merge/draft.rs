@@ -4,9 +4,11 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 
+use super::error::MergeError;
 use super::named::Changeable;
+use super::switches::{self, Removed};
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
-use crate::checkpoint::{Checkpoint, Document, Entry, Parts, PythonModule, Vocabulary};
+use crate::checkpoint::{Checkpoint, Document, Entry, FileName, Parts, PythonModule, Vocabulary};
 use crate::report::model::{ChangedTensor, Dropped, MergedFile, Seam};
 use crate::surgery::plan::{Plan, PlannedShard};
 
@@ -57,5 +59,45 @@ impl MergeDraft {
             }
         }
         Checkpoint::planned(out, parts)
+    }
+
+    /// Adds keys that [`switches`] removed from a document to the repairs of the report.
+    pub(super) fn note_removed(&mut self, name: &str, removed: &Removed) {
+        if !removed.is_empty() {
+            let keys: Vec<&str> = removed.iter().copied().collect();
+            let keys = keys.join(", ");
+            self.repairs.push(format!(
+                "{name}: {keys} of the donor not copied; a merge copies no key that makes a loader run code"
+            ));
+        }
+    }
+
+    /// The bytes of a JSON document that the recipe copies; `None` when it contains no switch, so that the file stays as it
+    /// is.
+    pub(super) fn stripped_copy(
+        &mut self,
+        role: &str,
+        name: &FileName,
+        document: &Document,
+    ) -> Result<Option<Arc<[u8]>>, MergeError> {
+        let Some(mut value) = document.value.clone() else {
+            return Err(MergeError::Donor(format!(
+                "the {role} donor's {name} cannot be read as JSON; run `ckpt-doctor check` on it"
+            )));
+        };
+        let removed = switches::strip(name, &mut value);
+        if removed.is_empty() {
+            return Ok(None);
+        }
+        if !document.left_out.is_empty() {
+            let keys: Vec<&str> = removed.into_iter().collect();
+            return Err(MergeError::Donor(format!(
+                "the {role} donor's {name} contains {}, which makes a loader run code; remove it from the donor",
+                keys.join(" and ")
+            )));
+        }
+        self.note_removed(name, &removed);
+        let text = Document::from_value(&**name, value).with_numbers_of(document, "").text;
+        Ok(Some(text.as_deref().unwrap_or_default().as_bytes().into()))
     }
 }

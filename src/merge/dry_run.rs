@@ -5,10 +5,10 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::context::Donor;
+use super::donor_tensor::DonorTensor;
 use super::draft::MergeDraft;
 use super::error::PipelineError;
-use super::manifest::DonorTensor;
+use super::parts::Donor;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::{ConfigChange, DryRun, MergedFile, PlannedShardSize, ToolInfo};
 use crate::surgery::expr::{TensorExpr, TensorTransform};

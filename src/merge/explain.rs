@@ -3,25 +3,26 @@
 use crate::checkpoint::files;
 use serde_json::Value;
 
-use super::context::{Context, Donor};
+use super::parts::Donor;
 use crate::knowledge::expression::FunctionCall;
+use crate::knowledge::recipe::Recipe;
 use crate::knowledge::source::hint;
-use crate::knowledge::{EvalError, Expression};
+use crate::knowledge::{EvalError, Expression, Scope};
 
-/// The cause of an error as one sentence, then the expression.
-pub(super) fn cause(context: &Context<'_>, error: &EvalError) -> String {
+/// The cause of an error as one sentence, then the expression. [`super::context::Context`] calls it with what it has bound.
+pub(super) fn cause(recipe: &Recipe, donors: &[Donor], scope: &Scope<'_>, error: &EvalError) -> String {
     let references = Expression::parse(&error.source_text).map(|e| e.references()).unwrap_or_default();
-    let missing_value = || references.paths.iter().find_map(|path| missing_value(context, path));
-    let missing_tensor = || references.calls.iter().find_map(|call| missing_tensor(context, call));
-    let missing_name = || references.paths.iter().find_map(|path| missing_name(context, path));
+    let missing_value = || references.paths.iter().find_map(|path| missing_value(recipe, donors, path));
+    let missing_tensor = || references.calls.iter().find_map(|call| missing_tensor(donors, call));
+    let missing_name = || references.paths.iter().find_map(|path| missing_name(scope, path));
     let words = missing_value().or_else(missing_tensor).or_else(missing_name);
     format!("{} (`{}`)", words.unwrap_or_else(|| in_words(&error.cause)), error.source_text)
 }
 
 /// The first key that a value of the recipe's own lacks, such as one that `let` defines.
-fn missing_name(context: &Context<'_>, path: &[String]) -> Option<String> {
+fn missing_name(scope: &Scope<'_>, path: &[String]) -> Option<String> {
     let (root, keys) = path.split_first()?;
-    let (mut here, mut place) = (context.scope.get(root)?, root.clone());
+    let (mut here, mut place) = (scope.get(root)?, root.clone());
     for key in keys {
         let Value::Object(map) = &mut here else { break };
         let Some(value) = map.remove(key) else { return Some(format!("{place} has no {key}")) };
@@ -32,14 +33,14 @@ fn missing_name(context: &Context<'_>, path: &[String]) -> Option<String> {
 }
 
 /// The first key of a path that a donor's config lacks.
-fn missing_value(context: &Context<'_>, path: &[String]) -> Option<String> {
+fn missing_value(recipe: &Recipe, donors: &[Donor], path: &[String]) -> Option<String> {
     let (stored, path) = match path.split_first() {
         Some((first, path)) if first == "stored" => (true, path),
         _ => (false, path),
     };
     let (role, keys) = path.split_first()?;
-    let spec = context.recipe.donors.iter().find(|spec| spec.role == *role)?;
-    let Some(donor) = context.donor(role) else {
+    let spec = recipe.donors.iter().find(|spec| spec.role == *role)?;
+    let Some(donor) = donors.iter().find(|donor| donor.role == *role) else {
         return Some(format!("no {role} donor is given, {}; pass --donor {role}=DIR", spec.what));
     };
     let file = donor.checkpoint.document(files::CONFIG).and_then(|document| document.value.as_ref());
@@ -66,9 +67,11 @@ fn missing_value(context: &Context<'_>, path: &[String]) -> Option<String> {
 }
 
 /// The tensor that a call of `shape` names and the donor lacks.
-fn missing_tensor(context: &Context<'_>, call: &FunctionCall) -> Option<String> {
+fn missing_tensor(donors: &[Donor], call: &FunctionCall) -> Option<String> {
     let (true, [Some(role), Some(name)]) = (call.function == "shape", call.arguments.as_slice()) else { return None };
-    let Some(donor) = context.donor(role) else { return Some(format!("no {role} donor is given")) };
+    let Some(donor) = donors.iter().find(|donor| donor.role == *role) else {
+        return Some(format!("no {role} donor is given"));
+    };
     if donor.checkpoint.tensor(name).is_some() {
         return None;
     }

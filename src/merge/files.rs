@@ -11,7 +11,7 @@ use super::context::Context;
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::error::MergeError;
-use super::{CARD, REPORT, manifest, switches};
+use super::{CARD, REPORT, manifest};
 use crate::check::modules::{entries, relative_modules};
 use crate::checkpoint::open::TOKENIZER_CAP;
 use crate::checkpoint::{Document, FileName, FilePattern};
@@ -151,7 +151,7 @@ fn copy_of(
         let read = donor.checkpoint.documents.get(&**name);
         let read = read.filter(|d| d.text.as_deref().is_some_and(|text| text.as_bytes() == bytes));
         let document = read.map_or_else(|| Cow::Owned(Document::parse(&**name, &bytes)), Cow::Borrowed);
-        stripped = switches::stripped_copy(role, name, &document, draft)?;
+        stripped = draft.stripped_copy(role, name, &document)?;
         if stripped.is_none() {
             draft.documents.push(document.into_owned());
         }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use serde_json::{Value, json};
 
-use super::context::Donor;
 use super::dtypes;
+use super::parts::Donor;
 use crate::knowledge::scales::Scales;
 use crate::knowledge::{Loader, Scope};
 

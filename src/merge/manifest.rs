@@ -2,14 +2,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
 use super::CARD;
-use super::context::{Donor, Options};
+use super::donor_tensor::DonorTensor;
 use super::hub::HubOrigin;
 use super::named::Changeable;
-use super::record::Recorded;
+use super::options::Options;
+use super::parts::Donor;
 use super::run::MergeRun;
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
 use crate::checkpoint::{Checkpoint, FileName, HashAlgorithm, hex, parallel};
@@ -19,11 +20,23 @@ use crate::report::model::{ToolInfo, Training};
 use crate::surgery::ApplyError;
 use crate::surgery::donor::{digest_own, sha256};
 use crate::surgery::expr::{TensorExpr, TensorTransform};
-use crate::surgery::plan::{Plan, PlannedFile, RowSlice, TensorRef};
+use crate::surgery::plan::{Plan, PlannedFile};
 use crate::surgery::written::WrittenShard;
 
 /// File name in the merged directory.
 pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
+
+/// What the files describe, apart from the run.
+pub(super) struct Recorded<'m> {
+    pub(super) recipe: &'m Recipe,
+    pub(super) donors: &'m [Donor],
+    pub(super) digests: &'m BTreeMap<String, DonorDigests>,
+    pub(super) plan: &'m Plan,
+    /// What the entries of the recipe may change.
+    pub(super) changeable: &'m Changeable,
+    /// Algorithm of the digests of the tensors.
+    pub(super) hash: HashAlgorithm,
+}
 
 /// `merge-manifest.json`: how a merged checkpoint was made.
 ///
@@ -134,41 +147,6 @@ pub(crate) struct TensorOrigin {
     pub transform: TensorTransform,
     /// How it was made of tensors of donors.
     pub source: TensorExpr<DonorTensor>,
-}
-
-/// A tensor of a donor.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-pub(crate) struct DonorTensor {
-    /// Role of the donor.
-    pub donor: String,
-    /// Name in the donor.
-    pub name: String,
-    /// Element type in the donor; the values were cast if it differs from that of the result.
-    pub dtype: String,
-    /// Shape of the part that was used.
-    pub shape: Vec<u64>,
-    /// The rows that were used, if not all.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub slice: Option<RowSlice>,
-    /// Digest of this part; missing if it was copied, so that the digest is the one of the result, or not read, and with the
-    /// algorithm `none`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub digest: Option<String>,
-}
-
-impl DonorTensor {
-    /// The record of a source.
-    pub(super) fn new(from: &TensorRef, digest: Option<String>) -> Self {
-        Self {
-            donor: from.donor.clone(),
-            name: from.name.clone(),
-            dtype: from.dtype.name().to_owned(),
-            shape: from.shape.clone(),
-            slice: from.slice,
-            digest,
-        }
-    }
 }
 
 /// The donors by content. With `all_bytes`, whole shards are hashed, several at a time, otherwise only their headers.

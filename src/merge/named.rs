@@ -8,14 +8,16 @@ use regex_syntax::hir::Look;
 use regex_syntax::hir::literal::Extractor;
 use serde::{Deserialize, Serialize};
 
+use super::donor_tensor::DonorTensor;
 use super::error::MergeError;
-use super::manifest::DonorTensor;
 use super::parts::PartOf;
 use crate::check::adapter::lora::module_of;
 use crate::checkpoint::escape;
 use crate::checkpoint::work::Work;
 use crate::surgery::expr::{TensorExpr, TensorTransform};
-use crate::surgery::plan::{Plan, PlannedTensor, TensorRef};
+use crate::surgery::plan::Plan;
+use crate::surgery::planned_tensor::PlannedTensor;
+use crate::surgery::tensor_ref::TensorRef;
 
 /// The tensors of a donor that an entry of the recipe names, and may change: those of a part, of a pattern, or of both.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

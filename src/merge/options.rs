@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use super::context::Options;
 use super::error::MergeError;
 use crate::checkpoint::module::is_dotted_name;
 use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe};
 use crate::knowledge::source::hint;
+
+/// Options with their values, by name.
+pub type Options = BTreeMap<String, String>;
 
 /// Shard size of a recipe without this option: the default of `save_pretrained`.
 pub(super) const DEFAULT_SHARD: u64 = 5_000_000_000;

@@ -1,19 +1,32 @@
-//! The parts of donors: which of their tensors and configs a recipe means by `part: "language"`.
+//! Donors and their parts: which of their tensors and configs a recipe means by `part: "language"`.
 
 use crate::checkpoint::files;
+use std::sync::Arc;
+
 use serde_json::{Map, Value, json};
 
-use super::context::{Context, Donor};
 use super::error::MergeError;
-use super::{explain, switches};
+use super::switches;
 use crate::check::Outcome;
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::parts::{Layout, ModelParts, Own, Part};
-use crate::knowledge::{Knowledge, Library, Loader, Scope};
-use crate::report::model::Seam;
+use crate::knowledge::{Knowledge, Library, Loader};
 
 /// Keys of a config that speak of the directory it was read from, and not of the model.
 const BOOKKEEPING: [&str; 5] = ["_name_or_path", "architectures", "auto_map", "transformers_version", "_commit_hash"];
+
+/// A donor in its role.
+#[derive(Debug, Clone)]
+pub struct Donor {
+    /// Role in the recipe.
+    pub role: String,
+    /// The donor's checkpoint.
+    pub checkpoint: Arc<Checkpoint>,
+    /// The config with defaults of the class filled in; null for a directory without a checkpoint.
+    pub config: Value,
+    /// The parts of its model; `None` when none are known of its architecture.
+    pub(super) parts: Option<DonorParts>,
+}
 
 /// The parts of one donor, and how its tensors are named.
 #[derive(Debug, Clone)]
@@ -97,18 +110,6 @@ impl<'a> PartOf<'a> {
         Some(Self { donor, parts, name, part })
     }
 
-    /// As [`Self::find`], with an error that names the parts of the donor.
-    pub(super) fn get(context: &Context<'a>, role: &str, name: &str) -> Result<Self, MergeError> {
-        let Some(donor) = context.donor(role) else {
-            return Err(MergeError::Recipe(format!("{}: no {role} donor is given", context.recipe.recipe)));
-        };
-        Self::find(donor, name).ok_or_else(|| {
-            let names: Vec<&str> = donor.parts.iter().flat_map(DonorParts::names).collect();
-            let has = if names.is_empty() { "none is known of its architecture".to_owned() } else { names.join(", ") };
-            MergeError::Donor(format!("the {role} donor has no part {name}; its parts: {has}"))
-        })
-    }
-
     /// The donor that has the part.
     pub(super) const fn donor(self) -> &'a Donor {
         self.donor
@@ -181,27 +182,8 @@ impl<'a> PartOf<'a> {
         self.parts.layout.stored(self.name, inside)
     }
 
-    /// Variables of [`crate::knowledge::parts::Follow`] and [`crate::knowledge::parts::Need`]: `self` is the place in the
-    /// model, `new` the part that comes to stand there.
-    pub(super) fn scope<'s>(self, context: &'s Context<'_>, new: PartOf<'_>) -> Result<Scope<'s>, MergeError> {
-        let mut scope = context.scope.child();
-        let at = self.stored().map_or("", |(at, _)| at);
-        scope.bind("at", &json!(at));
-        scope.bind("part", new.config());
-        scope.bind("host", self.host());
-        scope.bind("host_stored", value_of(&self.donor.checkpoint, files::CONFIG).unwrap_or(&Value::Null));
-        for (name, donor) in [("host_preprocessor", self.donor), ("part_preprocessor", new.donor)] {
-            scope.bind(name, value_of(&donor.checkpoint, files::PREPROCESSOR_CONFIG).unwrap_or(&json!({})));
-        }
-        for item in &self.part.lets {
-            let value = item.is.eval(&scope).map_err(context.at(format!("{} of the part {}", item.name, self.name)))?;
-            scope.bind(&item.name, &value);
-        }
-        Ok(scope)
-    }
-
     /// Why a part cannot stand in this place, by its model type.
-    fn refuses(self, new: Self) -> Option<String> {
+    pub(super) fn refuses(self, new: Self) -> Option<String> {
         let (takes, model_type) = (self.part.takes.as_ref()?, new.model_type().unwrap_or("of an unknown type"));
         let class = self.host().get("architectures").and_then(|a| a.get(0)).and_then(Value::as_str);
         (!takes.iter().any(|t| t == model_type)).then(|| {
@@ -266,35 +248,6 @@ impl<'a> PartOf<'a> {
         switches::strip(files::CONFIG, &mut own);
         Ok(own.as_object().cloned().unwrap_or_default())
     }
-}
-
-/// The seams of parts that come to stand in another model: types that its class does not build there, and what else it
-/// needs of them.
-pub(super) fn seams(context: &Context<'_>) -> Result<Vec<Seam>, MergeError> {
-    let mut seams = Vec::new();
-    for spec in context.recipe.tensors.iter().filter(|spec| spec.drop.is_none()) {
-        let (Some(name), Some(into)) = (&spec.part, &spec.into) else { continue };
-        if !context.holds(spec.when.as_ref(), "tensors")? {
-            continue;
-        }
-        let name = name.try_render(&context.scope).map_err(context.at("part"))?;
-        let (place, new) = (PartOf::get(context, into, &name)?, PartOf::get(context, &spec.from, &name)?);
-        if let Some(message) = place.refuses(new).or_else(|| explain::empty(new.donor)) {
-            seams.push(Seam { message, ..Seam::default() });
-            continue;
-        }
-        // Without a tokenizer of the part's donor, the model keeps what it has.
-        if context.recipe.tokens.is_none() {
-            continue;
-        }
-        let scope = place.scope(context, new)?;
-        for need in &place.part.needs {
-            if !need.that.eval_bool(&scope).map_err(context.at(format!("the part {name} of {into}")))? {
-                seams.push(Seam { message: need.message.render(&scope), ..Seam::default() });
-            }
-        }
-    }
-    Ok(seams)
 }
 
 /// The content of a document.

@@ -4,10 +4,12 @@
 
 use serde_json::Value;
 
-use super::context::{Context, Donor, Options};
+use super::context::Context;
 use super::draft::MergeDraft;
 use super::error::MergeError;
-use super::{alike, documents, files, options, parts, tensors};
+use super::options::{self, Options};
+use super::parts::Donor;
+use super::{alike, documents, files, seams, tensors};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::Recipe;
 use crate::report::model::Seam;
@@ -61,7 +63,7 @@ fn fill(
             options: seam.options.iter().map(|o| format!("--set {o}")).collect(),
         });
     }
-    let refused = parts::seams(&context)?;
+    let refused = seams::seams(&context)?;
     if !refused.is_empty() {
         draft.seams.extend(refused);
         return Ok(());

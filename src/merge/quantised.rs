@@ -3,9 +3,8 @@
 use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
-use super::context::Donor;
 use super::error::MergeError;
-use super::parts::DonorParts;
+use super::parts::{Donor, DonorParts};
 use crate::check::quantization::signature;
 use crate::checkpoint::{Checkpoint, Dtype, Tensor};
 use crate::knowledge::quantization::{Scheme, stated};

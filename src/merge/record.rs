@@ -1,30 +1,12 @@
 //! The files that describe a result: model card, report and manifest. They are made when the shards are written.
 
-use std::collections::BTreeMap;
-
-use super::context::Donor;
-use super::manifest::{self, DonorDigests};
-use super::named::Changeable;
+use super::manifest::{self, Recorded};
 use super::run::{MergeRun, count};
 use super::{CARD, REPORT, card};
-use crate::checkpoint::HashAlgorithm;
-use crate::knowledge::recipe::Recipe;
 use crate::report::markdown;
 use crate::report::model::MergedFile;
-use crate::surgery::plan::{Plan, PlannedFile};
+use crate::surgery::plan::PlannedFile;
 use crate::surgery::written::WrittenShard;
-
-/// What the files describe, apart from the run.
-pub(super) struct Recorded<'m> {
-    pub(super) recipe: &'m Recipe,
-    pub(super) donors: &'m [Donor],
-    pub(super) digests: &'m BTreeMap<String, DonorDigests>,
-    pub(super) plan: &'m Plan,
-    /// What the entries of the recipe may change.
-    pub(super) changeable: &'m Changeable,
-    /// Algorithm of the digests of the tensors.
-    pub(super) hash: HashAlgorithm,
-}
 
 /// Notes the stage `write`, and returns the files, of which the manifest has the digests of all others.
 ///

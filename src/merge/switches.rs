@@ -1,14 +1,10 @@
-//! Removes keys that make a loader run code from the documents of a result, whichever edit brought them.
+//! Keys that make a loader run code, which no document of a result has, whichever edit brought them.
 
 use crate::checkpoint::files;
 use std::collections::BTreeSet;
-use std::sync::Arc;
 
 use serde_json::{Map, Value};
 
-use super::draft::MergeDraft;
-use super::error::MergeError;
-use crate::checkpoint::{Document, FileName};
 use crate::knowledge::recipe::{AUTO_MAP, CODE_SWITCHES};
 
 /// Documents whose keys are tokens: a token may be spelled like a switch, and then has an integer.
@@ -65,44 +61,4 @@ fn remove(
             removed.insert(key);
         }
     }
-}
-
-/// Adds the removed keys to the repairs of the report.
-pub(super) fn record(name: &str, removed: &Removed, draft: &mut MergeDraft) {
-    if !removed.is_empty() {
-        let keys: Vec<&str> = removed.iter().copied().collect();
-        let keys = keys.join(", ");
-        draft.repairs.push(format!(
-            "{name}: {keys} of the donor not copied; a merge copies no key that makes a loader run code"
-        ));
-    }
-}
-
-/// The bytes of a JSON document that the recipe copies; `None` when it contains no switch, so that the file stays as it
-/// is.
-pub(super) fn stripped_copy(
-    role: &str,
-    name: &FileName,
-    document: &Document,
-    draft: &mut MergeDraft,
-) -> Result<Option<Arc<[u8]>>, MergeError> {
-    let Some(mut value) = document.value.clone() else {
-        return Err(MergeError::Donor(format!(
-            "the {role} donor's {name} cannot be read as JSON; run `ckpt-doctor check` on it"
-        )));
-    };
-    let removed = strip(name, &mut value);
-    if removed.is_empty() {
-        return Ok(None);
-    }
-    if !document.left_out.is_empty() {
-        let keys: Vec<&str> = removed.into_iter().collect();
-        return Err(MergeError::Donor(format!(
-            "the {role} donor's {name} contains {}, which makes a loader run code; remove it from the donor",
-            keys.join(" and ")
-        )));
-    }
-    record(name, &removed, draft);
-    let text = Document::from_value(&**name, value).with_numbers_of(document, "").text;
-    Ok(Some(text.as_deref().unwrap_or_default().as_bytes().into()))
 }

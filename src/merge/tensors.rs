@@ -3,149 +3,31 @@
 use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use regex::Regex;
 use serde_json::Value;
 
 use super::adapter::MergedAdapter;
-use super::context::{Context, Donor};
+use super::context::Context;
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
 use super::dtypes;
 use super::error::MergeError;
 use super::explain;
-use super::fit::{Fit, StartedModules};
-use super::named::{AnnouncedCast, Bounds, Changeable, MergedRoles, NamedTensors, pattern};
-use super::parts::PartOf;
+use super::fit::Fit;
+use super::named::{AnnouncedCast, Bounds, Changeable, pattern};
+use super::parts::Donor;
 use super::run::count;
-use crate::checkpoint::{Dtype, Shard, Tensor};
+use super::taken::{StartedModules, TakenTensor, TensorRule};
+use crate::checkpoint::Dtype;
 use crate::knowledge::quantization;
 use crate::knowledge::recipe::TensorSpec;
 use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
+use crate::surgery::expr::NewValues;
 use crate::surgery::expr::{TensorExpr, TensorTransform};
-use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef, into_shards};
+use crate::surgery::plan::into_shards;
+use crate::surgery::planned_tensor::PlannedTensor;
+use crate::surgery::tensor_ref::TensorRef;
 use crate::surgery::values::can_compute;
-
-/// A tensor spec with its parts evaluated once.
-pub(super) struct TensorRule<'a> {
-    spec: &'a TensorSpec,
-    names: Regex,
-    rename: Option<String>,
-    slice: Option<[u64; 2]>,
-    pub(super) fit: Fit,
-    scale: Option<f64>,
-    dtype: Option<Dtype>,
-    adapter: Option<MergedAdapter>,
-    /// The part that the tensors belong to, and the one whose place they take.
-    part: Option<PartOf<'a>>,
-    into: Option<PartOf<'a>>,
-}
-
-impl TensorRule<'_> {
-    /// What the tensors are, for the report.
-    fn pattern(&self) -> &str {
-        self.part.filter(|_| self.spec.names.is_empty()).map_or(self.spec.names.as_str(), |part| part.name)
-    }
-
-    /// The factor on a donor tensor. The output of a part that is meant as a whole is scaled once, by its last layer.
-    fn scale_of(&self, tensor: &Tensor) -> Option<f64> {
-        let whole = self.part.filter(|_| self.spec.names.is_empty());
-        self.scale.filter(|_| whole.is_none_or(|part| part.is_output(&tensor.name)))
-    }
-
-    /// Fails for a factor on a part of which no output is known.
-    fn scales_something(&self, recipe: &str) -> Result<(), MergeError> {
-        let Some(part) = self.part.filter(|_| self.scale.is_some() && self.spec.names.is_empty()) else {
-            return Ok(());
-        };
-        if part.donor().checkpoint.tensors().any(|(_, tensor)| part.is_output(&tensor.name)) {
-            return Ok(());
-        }
-        Err(MergeError::Donor(format!(
-            "recipe {recipe}: the part {} of the {} donor cannot be scaled: rules/parts names no tensor of its last layer; name the tensors by `names`",
-            part.name,
-            part.donor().role
-        )))
-    }
-
-    /// The tensors that the entry may change; `None` when it changes none, or names none.
-    fn changeable(&self) -> Option<NamedTensors> {
-        let changes = self.fit != Fit::Copy || self.scale.is_some() || self.slice.is_some();
-        NamedTensors::of_entry(&self.spec.from, self.part, &self.spec.names).filter(|_| changes)
-    }
-
-    /// The casts that the entry announces.
-    fn casts(&self) -> impl Iterator<Item = AnnouncedCast> {
-        let own = self.dtype.map(|dtype| AnnouncedCast { donor: self.spec.from.clone(), to: dtype.name().to_owned() });
-        own.into_iter().chain(self.adapter.iter().flat_map(|adapter| adapter.casts.clone()))
-    }
-
-    /// The donor and the adapter that is merged into it.
-    fn merged(&self) -> Option<MergedRoles> {
-        Some(MergedRoles { base: self.spec.from.clone(), adapter: self.adapter.as_ref()?.role.clone() })
-    }
-
-    /// Fails unless the entry takes every tensor that its adapter changes.
-    fn takes_all(&self, taken: &[TakenTensor<'_>]) -> Result<(), MergeError> {
-        let Some(adapter) = &self.adapter else { return Ok(()) };
-        let own: BTreeSet<&str> = taken
-            .iter()
-            .filter(|taken| std::ptr::eq(taken.rule, self))
-            .map(|taken| taken.tensor.name.as_str())
-            .collect();
-        match adapter.names().find(|name| !own.contains(name)) {
-            None => Ok(()),
-            Some(left) => Err(MergeError::Recipe(format!(
-                "the {} donor changes {left}, which the entry with the adapter does not take",
-                adapter.role
-            ))),
-        }
-    }
-
-    /// Whether a donor tensor is meant.
-    fn takes(&self, donor: &Donor, tensor: &Tensor) -> bool {
-        self.spec.from == donor.role
-            && self.names.is_match(&tensor.name)
-            && self.part.is_none_or(|part| part.inside(&tensor.name).is_some())
-    }
-
-    /// The name of a donor tensor in the result; `None` when the place of its part has none for it.
-    fn name(&self, tensor: &Tensor) -> Option<String> {
-        if let Some(to) = &self.rename {
-            return Some(self.names.replace(&tensor.name, to.as_str()).into_owned());
-        }
-        match (self.part.and_then(|part| part.inside(&tensor.name)), self.into) {
-            (Some(inside), Some(place)) => place.name_of(&inside),
-            (Some(inside), None) if self.spec.alone => Some(inside),
-            _ => Some(tensor.name.clone()),
-        }
-    }
-}
-
-/// A donor tensor that the recipe selects, with its name in the result.
-pub(super) struct TakenTensor<'a> {
-    name: String,
-    pub(super) donor: &'a Donor,
-    shard: &'a Shard,
-    pub(super) tensor: &'a Tensor,
-    pub(super) rule: &'a TensorRule<'a>,
-}
-
-impl TakenTensor<'_> {
-    /// The shape of the rows that are used.
-    pub(super) fn shape(&self) -> Vec<u64> {
-        let mut shape = self.tensor.shape.clone();
-        if let (Some(rows), Some([_, count])) = (shape.first_mut(), self.rule.slice) {
-            *rows = count;
-        }
-        shape
-    }
-
-    /// The element type in the result.
-    fn dtype(&self) -> Dtype {
-        self.rule.dtype.filter(|_| can_compute(self.tensor.dtype)).unwrap_or(self.tensor.dtype)
-    }
-}
 
 /// Plans the shards of the result; shape mismatches become seams of the draft.
 pub(super) fn plan(
@@ -392,7 +274,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         };
         let name =
             spec.part.as_ref().map(|part| part.try_render(&context.scope)).transpose().map_err(context.at("part"))?;
-        let part_of = |role: &str| name.as_ref().map(|name| PartOf::get(context, role, name)).transpose();
+        let part_of = |role: &str| name.as_ref().map(|name| context.part(role, name)).transpose();
         let part = part_of(&spec.from)?;
         let into = spec.into.as_deref().map_or(Ok(None), part_of)?;
         let wrong = |key: &str, value: &Value, expected: &str| {

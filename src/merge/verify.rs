@@ -6,7 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use self::recorded::{Recorded, RecordedFile, RecordedShard, RecordedTensor};
-use super::manifest::{self, DonorTensor};
+use super::donor_tensor::DonorTensor;
+use super::manifest;
 use super::named::Bounds;
 use super::run::count;
 use crate::checkpoint::contents::digests::{HashJob, hash};
@@ -17,7 +18,8 @@ use crate::report::verification::{DifferenceKind, Verification, VerifiedPart};
 use crate::surgery::ApplyError;
 use crate::surgery::compare::compare;
 use crate::surgery::expr::TensorExpr;
-use crate::surgery::plan::{PlannedTensor, TensorRef};
+use crate::surgery::planned_tensor::PlannedTensor;
+use crate::surgery::tensor_ref::TensorRef;
 
 /// Why a result could not be verified.
 #[derive(Debug, thiserror::Error)]

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::Path;
 
-use super::plan::PlannedTensor;
+use super::planned_tensor::PlannedTensor;
 
 /// Size of a block in bytes: that of a page on most systems, and the default of mkfs.
 pub const BLOCK: u64 = 4096;
@@ -147,7 +147,8 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::Dtype;
-    use crate::surgery::plan::{PlannedShard, TensorRef, into_shards};
+    use crate::surgery::plan::{PlannedShard, into_shards};
+    use crate::surgery::tensor_ref::TensorRef;
 
     const MIB: u64 = 1 << 20;
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::donor::{DonorFile, OpenDonors};
 use super::error::ApplyError;
-use super::plan::PlannedTensor;
+use super::planned_tensor::PlannedTensor;
 use super::stream::{block, stream};
 use crate::checkpoint::HashAlgorithm;
 

@@ -7,7 +7,7 @@ use std::convert::Infallible;
 
 use serde::{Deserialize, Serialize};
 
-use super::plan::{NewValues, TensorRef};
+use super::tensor_ref::TensorRef;
 use super::values::can_compute;
 use crate::checkpoint::{Dtype, byte_len};
 
@@ -81,6 +81,50 @@ pub enum TensorExpr<S> {
         /// The product.
         product: Product<S>,
     },
+}
+
+/// The values of a tensor that starts again, as its class gives them to a new model.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+#[cfg_attr(not(feature = "internals"), non_exhaustive)]
+pub enum NewValues {
+    /// Zeros: biases, and norms that add 1 to their weight.
+    Zeros,
+    /// Ones: the weights of other norms.
+    Ones,
+    /// Seeded normal values with mean 0 and this standard deviation.
+    Normal(f64),
+    /// Seeded values that are evenly spread between the negative of this number and the number.
+    Uniform(f64),
+}
+
+impl NewValues {
+    /// The values that manifests before version 4 mean by `reinit`: they did not record any.
+    #[must_use]
+    pub const fn former(shape: &[u64]) -> Self {
+        if shape.len() < 2 { Self::Zeros } else { Self::Normal(0.02) }
+    }
+
+    /// Whether the number can be that of a distribution; one in a manifest may be anything.
+    #[must_use]
+    pub fn is_possible(self) -> bool {
+        match self {
+            Self::Zeros | Self::Ones => true,
+            Self::Normal(size) | Self::Uniform(size) => size.is_finite() && size > 0.0,
+        }
+    }
+
+    /// What reports call them: `zeros`, `normal 0.02`.
+    #[must_use]
+    pub fn words(self) -> String {
+        match self {
+            Self::Zeros => "zeros".to_owned(),
+            Self::Ones => "ones".to_owned(),
+            Self::Normal(deviation) => format!("normal {deviation:.3}"),
+            Self::Uniform(limit) => format!("uniform {limit:.3}"),
+        }
+    }
 }
 
 /// A constant multiple of a product of two matrices. Its values are binary32: sums are computed in binary64 and rounded, then

@@ -4,14 +4,13 @@
 //! ([`PlannedShard::preview`]), so that the same rules check it before it is written.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::align::{self, BLOCK};
-use super::expr::{TensorExpr, TensorTransform};
-use crate::checkpoint::{Dtype, FileName, Shard, Tensor, byte_len};
+use super::planned_tensor::PlannedTensor;
+use crate::checkpoint::{FileName, Shard};
 
 /// A checkpoint to be written.
 #[derive(Debug, Clone, Default)]
@@ -52,179 +51,6 @@ pub struct PlannedShard {
 #[must_use]
 pub fn format_pt() -> BTreeMap<String, String> {
     BTreeMap::from([("format".to_owned(), "pt".to_owned())])
-}
-
-/// A tensor of a planned shard: type and shape are those of its expression.
-#[derive(Debug, Clone)]
-pub struct PlannedTensor {
-    /// State-dict name.
-    pub name: String,
-    /// Element type.
-    pub dtype: Dtype,
-    /// Shape in the result.
-    pub shape: Vec<u64>,
-    /// How its values are made.
-    pub source: TensorExpr<TensorRef>,
-}
-
-/// A tensor of a donor, or some of its rows, with the byte range.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TensorRef {
-    /// Donor role.
-    pub donor: String,
-    /// File that contains the bytes.
-    pub path: PathBuf,
-    /// Name in the donor.
-    pub name: String,
-    /// Element type in the donor.
-    pub dtype: Dtype,
-    /// Shape of the part that is used.
-    pub shape: Vec<u64>,
-    /// First byte of the part, from the start of the file.
-    pub offset: u64,
-    /// Number of bytes of the part.
-    pub len: u64,
-    /// The rows that are used, if not all.
-    pub slice: Option<RowSlice>,
-}
-
-/// Consecutive rows of a tensor.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
-pub struct RowSlice {
-    /// Index of the first row.
-    pub first: u64,
-    /// Number of rows of the whole tensor.
-    pub of: u64,
-}
-
-/// The values of a tensor that starts again, as its class gives them to a new model.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-#[serde(rename_all = "kebab-case")]
-#[cfg_attr(not(feature = "internals"), non_exhaustive)]
-pub enum NewValues {
-    /// Zeros: biases, and norms that add 1 to their weight.
-    Zeros,
-    /// Ones: the weights of other norms.
-    Ones,
-    /// Seeded normal values with mean 0 and this standard deviation.
-    Normal(f64),
-    /// Seeded values that are evenly spread between the negative of this number and the number.
-    Uniform(f64),
-}
-
-impl NewValues {
-    /// The values that manifests before version 4 mean by `reinit`: they did not record any.
-    #[must_use]
-    pub const fn former(shape: &[u64]) -> Self {
-        if shape.len() < 2 { Self::Zeros } else { Self::Normal(0.02) }
-    }
-
-    /// Whether the number can be that of a distribution; one in a manifest may be anything.
-    #[must_use]
-    pub fn is_possible(self) -> bool {
-        match self {
-            Self::Zeros | Self::Ones => true,
-            Self::Normal(size) | Self::Uniform(size) => size.is_finite() && size > 0.0,
-        }
-    }
-
-    /// What reports call them: `zeros`, `normal 0.02`.
-    #[must_use]
-    pub fn words(self) -> String {
-        match self {
-            Self::Zeros => "zeros".to_owned(),
-            Self::Ones => "ones".to_owned(),
-            Self::Normal(deviation) => format!("normal {deviation:.3}"),
-            Self::Uniform(limit) => format!("uniform {limit:.3}"),
-        }
-    }
-}
-
-impl TensorRef {
-    /// A tensor of a shard in `root`, or some of its rows: the index of the first one and their number.
-    ///
-    /// # Errors
-    /// The reason why the tensor lacks these rows.
-    pub fn new(
-        donor: &str,
-        root: &Path,
-        shard: &Shard,
-        tensor: &Tensor,
-        rows: Option<[u64; 2]>,
-    ) -> Result<Self, String> {
-        let mut from = Self {
-            donor: donor.to_owned(),
-            path: root.join(&shard.name),
-            name: tensor.name.clone(),
-            dtype: tensor.dtype,
-            shape: tensor.shape.clone(),
-            offset: shard.data_start.saturating_add(tensor.begin),
-            len: tensor.len(),
-            slice: None,
-        };
-        if let Some([first, count]) = rows {
-            let of = tensor.shape.first().copied().unwrap_or_default();
-            let missing = || format!("it has no {count} rows from row {first} on");
-            let row = byte_len(tensor.dtype, tensor.shape.get(1..).unwrap_or_default()).ok_or_else(missing)?;
-            let end = first.checked_add(count).filter(|end| *end <= of && count > 0).ok_or_else(missing)?;
-            from.shape.iter_mut().take(1).for_each(|rows| *rows = count);
-            from.offset = from.offset.saturating_add(row.saturating_mul(first));
-            from.len = row.saturating_mul(end.saturating_sub(first));
-            from.slice = (count != of).then_some(RowSlice { first, of });
-        }
-        Ok(from)
-    }
-}
-
-impl PlannedTensor {
-    /// The tensor that an expression makes.
-    ///
-    /// # Errors
-    /// Why it cannot be made.
-    pub fn new(name: String, source: TensorExpr<TensorRef>) -> Result<Self, String> {
-        let (dtype, shape) = source.typed()?;
-        Ok(Self { name, dtype, shape, source })
-    }
-
-    /// A whole donor tensor, unchanged.
-    #[must_use]
-    pub fn copy(name: String, from: TensorRef) -> Self {
-        Self { name, dtype: from.dtype, shape: from.shape.clone(), source: TensorExpr::Stored(from) }
-    }
-
-    /// The bytes of a donor's file that are those of the tensor; `None` when it is computed.
-    #[must_use]
-    pub const fn copied(&self) -> Option<&TensorRef> {
-        self.source.copied()
-    }
-
-    /// How its bytes are made, in one word.
-    #[must_use]
-    pub fn transform(&self) -> TensorTransform {
-        self.source.transform()
-    }
-
-    /// Number of bytes in the result.
-    ///
-    /// Shapes of a plan come from checked headers and architectures with limits; an overflow is counted as the largest
-    /// size, which no disk can hold.
-    #[must_use]
-    pub(crate) fn len(&self) -> u64 {
-        byte_len(self.dtype, &self.shape).unwrap_or(u64::MAX)
-    }
-}
-
-#[cfg(test)]
-impl PlannedTensor {
-    /// The tensor with zeros in place of its values.
-    pub(crate) fn started(self) -> Self {
-        let (values, dtype, shape) = (NewValues::Zeros, self.dtype, self.shape.clone());
-        let instead_of = self.source.main().clone();
-        Self { source: TensorExpr::Initialise { values, dtype, shape, instead_of }, ..self }
-    }
 }
 
 impl PlannedShard {

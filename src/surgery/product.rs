@@ -8,8 +8,7 @@ use std::io::{self, Write};
 
 use super::convert::CastLosses;
 use super::expr::{Factor, Product};
-use super::plan::TensorRef;
-use super::transform::ReadAt;
+use super::tensor_ref::{ReadAt, TensorRef};
 use super::values::{Census, Codec};
 use crate::checkpoint::Dtype;
 

@@ -10,9 +10,11 @@ use rand_distr::{Distribution, Normal, StandardNormal, Uniform};
 use sha2::{Digest, Sha256};
 
 use super::convert::{CastLosses, Converter};
+use super::expr::NewValues;
 use super::expr::TensorExpr;
-use super::plan::{NewValues, PlannedTensor, TensorRef};
+use super::planned_tensor::PlannedTensor;
 use super::product::Adder;
+use super::tensor_ref::{ReadAt, TensorRef};
 use super::values::Codec;
 use crate::checkpoint::Dtype;
 use crate::checkpoint::reserve::reserved;
@@ -82,9 +84,6 @@ fn convert(
     losses.add(converter.losses());
     Ok(())
 }
-
-/// Reads bytes of a donor's tensor: `read(tensor, offset within the tensor, buffer)`.
-pub type ReadAt<'a> = dyn FnMut(&TensorRef, u64, &mut [u8]) -> io::Result<()> + 'a;
 
 /// Reads bytes of the only operand of an operation: `read(offset within the tensor, buffer)`.
 pub type ReadOperand<'a> = dyn FnMut(u64, &mut [u8]) -> io::Result<()> + 'a;

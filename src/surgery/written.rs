@@ -4,7 +4,8 @@ use sha2::{Digest as _, Sha256};
 
 use super::convert::CastLosses;
 use super::expr::TensorExpr;
-use super::plan::{Plan, PlannedFile, PlannedTensor};
+use super::plan::{Plan, PlannedFile};
+use super::planned_tensor::PlannedTensor;
 use crate::checkpoint::{FileName, HashAlgorithm, hex, parallel};
 
 /// How [`super::apply()`] writes a plan. The bytes of the shards do not depend on it.

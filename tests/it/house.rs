@@ -1,5 +1,7 @@
 //! Conventions of rule files, fixtures and sources, checked without a checkpoint.
 
+mod circles;
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;

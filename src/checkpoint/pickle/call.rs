@@ -3,6 +3,7 @@
 //! Source: `torch/_utils.py` and `torch/serialization.py` of torch 2.15.0.
 
 use super::element::Element;
+use super::known::Known;
 use super::machine::{CALL, Machine, Stop, StorageIds, VALUE};
 use super::value::{DictKind, StorageRef, TensorRef, Value};
 
@@ -13,49 +14,6 @@ const MAX_ARGUMENTS: usize = 8;
 const MAX_DIMENSIONS: usize = 64;
 /// Work of a tensor and of a storage for the readers, who look at each several times.
 const VIEW: u64 = 600;
-
-/// What is known of an imported attribute.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Known {
-    OrderedDict,
-    /// A storage class.
-    Storage(Element),
-    /// `torch.storage.UntypedStorage`.
-    Untyped,
-    Dtype(Element),
-    /// `_rebuild_tensor`, with the number of its arguments.
-    Rebuild,
-    RebuildV2,
-    RebuildV3,
-    RebuildParameter,
-    Size,
-    /// `torch.serialization._get_layout`, whose result only sparse tensors have.
-    Layout,
-    /// `builtins.getattr`.
-    Getattr,
-    /// Anything else.
-    Other,
-}
-
-impl Known {
-    pub(super) fn new(module: &str, name: &str) -> Self {
-        let known = match (module, name) {
-            ("collections", "OrderedDict") => Some(Self::OrderedDict),
-            ("torch.storage", "UntypedStorage") => Some(Self::Untyped),
-            ("torch._utils", "_rebuild_tensor") => Some(Self::Rebuild),
-            ("torch._utils", "_rebuild_tensor_v2") => Some(Self::RebuildV2),
-            ("torch._utils", "_rebuild_tensor_v3") => Some(Self::RebuildV3),
-            ("torch._utils", "_rebuild_parameter") => Some(Self::RebuildParameter),
-            ("torch", "Size") => Some(Self::Size),
-            ("torch.serialization", "_get_layout") => Some(Self::Layout),
-            ("builtins", "getattr") => Some(Self::Getattr),
-            ("torch" | "torch.cuda", name) if name.ends_with("Storage") => Element::of_storage(name).map(Self::Storage),
-            ("torch", name) => Element::of_dtype(name).map(Self::Dtype),
-            _ => None,
-        };
-        known.unwrap_or(Self::Other)
-    }
-}
 
 impl Machine<'_> {
     /// Calls a function, or creates an object of a class.

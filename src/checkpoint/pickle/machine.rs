@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, HashMap};
 
 use super::PickleGlobal;
-use super::call::Known;
+use super::known::Known;
 use super::opcode;
 use super::value::{DictKind, Heap, Span, Value, number};
 use crate::checkpoint::work::{Work, WorkExceeded};

@@ -11,8 +11,8 @@ use serde_json::Value;
 use super::VerifyError;
 use crate::checkpoint::open::{JSON_CAP, read_own};
 use crate::checkpoint::{HashAlgorithm, is_plain_file_name};
+use crate::merge::donor_tensor::DonorTensor;
 use crate::merge::manifest;
-use crate::merge::manifest::DonorTensor;
 use crate::merge::named::{Bounds, Changeable, Stray, is_changed};
 use crate::surgery::expr::{TensorExpr, TensorTransform};
 

@@ -9,7 +9,9 @@ use crate::check::{Edit, renamed};
 use crate::checkpoint::open::TOKENIZER_CAP;
 use crate::checkpoint::shard::header::FORMATS;
 use crate::checkpoint::{Checkpoint, Document, FileName, Parts, PythonModule, Splice, spliced};
-use crate::surgery::plan::{PlannedShard, PlannedTensor, TensorRef, format_pt};
+use crate::surgery::plan::{PlannedShard, format_pt};
+use crate::surgery::planned_tensor::PlannedTensor;
+use crate::surgery::tensor_ref::TensorRef;
 
 /// Result of applying the edits of one fix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,7 +1,8 @@
 //! The work of writing a shard, cut into pieces that threads do in any order.
 
 use crate::surgery::align::Run;
-use crate::surgery::plan::{PlannedShard, PlannedTensor};
+use crate::surgery::plan::PlannedShard;
+use crate::surgery::planned_tensor::PlannedTensor;
 
 /// Maximum number of bytes of a job that copies; also the bytes copied between two checks for a signal.
 pub(super) const SLICE: u64 = 64 * 1024 * 1024;
@@ -67,7 +68,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::TensorRef;
+    use crate::surgery::tensor_ref::TensorRef;
 
     /// A tensor of bytes at an offset of a donor's file.
     fn tensor(path: &str, offset: u64, len: u64) -> PlannedTensor {

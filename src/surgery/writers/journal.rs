@@ -14,6 +14,7 @@ mod exchange;
 mod folder;
 mod header;
 mod key;
+mod owner;
 mod recover;
 mod replay;
 mod undo;

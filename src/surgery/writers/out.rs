@@ -11,7 +11,7 @@ use crate::checkpoint::digest::Hasher;
 use crate::surgery::align::{BLOCK, Run};
 use crate::surgery::donor::{DonorFile, OpenDonors};
 use crate::surgery::error::{ApplyError, io_at};
-use crate::surgery::plan::PlannedTensor;
+use crate::surgery::planned_tensor::PlannedTensor;
 use crate::surgery::stop::interrupted;
 use crate::surgery::stream::{Streamed, block, stream};
 use crate::surgery::written::WrittenTensor;

@@ -180,8 +180,10 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
+    use crate::surgery::expr::NewValues;
     use crate::surgery::expr::{Factor, Product, TensorExpr};
-    use crate::surgery::plan::{NewValues, PlannedTensor, TensorRef};
+    use crate::surgery::planned_tensor::PlannedTensor;
+    use crate::surgery::tensor_ref::TensorRef;
 
     /// Shards with tensors of every transform, from one donor's file.
     fn plans(donor: &Path) -> Vec<PlannedShard> {

@@ -4,9 +4,10 @@ use serde::Deserialize;
 
 use super::RecordedTensor;
 use crate::checkpoint::Dtype;
-use crate::merge::manifest::DonorTensor;
+use crate::merge::donor_tensor::DonorTensor;
+use crate::surgery::expr::NewValues;
 use crate::surgery::expr::{TensorExpr, TensorTransform};
-use crate::surgery::plan::{NewValues, RowSlice};
+use crate::surgery::tensor_ref::RowSlice;
 
 /// An entry of any version.
 #[derive(Debug, Deserialize)]

@@ -263,7 +263,9 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::plan::{PlannedTensor, TensorRef, format_pt};
+    use crate::surgery::plan::format_pt;
+    use crate::surgery::planned_tensor::PlannedTensor;
+    use crate::surgery::tensor_ref::TensorRef;
 
     /// Number of bytes of the tensor: several blocks and a part of one.
     const LEN: usize = 5 * 4096 + 5;

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 use super::exchange::{Taken, exchange, keep, rename_new, take_away};
 use super::folder::{Folder, remove_file, remove_tree};
 use super::header::{Headers, State};
-use super::write::copy_owner_and_mode;
+use super::owner::copy_owner_and_mode;
 use crate::checkpoint::hex;
 use crate::checkpoint::journal::{HeaderEdit, InodeIdentity, Journal, JournaledFile, NewFile, OldFile};
 use crate::checkpoint::open::{Identity, open_regular};

@@ -1,12 +1,13 @@
 //! Writes a repair into its checkpoint.
 
-use std::fs::{self, Permissions};
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::fs;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use super::folder::Folder;
 use super::header::Headers;
 use super::key::key;
+use super::owner::copy_owner_and_mode;
 use super::replay::Replay;
 use crate::checkpoint::journal::{Journal, JournaledFile, Key, NewFile, OldFile, StateFolder, VERSION};
 use crate::surgery::donor::DonorSnapshot;
@@ -17,7 +18,7 @@ use crate::surgery::repair::{Change, Content, Repair};
 use crate::surgery::stop::interrupted;
 use crate::surgery::writers::changes::{check_unchanged, explain_error, space, write_content};
 use crate::surgery::writers::sharing::Sharing;
-use crate::surgery::writers::system::{check_space, look, retry, sync_dir};
+use crate::surgery::writers::system::{check_space, look, sync_dir};
 
 /// Replaces the changed files of a repair, all of them or none.
 ///
@@ -174,19 +175,4 @@ fn stage(
     donor.unchanged()?;
     interrupted()?;
     Ok(Journal { version: VERSION, number, folder: Some(folder.identity()?), files, authenticator: None })
-}
-
-/// Gives a new file the owner and the mode of the `original`, whose metadata is `old`, and syncs it.
-pub(super) fn copy_owner_and_mode(path: &Path, original: &Path, old: &fs::Metadata) -> Result<(), RepairError> {
-    let new = fs::metadata(path).map_err(io_at(path, "reading metadata"))?;
-    if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
-        retry(|| std::os::unix::fs::chown(path, Some(old.uid()), Some(old.gid()))).map_err(|error| {
-            let whose = if new.uid() == old.uid() { "group" } else { "user" };
-            RepairError::Owner { path: original.to_owned(), whose, error }
-        })?;
-    }
-    // After the owner, because changing the owner may clear mode bits.
-    retry(|| fs::set_permissions(path, Permissions::from_mode(old.mode() & 0o7777)))
-        .map_err(io_at(path, "setting permissions"))?;
-    Ok(fs::File::open(path).and_then(|f| f.sync_all()).map_err(io_at(path, "syncing"))?)
 }

@@ -8,7 +8,8 @@ use std::path::PathBuf;
 use ckpt_doctor::checkpoint::{Dtype, byte_len};
 use ckpt_doctor::surgery::convert::CastLosses;
 use ckpt_doctor::surgery::expr::{Factor, Product, TensorExpr};
-use ckpt_doctor::surgery::plan::{PlannedTensor, TensorRef};
+use ckpt_doctor::surgery::planned_tensor::PlannedTensor;
+use ckpt_doctor::surgery::tensor_ref::TensorRef;
 use ckpt_doctor::surgery::transform;
 
 use super::FEW;
