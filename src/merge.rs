@@ -55,12 +55,16 @@ pub use validate::validate;
 #[cfg(feature = "cli")]
 pub use verify::verify;
 
+use draft::MergeDraft;
 use manifest::Recorded;
+use parts::Donor;
 use run::count;
 
 use crate::checkpoint::{Checkpoint, FileName};
 use crate::knowledge::Knowledge;
+use crate::knowledge::recipe::Recipe;
 use crate::report::model::{MergeStage, Role};
+use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::written::{Writing, WrittenShard};
 use crate::surgery::{Target, apply, check_target, claim_target};
 
@@ -129,27 +133,44 @@ pub fn run(
         return Ok(run.end(MergeStage::DryRun));
     }
 
-    let digests = manifest::donor_digests(&donors, &draft.plan, request.hash_donors)?;
-    let total = draft.plan.len();
-    let done = AtomicU64::new(0);
-    let recorded = Recorded {
-        recipe,
-        donors: &donors,
-        digests: &digests,
-        plan: &draft.plan,
-        hash: request.hash,
-        changeable: &draft.changeable,
-    };
-    let sizes = record::sizes(&run, &recorded);
-    let mut record = |written: &[WrittenShard]| record::files(&mut run, &recorded, written);
-    let leftover = apply(&draft.plan, &snapshots, &out, &sizes, &mut record, Writing::new(request.hash), &|bytes| {
-        let before = done.fetch_add(bytes, Ordering::Relaxed);
-        progress(before.saturating_add(bytes), total);
-    })?;
-    run.note_files(cleared.as_deref(), leftover.as_ref());
+    let cleared = cleared.as_deref();
+    ReadyMerge { request, recipe, donors: &donors, snapshots: &snapshots, draft: &draft, out: &out, cleared, knowledge }
+        .write(run, progress)
+}
 
-    let reopen = |error| PipelineError::Reopen { out: request.out.clone(), error };
-    let written = Checkpoint::open(&out).map_err(reopen)?;
-    run.check(Role::Written, &request.out, written, knowledge, &recipe.tolerates);
-    Ok(run.end(MergeStage::Written))
+/// A merge of which everything is decided.
+struct ReadyMerge<'m> {
+    request: &'m MergeRequest,
+    recipe: &'m Recipe,
+    donors: &'m [Donor],
+    snapshots: &'m [DonorSnapshot],
+    draft: &'m MergeDraft,
+    /// The directory to create.
+    out: &'m Path,
+    /// What an ended run had left of it.
+    cleared: Option<&'m Path>,
+    knowledge: &'m Knowledge,
+}
+
+impl ReadyMerge<'_> {
+    /// Writes the result, opens it, and checks it.
+    fn write(&self, mut run: MergeRun, progress: &(dyn Fn(u64, u64) + Sync)) -> Result<MergeRun, PipelineError> {
+        let Self { request, recipe, donors, draft, out, .. } = *self;
+        let digests = manifest::donor_digests(donors, &draft.plan, request.hash_donors)?;
+        let total = draft.plan.len();
+        let done = AtomicU64::new(0);
+        let (plan, changeable) = (&draft.plan, &draft.changeable);
+        let recorded = Recorded { recipe, donors, digests: &digests, plan, hash: request.hash, changeable };
+        let sizes = record::sizes(&run, &recorded);
+        let mut record = |written: &[WrittenShard]| record::files(&mut run, &recorded, written);
+        let leftover = apply(plan, self.snapshots, out, &sizes, &mut record, Writing::new(request.hash), &|bytes| {
+            let before = done.fetch_add(bytes, Ordering::Relaxed);
+            progress(before.saturating_add(bytes), total);
+        })?;
+        run.note_files(self.cleared, leftover.as_ref());
+        let reopen = |error| PipelineError::Reopen { out: request.out.clone(), error };
+        let written = Checkpoint::open(out).map_err(reopen)?;
+        run.check(Role::Written, &request.out, written, self.knowledge, &recipe.tolerates);
+        Ok(run.end(MergeStage::Written))
+    }
 }

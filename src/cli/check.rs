@@ -6,7 +6,6 @@ use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::look::{CheckRun, Checked, Looked, Stop, judge_by};
 use super::paths::{self, Targets};
-use super::settings::Resolved;
 use super::{baseline, fix, output, signals, skipped, workers};
 use crate::check::unused_suppressions;
 use crate::checkpoint::parallel;
@@ -107,7 +106,7 @@ impl CheckRun<'_> {
         }
         note_unchecked(&results.unchecked);
         let fix = &self.args.fix;
-        let changes = shown.iter().map(|c| fix::show(fix, &c.dir, &c.checkpoint, &c.outcome, &judge_by(self.by)));
+        let changes = shown.iter().map(|c| fix::show(fix, &c.dir, &c.checkpoint, &c.outcome, &judge_by(&self.by)));
         let changes = changes.sum::<anyhow::Result<usize>>()?;
         Ok(results.exit(changes > 0))
     }
@@ -115,7 +114,6 @@ impl CheckRun<'_> {
     /// Prints and writes the reports; the exit code.
     fn report(&self, mut results: Results) -> anyhow::Result<u8> {
         let Self { args, by, .. } = self;
-        let by: &Resolved = by;
         results.report_unused_suppressions(self);
         let looked = std::mem::take(&mut results.looked);
         let (mut reports, mut skips): (Vec<CheckpointReport>, Vec<_>) = (Vec::new(), Vec::new());
@@ -139,8 +137,6 @@ impl CheckRun<'_> {
                 skipped::print(dir, skipped, &by.knowledge.rules);
             }
         }
-        // Not freed: the process ends.
-        std::mem::forget(report);
         Ok(code)
     }
 }

@@ -57,23 +57,20 @@ impl From<anyhow::Error> for Stop {
 /// Options of a run, and what surrounds the directories that it checks.
 pub struct CheckRun<'a> {
     pub args: &'a CheckArgs,
-    pub by: &'a Resolved,
+    pub by: Resolved,
     surroundings: Surroundings,
     /// Real paths of `--follow-links`.
     followed: Arc<[PathBuf]>,
-    /// Whether the process ends after one directory, and need not free it.
-    ends: bool,
 }
 
 impl<'a> CheckRun<'a> {
     /// The options of a run on these directories.
     pub fn new(args: &'a CheckArgs, rules: Option<&Path>, dirs: &[PathBuf]) -> anyhow::Result<Self> {
         let surroundings = Surroundings::new(args.paths.iter().chain(dirs).map(PathBuf::as_path));
-        // Never freed: the process ends with the run.
-        let by: &Resolved = Box::leak(Box::new(resolve(&Typed::check(args, rules), &surroundings)?));
+        let by = resolve(&Typed::check(args, rules), &surroundings)?;
         let real = |dir: &PathBuf| dir.canonicalize().with_context(|| format!("--follow-links {}", dir.display()));
         let followed = args.follow_links.iter().map(real).collect::<anyhow::Result<_>>()?;
-        Ok(Self { args, by, surroundings, followed, ends: dirs.len() < 2 })
+        Ok(Self { args, by, surroundings, followed })
     }
 
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
@@ -105,11 +102,7 @@ impl<'a> CheckRun<'a> {
         let fix = &self.args.fix;
         report.fixing = Some(Fixing { unsafe_fixes: fix.unsafe_fixes, made: fix.writes() });
         let uses = suppression_uses(&self.by.knowledge, checkpoint, outcome);
-        let looked = Looked { report, uses, skipped: outcome.skipped.clone() };
-        if self.ends {
-            std::mem::forget(checked);
-        }
-        Ok(looked)
+        Ok(Looked { report, uses, skipped: outcome.skipped.clone() })
     }
 
     /// Reads and checks a checkpoint.
@@ -122,7 +115,7 @@ impl<'a> CheckRun<'a> {
         let outcome = if self.args.fix.writes() || self.args.fix.diff {
             check_for(&checkpoint, &self.by.knowledge, &self.by.versions)
         } else {
-            check_by(self.by)(&checkpoint)
+            check_by(&self.by)(&checkpoint)
         };
         let checked = Checked { dir: dir.to_owned(), checkpoint, outcome, repaired: Default::default() };
         self.refuse_unusable(&checked)?;
@@ -144,10 +137,12 @@ impl<'a> CheckRun<'a> {
         }
         let Checked { dir, checkpoint, outcome, .. } = checked;
         let repaired =
-            fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &judge_by(self.by))?;
+            fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &judge_by(&self.by))?;
         let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } = repaired;
-        let outcome = outcome
-            .map_or_else(|| check_by(self.by)(&checkpoint), |outcome| tried(&checkpoint, outcome, &judge_by(self.by)));
+        let outcome = outcome.map_or_else(
+            || check_by(&self.by)(&checkpoint),
+            |outcome| tried(&checkpoint, outcome, &judge_by(&self.by)),
+        );
         Ok(Checked { dir, checkpoint, outcome, repaired: (fixed, withdrawn) })
     }
 }

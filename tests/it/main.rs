@@ -10,6 +10,7 @@
     clippy::format_push_string,
     clippy::indexing_slicing,
     clippy::print_stdout,
+    clippy::too_many_lines,
     clippy::unwrap_used,
     reason = "a panic fails the test"
 )]

@@ -66,29 +66,35 @@ pub(super) fn predict(expected: &Expected, stored: &Stored) -> LoadReport {
     for name in stored.absent().filter(|name| matches!(renaming.name(name), Renamed::Is(n) if in_model(&n))) {
         silent.push(Silent { name: name.to_owned(), reason: SilentReason::IndexedButAbsent, by: None });
     }
+    silent.extend(hijacked(expected, stored));
+    silent.sort_by(|a, b| (a.reason, &a.name).cmp(&(b.reason, &b.name)));
+
+    let mismatched = mismatched(expected, stored, &renaming);
+    LoadReport { missing, unexpected, mismatched, silent, raises, ..LoadReport::default() }
+}
+
+/// Tensors whose prefix lets the loader rename the others: they load nowhere, without a message.
+fn hijacked(expected: &Expected, stored: &Stored) -> Vec<Silent> {
     let all: BTreeSet<String> = stored.names().map(str::to_owned).collect();
     let recognised = |file: &BTreeSet<String>, most: usize| {
         let renaming = Renaming::of(expected, file.iter().map(String::as_str));
-        let named = file
-            .iter()
-            .filter(|key| matches!(renaming.name(key), Renamed::Is(name) if expected.tensors.contains_key(&name)));
-        named.take(most).count()
+        let is_known =
+            |key: &&String| matches!(renaming.name(key), Renamed::Is(name) if expected.tensors.contains_key(&name));
+        file.iter().filter(is_known).take(most).count()
     };
-    for name in keys::hijackers(expected, &all, recognised) {
-        silent.push(Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None });
-    }
-    silent.sort_by(|a, b| (a.reason, &a.name).cmp(&(b.reason, &b.name)));
+    let silent = |name: &str| Silent { name: name.to_owned(), reason: SilentReason::PrefixHijack, by: None };
+    keys::hijackers(expected, &all, recognised).into_iter().map(silent).collect()
+}
 
-    let mismatched = stored
-        .shapes()
-        .filter_map(|(key, shape)| {
-            let Renamed::Is(name) = renaming.name(key) else { return None };
-            let tensor = expected.tensors.get(&name)?;
-            let differs = tensor.shape != shape;
-            differs.then(|| Mismatch { name, stored: shape.to_vec(), expected: tensor.shape.clone() })
-        })
-        .collect();
-    LoadReport { missing, unexpected, mismatched, silent, raises, ..LoadReport::default() }
+/// Tensors whose shape is not that of the class.
+fn mismatched(expected: &Expected, stored: &Stored, renaming: &Renaming<'_>) -> Vec<Mismatch> {
+    let mismatch = |(key, shape): (&str, &[u64])| {
+        let Renamed::Is(name) = renaming.name(key) else { return None };
+        let tensor = expected.tensors.get(&name)?;
+        let differs = tensor.shape != shape;
+        differs.then(|| Mismatch { name, stored: shape.to_vec(), expected: tensor.shape.clone() })
+    };
+    stored.shapes().filter_map(mismatch).collect()
 }
 
 /// The stored tensors under the class's names.

@@ -72,7 +72,9 @@ fn no_file_needs_a_file_that_needs_it() {
             break;
         }
         left.retain(|of, _| !ends.contains(of));
-        left.values_mut().for_each(|needs| needs.retain(|of| !ends.contains(of)));
+        for needs in left.values_mut() {
+            needs.retain(|of| !ends.contains(of));
+        }
     }
     loop {
         let wanted: BTreeSet<Module> = left.values().flatten().cloned().collect();

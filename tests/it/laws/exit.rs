@@ -11,7 +11,7 @@ use ckpt_doctor::report::model::CheckpointReport;
 use ckpt_doctor::report::{self, Format, Report, Style};
 use serde_json::Value;
 
-use super::verdicts::COMPARED;
+use super::verdicts::{COMPARED, holds};
 use crate::support::{Case, knowledge, on_cases, open};
 
 /// Values of `--for`: none, each known version, and versions that a known one stands for.
@@ -66,10 +66,10 @@ pub(super) fn exit(case: &Case, made: &Path, knowledge: &Knowledge) -> Vec<Strin
 fn the_exit_code_follows_the_loaders_that_were_named() {
     let knowledge = knowledge();
     // An adapter is judged by versions of PEFT.
-    let wanted = |name: &str| !name.starts_with("ADP");
-    let tried = on_cases(&knowledge, wanted, |_, case, made| exit(case, made, &knowledge));
-    let broken: Vec<String> = tried.into_iter().flat_map(|(_, broken)| broken).collect();
-    assert!(broken.is_empty(), "{} broken:\n{}", broken.len(), broken.join("\n"));
+    let look = |case: &Case, made: &Path| {
+        if case.name.starts_with("ADP") { Vec::new() } else { exit(case, made, &knowledge) }
+    };
+    holds(8, look, &knowledge);
 }
 
 /// A version that nobody read is judged as the nearest known one: the verdict, the severities and so the exit code.

@@ -104,7 +104,9 @@ fn expect_fails_where_check_says_that_the_model_raises_or_is_unknown() {
         assert_eq!(answers.len(), configs.len());
         for (config, answer) in configs.iter().zip(&answers) {
             let dir = room.path().join("checkpoint");
-            if config.get("quantization_config").is_some() || !write(&dir, config, version, &knowledge) {
+            // Code of the directory is no part of the config that `expect` is asked for.
+            let goes_beyond = ["quantization_config", "auto_map"].iter().any(|key| config.get(key).is_some());
+            if goes_beyond || !write(&dir, config, version, &knowledge) {
                 continue;
             }
             let checkpoint = Arc::new(Checkpoint::open(&dir).unwrap());

@@ -78,7 +78,7 @@ pub(super) fn company(case: &Case, made: &Path, knowledge: &Knowledge) -> Vec<St
 #[test]
 fn a_verdict_does_not_depend_on_the_other_loaders_of_the_run() {
     let knowledge = knowledge();
-    holds(4, |case, made| company(case, made, &knowledge), &knowledge);
+    holds(8, |case, made| company(case, made, &knowledge), &knowledge);
 }
 
 /// Law *ignorance*: what becomes better where a drawn file is not read, because it leads out of the directory.
@@ -173,5 +173,5 @@ impl Selections {
 #[test]
 fn a_verdict_does_not_depend_on_the_selected_rules_and_their_severities() {
     let selections = Selections::new(20_261_125);
-    holds(4, |case, made| selections.differing(case, made), &selections.whole);
+    holds(8, |case, made| selections.differing(case, made), &selections.whole);
 }

@@ -59,7 +59,7 @@ fn numbers_are_written_as_the_donors_spell_them() {
 #[test]
 fn a_merge_with_few_descriptors_leaves_nothing_behind() {
     let mut ends = std::collections::BTreeSet::new();
-    for descriptors in 4..12 {
+    for descriptors in 4..16 {
         let work = TempDir::new().unwrap();
         let plain = merge(work.path(), Path::new("out"));
         let mut command = Command::new("/bin/sh");
