@@ -58,26 +58,6 @@ impl<'a> Context<'a> {
         })
     }
 
-    /// Variables of [`crate::knowledge::parts::Follow`] and [`crate::knowledge::parts::Need`], for a place in a model and the
-    /// part `new` that comes to stand there.
-    pub(super) fn of_place(&self, place: PartOf<'_>, new: PartOf<'_>) -> Result<Scope<'_>, MergeError> {
-        let mut scope = self.scope.child();
-        let at = place.stored().map_or("", |(at, _)| at);
-        let host = place.donor();
-        scope.bind("at", &json!(at));
-        scope.bind("part", new.config());
-        scope.bind("host", place.host());
-        scope.bind("host_stored", value_of(&host.checkpoint, files::CONFIG).unwrap_or(&Value::Null));
-        for (name, donor) in [("host_preprocessor", host), ("part_preprocessor", new.donor())] {
-            scope.bind(name, value_of(&donor.checkpoint, files::PREPROCESSOR_CONFIG).unwrap_or(&json!({})));
-        }
-        for item in &place.part.lets {
-            let value = item.is.eval(&scope).map_err(self.at(format!("{} of the part {}", item.name, place.name)))?;
-            scope.bind(&item.name, &value);
-        }
-        Ok(scope)
-    }
-
     /// Name and shape of a donor tensor; `None` when the donor has no such tensor.
     pub(super) fn shaped(&self, t: &SeamTensor) -> Option<ShapedName> {
         let (_, tensor) = self.donor(&t.from)?.checkpoint.tensor(&t.name)?;

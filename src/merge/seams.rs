@@ -1,9 +1,36 @@
-//! What keeps a part from standing in another model.
+//! Places in models where parts of others come to stand, and what keeps them from standing there.
+
+use serde_json::{Value, json};
 
 use super::context::Context;
 use super::error::MergeError;
 use super::explain;
+use super::parts::{PartOf, value_of};
+use crate::checkpoint::files;
+use crate::knowledge::Scope;
 use crate::report::model::Seam;
+
+impl Context<'_> {
+    /// Variables of [`crate::knowledge::parts::Follow`] and [`crate::knowledge::parts::Need`], for a place in a model and the
+    /// part `new` that comes to stand there.
+    pub(super) fn of_place(&self, place: PartOf<'_>, new: PartOf<'_>) -> Result<Scope<'_>, MergeError> {
+        let mut scope = self.scope.child();
+        let at = place.stored().map_or("", |(at, _)| at);
+        let host = place.donor();
+        scope.bind("at", &json!(at));
+        scope.bind("part", new.config());
+        scope.bind("host", place.host());
+        scope.bind("host_stored", value_of(&host.checkpoint, files::CONFIG).unwrap_or(&Value::Null));
+        for (name, donor) in [("host_preprocessor", host), ("part_preprocessor", new.donor())] {
+            scope.bind(name, value_of(&donor.checkpoint, files::PREPROCESSOR_CONFIG).unwrap_or(&json!({})));
+        }
+        for item in &place.part.lets {
+            let value = item.is.eval(&scope).map_err(self.at(format!("{} of the part {}", item.name, place.name)))?;
+            scope.bind(&item.name, &value);
+        }
+        Ok(scope)
+    }
+}
 
 /// The seams of parts that come to stand in another model: types that its class does not build there, and what else it
 /// needs of them.

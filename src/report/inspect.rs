@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use self::columns::{Align, WIDTH, columns};
 use super::Style;
-use super::format::{and, bytes, more, name, plural, scaled, sentence, shape};
+use super::format::{and, bytes, more, name, plural, scaled, sentence, shape, wrap};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
@@ -80,7 +80,8 @@ pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: S
         indented(&mut out, &pretty(&inspection.proven));
     }
     for note in &inspection.notes {
-        let _ok = writeln!(out, "\n  note: {}", sentence(note));
+        out.push('\n');
+        prose(&mut out, &format!("note: {}", sentence(note)), style);
     }
     out
 }
@@ -117,36 +118,31 @@ fn files(out: &mut String, inspection: &Inspection, style: Style) {
 
 fn class(out: &mut String, inspection: &Inspection, style: Style) {
     let paint = Paint(style.color);
-    let _ok = match &inspection.config {
-        None => writeln!(out, "\n  class: no config.json"),
+    out.push('\n');
+    match &inspection.config {
+        None => prose(out, "class: no config.json", style),
         Some(config) => {
             let or = |text: &Option<String>, none: &str| text.as_deref().map_or_else(|| none.to_owned(), name);
-            let _ok = write!(
-                out,
-                "\n  class by config: {} (model_type {})",
-                paint.strong(&or(&config.class, "none")),
-                or(&config.model_type, "none")
-            );
-            if let Some(version) = &config.transformers_version {
-                let _ok = write!(out, ", written by transformers {}", name(version));
-            }
-            if let Some(method) = &config.quantization {
-                let _ok = write!(out, ", quantised with {}", name(method));
-            }
-            writeln!(out)
+            let class = paint.strong(&or(&config.class, "none"));
+            let model_type = or(&config.model_type, "none");
+            let version = config.transformers_version.as_ref();
+            let version = version.map(|version| format!(", written by transformers {}", name(version)));
+            let method = config.quantization.as_ref().map(|method| format!(", quantised with {}", name(method)));
+            let (version, method) = (version.unwrap_or_default(), method.unwrap_or_default());
+            prose(out, &format!("class by config: {class} (model_type {model_type}){version}{method}"), style);
         }
-    };
+    }
     let Some(best) = inspection.classes.first() else { return };
     let fit = best.fit.map(|fit| format!(", {} of names and shapes with the values below", percent(fit)));
-    let _ok = writeln!(
-        out,
-        "  class by tensors: {} ({}): matches {} of names{}; known for transformers {}",
+    let text = format!(
+        "class by tensors: {} ({}): matches {} of names{}; known for transformers {}",
         paint.strong(&name(&best.class)),
         name(&best.architecture),
         percent(best.names),
         fit.unwrap_or_default(),
         and(&best.loaders)
     );
+    prose(out, &text, style);
     let others: Vec<&ClassCandidate> = inspection.classes.iter().skip(1).collect();
     if !others.is_empty() {
         let mut shown: Vec<String> =
@@ -156,40 +152,83 @@ fn class(out: &mut String, inspection: &Inspection, style: Style) {
     }
 }
 
+/// A sentence in lines of the width of the terminal, indented by two columns, and by four from the second line on.
+fn prose(out: &mut String, text: &str, style: Style) {
+    let wrapped = wrap(text, style.width.map(|width| width.saturating_sub(4)));
+    for (number, line) in wrapped.lines().enumerate() {
+        let indent = if number == 0 { 2 } else { 4 };
+        let _ok = writeln!(out, "{:indent$}{line}", "");
+    }
+}
+
 fn values(out: &mut String, votes: &Votes, has_config: bool, style: Style) {
     let (outvoted, agreed): (Vec<&Vote>, Vec<&Vote>) = votes.votes.iter().partition(|v| v.outvotes());
-    let rows: Vec<[String; 5]> = outvoted
-        .into_iter()
-        .chain(agreed)
-        .map(|v| {
-            [
-                name(v.pointer.trim_start_matches('/')).replace('/', "."),
-                config_value(v),
-                name(&v.voted_value.to_string()),
-                tally(v),
-                v.evidence.first().map(|w| name(&w.to_string())).unwrap_or_default(),
-            ]
-        })
-        .collect();
+    let contradicted = outvoted.len();
+    let rows: Vec<[String; 5]> = outvoted.into_iter().chain(agreed).map(value).collect();
     let _ok = writeln!(out, "\n  config values inferred from the tensors");
     let first = if has_config { "config" } else { "default" };
-    table(out, ["", first, "tensors imply", "votes", "for example"], &rows, style);
+    if style.width.is_none_or(|width| width_of(&rows) <= width) {
+        table(out, ["", first, "tensors imply", "votes", "for example"], &rows, style);
+    } else {
+        narrow(out, first, &rows, contradicted, style.cap);
+    }
     let (before, after) = (votes.before, votes.after);
     let fits = |f: crate::check::votes::Fit| {
         format!("{} of {} stored, {} with another shape", f.found, f.expected, f.mismatched)
     };
-    let _ok = match votes.outvoted().count() {
-        0 => writeln!(out, "  the tensors contradict no value; tensors of the class: {}", fits(after)),
-        n => writeln!(
-            out,
-            "  the tensors contradict {}; tensors of the class: {}; with the inferred values: {}",
+    let text = match votes.outvoted().count() {
+        0 => format!("the tensors contradict no value; tensors of the class: {}", fits(after)),
+        n => format!(
+            "the tensors contradict {}; tensors of the class: {}; with the inferred values: {}",
             plural(n, "value"),
             fits(before),
             fits(after)
         ),
     };
+    prose(out, &text, style);
     for open in &votes.undecided {
-        let _ok = writeln!(out, "  undetermined; only this is known: {}", name(&open.constraint));
+        prose(out, &format!("undetermined; only this is known: {}", name(&open.constraint)), style);
+    }
+}
+
+/// A row of the table of values: key, value in the config, implied value, votes, and a tensor that implies it.
+fn value(v: &Vote) -> [String; 5] {
+    [
+        name(v.pointer.trim_start_matches('/')).replace('/', "."),
+        config_value(v),
+        name(&v.voted_value.to_string()),
+        tally(v),
+        v.evidence.first().map(|w| name(&w.to_string())).unwrap_or_default(),
+    ]
+}
+
+/// Width of these rows as a table, in columns.
+fn width_of<const N: usize>(rows: &[[String; N]]) -> usize {
+    let widest = |at: usize| rows.iter().filter_map(|row| row.get(at)).map(|cell| cell.chars().count()).max();
+    let cells: usize = (0..N).filter_map(widest).sum();
+    // A border and two blanks for each column, the last border and the indent.
+    cells.saturating_add(N.saturating_mul(3)).saturating_add(3)
+}
+
+/// The rows of [`value`] for a terminal that is too narrow for their table: names stand last and are not broken, and tensors
+/// are named only for the first rows, whose values are contradicted.
+fn narrow(out: &mut String, first: &str, rows: &[[String; 5]], contradicted: usize, cap: usize) {
+    let shown: Vec<[String; 4]> = rows
+        .iter()
+        .take(cap)
+        .map(|[key, config, implied, votes, _]| [config, implied, votes, key].map(Clone::clone))
+        .collect();
+    let mut text = String::new();
+    let alignment = [Align::Left, Align::Left, Align::Left, Align::Left];
+    columns(&mut text, [first, "implied", "votes", ""], alignment, &shown, WIDTH);
+    for line in text.lines() {
+        let _ok = writeln!(out, "  {line}");
+    }
+    if let Some(more) = more(rows.len(), cap) {
+        let _ok = writeln!(out, "    {more}");
+    }
+    for [key, .., example] in rows.iter().take(contradicted.min(cap)) {
+        let _ok = writeln!(out, "  {key} is implied by {example}");
     }
 }
 

@@ -10,6 +10,8 @@ use ckpt_doctor::check::load::{Stored, predict};
 use ckpt_doctor::check::votes::{Votes, explain, vote};
 use ckpt_doctor::checkpoint::{Checkpoint, Dtype, Parts, Shard, Tensor};
 use ckpt_doctor::knowledge::{Library, Loader};
+use ckpt_doctor::report::Style;
+use ckpt_doctor::report::inspect::full;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -194,6 +196,19 @@ fn inspect_summarises_a_checkpoint() {
     shots("outvoted");
     copy(&work, "llava3d-tiny", |c| *c = Value::Null);
     shots("no-config");
+}
+
+/// For a terminal of 80 columns no name of a value or of a class is broken.
+#[test]
+fn inspect_fits_a_narrow_terminal() {
+    let work = TempDir::new().unwrap();
+    copy(&work, "spatialvla-tiny", |c| c["vision_config"]["patch_size"] = json!(16));
+    let checkpoint = Checkpoint::open(work.path().join("spatialvla-tiny")).unwrap();
+    let inspection = inspect(&checkpoint, &Library::embedded());
+    let style = Style { width: Some(80), cap: 8, ..Style::default() };
+    let shown = full("spatialvla-tiny", &inspection, Some(1), style);
+    let below = shown.find("  class by config").unwrap();
+    snapshot!("inspect-narrow", without_others(&shown[below..], "full"));
 }
 
 #[test]
