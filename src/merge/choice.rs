@@ -131,7 +131,7 @@ fn exchange(recipe: &Recipe, run: &MergeRun) -> Option<String> {
     None
 }
 
-/// Why no recipe fits: donors in each other's role, or else the reasons of every recipe with these roles.
+/// Why no recipe fits: donors in each other's role, or else what the nearest recipe lacks.
 fn nothing_fits(recipes: &[Recipe], run: &MergeRun) -> String {
     let has_all = |recipe: &&Recipe| {
         run.checked.iter().all(
@@ -144,16 +144,12 @@ fn nothing_fits(recipes: &[Recipe], run: &MergeRun) -> String {
     }
     let is = |donor: &CheckedCheckpoint| format!("{} is {}", donor.role, architecture(donor));
     let donors: Vec<String> = run.checked.iter().map(is).collect();
-    // Recipes for donors of other roles are told only if no recipe is for these.
-    let is_told = |recipe: &&Recipe| has_all(recipe) || !recipes.iter().any(|recipe| has_all(&recipe));
-    let told = recipes.iter().filter(is_told);
-    let mut found: Vec<(&Recipe, Vec<String>)> = told.map(|recipe| (recipe, misfits(recipe, run))).collect();
-    found.sort_by_key(|(_, reasons)| reasons.len());
-    let reasons = found.iter().map(|(recipe, reasons)| format!("{} ({})", recipe.recipe, reasons.join(", and ")));
-    let reasons: Vec<String> = reasons.collect();
-    format!(
-        "no recipe fits these donors: {}; not {}; `ckpt-doctor recipes` lists the recipes",
-        donors.join(", "),
-        reasons.join("; not ")
-    )
+    // Recipes for donors of other roles are near only if no recipe is for these.
+    let is_near = |recipe: &&Recipe| has_all(recipe) || !recipes.iter().any(|recipe| has_all(&recipe));
+    let near = recipes.iter().filter(is_near).map(|recipe| (recipe, misfits(recipe, run)));
+    let nearest = near.min_by_key(|(_, reasons)| reasons.len());
+    let nearest = nearest.map_or_else(String::new, |(recipe, reasons)| {
+        format!("; for the nearest, {}, {}", recipe.recipe, reasons.join(", and "))
+    });
+    format!("no recipe fits these donors: {}{nearest}; `ckpt-doctor recipes` lists all", donors.join(", "))
 }

@@ -170,15 +170,14 @@ fn donors_that_no_recipe_takes_are_explained() {
     let texts = run(&["--vision", language, "--language", vision, "--recipe", "spatialvla-llava3d"]);
     assert!(texts.contains(swapped), "{texts}");
     let texts = run(&["--vision", vision]);
-    let missing = "not spatialvla-llava3d (the language donor is missing: --donor language=DIR";
+    let missing = "for the nearest, spatialvla-llava3d, the language donor is missing: --donor language=DIR";
     assert!(texts.contains(missing), "{texts}");
     let texts = run(&["--vision", language, "--language", language]);
-    assert!(
-        texts.contains("not paligemma-llama (the vision donor must be paligemma, but this is llava_llama"),
-        "{texts}"
-    );
+    let unfit = "for the nearest, spatialvla-llava3d, the vision donor must be spatialvla or spatialvla_wrapped, but this is \
+                 llava_llama; `ckpt-doctor recipes` lists all";
+    assert!(texts.contains(unfit), "{texts}");
     let texts = run(&["--donor", &format!("nobody={language}")]);
-    assert!(texts.contains("not paligemma-llama (it has no nobody donor"), "{texts}");
+    assert!(texts.contains("it has no nobody donor"), "{texts}");
 }
 
 #[test]
