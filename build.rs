@@ -85,7 +85,7 @@ fn convert(folder: &Path, to: &Path, heads: &mut BTreeMap<String, Value>) -> io:
     Ok(())
 }
 
-/// The name of the `Affected` of a rule.
+/// What `Affected::by` of `src/knowledge/rule/effect.rs` returns for a rule; a test compares the two.
 fn affected(rule: &Value) -> &'static str {
     let effects = rule.get("effects").and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
     match effects {

@@ -205,7 +205,7 @@ impl<'a> CheckFacts<'a> {
         let config = self.checkpoint.document(files::PROCESSOR_CONFIG).and_then(|d| d.value.as_ref());
         let open = |processor| {
             let config = config.unwrap_or(&Value::Null);
-            tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, version).ok().flatten()
+            tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, with).ok().flatten()
         };
         let tokenizer = processor.and_then(open).map(Rc::new);
         self.opened.borrow_mut().push(OpenedBy { class: class.to_owned(), with, tokenizer: tokenizer.clone() });

@@ -105,13 +105,7 @@ pub(super) fn report(knowledge: &Knowledge, checkpoint: &Checkpoint, faults: &[F
     let named = |rule: &&Rule| matches!(&rule.check, Check::Fault(f) if faults.iter().any(|fault| f.kinds.contains(&fault.kind)));
     let rules = knowledge.rules.rules.iter().filter(named);
     // Without a loader: these faults concern no load.
-    let context = Context {
-        bench: Bench::new(checkpoint),
-        targets: Vec::new(),
-        programs: &[],
-        fails_for_certain: false,
-        set_aside: OnceCell::new(),
-    };
+    let context = Context::new(checkpoint, Vec::new(), &[], &[]);
     let mut findings: Vec<Finding> =
         rules.flat_map(|rule| run(rule, &context, faults, &Scope::new()).unwrap_or_default()).collect();
     pinpoint(checkpoint, &mut findings);

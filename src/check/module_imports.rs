@@ -29,10 +29,10 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
 fn fault(known: &LoaderModules, module: &PythonModule, import: &Import, asked: &Asked<'_>) -> Option<Fault> {
     let path = import.module.as_str();
     let missing = |target: &Target| -> Option<BTreeSet<&str>> {
-        let gone = known.of(target.version());
+        let own = known.of(target.version());
         let names = import.names.iter().map(String::as_str);
-        let lacking = names.filter(|name| gone.has_name(path, name)).collect::<BTreeSet<_>>();
-        (gone.has_module(path) || !lacking.is_empty()).then_some(lacking)
+        let lacking = names.filter(|name| own.lacks_name(path, name)).collect::<BTreeSet<_>>();
+        (own.lacks_module(path) || !lacking.is_empty()).then_some(lacking)
     };
     let lacking: Vec<(&Target, BTreeSet<&str>)> =
         asked.targets.iter().filter_map(|target| Some((target, missing(target)?))).collect();
@@ -44,7 +44,7 @@ fn fault(known: &LoaderModules, module: &PythonModule, import: &Import, asked: &
         .with("module", module.name.as_str())
         .with("from", path)
         .with("names", names.into_iter().collect::<Vec<_>>())
-        .with("whole", known.of(first.version()).has_module(path))
+        .with("whole", known.of(first.version()).lacks_module(path))
         .with("versions", versions);
     Some(fault.under_all(lacking.iter().map(|(target, _)| target.loader.version())))
 }

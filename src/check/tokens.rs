@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use serde_json::{Map, Value, json};
 
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tokenizer, pointer};
-use crate::knowledge::processor::Processor;
+use crate::knowledge::processor::{OpensWith, Processor};
 use crate::knowledge::{EvalError, Scope};
 
 /// Most tokens that a processor may add; its config may state any count.
@@ -49,8 +49,8 @@ impl OpenedTokenizer {
 
 /// Adds a processor's tokens as `add_tokens` does: a known token keeps its id, a new one gets the next.
 ///
-/// With `version`, the tokenizer is opened by the class of that version's processor, with the special tokens of the class;
-/// without it, by its own class. `Ok(None)` when the tokenizer has no vocabulary file, so that ids cannot be known.
+/// With the tokenizer class of a version's processor ([`Processor::opens_with`]), that class opens it, with its special tokens;
+/// without one, its own class does. `Ok(None)` when the tokenizer has no vocabulary file, so that ids cannot be known.
 ///
 /// # Errors
 /// When a count of the processor's config is missing or absurd.
@@ -58,10 +58,9 @@ pub fn open_tokenizer(
     tokenizer: &Tokenizer,
     processor: &Processor,
     config: &Value,
-    version: Option<&str>,
+    with: Option<&OpensWith>,
 ) -> Result<Option<OpenedTokenizer>, EvalError> {
-    let class = version.and_then(|version| processor.opens_with(version));
-    let reopened = class.map(|class| tokenizer.with_defaults(&class.special));
+    let reopened = with.map(|class| tokenizer.with_defaults(&class.special));
     let tokenizer = reopened.as_ref().unwrap_or(tokenizer);
     let Some(length) = tokenizer.length() else { return Ok(None) };
     let mut scope = Scope::new();

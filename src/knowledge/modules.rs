@@ -55,28 +55,28 @@ impl LoaderModules {
         Ok(Self { versions: ByVersion::embedded("modules.json")? })
     }
 
-    /// What this version certainly lacks.
+    /// The modules of a version, as far as they are certain.
     #[must_use]
-    pub fn of(&self, version: &str) -> LackingModules<'_> {
+    pub fn of(&self, version: &str) -> VersionModules<'_> {
         let (newer, older) = self.versions.around(version);
-        LackingModules(newer.zip(older))
+        VersionModules(newer.zip(older))
     }
 }
 
-/// What a version certainly lacks: it is a known version that does, or is between two that do.
+/// The modules of a version. It lacks what a known version lacks, or what the two versions around it lack.
 #[derive(Debug, Clone, Copy)]
-pub struct LackingModules<'k>(Option<(&'k Lacking, &'k Lacking)>);
+pub struct VersionModules<'k>(Option<(&'k Lacking, &'k Lacking)>);
 
-impl LackingModules<'_> {
+impl VersionModules<'_> {
     /// Whether it lacks the module.
     #[must_use]
-    pub fn has_module(&self, module: &str) -> bool {
+    pub fn lacks_module(&self, module: &str) -> bool {
         self.0.is_some_and(|(newer, older)| !newer.has_module(module) && !older.has_module(module))
     }
 
     /// Whether it lacks a name of a module, or the module.
     #[must_use]
-    pub fn has_name(&self, module: &str, name: &str) -> bool {
+    pub fn lacks_name(&self, module: &str, name: &str) -> bool {
         self.0.is_some_and(|(newer, older)| newer.lacks(module, name) && older.lacks(module, name))
     }
 }
@@ -89,19 +89,19 @@ mod tests {
     fn modules_and_names_depend_on_the_version() {
         let modules = LoaderModules::embedded().unwrap();
         let processing = "transformers.models.paligemma.processing_paligemma";
-        assert!(modules.of("5.23.0").has_name(processing, "make_batched_images"));
-        assert!(!modules.of("4.47.0").has_name(processing, "make_batched_images"));
-        assert!(!modules.of("5.23.0").has_name(processing, "PaliGemmaProcessor"));
-        assert!(modules.of("4.47.0").has_module("transformers.models.gemma3.modeling_gemma3"));
-        assert!(!modules.of("5.23.0").has_module("transformers.models.gemma3.modeling_gemma3"));
+        assert!(modules.of("5.23.0").lacks_name(processing, "make_batched_images"));
+        assert!(!modules.of("4.47.0").lacks_name(processing, "make_batched_images"));
+        assert!(!modules.of("5.23.0").lacks_name(processing, "PaliGemmaProcessor"));
+        assert!(modules.of("4.47.0").lacks_module("transformers.models.gemma3.modeling_gemma3"));
+        assert!(!modules.of("5.23.0").lacks_module("transformers.models.gemma3.modeling_gemma3"));
         assert!(
-            modules.of("4.47.0").has_name("transformers", "Gemma3Config")
-                && !modules.of("4.57.6").has_name("transformers", "Gemma3Config")
+            modules.of("4.47.0").lacks_name("transformers", "Gemma3Config")
+                && !modules.of("4.57.6").lacks_name("transformers", "Gemma3Config")
         );
         assert!(has_word("one two", "one") && has_word("one two", "two") && has_word("ones one", "one"));
         assert!(!has_word("ones two", "one") && !has_word("one twos", "two"));
         // Nothing is known of versions outside those of the file.
-        assert!(!modules.of("99.0.0").has_name(processing, "make_batched_images"));
-        assert!(!modules.of("4.20.0").has_name("transformers", "Gemma3Config"));
+        assert!(!modules.of("99.0.0").lacks_name(processing, "make_batched_images"));
+        assert!(!modules.of("4.20.0").lacks_name("transformers", "Gemma3Config"));
     }
 }

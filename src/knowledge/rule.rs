@@ -126,8 +126,7 @@ pub struct Rule {
     pub lets: Vec<(String, Expression)>,
     /// As [`RuleFile::check`].
     pub check: Check,
-    /// What the effects are about.
-    #[serde(default)]
+    /// Whose loads the effects are about.
     pub affects: Affected,
     /// Path of the file, for a rule from `--rules`.
     #[serde(skip)]

@@ -26,7 +26,7 @@ use crate::surgery::written::WrittenShard;
 /// File name in the merged directory.
 pub(super) const NAME: FileName = FileName::constant("merge-manifest.json");
 
-/// What the files describe, apart from the run.
+/// What the model card, the report and the manifest describe, apart from the run.
 pub(super) struct Recorded<'m> {
     pub(super) recipe: &'m Recipe,
     pub(super) donors: &'m [Donor],

@@ -30,7 +30,7 @@ pub(crate) struct InspectDocument<'a> {
     tensor_list: Option<&'a [InspectedTensor]>,
 }
 
-/// A complete inspection as JSON (`schema` 1), with a list of tensors if there is one.
+/// A complete inspection as JSON, with a list of tensors if there is one.
 #[must_use]
 pub fn json(path: &str, inspection: &Inspection, tensor_list: Option<&[InspectedTensor]>) -> String {
     pretty(&InspectDocument { schema: 2, tool: ToolInfo::this(), path, inspection, tensor_list })
@@ -219,8 +219,7 @@ fn narrow(out: &mut String, first: &str, rows: &[[String; 5]], contradicted: usi
         .map(|[key, config, implied, votes, _]| [config, implied, votes, key].map(Clone::clone))
         .collect();
     let mut text = String::new();
-    let alignment = [Align::Left, Align::Left, Align::Left, Align::Left];
-    columns(&mut text, [first, "implied", "votes", ""], alignment, &shown, WIDTH);
+    columns(&mut text, [first, "implied", "votes", ""], [Align::Left; 4], &shown, WIDTH);
     for line in text.lines() {
         let _ok = writeln!(out, "  {line}");
     }

@@ -1,7 +1,5 @@
 //! A tensor to be written.
 
-#[cfg(test)]
-use super::expr::NewValues;
 use super::expr::{TensorExpr, TensorTransform};
 use super::tensor_ref::TensorRef;
 use crate::checkpoint::{Dtype, byte_len};
@@ -61,7 +59,7 @@ impl PlannedTensor {
 impl PlannedTensor {
     /// The tensor with zeros in place of its values.
     pub(crate) fn started(self) -> Self {
-        let (values, dtype, shape) = (NewValues::Zeros, self.dtype, self.shape.clone());
+        let (values, dtype, shape) = (super::expr::NewValues::Zeros, self.dtype, self.shape.clone());
         let instead_of = self.source.main().clone();
         Self { source: TensorExpr::Initialise { values, dtype, shape, instead_of }, ..self }
     }

@@ -10,8 +10,7 @@ use rand_distr::{Distribution, Normal, StandardNormal, Uniform};
 use sha2::{Digest, Sha256};
 
 use super::convert::{CastLosses, Converter};
-use super::expr::NewValues;
-use super::expr::TensorExpr;
+use super::expr::{NewValues, TensorExpr};
 use super::planned_tensor::PlannedTensor;
 use super::product::Adder;
 use super::tensor_ref::{ReadAt, TensorRef};

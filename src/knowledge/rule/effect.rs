@@ -70,11 +70,10 @@ pub struct Effect {
 }
 
 /// Whose loads the effects of a rule are about.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Affected {
     /// None: the rule has no effects.
-    #[default]
     Nothing,
     /// Only those of programs other than transformers.
     Programs,
@@ -83,7 +82,7 @@ pub enum Affected {
 }
 
 impl Affected {
-    /// What these effects are about.
+    /// The loads that these effects are about.
     #[must_use]
     pub fn by(effects: &[Effect]) -> Self {
         match effects {

@@ -180,8 +180,7 @@ mod tests {
 
     use super::*;
     use crate::checkpoint::{Dtype, FileName};
-    use crate::surgery::expr::NewValues;
-    use crate::surgery::expr::{Factor, Product, TensorExpr};
+    use crate::surgery::expr::{Factor, NewValues, Product, TensorExpr};
     use crate::surgery::planned_tensor::PlannedTensor;
     use crate::surgery::tensor_ref::TensorRef;
 

@@ -5,8 +5,7 @@ use serde::Deserialize;
 use super::RecordedTensor;
 use crate::checkpoint::Dtype;
 use crate::merge::donor_tensor::DonorTensor;
-use crate::surgery::expr::NewValues;
-use crate::surgery::expr::{TensorExpr, TensorTransform};
+use crate::surgery::expr::{NewValues, TensorExpr, TensorTransform};
 use crate::surgery::tensor_ref::RowSlice;
 
 /// An entry of any version.
