@@ -171,19 +171,19 @@ impl Library {
 
     /// The known loader that stands for a version of transformers for one checkpoint, with the class it builds.
     ///
-    /// A known version stands for itself alone. For any other it is the nearest one that has the class: `check` and
-    /// `expect` both ask here. `None` where none has it.
+    /// A known version stands for itself alone. For any other it is one directly beside it that has the class, the nearest
+    /// first: `check` and `expect` both ask here. `None` where neither has it.
     #[must_use]
     pub fn stands_for(&self, version: &str, config: &Value, names: &[&str]) -> Option<(Loader, Architecture<'_>)> {
         let built = |loader: Loader| Some((loader, self.find(config, names.iter().copied(), loader)?));
-        Loader::of_version(version).into_iter().find_map(built)
+        Loader::beside(version).into_iter().find_map(built)
     }
 
     /// As [`Self::stands_for`], for a class by its name.
     #[must_use]
     pub fn class_under(&self, version: &str, name: &str) -> Option<(Loader, Architecture<'_>)> {
         let built = |loader: Loader| Some((loader, self.class(name, loader)?));
-        Loader::of_version(version).into_iter().find_map(built)
+        Loader::beside(version).into_iter().find_map(built)
     }
 
     /// Stem and text of every file, unparsed.

@@ -59,33 +59,29 @@ impl Loader {
     /// [`Library::stands_for`](super::Library::stands_for) chooses among those that have a class.
     #[must_use]
     pub fn nearest(version: &str) -> Self {
-        let [nearest, ..] = Self::by_distance(version);
-        nearest
+        Self::beside(version).first().copied().unwrap_or(Self::NEWEST)
     }
 
-    /// All known loaders, the nearest to a version first: those of the same major version before others, then by the
-    /// second number; of two as near as each other the newer one.
-    #[must_use]
-    pub fn by_distance(version: &str) -> [Self; Self::ALL.len()] {
-        let mut loaders = Self::ALL;
+    /// The loaders that may stand for a version, the nearest first: the known one of this minor version, or else those
+    /// directly beside it, of its own major version if there are any.
+    ///
+    /// No other says anything about the version: a class that 4.47.0 has and 5.23.0 has not is not known to be in 5.24.0.
+    /// Text that does not start with a number (`main`) is judged as the newest.
+    pub(super) fn beside(version: &str) -> Vec<Self> {
         let mut numbers = version.split(|c: char| !c.is_ascii_digit()).map(str::parse::<u64>);
-        let Some(Ok(major)) = numbers.next() else {
-            loaders.reverse();
-            return loaders;
-        };
+        let Some(Ok(major)) = numbers.next() else { return vec![Self::NEWEST] };
         let minor = numbers.next().and_then(Result::ok).unwrap_or(0);
         let release = major.saturating_mul(100).saturating_add(minor.min(99));
-        loaders.reverse();
-        loaders.sort_by_key(|l| (l.major().abs_diff(major), l.release().abs_diff(release)));
-        loaders
-    }
-
-    /// The loaders that may stand for a version, the best first: a known version stands for itself alone.
-    pub(super) fn of_version(version: &str) -> Vec<Self> {
-        match Self::ALL.into_iter().find(|loader| loader.version() == version) {
-            Some(own) => vec![own],
-            None => Self::by_distance(version).to_vec(),
+        if let Some(own) = Self::ALL.into_iter().find(|loader| loader.release() == release) {
+            return vec![own];
         }
+        let (older, newer): (Vec<Self>, Vec<Self>) = Self::ALL.into_iter().partition(|l| l.release() < release);
+        let mut beside: Vec<Self> = newer.first().into_iter().chain(older.last()).copied().collect();
+        if beside.iter().any(|loader| loader.major() == major) {
+            beside.retain(|loader| loader.major() == major);
+        }
+        beside.sort_by_key(|l| (l.major().abs_diff(major), l.release().abs_diff(release)));
+        beside
     }
 
     /// The known loader nearest to the version that wrote this config.json; the newest if the config has no version.
@@ -246,8 +242,19 @@ mod tests {
         ] {
             assert_eq!(Loader::nearest(version), nearest, "{version}");
         }
-        assert_eq!(Loader::by_distance("4.50"), [Loader::V4_47_0, Loader::V4_57_6, Loader::V5_23_0]);
-        assert_eq!(Loader::by_distance("5.1"), [Loader::V5_23_0, Loader::V4_57_6, Loader::V4_47_0]);
+        for (version, beside) in [
+            ("4.44.2", &[Loader::V4_47_0][..]),
+            ("4.47.1", &[Loader::V4_47_0]),
+            ("4.50", &[Loader::V4_47_0, Loader::V4_57_6]),
+            ("4.52", &[Loader::V4_57_6, Loader::V4_47_0]),
+            ("4.57.3", &[Loader::V4_57_6]),
+            ("4.58.0.dev0", &[Loader::V4_57_6]),
+            ("5.1", &[Loader::V5_23_0]),
+            ("5.24.0", &[Loader::V5_23_0]),
+            ("9.9.9", &[Loader::V5_23_0]),
+        ] {
+            assert_eq!(Loader::beside(version), beside, "{version}");
+        }
         assert_eq!(Loader::of_config(&json!({ "transformers_version": "4.40.1" })), Loader::V4_47_0);
         assert_eq!(Loader::of_config(&json!({})), Loader::NEWEST);
         assert_eq!(Loader::V4_47_0.to_string(), "4.47.0");
