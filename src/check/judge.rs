@@ -69,15 +69,31 @@ struct Inputs<'a> {
 /// the same in each.
 #[derive(Debug, Default)]
 pub struct Memo {
-    causes: RefCell<Vec<(CauseKey, FoundCauses)>>,
+    reports: RefCell<Vec<(LoadKey, Option<LoadReport>)>>,
+    causes: RefCell<Vec<(LoadKey, FoundCauses)>>,
     classes: RefCell<Vec<(ClassKey, Result<Expected, Refusal>)>>,
 }
 
 /// The loader, the architecture and the class.
 type ClassKey = (Loader, String, String);
 
-/// The loader, the version that it stands for, and the class.
-type CauseKey = (Loader, Option<String>, String);
+/// The loader, the version that it stands for, the architecture and the class.
+type LoadKey = (Loader, Option<String>, String, String);
+
+/// What is found for this key: known from another list of versions, or by `find`.
+fn remembered<T: Clone>(known: &RefCell<Vec<(LoadKey, T)>>, key: LoadKey, find: impl FnOnce() -> T) -> T {
+    if let Some((_, found)) = known.borrow().iter().find(|(of, _)| *of == key) {
+        return found.clone();
+    }
+    let found = find();
+    known.borrow_mut().push((key, found.clone()));
+    found
+}
+
+fn load_key(target: &Target, architecture: Architecture<'_>) -> LoadKey {
+    let stands_for = target.stands_for.clone();
+    (target.loader, stands_for, architecture.name().to_owned(), architecture.class().to_owned())
+}
 
 impl<'a> Inputs<'a> {
     /// The scheme that a loader reads.

@@ -109,7 +109,7 @@ impl PredictedLoad {
         }
     }
 
-    /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.
+    /// The version it is for: `5.23.0`, or `4.51.3 (judged as 4.47.0)`.
     #[must_use]
     pub fn version(&self) -> String {
         version(&self.loader, self.stands_for.as_deref())

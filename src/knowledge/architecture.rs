@@ -156,7 +156,14 @@ impl<'l> Architecture<'l> {
     /// # Errors
     /// As [`Self::expect`].
     pub fn expect_given(&self, config: &Value, evidence: &Evidence) -> Result<Expected, Refusal> {
-        build::build(*self, config, evidence)
+        build::build(*self, config, evidence, &mut 0)
+    }
+
+    /// As [`Self::expect_given`], with the number of tensors and parts that it came to, if it was refused too.
+    pub(crate) fn expect_counted(&self, config: &Value, evidence: &Evidence) -> (Result<Expected, Refusal>, usize) {
+        let mut steps = 0;
+        let expected = build::build(*self, config, evidence, &mut steps);
+        (expected, steps)
     }
 }
 

@@ -142,7 +142,7 @@ fn parse_version(text: &str) -> Result<String, String> {
     }
     let known: Vec<&str> = Loader::ALL.into_iter().map(Loader::version).collect();
     Err(format!(
-        "expected VERSION or transformers==VERSION; known versions are {}, others are predicted as the nearest one",
+        "expected VERSION or transformers==VERSION; known versions are {}, others are judged as the nearest one",
         known.join(", ")
     ))
 }

@@ -272,7 +272,7 @@ pub fn agreeing(loads: &[PredictedLoad]) -> Vec<(&LoadReport, Vec<&PredictedLoad
     together
 }
 
-/// `transformers 4.51.3 (predicted as 4.47.0) and 5.23.0`.
+/// `transformers 4.51.3 (judged as 4.47.0) and 5.23.0`.
 pub fn versions(loaders: &[&PredictedLoad]) -> String {
     listed(loaders, "transformers ")
 }

@@ -1,7 +1,7 @@
 //! The fourth stage: causes of what a load report lists. One wrong prefix or config value explains many tensors.
 
-use super::Inputs;
 use super::predict::{Prediction, finished};
+use super::{Inputs, load_key, remembered};
 use crate::check::load::{self, LoadReport, Moved};
 use crate::check::votes::{self, Explanation, Vote};
 use crate::checkpoint::Fault;
@@ -48,14 +48,8 @@ fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> Explained
     let Some(report) = report.as_ref().filter(|_| is_searched) else {
         return ExplainedLoad { prediction, prefixes: Vec::new(), explanation: None };
     };
-    let key = (target.loader, target.stands_for.clone(), architecture.name().to_owned());
-    let known = inputs.memo.causes.borrow().iter().find(|(of, _)| *of == key).map(|(_, causes)| causes.clone());
-    let causes = known.unwrap_or_else(|| {
-        let found = search(inputs, &prediction, report);
-        inputs.memo.causes.borrow_mut().push((key, found.clone()));
-        found
-    });
-    let (prefixes, explanation) = causes;
+    let key = load_key(target, *architecture);
+    let (prefixes, explanation) = remembered(&inputs.memo.causes, key, || search(inputs, &prediction, report));
     ExplainedLoad { prediction, prefixes, explanation }
 }
 

@@ -3,8 +3,8 @@
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 
-use super::Inputs;
 use super::classes::BuiltClass;
+use super::{Inputs, load_key, remembered};
 use crate::check::index;
 use crate::check::load::{self, LoadReport, Target};
 use crate::check::quantization::Quantised;
@@ -28,7 +28,9 @@ pub(super) fn predict<'a>(inputs: &'a Inputs<'a>, built: Vec<BuiltClass<'a>>) ->
     let predicted = built.into_iter().filter_map(|one| {
         let expected = one.class.ok()?;
         let quantised = quantised(inputs, inputs.scheme_of(one.target.loader), Some(&expected));
-        let report = report(inputs, &one.target, &expected, quantised.as_ref());
+        let report = remembered(&inputs.memo.reports, load_key(&one.target, one.architecture), || {
+            report(inputs, &one.target, &expected, quantised.as_ref())
+        });
         Some(Prediction { target: one.target, architecture: one.architecture, expected, quantised, report })
     });
     predicted.collect()

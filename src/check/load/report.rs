@@ -142,7 +142,7 @@ impl LoadReport {
         ]
     }
 
-    /// The version it is for: `5.23.0`, or `4.51.3 (predicted as 4.47.0)`.
+    /// The version it is for: `5.23.0`, or `4.51.3 (judged as 4.47.0)`.
     #[must_use]
     pub(crate) fn version(&self) -> String {
         version(&self.loader, self.stands_for.as_deref())
@@ -189,7 +189,7 @@ pub enum SilentReason {
     TiedOver,
 }
 
-/// `5.23.0`, or `4.51.3 (predicted as 4.47.0)` for a loader that stands for another version.
+/// `5.23.0`, or `4.51.3 (judged as 4.47.0)` for a loader that stands for another version.
 pub(crate) fn version(loader: &str, stands_for: Option<&str>) -> String {
-    stands_for.map_or_else(|| loader.to_owned(), |asked| format!("{asked} (predicted as {loader})"))
+    stands_for.map_or_else(|| loader.to_owned(), |asked| format!("{asked} (judged as {loader})"))
 }

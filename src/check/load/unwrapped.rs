@@ -18,6 +18,8 @@ use crate::knowledge::wrappers::Wrappers;
 const DEPTH: usize = 4;
 /// Prefixes that are tried.
 const TRIED: usize = 8;
+/// Names times prefixes that are tried, beyond the first prefix.
+const RENAMED: usize = 50_000;
 /// A prefix is tried if one name of so many has it.
 const SHARE: usize = 8;
 /// Names times pairs of prefixes that a rename may compare.
@@ -187,7 +189,7 @@ fn prefixes(names: &[(String, String)]) -> Vec<String> {
     let often = names.len().div_ceil(SHARE).max(2);
     let mut prefixes: Vec<(&str, usize)> = counts.into_iter().filter(|(_, count)| *count >= often).collect();
     prefixes.sort_by_key(|(prefix, count)| (std::cmp::Reverse(*count), prefix.len()));
-    prefixes.truncate(TRIED);
+    prefixes.truncate(TRIED.min(RENAMED.checked_div(names.len()).unwrap_or(TRIED)).max(1));
     prefixes.sort_by_key(|(prefix, _)| prefix.len());
     prefixes.into_iter().map(|(prefix, _)| prefix.to_owned()).collect()
 }

@@ -26,7 +26,7 @@ pub fn vote(architecture: Architecture<'_>, config: &Value, stored: &Stored) -> 
 /// As [`vote`]; with `changed`, only votes on the values that had to change.
 pub(super) fn run(architecture: Architecture<'_>, config: &Value, stored: &Stored, changed: bool) -> Option<Votes> {
     let stored = &of_ordinary_layers(config, stored);
-    let mut space = Space::new(architecture, config, stored);
+    let mut space = Space::new(architecture, config, stored, changed);
     let mut state = SearchState::new(&mut space, config.clone())?;
     let (said, before) = (state.built.config.clone(), Fit::new(&state.built, &space.stored));
     space.learn(&said);

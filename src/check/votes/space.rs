@@ -9,11 +9,17 @@ use crate::check::load::{self, Stored};
 use crate::checkpoint::pointer;
 use crate::knowledge::{Architecture, Evidence, Expected};
 
-/// Tensors that may be built in one search: it tries a few hundred configs, and a mixture of experts has tens of
+/// Tensors that may be built in one search of all values: it tries a few hundred configs, and a mixture of experts has tens of
 /// thousands of tensors.
 const BUDGET: usize = 3_000_000;
+/// The same for the values that explain a report, in every check.
+const EXPLAINING: usize = 500_000;
+/// What is added to it for each stored tensor.
+const EXPLAINING_EACH: usize = 25;
 /// Fixed cost of a build, in tensors.
 const OVERHEAD: usize = 40;
+/// Stored tensors that are compared with a class at the cost of one that is built.
+const COMPARED: usize = 2;
 /// Most values of a config that are varied; a label map may have thousands.
 const LEAVES: usize = 600;
 /// Longest list whose elements are varied one by one.
@@ -31,19 +37,35 @@ pub(super) struct Space<'a> {
     pub numbered: Numbered,
     /// Keys that the files of the class have defaults for, without the numbers of list elements; empty when unknown.
     known: BTreeSet<String>,
-    /// Cost of a build beside its tensors, in tensors: it copies the config.
+    /// Cost of a build beside its tensors, in tensors: it copies the config, and compares what is stored.
     overhead: usize,
+    /// Cost that may be spent.
+    budget: usize,
     spent: Cell<usize>,
 }
 
 impl<'a> Space<'a> {
-    /// For a search that begins with this config. The names are those of the file until [`Self::rename`] is called with the class.
-    pub fn new(architecture: Architecture<'a>, config: &Value, files: &'a Stored) -> Self {
+    /// For a search that begins with this config, and `explaining` a report or of all values. The names are those of the file
+    /// until [`Self::rename`] is called with the class.
+    pub fn new(architecture: Architecture<'a>, config: &Value, files: &'a Stored, explaining: bool) -> Self {
         let evidence = files.evidence();
         let numbered = Numbered::from_names(evidence.iter().map(|(name, _)| name));
         let stored = evidence.clone();
-        let overhead = values(config).saturating_add(OVERHEAD);
-        Self { architecture, files, evidence, stored, numbered, known: BTreeSet::new(), overhead, spent: Cell::new(0) }
+        let count = evidence.iter().count();
+        let compared = count.checked_div(COMPARED).unwrap_or(0);
+        let budget = if explaining { EXPLAINING.saturating_add(count.saturating_mul(EXPLAINING_EACH)) } else { BUDGET };
+        let overhead = values(config).saturating_add(OVERHEAD).saturating_add(compared);
+        Self {
+            architecture,
+            files,
+            evidence,
+            stored,
+            numbered,
+            known: BTreeSet::new(),
+            overhead,
+            budget,
+            spent: Cell::new(0),
+        }
     }
 
     /// Spells the stored names as the loader would for this class; whether that changed any.
@@ -88,17 +110,16 @@ impl<'a> Space<'a> {
         if self.exhausted() {
             return None;
         }
-        let expected = self.architecture.expect_given(config, &self.evidence).ok();
-        let cost = expected.as_ref().map_or(0, |e| e.tensors.len()).saturating_add(self.overhead);
-        self.spent.set(self.spent.get().saturating_add(cost));
-        let mut expected = expected?;
+        let (expected, steps) = self.architecture.expect_counted(config, &self.evidence);
+        self.spent.set(self.spent.get().saturating_add(steps).saturating_add(self.overhead));
+        let mut expected = expected.ok()?;
         expected.drop_absent_groups(|name| self.stored.contains(name));
         Some(expected)
     }
 
     /// Whether the search had to stop early.
     pub fn exhausted(&self) -> bool {
-        self.spent.get() >= BUDGET
+        self.spent.get() >= self.budget
     }
 
     /// How far `expected` is from the store: 0 where every name and dimension agrees.

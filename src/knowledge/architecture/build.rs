@@ -22,7 +22,12 @@ const NAME_CAP: usize = 1_000;
 /// Models within a model that conversions are looked up for; real ones have a few.
 const MODULE_CAP: usize = 1_000;
 
-pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &Evidence) -> BuildResult<Expected> {
+pub(super) fn build(
+    architecture: Architecture<'_>,
+    config: &Value,
+    evidence: &Evidence,
+    steps: &mut usize,
+) -> BuildResult<Expected> {
     let Value::Object(config) = config else { return Err(Refusal::impossible("the config is not an object")) };
     let Architecture { library, file, class, loader } = architecture;
     let written = own_config(file, loader, config);
@@ -36,6 +41,7 @@ pub(super) fn build(architecture: Architecture<'_>, config: &Value, evidence: &E
         builder.class(file, class, Config { map: &config, scope: &scope }, Place::default())?;
         Ok(config)
     });
+    *steps = builder.steps;
     match outcome {
         Ok(config) => {
             let mut expected = builder.expected;

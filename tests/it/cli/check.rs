@@ -412,7 +412,7 @@ fn the_load_is_predicted_for_the_given_versions() {
 
     let shown = doctor(&[&["check", dir.to_str().unwrap()], &both[..]].concat());
     let shown = String::from_utf8(shown.stdout).unwrap();
-    assert!(shown.contains(": raises with transformers 5.1.0 (predicted as 5.23.0) and 4.47.0"), "{shown}");
+    assert!(shown.contains(": raises with transformers 5.1.0 (judged as 5.23.0) and 4.47.0"), "{shown}");
 
     for wrong in ["v5.23.0", "torch==2.0", "transformers==", "transformers==main"] {
         let output = doctor(&["check", dir.to_str().unwrap(), "--for", wrong]);
