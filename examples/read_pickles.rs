@@ -25,7 +25,7 @@ fn main() -> io::Result<()> {
         };
         let tensors: Map<String, Value> =
             shard.tensors.iter().map(|t| (t.name.clone(), json!([t.dtype.name(), t.shape, digest(t)]))).collect();
-        let pickle = shard.pickle.clone().unwrap_or_default();
+        let pickle = shard.pickle().cloned().unwrap_or_default();
         // NaN in random bytes is no fault of the container.
         let faults: Vec<&str> =
             shard.faults.iter().map(|f| f.kind.name()).filter(|kind| *kind != "non-finite-weights").collect();

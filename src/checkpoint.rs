@@ -62,7 +62,7 @@ pub use module::PythonModule;
 pub use nested::Nested;
 pub use open::{NotRead, OpenError, is_plain_file_name, open_regular};
 pub use pickle::PickleGlobal;
-pub use shard::{Dtype, Shard, Tensor, byte_len};
+pub use shard::{Dtype, Shard, ShardFormat, Tensor, byte_len};
 pub use source::{MemoryFiles, Source, SourceFile};
 #[cfg(feature = "internals")]
 pub use text::hex;

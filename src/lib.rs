@@ -72,7 +72,7 @@ pub use check::load::{LoadReport, Mismatch, Silent, SilentReason};
 pub use check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad};
 pub use check::{Edit, Finding, FixHint, Location, Safety, Severity};
 pub use checkpoint::{
-    Dtype, Fault, FaultKind, HashAlgorithm, Place, Progress, Shard, Tensor, TensorContents, TensorStats,
+    Dtype, Fault, FaultKind, HashAlgorithm, Place, Progress, Shard, ShardFormat, Tensor, TensorContents, TensorStats,
 };
 pub use report::model::{
     ChangedTensor, CheckpointReport, Counts, Dropped, Fixed, MergeReport, MergeStage, MergedFile, Report, Role, Seam,

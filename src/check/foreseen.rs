@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::engine::check_for;
 use super::verdict::LoadVerdict;
-use crate::checkpoint::{Checkpoint, Document, Dtype, Parts, Shard, Tensor, files};
+use crate::checkpoint::{Checkpoint, Document, Dtype, Parts, Shard, ShardFormat, Tensor, files};
 use crate::knowledge::quantization::block;
 use crate::knowledge::rule::Object;
 use crate::knowledge::{Expected, Knowledge};
@@ -43,6 +43,7 @@ fn shard(expected: &Expected) -> Shard {
     };
     let tensors = stored.map(tensor).collect();
     let metadata = Some([("format".to_owned(), "pt".to_owned())].into());
+    let format = ShardFormat::Safetensors { metadata, header_sha256: String::new() };
     let name = files::WEIGHTS.to_owned();
-    Shard { name, file_len: end.saturating_add(8), data_start: 8, tensors, metadata, ..Shard::default() }
+    Shard { name, file_len: end.saturating_add(8), data_start: 8, tensors, format, ..Shard::default() }
 }

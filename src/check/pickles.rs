@@ -14,7 +14,7 @@ const NAMED: usize = 8;
 pub fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge) -> Vec<Fault> {
     let mut faults = Vec::new();
     for shard in checkpoint.shards.values().chain(checkpoint.pickles.values()) {
-        let Some(pickle) = &shard.pickle else { continue };
+        let Some(pickle) = shard.pickle() else { continue };
         let (harmful, others): (Vec<_>, Vec<_>) =
             pickle.globals.iter().partition(|global| knowledge.pickles.is_harmful(global));
         faults.extend(imports(FaultKind::PickleGlobalHarmful, shard, &harmful));
@@ -46,7 +46,7 @@ pub fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge) -> Vec<Fault> {
 
 /// What was read of a pickle that a loader opens; `None` for one with a fault of its own.
 fn weights(shard: &Shard) -> Option<Fault> {
-    let pickle = shard.pickle.as_ref()?;
+    let pickle = shard.pickle()?;
     let fault = Fault::new(FaultKind::PickleWeights).at(Place::file(&*shard.name));
     let fault = fault.with("tensors", shard.count());
     let strided = Some(pickle.strided.len()).filter(|count| *count > 0);

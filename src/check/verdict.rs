@@ -181,7 +181,7 @@ impl Basis<'_> {
 
     /// A pickle with a construct that is not modelled, and the construct.
     fn doubt(&self) -> Option<(&str, &str)> {
-        let mut pickles = self.checkpoint.shards.values().filter_map(|shard| Some((shard, shard.pickle.as_ref()?)));
+        let mut pickles = self.checkpoint.shards.values().filter_map(|shard| Some((shard, shard.pickle()?)));
         pickles.find_map(|(shard, pickle)| Some((shard.name.as_str(), pickle.doubt.as_deref()?)))
     }
 

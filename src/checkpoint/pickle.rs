@@ -11,7 +11,7 @@ use super::budget::Budget;
 use super::fault::Faults;
 use super::shard::header::other_format;
 use super::work::Work;
-use super::{Checkpoint, Fault, FaultKind, Place, Shard, Source, SourceFile, adapter};
+use super::{Checkpoint, Fault, FaultKind, Place, Shard, ShardFormat, Source, SourceFile, adapter};
 
 mod beside;
 mod call;
@@ -105,26 +105,26 @@ impl Shard {
     /// Whether the file is a pickle, and no safetensors file.
     #[must_use]
     pub const fn is_pickle(&self) -> bool {
-        self.pickle.is_some()
+        matches!(self.format, ShardFormat::Pickle(_))
     }
 
     /// Whether the bytes of a tensor are one run in the file, in the order of its elements.
     #[must_use]
     pub fn is_contiguous(&self, tensor: &str) -> bool {
-        self.pickle.as_ref().is_none_or(|pickle| !pickle.strided.contains(tensor))
+        self.pickle().is_none_or(|pickle| !pickle.strided.contains(tensor))
     }
 
     /// Reads the pickle `name`. Never fails: every problem becomes a fault.
     pub(super) fn read_pickle(source: &Source, name: &str, budget: &mut Budget) -> Self {
         match source.open_regular(name, u64::MAX) {
             Ok(file) => read(name, &file, budget),
-            Err(error) => Self { pickle: Some(Box::default()), ..Self::unopened(name, &error) },
+            Err(error) => Self { format: ShardFormat::unread_pickle(), ..Self::unopened(name, &error) },
         }
     }
 
     /// A pickle that is not read because the checkpoint is too large.
     pub(super) fn unopened_pickle(name: &str) -> Self {
-        Self { pickle: Some(Box::default()), ..Self::over_budget(name) }
+        Self { format: ShardFormat::unread_pickle(), ..Self::over_budget(name) }
     }
 
     /// Reads a pickle that is in memory.
@@ -141,7 +141,7 @@ fn read(name: &str, file: &SourceFile, budget: &mut Budget) -> Shard {
         name: name.to_owned(),
         file_len: file.len(),
         unread: true,
-        pickle: Some(Box::default()),
+        format: ShardFormat::unread_pickle(),
         ..Shard::default()
     };
     // The machine holds the work while the reader holds the rest of the budget.
@@ -152,7 +152,7 @@ fn read(name: &str, file: &SourceFile, budget: &mut Budget) -> Shard {
     }
     reader.budget.work = work;
     let PickleReader { mut shard, pickle, faults, .. } = reader;
-    shard.pickle = Some(Box::new(pickle));
+    shard.format = ShardFormat::Pickle(Box::new(pickle));
     shard.faults = faults.into_vec();
     shard
 }

@@ -17,7 +17,7 @@ use super::parallel;
 use super::pickle::{is_pickle_name, may_be_pickle, starts_like_pickle};
 use super::{
     Checkpoint, Document, Entry, EntryKind, Fault, FaultKind, LfsPointer, Nested, OpenError, Place, PythonModule,
-    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, Source, Vocabulary, escape,
+    REPAIR_FOLDER, REPAIR_JOURNAL, Shard, ShardFormat, Source, Vocabulary, escape,
 };
 
 /// Suffixes of unfinished downloads.
@@ -406,7 +406,8 @@ fn entry(source: &Source, name: &str, faults: &mut Vec<Fault>) -> Entry {
 fn own_shard(source: &Source, name: &str, shard: Shard) -> Shard {
     match source.check_link(name) {
         Err(error @ OpenError::Outside { .. }) if shard.tensors.is_empty() && !shard.is_sound() => {
-            Shard { pickle: shard.pickle.map(|_| Box::default()), ..Shard::unopened(name, &error) }
+            let format = if shard.is_pickle() { ShardFormat::unread_pickle() } else { ShardFormat::default() };
+            Shard { format, ..Shard::unopened(name, &error) }
         }
         _ => shard,
     }

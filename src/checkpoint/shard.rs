@@ -61,8 +61,6 @@ pub struct Shard {
     pub data_start: u64,
     /// Readable entries, in header order.
     pub tensors: Vec<Tensor>,
-    /// `__metadata__`; `None` when the header has none.
-    pub metadata: Option<BTreeMap<String, String>>,
     /// The header could not be parsed to its end, so a tensor missing here may still exist.
     pub unread: bool,
     /// Why nothing was read of the file; `None` when its header was at least begun.
@@ -71,15 +69,68 @@ pub struct Shard {
     pub unreadable: Vec<String>,
     /// Number of tensors that were counted and not read, because the checkpoint is too large.
     pub further: u64,
-    /// SHA-256 of the first `data_start` bytes, in hexadecimal; empty for a planned shard.
-    pub header_sha256: String,
-    /// What only a pickle has; `None` for a safetensors file.
-    pub pickle: Option<Box<Pickle>>,
+    /// What only files of its format have.
+    pub format: ShardFormat,
     /// Faults of the container.
     pub faults: Vec<Fault>,
 }
 
+/// The format of a file of tensors, with what only files of this format have.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ShardFormat {
+    /// safetensors.
+    Safetensors {
+        /// `__metadata__`; `None` when the header has none.
+        metadata: Option<BTreeMap<String, String>>,
+        /// SHA-256 of the first [`Shard::data_start`] bytes, in hexadecimal; empty for a planned shard.
+        header_sha256: String,
+    },
+    /// A pickle, in a zip archive or in the format before it.
+    Pickle(Box<Pickle>),
+}
+
+impl ShardFormat {
+    /// A pickle of which nothing was read.
+    pub(super) fn unread_pickle() -> Self {
+        Self::Pickle(Box::default())
+    }
+}
+
+/// A safetensors file without a header.
+impl Default for ShardFormat {
+    fn default() -> Self {
+        Self::Safetensors { metadata: None, header_sha256: String::new() }
+    }
+}
+
 impl Shard {
+    /// `__metadata__` of its header; `None` for a pickle too.
+    #[must_use]
+    pub const fn metadata(&self) -> Option<&BTreeMap<String, String>> {
+        match &self.format {
+            ShardFormat::Safetensors { metadata, .. } => metadata.as_ref(),
+            ShardFormat::Pickle(_) => None,
+        }
+    }
+
+    /// SHA-256 of its header, in hexadecimal; empty for a planned shard and for a pickle.
+    #[must_use]
+    pub fn header_sha256(&self) -> &str {
+        match &self.format {
+            ShardFormat::Safetensors { header_sha256, .. } => header_sha256,
+            ShardFormat::Pickle(_) => "",
+        }
+    }
+
+    /// What only a pickle has; `None` for a safetensors file.
+    #[must_use]
+    pub fn pickle(&self) -> Option<&Pickle> {
+        match &self.format {
+            ShardFormat::Pickle(pickle) => Some(pickle),
+            ShardFormat::Safetensors { .. } => None,
+        }
+    }
+
     /// Whether the header was read and has no fault.
     #[must_use]
     pub(crate) fn is_sound(&self) -> bool {

@@ -161,7 +161,8 @@ pub(super) fn donor_digests(
     let digests = |donor: &Donor| {
         let hub = HubOrigin::find(&donor.checkpoint);
         let shards = donor.checkpoint.shards.iter().map(|(name, shard)| {
-            let digest = DonorShard { bytes: shard.file_len, header_sha256: shard.header_sha256.clone(), sha256: None };
+            let digest =
+                DonorShard { bytes: shard.file_len, header_sha256: shard.header_sha256().to_owned(), sha256: None };
             (name.clone(), digest)
         });
         let files = small_files(&donor.checkpoint, plan)?;

@@ -357,7 +357,7 @@ impl<'d> Given<'d> {
 
 /// Whether a shard has the recorded size and header.
 fn has_header(found: &Shard, recorded: &RecordedShard) -> bool {
-    found.file_len == recorded.bytes && found.header_sha256 == recorded.header_sha256
+    found.file_len == recorded.bytes && found.header_sha256() == recorded.header_sha256
 }
 
 /// The shards of a checkpoint against recorded sizes and headers; `refused` says why one must not be read.

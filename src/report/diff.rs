@@ -85,7 +85,7 @@ fn shard(out: &mut String, at: &str, repair: &Repair, new: &PlannedShard) {
     table.load_style(presets::UTF8_FULL_CONDENSED);
     table.set_header([name(at), "before".to_owned(), "after".to_owned()]);
     let old = repair.original.shards.get(&*new.name);
-    let metadata = old.and_then(|shard| shard.metadata.clone()).unwrap_or_default();
+    let metadata = old.and_then(|shard| shard.metadata().cloned()).unwrap_or_default();
     for (key, value) in new.metadata.iter().filter(|(key, value)| metadata.get(*key) != Some(value)) {
         let before = metadata.get(key).map(|v| name(v)).unwrap_or_default();
         table.add_row([format!("__metadata__ {}", name(key)), before, name(value)]);

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::align::{self, BLOCK};
 use super::planned_tensor::PlannedTensor;
-use crate::checkpoint::{FileName, Shard};
+use crate::checkpoint::{FileName, Shard, ShardFormat};
 
 /// A checkpoint to be written.
 #[derive(Debug, Clone, Default)]
@@ -110,7 +110,11 @@ impl PlannedShard {
     pub fn preview(&self) -> Shard {
         let header = self.header();
         let file_len = (header.len() as u64).saturating_add(self.data_len());
-        Shard { header_sha256: String::new(), ..Shard::parse(self.name.to_string(), file_len, &header) }
+        let mut shard = Shard::parse(self.name.to_string(), file_len, &header);
+        if let ShardFormat::Safetensors { header_sha256, .. } = &mut shard.format {
+            header_sha256.clear();
+        }
+        shard
     }
 }
 

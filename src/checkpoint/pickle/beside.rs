@@ -5,7 +5,7 @@
 
 use super::machine::{Machine, Stop};
 use super::{PICKLE_CAP, PickleFormat};
-use crate::checkpoint::{Fault, FaultKind, Place, Shard};
+use crate::checkpoint::{Fault, FaultKind, Place, Shard, ShardFormat};
 
 /// Reasons to stop for which Python raises as well, whatever the values. Source: `Lib/pickle.py` of `CPython` 3.13, and
 /// `persistent_load` and `_legacy_load` in `torch/serialization.py` of torch 2.15.0.
@@ -52,7 +52,7 @@ pub(super) fn keep_faults(shard: &mut Shard, is_state: bool) {
         _ => false,
     });
     let is_too_large = shard.faults.iter().any(|fault| fault.kind == FaultKind::PickleTooLarge);
-    let Some(pickle) = &mut shard.pickle else { return };
+    let ShardFormat::Pickle(pickle) = &mut shard.format else { return };
     // An archive in which no pickle was read, though it has one.
     let is_closed = pickle.format == PickleFormat::Zip && pickle.opcodes.is_empty();
     let reason = malformed.as_ref().and_then(|fault| fault.detail.get("reason")?.as_str()).or(pickle.doubt.as_deref());

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use sha2::{Digest as _, Sha256};
 
 use super::entry::HeaderEntry;
-use super::{MAX_HEADER, Shard, layout};
+use super::{MAX_HEADER, Shard, ShardFormat, layout};
 use crate::checkpoint::budget::Budget;
 use crate::checkpoint::fault::Faults;
 use crate::checkpoint::lfs::LfsPointer;
@@ -53,7 +53,8 @@ fn parse(mut shard: Shard, head: &[u8], budget: &mut Budget) -> Shard {
         }
     };
     shard.data_start = data_start;
-    shard.header_sha256 = hex(&Sha256::digest(head.get(..header.len().saturating_add(8)).unwrap_or(head)));
+    let header_sha256 = hex(&Sha256::digest(head.get(..header.len().saturating_add(8)).unwrap_or(head)));
+    shard.format = ShardFormat::Safetensors { metadata: None, header_sha256 };
 
     let mut faults = Faults::default();
     let Some(text) = header_text(&shard, header, &mut faults) else {
@@ -77,10 +78,10 @@ fn parse(mut shard: Shard, head: &[u8], budget: &mut Budget) -> Shard {
         check_format(&shard, &metadata, &mut faults);
     }
     shard.unread = unread;
-    shard.metadata = match metadata {
-        HeaderMetadata::Strings(strings) => Some(strings),
-        HeaderMetadata::Absent | HeaderMetadata::Null => None,
-    };
+    if let (ShardFormat::Safetensors { metadata, .. }, HeaderMetadata::Strings(strings)) = (&mut shard.format, metadata)
+    {
+        *metadata = Some(strings);
+    }
     let entries = without_duplicates(&shard, entries, &mut faults);
     layout::check(&shard, &entries, &mut faults);
     shard.tensors.reserve_exact(entries.len());

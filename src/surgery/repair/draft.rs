@@ -302,7 +302,7 @@ impl RepairDraft {
             };
             PlannedTensor::copy(t.name.clone(), from)
         });
-        let metadata = shard.metadata.clone().unwrap_or_default();
+        let metadata = shard.metadata().cloned().unwrap_or_default();
         Some(PlannedShard {
             name: FileName::parse(file).ok()?,
             tensors: tensors.collect(),

@@ -32,7 +32,7 @@ pub(super) fn check_unchanged(repair: &Repair, change: &Change, path: &Path) -> 
                 let reason = fault.detail.get("reason").and_then(Value::as_str).unwrap_or_default();
                 unreadable = Some(io::Error::other(reason.to_owned()));
             }
-            (now.file_len, &now.header_sha256) == (was.file_len, &was.header_sha256)
+            (now.file_len, now.header_sha256()) == (was.file_len, was.header_sha256())
         }),
         (Content::Text(_), Some(entry)) => {
             let document = original.document(&change.name).and_then(|d| d.text.clone());
@@ -68,7 +68,7 @@ fn changes_nothing(original: &Checkpoint, change: &Change) -> bool {
             document.or_else(module).is_some_and(|old| old == new)
         }
         Content::Shard(new) => original.shards.get(&change.name).is_some_and(|old| {
-            new.file_len() == old.file_len && hex(&Sha256::digest(new.header())) == old.header_sha256
+            new.file_len() == old.file_len && hex(&Sha256::digest(new.header())) == old.header_sha256()
         }),
     }
 }

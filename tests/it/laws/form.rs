@@ -148,7 +148,7 @@ fn plain_documents(checkpoint: &Checkpoint) -> Vec<(String, Value)> {
 /// Whether the header and data of every shard are as safetensors writes them.
 pub(super) fn has_plain_shards(checkpoint: &Checkpoint) -> bool {
     let is_plain =
-        |shard: &checkpoint::Shard| !shard.is_pickle() && shard.faults.is_empty() && shard.metadata.is_some();
+        |shard: &checkpoint::Shard| !shard.is_pickle() && shard.faults.is_empty() && shard.metadata().is_some();
     !checkpoint.shards.is_empty() && checkpoint.shards.values().all(is_plain)
 }
 

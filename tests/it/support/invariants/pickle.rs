@@ -11,7 +11,7 @@ pub const NAME: &str = "pytorch_model.bin";
 pub fn hold(bytes: &[u8]) {
     let shard = Shard::parse_pickle(NAME, bytes);
     super::faults_are_placed(&shard.faults, NAME, None);
-    let pickle = shard.pickle.as_ref().expect("it was read as a pickle");
+    let pickle = shard.pickle().expect("it was read as a pickle");
     assert!(pickle.globals.iter().all(|global| global.offset < bytes.len() as u64), "an import lies outside");
     assert!(!shard.unread || !shard.faults.is_empty() || pickle.doubt.is_some(), "unread without a reason");
     let len = bytes.len() as u64;
