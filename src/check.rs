@@ -24,6 +24,7 @@ mod model_type;
 mod module_imports;
 pub mod modules;
 pub mod observe;
+pub mod options;
 mod outcome;
 mod pickles;
 mod policy;

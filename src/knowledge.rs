@@ -63,7 +63,6 @@ use refusals::Refusals;
 use ropes::{RopeForms, RopeKeys};
 use rule::RuleSet;
 use scales::Scales;
-use settings::Policy;
 use source::DataError;
 use statistics::StatisticsPlaces;
 use text_classes::TextTypes;
@@ -136,8 +135,6 @@ pub struct Knowledge {
     pub scales: Table<Scales>,
     /// Parts of tensor names that wrappers add.
     pub wrappers: Table<Wrappers>,
-    /// Severities and suppressions of a settings file for single findings.
-    pub policy: Policy,
 }
 
 impl Knowledge {
@@ -224,7 +221,6 @@ impl Knowledge {
             text_types: table!(TextTypes::embedded),
             scales: table!(Scales::embedded),
             wrappers: table!(Wrappers::embedded),
-            policy: Policy::default(),
         }
     }
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::{Error, knowledge};
 use crate::check::check_for;
+use crate::check::options::RunOptions;
 use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Progress, ReadOptions};
@@ -90,7 +91,8 @@ impl Checker {
             checkpoint.check_hashes(progress);
         }
         let checkpoint = Arc::new(checkpoint);
-        let check = |checkpoint: &Arc<Checkpoint>| check_for(checkpoint, knowledge, &self.versions);
+        let options = RunOptions::for_versions(&self.versions);
+        let check = |checkpoint: &Arc<Checkpoint>| check_for(checkpoint, knowledge, &options);
         let outcome = tried(&checkpoint, check(&checkpoint), &check);
         Ok(CheckpointReport::new(shown(path), None, &checkpoint, &outcome))
     }

@@ -12,7 +12,8 @@ use super::bounded::bounded;
 use super::evaluate::{Context, has_faults, pinpoint, run_rules};
 use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
-use super::observe::{RunOrder, explain, observe_files, observe_versions};
+use super::observe::{explain, observe_files, observe_versions};
+use super::options::RunOptions;
 use super::outcome::Outcome;
 use super::tokens::OpenedTokenizer;
 use super::variables::{self, declared};
@@ -30,29 +31,18 @@ use crate::knowledge::{Expression, Knowledge, Loader, Scope};
 /// Runs every rule over a checkpoint, for the version of transformers that wrote it and the newest of each major version.
 #[must_use]
 pub fn check(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge) -> Outcome {
-    check_for(checkpoint, knowledge, &[])
+    check_for(checkpoint, knowledge, &RunOptions::default())
 }
 
-/// As [`check`], for these versions of transformers unless the list is empty; `peft==0.13.2` is one of PEFT.
+/// As [`check`], with the options of a run.
 ///
 /// Findings are those of the selected rules, with causes searched under the leading loaders. The verdict on each loader is by
 /// all rules, and that of a run for it alone: a loader does the same whatever else a run is asked for.
 #[must_use]
-pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, versions: &[String]) -> Outcome {
-    check_in_order(checkpoint, knowledge, versions, RunOrder::OfTable)
-}
-
-/// As [`check_for`], with the observers in this order, which changes nothing. Tests draw it.
-#[must_use]
-pub fn check_in_order(
-    checkpoint: &Arc<Checkpoint>,
-    knowledge: &Knowledge,
-    versions: &[String],
-    order: RunOrder,
-) -> Outcome {
-    let Requirements { transformers: versions, peft, programs } = Requirements::new(versions);
+pub fn check_for(checkpoint: &Arc<Checkpoint>, knowledge: &Knowledge, options: &RunOptions) -> Outcome {
+    let Requirements { transformers: versions, peft, programs } = Requirements::new(&options.versions);
     let programs = knowledge.asked_programs(&programs);
-    let run = CheckFacts::new(checkpoint, knowledge, &peft, &programs, order);
+    let run = CheckFacts::new(checkpoint, knowledge, options, &peft, &programs);
     let reading = run.read(&versions, Purpose::Findings);
     let mut outcome = reading.outcome.clone();
     let rules = &knowledge.rules;
@@ -71,7 +61,7 @@ pub fn check_in_order(
     outcome.findings.iter_mut().for_each(|finding| defer_fix(finding, &verdicts));
     outcome.verdicts = verdicts;
     outcome.findings = bounded(std::mem::take(&mut outcome.findings));
-    policy::apply_policy(&knowledge.policy, checkpoint, &mut outcome);
+    policy::apply_policy(&options.policy, checkpoint, &mut outcome);
     outcome
 }
 
@@ -79,11 +69,11 @@ pub fn check_in_order(
 struct CheckFacts<'a> {
     checkpoint: &'a Arc<Checkpoint>,
     knowledge: &'a Knowledge,
+    options: &'a RunOptions,
     programs: &'a [AskedProgram<'a>],
     stored: Stored,
     /// Rows of the largest token embedding, which every token id must stay below; `None` without one.
     rows: Option<u64>,
-    order: RunOrder,
     /// Faults that do not depend on versions of transformers.
     faults: Vec<Fault>,
     /// What the readings of the run share of their predicted loads.
@@ -171,21 +161,21 @@ impl<'a> CheckFacts<'a> {
     fn new(
         checkpoint: &'a Arc<Checkpoint>,
         knowledge: &'a Knowledge,
+        options: &'a RunOptions,
         peft: &[String],
         programs: &'a [AskedProgram<'a>],
-        order: RunOrder,
     ) -> Self {
         let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
         let view = FilesView { checkpoint, knowledge, programs, peft, rows };
-        let faults = observe_files(&view, order);
+        let faults = observe_files(&view, options.order);
         let stored = Stored::of(checkpoint);
         Self {
             checkpoint,
             knowledge,
+            options,
             programs,
             stored,
             rows,
-            order,
             faults,
             memo: judge::Memo::default(),
             opened: RefCell::default(),
@@ -248,6 +238,7 @@ impl<'a> CheckFacts<'a> {
         let opened = architecture.and_then(|class| self.opened(class, leading));
         let mut scope = variables::scope(checkpoint, architecture, &model, opened.as_deref(), self.rows);
         bind_run(&mut scope, knowledge, config, versions, architecture);
+        scope.bind("metadata_only", &self.options.policy.metadata_only.into());
         scope.bind("robot", &robots::policy(checkpoint));
         scope.bind("opened", &self.opened_by_version(architecture));
         scope.bind("missing_attributes", &processor::missing_attributes(checkpoint, of_class));
@@ -266,9 +257,9 @@ impl<'a> CheckFacts<'a> {
             of_class,
             scope: &scope,
         };
-        let observed = observe_versions(&view, self.order);
+        let observed = observe_versions(&view, self.options.order);
         let faults = self.faults.iter().cloned().chain(observed.faults);
-        let faults = explain(faults, &observed.facts, &view, self.order);
+        let faults = explain(faults, &observed.facts, &view, self.options.order);
         let program = observed.facts.directory.as_ref().map_or("", directory::program);
         scope.bind("program", &program.into());
         outcome.loads.iter_mut().for_each(LoadReport::shorten);
@@ -410,7 +401,6 @@ fn bind_run(
     scope.bind("named", &(!versions.is_empty()).into());
     let groups_heads = |name: &str| knowledge.library.speaks_of(name, "c.num_key_value_heads");
     scope.bind("groups_heads", &architecture.is_none_or(groups_heads).into());
-    scope.bind("metadata_only", &knowledge.policy.metadata_only.into());
 }
 
 /// Adds to the fault of an unknown class the known one that has its tensor names.

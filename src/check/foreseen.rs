@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use super::engine::check_for;
+use super::options::RunOptions;
 use super::verdict::LoadVerdict;
 use crate::checkpoint::{Checkpoint, Document, Dtype, Parts, Shard, ShardFormat, Tensor, files};
 use crate::knowledge::quantization::block;
@@ -10,7 +11,7 @@ use crate::knowledge::rule::Object;
 use crate::knowledge::{Expected, Knowledge};
 
 /// The verdict on the model under a version of transformers, and its reason. `expect` calls it with the bytes of a config and
-/// the class that it has built, so that it refuses what `check` refuses. `knowledge` must allow directories without weights.
+/// the class that it has built, so that it refuses what `check` refuses.
 ///
 /// Quantised weights have tensors of other names, so there the config is judged alone; it is at best not predicted.
 #[must_use]
@@ -25,7 +26,10 @@ pub fn verdict_on_config(
     let shards = if is_quantised { Vec::new() } else { vec![shard(expected)] };
     let parts = Parts { documents: vec![document], shards, ..Parts::default() };
     let checkpoint = Arc::new(Checkpoint::planned("expected", parts));
-    let outcome = check_for(&checkpoint, knowledge, &[version.to_owned()]);
+    // A config is judged, not a directory.
+    let mut options = RunOptions::for_versions(&[version.to_owned()]);
+    options.policy.metadata_only = true;
+    let outcome = check_for(&checkpoint, knowledge, &options);
     let objects = outcome.verdicts.into_iter().flat_map(|load| load.objects);
     let model = objects.into_iter().find(|object| object.object == Object::Model);
     model.map_or((LoadVerdict::NotPredicted, None), |model| (model.verdict, model.why))

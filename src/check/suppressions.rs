@@ -9,7 +9,7 @@ use super::finding::Finding;
 use super::outcome::Outcome;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::Knowledge;
-use crate::knowledge::settings::{Suppression, absolute};
+use crate::knowledge::settings::{Policy, Suppression, absolute};
 
 /// What became of one suppression in one checkpoint.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -24,7 +24,12 @@ pub struct SuppressionUse {
 
 /// The suppressions of the settings, in their order, as one checkpoint used them.
 #[must_use]
-pub fn suppression_uses(knowledge: &Knowledge, checkpoint: &Checkpoint, outcome: &Outcome) -> Vec<SuppressionUse> {
+pub fn suppression_uses(
+    knowledge: &Knowledge,
+    policy: &Policy,
+    checkpoint: &Checkpoint,
+    outcome: &Outcome,
+) -> Vec<SuppressionUse> {
     let of = |suppression: &Suppression| {
         let used = outcome.suppressed.iter().any(|s| s.accepted.by == suppression.written);
         let names = checkpoint.entries.keys().map(String::as_str);
@@ -41,7 +46,7 @@ pub fn suppression_uses(knowledge: &Knowledge, checkpoint: &Checkpoint, outcome:
             unused: if used { Vec::new() } else { evaluate::report(knowledge, checkpoint, &[fault()]) },
         }
     };
-    knowledge.policy.suppressions.iter().map(of).collect()
+    policy.suppressions.iter().map(of).collect()
 }
 
 /// A finding for each suppression that suppressed nothing, with the index of the checkpoint to report it for.
@@ -52,11 +57,12 @@ pub fn suppression_uses(knowledge: &Knowledge, checkpoint: &Checkpoint, outcome:
 #[must_use]
 pub fn unused_suppressions(
     knowledge: &Knowledge,
+    policy: &Policy,
     looked: &[(&Path, &[SuppressionUse])],
     searched: &[PathBuf],
 ) -> Vec<(usize, Finding)> {
     let mut found = Vec::new();
-    for (number, suppression) in knowledge.policy.suppressions.iter().enumerate() {
+    for (number, suppression) in policy.suppressions.iter().enumerate() {
         let asked = knowledge.rules.rules.iter().any(|r| suppression.codes.contains(&r.code));
         let uses: Vec<&SuppressionUse> = looked.iter().filter_map(|(_, uses)| uses.get(number)).collect();
         let roots = looked.iter().map(|(root, _)| *root);

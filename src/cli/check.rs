@@ -60,7 +60,7 @@ impl Results {
         let is_checked = |path: &&PathBuf| !self.unchecked.iter().any(|u| Path::new(&u.path).starts_with(path));
         let searched: Vec<PathBuf> = run.args.paths.iter().filter(is_checked).cloned().collect();
         let uses: Vec<_> = self.looked.iter().map(|(dir, looked)| (dir.as_path(), looked.uses.as_slice())).collect();
-        for (at, finding) in unused_suppressions(&run.by.knowledge, &uses, &searched) {
+        for (at, finding) in unused_suppressions(&run.by.knowledge, &run.by.options.policy, &uses, &searched) {
             if let Some((_, looked)) = self.looked.get_mut(at) {
                 looked.report.add(finding);
             }

@@ -47,9 +47,7 @@ struct Answer {
 
 /// Runs `expect`.
 pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
-    let mut knowledge = library::knowledge(library::rules(rules)?, rules)?;
-    // A config is judged, not a directory.
-    knowledge.policy.metadata_only = true;
+    let knowledge = library::knowledge(library::rules(rules)?, rules)?;
     let mut failed = false;
     let mut list = Vec::new();
     let mut answer = |input: Input| -> anyhow::Result<()> {

@@ -97,11 +97,11 @@ impl<'a> CheckRun<'a> {
         let Checked { dir, checkpoint, outcome, repaired } = &checked;
         let mut report = CheckpointReport::new(shown(dir), None, checkpoint, outcome);
         report.settings = self.by.file.as_ref().map(|file| shown(file));
-        report.overrides = Overrides::of(&self.by.knowledge);
+        report.overrides = Overrides::of(&self.by.knowledge, &self.by.options.policy);
         (report.fixed, report.withdrawn) = repaired.clone();
         let fix = &self.args.fix;
         report.fixing = Some(Fixing { unsafe_fixes: fix.unsafe_fixes, made: fix.writes() });
-        let uses = suppression_uses(&self.by.knowledge, checkpoint, outcome);
+        let uses = suppression_uses(&self.by.knowledge, &self.by.options.policy, checkpoint, outcome);
         Ok(Looked { report, uses, skipped: outcome.skipped.clone() })
     }
 
@@ -113,7 +113,7 @@ impl<'a> CheckRun<'a> {
         };
         let checkpoint = read()?;
         let outcome = if self.args.fix.writes() || self.args.fix.diff {
-            check_for(&checkpoint, &self.by.knowledge, &self.by.versions)
+            check_for(&checkpoint, &self.by.knowledge, &self.by.options)
         } else {
             check_by(&self.by)(&checkpoint)
         };
@@ -154,7 +154,7 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
 
 /// Checks a checkpoint without a try of its fixes.
 pub fn judge_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
-    |checkpoint| check_for(checkpoint, &by.knowledge, &by.versions)
+    |checkpoint| check_for(checkpoint, &by.knowledge, &by.options)
 }
 
 /// Tells how many files were compared with recorded hashes: without a record, a changed file is not found.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use super::args::{CheckArgs, SettingsArgs};
 use super::{library, output};
 use crate::check::Severity;
+use crate::check::options::RunOptions;
 use crate::checkpoint::platform::{here, shown};
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::expanded;
@@ -15,10 +16,10 @@ use crate::knowledge::settings::{Chain, Surroundings};
 pub struct Resolved {
     /// The settings file, if any.
     pub file: Option<PathBuf>,
-    /// Rules, architectures and policy of the checks.
+    /// The selected rules, architectures and tables.
     pub knowledge: Knowledge,
-    /// Versions to predict the load for.
-    pub versions: Vec<String>,
+    /// Versions to predict the load for, and the policy of the settings file.
+    pub options: RunOptions,
     /// Lowest severity that fails.
     pub fail_on: Severity,
     /// Lowest severity that is reported.
@@ -105,8 +106,8 @@ impl Typed {
         policy.metadata_only |= self.metadata_only;
         let versions = if self.versions.is_empty() { chain.versions()? } else { expanded(self.versions.clone()) };
         Ok(Resolved {
-            knowledge: Knowledge { policy, ..library::knowledge(rules, folder.as_deref())? },
-            versions,
+            knowledge: library::knowledge(rules, folder.as_deref())?,
+            options: RunOptions { versions, policy, ..RunOptions::default() },
             fail_on: self.fail_on.or_else(|| chain.fail_on()).unwrap_or(Severity::Error),
             min_severity: self.min_severity.or_else(|| chain.min_severity()).unwrap_or(Severity::Info),
             baseline: self.baseline.clone().or_else(|| chain.baseline()),

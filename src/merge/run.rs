@@ -9,6 +9,7 @@ use super::dry_run::PlanDocument;
 use super::parts::DonorParts;
 use super::training::training;
 use super::usage::Usage;
+use crate::check::options::RunOptions;
 use crate::check::{Finding, Outcome, Severity, check_for};
 use crate::checkpoint::{Checkpoint, HashAlgorithm};
 use crate::knowledge::Knowledge;
@@ -162,7 +163,7 @@ impl MergeRun {
         tolerated: &[String],
     ) -> bool {
         let checkpoint = Arc::new(checkpoint);
-        let outcome = check_for(&checkpoint, knowledge, &self.versions);
+        let outcome = check_for(&checkpoint, knowledge, &RunOptions::for_versions(&self.versions));
         let found = |severity| outcome.findings.iter().filter(|f| f.severity == severity).count();
         let stops = |f: &&Finding| f.severity == Severity::Error && !tolerated.contains(&f.code);
         let stopping = outcome.findings.iter().filter(stops).count();

@@ -14,6 +14,7 @@ use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
 use crate::checkpoint::{TensorContents, untold};
 use crate::knowledge::Knowledge;
+use crate::knowledge::settings::Policy;
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
 /// The report of one run. Serialised, it is the JSON contract (`schema` 3).
@@ -220,12 +221,12 @@ pub struct Overrides {
 impl Overrides {
     /// The changes; `None` when nothing is changed.
     #[must_use]
-    pub fn of(knowledge: &Knowledge) -> Option<Self> {
+    pub fn of(knowledge: &Knowledge, policy: &Policy) -> Option<Self> {
         let overrides = Self {
             rules_off: knowledge.rules.unselected.len(),
             regraded: knowledge.rules.rules.iter().filter(|rule| rule.regraded.is_some()).count(),
-            paths: knowledge.policy.paths(),
-            metadata_only: knowledge.policy.metadata_only,
+            paths: policy.paths(),
+            metadata_only: policy.metadata_only,
         };
         (overrides != Self::default()).then_some(overrides)
     }

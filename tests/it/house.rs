@@ -332,6 +332,80 @@ fn no_source_spells_a_class_or_a_model_type() {
     none(&new.chain(stale).collect::<Vec<_>>());
 }
 
+/// Config keys that sources may spell, and why they are no knowledge of `rules/`.
+const SPELLED_KEYS: [(&str, &[&str], &str); 18] = [
+    ("src/check/adapter/lora.rs", &["bias"], "a field of adapter_config.json"),
+    ("src/check/built_tokenizer.rs", &["decoder"], "a field of tokenizer.json"),
+    ("src/check/fix/repairs/configs.rs", &["text_config", "tie_word_embeddings"], "the keys that a repair moves"),
+    ("src/check/judge/integers.rs", &["bias"], "the end of a tensor's name"),
+    ("src/check/load/convert.rs", &["dim", "num_attention_heads"], "arguments of conversions, by their code"),
+    ("src/check/load/keys.rs", &["bias"], "the end of a tensor's name"),
+    ("src/check/refusals.rs", &["id2label"], "the one key whose keys become integers"),
+    (
+        "src/check/size.rs",
+        &["head_dim", "intermediate_size", "mm_vision_tower", "num_key_value_heads", "vision_config", "vocab_size"],
+        "keys by which a nameless size is guessed, for people",
+    ),
+    (
+        "src/check/variables.rs",
+        &["llm_config", "text_config"],
+        "where the config of the language model is, by convention",
+    ),
+    ("src/check/votes/space.rs", &["id2label"], "a key that shapes no tensor"),
+    ("src/knowledge/architecture.rs", &["text_config"], "get_text_config"),
+    (
+        "src/knowledge/architecture/doubt.rs",
+        &["hidden_size", "intermediate_size", "num_attention_heads", "num_hidden_layers", "vocab_size"],
+        "keys that every class has, which are named last",
+    ),
+    (
+        "src/knowledge/architecture/resolve.rs",
+        &["layer_types", "layers_block_type", "linear_attention"],
+        "the keys and words that the base class of configs renames",
+    ),
+    ("src/knowledge/library.rs", &["text_config"], "get_text_config"),
+    ("src/knowledge/prediction.rs", &["text_config"], "get_text_config"),
+    ("src/knowledge/resemblance.rs", &["bias"], "the end of a tensor's name"),
+    ("src/knowledge/scales.rs", &["text_config"], "get_text_config"),
+    (
+        "src/merge",
+        &["text_config", "tie_word_embeddings", "vocab_size"],
+        "what a merge writes into a config of its own",
+    ),
+];
+
+/// Config keys that a class reads are knowledge, so they stand in `rules/`.
+#[test]
+fn no_source_spells_a_config_key() {
+    let read = Regex::new(r"\bc\.([a-z_][a-z0-9_]+)").expect("a pattern");
+    let architectures = texts("rules/architectures");
+    let keys: BTreeSet<&str> = architectures
+        .iter()
+        .flat_map(|(_, text)| read.captures_iter(text))
+        .map(|found| found.extract::<1>().1[0])
+        .collect();
+    assert!(keys.len() > 500, "{} keys", keys.len());
+    let literal = Regex::new(r#""/?([a-z_][a-z0-9_]*)""#).expect("a pattern");
+    let mut spelled: BTreeSet<(&str, String)> = BTreeSet::new();
+    let mut wrong = Vec::new();
+    for (path, text) in sources().into_iter().filter(|(path, _)| !path.ends_with("/tests.rs")) {
+        for found in literal.captures_iter(&without_tests(&text)).filter(|found| keys.contains(&found[1])) {
+            let place =
+                SPELLED_KEYS.iter().find(|(place, keys, _)| path.starts_with(place) && keys.contains(&&found[1]));
+            match place {
+                Some((place, ..)) => _ = spelled.insert((*place, found[1].to_owned())),
+                None => wrong.push(format!("{path} spells {}: put it into rules/", &found[1])),
+            }
+        }
+    }
+    for (place, key) in SPELLED_KEYS.iter().flat_map(|(place, keys, _)| keys.iter().map(move |key| (*place, *key))) {
+        if !spelled.contains(&(place, key.to_owned())) {
+            wrong.push(format!("{place} does not spell {key} any more"));
+        }
+    }
+    none(&wrong);
+}
+
 /// Clippy denies operations that can panic. No source allows them, and only the module that maps files has unsafe code.
 #[test]
 fn no_source_allows_panics_or_unsafe_code() {

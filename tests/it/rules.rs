@@ -15,6 +15,7 @@ use std::fmt::Write as _;
 use crate::support::{Expect, Tried, tried};
 use ckpt_doctor::check::finding::{Finding, Severity};
 use ckpt_doctor::check::load::LoadReport;
+use ckpt_doctor::check::options::RunOptions;
 use ckpt_doctor::check::verdict::LoadVerdict;
 use ckpt_doctor::check::{check, check_for};
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, FaultSource};
@@ -186,7 +187,7 @@ fn severity_follows_the_loaders_of_the_run() {
     let found = |dir: &std::path::Path, versions: &[&str]| {
         let versions: Vec<String> = versions.iter().map(|v| (*v).to_owned()).collect();
         let checkpoint = Checkpoint::open(dir).expect("a checkpoint").into();
-        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &versions);
+        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &RunOptions::for_versions(&versions));
         let finding = outcome.findings.into_iter().find(|f| f.code == "SAF009").expect("SAF009");
         let loaders = finding.effects.into_iter().map(|e| (e.loader, e.stands_for));
         (finding.severity, loaders.collect::<Vec<_>>())
@@ -213,7 +214,7 @@ fn weights_of_another_program_are_an_error_when_transformers_is_named() {
     let dir = crate::support::made("llama", &format!("[{}, {}, {pack}]", keys[0], keys[1]), room.path());
     for (versions, severity) in [(Vec::new(), Severity::Info), (vec!["5.23.0".to_owned()], Severity::Error)] {
         let checkpoint = Checkpoint::open(&dir).expect("a checkpoint").into();
-        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &versions);
+        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &RunOptions::for_versions(&versions));
         let finding = outcome.findings.iter().find(|f| f.code == "QNT010").expect("QNT010");
         assert_eq!(finding.severity, severity, "{versions:?}");
         assert!(outcome.verdicts.iter().all(|load| load.verdict == LoadVerdict::Raises), "{:?}", outcome.verdicts);
@@ -234,7 +235,7 @@ fn a_finding_that_rests_on_a_nearby_version_is_an_error_for_a_named_one() {
     ] {
         let versions: Vec<String> = versions.iter().map(|v| (*v).to_owned()).collect();
         let checkpoint = Checkpoint::open(&dir).expect("a checkpoint").into();
-        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &versions);
+        let outcome = check_for(&checkpoint, &crate::support::knowledge(), &RunOptions::for_versions(&versions));
         let missing = outcome.findings.iter().find(|f| f.code == "ARC003").expect("ARC003");
         assert_eq!(missing.severity, severity, "{versions:?}");
         assert!(outcome.verdicts.iter().all(|load| load.verdict == LoadVerdict::LoadsWrong), "{:?}", outcome.verdicts);

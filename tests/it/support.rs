@@ -20,7 +20,8 @@ use std::process::Command;
 use std::sync::{Arc, Mutex, OnceLock};
 
 use ckpt_doctor::check::finding::{Finding, Severity};
-use ckpt_doctor::check::{Outcome, Safety, check, check_for, suppression_uses, unused_suppressions};
+use ckpt_doctor::check::options::RunOptions;
+use ckpt_doctor::check::{Outcome, Safety, check_for, suppression_uses, unused_suppressions};
 use ckpt_doctor::checkpoint::journal::StateFolder;
 use ckpt_doctor::checkpoint::{Checkpoint, FaultKind, ReadOptions, telling_all};
 use ckpt_doctor::knowledge::rule::RuleSet;
@@ -216,12 +217,13 @@ fn under(settings: &serde_json::Value, dir: &Path, mut knowledge: Knowledge) -> 
     let above = dir.parent().expect("a folder above");
     let source =
         SettingsSource::parse("ckpt-doctor.json5", above, &settings.to_string()).unwrap_or_else(|e| panic!("{e}"));
-    knowledge.policy =
-        Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
+    let policy = Chain(vec![source]).govern(&mut knowledge.rules, Choice::default()).unwrap_or_else(|e| panic!("{e}"));
     let checkpoint = Arc::new(read(dir));
-    let mut outcome = check(&checkpoint, &knowledge);
-    let uses = suppression_uses(&knowledge, &checkpoint, &outcome);
-    let unused = unused_suppressions(&knowledge, &[(checkpoint.source.path(), &uses)], &[above.to_owned()]);
+    let options = RunOptions { policy, ..RunOptions::default() };
+    let mut outcome = check_for(&checkpoint, &knowledge, &options);
+    let uses = suppression_uses(&knowledge, &options.policy, &checkpoint, &outcome);
+    let unused =
+        unused_suppressions(&knowledge, &options.policy, &[(checkpoint.source.path(), &uses)], &[above.to_owned()]);
     outcome.findings.extend(unused.into_iter().map(|(_, finding)| finding));
     (checkpoint, outcome)
 }
@@ -285,7 +287,7 @@ pub fn open(dir: &Path, deep: bool, loaders: &[String], knowledge: &Knowledge) -
         checkpoint.check_hashes(&|_| {});
     }
     let checkpoint = Arc::new(checkpoint);
-    let outcome = check_for(&checkpoint, knowledge, loaders);
+    let outcome = check_for(&checkpoint, knowledge, &RunOptions::for_versions(loaders));
     (checkpoint, outcome)
 }
 

@@ -10,6 +10,7 @@ use std::fs;
 use std::path::Path;
 use std::sync::Arc;
 
+use ckpt_doctor::check::options::RunOptions;
 use ckpt_doctor::check::{Outcome, Severity, check_for};
 use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::knowledge::Knowledge;
@@ -40,7 +41,7 @@ fn write(model: &Value, dir: &Path) {
 /// What is found for these versions, and what all fixes together would change.
 fn judged(dir: &Path, versions: &[String], knowledge: &Knowledge) -> (Outcome, Repair) {
     let checkpoint = Arc::new(Checkpoint::open(dir).expect("a directory"));
-    let judge = |c: &Arc<Checkpoint>| check_for(c, knowledge, versions);
+    let judge = |c: &Arc<Checkpoint>| check_for(c, knowledge, &RunOptions::for_versions(versions));
     let outcome = judge(&checkpoint);
     let repair = plan(&checkpoint, outcome.clone(), true, &judge);
     (outcome, repair)

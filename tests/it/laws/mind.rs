@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ckpt_doctor::HashAlgorithm;
+use ckpt_doctor::check::options::RunOptions;
 use ckpt_doctor::check::verdict::{LoadVerdict, PredictedLoad};
 use ckpt_doctor::check::{Outcome, check, check_for};
 use ckpt_doctor::checkpoint::Checkpoint;
@@ -110,7 +111,7 @@ fn expect_fails_where_check_says_that_the_model_raises_or_is_unknown() {
                 continue;
             }
             let checkpoint = Arc::new(Checkpoint::open(&dir).unwrap());
-            let outcome = check_for(&checkpoint, &knowledge, &[version.to_owned()]);
+            let outcome = check_for(&checkpoint, &knowledge, &RunOptions::for_versions(&[version.to_owned()]));
             let objects = outcome.verdicts.iter().flat_map(|load| &load.objects);
             let model = objects.into_iter().find(|object| object.object == Object::Model).unwrap();
             compared += 1;

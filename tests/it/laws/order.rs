@@ -1,7 +1,8 @@
 //! Observers run in any order.
 
-use ckpt_doctor::check::engine::check_in_order;
+use ckpt_doctor::check::engine::check_for;
 use ckpt_doctor::check::observe::RunOrder;
+use ckpt_doctor::check::options::RunOptions;
 
 use super::cases;
 use crate::support::{Draw, knowledge, on_cases, open};
@@ -18,7 +19,7 @@ fn the_order_of_observers_changes_nothing() {
         let mut draw = Draw::new(case.name.bytes().map(u64::from).sum::<u64>() + 1);
         (0..2).all(|_| {
             let order = RunOrder::Drawn(u64::try_from(draw.below(1 << 30)).unwrap());
-            format!("{:?}", check_in_order(&checkpoint, &knowledge, &[], order)) == table
+            format!("{:?}", check_for(&checkpoint, &knowledge, &RunOptions { order, ..RunOptions::default() })) == table
         })
     });
     assert!(differing.len() >= 50, "only {} cases were drawn", differing.len());

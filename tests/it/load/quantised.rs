@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use ckpt_doctor::check::check_for;
+use ckpt_doctor::check::options::RunOptions;
 use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::knowledge::Loader;
 use serde_json::{Value, json};
@@ -52,7 +53,8 @@ fn a_block_counts_where_the_version_reads_it() {
         let changes: Vec<Change> =
             std::iter::once(set).chain(names.iter().map(|name| pack(name))).map(|one| change(&one)).collect();
         apply_all(place, &changes, &dir);
-        let outcome = check_for(&Arc::new(Checkpoint::open(&dir).unwrap()), &knowledge, &versions);
+        let outcome =
+            check_for(&Arc::new(Checkpoint::open(&dir).unwrap()), &knowledge, &RunOptions::for_versions(&versions));
         let counts: Counts = Loader::ALL.map(|loader| {
             let load = outcome.loads.iter().find(|load| load.loader == loader.version())?;
             Some((load.missing.len(), load.unexpected.len()))

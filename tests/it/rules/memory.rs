@@ -6,6 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ckpt_doctor::check::check_for;
+use ckpt_doctor::check::options::RunOptions;
 use ckpt_doctor::checkpoint::{Checkpoint, MemoryFiles, ReadOptions, Source};
 use ckpt_doctor::knowledge::Knowledge;
 
@@ -57,7 +58,7 @@ fn checked(source: Source, case: &Case, knowledge: &Knowledge) -> (String, Strin
         checkpoint.check_hashes(&|_| {});
     }
     let checkpoint = Arc::new(checkpoint);
-    let outcome = check_for(&checkpoint, knowledge, &case.loaders);
+    let outcome = check_for(&checkpoint, knowledge, &RunOptions::for_versions(&case.loaders));
     let Checkpoint { entries, contents, nested, .. } = &*checkpoint;
     let faults: Vec<_> = checkpoint.all_faults().collect();
     (format!("{entries:#?}\n{nested:#?}\n{contents:#?}\n{faults:#?}"), format!("{outcome:#?}"))

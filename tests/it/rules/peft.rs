@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ckpt_doctor::check::check_for;
 use ckpt_doctor::check::finding::{Finding, Severity};
+use ckpt_doctor::check::options::RunOptions;
 use ckpt_doctor::checkpoint::Checkpoint;
 
 use crate::support::{knowledge, made};
@@ -18,7 +19,7 @@ fn of_keys(versions: &[&str]) -> Vec<Finding> {
     ]"#;
     let checkpoint = Arc::new(Checkpoint::open(made("lora", changes, room.path())).expect("a directory"));
     let versions: Vec<String> = versions.iter().map(|version| (*version).to_owned()).collect();
-    let outcome = check_for(&checkpoint, &knowledge(), &versions);
+    let outcome = check_for(&checkpoint, &knowledge(), &RunOptions::for_versions(&versions));
     outcome.findings.into_iter().filter(|finding| finding.code == "ADP016").collect()
 }
 
