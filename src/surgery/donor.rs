@@ -13,6 +13,7 @@ use super::retry::retry;
 use super::stop::interrupted;
 use crate::checkpoint::list::list;
 use crate::checkpoint::open::{Identity, OpenError, Opened, TOKENIZER_CAP, open_regular};
+use crate::checkpoint::platform::is_out_of_descriptors;
 use crate::checkpoint::{Source, hex};
 
 /// The identities of a directory's files at the start of a run.
@@ -76,8 +77,12 @@ pub(super) struct DonorFile {
 
 impl DonorFile {
     pub(super) fn open(path: &Path) -> Result<Self, ApplyError> {
-        let opened = open_regular(path, u64::MAX)
-            .map_err(|e| ApplyError::Changed { path: path.to_owned(), reason: format!("became unreadable ({e})") })?;
+        let opened = open_regular(path, u64::MAX).map_err(|error| match error {
+            OpenError::Io { source, .. } if is_out_of_descriptors(&source) => {
+                ApplyError::Descriptors { path: path.to_owned() }
+            }
+            error => ApplyError::Changed { path: path.to_owned(), reason: format!("became unreadable ({error})") },
+        })?;
         Ok(Self { path: path.to_owned(), opened })
     }
 

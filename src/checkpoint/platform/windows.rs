@@ -17,6 +17,8 @@ const FILE_SHARE_READ: u32 = 1;
 const FILE_SHARE_WRITE: u32 = 2;
 // https://learn.microsoft.com/windows/win32/debug/system-error-codes--1700-3999-
 const ERROR_CANT_RESOLVE_FILENAME: i32 = 1921;
+// https://learn.microsoft.com/windows/win32/debug/system-error-codes--0-499-
+const ERROR_TOO_MANY_OPEN_FILES: i32 = 4;
 
 /// Opens a file for reading; a link (symbolic link or junction) is refused unless `follow`.
 ///
@@ -56,6 +58,11 @@ pub(crate) fn identity(metadata: &Metadata) -> Identity {
 /// Whether the error says that a link leads back to itself, or that a link was not followed.
 pub(crate) fn is_loop(error: &io::Error) -> bool {
     error.raw_os_error() == Some(ERROR_CANT_RESOLVE_FILENAME)
+}
+
+/// Whether the error says that this process may open no more files.
+pub(crate) fn is_out_of_descriptors(error: &io::Error) -> bool {
+    error.raw_os_error() == Some(ERROR_TOO_MANY_OPEN_FILES)
 }
 
 /// Fills the buffer with the bytes from `at` on.

@@ -43,6 +43,23 @@ fn an_occupied_target_is_refused() {
     assert_eq!(merge(&vision, &donor("llava3d-tiny"), &empty, &[]).status.code(), Some(0));
 }
 
+#[test]
+fn without_descriptors_the_limit_is_named() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    let script = "ulimit -n 8; exec \"$0\" \"$@\"";
+    let mut command = Command::new("/bin/sh");
+    command.env("XDG_STATE_HOME", crate::support::state());
+    command.args(["-c", script, env!("CARGO_BIN_EXE_ckpt-doctor"), "build-merged"]);
+    command.arg("--donor").arg(format!("vision={}", donor("spatialvla-tiny").display()));
+    command.arg("--donor").arg(format!("language={}", donor("llava3d-tiny").display()));
+    let run = command.arg("--out").arg(&out).output().unwrap();
+    assert_eq!(run.status.code(), Some(2), "{}", text(&run));
+    let said = text(&run);
+    assert!(said.contains("too many files are open; raise the limit on open files (`ulimit -n`)"), "{said}");
+    assert!(!out.exists());
+}
+
 /// A change of a donor.
 type Damage = fn(&Path);
 
