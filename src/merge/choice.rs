@@ -3,7 +3,7 @@
 use super::error::MergeError;
 use super::run::{CheckedCheckpoint, MergeRequest, MergeRun};
 use crate::knowledge::recipe::{DonorSpec, Recipe};
-use crate::knowledge::source::hint;
+use crate::knowledge::source::{hint, nearest};
 use crate::report::model::Role;
 
 /// Selects the recipe whose roles the donors can take; a recipe that names their architectures goes before one that takes
@@ -92,7 +92,9 @@ fn misfits(recipe: &Recipe, run: &MergeRun) -> Vec<String> {
         if let Role::Donor(role) = &donor.role
             && !recipe.donors.iter().any(|spec| spec.role == *role)
         {
-            reasons.push(format!("it has no {role} donor"));
+            let near = nearest(role, recipe.donors.iter().map(|spec| spec.role.as_str()));
+            let hint = near.map(|near| format!(" (did you mean {near}?)")).unwrap_or_default();
+            reasons.push(format!("it has no {role} donor{hint}"));
         }
     }
     for spec in &recipe.donors {

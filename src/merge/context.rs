@@ -15,6 +15,7 @@ use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor, TokenSpec};
+use crate::knowledge::source::nearest;
 use crate::knowledge::{EvalError, Expression, Knowledge, Library, Scope};
 use crate::report::model::ShapedName;
 
@@ -53,8 +54,12 @@ impl<'a> Context<'a> {
         };
         PartOf::find(donor, name).ok_or_else(|| {
             let names: Vec<&str> = donor.parts.iter().flat_map(DonorParts::names).collect();
-            let has = if names.is_empty() { "none is known of its architecture".to_owned() } else { names.join(", ") };
-            MergeError::Donor(format!("the {role} donor has no part {name}; its parts: {has}"))
+            let hint = match nearest(name, names.iter().copied()) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None if names.is_empty() => "none is known of its architecture".to_owned(),
+                None => format!("its parts: {}", names.join(", ")),
+            };
+            MergeError::Donor(format!("the {role} donor has no part {name}; {hint}"))
         })
     }
 

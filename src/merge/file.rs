@@ -7,7 +7,7 @@ use super::options;
 use super::recipe_file::{self, text};
 use crate::knowledge::Knowledge;
 use crate::knowledge::recipe::{MergeFile, Recipe};
-use crate::knowledge::source::{self, DataError, hint};
+use crate::knowledge::source::{self, DataError, hint, nearest};
 
 /// A merge file with its paths resolved against its folder.
 #[derive(Debug, Clone, Default)]
@@ -127,6 +127,9 @@ fn find_recipe(knowledge: &Knowledge, name: &str, base: &Path) -> Result<Recipe,
         return recipe_file::read(&path, knowledge);
     }
     let names: Vec<&str> = knowledge.recipes.iter().map(|r| r.recipe.as_str()).collect();
-    let names = names.join(", ");
-    Err(DataError::new(name, format!("unknown recipe; pass one of {names}, or the path of a .json5 file")))
+    let hint = match nearest(name, names.iter().copied()) {
+        Some(near) => format!("did you mean `{near}`?"),
+        None => format!("pass one of {}, or the path of a .json5 file", names.join(", ")),
+    };
+    Err(DataError::new(name, format!("unknown recipe; {hint}")))
 }

@@ -79,6 +79,8 @@ impl Folder<'_> {
 /// The text of a recipe or merge file.
 pub(super) fn text(path: &Path) -> Result<String, DataError> {
     let name = path.display().to_string();
-    let bytes = read_capped(path, JSON_CAP).map_err(|error| DataError::new(&name, error.to_string()))?;
+    // Most of its messages begin with the path, which the error names already.
+    let told = |error: String| error.strip_prefix(&format!("{name} ")).map_or_else(|| error.clone(), str::to_owned);
+    let bytes = read_capped(path, JSON_CAP).map_err(|error| DataError::new(&name, told(error.to_string())))?;
     String::from_utf8(bytes).map_err(|_| DataError::new(&name, "not UTF-8"))
 }

@@ -215,3 +215,71 @@ fn a_seam_names_both_tensors_both_shapes_and_the_options() {
         assert!(output.contains(word), "{word} is not in\n{output}");
     }
 }
+
+/// Wrong inputs, with `V` for the SpatialVLA donor, `L` for the LLaVA-3D one, `R` for a folder and `F` for a file in it.
+const WRONG: [&str; 34] = [
+    "build-merged --recipe spatialvla-lava3d --vision V --language L --out R/o",
+    "build-merged --recipe zzz --vision V --language L --out R/o",
+    "build-merged --recipe R/none.json5 --vision V --language L --out R/o",
+    "build-merged --recipe F --vision V --language L --out R/o",
+    "build-merged --donor visoin=V --language L --out R/o",
+    "build-merged --donor V --language L --out R/o",
+    "build-merged --vision V --out R/o",
+    "build-merged --vision R/none --language L --out R/o",
+    "build-merged --vision F --language L --out R/o",
+    "build-merged --vision L --language V --out R/o",
+    "build-merged --vision R/empty --language L --out R/o",
+    "build-merged --vision V --language L",
+    "build-merged --vision V --language L --out R/no/o",
+    "build-merged --vision V --language L --out R",
+    "build-merged --vision V --language L --out V",
+    "build-merged --vision V --language L --out R/o --set spatail=off",
+    "build-merged --vision V --language L --out R/o --set spatial=of",
+    "build-merged --vision V --language L --out R/o --set spatial",
+    "build-merged --vision V --language L --out R/o --set shard-size=5XB",
+    "build-merged --vision V --language L --out R/o --set dtype=int4",
+    "build-merged --vision V --language L --out R/o --for 4.99",
+    "build-merged R/none.json5",
+    "build-merged F",
+    "extract V --part visoin --out R/o",
+    "extract V --part tower --out R/o",
+    "extract V --out R/o",
+    "extract R/none --part vision --out R/o",
+    "extract V --part vision --out R/o --set nope=1",
+    "insert V --part language --from L --out R/o",
+    "insert V --part langauge --from L --out R/o",
+    "insert V --part language --from R/none --out R/o",
+    "merge-adapter V L --out R/o",
+    "verify R",
+    "verify R/none",
+];
+
+#[test]
+fn wrong_inputs_get_one_clear_line() {
+    let work = TempDir::new().unwrap();
+    fs::create_dir(work.path().join("empty")).unwrap();
+    fs::write(work.path().join("file.json5"), "{ not: json5").unwrap();
+    let place = work.path().display().to_string();
+    let mut all = String::new();
+    for typed in WRONG {
+        let path = |word: &str| match word {
+            "V" => donor("spatialvla-tiny").display().to_string(),
+            "L" => donor("llava3d-tiny").display().to_string(),
+            "F" => format!("{place}/file.json5"),
+            "R" => place.clone(),
+            _ => word
+                .replace("R/", &format!("{place}/"))
+                .replace("=V", &format!("={}", donor("spatialvla-tiny").display())),
+        };
+        let args: Vec<String> = typed.split(' ').map(path).collect();
+        let run = doctor(&args.iter().map(String::as_str).collect::<Vec<_>>());
+        assert_ne!(run.status.code(), Some(0), "{typed}");
+        assert!(!work.path().join("o").exists(), "{typed}");
+        let errors = String::from_utf8(run.stderr).unwrap();
+        let lines: Vec<&str> = errors.lines().filter(|line| line.starts_with("error")).collect();
+        assert_eq!(lines.len(), 1, "{typed}: {}{errors}", String::from_utf8_lossy(&run.stdout));
+        let shown = lines[0].replace(&place, "R").replace(&format!("{}/", crate::support::project().display()), "");
+        all.push_str(&format!("$ ckpt-doctor {typed}\n{shown}\n\n"));
+    }
+    snapshot!("merge-wrong-inputs", all);
+}
