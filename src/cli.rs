@@ -11,10 +11,12 @@ mod generate;
 mod hints;
 mod init;
 mod inspect;
+mod interpreter;
 mod library;
 mod look;
 mod output;
 mod paths;
+mod pins;
 mod progress;
 mod recipes;
 mod renderer;
@@ -102,7 +104,7 @@ fn run() -> ExitCode {
         return ExitCode::from(exit::FAILED);
     }
     let result = match command {
-        args::Command::Check(args) => check::run(&args, rules.as_deref()),
+        args::Command::Check(args) => check::run(args, rules.as_deref()),
         args::Command::Undo(args) => undo::run(&args),
         args::Command::Inspect(args) => inspect::run(&args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(&args, rules.as_deref()),

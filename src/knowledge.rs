@@ -17,6 +17,7 @@ mod ordered;
 pub mod parts;
 pub mod peft;
 pub mod pickles;
+pub mod pins;
 pub mod prediction;
 pub mod processor;
 pub mod program;

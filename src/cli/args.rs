@@ -7,6 +7,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser as _};
 use clap::{Arg, Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
+use super::pins::or_file;
 use crate::check::Severity;
 use crate::checkpoint::HashAlgorithm;
 use crate::knowledge::loader::{parse_program, parse_requirement, parse_requirement_or_all};
@@ -126,9 +127,9 @@ pub struct ExpectArgs {
     /// and, to override the config's own class, a class name under "class"
     #[arg(value_name = "CONFIG|DIR|@FILE", required = true)]
     pub configs: Vec<String>,
-    /// Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3; the nearest known version that
-    /// has the class is used [default: the version that the config names]
-    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = parse_requirement)]
+    /// Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3, or @FILE for the one that a lock file
+    /// pins; the nearest known version that has the class is used [default: the version that the config names]
+    #[arg(long = "for", value_name = "transformers==VERSION", value_parser = or_file(parse_requirement))]
     pub target: Option<String>,
     /// Output format; in jsonl, a config that fails has an "error" and the others are still printed
     #[arg(long, alias = "format", value_name = "FMT", default_value = "text")]
@@ -248,10 +249,14 @@ pub struct CheckArgs {
     #[arg(value_name = "PATH", default_value = ".")]
     pub paths: Vec<PathBuf>,
     /// Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm, mlx-lm and
-    /// llama.cpp for what is known of them; may be repeated [default: the version that wrote config.json, and the newest
-    /// known of each major version]
-    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_program)]
+    /// llama.cpp for what is known of them; @FILE for those that a lock file, pyproject.toml or requirements file pins; may be
+    /// repeated [default: the version that wrote config.json, and the newest known of each major version]
+    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = or_file(parse_program))]
     pub versions: Vec<String>,
+    /// As --for, for the versions of transformers and PEFT that this Python interpreter has: it is started to list them, and
+    /// nothing of a model is run
+    #[arg(long, value_name = "PYTHON")]
+    pub for_python: Option<PathBuf>,
     /// Also read the bytes of every tensor, to find NaN, infinity, trailing zeros and tied weights that differ
     #[arg(long)]
     pub deep: bool,
@@ -390,9 +395,9 @@ pub struct BuildMergedArgs {
     /// Set an option of the recipe; may be repeated
     #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
     pub set: Vec<(String, String)>,
-    /// Version of transformers that the result is for: 4.57, transformers==4.57.3, or all; may be repeated. The result is
-    /// checked for it, and options whose default depends on the version follow it
-    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = parse_requirement_or_all)]
+    /// Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may
+    /// be repeated. The result is checked for it, and options whose default depends on the version follow it
+    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = or_file(parse_requirement_or_all))]
     pub versions: Vec<String>,
     /// Plan and check the merge, and write nothing
     #[arg(long)]

@@ -10,7 +10,7 @@ use clap::CommandFactory as _;
 use super::args::{BuildMergedArgs, Cli, SeverityName};
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::progress::Meter;
-use super::{library, output, signals};
+use super::{library, output, pins, signals};
 use crate::check::Severity;
 use crate::knowledge::Knowledge;
 use crate::knowledge::loader::expanded;
@@ -102,7 +102,7 @@ fn request(args: &BuildMergedArgs, knowledge: &Knowledge) -> anyhow::Result<Merg
     }
     options.extend(typed);
     let out = out.context("no output directory given; pass --out DIR")?;
-    let versions = expanded(args.versions.clone());
+    let versions = expanded(pins::transformers(&args.versions)?);
     let hash = args.hash.algorithm();
     let (dry_run, hash_donors) = (args.dry_run, args.hash_donors);
     Ok(MergeRequest { recipe, donors, options, versions, out, dry_run, hash, hash_donors })

@@ -6,7 +6,7 @@ use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::look::{CheckRun, Checked, Looked, Stop, judge_by};
 use super::paths::{self, Targets};
-use super::{baseline, fix, output, signals, skipped, workers};
+use super::{baseline, fix, interpreter, output, pins, signals, skipped, workers};
 use crate::check::unused_suppressions;
 use crate::checkpoint::parallel;
 use crate::checkpoint::platform::shown;
@@ -14,8 +14,13 @@ use crate::report::model::{CheckpointReport, UncheckedPath};
 use crate::report::{Report, fixes};
 
 /// Runs `check`.
-pub fn run(args: &CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+pub fn run(mut args: CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
+    args.versions = pins::programs(&args.versions)?;
     let Targets { mut dirs, unchecked } = paths::targets(&args.paths, args.quiet)?;
+    if let Some(python) = args.for_python.take() {
+        args.versions.extend(interpreter::versions(&python, &dirs)?);
+    }
+    let args = &args;
     // One output takes the given checkpoint, without those in its folders.
     if args.fix.output.is_some() && dirs.iter().any(|dir| args.paths.contains(dir)) {
         dirs.retain(|dir| args.paths.contains(dir));

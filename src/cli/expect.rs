@@ -12,7 +12,7 @@ use serde_json::{Map, Value, json};
 
 use super::args::{ExpectArgs, ExpectFormat};
 use super::exit::{CLEAN, FINDINGS};
-use super::{library, output};
+use super::{library, output, pins};
 use crate::check::foreseen::verdict_on_config;
 use crate::check::verdict::LoadVerdict;
 use crate::checkpoint::open::{JSON_CAP, open_regular, read_capped, read_own};
@@ -48,10 +48,11 @@ struct Answer {
 /// Runs `expect`.
 pub fn run(args: &ExpectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let knowledge = library::knowledge(library::rules(rules)?, rules)?;
+    let version = args.target.as_deref().map(pins::one_transformers).transpose()?;
     let mut failed = false;
     let mut list = Vec::new();
     let mut answer = |input: Input| -> anyhow::Result<()> {
-        let answer = build(&knowledge, input, args.target.as_deref());
+        let answer = build(&knowledge, input, version.as_deref());
         failed |= answer.expected.is_err();
         match args.output_format {
             ExpectFormat::Text => output::print(&text(&answer)),

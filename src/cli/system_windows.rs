@@ -2,6 +2,7 @@
 
 use std::io;
 use std::path::PathBuf;
+use std::process::ExitStatus;
 use std::time::Duration;
 
 /// Width of the terminal at standard output, in columns; `None` when it does not tell.
@@ -18,6 +19,11 @@ pub fn shows_color() -> bool {
 /// Bytes of the stack of the main thread: what linkers reserve.
 pub const fn stack() -> Option<u64> {
     Some(1 << 20)
+}
+
+/// What ended a process: `exit code 101`.
+pub fn ended(status: ExitStatus) -> String {
+    format!("exit code {}", status.code().unwrap_or_default())
 }
 
 /// The file of this program, to start it again.

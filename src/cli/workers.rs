@@ -1,10 +1,10 @@
 //! Checks the directories of a zoo in workers: the program, started again with [`ARGUMENT`] and the arguments of the run.
 //!
-//! A worker reads the directories of the run and then numbers of those to check, and answers each with the report. One that is
-//! ended, by its own abort or by the kernel, costs the report of the directory that it was at, and no other.
+//! A worker reads the versions and the directories of the run and then numbers of those to check, and answers each with the
+//! report. One that is ended, by its own abort or by the kernel, costs the report of the directory that it was at, and no other.
 
 use std::ffi::{OsStr, OsString};
-use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
+use std::io::{self, BufRead, BufReader, Read as _, Write as _};
 use std::os::unix::ffi::{OsStrExt as _, OsStringExt as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -45,6 +45,27 @@ pub fn look(run: &CheckRun<'_>, dirs: &[PathBuf], workers: usize) -> Vec<Result<
     )
 }
 
+/// A list for a worker: each text and the list end with a zero.
+fn list<'t>(texts: impl Iterator<Item = &'t [u8]>) -> Vec<u8> {
+    let mut list: Vec<u8> = texts.flat_map(|text| [text, b"\0"].concat()).collect();
+    list.push(0);
+    list
+}
+
+/// Reads what [`list`] wrote.
+fn read_list(input: &mut impl BufRead) -> io::Result<Vec<OsString>> {
+    let mut list = Vec::new();
+    loop {
+        let mut text = Vec::new();
+        input.read_until(0, &mut text)?;
+        text.pop();
+        if text.is_empty() {
+            return Ok(list);
+        }
+        list.push(OsString::from_vec(text));
+    }
+}
+
 /// A process that checks directories, one after another.
 struct Worker {
     child: Child,
@@ -64,9 +85,9 @@ impl Worker {
             return Err(io::ErrorKind::BrokenPipe.into());
         };
         let mut worker = Self { child, input: Some(input), output: BufReader::new(output) };
-        let mut list: Vec<u8> = dirs.iter().flat_map(|dir| [dir.as_os_str().as_bytes(), b"\0"].concat()).collect();
-        list.push(0);
-        worker.tell(&list)?;
+        let versions = list(run.by.options.versions.iter().map(String::as_bytes));
+        worker.tell(&versions)?;
+        worker.tell(&list(dirs.iter().map(|dir| dir.as_os_str().as_bytes())))?;
         Ok(worker)
     }
 
@@ -117,20 +138,13 @@ pub fn main(args: impl Iterator<Item = OsString>) -> u8 {
 }
 
 fn serve(args: impl Iterator<Item = OsString>) -> anyhow::Result<()> {
-    let Cli { command: Subcommand::Check(args), rules } = Cli::try_parse_from(args)? else {
+    let Cli { command: Subcommand::Check(mut args), rules } = Cli::try_parse_from(args)? else {
         anyhow::bail!("only check has workers");
     };
     let mut input = io::stdin().lock();
-    let mut dirs = Vec::new();
-    loop {
-        let mut path = Vec::new();
-        input.read_until(0, &mut path)?;
-        path.pop();
-        if path.is_empty() {
-            break;
-        }
-        dirs.push(PathBuf::from(OsString::from_vec(path)));
-    }
+    // The run has read the files that pin them, and asked the interpreter.
+    args.versions = read_list(&mut input)?.into_iter().map(|version| version.to_string_lossy().into_owned()).collect();
+    let dirs: Vec<PathBuf> = read_list(&mut input)?.into_iter().map(PathBuf::from).collect();
     // The notes on the settings are those of the run.
     let run = output::silently(|| CheckRun::new(&args, rules.as_deref(), &dirs))?;
     let mut line = String::new();

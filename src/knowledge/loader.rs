@@ -206,6 +206,14 @@ impl Requirements {
         }
         all
     }
+
+    /// The list of texts that [`Self::new`] reads.
+    #[must_use]
+    pub fn texts(&self) -> Vec<String> {
+        let peft = self.peft.iter().map(|version| format!("{PEFT}{version}"));
+        let programs = self.programs.iter().map(|program| program.name().to_owned());
+        self.transformers.iter().cloned().chain(peft).chain(programs).collect()
+    }
 }
 
 /// The versions of a list that [`parse_requirement_or_all`] read; the start of a known version, `4.57`, is that one.
@@ -285,8 +293,9 @@ mod tests {
         assert_eq!(asked(&["all"]), ["4.47.0", "4.57.6", "5.23.0"]);
         assert_eq!(asked(&["4.57", "5", "4.5", "4.51.3"]), ["4.57.6", "5.23.0", "4.5", "4.51.3"]);
         let all = Requirements::new(&["peft==0.13.2", "4.57", "vllm"].map(|t| parse_program(t).unwrap()));
-        assert_eq!((all.peft, all.transformers), (vec!["0.13.2".to_owned()], vec!["4.57".to_owned()]));
+        assert_eq!((&*all.peft, &*all.transformers), (&["0.13.2".to_owned()][..], &["4.57".to_owned()][..]));
         assert_eq!(all.programs, [Program::Vllm]);
+        assert_eq!(all.texts(), ["4.57", "peft==0.13.2", "vllm"]);
         assert!(parse_program("vlm").unwrap_err().contains("vllm"));
         assert!(!parse_program("4.99").unwrap_err().contains("vllm"));
         assert!(parse_program("peft==new").is_err());

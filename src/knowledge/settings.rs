@@ -55,7 +55,7 @@ pub struct Settings {
     /// Whether weights may be missing, for copies of the documents alone; such a directory has no predicted load.
     #[serde(default, rename = "metadata-only")]
     pub metadata_only: Option<bool>,
-    /// Versions of transformers to predict the load for: `["transformers==4.47.0"]`.
+    /// Versions of transformers to predict the load for: `["transformers==4.47.0"]`, or `["@uv.lock"]` for those that a file pins.
     #[serde(default, rename = "for")]
     pub versions: Option<Vec<String>>,
     /// Folder with additional rules (`checks/`) and architectures (`architectures/`).

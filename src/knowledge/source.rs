@@ -30,6 +30,12 @@ impl DataError {
         Self { file: file.to_owned(), place: None, reason: reason.into() }
     }
 
+    /// An error in `file` at a line and column, from 1.
+    #[must_use]
+    pub fn at(file: &str, place: (usize, usize), reason: impl Into<String>) -> Self {
+        Self { place: Some(place), ..Self::new(file, reason) }
+    }
+
     /// An error in `file` at the first occurrence of `word` in `text`.
     #[must_use]
     pub fn about(file: &str, text: &str, word: &str, reason: impl Into<String>) -> Self {

@@ -4,6 +4,8 @@
 mod check;
 mod expect;
 #[cfg(unix)]
+mod pins;
+#[cfg(unix)]
 mod selection;
 #[cfg(target_os = "linux")]
 mod templates;

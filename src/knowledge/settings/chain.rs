@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use super::SettingsSource;
 use super::policy::Policy;
 use crate::knowledge::loader::{expanded, parse_program};
+use crate::knowledge::pins::read_pins;
 use crate::knowledge::rule::{RuleSet, Severity};
 use crate::knowledge::selection::{Choice, UnknownRule};
 use crate::knowledge::source::DataError;
@@ -78,13 +79,18 @@ impl Chain {
     /// Versions to predict the load for.
     ///
     /// # Errors
-    /// A text that is neither a requirement such as `transformers==4.47.0` nor `all`.
+    /// A text that is neither a requirement such as `transformers==4.47.0` nor `all`, and a file `@FILE` that pins no version.
     pub fn versions(&self) -> Result<Vec<String>, DataError> {
         let Some((source, versions)) = self.last(|s| Some((s, s.settings.versions.as_ref()?))) else {
             return Ok(Vec::new());
         };
-        let read = |text: &String| parse_program(text).map_err(|e| source.wrong(text, format!("for: {text}: {e}")));
-        Ok(expanded(versions.iter().map(read).collect::<Result<_, _>>()?))
+        let read = |text: &String| match text.strip_prefix('@') {
+            Some(file) => Ok(read_pins(&source.dir.join(file))?.texts()),
+            None => {
+                parse_program(text).map(|text| vec![text]).map_err(|e| source.wrong(text, format!("for: {text}: {e}")))
+            }
+        };
+        Ok(expanded(versions.iter().map(read).collect::<Result<Vec<_>, _>>()?.concat()))
     }
 
     /// Selects rules and sets their severities; the command line, `typed`, takes precedence over the files. Returns the

@@ -44,7 +44,8 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "init" -d 'W
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "completions" -d 'Print the completions for a shell'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "man" -d 'Print a page of the manual'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "help" -d 'Print this message or the help of the given subcommand(s)'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l for -d 'Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm, mlx-lm and llama.cpp for what is known of them; may be repeated [default: the version that wrote config.json, and the newest known of each major version]' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l for -d 'Predict the load for these versions: 4.57, transformers==4.57.3, or all; peft==0.13.2 for adapters; vllm, mlx-lm and llama.cpp for what is known of them; @FILE for those that a lock file, pyproject.toml or requirements file pins; may be repeated [default: the version that wrote config.json, and the newest known of each major version]' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l for-python -d 'As --for, for the versions of transformers and PEFT that this Python interpreter has: it is started to list them, and nothing of a model is run' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l follow-links -d 'Read files through symbolic links that lead into this directory; may be repeated. Other links out of a checkpoint are not followed, except into the Hub cache' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s j -l jobs -d 'Directories that are checked at once, each by a process of its own [default: one for each processor, at most 16]' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l select -d 'Run only these rules: codes, prefixes of codes (JSN) or names, comma-separated' -r
@@ -101,7 +102,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l language -d 'Short for --donor language=DIR' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l out -d 'Output directory; it must not exist, or be empty' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l set -d 'Set an option of the recipe; may be repeated' -r
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, or all; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
 blake3\t'BLAKE3'
@@ -135,7 +136,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l vision
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l language -d 'Short for --donor language=DIR' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l out -d 'Output directory; it must not exist, or be empty' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l set -d 'Set an option of the recipe; may be repeated' -r
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, or all; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
 blake3\t'BLAKE3'
@@ -254,7 +255,7 @@ never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s V -l version -d 'Print version'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand expect" -l for -d 'Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3; the nearest known version that has the class is used [default: the version that the config names]' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand expect" -l for -d 'Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3, or @FILE for the one that a lock file pins; the nearest known version that has the class is used [default: the version that the config names]' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand expect" -l output-format -d 'Output format; in jsonl, a config that fails has an "error" and the others are still printed' -r -f -a "text\t'One tensor per line'
 json\t'A list with one object per config'
 jsonl\t'One object per line and config'"
