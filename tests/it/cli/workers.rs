@@ -107,17 +107,23 @@ fn workers(parent: u32) -> Vec<String> {
 fn a_killed_worker_costs_one_directory() {
     let (room, dirs) = zoo();
     let document = room.path().join("report.json");
-    let mut command = program();
-    command.args(["check", "--isolated", "--jobs", "2", "--report"]).arg(format!("json={}", document.display()));
-    let mut run = command.args(&dirs).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let victim = loop {
-        assert!(run.try_wait().unwrap().is_none(), "the run ended before a worker was seen");
-        if let Some(victim) = workers(run.id()).pop() {
-            break victim;
-        }
+    let killed = || {
+        let mut command = program();
+        command.args(["check", "--isolated", "--jobs", "2", "--report"]).arg(format!("json={}", document.display()));
+        let mut run = command.args(&dirs).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let victim = loop {
+            assert!(run.try_wait().unwrap().is_none(), "the run ended before a worker was seen");
+            if let Some(victim) = workers(run.id()).pop() {
+                break victim;
+            }
+        };
+        // It may have ended meanwhile.
+        let _status = Command::new("kill").args(["-9", &victim]).stderr(Stdio::null()).status().unwrap();
+        run.wait_with_output().unwrap()
     };
-    assert!(Command::new("kill").args(["-9", &victim]).status().unwrap().success());
-    let output = run.wait_with_output().unwrap();
+    // On a busy machine the worker may be through when it is killed: then every directory has its report.
+    let output =
+        (0..20).map(|_| killed()).find(|output| output.status.code() != Some(1)).expect("a worker that is killed");
     let (unchecked, checked) = unchecked(&serde_json::from_slice(&fs::read(&document).unwrap()).unwrap());
     assert_eq!(output.status.code(), Some(2));
     assert_eq!((unchecked.len(), checked), (1, dirs.len() - 1), "{unchecked:#?}");
