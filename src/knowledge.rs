@@ -19,6 +19,7 @@ pub mod peft;
 pub mod pickles;
 pub mod pins;
 pub mod prediction;
+pub mod problems;
 pub mod processor;
 pub mod program;
 pub mod quantization;

@@ -179,9 +179,9 @@ pub enum ExpectFormat {
 /// Arguments of `explain`.
 #[derive(Debug, Args)]
 pub struct ExplainArgs {
-    /// Code, name or family of rules (IDX005, shard-missing, IDX), or name of a recipe
-    #[arg(value_name = "RULE|RECIPE")]
-    pub rule: String,
+    /// Code, name or family of rules (IDX005, shard-missing, IDX), name of a recipe, or the text of an error
+    #[arg(value_name = "RULE|RECIPE|ERROR", required = true)]
+    pub words: Vec<String>,
     /// Settings file selection.
     #[command(flatten)]
     pub settings: SettingsArgs,

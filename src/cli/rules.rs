@@ -3,12 +3,14 @@
 use std::fmt::{self, Write};
 use std::path::Path;
 
+use anyhow::bail;
 use comfy_table::{Table, presets};
 
 use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
 use super::settings::{Typed, resolve};
+use crate::knowledge::problems::{reported_problems, search};
 use crate::knowledge::rule::{Fix, Object, Rule, RuleSet, Safety, example};
 use crate::knowledge::settings::Surroundings;
 use crate::knowledge::{Loader, Template};
@@ -26,11 +28,13 @@ pub fn list(args: &SettingsArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let here = resolve(&Typed::new(&args.settings, rules), &Surroundings::new([]))?;
     let rules = &here.knowledge.rules;
-    let recipe = here.knowledge.recipes.iter().find(|recipe| recipe.recipe == args.rule);
-    let text = match (recipe, family(rules, &args.rule)) {
+    let words = args.words.join(" ");
+    let recipe = here.knowledge.recipes.iter().find(|recipe| recipe.recipe == words);
+    let text = match (recipe, family(rules, &words)) {
         (Some(recipe), _) => recipes::page(recipe),
         (None, Some(list)) => list,
-        (None, None) => page(rules.find(&args.rule)?)?,
+        (None, None) if words.trim().contains(char::is_whitespace) => error_page(rules, &words)?,
+        (None, None) => page(rules.find(&words)?)?,
     };
     output::print(&text)?;
     Ok(CLEAN)
@@ -41,6 +45,28 @@ fn table<'r, const N: usize>(rows: impl Iterator<Item = [&'r str; N]>) -> String
     table.load_style(presets::NOTHING);
     table.add_rows(rows);
     table.lines().fold(String::new(), |text, line| text + line.trim() + "\n")
+}
+
+/// The problems that the text of an error may come from.
+fn error_page(rules: &RuleSet, words: &str) -> anyhow::Result<String> {
+    let problems = reported_problems(rules)?;
+    let found = search(&problems, words);
+    if found.is_empty() {
+        bail!("no known problem has a text like this; `ckpt-doctor check DIR` tells what is wrong with a directory");
+    }
+    let mut out = String::from("Known problems with a text like this, the most similar first\n");
+    for problem in found {
+        writeln!(out, "\n{}\n  Error: {}\n  Cause: {}", problem.problem, problem.symptom, problem.cause)?;
+        match problem.code.as_ref().and_then(|code| rules.find(code).ok()) {
+            Some(rule) => writeln!(out, "  Rule: {} {}", rule.code, rule.name)?,
+            None => writeln!(out, "  Rule: none, the files do not show it")?,
+        }
+        if let Some(thread) = &problem.thread {
+            writeln!(out, "  Reported in: {thread}")?;
+        }
+    }
+    writeln!(out, "\n`ckpt-doctor check DIR` tells whether a directory has one of them.")?;
+    Ok(out)
 }
 
 /// Title and rules of a family; `None` if `word` is not a family.

@@ -78,8 +78,8 @@ pub(super) struct DonorFile {
 impl DonorFile {
     pub(super) fn open(path: &Path) -> Result<Self, ApplyError> {
         let opened = open_regular(path, u64::MAX).map_err(|error| match error {
-            OpenError::Io { source, .. } if is_out_of_descriptors(&source) => {
-                ApplyError::Descriptors { path: path.to_owned() }
+            OpenError::Io { source: error, .. } if is_out_of_descriptors(&error) => {
+                ApplyError::Descriptors { path: path.to_owned(), error }
             }
             error => ApplyError::Changed { path: path.to_owned(), reason: format!("became unreadable ({error})") },
         })?;

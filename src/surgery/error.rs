@@ -70,10 +70,12 @@ pub enum ApplyError {
         limit: String,
     },
     /// A donor's file cannot be opened, because too many files are open.
-    #[error("{path}: too many files are open; raise the limit on open files (`ulimit -n`); nothing was written", path = path.display())]
+    #[error("{path}: opening: {error}; raise the limit on open files (`ulimit -n`); nothing was written", path = path.display())]
     Descriptors {
         /// The donor's file.
         path: PathBuf,
+        /// The system's error.
+        error: io::Error,
     },
     /// A donor changed during the run.
     #[error("{path}: {reason} during the run; nothing was written, retry once nothing else modifies it", path = path.display())]

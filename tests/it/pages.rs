@@ -240,6 +240,7 @@ fn the_page_of_data_files_is_fresh() {
          | `lists.json5` | lists that the expressions of rules read with `listed(name)` |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\
          | `examples.json` | an example of each rule, generated from its fixtures |\n\
+         | `problems.json` | reported problems, which `explain` searches, generated from `fixtures/reported` |\n\
          | `expressions.txt` | the expressions of all these files, parsed; written by `CKPT_DOCTOR_WRITE=1 cargo test --lib` |\n\n\
          Files that people write are JSON5. The keys below come from the JSON Schemas in [`schemas/`](../schemas). *Expression* means an \
          expression in [CEL](https://cel.dev), and *template* a text with expressions in braces, in which `{{{{` and `}}}}` \

@@ -6,6 +6,7 @@
 //! `tests/peer/reported.py`, which opens them with the real loaders.
 
 mod page;
+mod search;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;

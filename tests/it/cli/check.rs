@@ -356,6 +356,13 @@ fn rules_can_be_chosen_listed_and_explained() {
     let one = doctor(&["explain", "shard-missing"]);
     assert_eq!(one.status.code(), Some(0));
     snapshot!("cli-explain", String::from_utf8(one.stdout).unwrap());
+    let error =
+        doctor(&["explain", "RuntimeError:", "size mismatch for lm_head.weight: copying a param with shape [7]"]);
+    snapshot!("cli-explain-error", String::from_utf8(error.stdout).unwrap());
+    let unknown = doctor(&["explain", "hello printer"]);
+    assert_eq!(unknown.status.code(), Some(2));
+    let said = String::from_utf8(unknown.stderr).unwrap();
+    assert!(said.starts_with("error: no known problem has a text like this; `ckpt-doctor check DIR` tells"), "{said}");
     let family = doctor(&["explain", "idx"]);
     let family = String::from_utf8(family.stdout).unwrap();
     assert!(family.starts_with("IDX: The index and its shards\n\nIDX001 "), "{family}");

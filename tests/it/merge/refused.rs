@@ -56,7 +56,10 @@ fn without_descriptors_the_limit_is_named() {
     let run = command.arg("--out").arg(&out).output().unwrap();
     assert_eq!(run.status.code(), Some(2), "{}", text(&run));
     let said = text(&run);
-    assert!(said.contains("too many files are open; raise the limit on open files (`ulimit -n`)"), "{said}");
+    assert!(
+        said.contains("opening: Too many open files (os error 24); raise the limit on open files (`ulimit -n`)"),
+        "{said}"
+    );
     assert!(!out.exists());
 }
 

@@ -4,9 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use ckpt_doctor::check::Safety;
+use ckpt_doctor::knowledge::problems::ReportedProblem;
 use serde_json::Value;
 
-use super::{Found, Problem, Rebuilt, found};
+use super::{Found, Problem, Rebuilt, found, problems};
 use crate::pages::{fresh, markdown};
 
 const HEAD: &str = "# Problems that users reported
@@ -68,6 +69,19 @@ fn entry(problem: &Problem, found: Option<&Found>) -> String {
         let _ = writeln!(out, "- Not visible in the files: {}", markdown(why));
     }
     out
+}
+
+#[test]
+fn embedded_problems_are_fresh() {
+    let embedded = |problem: Problem| ReportedProblem {
+        code: problem.case.map(|case| case.expect.code),
+        thread: problem.threads.into_iter().next(),
+        problem: problem.problem,
+        symptom: problem.symptom,
+        cause: problem.cause,
+    };
+    let all: Vec<ReportedProblem> = problems().into_iter().map(embedded).collect();
+    fresh("rules/problems.json", &format!("{}\n", serde_json::to_string_pretty(&all).expect("text")));
 }
 
 #[test]
