@@ -8,7 +8,7 @@
 //! use ckpt_doctor::{Checker, LoadVerdict, Severity};
 //!
 //! # fn main() -> Result<(), ckpt_doctor::Error> {
-//! let report = Checker::new().loader("4.57")?.check("fixtures/donors/llava3d-tiny")?;
+//! let report = Checker::new().loader("4.50")?.check("fixtures/donors/llava3d-tiny")?;
 //! for finding in &report.findings {
 //!     println!("{} {}: {}", finding.code, finding.name, finding.message);
 //! }
