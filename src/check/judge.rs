@@ -81,7 +81,7 @@ type ClassKey = (Loader, String, String);
 type LoadKey = (Loader, Option<String>, String, String);
 
 /// What is found for this key: known from another list of versions, or by `find`.
-fn remembered<T: Clone>(known: &RefCell<Vec<(LoadKey, T)>>, key: LoadKey, find: impl FnOnce() -> T) -> T {
+fn remembered<K: PartialEq, T: Clone>(known: &RefCell<Vec<(K, T)>>, key: K, find: impl FnOnce() -> T) -> T {
     if let Some((_, found)) = known.borrow().iter().find(|(of, _)| *of == key) {
         return found.clone();
     }
@@ -104,12 +104,7 @@ impl<'a> Inputs<'a> {
     /// As [`load::build`].
     fn build(&self, architecture: Architecture<'_>) -> Result<Expected, Refusal> {
         let key = (architecture.loader(), architecture.name().to_owned(), architecture.class().to_owned());
-        let known = self.memo.classes.borrow().iter().find(|(of, _)| *of == key).map(|(_, class)| class.clone());
-        known.unwrap_or_else(|| {
-            let class = load::build(architecture, self.config, self.stored);
-            self.memo.classes.borrow_mut().push((key, class.clone()));
-            class
-        })
+        remembered(&self.memo.classes, key, || load::build(architecture, self.config, self.stored))
     }
 
     fn is_plain(&self) -> bool {

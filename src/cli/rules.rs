@@ -57,8 +57,8 @@ fn error_page(rules: &RuleSet, words: &str) -> anyhow::Result<String> {
     let mut out = String::from("Known problems with a text like this, the most similar first\n");
     for problem in found {
         writeln!(out, "\n{}\n  Error: {}\n  Cause: {}", problem.problem, problem.symptom, problem.cause)?;
-        match problem.code.as_ref().and_then(|code| rules.find(code).ok()) {
-            Some(rule) => writeln!(out, "  Rule: {} {}", rule.code, rule.name)?,
+        match &problem.code {
+            Some(code) => writeln!(out, "  Rule: {code} {}", rules.find(code)?.name)?,
             None => writeln!(out, "  Rule: none, the files do not show it")?,
         }
         if let Some(thread) = &problem.thread {
