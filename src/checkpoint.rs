@@ -84,8 +84,8 @@ pub struct Checkpoint {
     pub source: Source,
     /// All entries of the directory that are not hidden, by name.
     pub entries: BTreeMap<String, Entry>,
-    /// JSON documents, by file name.
-    pub documents: BTreeMap<String, Document>,
+    /// JSON documents, by file name. Copies of a checkpoint share them.
+    pub documents: BTreeMap<String, Arc<Document>>,
     /// Shards on disk, by file name: safetensors files, including those that no index lists, and the pickles that a loader
     /// opens in their place.
     pub shards: BTreeMap<String, Shard>,
@@ -95,8 +95,8 @@ pub struct Checkpoint {
     pub index: Option<Index>,
     /// Python modules, by file name.
     pub modules: BTreeMap<String, PythonModule>,
-    /// The tokenizer.
-    pub tokenizer: Tokenizer,
+    /// The tokenizer. Copies of a checkpoint share it.
+    pub tokenizer: Arc<Tokenizer>,
     /// Text of files that are neither documents nor modules, by name: `chat_template.jinja`.
     pub texts: BTreeMap<String, Arc<str>>,
     /// The model card; `None` when README.md is absent or was not read.
@@ -153,37 +153,38 @@ impl Checkpoint {
         let mut checkpoint = Self {
             source: Source::Memory(MemoryFiles::empty(path)),
             entries,
-            documents: documents.into_iter().map(|d| (d.name.clone(), d)).collect(),
+            documents: documents.into_iter().map(|d| (d.name.clone(), Arc::new(d))).collect(),
             shards: shards.into_iter().map(|s| (s.name.clone(), s)).collect(),
             modules: modules.into_iter().map(|m| (m.name.clone(), m)).collect(),
             ..Self::default()
         };
-        checkpoint.derive(vocabularies);
+        checkpoint.derive_tokenizer(vocabularies);
+        checkpoint.derive_index();
         checkpoint
     }
 
     /// Clones the checkpoint with `parts` added; a part replaces the part of the same name.
     ///
-    /// Index and tokenizer are derived again. Entries of other files and the faults of the directory stay.
+    /// Index and tokenizer are derived again if their files are among the parts. Entries of other files and the faults of the
+    /// directory stay.
     #[must_use]
     pub fn replaced(&self, parts: Parts) -> Self {
-        let Parts { documents, shards, modules, mut vocabularies, entries } = parts;
+        let Parts { documents, shards, modules, vocabularies, entries } = parts;
         let mut next = Self { contents: Arc::default(), ..self.clone() };
+        let mut names = documents.iter().map(|d| &d.name).chain(vocabularies.keys()).chain(entries.keys());
+        let tokenizer_changes = names.any(|name| tokenizer::is_read(name));
+        let index_changes = documents.iter().any(|d| Index::is_index(&d.name) || d.name == files::PICKLE_INDEX);
+        let kept = self.tokenizer.vocabularies.iter().filter(|(name, _)| documents.iter().all(|d| d.name != **name));
+        let kept: BTreeMap<_, _> = kept.map(|(name, vocabulary)| (name.clone(), Arc::clone(vocabulary))).collect();
         next.entries.extend(entries);
         let mut entry = |name: &str, size: Option<u64>| {
             let entry = next.entries.entry(name.to_owned()).or_default();
             *entry = Entry { kind: EntryKind::Regular, size: size.unwrap_or(0), ..entry.clone() };
         };
         let len = |text: &Option<Arc<str>>| text.as_ref().and_then(|t| u64::try_from(t.len()).ok());
-        let own = |name: &str| tokenizer::VOCABULARY_FILES.contains(&name) && documents.iter().any(|d| d.name == name);
-        let kept = self.tokenizer.vocabularies.iter().filter(|(name, _)| !own(name));
-        for (name, vocabulary) in kept {
-            vocabularies.entry(name.clone()).or_insert_with(|| Arc::clone(vocabulary));
-        }
-        let indexed = documents.iter().any(|d| Index::is_index(&d.name) || d.name == files::PICKLE_INDEX);
         for document in documents {
             entry(&document.name, len(&document.text));
-            next.documents.insert(document.name.clone(), document);
+            next.documents.insert(document.name.clone(), Arc::new(document));
         }
         for module in modules {
             entry(&module.name, len(&module.text));
@@ -193,20 +194,26 @@ impl Checkpoint {
             entry(&shard.name, Some(shard.file_len));
             next.shards.insert(shard.name.clone(), shard);
         }
-        let (index, faults) = (next.index.take(), std::mem::take(&mut next.tokenizer.faults));
-        next.derive(vocabularies);
-        // The first pass moved faults of duplicate keys from the document to the index, so an unchanged index is kept.
-        if !indexed {
-            next.index = index;
+        if tokenizer_changes {
+            next.derive_tokenizer(kept.into_iter().chain(vocabularies).collect());
+            Arc::make_mut(&mut next.tokenizer).faults.clone_from(&self.tokenizer.faults);
         }
-        next.tokenizer.faults = faults;
+        // Faults of duplicate keys were moved from the document to the index, so an unchanged index is kept.
+        if index_changes {
+            next.index = None;
+            next.derive_index();
+        }
         next
     }
 
-    /// Derives index and tokenizer from the documents.
-    fn derive(&mut self, vocabularies: BTreeMap<String, Arc<Vocabulary>>) {
+    /// Derives the tokenizer from the documents and from vocabularies read before.
+    fn derive_tokenizer(&mut self, vocabularies: BTreeMap<String, Arc<Vocabulary>>) {
         let files = tokenizer::VOCABULARY_FILES.into_iter().filter(|f| self.has_file(f)).map(str::to_owned).collect();
-        self.tokenizer = Tokenizer::new(&self.documents, vocabularies, files);
+        self.tokenizer = Arc::new(Tokenizer::new(&self.documents, vocabularies, files));
+    }
+
+    /// Derives the index from its document.
+    fn derive_index(&mut self) {
         let name = if self.documents.contains_key(files::INDEX) {
             Some(files::INDEX.to_owned())
         } else {
@@ -214,7 +221,7 @@ impl Checkpoint {
             let pickles = || self.documents.keys().find(|name| *name == files::PICKLE_INDEX && only_pickles);
             self.documents.keys().find(|name| Index::is_index(name)).or_else(pickles).cloned()
         };
-        if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)) {
+        if let Some(document) = name.and_then(|name| self.documents.get_mut(&name)).map(Arc::make_mut) {
             self.index = Some(Index::from_document(document));
             // The index reports duplicate keys under a kind of its own.
             document.faults.retain(|f| f.kind != FaultKind::DuplicateJsonKey);
@@ -236,7 +243,7 @@ impl Checkpoint {
     /// The document of this file name, or of this path below a folder.
     #[must_use]
     pub fn document(&self, name: &str) -> Option<&Document> {
-        self.documents.get(name).or_else(|| self.nested.documents.get(name))
+        self.documents.get(name).or_else(|| self.nested.documents.get(name)).map(AsRef::as_ref)
     }
 
     /// The text of a document, Python module or model card, byte for byte; `None` for other files and when it is not

@@ -32,6 +32,7 @@ pub mod rule;
 pub mod scales;
 pub mod selection;
 pub mod settings;
+mod sorted;
 pub mod source;
 pub mod statistics;
 pub mod text_classes;

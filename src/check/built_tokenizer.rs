@@ -85,7 +85,7 @@ fn class_of<'k>(
         (Some(named), Some(own)) if named != own && is_overruled => own,
         (named, own) => named.or(own)?,
     };
-    built.classes.get(name).map(|class| (name, class))
+    built.class(name).map(|class| (name, class))
 }
 
 /// Whether a part of tokenizer.json is byte-level; `AutoTokenizer` then opens it as it is instead of as `LlamaTokenizer`.

@@ -4,7 +4,7 @@ use crate::checkpoint::files;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use indexmap::IndexMap;
-use serde_json::Value;
+use serde_json::{Map, Value};
 use unicode_normalization::UnicodeNormalization as _;
 
 use super::model_type::is_model;
@@ -59,8 +59,10 @@ pub fn all_read(checkpoint: &Checkpoint) -> bool {
 /// and was read, and every key of the index is in a shard.
 pub(super) fn is_complete(checkpoint: &Checkpoint) -> bool {
     let map = checkpoint.index.as_ref().and_then(|index| checkpoint.document(&index.document)?.get("/weight_map"));
-    let listed = map.and_then(Value::as_object).into_iter().flat_map(|map| map.keys());
-    let held: HashSet<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+    let holds_all = |listed: &Map<String, Value>| {
+        let held: HashSet<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+        listed.keys().all(|name| held.contains(name.as_str()))
+    };
     let mut families: BTreeMap<(&str, u32), BTreeSet<u32>> = BTreeMap::new();
     for (prefix, number, count) in shard_names(checkpoint).into_iter().filter_map(numbered) {
         families.entry((prefix, count)).or_default().insert(number);
@@ -68,7 +70,7 @@ pub(super) fn is_complete(checkpoint: &Checkpoint) -> bool {
     let whole = |count: u32, numbers: &BTreeSet<u32>| usize::try_from(count).is_ok_and(|count| numbers.len() >= count);
     all_read(checkpoint)
         && checkpoint.shards.values().all(|shard| shard.unreadable.is_empty())
-        && listed.into_iter().all(|name| held.contains(name.as_str()))
+        && map.and_then(Value::as_object).is_none_or(holds_all)
         && families.iter().all(|((_, count), numbers)| whole(*count, numbers))
 }
 

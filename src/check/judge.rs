@@ -69,16 +69,13 @@ struct Inputs<'a> {
 /// the same in each.
 #[derive(Debug, Default)]
 pub struct Memo {
-    reports: RefCell<Vec<(LoadKey, Option<LoadReport>)>>,
-    causes: RefCell<Vec<(LoadKey, FoundCauses)>>,
+    reports: RefCell<Vec<(ClassKey, Option<LoadReport>)>>,
+    causes: RefCell<Vec<(ClassKey, FoundCauses)>>,
     classes: RefCell<Vec<(ClassKey, Result<Expected, Refusal>)>>,
 }
 
 /// The loader, the architecture and the class.
 type ClassKey = (Loader, String, String);
-
-/// The loader, the version that it stands for, the architecture and the class.
-type LoadKey = (Loader, Option<String>, String, String);
 
 /// What is found for this key: known from another list of versions, or by `find`.
 fn remembered<K: PartialEq, T: Clone>(known: &RefCell<Vec<(K, T)>>, key: K, find: impl FnOnce() -> T) -> T {
@@ -90,9 +87,8 @@ fn remembered<K: PartialEq, T: Clone>(known: &RefCell<Vec<(K, T)>>, key: K, find
     found
 }
 
-fn load_key(target: &Target, architecture: Architecture<'_>) -> LoadKey {
-    let stands_for = target.stands_for.clone();
-    (target.loader, stands_for, architecture.name().to_owned(), architecture.class().to_owned())
+fn class_key(architecture: Architecture<'_>) -> ClassKey {
+    (architecture.loader(), architecture.name().to_owned(), architecture.class().to_owned())
 }
 
 impl<'a> Inputs<'a> {
@@ -103,8 +99,7 @@ impl<'a> Inputs<'a> {
 
     /// As [`load::build`].
     fn build(&self, architecture: Architecture<'_>) -> Result<Expected, Refusal> {
-        let key = (architecture.loader(), architecture.name().to_owned(), architecture.class().to_owned());
-        remembered(&self.memo.classes, key, || load::build(architecture, self.config, self.stored))
+        remembered(&self.memo.classes, class_key(architecture), || load::build(architecture, self.config, self.stored))
     }
 
     fn is_plain(&self) -> bool {

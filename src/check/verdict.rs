@@ -165,15 +165,18 @@ impl Basis<'_> {
         self.checkpoint.shards.values().any(|shard| shard.is_sound() || !shard.tensors.is_empty())
     }
 
-    /// The first file beside config.json that transformers opens for a model and that was not read, and why. Of a file that the
-    /// loader cannot read either, findings tell what it does.
-    fn unread(&self) -> Option<(&str, NotRead)> {
+    /// The first file that transformers opens for an object, beside config.json, and that was not read, and why. Of a file that
+    /// the loader cannot read either, findings tell what it does.
+    fn unread(&self, object: Object) -> Option<(&str, NotRead)> {
+        let is_model = object == Object::Model;
         let index = self.checkpoint.index.iter().map(|index| index.document.as_str());
-        let documents = index.chain([files::ADAPTER_CONFIG, files::GENERATION_CONFIG]);
-        let documents = documents.filter_map(|name| self.checkpoint.document(name));
+        let of_model = index.chain([files::ADAPTER_CONFIG, files::GENERATION_CONFIG]).filter(|_| is_model);
+        let own = self.checkpoint.documents.keys().map(String::as_str);
+        let own = own.filter(|name| !is_model && Object::reading(name) == Some(object));
+        let documents = of_model.chain(own).filter_map(|name| self.checkpoint.document(name));
         let documents = documents.map(|document| (document.name.as_str(), document.not_read));
         let shards = self.checkpoint.shards.values();
-        let opened = shards.filter(|shard| index::is_opened(self.checkpoint, &shard.name));
+        let opened = shards.filter(|shard| is_model && index::is_opened(self.checkpoint, &shard.name));
         let opened = opened.map(|shard| (shard.name.as_str(), shard.not_read));
         let mut unread = documents.chain(opened).filter_map(|(name, not_read)| Some((name, not_read?)));
         unread.find(|(_, not_read)| *not_read != NotRead::Unreadable)
@@ -197,8 +200,8 @@ impl Basis<'_> {
         let (mut verdict, mut why) = self.alone(object, loader);
         // The exception that ends the predicted load is exact; of anything else, a finding tells more.
         let is_exact = object == Object::Model && self.report(loader).is_some_and(|report| report.raises.is_some());
-        // Of weights that were not read, it is not known that they load at all.
-        let is_unread = object == Object::Model && self.unread().is_some();
+        // Of files that were not read, it is not known that they load at all.
+        let is_unread = self.unread(object).is_some();
         let counts = |effect: &FindingEffect| !is_unread || effect.outcome == Consequence::Raises;
         if let Some((_, worst)) = effects()
             .rev()
@@ -230,8 +233,13 @@ impl Basis<'_> {
 
     /// The verdict on an object without the effects of findings.
     fn alone(&self, object: Object, loader: &str) -> (LoadVerdict, Option<String>) {
+        let not_read = || {
+            let (file, not_read) = self.unread(object)?;
+            Some((LoadVerdict::NotPredicted, Some(format!("{file} {}, and was not read", not_read.words()))))
+        };
         if object != Object::Model || is_program(loader) {
-            return (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
+            let known = (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
+            return not_read().filter(|_| object != Object::Model).unwrap_or(known);
         }
         if self.checkpoint.config().is_none() {
             return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));
@@ -245,9 +253,8 @@ impl Basis<'_> {
         if let Some((shard, doubt)) = self.doubt() {
             return (LoadVerdict::NotPredicted, Some(format!("{shard} was not understood: {doubt}")));
         }
-        if let Some((file, not_read)) = self.unread() {
-            let why = format!("{file} {}, and was not read", not_read.words());
-            return (LoadVerdict::NotPredicted, Some(why));
+        if let Some(verdict) = not_read() {
+            return verdict;
         }
         match self.report(loader) {
             Some(_) if !self.was_read() => {

@@ -6,6 +6,7 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::Arc;
 
 use globset::GlobSet;
 
@@ -46,10 +47,10 @@ pub(super) fn mark_pointers(checkpoint: &mut Checkpoint, trusts: &dyn Fn(&Path) 
             fault.detail.insert("tracked".to_owned(), true.into());
         }
     };
-    let documents = checkpoint.documents.values_mut().flat_map(|d| &mut d.faults);
+    let documents = checkpoint.documents.values_mut().flat_map(|d| &mut Arc::make_mut(d).faults);
     let shards = checkpoint.shards.values_mut().flat_map(|s| &mut s.faults);
     let modules = checkpoint.modules.values_mut().flat_map(|m| &mut m.faults);
-    let others = checkpoint.faults.iter_mut().chain(&mut checkpoint.tokenizer.faults);
+    let others = checkpoint.faults.iter_mut().chain(&mut Arc::make_mut(&mut checkpoint.tokenizer).faults);
     documents.chain(shards).chain(modules).chain(others).for_each(mark);
 }
 

@@ -4,6 +4,7 @@
 //! of a training run. So faults of these documents are not reported here.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
 
 use super::budget::Budget;
 use super::open::JSON_CAP;
@@ -20,7 +21,7 @@ pub struct Nested {
     /// Paths from the checkpoint, with `/`; those of folders end with it: `unet/`, `unet/config.json`.
     pub names: BTreeSet<String>,
     /// Documents by these paths.
-    pub documents: BTreeMap<String, Document>,
+    pub documents: BTreeMap<String, Arc<Document>>,
 }
 
 /// Whether the document at this path is read: the configs of the parts of a pipeline (diffusers) and of the modules of a
@@ -70,7 +71,7 @@ impl Nested {
             Err(error) => Document::unread(path, &error),
         };
         budget.spend_values(&document);
-        self.documents.insert(path.to_owned(), document);
+        self.documents.insert(path.to_owned(), Arc::new(document));
     }
 }
 

@@ -153,9 +153,10 @@ fn read(source: Source) -> Result<Checkpoint, OpenError> {
         checkpoint.faults.push(foreign_journal(&JournalDistrust::Unverified));
     }
     checkpoint.place_pickles();
-    checkpoint.derive(vocabularies);
+    checkpoint.derive_tokenizer(vocabularies);
+    checkpoint.derive_index();
     checkpoint.base = AdapterBase::read(&checkpoint, &mut budget);
-    checkpoint.tokenizer.faults.extend(vocabulary_faults);
+    Arc::make_mut(&mut checkpoint.tokenizer).faults.extend(vocabulary_faults);
     Ok(checkpoint)
 }
 
@@ -217,7 +218,7 @@ impl SourceReader {
             let module = PythonModule { name: name.to_owned(), unread: true, ..PythonModule::default() };
             self.checkpoint.modules.insert(name.to_owned(), module);
         } else if !is_left && is_document(name) {
-            self.checkpoint.documents.insert(name.to_owned(), Document::over_budget(name));
+            self.checkpoint.documents.insert(name.to_owned(), Arc::new(Document::over_budget(name)));
         }
     }
 
@@ -304,7 +305,7 @@ impl SourceReader {
                     Ok(bytes) => Document::parse(name, &bytes),
                     Err(error) => Document::unread(name, &error),
                 };
-                self.checkpoint.documents.insert(name.to_owned(), document);
+                self.checkpoint.documents.insert(name.to_owned(), Arc::new(document));
             }
             Some(content @ FileContent::Module) => {
                 let module = match read(content) {

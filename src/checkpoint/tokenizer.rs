@@ -26,6 +26,12 @@ pub const VOCABULARY_FILES: [&str; 8] = [
     files::TIKTOKEN_MODEL,
 ];
 
+/// Whether [`Tokenizer::new`] reads a file of this name.
+pub(super) fn is_read(name: &str) -> bool {
+    [files::TOKENIZER_CONFIG, files::ADDED_TOKENS, files::SPECIAL_TOKENS].contains(&name)
+        || VOCABULARY_FILES.contains(&name)
+}
+
 /// Whether a file of this name is the vocabulary of a tokenizer, or a part of it.
 #[must_use]
 pub fn is_vocabulary(name: &str) -> bool {
@@ -112,7 +118,7 @@ impl Tokenizer {
     /// `files` lists the vocabulary files that exist, readable or not.
     #[must_use]
     pub fn new(
-        documents: &BTreeMap<String, Document>,
+        documents: &BTreeMap<String, Arc<Document>>,
         mut vocabularies: BTreeMap<String, Arc<Vocabulary>>,
         files: BTreeSet<String>,
     ) -> Self {
@@ -325,10 +331,10 @@ impl Tokenizer {
 
     /// Computes ids and length as transformers does on load: stated tokens first, then special ones.
     fn resolve(&mut self) {
-        let base = self.base().cloned();
+        let base = self.source.as_ref().and_then(|source| self.vocabularies.get(source)).cloned();
         let fast = self.source.as_deref() == Some(files::TOKENIZER);
         let in_base = |token: &str| base.as_ref().is_some_and(|b| b.id_of(token).is_some());
-        let base_len = base.as_ref().map_or(0, Vocabulary::len);
+        let base_len = base.as_ref().map_or(0, |base| base.len());
         let mut ids: BTreeMap<String, u64> = BTreeMap::new();
         let stated = self.added_tokens_decoder.as_ref().or(self.added_tokens_json.as_ref());
         let mut later: Vec<&str> = Vec::new();

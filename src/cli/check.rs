@@ -111,7 +111,7 @@ impl CheckRun<'_> {
         }
         note_unchecked(&results.unchecked);
         let fix = &self.args.fix;
-        let changes = shown.iter().map(|c| fix::show(fix, &c.dir, &c.checkpoint, &c.outcome, &judge_by(&self.by)));
+        let changes = shown.iter().map(|c| fix::show(fix, &c.dir, &c.checkpoint, &c.outcome, &judge_by(self.by)));
         let changes = changes.sum::<anyhow::Result<usize>>()?;
         Ok(results.exit(changes > 0))
     }

@@ -57,7 +57,8 @@ impl From<anyhow::Error> for Stop {
 /// Options of a run, and what surrounds the directories that it checks.
 pub struct CheckRun<'a> {
     pub args: &'a CheckArgs,
-    pub by: Resolved,
+    /// It lives until the process ends, as the run does, so that nothing is freed value by value.
+    pub by: &'static Resolved,
     surroundings: Surroundings,
     /// Real paths of `--follow-links`.
     followed: Arc<[PathBuf]>,
@@ -67,7 +68,7 @@ impl<'a> CheckRun<'a> {
     /// The options of a run on these directories.
     pub fn new(args: &'a CheckArgs, rules: Option<&Path>, dirs: &[PathBuf]) -> anyhow::Result<Self> {
         let surroundings = Surroundings::new(args.paths.iter().chain(dirs).map(PathBuf::as_path));
-        let by = resolve(&Typed::check(args, rules), &surroundings)?;
+        let by = Box::leak(Box::new(resolve(&Typed::check(args, rules), &surroundings)?));
         let real = |dir: &PathBuf| dir.canonicalize().with_context(|| format!("--follow-links {}", dir.display()));
         let followed = args.follow_links.iter().map(real).collect::<anyhow::Result<_>>()?;
         Ok(Self { args, by, surroundings, followed })
@@ -115,7 +116,7 @@ impl<'a> CheckRun<'a> {
         let outcome = if self.args.fix.writes() || self.args.fix.diff {
             check_for(&checkpoint, &self.by.knowledge, &self.by.options)
         } else {
-            check_by(&self.by)(&checkpoint)
+            check_by(self.by)(&checkpoint)
         };
         let checked = Checked { dir: dir.to_owned(), checkpoint, outcome, repaired: Default::default() };
         self.refuse_unusable(&checked)?;
@@ -137,12 +138,10 @@ impl<'a> CheckRun<'a> {
         }
         let Checked { dir, checkpoint, outcome, .. } = checked;
         let repaired =
-            fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &judge_by(&self.by))?;
+            fix::repair(&self.args.fix, dir, &checkpoint, outcome, &|dir| self.open(dir), &judge_by(self.by))?;
         let fix::Repaired { dir, checkpoint, outcome, fixed, withdrawn } = repaired;
-        let outcome = outcome.map_or_else(
-            || check_by(&self.by)(&checkpoint),
-            |outcome| tried(&checkpoint, outcome, &judge_by(&self.by)),
-        );
+        let outcome = outcome
+            .map_or_else(|| check_by(self.by)(&checkpoint), |outcome| tried(&checkpoint, outcome, &judge_by(self.by)));
         Ok(Checked { dir, checkpoint, outcome, repaired: (fixed, withdrawn) })
     }
 }

@@ -25,7 +25,8 @@ pub use refusal::Refusal;
 
 use super::{Evidence, Library, Loader};
 
-/// Tensors an architecture may have; a config that asks for more is refused.
+/// Tensors that a config may ask for whatever is stored; one that asks for more, and for more than twice what is stored, is
+/// refused. Kimi K2 has 70 000.
 pub const TENSOR_CAP: usize = 60_000;
 
 /// Depth of configs within configs, and of parts within parts.

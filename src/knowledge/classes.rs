@@ -1,10 +1,9 @@
 //! The tokenizer and processor classes that versions of transformers open by the names in files.
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 
 use super::by_version::ByVersion;
+use super::sorted::SortedMap;
 use super::source::DataError;
 
 /// A thing whose class a file names.
@@ -50,11 +49,11 @@ impl ClassKind {
 }
 
 /// Model types by class name: those whose checkpoints have it.
-type Classes = BTreeMap<String, Vec<String>>;
+type Classes = SortedMap<Vec<&'static str>>;
 
 /// The classes of one version.
 #[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, bound(deserialize = "'de: 'static"))]
 struct Lists {
     tokenizer: Classes,
     image_processor: Classes,
@@ -62,7 +61,7 @@ struct Lists {
     feature_extractor: Classes,
     processor: Classes,
     /// Parts that a processor opens by a class of its own, whatever the files name.
-    fixed: BTreeMap<String, Vec<ClassKind>>,
+    fixed: SortedMap<Vec<ClassKind>>,
 }
 
 impl Lists {
@@ -79,7 +78,7 @@ impl Lists {
     /// The class that checkpoints of this model type name.
     fn of_model_type(&self, kind: ClassKind, model_type: &str) -> Option<&str> {
         let mut classes = self.of(kind).iter();
-        classes.find(|(_, types)| types.iter().any(|t| t == model_type)).map(|(name, _)| name.as_str())
+        classes.find(|(_, types)| types.contains(&model_type)).map(|(name, _)| name)
     }
 }
 
@@ -139,7 +138,7 @@ impl ClassNames {
     #[must_use]
     pub fn in_other_case(&self, kind: ClassKind, name: &str) -> Option<&str> {
         let mut names = self.versions.values().rev().flat_map(|lists| lists.of(kind).keys());
-        names.find(|other| other.eq_ignore_ascii_case(name) && *other != name).map(String::as_str)
+        names.find(|other| other.eq_ignore_ascii_case(name) && *other != name)
     }
 }
 

@@ -1,27 +1,26 @@
 //! Modules of transformers, and names in them, that a version lacks and another one has.
 
-use std::collections::{BTreeMap, BTreeSet};
-
 use serde::Deserialize;
 
 use super::by_version::ByVersion;
+use super::sorted::SortedMap;
 use super::source::DataError;
 
 /// What one version lacks.
 #[derive(Debug, Clone, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, bound(deserialize = "'de: 'static"))]
 struct Lacking {
-    /// Dotted names of modules and packages; what is in a missing package is not listed.
-    modules: BTreeSet<String>,
+    /// Dotted names of modules and packages, sorted; what is in a missing package is not listed.
+    modules: Vec<&'static str>,
     /// Names by module, separated by blanks.
-    names: BTreeMap<String, String>,
+    names: SortedMap<&'static str>,
 }
 
 impl Lacking {
     fn has_module(&self, module: &str) -> bool {
         let ends = module.match_indices('.').map(|(end, _)| end).chain([module.len()]);
         let mut parents = ends.filter_map(|end| module.get(..end));
-        !parents.any(|parent| self.modules.contains(parent))
+        !parents.any(|parent| self.modules.binary_search(&parent).is_ok())
     }
 
     fn lacks(&self, module: &str, name: &str) -> bool {
@@ -33,8 +32,8 @@ impl Lacking {
 fn has_word(text: &str, word: &str) -> bool {
     let is_edge = |byte: Option<&u8>| byte.is_none_or(|byte| *byte == b' ');
     let bytes = text.as_bytes();
-    let mut found = text.match_indices(word);
-    found.any(|(at, _)| {
+    let mut found = memchr::memmem::find_iter(bytes, word);
+    found.any(|at| {
         is_edge(at.checked_sub(1).and_then(|before| bytes.get(before)))
             && is_edge(at.checked_add(word.len()).and_then(|after| bytes.get(after)))
     })

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Deserialize;
 
 use super::by_version::ByVersion;
+use super::sorted::{Lazy, SortedMap};
 use super::source::DataError;
 use super::statistics::Pattern;
 
@@ -31,16 +32,24 @@ pub struct BuiltTokenizer {
 
 /// The classes of one version.
 #[derive(Debug, Clone, Default, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default, deny_unknown_fields, bound(deserialize = "'de: 'static"))]
 pub struct BuiltTokenizers {
     /// By the name without `Fast`.
-    pub classes: BTreeMap<String, BuiltTokenizer>,
+    classes: SortedMap<Lazy<BuiltTokenizer>>,
     /// Model types whose own class is opened whatever `tokenizer_config.json` names.
-    pub overruled: BTreeSet<String>,
+    pub overruled: BTreeSet<&'static str>,
     /// Patterns of `_name_or_path`, in lower case, with which tokenizer.json is opened as it is.
     pub as_is: Vec<Pattern>,
     /// Classes of transformers 4 that do not keep the post-processor of tokenizer.json, by the name without `Fast`.
-    replaces: BTreeSet<String>,
+    replaces: BTreeSet<&'static str>,
+}
+
+impl BuiltTokenizers {
+    /// The class of this name without `Fast`.
+    #[must_use]
+    pub fn class(&self, name: &str) -> Option<&BuiltTokenizer> {
+        self.classes.get(name)?.get()
+    }
 }
 
 /// `rules/tokenizers.json`, which `tools/loader_tokenizers.py` writes. transformers 4 opens tokenizer.json as it is, so its

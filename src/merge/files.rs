@@ -1,7 +1,6 @@
 //! The files of a merge: documents, copies, Python modules, templates and the index; `config.json` is written last.
 
 use crate::checkpoint::files;
-use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -150,10 +149,10 @@ fn copy_of(
     if name.to_ascii_lowercase().ends_with(".json") && &**name != files::VOCAB_JSON {
         let read = donor.checkpoint.documents.get(&**name);
         let read = read.filter(|d| d.text.as_deref().is_some_and(|text| text.as_bytes() == bytes));
-        let document = read.map_or_else(|| Cow::Owned(Document::parse(&**name, &bytes)), Cow::Borrowed);
+        let document = read.map_or_else(|| Arc::new(Document::parse(&**name, &bytes)), Arc::clone);
         stripped = draft.stripped_copy(role, name, &document)?;
         if stripped.is_none() {
-            draft.documents.push(document.into_owned());
+            draft.documents.push(Arc::unwrap_or_clone(document));
         }
     }
     let (bytes, how) = stripped.map_or_else(|| (bytes.into(), "unchanged"), |stripped| (stripped, "edited"));

@@ -1,7 +1,7 @@
 //! The fourth stage: causes of what a load report lists. One wrong prefix or config value explains many tensors.
 
 use super::predict::{Prediction, finished};
-use super::{Inputs, load_key, remembered};
+use super::{Inputs, class_key, remembered};
 use crate::check::load::{self, LoadReport, Moved};
 use crate::check::votes::{self, Explanation, Vote};
 use crate::checkpoint::Fault;
@@ -48,13 +48,16 @@ fn explain_one<'a>(inputs: &Inputs<'_>, prediction: Prediction<'a>) -> Explained
     let Some(report) = report.as_ref().filter(|_| is_searched) else {
         return ExplainedLoad { prediction, prefixes: Vec::new(), explanation: None };
     };
-    let key = load_key(target, *architecture);
-    let (prefixes, explanation) = remembered(&inputs.memo.causes, key, || search(inputs, &prediction, report));
+    let key = class_key(*architecture);
+    let (prefixes, mut explanation) = remembered(&inputs.memo.causes, key, || search(inputs, &prediction, report));
+    if let Some(explanation) = &mut explanation {
+        explanation.rest.stands_for.clone_from(&target.stands_for);
+    }
     ExplainedLoad { prediction, prefixes, explanation }
 }
 
 fn search(inputs: &Inputs<'_>, prediction: &Prediction<'_>, report: &LoadReport) -> FoundCauses {
-    let Prediction { target, architecture, expected, .. } = prediction;
+    let Prediction { architecture, expected, .. } = prediction;
     let moved = load::moved(&inputs.knowledge.wrappers, *architecture, inputs.config, expected, inputs.stored, report);
     // Tensors under another prefix load nowhere, but their shapes still imply config values.
     let (class, stored, moved_report) =
@@ -65,8 +68,8 @@ fn search(inputs: &Inputs<'_>, prediction: &Prediction<'_>, report: &LoadReport)
         (Some(explanation), Some(moved)) => (Some(explanation), moved.faults),
         (None, Some(Moved { report, faults, .. })) => (Some(Explanation { votes: Vec::new(), rest: report }), faults),
     };
-    let explanation = explanation
-        .map(|Explanation { votes, rest }| Explanation { votes, rest: finished(inputs.checkpoint, target, rest) });
+    let explanation =
+        explanation.map(|Explanation { votes, rest }| Explanation { votes, rest: finished(inputs.checkpoint, rest) });
     (prefixes, explanation)
 }
 

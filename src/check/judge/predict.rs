@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 
 use super::classes::BuiltClass;
-use super::{Inputs, load_key, remembered};
+use super::{Inputs, class_key, remembered};
 use crate::check::index;
 use crate::check::load::{self, LoadReport, Target};
 use crate::check::quantization::Quantised;
@@ -28,9 +28,12 @@ pub(super) fn predict<'a>(inputs: &'a Inputs<'a>, built: Vec<BuiltClass<'a>>) ->
     let predicted = built.into_iter().filter_map(|one| {
         let expected = one.class.ok()?;
         let quantised = quantised(inputs, inputs.scheme_of(one.target.loader), Some(&expected));
-        let report = remembered(&inputs.memo.reports, load_key(&one.target, one.architecture), || {
+        let mut report = remembered(&inputs.memo.reports, class_key(one.architecture), || {
             report(inputs, &one.target, &expected, quantised.as_ref())
         });
+        if let Some(report) = &mut report {
+            report.stands_for.clone_from(&one.target.stands_for);
+        }
         Some(Prediction { target: one.target, architecture: one.architecture, expected, quantised, report })
     });
     predicted.collect()
@@ -64,11 +67,11 @@ fn report(
         Some(quantised) => quantised.spelled(report)?,
         None => report,
     };
-    Some(finished(inputs.checkpoint, target, report))
+    Some(finished(inputs.checkpoint, report))
 }
 
 /// Removes from a report what the files themselves explain.
-pub(super) fn finished(checkpoint: &Checkpoint, target: &Target, mut report: LoadReport) -> LoadReport {
+pub(super) fn finished(checkpoint: &Checkpoint, mut report: LoadReport) -> LoadReport {
     // A tensor whose header entry could not be read exists.
     let unreadable: BTreeSet<&str> =
         checkpoint.shards.values().flat_map(|s| &s.unreadable).map(String::as_str).collect();
@@ -80,7 +83,6 @@ pub(super) fn finished(checkpoint: &Checkpoint, target: &Target, mut report: Loa
     report.mismatched.retain(|m| !impossible.contains(m.name.as_str()));
     // A tensor that is overwritten by an equal one loses nothing.
     report.silent.retain(|s| s.by.as_deref().and_then(|by| same_bytes(checkpoint, &s.name, by)) != Some(true));
-    report.stands_for.clone_from(&target.stands_for);
     report
 }
 

@@ -84,6 +84,15 @@ fn the_version_that_wrote_the_config_leads() {
 }
 
 #[test]
+fn a_loader_that_leads_for_another_is_judged_as_itself() {
+    let case = Case::new("spatialvla-tiny").set("transformers_version", json!("5.23.0"));
+    let inputs = case.inputs();
+    let targets = resolve_targets(&inputs);
+    let leading: Vec<_> = targets.iter().filter(|one| one.target.leads).map(|one| one.target.version()).collect();
+    assert_eq!(leading, ["4.47.0"]);
+}
+
+#[test]
 fn versions_that_the_user_names_all_lead() {
     let case = Case::new("spatialvla-tiny").versions(&["4.47.0", "4.46.1"]);
     let inputs = case.inputs();

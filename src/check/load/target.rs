@@ -42,10 +42,10 @@ impl Target {
             || self.versions.iter().any(|version| version == self.loader.version())
     }
 
-    /// Lets it lead in place of the loader of `version`, which does not know the class.
-    pub(in crate::check) fn lead(&mut self, version: Option<&str>) {
+    /// Lets it lead in place of the loader of the version that wrote config.json, which does not know the class. It is still
+    /// judged as its own version.
+    pub(in crate::check) const fn lead(&mut self) {
         self.leads = true;
-        self.stands_for = version.filter(|v| *v != self.loader.version()).map(str::to_owned);
     }
 }
 
@@ -111,7 +111,6 @@ pub fn targets<'l>(
     names: &[&str],
     named: &[String],
 ) -> Vec<(Target, Architecture<'l>)> {
-    let version = config.get("transformers_version").and_then(Value::as_str);
     let mut known: Vec<(Target, Architecture<'l>)> = Vec::new();
     for (version, leads) in versions(Some(config), named) {
         let Some((loader, architecture)) = library.stands_for(version, config, names) else { continue };
@@ -130,7 +129,7 @@ pub fn targets<'l>(
             known.extend(other.map(|(loader, class)| (Target::new(loader, loader.version(), true, false), class)));
         }
         if let Some((target, _)) = known.first_mut() {
-            target.lead(version);
+            target.lead();
         }
     }
     known

@@ -32,7 +32,8 @@ pub(super) fn build(
     let Architecture { library, file, class, loader } = architecture;
     let written = own_config(file, loader, config);
     let resolver = Resolver { library, loader, evidence };
-    let mut builder = Builder { resolver, expected: Expected::default(), modules: Vec::new(), steps: 0 };
+    let cap = TENSOR_CAP.max(evidence.iter().count().saturating_mul(2));
+    let mut builder = Builder { resolver, expected: Expected::default(), modules: Vec::new(), steps: 0, cap };
     let mut read = written.clone();
     // No template reads which modules a loader would fetch, and hostile ones are many.
     read.shift_remove("auto_map");
@@ -108,6 +109,8 @@ struct Builder<'l> {
     /// The models visited so far, outermost first.
     modules: Vec<Module<'l>>,
     steps: usize,
+    /// Tensors that the class may have.
+    cap: usize,
 }
 
 /// The model type of a part's config that is none of those of the one class which the description has there.
@@ -244,9 +247,9 @@ impl<'l> Builder<'l> {
             return Err(Refusal::impossible(format!("{words}: no layer is built")));
         }
         let count_of = count.eval_u64(scope)?;
-        if count_of > TENSOR_CAP as u64 {
+        if count_of > self.cap as u64 {
             let words = around.origin.words(count, &count_of.into());
-            return Err(self.too_many(format!("{words}, more than {TENSOR_CAP} tensors")));
+            return Err(self.too_many(format!("{words}, more than {} tensors", self.cap)));
         }
         // Of the experts of a layer one condition decides, which costs more than the tensors of one.
         let shared = member.when.as_ref().filter(|when| {
@@ -285,8 +288,8 @@ impl<'l> Builder<'l> {
         place: Place<'_>,
     ) -> BuildResult<()> {
         self.steps = self.steps.saturating_add(1);
-        if self.steps > STEP_CAP || self.expected.tensors.len() > TENSOR_CAP {
-            return Err(self.too_many(format!("the config implies more than {TENSOR_CAP} tensors")));
+        if self.steps > STEP_CAP || self.expected.tensors.len() > self.cap {
+            return Err(self.too_many(format!("the config implies more than {} tensors", self.cap)));
         }
         if !holds(when, scope)? {
             return Ok(());

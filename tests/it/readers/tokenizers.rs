@@ -1,8 +1,7 @@
 //! Vocabularies and added tokens.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 
 use ckpt_doctor::checkpoint::{Document, FaultKind, Tokenizer, Vocabulary};
 use serde_json::json;
@@ -29,7 +28,7 @@ pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(cases);
 
 fn cases() -> Vec<Case> {
     let model = |label, expected: &[FaultKind], bytes: &[u8]| {
-        Case::new(label, expected, open_with("tokenizer.model", bytes).tokenizer.faults)
+        Case::new(label, expected, open_with("tokenizer.model", bytes).tokenizer.faults.clone())
     };
     let mut cut = sentencepiece(&["<unk>", "<s>", "</s>"]);
     cut.truncate(20);
@@ -61,7 +60,7 @@ fn tokenizer(documents: Vec<Document>, model: Option<Vec<u8>>) -> Tokenizer {
         files.insert("tokenizer.model".into());
         vocabularies.insert("tokenizer.model".into(), Arc::new(Vocabulary::parse("tokenizer.model", &bytes).unwrap()));
     }
-    Tokenizer::new(&documents.into_iter().map(|d| (d.name.clone(), d)).collect(), vocabularies, files)
+    Tokenizer::new(&documents.into_iter().map(|d| (d.name.clone(), Arc::new(d))).collect(), vocabularies, files)
 }
 
 fn document(name: &str, value: &serde_json::Value) -> Document {

@@ -136,7 +136,7 @@ pub fn tokenizer(files: &[(&str, &[u8])]) {
     for (name, bytes) in files {
         names.insert((*name).to_owned());
         if name.ends_with(".json") {
-            documents.insert((*name).to_owned(), hold(name, bytes));
+            documents.insert((*name).to_owned(), Arc::new(hold(name, bytes)));
         } else if let Some(vocabulary) = vocabulary(name, bytes) {
             vocabularies.insert((*name).to_owned(), Arc::new(vocabulary));
         }
