@@ -87,10 +87,11 @@ fn with_fitting_class<'a>(inputs: &Inputs<'_>, one: TargetClass<'a>) -> TargetCl
 
 /// Lets another loader lead where the one that should does not know a part, unless the user named versions.
 fn leading<'a>(inputs: &Inputs<'a>, mut built: Vec<BuiltClass<'a>>) -> Vec<BuiltClass<'a>> {
-    if inputs.versions.is_empty() && is_unknown(&built) {
-        if let Some(known) = built.iter_mut().find(|one| one.class.is_ok()) {
-            known.target.lead();
-        }
+    if inputs.versions.is_empty()
+        && is_unknown(&built)
+        && let Some(known) = built.iter_mut().find(|one| one.class.is_ok())
+    {
+        known.target.lead();
     }
     built
 }
