@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writing under adverse conditions: failing calls, full disks, kills, signals, changing donors, two runs at once. After
+"""Writing under adverse conditions: failing calls and allocations, full disks, kills, signals, changing donors, two runs at once. After
 each: inputs unchanged, the target missing, old or complete, no other files left, and the next run complete.
 
     crash.py [--full] [--seed N] [PART...]
@@ -27,6 +27,7 @@ from harm import Broken, go_on, stopped_at
 from jobs import JOBS
 from order import Unordered, durable
 from pressure import Pressure
+from starved import Starved
 
 # Text of the error message for each error of a call.
 MESSAGES = {
@@ -59,7 +60,7 @@ REMOVES = ("unlink", "unlinkat", "rmdir")
 CLOSES = ("EDQUOT", "ENOMEM", "EROFS", "EIO")
 
 
-class Crash(Pressure):
+class Crash(Pressure, Starved):
     def __init__(self, jobs, full, rng):
         self.jobs, self.full, self.rng = jobs, full, rng
         self.figures = []
@@ -317,7 +318,20 @@ class Crash(Pressure):
             job.reset()
 
 
-PARTS = ["faults", "closes", "removals", "kills", "signals", "limits", "order", "changes", "saves", "rounds", "disks"]
+PARTS = [
+    "faults",
+    "closes",
+    "removals",
+    "kills",
+    "allocations",
+    "signals",
+    "limits",
+    "order",
+    "changes",
+    "saves",
+    "rounds",
+    "disks",
+]
 
 
 def main():

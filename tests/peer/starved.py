@@ -1,0 +1,92 @@
+"""A part of crash.py: allocations that find no memory. A run that is aborted there leaves the disk as a kill does."""
+
+import os
+import signal
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+from harm import Broken, one_thread
+
+SOURCE = Path(__file__).with_name("starved.c")
+ABORTS = (-signal.SIGABRT, -signal.SIGSEGV)
+
+
+class Starved:
+    def allocations(self):
+        """A drawn allocation of a run fails, alone or with all after it: most of them while files are written."""
+        library = self.jobs[0].place / "starved.so"
+        subprocess.run(["cc", "-shared", "-fPIC", "-O2", "-o", library, SOURCE], check=True)
+        for job in self.jobs:
+            count = self.allocations_of(job, library)
+            untouched = listed(job.work)
+            first = self.first(job, library, count, lambda job=job, untouched=untouched: listed(job.work) != untouched)
+            last = self.first(job, library, count, lambda job=job: job.target() == job.complete)
+            most = {"build": 500}.get(job.name, 300) if self.full else 12
+            writing = range(first, max(first + 1, min(last + 200, count)))
+            drawn = [self.rng.choice(writing) if i % 4 else self.rng.randrange(count) for i in range(most)]
+            cases = [(library, f"{at}{'' if i % 2 else '+'}") for i, at in enumerate(drawn)]
+            ends = Counter(self.each(job, cases, self.starve))
+            counts = ", ".join(f"{n} {end}" for end, n in sorted(ends.items()))
+            self.report(f"{job.name}: {most} of {count} allocations failed, most of {len(writing)} while it wrote ({counts})")
+
+    @staticmethod
+    def starved(job, library, **variables):
+        command = [*one_thread(), "env", f"LD_PRELOAD={library}", *[f"{k}={v}" for k, v in variables.items()], *job.argv()]
+        job.command = " ".join(map(str, command))
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
+        return done.returncode, done.stdout
+
+    def allocations_of(self, job, library):
+        job.reset()
+        note = job.place / "allocations"
+        code, output = self.starved(job, library, COUNT_ALLOCATIONS=note)
+        if code != 0:
+            raise Broken(f"{job.name} with counted allocations: exit {code}\n{output}")
+        count = int(note.read_text())
+        note.unlink()
+        job.reset()
+        return count
+
+    def first(self, job, library, count, is_reached):
+        """The first allocation of which the failure comes too late: the disk is as `is_reached` says."""
+        low, high = 0, count
+        while low < high:
+            middle = (low + high) // 2
+            job.reset()
+            self.starved(job, library, FAIL_ALLOCATION=f"{middle}+")
+            low, high = (low, middle) if is_reached() else (middle + 1, high)
+        job.reset()
+        return min(low, count - 1)
+
+    @classmethod
+    def starve(cls, job, library, at):
+        job.reset()
+        before = job.inputs()
+        code, output = cls.starved(job, library, FAIL_ALLOCATION=at)
+        try:
+            if code in ABORTS:
+                if code != -signal.SIGABRT:
+                    raise Broken(f"ended by signal {-code}\n{output}")
+                if not any(words in output for words in ("memory allocation of", "failed to allocate")):
+                    raise Broken(f"aborted without a word on memory\n{output}")
+                return f"aborted ({cls.after_kill(job, before)})"
+            # The error of a call of the system, or of a reservation that may fail.
+            if job.inputs() != before:
+                raise Broken("an input was changed")
+            if code < 0 or code in (101, 134, 139):
+                raise Broken(f"ended by a signal or a panic: {code}\n{output}")
+            if code == 0 and job.state() != "complete":
+                raise Broken("exit 0, but the target is not complete")
+            if code != 0 and "memory" not in output:
+                raise Broken(f"exit {code} without a word on memory\n{output}")
+            job.recovers()
+            return "exit 0" if code == 0 else "error"
+        except Broken as broken:
+            raise Broken(f"{job.name} without memory at allocation {at}: {broken}") from broken
+
+
+def listed(directory):
+    """Names below a directory, with the sizes of files."""
+    paths = (Path(root) / name for root, folders, files in os.walk(directory) for name in [*folders, *files])
+    return sorted((str(path), path.lstat().st_size) for path in paths)
