@@ -13,7 +13,7 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
-use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, Heads, RefusedValues};
+use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, Heads, RefusedValues, ValueKind};
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
@@ -48,7 +48,7 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
         let class = knowledge.library.named_class(config).or_else(|| auto_class(knowledge, config, target));
         let refused = class.map(|class| refusals(knowledge, config, target, class)).unwrap_or_default();
         let mut found = of_class(knowledge, &configs, &refused, target.version());
-        found.extend(dtype(knowledge, config, target.version()));
+        found.extend(dtypes(knowledge, config, target, class));
         found.extend(rope_form(knowledge, config, target.version()));
         let mut own = of_kinds(knowledge, &configs, &refused, target.version());
         own.retain(|rejection| {
@@ -91,7 +91,9 @@ fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str)
         let key = pointer.trim_start_matches('/');
         let named = config.pointer(&format!("{pointer}/model_type")).and_then(Value::as_str);
         let tried = architecture.and_then(|architecture| architecture.sub_config_type(key));
-        match named.filter(|named| tried.is_some_and(|tried| tried != *named)) {
+        // A part that names the whole is of the class that the whole has for it: `qwen3_vl` in its vision_config.
+        let is_whole = |named: &str| config.get("model_type").and_then(Value::as_str) == Some(named);
+        match named.filter(|named| !is_whole(named) && tried.is_some_and(|tried| tried != *named)) {
             Some(named) => {
                 let part = knowledge.library.auto_class(named, "model", target.loader).map(of_class);
                 refused.with_part(key, part.unwrap_or_default())
@@ -175,8 +177,9 @@ fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusal
     }
     for key in rope_type {
         let of_key = ropes(config, key).into_iter();
-        found.extend(of_key.filter_map(|(pointer, rope)| unknown_rope(knowledge, version, &pointer, rope)));
+        found.extend(of_key.filter_map(|(pointer, rope)| unknown_rope(knowledge, version, config, (&pointer, rope))));
     }
+    found.extend(refused.values().iter().flat_map(|values| rope_text(config, values)));
     for key in rope_factor {
         found.extend(ropes(config, key).into_iter().filter_map(|(pointer, rope)| rope_without_factor(pointer, rope)));
     }
@@ -267,10 +270,18 @@ fn rope_type(rope: &Map<String, Value>) -> Option<(&'static str, &str)> {
     named("rope_type").or_else(|| named("type"))
 }
 
-fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<String, Value>) -> Option<Rejection> {
+fn unknown_rope(
+    knowledge: &Knowledge,
+    version: &str,
+    config: &Value,
+    (pointer, rope): (&str, &Map<String, Value>),
+) -> Option<Rejection> {
     let (key, name) = rope_type(rope)?;
     // The classes with sections for time, height and width read this type, once written by themselves, as `default`.
-    let is_sectioned = rope.contains_key("mrope_section") && rope.get("type").is_some_and(|name| name == "mrope");
+    let of_part = config.pointer(&format!("{}/model_type", parent(pointer)));
+    let model_type = of_part.or_else(|| config.get("model_type")).and_then(Value::as_str);
+    let is_sectioned = rope.get("type").is_some_and(|name| name == "mrope")
+        && model_type.is_some_and(|model_type| knowledge.rope_forms.has_sections(model_type));
     (!is_sectioned && knowledge.names.lacks(version, NameKind::RopeType, name)).then(|| Rejection {
         pointer: format!("{pointer}/{key}"),
         value: name.into(),
@@ -278,6 +289,24 @@ fn unknown_rope(knowledge: &Knowledge, version: &str, pointer: &str, rope: &Map<
         raises: format!("KeyError: '{}'", escape(name, CAP)),
         similar: knowledge.names.similar(NameKind::RopeType, name).map(str::to_owned),
     })
+}
+
+/// A text in place of rope parameters, where a list has no attribute `get` either. A text with `type` in it raises otherwise.
+fn rope_text(config: &Value, values: &RefusedValues) -> Vec<Rejection> {
+    let reads = values.raises == "AttributeError" && values.kinds.contains(&ValueKind::List);
+    let keys = values.keys.iter().filter(|key| reads && key.ends_with("rope_scaling"));
+    let rejection = |key: &String| {
+        let pointer = format!("/{key}");
+        let text = config.pointer(&pointer)?.as_str().filter(|text| !text.contains("type"))?;
+        Some(Rejection {
+            value: text.into(),
+            because: "which is no object".to_owned(),
+            raises: "AttributeError: 'str' object has no attribute 'get'".to_owned(),
+            similar: None,
+            pointer,
+        })
+    };
+    keys.filter_map(rejection).collect()
 }
 
 fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rejection> {
@@ -312,13 +341,24 @@ fn undivided(
     })
 }
 
-/// A dtype that torch does not have. Versions since 4.56 prefer `dtype` to `torch_dtype`.
-fn dtype(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Rejection> {
+/// Types that torch does not have, of the config and of the parts for which the class has a config class: each builds its own.
+fn dtypes(knowledge: &Knowledge, config: &Value, target: &Target, class: Option<&str>) -> Vec<Rejection> {
+    let architecture = class.and_then(|class| knowledge.library.class(class, target.loader));
+    let is_config = |pointer: &String| {
+        architecture.is_some_and(|class| class.sub_config_type(pointer.trim_start_matches('/')).is_some())
+    };
+    let places = std::iter::once(String::new()).chain(sub_configs(config).filter(is_config));
+    places.filter_map(|at| dtype(knowledge, config, &at, target.version())).collect()
+}
+
+/// A dtype that torch does not have, in the config at a pointer. Versions since 4.56 prefer `dtype` to `torch_dtype`.
+fn dtype(knowledge: &Knowledge, config: &Value, at: &str, version: &str) -> Option<Rejection> {
+    let config = config.pointer(at)?;
     let named = |key: &'static str| Some((key, config.get(key)?.as_str()?));
     let newer = if version_numbers(version) >= vec![4, 56] { named("dtype") } else { None };
     let (key, name) = newer.or_else(|| named("torch_dtype"))?;
     knowledge.names.lacks(version, NameKind::Dtype, name).then(|| Rejection {
-        pointer: format!("/{key}"),
+        pointer: format!("{at}/{key}"),
         value: name.into(),
         because: "which is no dtype of torch".to_owned(),
         raises: format!("AttributeError: module 'torch' has no attribute '{}'", escape(name, CAP)),
