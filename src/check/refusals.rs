@@ -300,7 +300,7 @@ fn rope_text(config: &Value, values: &RefusedValues) -> Vec<Rejection> {
         let text = config.pointer(&pointer)?.as_str().filter(|text| !text.contains("type"))?;
         Some(Rejection {
             value: text.into(),
-            because: "which is no object".to_owned(),
+            because: "which the class refuses".to_owned(),
             raises: "AttributeError: 'str' object has no attribute 'get'".to_owned(),
             similar: None,
             pointer,
@@ -394,4 +394,25 @@ fn quantisation(knowledge: &Knowledge, config: &Value, asked: &Asked<'_>) -> Opt
 /// The pointer of the object that has this one as a key.
 fn parent(pointer: &str) -> &str {
     pointer.rsplit_once('/').map_or("", |(parent, _)| parent)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::{RefusedValues, ValueKind, rope_text};
+
+    #[test]
+    fn a_text_for_rope_parameters_is_refused_where_a_list_is() {
+        let values = |raises: &str| RefusedValues {
+            raises: raises.to_owned(),
+            kinds: vec![ValueKind::List],
+            keys: vec!["rope_scaling".to_owned()],
+        };
+        let found = |text: &str, raises: &str| rope_text(&json!({ "rope_scaling": text }), &values(raises)).len();
+        assert_eq!(
+            (found("x", "AttributeError"), found("x", "TypeError"), found("a type", "AttributeError")),
+            (1, 0, 0)
+        );
+    }
 }

@@ -11,7 +11,7 @@ use super::sharing::Sharing;
 use super::staging::Staging;
 use super::system::{check_space, create, retry};
 use super::target::claim_target;
-use crate::checkpoint::open::{TOKENIZER_CAP, read_own, real_target};
+use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_own, real_target};
 use crate::checkpoint::{Entry, EntryKind};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{ApplyError, RepairError, io_at};
@@ -82,10 +82,24 @@ fn copied(repair: &Repair, root: &Path, parent: &Path) -> Vec<u64> {
 /// as in the original.
 fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
     let from = &root.join(name);
-    let Ok(real) = fs::canonicalize(from) else { return Ok(()) };
+    let real = match fs::canonicalize(from) {
+        Ok(real) => real,
+        // A call that fails for another reason would leave a file out of the copy.
+        Err(error) => match OpenError::from_io(from, error) {
+            OpenError::NotFound { .. } | OpenError::DanglingLink { .. } | OpenError::SymlinkLoop { .. } => {
+                return Ok(());
+            }
+            error => return Err(io_at(from, "resolving")(io::Error::other(error))),
+        },
+    };
     let metadata = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?;
     let size = metadata.len();
-    if metadata.is_file() && real_target(root, &[], from).is_ok() {
+    let is_own = match real_target(root, &[], from) {
+        Ok(_) => true,
+        Err(error @ OpenError::Io { .. }) => return Err(io_at(from, "resolving")(io::Error::other(error))),
+        Err(_) => false,
+    };
+    if metadata.is_file() && is_own {
         match retry(|| fs::hard_link(&real, to)) {
             Ok(()) => return Ok(()),
             // Another file system, no hard links, or a file of another user. A check reads no document behind a symbolic link.
