@@ -101,9 +101,8 @@ fn of_shard(checkpoint: &Checkpoint, shard: &Shard, places: &StatisticsPlaces) -
             continue;
         };
         let Some(values) = checkpoint.numbers(shard, tensor) else { continue };
-        let place = || Place::file(&shard.name).in_tensor(&tensor.name);
         let set = sets.entry(stem).or_insert_with(|| StatisticSet {
-            place: place(),
+            place: Place::file(&shard.name),
             name: stem.to_owned(),
             values: BTreeMap::new(),
         });
@@ -119,8 +118,12 @@ impl StatisticSet {
         found.into_iter().flatten().collect()
     }
 
-    fn fault(&self, kind: FaultKind) -> Fault {
-        Fault::new(kind).at(self.place.clone()).with("set", self.name.as_str())
+    /// A fault of one of the statistics, each of which is a tensor in a shard.
+    fn fault(&self, kind: FaultKind, statistic: &str) -> Fault {
+        let place = self.place.clone();
+        let is_document = place.pointer.is_some();
+        let place = if is_document { place } else { place.in_tensor(format!("{}.{statistic}", self.name)) };
+        Fault::new(kind).at(place).with("set", self.name.as_str())
     }
 
     /// A number that is null, NaN or infinite.
@@ -129,7 +132,7 @@ impl StatisticSet {
             Some((statistic.clone(), values.iter().position(Option::is_none)?, values.len()))
         };
         let (statistic, dimension, width) = self.values.iter().find_map(first)?;
-        let fault = self.fault(FaultKind::StatisticsNotFinite).with("statistic", statistic);
+        let fault = self.fault(FaultKind::StatisticsNotFinite, &statistic).with("statistic", statistic);
         Some(fault.with("dimension", dimension).with("width", width))
     }
 
@@ -143,7 +146,7 @@ impl StatisticSet {
             .collect();
         let (first, width) = widths.first()?;
         let (other, other_width) = widths.iter().find(|(_, other)| other != width)?;
-        let fault = self.fault(FaultKind::StatisticsWidthsDiffer);
+        let fault = self.fault(FaultKind::StatisticsWidthsDiffer, other);
         let fault = fault.with("one", first.as_str()).with("one_width", *width);
         Some(fault.with("other", other.as_str()).with("other_width", *other_width))
     }
@@ -154,7 +157,7 @@ impl StatisticSet {
             let (lows, highs) = (self.values.get(low)?, self.values.get(high)?);
             let dimension = lows.iter().zip(highs).position(|(l, h)| is_above(*l, *h))?;
             let at = |values: &Vec<Option<f64>>| json!(values.get(dimension).copied().flatten());
-            let fault = self.fault(FaultKind::StatisticsOutOfOrder).with("low", low).with("high", high);
+            let fault = self.fault(FaultKind::StatisticsOutOfOrder, low).with("low", low).with("high", high);
             Some(fault.with("low_value", at(lows)).with("high_value", at(highs)).with("dimension", dimension))
         };
         ORDERED.into_iter().find_map(pair)
@@ -168,7 +171,7 @@ impl StatisticSet {
             Some((statistic.clone(), dimension, values.get(dimension).copied().flatten()))
         };
         let (statistic, dimension, value) = self.values.iter().filter(|(name, _)| *name != "count").find_map(first)?;
-        let fault = self.fault(FaultKind::StatisticsImplausible).with("statistic", statistic);
+        let fault = self.fault(FaultKind::StatisticsImplausible, &statistic).with("statistic", statistic);
         Some(fault.with("dimension", dimension).with("value", json!(value)))
     }
 }

@@ -162,7 +162,7 @@ impl Basis<'_> {
 
     /// Whether any shard was read; the names of an index alone tell nothing of a load.
     fn was_read(&self) -> bool {
-        self.checkpoint.shards.values().any(|shard| shard.is_sound() || !shard.tensors.is_empty())
+        self.checkpoint.shards.values().any(|shard| shard.tells_all_tensors() || !shard.tensors.is_empty())
     }
 
     /// The first file that transformers opens for an object, beside config.json, and that was not read, and why. Of a file that

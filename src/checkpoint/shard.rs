@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use super::pickle::Pickle;
-use super::{Fault, NotRead, OpenError, Place};
+use super::{Fault, FaultKind, NotRead, OpenError, Place};
 
 mod dtype;
 mod entry;
@@ -135,6 +135,13 @@ impl Shard {
     #[must_use]
     pub(crate) fn is_sound(&self) -> bool {
         !self.unread && self.faults.is_empty()
+    }
+
+    /// Whether every tensor that a class may have is known: the header was read, and without a fault but names that no class
+    /// makes, those above 1 KiB among them.
+    #[must_use]
+    pub(crate) fn tells_all_tensors(&self) -> bool {
+        !self.unread && self.faults.iter().all(|fault| fault.kind == FaultKind::OddTensorName)
     }
 
     /// Whether the file has the bytes of every tensor that its header lists.

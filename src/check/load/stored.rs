@@ -82,7 +82,7 @@ impl Stored {
     fn together(shards: &[&Shard]) -> Self {
         let tensors = shards.iter().flat_map(|shard| &shard.tensors);
         let tensors = tensors.map(|t| (t.name.clone(), Some(t.shape.clone()))).collect();
-        Self { tensors, was_read: shards.iter().any(|shard| shard.is_sound()), ..Self::default() }
+        Self { tensors, was_read: shards.iter().any(|shard| shard.tells_all_tensors()), ..Self::default() }
     }
 
     /// Names and shapes of one file.

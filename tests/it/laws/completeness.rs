@@ -95,7 +95,8 @@ fn scatter(draw: &mut Draw, dir: &Path) -> (BTreeSet<String>, bool) {
 fn clean_implies_that_every_tensor_is_stored() {
     let knowledge = crate::support::knowledge();
     let (mut clean, mut short) = (0, 0);
-    for seed in 0..cases(100) {
+    // The last one had a tensor of a name that is not kept, and no other.
+    for seed in (0..cases(100)).chain([468]) {
         let mut draw = Draw::new(seed);
         let room = TempDir::new().unwrap();
         let dir = room.path().join("model");
