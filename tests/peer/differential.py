@@ -485,6 +485,9 @@ def outcomes(told, entry, version, everything):
         found.append("false clean")
     elif not bad and (model.get("why") or "").startswith("forward raises") and (told["forward"] or not told["runs"]):
         found.append("raises later")
+    elif not bad and verdict == "loads-wrong" and (model.get("why") or "").startswith("rotary embeddings have"):
+        # Parameters are compared here; what a class computes of a config, such as these tables, shows in logits.
+        found.append("computes otherwise")
     elif not bad and verdict != "loads" and not (actual == "ignores" and verdict == "loads-wrong"):
         found.append("false error")
     elif bad and (verdict == "raises") != (actual == "raises"):
