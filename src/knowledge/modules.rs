@@ -85,6 +85,11 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_modules_are_sorted() {
+        assert!(LoaderModules::embedded().unwrap().versions.values().all(|lacking| lacking.modules.is_sorted()));
+    }
+
+    #[test]
     fn modules_and_names_depend_on_the_version() {
         let modules = LoaderModules::embedded().unwrap();
         let processing = "transformers.models.paligemma.processing_paligemma";

@@ -80,3 +80,16 @@ impl TokenizerClasses {
         self.versions.values().any(|built| built.replaces.contains(class))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::TokenizerClasses;
+
+    #[test]
+    fn every_class_is_well_formed() {
+        let classes = TokenizerClasses::embedded().unwrap();
+        let all: Vec<_> = classes.versions.values().flat_map(|built| built.classes.iter()).collect();
+        let malformed: Vec<_> = all.iter().filter(|(_, class)| class.get().is_none()).map(|(name, _)| name).collect();
+        assert!(all.len() > 20 && malformed.is_empty(), "{} classes, {malformed:?}", all.len());
+    }
+}
