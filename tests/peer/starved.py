@@ -23,10 +23,9 @@ class Starved:
         subprocess.run(["cc", "-shared", "-fPIC", "-O2", "-o", library, SOURCE], check=True)
         for job in self.jobs:
             count = self.allocations_of(job, library)
-            untouched = listed(job.work)
-            first = self.first(job, library, count, lambda job=job, untouched=untouched: listed(job.work) != untouched)
             last = self.first(job, library, count, lambda job=job: job.target() == job.complete)
-            most = {"build": 500}.get(job.name, 300) if self.full else 12
+            first = self.first_change(job, library, count) if self.full else max(0, last - 500)
+            most = {"build": 500}.get(job.name, 300) if self.full else 6
             writing = range(first, max(first + 1, min(last + 200, count)))
             drawn = [self.rng.choice(writing) if i % 4 else self.rng.randrange(count) for i in range(most)]
             cases = [(library, f"{at}{'' if i % 2 else '+'}") for i, at in enumerate(drawn)]
@@ -51,6 +50,10 @@ class Starved:
         note.unlink()
         job.reset()
         return count
+
+    def first_change(self, job, library, count):
+        untouched = listed(job.work)
+        return self.first(job, library, count, lambda: listed(job.work) != untouched)
 
     def first(self, job, library, count, is_reached):
         """The first allocation of which the failure comes too late: the disk is as `is_reached` says."""
