@@ -239,7 +239,7 @@ impl Basis<'_> {
         };
         if object != Object::Model || is_program(loader) {
             let known = (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
-            return not_read().filter(|_| object != Object::Model).unwrap_or(known);
+            return not_read().unwrap_or(known);
         }
         if self.checkpoint.config().is_none() {
             return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));

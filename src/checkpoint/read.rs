@@ -385,7 +385,7 @@ fn names(source: &Source) -> Result<(BTreeSet<String>, u64), OpenError> {
 /// Reads one directory entry, and adds the faults that no reader of its content would report.
 fn entry(source: &Source, name: &str, faults: &mut Vec<Fault>) -> Entry {
     let link = source.link(name);
-    // A call that fails once, as for want of memory, would leave a file out of which the content is read.
+    // A call may fail once, as for want of memory. Without a second one the file would be missing, though its content is read.
     let again = |error| if matches!(error, OpenError::Io { .. }) { source.stat(name) } else { Err(error) };
     let Ok((kind, size)) = source.stat(name).or_else(again) else {
         return Entry { kind: EntryKind::Broken, link, ..Entry::default() };

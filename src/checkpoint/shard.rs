@@ -137,8 +137,8 @@ impl Shard {
         !self.unread && self.faults.is_empty()
     }
 
-    /// Whether every tensor that a class may have is known: the header was read, and without a fault but names that no class
-    /// makes, those above 1 KiB among them.
+    /// Whether the file has no other tensors of a model class than those that are known: its header was read, and no fault
+    /// leaves out a tensor but for names above 1 KiB, which no class has.
     #[must_use]
     pub(crate) fn tells_all_tensors(&self) -> bool {
         !self.unread && self.faults.iter().all(|fault| fault.kind == FaultKind::OddTensorName)

@@ -1,4 +1,4 @@
-//! Tables of built-in files, in the order of their keys.
+//! Parts of built-in files that cost little until they are needed: every start of the program reads them.
 
 use std::marker::PhantomData;
 use std::sync::OnceLock;
@@ -28,8 +28,8 @@ impl<'de: 'static, T> Deserialize<'de> for Lazy<T> {
     }
 }
 
-/// A JSON object of a built-in file by its keys, which are sorted in the file: reading it takes one allocation, where a
-/// `BTreeMap` of strings takes one for each key. The keys have no escapes.
+/// A JSON object of a built-in file by its keys, which have no escapes. It is a list, because a `BTreeMap` compares each key
+/// with several others as it grows, and `ordered` copies each key to find those that users wrote twice.
 #[derive(Debug, Clone)]
 pub(super) struct SortedMap<V>(Vec<(&'static str, V)>);
 
@@ -83,7 +83,7 @@ impl<'de: 'static, V: Deserialize<'de>> Deserialize<'de> for SortedMap<V> {
         }
 
         let mut entries = deserializer.deserialize_map(Entries(PhantomData))?;
-        // Fast for those that are sorted.
+        // The files are sorted, so this moves nothing.
         entries.sort_by_key(|(key, _)| *key);
         Ok(Self(entries))
     }

@@ -7,7 +7,8 @@ Each FOLDER has one version of transformers, for the Python that runs this. Smal
 N of their copies, for each version, have one random change: a value of config.json, the tensors, or the index. A load is bad
 when it raises, or when parameters keep random values or others than the stored ones. Three things are counted: false clean
 (a bad load, and the verdict is `loads`), false errors (a sound one, and the verdict is `raises` or `loads wrong`), and lists
-of missing, unexpected and mismatched tensors that differ from the loader's. `not predicted` is counted apart.
+of missing, unexpected and mismatched tensors that differ from the loader's. `not predicted` is counted apart, and so is what
+parameters do not show: an exception of forward, and rotary tables that a class computes of its config.
 
 `--keep` keeps the mutants and what the loaders did. A second run with the same directory only runs `check`.
 """

@@ -1,7 +1,7 @@
 //! A repaired copy of a checkpoint: changed files are written, all others linked.
 
 use std::fs;
-use std::io::ErrorKind::{CrossesDevices, PermissionDenied, TooManyLinks, Unsupported};
+use std::io::ErrorKind::{CrossesDevices, NotFound, PermissionDenied, TooManyLinks, Unsupported};
 use std::io::{self, Write as _};
 use std::os::unix::fs::{MetadataExt as _, symlink};
 use std::path::Path;
@@ -12,6 +12,7 @@ use super::staging::Staging;
 use super::system::{check_space, create, retry};
 use super::target::claim_target;
 use crate::checkpoint::open::{OpenError, TOKENIZER_CAP, read_own, real_target};
+use crate::checkpoint::platform::is_loop;
 use crate::checkpoint::{Entry, EntryKind};
 use crate::surgery::donor::DonorSnapshot;
 use crate::surgery::error::{ApplyError, RepairError, io_at};
@@ -84,19 +85,15 @@ fn link(root: &Path, name: &str, to: &Path) -> Result<(), ApplyError> {
     let from = &root.join(name);
     let real = match fs::canonicalize(from) {
         Ok(real) => real,
-        // A call that fails for another reason would leave a file out of the copy.
-        Err(error) => match OpenError::from_io(from, error) {
-            OpenError::NotFound { .. } | OpenError::DanglingLink { .. } | OpenError::SymlinkLoop { .. } => {
-                return Ok(());
-            }
-            error => return Err(io_at(from, "resolving")(io::Error::other(error))),
-        },
+        Err(error) if error.kind() == NotFound || is_loop(&error) => return Ok(()),
+        // A call that failed for another reason does not make the link broken.
+        Err(error) => return Err(io_at(from, "resolving")(error)),
     };
     let metadata = fs::metadata(&real).map_err(io_at(from, "reading metadata"))?;
     let size = metadata.len();
     let is_own = match real_target(root, &[], from) {
         Ok(_) => true,
-        Err(error @ OpenError::Io { .. }) => return Err(io_at(from, "resolving")(io::Error::other(error))),
+        Err(OpenError::Io { source, .. }) => return Err(io_at(from, "resolving")(source)),
         Err(_) => false,
     };
     if metadata.is_file() && is_own {

@@ -95,7 +95,7 @@ fn scatter(draw: &mut Draw, dir: &Path) -> (BTreeSet<String>, bool) {
 fn clean_implies_that_every_tensor_is_stored() {
     let knowledge = crate::support::knowledge();
     let (mut clean, mut short) = (0, 0);
-    // The last one had a tensor of a name that is not kept, and no other.
+    // The last one has a single tensor, whose name is too long to be kept.
     for seed in (0..cases(100)).chain([468]) {
         let mut draw = Draw::new(seed);
         let room = TempDir::new().unwrap();
@@ -123,7 +123,7 @@ fn clean_implies_that_every_tensor_is_stored() {
             keys == index.weight_map.len()
                 && index.weight_map.values().all(|file| checkpoint.shards.contains_key(&**file))
         });
-        // What is left of a class that nobody knows may be a tensor whose name is not kept.
+        // A tensor whose name is not kept may be one of a class that nobody knows.
         let is_short = found.is_empty() && !has_long || is_known && found != all || !opened;
         let codes: Vec<_> = outcome.findings.iter().map(|finding| finding.code.as_str()).collect();
         if is_short {
