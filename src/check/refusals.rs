@@ -50,6 +50,7 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
         let mut found = of_class(knowledge, &configs, &refused, target.version());
         found.extend(dtypes(knowledge, config, target, class));
         found.extend(rope_form(knowledge, config, target.version()));
+        found.retain(|rejection| !is_overridden(config, &rejection.pointer));
         let mut own = of_kinds(knowledge, &configs, &refused, target.version());
         own.retain(|rejection| {
             !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)

@@ -7,6 +7,7 @@ mod lets;
 mod memory;
 mod names;
 mod peft;
+mod refusals;
 mod seeded;
 
 use std::collections::BTreeSet;

@@ -13,7 +13,7 @@ SOURCE = Path(__file__).with_name("starved.c")
 # preloaded library. tree-sitter-python 0.25.0 writes to the start of an array that it could not reserve (`array_push` in its
 # src/scanner.c), so that only a run that reads Python modules may end there.
 ABORTED, NULL = -signal.SIGABRT, -signal.SIGSEGV
-WORDS = {ABORTED: ("memory allocation of", "failed to allocate"), NULL: ("a null pointer was used",)}
+WORDS = {ABORTED: ("memory allocation of", "tree-sitter failed to"), NULL: ("a null pointer was used",)}
 READS_MODULES = ("build",)
 
 
