@@ -13,7 +13,8 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
-use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, Heads, RefusedValues, ValueKind};
+use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, Heads, Lengths, RefusedValues, ValueKind, Words};
+use crate::knowledge::source;
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
@@ -180,6 +181,8 @@ fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusal
         let of_key = ropes(config, key).into_iter();
         found.extend(of_key.filter_map(|(pointer, rope)| unknown_rope(knowledge, version, config, (&pointer, rope))));
     }
+    found.extend(refused.words.iter().filter_map(|words| unknown_word(config, words)));
+    found.extend(refused.lengths.iter().filter_map(|lengths| other_length(configs, lengths)));
     found.extend(refused.values().iter().flat_map(|values| rope_text(config, values)));
     for key in rope_factor {
         found.extend(ropes(config, key).into_iter().filter_map(|(pointer, rope)| rope_without_factor(pointer, rope)));
@@ -319,6 +322,38 @@ fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rej
         raises: format!("KeyError: Missing required keys for 'rope_type'='{name}': {{'factor'}}"),
         similar: None,
         pointer,
+    })
+}
+
+/// A word that is none of those that the class takes.
+fn unknown_word(config: &Value, Words(key, raises, load): &Words) -> Option<Rejection> {
+    let pointer = format!("/{key}");
+    let word = config.pointer(&pointer)?.as_str().filter(|word| load.iter().all(|known| known != word))?;
+    Some(Rejection {
+        value: word.into(),
+        because: "which the class does not know".to_owned(),
+        raises: raises.clone(),
+        similar: source::nearest(word, load.iter().map(String::as_str)).map(str::to_owned),
+        pointer,
+    })
+}
+
+/// A list with another number of elements than those beside it: of three lists, the one that differs from the two others.
+fn other_length(configs: &Configs<'_>, Lengths(group, raises): &Lengths) -> Option<Rejection> {
+    let size = |value: &Value| value.as_array().map(|list| list.len() as u64).or_else(|| value.as_u64());
+    let pointers = group.iter().map(|key| (key, format!("/{key}")));
+    let read = pointers.map(|(key, pointer)| configs.read(&pointer).and_then(|value| Some((key, value, size(value)?))));
+    let sizes: Vec<(&String, &Value, u64)> = read.collect::<Option<_>>()?;
+    let alike = |of: u64| sizes.iter().filter(|(.., size)| *size == of).count();
+    let usual = sizes.iter().rev().max_by_key(|(_, value, size)| (alike(*size), value.is_u64()))?;
+    let odd = sizes.iter().find(|(_, value, size)| value.is_array() && *size != usual.2)?;
+    let (of, name) = (if usual.1.is_array() { "that of " } else { "" }, usual.0.replace('/', "."));
+    Some(Rejection {
+        pointer: format!("/{}", odd.0),
+        value: odd.1.clone(),
+        because: format!("whose length is {} where {of}{name} is {}", odd.2, usual.2),
+        raises: raises.clone(),
+        similar: None,
     })
 }
 

@@ -22,6 +22,10 @@ pub struct ClassRefusals {
     pub rope_type: Vec<String>,
     /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
     pub rope_factor: Vec<String>,
+    /// Keys of which only a few words load.
+    pub words: Vec<Words>,
+    /// Lists that must have as many elements as others beside them.
+    pub lengths: Vec<Lengths>,
     /// Defaults of keys of heads and padding ids, by pointer.
     pub defaults: BTreeMap<String, u64>,
     /// The exception that a parameter raises that is stored as integers.
@@ -33,6 +37,14 @@ pub struct ClassRefusals {
 /// A count of attention heads, the key beside it that it has to divide, and the exception otherwise.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Heads(pub String, pub String, pub String);
+
+/// A key that holds a word, the exception that an unknown word raises, and the words that load.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Words(pub String, pub String, pub Vec<String>);
+
+/// Lists that must have the same length, or a list and the count of its elements, and the exception otherwise.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Lengths(pub Vec<String>, pub String);
 
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(untagged)]
@@ -124,6 +136,13 @@ impl ClassRefusals {
         self.heads.extend(
             part.heads.iter().cloned().map(|Heads(at, width, raises)| Heads(under.clone() + &at, width, raises)),
         );
+        self.words.retain(|Words(pointer, ..)| !pointer.starts_with(&under));
+        self.words
+            .extend(part.words.iter().cloned().map(|Words(at, raises, load)| Words(under.clone() + &at, raises, load)));
+        self.lengths.retain(|Lengths(group, _)| !group.iter().any(|pointer| pointer.starts_with(&under)));
+        self.lengths.extend(
+            part.lengths.iter().cloned().map(|Lengths(group, raises)| Lengths(replaced(Vec::new(), group), raises)),
+        );
         self.defaults.retain(|pointer, _| !pointer.starts_with(&under));
         self.defaults.extend(part.defaults.iter().map(|(pointer, value)| (format!("{under}{pointer}"), *value)));
         let own =
@@ -158,7 +177,13 @@ impl ClassRefusals {
         let values =
             self.values().iter().flat_map(|v| v.keys.iter().map(|key| of_key(&v.raises, &v.kinds, key.clone())));
         let values = Some(Values::Own(values.filter(|v| !v.kinds.is_empty()).collect()));
+        let words = |Words(key, raises, load): Words| {
+            let Words(.., others) = other.words.iter().find(|o| o.0 == key)?;
+            Some(Words(key, raises, load.iter().chain(others).cloned().collect()))
+        };
         Self {
+            words: self.words.into_iter().filter_map(words).collect(),
+            lengths: self.lengths.into_iter().filter(|row| other.lengths.iter().any(|o| o.0 == row.0)).collect(),
             activation: both(self.activation, &other.activation),
             heads: self.heads.into_iter().filter(|Heads(key, ..)| other.heads.iter().any(|o| o.0 == *key)).collect(),
             padding: both(self.padding, &other.padding),

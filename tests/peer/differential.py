@@ -7,8 +7,8 @@ Each FOLDER has one version of transformers, for the Python that runs this. Smal
 N of their copies, for each version, have one random change: a value of config.json, the tensors, or the index. A load is bad
 when it raises, or when parameters keep random values or others than the stored ones. Three things are counted: false clean
 (a bad load, and the verdict is `loads`), false errors (a sound one, and the verdict is `raises` or `loads wrong`), and lists
-of missing, unexpected and mismatched tensors that differ from the loader's. `not predicted` is counted apart, and so is what
-parameters do not show: an exception of forward, and rotary tables that a class computes of its config.
+of missing, unexpected and mismatched tensors that differ from the loader's. Counted apart are `not predicted`, by whether the
+class is known, and what parameters do not show: an exception of forward, and rotary tables that a class computes of its config.
 
 `--keep` keeps the mutants and what the loaders did. A second run with the same directory only runs `check`.
 """
@@ -481,7 +481,7 @@ def outcomes(told, entry, version, everything):
     bad = actual in ("raises", "wrong")
     found = ["bad" if bad else "sound"]
     if verdict == "not-predicted":
-        found.append("not predicted")
+        found.append("class unknown" if model.get("why") == "its class is unknown" else "not predicted")
     elif bad and verdict in ("loads", "none"):
         found.append("false clean")
     elif not bad and (model.get("why") or "").startswith("forward raises") and (told["forward"] or not told["runs"]):
@@ -500,7 +500,7 @@ def outcomes(told, entry, version, everything):
         if report != told["lists"] and verdict != "not-predicted":
             found.append("other lists")
     if everything:
-        for kind in set(found) & {"false clean", "false error", "other consequence", "other lists"}:
+        for kind in set(found) & {"false clean", "false error", "not predicted", "other consequence", "other lists"}:
             config = json.loads(Path(told["folder"], "config.json").read_text())
             detail = (
                 differences(report, told["lists"])

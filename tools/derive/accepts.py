@@ -4,6 +4,10 @@ A small model of every class is saved, and loaded again with one value of its co
 whose replacement raises, and the exception. Each entry is one line: the program reads only the lines that it needs. Field types
 that the architecture files know are left out.
 
+Tried are the keys of the config, those that the class asks for and the config lacks, those that the config class takes out of its
+keyword arguments, and its properties. Two more tables are found so: keys of which only a few words load, and lists that must have
+as many elements as others beside them.
+
 The first class of a config class is tried with every key. The others are tried with one replacement of each key, and with all of
 them where that one shows a difference.
 """
@@ -87,6 +91,8 @@ class Small:
         with time_limit(SECONDS * 4):
             cls(cls.config_class.from_dict(copy.deepcopy(config))).save_pretrained(folder)
         self.words = configs.compared_words(*sources.texts(cls, cls.config_class))
+        self.asked, self.literals = read_by(cls, config)
+        self.unsettable = set(unsettable(cls.config_class))
         self.file = self.folder / "config.json"
         written = json.loads(self.file.read_text())
         # Every key that the config has, with its value; keys that the hub has and the class writes otherwise as well.
@@ -119,6 +125,10 @@ class Small:
         names = {each and each.split(":", 1)[0] for each in said}
         if None in names:
             return None
+        # A key that the config lacks may want others that it lacks as well.
+        is_asked = pointer[-1] in self.asked.get(pointer[:-1], []) and pointer[-1] not in self.unsettable
+        if is_asked and (kind == "true" or any("object has no attribute" in each and "onfig'" in each for each in said)):
+            return None
         # A value of the same type that does not fit does not tell of others.
         value = at(self.config, pointer)
         if isinstance(value, {"list": list, "object": dict, "true": bool, "false": bool}.get(kind, ())) and pointer[-1] != ROPE:
@@ -150,6 +160,60 @@ class Small:
         return fits + lists + [each[-1:] for each in lists] + [[1, 2], [0, 1]]
 
 
+def read_by(cls, config):
+    """({path of a config: keys that the class asks it for and it lacks}, the words in the sources of the class and its parts)."""
+    asked = collections.defaultdict(list)
+
+    def lacks(self, key):
+        asked[id(self)].append(key)
+        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{key}'")
+
+    base = transformers.PretrainedConfig
+    before = base.__dict__.get("__getattr__")
+    try:
+        base.__getattr__ = lacks
+        with contextlib.suppress(Exception, TooSlow), time_limit(SECONDS), torch.device("meta"):
+            model = cls(cls.config_class.from_dict(copy.deepcopy(config)))
+    finally:
+        if before is None:
+            del base.__getattr__
+        else:
+            base.__getattr__ = before
+    if "model" not in locals():
+        return {}, []
+    found, classes = {}, {type(module) for module in model.modules()}
+    for path, part in configs_in(model.config):
+        classes.add(type(part))
+        text = "\n".join(sources.texts(cls, type(part), *classes))
+        general = set(base().to_dict())
+        names = [*asked[id(part)], *sources.popped(type(part)), *unsettable(type(part))]
+        found[path] = [
+            key
+            for key in dict.fromkeys(names)
+            if not key.startswith("_")
+            and key not in general | NEVER
+            and re.search(rf"[\"']{key}[\"']|config\.{key}\b|def {key}\b", text)
+        ]
+    modules = "\n".join(sources.texts(cls, cls.config_class, *classes))
+    return found, sorted(set(re.findall(r"[\"']([\w.|+-]{2,40})[\"']", modules)))
+
+
+def configs_in(config, path=()):
+    """A config and those that it has, with their paths."""
+    yield path, config
+    for key, value in vars(config).items():
+        if isinstance(value, transformers.PretrainedConfig) and not key.startswith("_") and len(path) < 3:
+            yield from configs_in(value, (*path, key))
+
+
+def unsettable(config_class):
+    """Properties of a config class that cannot be set."""
+    for each in sources.bases(config_class, transformers.PretrainedConfig):
+        for key, value in vars(each).items():
+            if isinstance(value, property) and value.fset is None:
+                yield key
+
+
 def at(config, pointer):
     for key in pointer:
         config = config.get(key) if isinstance(config, dict) else None
@@ -164,8 +228,9 @@ def nested(config, path=()):
             yield from nested(value, (*path, key))
 
 
-def pointers(config, every):
+def pointers(small, every):
     """The keys to try: those that not every config has, and the others of the root where `every` is set."""
+    config = small.config
     general = set(transformers.PretrainedConfig().to_dict()) - TRIED
     for path, part in nested(config):
         for key in part:
@@ -173,6 +238,7 @@ def pointers(config, every):
                 yield (*path, key)
         if NEW and ROPE in part:
             yield from ((*path, "rope_theta"), (*path, "rope_scaling"), (*path, "partial_rotary_factor"))
+        yield from ((*path, key) for key in small.asked.get(path, []))
     if every:
         yield from ((key,) for key in ("dtype", "torch_dtype", "id2label", "label2id", "pad_token_id") if key not in config)
 
@@ -223,7 +289,7 @@ def special(small):
     for path, part in nested(small.config):
         for key, value in part.items():
             if isinstance(value, str) and value in ACT2FN:
-                put("activation", (*path, key), "swoosh", "KeyError: 'swoosh'" if not NEW else "swoosh")
+                put("activation", (*path, key), "swoosh", "swoosh")
         vocabulary = part.get("vocab_size")
         if isinstance(vocabulary, int):
             put("padding", (*path, "pad_token_id"), vocabulary, "AssertionError: Padding_idx must be within num_embeddings")
@@ -235,6 +301,63 @@ def special(small):
             'KeyError: "Missing required keys in `',
         )
     return found
+
+
+def words(small, known=None):
+    """[(pointer, exception, words that load)] of the keys of which an unknown word raises.
+
+    `known` is that of a class of the same config class: what loads there is not tried again.
+    """
+    general = set(transformers.PretrainedConfig().to_dict())
+    for path, part in nested(small.config):
+        for key, value in part.items():
+            if not isinstance(value, str) or value in ACT2FN or key in general | NEVER or "backbone" in key:
+                continue
+            pointer, nonsense = (*path, key), ("swoosh", "xyzzy")
+            said = [without_word(small.raises(pointer, word), word) for word in nonsense]
+            if said[0] is None or said[0] != said[1]:
+                continue
+            if of_key := [row for row in known or () if row[:2] == ["/".join(pointer), said[0].split(":", 1)[0]]]:
+                yield of_key[0]
+                continue
+            tried = dict.fromkeys([value, *small.words.get(key, []), *small.literals])
+            loads = [word for word in tried if without_word(small.raises(pointer, word), word) != said[0]]
+            if value in loads and len(loads) < len(tried) / 2:
+                yield ["/".join(pointer), said[0].split(":", 1)[0], loads]
+
+
+def without_word(said, word):
+    return said and re.sub(rf"(?<!\w){re.escape(word)}(?!\w)", "", said)[:200]
+
+
+def lengths(small):
+    """[(pointers of lists that must have the same length, or of that and a count, exception)]."""
+    for path, part in nested(small.config):
+        lists = {
+            key: value
+            for key, value in part.items()
+            if isinstance(value, list) and value and all(isinstance(each, (int, float, str)) for each in value)
+        }
+        longer = {key: changed(small.config, (*path, key), [*value, value[-1]]) for key, value in lists.items()}
+        raised = {key: said for key, config in longer.items() if (said := small.outcome(config))}
+        done = set()
+        for key in raised:
+            if key in done:
+                continue
+            size = len(lists[key])
+            counts = [
+                other
+                for other, value in part.items()
+                if value == size and type(value) is int and small.outcome(changed(longer[key], (*path, other), size + 1)) is None
+            ]
+            alike = [other for other in raised if len(lists[other]) == size and raised[other].split(":")[0] == raised[key].split(":")[0]]
+            config = longer[key]
+            for other in alike:
+                config = changed(config, (*path, other), [*lists[other], lists[other][-1]])
+            group = [key, counts[0]] if counts else alike if len(alike) > 1 and small.outcome(config) is None else []
+            if group:
+                done.update(group)
+                yield ["/".join((*path, each)) for each in group], raised[key].split(":", 1)[0]
 
 
 def heads(small):
@@ -256,11 +379,12 @@ def heads(small):
 def values(small, every, known=None):
     """{(pointer, kind): exception}. `known` is what a class of the same config class refuses."""
     found = {}
-    for pointer in dict.fromkeys(pointers(small.config, every)):
+    for pointer in dict.fromkeys(pointers(small, every)):
         if known is not None:
             of_key = {kind: raised for (p, kind), raised in known.items() if p == pointer}
-            tried = next(iter(of_key), "object")
-            if small.refuses(pointer, tried) == of_key.get(tried):
+            # What a field of transformers 5 has no type for tells nothing of what the class makes of the value.
+            tried = {next(iter(of_key), "object"), "negative"}
+            if all(small.refuses(pointer, kind) == of_key.get(kind) for kind in tried):
                 found.update({(pointer, kind): raised for kind, raised in of_key.items()})
                 continue
         first = {kind: raised for kind in FIRST if (raised := small.refuses(pointer, kind))}
@@ -335,6 +459,7 @@ def family(args):
                 entry["heads"].append([pointer, width, raised])
             if raised := integers(models[0]):
                 entry["integers"] = raised
+            entry |= of_words_and_lengths(models, out.get(first, {}))
             kept = {
                 (pointer, kind): raised
                 for (pointer, kind), raised in found.items()
@@ -347,6 +472,31 @@ def family(args):
                 entry["values"] = first
             out[name] = finished(entry, catalogue.find_class(name).config_class)
     return out
+
+
+def of_words_and_lengths(models, known):
+    """The tables of words and lengths of a class, as far as all its models agree.
+
+    `known` are those of a class of the same config class.
+    """
+    found = {"words": [], "lengths": []}
+    for pointer, raised, loads in words(models[0], known.get("words")):
+        place = tuple(pointer.split("/"))
+        others = [other for other in models[1:] if isinstance(at(other.config, place), str)]
+        said = [other.raises(place, "swoosh") for other in others]
+        if all(each and each.startswith(raised) for each in said):
+            own = [at(other.config, place) for other in others]
+            found["words"].append([pointer, raised, sorted({*loads, *own})])
+    for pointers_, raised in lengths(models[0]):
+        sizes = [{size_at(other.config, pointer) for pointer in pointers_} for other in models[1:]]
+        if all(len(each) == 1 for each in sizes):
+            found["lengths"].append([pointers_, raised])
+    return {kind: rows for kind, rows in found.items() if rows}
+
+
+def size_at(config, pointer):
+    value = at(config, tuple(pointer.split("/")))
+    return len(value) if isinstance(value, list) else value
 
 
 def finished(entry, config_class):
@@ -409,6 +559,10 @@ def composed(entries, parts):
                 out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
             elif kind == "integers":
                 out[kind] = found
+            elif kind == "words":
+                out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
+            elif kind == "lengths":
+                out[kind] += [[[under + pointer for pointer in group], raised] for group, raised in found]
             elif kind == "defaults":
                 out[kind] = {**(out[kind] or {}), **{under + key: value for key, value in found.items()}}
             else:
