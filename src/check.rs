@@ -5,6 +5,8 @@ mod bounded;
 mod built_tokenizer;
 mod card;
 mod class_names;
+#[cfg(feature = "cli")]
+pub mod compare;
 mod config_pattern;
 mod directory;
 pub mod engine;

@@ -303,10 +303,26 @@ impl Checkpoint {
             return Some(false);
         }
         if self.deep {
-            return contents::same_bytes(&self.source, one, other);
+            return contents::same_bytes([&self.source; 2], one, other);
         }
         let sample = |(shard, tensor)| contents::sample(&self.source, shard, tensor);
         (sample(one)? != sample(other)?).then_some(false)
+    }
+
+    /// Whether a tensor of this checkpoint has the same bytes as one of another checkpoint, of the same type and shape: all of
+    /// them, or the first, middle and last ones. `None` when they cannot be read.
+    pub(crate) fn bytes_equal(
+        &self,
+        one: (&Shard, &Tensor),
+        beside: &Self,
+        other: (&Shard, &Tensor),
+        all: bool,
+    ) -> Option<bool> {
+        let sources = [&self.source, &beside.source];
+        if all {
+            return contents::same_bytes(sources, one, other);
+        }
+        Some(contents::sample(sources[0], one.0, one.1)? == contents::sample(sources[1], other.0, other.1)?)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

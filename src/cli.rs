@@ -4,6 +4,7 @@ mod args;
 mod baseline;
 mod build_merged;
 mod check;
+mod diff;
 mod exit;
 mod expect;
 mod fix;
@@ -107,6 +108,7 @@ fn run() -> ExitCode {
         args::Command::Check(args) => check::run(args, rules.as_deref()),
         args::Command::Undo(args) => undo::run(&args),
         args::Command::Inspect(args) => inspect::run(&args, rules.as_deref()),
+        args::Command::Diff(args) => diff::run(&args, rules.as_deref()),
         args::Command::Expect(args) => expect::run(&args, rules.as_deref()),
         args::Command::BuildMerged(args) => build_merged::run(&args, rules.as_deref()),
         args::Command::Verify(args) => verify::run(&args),

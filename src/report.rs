@@ -10,6 +10,8 @@ pub(crate) mod card;
 mod ci;
 mod collapse;
 #[cfg(feature = "cli")]
+pub mod compare;
+#[cfg(feature = "cli")]
 mod concise;
 #[cfg(feature = "cli")]
 pub mod diff;

@@ -28,6 +28,7 @@ use crate::merge::dry_run::PlanDocument;
 use crate::merge::manifest::Manifest;
 use crate::report::Report;
 use crate::report::baseline::Baseline;
+use crate::report::compare::DiffDocument;
 use crate::report::inspect::InspectDocument;
 use crate::report::recipes::RecipesDocument;
 use crate::report::verification::Verification;
@@ -97,6 +98,7 @@ fn outputs() -> Vec<(&'static str, Value)> {
     vec![
         ("report", schema::<Report>("The JSON report of ckpt-doctor check and build-merged", settings())),
         ("inspect", schema::<InspectDocument<'_>>("The JSON report of ckpt-doctor inspect", settings())),
+        ("diff", schema::<DiffDocument<'_>>("The JSON report of ckpt-doctor diff", settings())),
         ("recipes", schema::<RecipesDocument<'_>>("The JSON list of ckpt-doctor recipes", settings())),
         ("verification", schema::<Verification>("The JSON report of ckpt-doctor verify", settings())),
         ("plan", schema::<PlanDocument>("The plan of ckpt-doctor build-merged --dry-run --plan", settings())),

@@ -29,15 +29,20 @@ const CHUNK: usize = 40 * BLOCK;
 /// has no digest.
 const HASHED_ZEROS: u64 = 1 << 30;
 
-/// Whether two tensors of the same length have the same bytes; `None` when they cannot be read. Holes are zeros.
-pub(super) fn same_bytes(source: &Source, one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<bool> {
-    let start = |(shard, tensor): (&Shard, &Tensor)| {
+/// Whether two tensors of the same length, each in a file of its source, have the same bytes; `None` when they cannot be read.
+/// Holes are zeros.
+pub(super) fn same_bytes(
+    [source, beside]: [&Source; 2],
+    one: (&Shard, &Tensor),
+    other: (&Shard, &Tensor),
+) -> Option<bool> {
+    let start = |source: &Source, (shard, tensor): (&Shard, &Tensor)| {
         let file = source.open_regular(&shard.name, u64::MAX).ok()?;
         let is_whole = file.len() == shard.file_len && !shard.unread && shard.is_contiguous(&tensor.name);
         let start = shard.data_start.checked_add(tensor.begin)?;
         (is_whole && start.checked_add(tensor.len())? <= shard.file_len).then_some((file, start))
     };
-    let ((one_file, one_start), (other_file, other_start)) = (start(one)?, start(other)?);
+    let ((one_file, one_start), (other_file, other_start)) = (start(source, one)?, start(beside, other)?);
     let [mut buffer, mut there] = [(); 2].map(|()| vec![0_u8; CHUNK]);
     let mut equal = one.1.len() == other.1.len();
     let mut readable = true;

@@ -49,6 +49,9 @@ pub enum Command {
     Verify(VerifyArgs),
     /// Summarise a checkpoint: tensors, model class, inferred config values
     Inspect(InspectArgs),
+    /// Compare two checkpoints: tensors under one naming, config values, tokens and files
+    #[command(visible_alias = "compare")]
+    Diff(DiffArgs),
     /// Print the tensors that a model class expects, from its config alone
     Expect(ExpectArgs),
     /// Print the documentation of a rule or a recipe
@@ -159,7 +162,27 @@ pub struct InspectArgs {
     pub color: Color,
 }
 
-/// Formats of `inspect` and `verify`.
+/// Arguments of `diff`.
+#[derive(Debug, Args)]
+pub struct DiffArgs {
+    /// The first checkpoint: a directory, or a .safetensors file
+    #[arg(value_name = "BEFORE")]
+    pub before: PathBuf,
+    /// The second one
+    #[arg(value_name = "AFTER")]
+    pub after: PathBuf,
+    /// Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones
+    #[arg(long)]
+    pub bytes: bool,
+    /// Output format
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
+    pub output_format: InspectFormat,
+    /// When to print colours; auto respects `NO_COLOR`
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    pub color: Color,
+}
+
+/// Formats of `inspect`, `diff` and `verify`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum InspectFormat {
     /// For a terminal

@@ -16,7 +16,7 @@ const COMMANDS: [(&[&str], Option<&str>); 13] = [
         Some("check"),
     ),
     (&["fix", "format", "heal", "repair"], Some("check --fix")),
-    (&["diff"], Some("check --diff")),
+    (&["cmp", "delta"], Some("diff")),
     (
         &[
             "cat", "describe", "dump", "header", "headers", "info", "keys", "list", "ls", "print", "shapes", "show",
@@ -32,7 +32,7 @@ const COMMANDS: [(&[&str], Option<&str>); 13] = [
     (&["docs", "rule", "why"], Some("explain")),
     (&["config", "settings"], Some("init")),
     (&["version"], Some("--version")),
-    (&["compare", "convert", "download", "pull", "push", "quantise", "quantize", "upload"], None),
+    (&["convert", "download", "pull", "push", "quantise", "quantize", "upload"], None),
 ];
 
 /// Options that people type, with an option that does it and how it is passed. The first whose option the command has is offered.

@@ -17,27 +17,7 @@ use crate::report::inspect as report;
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let path = &args.path;
-    if !path.exists() {
-        bail!("{}: no such file or directory", path.display());
-    }
-    let checkpoint = if let Some(shard) = alone(path) {
-        shard
-    } else {
-        let kinds = Directories::embedded()?;
-        let mut found = find_checkpoints(path, &|names| kinds.recognise(names));
-        // Those in the folders of a checkpoint are inspected on their own.
-        if found.checkpoints.contains(path) {
-            found.checkpoints.retain(|dir| dir == path);
-        }
-        let [dir] = found.checkpoints.as_slice() else {
-            if let Some(reason) = paths::nothing(path, &found) {
-                bail!("{}: {reason}", path.display());
-            }
-            let count = found.checkpoints.len();
-            bail!("{}: contains {count} checkpoints; pass one of them, or a .safetensors file", path.display());
-        };
-        Checkpoint::open(dir).with_context(|| dir.display().to_string())?
-    };
+    let checkpoint = open(path)?;
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
     let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?));
@@ -47,6 +27,31 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         (InspectFormat::Json, listed) => report::json(&name, &inspection(rules)?, listed.as_deref()),
     })?;
     Ok(CLEAN)
+}
+
+/// Opens the checkpoint at a path, or in it, or a file of tensors. `inspect` and `diff` call it. Fails where there is none, and
+/// where there are several.
+pub(super) fn open(path: &Path) -> anyhow::Result<Checkpoint> {
+    if !path.exists() {
+        bail!("{}: no such file or directory", path.display());
+    }
+    if let Some(shard) = alone(path) {
+        return Ok(shard);
+    }
+    let kinds = Directories::embedded()?;
+    let mut found = find_checkpoints(path, &|names| kinds.recognise(names));
+    // Those in the folders of a checkpoint are opened on their own.
+    if found.checkpoints.iter().any(|dir| dir == path) {
+        found.checkpoints.retain(|dir| dir == path);
+    }
+    let [dir] = found.checkpoints.as_slice() else {
+        if let Some(reason) = paths::nothing(path, &found) {
+            bail!("{}: {reason}", path.display());
+        }
+        let count = found.checkpoints.len();
+        bail!("{}: contains {count} checkpoints; pass one of them, or a .safetensors file", path.display());
+    };
+    Checkpoint::open(dir).with_context(|| dir.display().to_string())
 }
 
 /// The tensors that match a pattern; fails if there is none, unless the pattern matches all. Names the files of which tensors

@@ -2,6 +2,8 @@
 
 #[cfg(unix)]
 mod check;
+#[cfg(unix)]
+mod diff;
 mod expect;
 #[cfg(unix)]
 mod pins;

@@ -127,6 +127,15 @@ fn inspections_follow_their_schema() {
 }
 
 #[test]
+fn differences_follow_their_schema() {
+    let diff = jsonschema::draft202012::new(&schema("diff")).unwrap();
+    let [one, other] = ["fixtures/donors/llava3d-tiny", "fixtures/donors/spatialvla-tiny"];
+    for pair in [[one, other], [one, one]] {
+        holds(&diff, &printed(project(), &["diff", pair[0], pair[1], "--output-format", "json"]));
+    }
+}
+
+#[test]
 fn the_list_of_recipes_follows_its_schema() {
     let recipes = jsonschema::draft202012::new(&schema("recipes")).unwrap();
     let list = printed(project(), &["recipes", "--output-format", "json"]);

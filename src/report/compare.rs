@@ -1,0 +1,155 @@
+//! The result of `diff`, for people or as JSON.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::Style;
+use super::collapse::collapse;
+use super::format::{more, name, plural, sentence, shape};
+use super::json::pretty;
+use super::model::ToolInfo;
+use super::terminal::paint::Paint;
+use crate::check::compare::{ComparedBytes, Differences, DocumentChange, OneSided, Renaming, TensorDifferences};
+use crate::checkpoint::escape;
+
+/// Maximum number of lines of one kind; the others are counted.
+const LINES: usize = 20;
+
+/// Maximum length of a value, in characters.
+const VALUE: usize = 60;
+
+#[derive(Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub(crate) struct DiffDocument<'a> {
+    schema: u32,
+    tool: ToolInfo,
+    /// The first path.
+    before: &'a str,
+    /// The second path.
+    after: &'a str,
+    #[serde(flatten)]
+    differences: &'a Differences,
+}
+
+/// All differences as JSON.
+#[must_use]
+pub fn json(before: &str, after: &str, differences: &Differences) -> String {
+    pretty(&DiffDocument { schema: 1, tool: ToolInfo::this(), before, after, differences })
+}
+
+/// The differences for a terminal. Nothing is cut to its width: long lists of one kind are counted.
+#[must_use]
+pub fn full(before: &str, after: &str, differences: &Differences, style: Style) -> String {
+    let paint = Paint(style.color);
+    let mut out = String::new();
+    let verdict = match (differences.differ, differences.unknown.is_empty()) {
+        (true, _) => " differ",
+        (false, true) => ": no difference found",
+        (false, false) => ": no difference found in what could be compared",
+    };
+    let _ok = writeln!(out, "{} and {}{verdict}", paint.strong(&name(before)), paint.strong(&name(after)));
+    tensors(&mut out, &differences.tensors, paint);
+    for DocumentChange { file, values, further } in &differences.documents {
+        let line = |at: &str, before: &Option<Value>, after: &Option<Value>| {
+            format!("{}: {} -> {}", name(at), value(before.as_ref()), value(after.as_ref()))
+        };
+        let lines = values.iter().map(|change| line(&change.pointer, &change.before, &change.after));
+        section(&mut out, &name(file), lines, *further, paint);
+    }
+    if let Some(tokens) = &differences.tokens {
+        let id = |id: Option<u64>| id.map_or_else(|| "none".to_owned(), |id| id.to_string());
+        let (token, before, after) = (name(&tokens.first), id(tokens.before), id(tokens.after));
+        let first =
+            format!("{} with another id, the first is {token}: {before} -> {after}", plural(tokens.tokens, "token"));
+        section(&mut out, "tokenizer", std::iter::once(first), 0, paint);
+    }
+    let files = &differences.files;
+    let marked = |mark: &str, names: &[String]| names.iter().map(|file| format!("{mark} {}", name(file))).collect();
+    let lists: [Vec<String>; 3] =
+        [("-", &files.removed), ("+", &files.added), ("~", &files.changed)].map(|(mark, names)| marked(mark, names));
+    section(&mut out, "files", lists.into_iter().flatten(), 0, paint);
+    section(&mut out, "not compared", differences.unknown.iter().map(|text| sentence(text)), 0, paint);
+    out
+}
+
+fn tensors(out: &mut String, found: &TensorDifferences, paint: Paint) {
+    let read = match found.bytes {
+        ComparedBytes::Sampled => "equal in type, shape, and their first, middle and last bytes (--bytes compares all)",
+        ComparedBytes::All => "equal in type, shape and bytes",
+    };
+    let (before, after) = (plural(found.before, "tensor"), found.after);
+    let line = format!("{before} in the first, {after} in the second; {} {read}", found.equal);
+    section(out, "tensors", std::iter::once(line).filter(|_| (found.before, after) != (0, 0)), 0, paint);
+    let renamed = found.renamed.iter().map(|Renaming { from, to, tensors }| {
+        let change = match (name(from), name(to)) {
+            (from, _) if to.is_empty() => format!("{from} removed"),
+            (_, to) if from.is_empty() => format!("{to} added"),
+            (from, to) => format!("{from} -> {to}"),
+        };
+        format!("{change} ({})", plural(*tensors, "tensor"))
+    });
+    section(out, "renamed tensors, by prefix", renamed, 0, paint);
+    if let Some(c) = &found.converted {
+        let (one, other) = (plural(c.before, "tensor"), plural(c.after, "tensor"));
+        let line = format!(
+            "{one} of the first and {other} of the second have the same names and shapes once transformers {} has opened them; their bytes were not compared",
+            c.loader
+        );
+        section(out, "converted tensors", std::iter::once(line), 0, paint);
+    }
+    section(out, "tensors of the first alone", one_sided(&found.removed), 0, paint);
+    section(out, "tensors of the second alone", one_sided(&found.added), 0, paint);
+    let reshaped = found.reshaped.iter().map(|r| (format!("{} -> {}", shape(&r.before), shape(&r.after)), &*r.name));
+    section(out, "tensors of another shape", grouped(reshaped), 0, paint);
+    let recast = found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name));
+    section(out, "tensors of another type", grouped(recast), 0, paint);
+    let changed = found.changed.iter().map(|changed| (String::new(), changed.as_str()));
+    section(out, "tensors with other bytes", grouped(changed), 0, paint);
+}
+
+fn one_sided(tensors: &[OneSided]) -> impl Iterator<Item = String> {
+    grouped(tensors.iter().map(|tensor| {
+        let size = tensor.shape.as_deref().map(shape);
+        let words: Vec<String> = size.into_iter().chain(tensor.dtype.clone()).collect();
+        (words.join(" "), tensor.name.as_str())
+    }))
+}
+
+/// One line for the names of the same description, with numbered ones collapsed.
+fn grouped<'n>(named: impl Iterator<Item = (String, &'n str)>) -> impl Iterator<Item = String> {
+    let mut kinds: Vec<(String, Vec<&str>)> = Vec::new();
+    for (what, tensor) in named {
+        match kinds.iter_mut().find(|(kind, _)| *kind == what) {
+            Some((_, names)) => names.push(tensor),
+            None => kinds.push((what, vec![tensor])),
+        }
+    }
+    kinds.into_iter().flat_map(|(what, names)| {
+        let line = move |pattern: String, count: usize| {
+            let counted = if count > 1 { format!(" ({count} tensors)") } else { String::new() };
+            format!("{} {what}", name(&pattern)).trim_end().to_owned() + &counted
+        };
+        collapse(names).into_iter().map(move |group| line(group.pattern, group.count)).collect::<Vec<_>>()
+    })
+}
+
+/// A title and its lines, if there are any, with the number of `further` ones.
+fn section(out: &mut String, title: &str, lines: impl Iterator<Item = String>, further: usize, paint: Paint) {
+    let lines: Vec<String> = lines.collect();
+    if lines.is_empty() {
+        return;
+    }
+    let _ok = writeln!(out, "\n  {}", paint.strong(title));
+    for line in lines.iter().take(LINES) {
+        let _ok = writeln!(out, "    {line}");
+    }
+    if let Some(more) = more(lines.len().saturating_add(further), LINES) {
+        let _ok = writeln!(out, "    {more}");
+    }
+}
+
+fn value(value: Option<&Value>) -> String {
+    value.map_or_else(|| "missing".to_owned(), |value| escape(&value.to_string(), VALUE))
+}
