@@ -38,7 +38,8 @@ def without(text, version, name):
 
 def with_corner(text, version, name, when):
     """The text of a file whose class is not predicted under this condition, in all versions of the entry."""
-    corner = f"{{ when: {json.dumps(when)}, why: {json.dumps('what ' + when.replace('c.', '') + ' does is not described')} }}"
+    told = re.sub(r"has\([^)]*\) && ", "", when).replace("c.", "")
+    corner = f"{{ when: {json.dumps(when)}, why: {json.dumps(f'what {told} does is not described')} }}"
     for entry, cls, versions in list(entries(text)):
         if cls == name and version in versions and corner not in entry:
             left = entry.replace("not_predicted_when: [", f"not_predicted_when: [{corner}, ", 1)

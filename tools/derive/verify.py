@@ -51,9 +51,9 @@ class Program:
         return (json.loads(line) for line in lines)
 
 
-# The program says that it does not know the model a config chooses for a part: no wrong answer, and no right one.
+# The program says that it does not know the model a config chooses for a part, or a value: no wrong answer, and no right one.
 UNKNOWN_PART = re.compile(
-    r"it is not known here: |\) is not known here|is not known here$|which it has as a part, is not known"
+    r"it is not known here: |\) is not known here|is not known here$|which it has as a part, is not known|is not described here$"
 )
 
 
