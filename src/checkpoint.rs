@@ -45,6 +45,7 @@ pub mod tokenizer;
 mod untold;
 pub(crate) mod work;
 
+pub(crate) use contents::Distance;
 pub use contents::{HashedFiles, Progress, ReadOptions, TensorContents, TensorStats};
 pub use digest::HashAlgorithm;
 pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
@@ -323,6 +324,12 @@ impl Checkpoint {
             return contents::same_bytes(sources, one, other);
         }
         Some(contents::sample(sources[0], one.0, one.1)? == contents::sample(sources[1], other.0, other.1)?)
+    }
+
+    /// How far the values of a tensor are from those of a tensor of another checkpoint, of the same shape. `None` when they
+    /// are no floats, not finite, or cannot be read.
+    pub(crate) fn distance(&self, one: (&Shard, &Tensor), beside: &Self, other: (&Shard, &Tensor)) -> Option<Distance> {
+        contents::distance([&self.source, &beside.source], one, other)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

@@ -60,8 +60,8 @@ pub struct TensorDifferences {
     pub reshaped: Vec<Reshaped>,
     /// With another type.
     pub recast: Vec<Recast>,
-    /// Names, in the first checkpoint, of those whose bytes differ although type and shape are the same.
-    pub changed: Vec<String>,
+    /// With other bytes, and the same type and shape.
+    pub changed: Vec<Changed>,
 }
 
 /// The bytes that are compared of two tensors with the same type and shape.
@@ -74,6 +74,8 @@ pub enum ComparedBytes {
     Sampled,
     /// All.
     All,
+    /// All, and how far the values are from each other where they differ.
+    Measured,
 }
 
 /// A prefix of names that the second checkpoint has in place of another one.
@@ -125,7 +127,7 @@ pub struct Reshaped {
 }
 
 /// A tensor with another type.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct Recast {
     /// Its name in the first checkpoint.
@@ -134,6 +136,61 @@ pub struct Recast {
     pub before: String,
     /// Its type in the second one.
     pub after: String,
+    /// By how much its values differ; missing unless it was asked for, and for values that are no finite floats.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by: Option<Magnitude>,
+}
+
+/// A tensor with other bytes.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct Changed {
+    /// Its name in the first checkpoint.
+    pub name: String,
+    /// By how much; missing unless it was asked for, and for values that are no finite floats.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by: Option<Magnitude>,
+}
+
+/// How far the values of a tensor are from those of another one. The norms are Euclidean ones of all values.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct Magnitude {
+    /// Norm of the first tensor.
+    pub norm_before: f64,
+    /// Norm of the second tensor.
+    pub norm_after: f64,
+    /// Norm of the difference.
+    pub norm_of_difference: f64,
+    /// The largest difference of two values.
+    pub largest_difference: f64,
+}
+
+impl Magnitude {
+    /// That of several tensors together.
+    #[must_use]
+    pub fn and(self, other: Self) -> Self {
+        Self {
+            norm_before: self.norm_before.hypot(other.norm_before),
+            norm_after: self.norm_after.hypot(other.norm_after),
+            norm_of_difference: self.norm_of_difference.hypot(other.norm_of_difference),
+            largest_difference: self.largest_difference.max(other.largest_difference),
+        }
+    }
+
+    /// The norm of the difference, as a share of the first norm; `None` when that is zero.
+    #[must_use]
+    pub fn relative(self) -> Option<f64> {
+        (self.norm_before > 0.0).then(|| self.norm_of_difference / self.norm_before)
+    }
+
+    /// The cosine of the angle between both; `None` when one norm is zero.
+    #[must_use]
+    pub fn cosine(self) -> Option<f64> {
+        let (a, b, d) = (self.norm_before, self.norm_after, self.norm_of_difference);
+        // That is (a² + b² − d²) / 2ab, without the difference of large squares.
+        (a > 0.0 && b > 0.0).then(|| 1.0 - (d - (a - b).abs()) * (d + (a - b).abs()) / (2.0 * a * b))
+    }
 }
 
 /// A JSON document that differs.
@@ -254,17 +311,27 @@ fn tensors(
     let mut found = TensorDifferences { before, after, renamed, bytes, ..TensorDifferences::default() };
     let sides = converted::sides(one, other, library, &left, &right);
     (found.converted, found.removed, found.added) = (sides.converted, sides.removed, sides.added);
+    let by = |before, after| {
+        let measured = (bytes == ComparedBytes::Measured).then(|| one.distance(before, other, after)).flatten();
+        measured.map(|found| Magnitude {
+            norm_before: found.before,
+            norm_after: found.after,
+            norm_of_difference: found.difference,
+            largest_difference: found.largest,
+        })
+    };
     for (before, after) in pairs {
         let name = || before.1.name.clone();
         if before.1.shape != after.1.shape {
             let (before, after) = (before.1.shape.clone(), after.1.shape.clone());
             found.reshaped.push(Reshaped { name: name(), before, after });
         } else if before.1.dtype != after.1.dtype {
+            let by = by(before, after);
             let [before, after] = [before, after].map(|(_, tensor)| dtype(tensor.dtype));
-            found.recast.push(Recast { name: name(), before, after });
+            found.recast.push(Recast { name: name(), before, after, by });
         } else {
-            match one.bytes_equal((before.0, before.1), other, (after.0, after.1), bytes == ComparedBytes::All) {
-                Some(false) => found.changed.push(name()),
+            match one.bytes_equal(before, other, after, bytes != ComparedBytes::Sampled) {
+                Some(false) => found.changed.push(Changed { name: name(), by: by(before, after) }),
                 Some(true) => found.equal = found.equal.saturating_add(1),
                 None => unknown.push(format!("the bytes of {} could not be compared", before.1.name)),
             }

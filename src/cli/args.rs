@@ -174,6 +174,9 @@ pub struct DiffArgs {
     /// Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones
     #[arg(long)]
     pub bytes: bool,
+    /// Compare all bytes, and print how far the values of tensors are from each other that differ
+    #[arg(long)]
+    pub stats: bool,
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,

@@ -12,7 +12,11 @@ use crate::report::compare as report;
 /// Runs `diff`: 0 without a difference, 1 with one, 2 when there is none in what could be compared and not all could.
 pub fn run(args: &DiffArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let (before, after) = (inspect::open(&args.before)?, inspect::open(&args.after)?);
-    let bytes = if args.bytes { ComparedBytes::All } else { ComparedBytes::Sampled };
+    let bytes = match (args.stats, args.bytes) {
+        (true, _) => ComparedBytes::Measured,
+        (false, true) => ComparedBytes::All,
+        (false, false) => ComparedBytes::Sampled,
+    };
     let differences = compare(&before, &after, &library::with(rules)?, bytes);
     let [before, after] = [&args.before, &args.after].map(|path| shown(path));
     output::print(&match args.output_format {

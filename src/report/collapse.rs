@@ -21,31 +21,46 @@ type Words = Vec<String>;
 /// A pattern matches exactly the given names: numbers are only combined if every combination occurs. A duplicate name
 /// is counted twice only if it contains no numbers.
 pub fn collapse<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<NameGroup> {
+    collapse_with(names.into_iter().map(|name| (name, ())), |(), ()| ()).into_iter().map(|(group, ())| group).collect()
+}
+
+/// As [`collapse`], of names with a value each; that of a pattern is made of the values of its names by `join`.
+pub fn collapse_with<'a, T: Copy>(
+    named: impl IntoIterator<Item = (&'a str, T)>,
+    join: impl Fn(T, T) -> T,
+) -> Vec<(NameGroup, T)> {
     let mut order: Vec<Words> = Vec::new();
-    let mut families: BTreeMap<Words, Vec<Vec<NumberList>>> = BTreeMap::new();
-    for name in names {
+    let mut families: BTreeMap<Words, Vec<(NumberList, T)>> = BTreeMap::new();
+    for (name, value) in named {
         let (words, numbers) = split(name);
-        let members = families.entry(words).or_insert_with_key(|words| {
+        let family = families.entry(words).or_insert_with_key(|words| {
             order.push(words.clone());
             Vec::new()
         });
-        members.push(numbers.into_iter().map(|n| vec![n]).collect());
+        family.push((numbers, value));
     }
     let mut groups = Vec::new();
     for words in order {
-        let mut members = families.remove(&words).unwrap_or_default();
+        let family = families.remove(&words).unwrap_or_default();
+        let values = |wanted: &dyn Fn(&NumberList) -> bool| {
+            family.iter().filter(|(numbers, _)| wanted(numbers)).map(|(_, value)| *value).reduce(&join)
+        };
+        if words.len() <= 1 {
+            let group = NameGroup { pattern: words.concat(), count: family.len() };
+            groups.extend(values(&|_| true).map(|value| (group, value)));
+            continue;
+        }
+        let mut members: Vec<Vec<NumberList>> =
+            family.iter().map(|(numbers, _)| numbers.iter().map(|n| vec![*n]).collect()).collect();
         for at in (0..words.len().saturating_sub(1)).rev() {
             members = gather(members, at);
         }
-        let plain = words.len() <= 1;
-        if plain {
-            groups.push(NameGroup { pattern: words.concat(), count: members.len() });
-            continue;
+        for lists in members {
+            let count = lists.iter().map(Vec::len).fold(1, usize::saturating_mul);
+            let has = |numbers: &NumberList| numbers.iter().zip(&lists).all(|(n, list)| list.binary_search(n).is_ok());
+            let group = NameGroup { pattern: pattern(&words, &lists), count };
+            groups.extend(values(&has).map(|value| (group, value)));
         }
-        groups.extend(members.into_iter().map(|numbers| NameGroup {
-            pattern: pattern(&words, &numbers),
-            count: numbers.iter().map(Vec::len).fold(1, usize::saturating_mul),
-        }));
     }
     groups
 }
@@ -136,6 +151,14 @@ mod tests {
 
     fn shown(names: &[&str]) -> Vec<(String, usize)> {
         collapse(names.iter().copied()).into_iter().map(|NameGroup { pattern, count }| (pattern, count)).collect()
+    }
+
+    #[test]
+    fn the_value_of_a_pattern_is_that_of_its_names() {
+        let named = [("l.0.w", 1), ("l.1.w", 2), ("l.1.b", 4), ("x", 8), ("l.3.w", 16)];
+        let found = super::collapse_with(named, |a, b| a + b);
+        let found: Vec<(&str, usize, i32)> = found.iter().map(|(g, sum)| (g.pattern.as_str(), g.count, *sum)).collect();
+        assert_eq!(found, [("l.{0..1,3}.w", 3, 19), ("l.1.b", 1, 4), ("x", 1, 8)]);
     }
 
     #[test]

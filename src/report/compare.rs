@@ -6,12 +6,14 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::Style;
-use super::collapse::collapse;
+use super::collapse::{NameGroup, collapse_with};
 use super::format::{more, name, plural, sentence, shape};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::paint::Paint;
-use crate::check::compare::{ComparedBytes, Differences, DocumentChange, OneSided, Renaming, TensorDifferences};
+use crate::check::compare::{
+    ComparedBytes, Differences, DocumentChange, Magnitude, OneSided, Renaming, TensorDifferences,
+};
 use crate::checkpoint::escape;
 
 /// Maximum number of lines of one kind; the others are counted.
@@ -77,7 +79,7 @@ pub fn full(before: &str, after: &str, differences: &Differences, style: Style) 
 fn tensors(out: &mut String, found: &TensorDifferences, paint: Paint) {
     let read = match found.bytes {
         ComparedBytes::Sampled => "equal in type, shape, and their first, middle and last bytes (--bytes compares all)",
-        ComparedBytes::All => "equal in type, shape and bytes",
+        ComparedBytes::All | ComparedBytes::Measured => "equal in type, shape and bytes",
     };
     let (before, after) = (plural(found.before, "tensor"), found.after);
     let line = format!("{before} in the first, {after} in the second; {} {read}", found.equal);
@@ -103,10 +105,10 @@ fn tensors(out: &mut String, found: &TensorDifferences, paint: Paint) {
     section(out, "tensors of the second alone", one_sided(&found.added), 0, paint);
     let reshaped = found.reshaped.iter().map(|r| (format!("{} -> {}", shape(&r.before), shape(&r.after)), &*r.name));
     section(out, "tensors of another shape", grouped(reshaped), 0, paint);
-    let recast = found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name));
-    section(out, "tensors of another type", grouped(recast), 0, paint);
-    let changed = found.changed.iter().map(|changed| (String::new(), changed.as_str()));
-    section(out, "tensors with other bytes", grouped(changed), 0, paint);
+    let recast = found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name, r.by));
+    section(out, "tensors of another type", measured(recast), 0, paint);
+    let changed = found.changed.iter().map(|changed| (String::new(), &*changed.name, changed.by));
+    section(out, "tensors with other bytes", measured(changed), 0, paint);
 }
 
 fn one_sided(tensors: &[OneSided]) -> impl Iterator<Item = String> {
@@ -117,22 +119,40 @@ fn one_sided(tensors: &[OneSided]) -> impl Iterator<Item = String> {
     }))
 }
 
-/// One line for the names of the same description, with numbered ones collapsed.
 fn grouped<'n>(named: impl Iterator<Item = (String, &'n str)>) -> impl Iterator<Item = String> {
-    let mut kinds: Vec<(String, Vec<&str>)> = Vec::new();
-    for (what, tensor) in named {
+    measured(named.map(|(what, tensor)| (what, tensor, None)))
+}
+
+/// One line for the names of the same description, with numbered ones collapsed, and how far they are apart together.
+fn measured<'n>(named: impl Iterator<Item = (String, &'n str, Option<Magnitude>)>) -> impl Iterator<Item = String> {
+    let mut kinds: Vec<(String, Vec<(&str, Option<Magnitude>)>)> = Vec::new();
+    for (what, tensor, by) in named {
         match kinds.iter_mut().find(|(kind, _)| *kind == what) {
-            Some((_, names)) => names.push(tensor),
-            None => kinds.push((what, vec![tensor])),
+            Some((_, tensors)) => tensors.push((tensor, by)),
+            None => kinds.push((what, vec![(tensor, by)])),
         }
     }
-    kinds.into_iter().flat_map(|(what, names)| {
-        let line = move |pattern: String, count: usize| {
-            let counted = if count > 1 { format!(" ({count} tensors)") } else { String::new() };
-            format!("{} {what}", name(&pattern)).trim_end().to_owned() + &counted
+    kinds.into_iter().flat_map(|(what, tensors)| {
+        let line = move |(group, by): (NameGroup, Option<Magnitude>)| {
+            let counted = if group.count > 1 { format!(" ({} tensors)", group.count) } else { String::new() };
+            let described = format!("{} {what}", name(&group.pattern)).trim_end().to_owned() + &counted;
+            by.map_or(described.clone(), |by| format!("{described}: {}", amount(by)))
         };
-        collapse(names).into_iter().map(move |group| line(group.pattern, group.count)).collect::<Vec<_>>()
+        collapse_with(tensors, |one, other| Some(one?.and(other?))).into_iter().map(line).collect::<Vec<_>>()
     })
+}
+
+/// `0.0012 of the norm, at most 0.03, cosine 0.999999`.
+fn amount(by: Magnitude) -> String {
+    let share =
+        by.relative().map_or_else(|| "all of the norm".to_owned(), |share| format!("{} of the norm", figures(share)));
+    let cosine = by.cosine().map(|cosine| format!(", cosine {cosine:.6}")).unwrap_or_default();
+    format!("{share}, at most {}{cosine}", figures(by.largest_difference))
+}
+
+/// A number with three significant digits.
+fn figures(number: f64) -> String {
+    if number == 0.0 || (0.001..1000.0).contains(&number) { format!("{number:.3}") } else { format!("{number:.2e}") }
 }
 
 /// A title and its lines, if there are any, with the number of `further` ones.

@@ -104,6 +104,30 @@ fn another_type_is_told_for_all_tensors_at_once() {
 }
 
 #[test]
+fn how_far_values_are_apart_is_measured() {
+    let room = TempDir::new().unwrap();
+    // 3 and 4, and 3 and 5: a norm of 5, and a difference of 1. BF16 has the upper half of F32.
+    let [three, four, five] = ["00004040", "00008040", "0000a040"];
+    let with = |second: &str| {
+        let poke = |at: usize, hex: &str| {
+            format!(r#"{{ poke: {{ tensor: "model.pair.weight", at: {at}, bytes: [{{ hex: "{hex}" }}] }} }}"#)
+        };
+        let pair = r#"{ add_tensor: { name: "model.pair.weight", shape: [2], dtype: "F32" } }"#;
+        format!("[{pair}, {}, {}]", poke(0, three), poke(4, second))
+    };
+    make(room.path(), "before", "llama", &with(four));
+    make(room.path(), "after", "llama", &with(five));
+    let found = text(room.path(), &["before", "after", "--stats"], 1);
+    assert!(found.contains("    model.pair.weight: 0.200 of the norm, at most 1.000, cosine 0.994692\n"), "{found}");
+    let found: Value =
+        serde_json::from_str(&text(room.path(), &["before", "after", "--stats", "--output-format", "json"], 1))
+            .unwrap();
+    let by = &found["tensors"]["changed"][0]["by"];
+    assert_eq!([&by["norm_before"], &by["norm_of_difference"], &by["largest_difference"]], [5.0, 1.0, 1.0]);
+    assert_eq!(found["tensors"]["bytes"], "measured");
+}
+
+#[test]
 fn what_could_not_be_read_is_said_and_exits_with_2() {
     let room = TempDir::new().unwrap();
     make(room.path(), "before", "llama", "[]");
