@@ -2,6 +2,7 @@
 
 pub mod architecture;
 mod by_version;
+pub mod cache;
 pub mod classes;
 pub mod directories;
 pub mod embeddings;

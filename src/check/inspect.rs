@@ -1,5 +1,6 @@
 //! The summary of a checkpoint: amounts, and the class and config values that its tensors imply.
 
+mod memory;
 mod tensors;
 mod tree;
 
@@ -10,10 +11,11 @@ use serde_json::{Map, Value};
 
 use super::load::{self, Stored};
 use super::votes::{self, Fit, Votes, vote};
-use crate::checkpoint::{Checkpoint, Tensor, pointer};
+use crate::checkpoint::{Checkpoint, Dtype, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
 use crate::knowledge::{Architecture, Library, Loader};
 
+pub use self::memory::{CacheInput, Memory};
 pub use self::tensors::{InspectedTensor, tensors};
 pub use self::tree::InspectedModule;
 
@@ -46,6 +48,8 @@ pub struct Inspection {
     pub votes: Option<Votes>,
     /// A config.json with only the values that the tensors imply; null if no class matches.
     pub proven: Value,
+    /// The memory that the class takes with the values of config.json; null for an unknown class, and for quantised weights.
+    pub memory: Option<Memory>,
     /// Why parts of the summary are missing.
     pub notes: Vec<String>,
 }
@@ -121,9 +125,9 @@ pub struct ClassCandidate {
     pub fit: Option<f64>,
 }
 
-/// Summarises a checkpoint. Reads no file: [`Checkpoint::open`] has read what is needed.
+/// Summarises a checkpoint, with the size of a cache for `cache`. Reads no file: [`Checkpoint::open`] has read what is needed.
 #[must_use]
-pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
+pub fn inspect(checkpoint: &Checkpoint, library: &Library, cache: CacheInput) -> Inspection {
     let mut tensors = Amount::default();
     let mut dtypes: BTreeMap<String, Amount> = BTreeMap::new();
     for (_, tensor) in checkpoint.tensors() {
@@ -144,6 +148,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         classes: Vec::new(),
         votes: None,
         proven: Value::Null,
+        memory: None,
         notes: Vec::new(),
     };
     let mut stored = Stored::of(checkpoint);
@@ -156,6 +161,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library) -> Inspection {
         return inspection;
     }
     judge(&mut inspection, checkpoint.config(), &stored, library);
+    inspection.memory = memory(checkpoint, &stored, library, cache);
     inspection
 }
 
@@ -209,6 +215,19 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
         )),
     }
     inspection.classes = classes;
+}
+
+/// The memory of the class that config.json names; `None` without one that can be built, and for quantised weights.
+fn memory(checkpoint: &Checkpoint, stored: &Stored, library: &Library, cache: CacheInput) -> Option<Memory> {
+    let config = checkpoint.config().filter(|c| !c.get("quantization_config").is_some_and(Value::is_object))?;
+    let expected = load::build(by_config(library, config, stored)?, config, stored).ok()?;
+    let mut elements: BTreeMap<Dtype, u64> = BTreeMap::new();
+    for (_, tensor) in checkpoint.tensors().filter(|(_, tensor)| !tensor.dtype.is_integer()) {
+        let own = elements.entry(tensor.dtype).or_default();
+        *own = own.saturating_add(tensor.shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d)));
+    }
+    let (dtype, _) = elements.into_iter().max_by_key(|(_, count)| *count)?;
+    memory::of(&expected, dtype, cache)
 }
 
 /// The class that config.json names, under the loader it names or else another.

@@ -154,6 +154,12 @@ pub struct InspectArgs {
     /// List the tensors, or those whose names match GLOB (`*` is any text): shape, dtype, bytes, and place in the files
     #[arg(long, value_name = "GLOB", num_args = 0..=1, require_equals = true, default_missing_value = "*")]
     pub tensors: Option<String>,
+    /// Tokens of the cache whose memory is told [default: the longest input that the config names]
+    #[arg(long, value_name = "TOKENS")]
+    pub context: Option<u64>,
+    /// Sequences of that cache
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub batch: u64,
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,

@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
-use crate::check::inspect::{InspectedTensor, inspect, tensors};
+use crate::check::inspect::{CacheInput, InspectedTensor, inspect, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
@@ -20,7 +20,8 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let checkpoint = open(path)?;
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
-    let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?));
+    let cache = CacheInput { context: args.context, batch: args.batch };
+    let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?, cache));
     output::print(&match (args.output_format, listed) {
         (InspectFormat::Full, Some(listed)) => report::tensors(&listed),
         (InspectFormat::Full, None) => report::full(&name, &inspection(rules)?, args.depth, output::style(args.color)),

@@ -14,7 +14,7 @@ use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
-use crate::check::inspect::{Amount, ClassCandidate, InspectedTensor, Inspection};
+use crate::check::inspect::{Amount, ClassCandidate, InspectedTensor, Inspection, Memory};
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
@@ -72,6 +72,9 @@ pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: S
     tree::render(&mut out, &inspection.tree, levels, style);
     files(&mut out, inspection, style);
     class(&mut out, inspection, style);
+    if let Some(found) = &inspection.memory {
+        memory(&mut out, found, style);
+    }
     if let Some(votes) = &inspection.votes {
         values(&mut out, votes, inspection.config.is_some(), style);
     }
@@ -114,6 +117,30 @@ fn files(out: &mut String, inspection: &Inspection, style: Style) {
         .collect();
     let _ok = writeln!(out, "\n  files");
     table(out, ["", "bytes", "tensors"], &rows, style);
+}
+
+fn memory(out: &mut String, found: &Memory, style: Style) {
+    let dtype = name(&found.dtype);
+    let mut rows = vec![
+        ["weights".to_owned(), bytes(found.weights), format!("in {dtype}")],
+        [
+            "training step".to_owned(),
+            bytes(found.training),
+            format!("weights, gradients and both moments of AdamW in {dtype}, without activations"),
+        ],
+    ];
+    if let Some(cache) = &found.cache {
+        let size = if cache.at_most { format!("≤ {}", bytes(cache.bytes)) } else { bytes(cache.bytes) };
+        let (batch, context) = (plural_of(cache.batch, "sequence"), plural_of(cache.context, "token"));
+        let of = format!("keys and values of {batch} of {context} in {dtype}");
+        rows.push(["cache".to_owned(), size, of]);
+    }
+    let _ok = writeln!(out, "\n  memory");
+    table(out, ["", "bytes", ""], &rows, style);
+}
+
+fn plural_of(n: u64, noun: &str) -> String {
+    plural(usize::try_from(n).unwrap_or(usize::MAX), noun)
 }
 
 fn class(out: &mut String, inspection: &Inspection, style: Style) {

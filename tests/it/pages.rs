@@ -236,6 +236,7 @@ fn the_page_of_data_files_is_fresh() {
          | `statistics.json5` | where policies of robots keep their statistics |\n\
          | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
          | `prediction-layers.json5` | layers that predict further tokens, which no class builds |\n\
+         | `caches.json5` | keys of configs that tell how much the cache of keys and values takes |\n\
          | `wrappers.json5` | parts of tensor names that wrappers such as torch.compile add |\n\
          | `lists.json5` | lists that the expressions of rules read with `listed(name)` |\n\
          | `catalogue.json5` | titles of families, and retired codes and names |\n\

@@ -127,7 +127,11 @@ class Small:
             return None
         # A key that the config lacks may want others that it lacks as well.
         is_asked = pointer[-1] in self.asked.get(pointer[:-1], []) and pointer[-1] not in self.unsettable
-        if is_asked and (kind == "true" or any("object has no attribute" in each and "onfig'" in each for each in said)):
+        if is_asked and any("object has no attribute" in each and "onfig'" in each for each in said):
+            return None
+        # A number, or true, may fit where these do not: what refuses them for their type refuses false as well.
+        is_fit = kind in ("true", "above-one") and "drop" not in pointer[-1]
+        if is_asked and is_fit and self.refuses(pointer, "false") != said[0].split(":", 1)[0]:
             return None
         # A value of the same type that does not fit does not tell of others.
         value = at(self.config, pointer)

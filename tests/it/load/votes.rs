@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ckpt_doctor::check::inspect::{Inspection, inspect};
+use ckpt_doctor::check::inspect::{CacheInput, Inspection, inspect};
 use ckpt_doctor::check::load::LoadReport;
 use ckpt_doctor::check::load::{Stored, predict};
 use ckpt_doctor::check::votes::{Votes, explain, vote};
@@ -16,6 +16,8 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::support::data::{Map, config, map};
+
+const CACHE: CacheInput = CacheInput { context: None, batch: 1 };
 
 fn votes(config: &Value, map: &Map) -> Votes {
     let library = Library::embedded();
@@ -109,7 +111,7 @@ fn without_a_config_class_and_values_are_found() {
         ("spatialvla-tiny", "SpatialVLAForConditionalGeneration", 30),
         ("llava3d-7b", "LlavaLlamaForCausalLM", 5),
     ] {
-        let found: Inspection = inspect(&bare(map(name)), &Library::embedded());
+        let found: Inspection = inspect(&bare(map(name)), &Library::embedded(), CACHE);
         assert_eq!(found.classes[0].class, class, "{name}");
         let votes = found.votes.as_ref().expect("votes");
         assert!(votes.after.is_exact(), "{name}: {:?}", votes.after);
@@ -120,7 +122,7 @@ fn without_a_config_class_and_values_are_found() {
 
 #[test]
 fn names_unlike_any_class_are_reported() {
-    let found = inspect(&bare(Map::from([("a.b".to_owned(), vec![2])])), &Library::embedded());
+    let found = inspect(&bare(Map::from([("a.b".to_owned(), vec![2])])), &Library::embedded(), CACHE);
     assert_eq!((found.classes.len(), found.proven.is_null()), (0, true));
     assert_eq!(found.notes, ["no known class has tensor names like these"]);
 }
@@ -204,7 +206,7 @@ fn inspect_fits_a_narrow_terminal() {
     let work = TempDir::new().unwrap();
     copy(&work, "spatialvla-tiny", |c| c["vision_config"]["patch_size"] = json!(16));
     let checkpoint = Checkpoint::open(work.path().join("spatialvla-tiny")).unwrap();
-    let inspection = inspect(&checkpoint, &Library::embedded());
+    let inspection = inspect(&checkpoint, &Library::embedded(), CACHE);
     let style = Style { width: Some(80), cap: 8, ..Style::default() };
     let shown = full("spatialvla-tiny", &inspection, Some(1), style);
     let below = shown.find("  class by config").unwrap();

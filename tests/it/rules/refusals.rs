@@ -29,3 +29,15 @@ fn a_part_that_another_one_replaces_refuses_nothing() {
     config["text_config_dict"] = json!({ "hidden_size": 512 });
     assert_eq!(refused(&config), [] as [&str; 0]);
 }
+
+/// `HubertModel` of transformers 4.47.0 raises where its three lists of convolutions differ in length.
+#[test]
+fn a_list_of_another_length_than_those_beside_it_is_refused() {
+    let with = |dims: &[u64], strides: &[u64]| {
+        json!({ "architectures": ["HubertModel"], "model_type": "hubert", "transformers_version": "4.47.0",
+            "conv_dim": dims, "conv_stride": strides, "conv_kernel": [10, 3], "num_feat_extract_layers": 2 })
+    };
+    assert_eq!(refused(&with(&[8, 8], &[5, 2])), [] as [&str; 0]);
+    assert_eq!(refused(&with(&[8, 8, 8], &[5, 2])), ["/conv_dim"]);
+    assert_eq!(refused(&with(&[8, 8], &[5])), ["/conv_stride"]);
+}
