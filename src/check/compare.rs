@@ -308,7 +308,7 @@ fn tensors(
         pairs.extend(left.remove(name).zip(right.remove(name)));
     }
     let renamed = renamings::pair(&mut left, &mut right, &mut pairs);
-    let mut found = TensorDifferences { before, after, renamed, bytes, ..TensorDifferences::default() };
+    let mut found = TensorDifferences { before, after, bytes, renamed, ..TensorDifferences::default() };
     let sides = converted::sides(one, other, library, &left, &right);
     (found.converted, found.removed, found.added) = (sides.converted, sides.removed, sides.added);
     let by = |before, after| {

@@ -123,9 +123,12 @@ fn grouped<'n>(named: impl Iterator<Item = (String, &'n str)>) -> impl Iterator<
     measured(named.map(|(what, tensor)| (what, tensor, None)))
 }
 
+/// A tensor, and how far it is from its partner where that was measured.
+type Apart<'n> = (&'n str, Option<Magnitude>);
+
 /// One line for the names of the same description, with numbered ones collapsed, and how far they are apart together.
 fn measured<'n>(named: impl Iterator<Item = (String, &'n str, Option<Magnitude>)>) -> impl Iterator<Item = String> {
-    let mut kinds: Vec<(String, Vec<(&str, Option<Magnitude>)>)> = Vec::new();
+    let mut kinds: Vec<(String, Vec<Apart<'_>>)> = Vec::new();
     for (what, tensor, by) in named {
         match kinds.iter_mut().find(|(kind, _)| *kind == what) {
             Some((_, tensors)) => tensors.push((tensor, by)),

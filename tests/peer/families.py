@@ -183,13 +183,19 @@ def main():
                 if what == "wrong":
                     wrong.add(name)
                     if a.list:
-                        place = f" {r['place']} = {json.dumps(value_at(r['config'], r['place']))[:60]}" if r.get("place") else ""
+                        place = (
+                            f" {r['place']} = {json.dumps(value_at(r['config'], r['place']))[:60]}" if r.get("place") else ""
+                        )
                         print(f"{version} {name} {r['kind']}{place}: {said}"[:260])
             if a.save:
                 for name in wrong:
                     keep(version, name, [r for n, r in asked if n == name])
     for version in folders:
-        for name in ("branches",) if a.branches else ("aliases", "getattr keys", "dropped derived keys", "files of another version", "others"):
+        for name in (
+            ("branches",)
+            if a.branches
+            else ("aliases", "getattr keys", "dropped derived keys", "files of another version", "others")
+        ):
             each = {what: counts[version, name, what] for what in ("exact", "not predicted", "wrong", "raises", "builds")}
             sound = each["exact"] + each["not predicted"] + each["wrong"]
             told = ", ".join(f"{n} {what}" for what, n in each.items() if n)

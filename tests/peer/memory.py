@@ -11,9 +11,7 @@ or below a bound that is named as one.
 
 import argparse
 import json
-import os
 import random
-import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
@@ -112,7 +110,9 @@ def main():
                 if own.get("cache") and cache:
                     counts["bounds" if cache["at_most"] else "caches"] += 1
                     off = (cache["bytes"] - own["cache"]) / own["cache"]
-                    tally.expect(off >= -0.02 if cache["at_most"] else abs(off) <= 0.02, f"{name}: cache {cache}, not {own['cache']}")
+                    tally.expect(
+                        off >= -0.02 if cache["at_most"] else abs(off) <= 0.02, f"{name}: cache {cache}, not {own['cache']}"
+                    )
                 elif own.get("cache"):
                     counts["caches not told"] += 1
                     if a.list:

@@ -352,9 +352,15 @@ def lengths(small):
             counts = [
                 other
                 for other, value in part.items()
-                if value == size and type(value) is int and small.outcome(changed(longer[key], (*path, other), size + 1)) is None
+                if value == size
+                and type(value) is int
+                and small.outcome(changed(longer[key], (*path, other), size + 1)) is None
             ]
-            alike = [other for other in raised if len(lists[other]) == size and raised[other].split(":")[0] == raised[key].split(":")[0]]
+            alike = [
+                other
+                for other in raised
+                if len(lists[other]) == size and raised[other].split(":")[0] == raised[key].split(":")[0]
+            ]
             config = longer[key]
             for other in alike:
                 config = changed(config, (*path, other), [*lists[other], lists[other][-1]])

@@ -185,7 +185,9 @@ class Sides:
                 if held == bool(targets & {body}) or not held and targets - {body}:
                     ran += 1
                 else:
-                    never.append(f"{file.split(MODELS)[-1]}:{at}: {ast.unparse(node.test)[:90]}: {'held' if held else 'failed'} never")
+                    never.append(
+                        f"{file.split(MODELS)[-1]}:{at}: {ast.unparse(node.test)[:90]}: {'held' if held else 'failed'} never"
+                    )
         return ran, total, never
 
 

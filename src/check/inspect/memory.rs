@@ -24,7 +24,7 @@ pub struct Memory {
     pub dtype: String,
     /// The parameters in this type; tied ones count once.
     pub weights: u64,
-    /// Weights, their gradients and the two moments of AdamW, all in this type.
+    /// Weights, their gradients and the two moments of `AdamW`, all in this type.
     pub training: u64,
     /// The cache of keys and values; null for classes whose caches are not known.
     pub cache: Option<CacheMemory>,
