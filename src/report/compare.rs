@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::Style;
 use super::collapse::{NameGroup, collapse_with};
-use super::format::{more, name, plural, sentence, shape};
+use super::format::{more, name, plural, sentence, shape, wrap};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::paint::Paint;
@@ -15,9 +15,6 @@ use crate::check::compare::{
     ComparedBytes, Differences, DocumentChange, Magnitude, OneSided, Renaming, TensorDifferences,
 };
 use crate::checkpoint::escape;
-
-/// Maximum number of lines of one kind; the others are counted.
-const LINES: usize = 20;
 
 /// Maximum length of a value, in characters.
 const VALUE: usize = 60;
@@ -41,7 +38,7 @@ pub fn json(before: &str, after: &str, differences: &Differences) -> String {
     pretty(&DiffDocument { schema: 1, tool: ToolInfo::this(), before, after, differences })
 }
 
-/// The differences for a terminal. Nothing is cut to its width: long lists of one kind are counted.
+/// The differences for a terminal. Of long lists, the first lines are printed and the others counted.
 #[must_use]
 pub fn full(before: &str, after: &str, differences: &Differences, style: Style) -> String {
     let paint = Paint(style.color);
@@ -52,38 +49,39 @@ pub fn full(before: &str, after: &str, differences: &Differences, style: Style) 
         (false, false) => ": no difference found in what could be compared",
     };
     let _ok = writeln!(out, "{} and {}{verdict}", paint.strong(&name(before)), paint.strong(&name(after)));
-    tensors(&mut out, &differences.tensors, paint);
+    tensors(&mut out, &differences.tensors, style);
     for DocumentChange { file, values, further } in &differences.documents {
         let line = |at: &str, before: &Option<Value>, after: &Option<Value>| {
             format!("{}: {} -> {}", name(at), value(before.as_ref()), value(after.as_ref()))
         };
         let lines = values.iter().map(|change| line(&change.pointer, &change.before, &change.after));
-        section(&mut out, &name(file), lines, *further, paint);
+        section(&mut out, &name(file), lines, *further, style);
     }
     if let Some(tokens) = &differences.tokens {
         let id = |id: Option<u64>| id.map_or_else(|| "none".to_owned(), |id| id.to_string());
         let (token, before, after) = (name(&tokens.first), id(tokens.before), id(tokens.after));
         let first =
             format!("{} with another id, the first is {token}: {before} -> {after}", plural(tokens.tokens, "token"));
-        section(&mut out, "tokenizer", std::iter::once(first), 0, paint);
+        section(&mut out, "tokenizer", std::iter::once(first), 0, style);
     }
     let files = &differences.files;
     let marked = |mark: &str, names: &[String]| names.iter().map(|file| format!("{mark} {}", name(file))).collect();
     let lists: [Vec<String>; 3] =
         [("-", &files.removed), ("+", &files.added), ("~", &files.changed)].map(|(mark, names)| marked(mark, names));
-    section(&mut out, "files", lists.into_iter().flatten(), 0, paint);
-    section(&mut out, "not compared", differences.unknown.iter().map(|text| sentence(text)), 0, paint);
+    section(&mut out, "files", lists.into_iter().flatten(), 0, style);
+    section(&mut out, "not compared", differences.unknown.iter().map(|text| sentence(text)), 0, style);
     out
 }
 
-fn tensors(out: &mut String, found: &TensorDifferences, paint: Paint) {
+fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
     let read = match found.bytes {
         ComparedBytes::Sampled => "equal in type, shape, and their first, middle and last bytes (--bytes compares all)",
         ComparedBytes::All | ComparedBytes::Measured => "equal in type, shape and bytes",
     };
-    let (before, after) = (plural(found.before, "tensor"), found.after);
-    let line = format!("{before} in the first, {after} in the second; {} {read}", found.equal);
-    section(out, "tensors", std::iter::once(line).filter(|_| (found.before, after) != (0, 0)), 0, paint);
+    let counts = format!("{} in the first, {} in the second", plural(found.before, "tensor"), found.after);
+    let lines =
+        [counts, format!("{} {read}", found.equal)].into_iter().filter(|_| (found.before, found.after) != (0, 0));
+    section(out, "tensors", lines, 0, style);
     let renamed = found.renamed.iter().map(|Renaming { from, to, tensors }| {
         let change = match (name(from), name(to)) {
             (from, _) if to.is_empty() => format!("{from} removed"),
@@ -92,23 +90,23 @@ fn tensors(out: &mut String, found: &TensorDifferences, paint: Paint) {
         };
         format!("{change} ({})", plural(*tensors, "tensor"))
     });
-    section(out, "renamed tensors, by prefix", renamed, 0, paint);
+    section(out, "renamed tensors, by prefix", renamed, 0, style);
     if let Some(c) = &found.converted {
         let (one, other) = (plural(c.before, "tensor"), plural(c.after, "tensor"));
         let line = format!(
             "{one} of the first and {other} of the second have the same names and shapes once transformers {} has opened them; their bytes were not compared",
             c.loader
         );
-        section(out, "converted tensors", std::iter::once(line), 0, paint);
+        section(out, "converted tensors", std::iter::once(line), 0, style);
     }
-    section(out, "tensors of the first alone", one_sided(&found.removed), 0, paint);
-    section(out, "tensors of the second alone", one_sided(&found.added), 0, paint);
+    section(out, "tensors of the first alone", one_sided(&found.removed), 0, style);
+    section(out, "tensors of the second alone", one_sided(&found.added), 0, style);
     let reshaped = found.reshaped.iter().map(|r| (format!("{} -> {}", shape(&r.before), shape(&r.after)), &*r.name));
-    section(out, "tensors of another shape", grouped(reshaped), 0, paint);
+    section(out, "tensors of another shape", grouped(reshaped), 0, style);
     let recast = found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name, r.by));
-    section(out, "tensors of another type", measured(recast), 0, paint);
+    section(out, "tensors of another type", measured(recast), 0, style);
     let changed = found.changed.iter().map(|changed| (String::new(), &*changed.name, changed.by));
-    section(out, "tensors with other bytes", measured(changed), 0, paint);
+    section(out, "tensors with other bytes", measured(changed), 0, style);
 }
 
 fn one_sided(tensors: &[OneSided]) -> impl Iterator<Item = String> {
@@ -159,16 +157,20 @@ fn figures(number: f64) -> String {
 }
 
 /// A title and its lines, if there are any, with the number of `further` ones.
-fn section(out: &mut String, title: &str, lines: impl Iterator<Item = String>, further: usize, paint: Paint) {
+fn section(out: &mut String, title: &str, lines: impl Iterator<Item = String>, further: usize, style: Style) {
     let lines: Vec<String> = lines.collect();
     if lines.is_empty() {
         return;
     }
-    let _ok = writeln!(out, "\n  {}", paint.strong(title));
-    for line in lines.iter().take(LINES) {
-        let _ok = writeln!(out, "    {line}");
+    let _ok = writeln!(out, "\n  {}", Paint(style.color).strong(title));
+    for line in lines.iter().take(style.cap) {
+        let wrapped = wrap(line, style.width.map(|width| width.saturating_sub(6)));
+        for (number, part) in wrapped.lines().enumerate() {
+            let indent = if number == 0 { 4 } else { 6 };
+            let _ok = writeln!(out, "{:indent$}{part}", "");
+        }
     }
-    if let Some(more) = more(lines.len().saturating_add(further), LINES) {
+    if let Some(more) = more(lines.len().saturating_add(further), style.cap) {
         let _ok = writeln!(out, "    {more}");
     }
 }
