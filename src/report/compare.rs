@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::Style;
 use super::collapse::{NameGroup, collapse_with};
-use super::format::{more, name, plural, sentence, shape, wrap};
+use super::format::{more, name, plural, sentence, shape, shortened, wrap};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::paint::Paint;
@@ -15,6 +15,9 @@ use crate::check::compare::{
     ComparedBytes, Differences, DocumentChange, Magnitude, OneSided, Renaming, TensorDifferences,
 };
 use crate::checkpoint::escape;
+
+/// Columns before a line that goes on with the one above.
+const INDENT: usize = 6;
 
 /// Maximum length of a value, in characters.
 const VALUE: usize = 60;
@@ -99,33 +102,39 @@ fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
         );
         section(out, "converted tensors", std::iter::once(line), 0, style);
     }
-    section(out, "tensors of the first alone", one_sided(&found.removed), 0, style);
-    section(out, "tensors of the second alone", one_sided(&found.added), 0, style);
+    section(out, "tensors of the first alone", one_sided(&found.removed, style), 0, style);
+    section(out, "tensors of the second alone", one_sided(&found.added, style), 0, style);
     let reshaped = found.reshaped.iter().map(|r| (format!("{} -> {}", shape(&r.before), shape(&r.after)), &*r.name));
-    section(out, "tensors of another shape", grouped(reshaped), 0, style);
+    section(out, "tensors of another shape", grouped(reshaped, style), 0, style);
     let recast = found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name, r.by));
-    section(out, "tensors of another type", measured(recast), 0, style);
+    section(out, "tensors of another type", measured(recast, style), 0, style);
     let changed = found.changed.iter().map(|changed| (String::new(), &*changed.name, changed.by));
-    section(out, "tensors with other bytes", measured(changed), 0, style);
+    section(out, "tensors with other bytes", measured(changed, style), 0, style);
 }
 
-fn one_sided(tensors: &[OneSided]) -> impl Iterator<Item = String> {
-    grouped(tensors.iter().map(|tensor| {
-        let size = tensor.shape.as_deref().map(shape);
-        let words: Vec<String> = size.into_iter().chain(tensor.dtype.clone()).collect();
-        (words.join(" "), tensor.name.as_str())
-    }))
+fn one_sided(tensors: &[OneSided], style: Style) -> impl Iterator<Item = String> {
+    grouped(
+        tensors.iter().map(|tensor| {
+            let size = tensor.shape.as_deref().map(shape);
+            let words: Vec<String> = size.into_iter().chain(tensor.dtype.clone()).collect();
+            (words.join(" "), tensor.name.as_str())
+        }),
+        style,
+    )
 }
 
-fn grouped<'n>(named: impl Iterator<Item = (String, &'n str)>) -> impl Iterator<Item = String> {
-    measured(named.map(|(what, tensor)| (what, tensor, None)))
+fn grouped<'n>(named: impl Iterator<Item = (String, &'n str)>, style: Style) -> impl Iterator<Item = String> {
+    measured(named.map(|(what, tensor)| (what, tensor, None)), style)
 }
 
 /// A tensor, and how far it is from its partner where that was measured.
 type Apart<'n> = (&'n str, Option<Magnitude>);
 
 /// One line for the names of the same description, with numbered ones collapsed, and how far they are apart together.
-fn measured<'n>(named: impl Iterator<Item = (String, &'n str, Option<Magnitude>)>) -> impl Iterator<Item = String> {
+fn measured<'n>(
+    named: impl Iterator<Item = (String, &'n str, Option<Magnitude>)>,
+    style: Style,
+) -> impl Iterator<Item = String> {
     let mut kinds: Vec<(String, Vec<Apart<'_>>)> = Vec::new();
     for (what, tensor, by) in named {
         match kinds.iter_mut().find(|(kind, _)| *kind == what) {
@@ -133,10 +142,12 @@ fn measured<'n>(named: impl Iterator<Item = (String, &'n str, Option<Magnitude>)
             None => kinds.push((what, vec![(tensor, by)])),
         }
     }
-    kinds.into_iter().flat_map(|(what, tensors)| {
+    let room = style.width.map(|width| width.saturating_sub(INDENT));
+    kinds.into_iter().flat_map(move |(what, tensors)| {
         let line = move |(group, by): (NameGroup, Option<Magnitude>)| {
             let counted = if group.count > 1 { format!(" ({} tensors)", group.count) } else { String::new() };
-            let described = format!("{} {what}", name(&group.pattern)).trim_end().to_owned() + &counted;
+            let pattern = shortened(&name(&group.pattern), room);
+            let described = format!("{pattern} {what}").trim_end().to_owned() + &counted;
             by.map_or(described.clone(), |by| format!("{described}: {}", amount(by)))
         };
         collapse_with(tensors, |one, other| Some(one?.and(other?))).into_iter().map(line).collect::<Vec<_>>()
@@ -164,9 +175,9 @@ fn section(out: &mut String, title: &str, lines: impl Iterator<Item = String>, f
     }
     let _ok = writeln!(out, "\n  {}", Paint(style.color).strong(title));
     for line in lines.iter().take(style.cap) {
-        let wrapped = wrap(line, style.width.map(|width| width.saturating_sub(6)));
+        let wrapped = wrap(line, style.width.map(|width| width.saturating_sub(INDENT)));
         for (number, part) in wrapped.lines().enumerate() {
-            let indent = if number == 0 { 4 } else { 6 };
+            let indent = if number == 0 { 4 } else { INDENT };
             let _ok = writeln!(out, "{:indent$}{part}", "");
         }
     }

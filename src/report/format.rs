@@ -50,6 +50,17 @@ pub fn wrap(text: &str, width: Option<usize>) -> String {
     out
 }
 
+/// A name of at most `width` characters: of a longer one, its start and its end, of which the end tells more.
+pub fn shortened(text: &str, width: Option<usize>) -> String {
+    let long = text.chars().count();
+    let Some(width) = width.filter(|width| long > *width) else { return text.to_owned() };
+    let kept = width.saturating_sub(1);
+    let first = kept / 3;
+    let start: String = text.chars().take(first).collect();
+    let end: String = text.chars().skip(long.saturating_sub(kept.saturating_sub(first))).collect();
+    format!("{start}…{end}")
+}
+
 /// `1 shard`, `2 shards`.
 pub fn plural(n: usize, noun: &str) -> String {
     if n == 1 { format!("1 {noun}") } else { format!("{n} {noun}s") }
@@ -414,7 +425,15 @@ pub fn advice(hint: &FixHint) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::{bytes, wrap};
+    use super::{bytes, shortened, wrap};
+
+    #[test]
+    fn a_long_name_keeps_its_start_and_its_end() {
+        assert_eq!(shortened("model.layers.0.mlp.up_proj.weight", Some(16)), "model…roj.weight");
+        assert_eq!(shortened("model.norm", Some(10)), "model.norm");
+        assert_eq!(shortened("model.norm", None), "model.norm");
+        assert_eq!(["ä".repeat(9), "ab".to_owned()].map(|name| shortened(&name, Some(0))), ["…", "…"]);
+    }
 
     #[test]
     fn lines_are_broken_at_spaces_alone() {
