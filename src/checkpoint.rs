@@ -46,6 +46,7 @@ mod untold;
 pub(crate) mod work;
 
 pub(crate) use contents::Distance;
+pub(crate) use contents::rank::DifferenceRank;
 pub use contents::{HashedFiles, Progress, ReadOptions, TensorContents, TensorStats};
 pub use digest::HashAlgorithm;
 pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
@@ -330,6 +331,17 @@ impl Checkpoint {
     /// are no floats, not finite, or cannot be read.
     pub(crate) fn distance(&self, one: (&Shard, &Tensor), beside: &Self, other: (&Shard, &Tensor)) -> Option<Distance> {
         contents::distance([&self.source, &beside.source], one, other)
+    }
+
+    /// The rank of the difference between a matrix and one of another checkpoint, of the same shape, above rounding errors. `None`
+    /// where [`Self::distance`] is, for vectors, and for rows that are too long.
+    pub(crate) fn difference_rank(
+        &self,
+        one: (&Shard, &Tensor),
+        beside: &Self,
+        other: (&Shard, &Tensor),
+    ) -> Option<DifferenceRank> {
+        contents::rank::rank([&self.source, &beside.source], one, other)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

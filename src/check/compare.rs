@@ -76,6 +76,8 @@ pub enum ComparedBytes {
     All,
     /// All, and how far the values are from each other where they differ.
     Measured,
+    /// The same, and the rank of the differences of matrices.
+    Ranked,
 }
 
 /// A prefix of names that the second checkpoint has in place of another one.
@@ -150,6 +152,19 @@ pub struct Changed {
     /// By how much; missing unless it was asked for, and for values that are no finite floats.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<Magnitude>,
+    /// Rank of the difference above rounding errors; missing unless it was asked for, and for all but matrices.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rank: Option<ChangedRank>,
+}
+
+/// The rank of a difference: 16 for a merged LoRA of that rank.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct ChangedRank {
+    /// The rank.
+    pub rank: usize,
+    /// Whether it may be larger.
+    pub at_least: bool,
 }
 
 /// How far the values of a tensor are from those of another one. The norms are Euclidean ones of all values.
@@ -312,7 +327,8 @@ fn tensors(
     let sides = converted::sides(one, other, library, &left, &right);
     (found.converted, found.removed, found.added) = (sides.converted, sides.removed, sides.added);
     let by = |before, after| {
-        let measured = (bytes == ComparedBytes::Measured).then(|| one.distance(before, other, after)).flatten();
+        let is_measured = matches!(bytes, ComparedBytes::Measured | ComparedBytes::Ranked);
+        let measured = is_measured.then(|| one.distance(before, other, after)).flatten();
         measured.map(|found| Magnitude {
             norm_before: found.before,
             norm_after: found.after,
@@ -331,7 +347,12 @@ fn tensors(
             found.recast.push(Recast { name: name(), before, after, by });
         } else {
             match one.bytes_equal(before, other, after, bytes != ComparedBytes::Sampled) {
-                Some(false) => found.changed.push(Changed { name: name(), by: by(before, after) }),
+                Some(false) => {
+                    let ranked = || one.difference_rank(before, other, after);
+                    let rank = (bytes == ComparedBytes::Ranked).then(ranked).flatten();
+                    let rank = rank.map(|found| ChangedRank { rank: found.rank, at_least: found.at_least });
+                    found.changed.push(Changed { name: name(), by: by(before, after), rank });
+                }
                 Some(true) => found.equal = found.equal.saturating_add(1),
                 None => unknown.push(format!("the bytes of {} could not be compared", before.1.name)),
             }

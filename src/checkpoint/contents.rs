@@ -14,6 +14,7 @@ mod formats;
 mod git_index;
 pub(super) mod hashes;
 mod pieces;
+pub(super) mod rank;
 mod read;
 mod tally;
 

@@ -180,15 +180,25 @@ pub struct DiffArgs {
     /// Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones
     #[arg(long)]
     pub bytes: bool,
-    /// Compare all bytes, and print how far the values of tensors are from each other that differ
-    #[arg(long)]
-    pub stats: bool,
+    /// Compare all bytes, and print how far the values of tensors are from each other that differ; with =rank also the rank of
+    /// the difference of two matrices, above rounding errors
+    #[arg(long, value_name = "WHAT", num_args = 0..=1, require_equals = true, default_missing_value = "values")]
+    pub stats: Option<DiffStats>,
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,
     /// When to print colours; auto respects `NO_COLOR`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
+}
+
+/// What `diff --stats` measures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum DiffStats {
+    /// Norm and largest value of the difference, and the cosine of the angle
+    Values,
+    /// These, and the rank of the difference
+    Rank,
 }
 
 /// Formats of `inspect`, `diff` and `verify`.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::args::{DiffArgs, InspectFormat};
+use super::args::{DiffArgs, DiffStats, InspectFormat};
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::{inspect, library, output};
 use crate::check::compare::{ComparedBytes, compare};
@@ -13,9 +13,10 @@ use crate::report::compare as report;
 pub fn run(args: &DiffArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let (before, after) = (inspect::open(&args.before)?, inspect::open(&args.after)?);
     let bytes = match (args.stats, args.bytes) {
-        (true, _) => ComparedBytes::Measured,
-        (false, true) => ComparedBytes::All,
-        (false, false) => ComparedBytes::Sampled,
+        (Some(DiffStats::Rank), _) => ComparedBytes::Ranked,
+        (Some(DiffStats::Values), _) => ComparedBytes::Measured,
+        (None, true) => ComparedBytes::All,
+        (None, false) => ComparedBytes::Sampled,
     };
     let differences = compare(&before, &after, &library::with(rules)?, bytes);
     let [before, after] = [&args.before, &args.after].map(|path| shown(path));

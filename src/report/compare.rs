@@ -12,7 +12,7 @@ use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::paint::Paint;
 use crate::check::compare::{
-    ComparedBytes, Differences, DocumentChange, Magnitude, OneSided, Renaming, TensorDifferences,
+    ChangedRank, ComparedBytes, Differences, DocumentChange, Magnitude, OneSided, Renaming, TensorDifferences,
 };
 use crate::checkpoint::escape;
 
@@ -79,7 +79,7 @@ pub fn full(before: &str, after: &str, differences: &Differences, style: Style) 
 fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
     let read = match found.bytes {
         ComparedBytes::Sampled => "equal in type, shape, and their first, middle and last bytes (--bytes compares all)",
-        ComparedBytes::All | ComparedBytes::Measured => "equal in type, shape and bytes",
+        ComparedBytes::All | ComparedBytes::Measured | ComparedBytes::Ranked => "equal in type, shape and bytes",
     };
     let counts = format!("{} in the first, {} in the second", plural(found.before, "tensor"), found.after);
     let lines =
@@ -106,9 +106,10 @@ fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
     section(out, "tensors of the second alone", one_sided(&found.added, style), 0, style);
     let reshaped = found.reshaped.iter().map(|r| (format!("{} -> {}", shape(&r.before), shape(&r.after)), &*r.name));
     section(out, "tensors of another shape", grouped(reshaped, style), 0, style);
-    let recast = found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name, r.by));
+    let recast =
+        found.recast.iter().map(|r| (format!("{} -> {}", r.before, r.after), &*r.name, Distances::of(r.by, None)));
     section(out, "tensors of another type", measured(recast, style), 0, style);
-    let changed = found.changed.iter().map(|changed| (String::new(), &*changed.name, changed.by));
+    let changed = found.changed.iter().map(|c| (String::new(), &*c.name, Distances::of(c.by, c.rank)));
     section(out, "tensors with other bytes", measured(changed, style), 0, style);
 }
 
@@ -128,11 +129,32 @@ fn grouped<'n>(named: impl Iterator<Item = (String, &'n str)>, style: Style) -> 
 }
 
 /// A tensor, and how far it is from its partner where that was measured.
-type Apart<'n> = (&'n str, Option<Magnitude>);
+type Apart<'n> = (&'n str, Option<Distances>);
+
+/// How far tensors are apart, and the ranks of their differences, if all were told: the smallest and the largest.
+#[derive(Clone, Copy)]
+struct Distances {
+    by: Magnitude,
+    ranks: Option<[ChangedRank; 2]>,
+}
+
+impl Distances {
+    fn of(by: Option<Magnitude>, rank: Option<ChangedRank>) -> Option<Self> {
+        Some(Self { by: by?, ranks: rank.map(|rank| [rank; 2]) })
+    }
+
+    fn and(self, other: Self) -> Self {
+        let ranks = self.ranks.zip(other.ranks).map(|([least, most], [low, high])| {
+            let larger = |one: ChangedRank, other: ChangedRank| (one.rank, one.at_least) > (other.rank, other.at_least);
+            [if larger(least, low) { low } else { least }, if larger(most, high) { most } else { high }]
+        });
+        Self { by: self.by.and(other.by), ranks }
+    }
+}
 
 /// One line for the names of the same description, with numbered ones collapsed, and how far they are apart together.
 fn measured<'n>(
-    named: impl Iterator<Item = (String, &'n str, Option<Magnitude>)>,
+    named: impl Iterator<Item = (String, &'n str, Option<Distances>)>,
     style: Style,
 ) -> impl Iterator<Item = String> {
     let mut kinds: Vec<(String, Vec<Apart<'_>>)> = Vec::new();
@@ -144,7 +166,7 @@ fn measured<'n>(
     }
     let room = style.width.map(|width| width.saturating_sub(INDENT));
     kinds.into_iter().flat_map(move |(what, tensors)| {
-        let line = move |(group, by): (NameGroup, Option<Magnitude>)| {
+        let line = move |(group, by): (NameGroup, Option<Distances>)| {
             let counted = if group.count > 1 { format!(" ({} tensors)", group.count) } else { String::new() };
             let pattern = shortened(&name(&group.pattern), room);
             let described = format!("{pattern} {what}").trim_end().to_owned() + &counted;
@@ -155,11 +177,16 @@ fn measured<'n>(
 }
 
 /// `0.0012 of the norm, at most 0.03, cosine 0.999999`.
-fn amount(by: Magnitude) -> String {
+fn amount(Distances { by, ranks }: Distances) -> String {
     let share =
         by.relative().map_or_else(|| "all of the norm".to_owned(), |share| format!("{} of the norm", figures(share)));
     let cosine = by.cosine().map(|cosine| format!(", cosine {cosine:.6}")).unwrap_or_default();
-    format!("{share}, at most {}{cosine}", figures(by.largest_difference))
+    let rank = |rank: ChangedRank| format!("{}{}", if rank.at_least { "≥ " } else { "" }, rank.rank);
+    let rank = ranks.map(|[least, most]| match (rank(least), rank(most)) {
+        (least, most) if least == most => format!(", rank {most}"),
+        (least, most) => format!(", rank {least} to {most}"),
+    });
+    format!("{share}, at most {}{cosine}{}", figures(by.largest_difference), rank.unwrap_or_default())
 }
 
 /// A number with three significant digits.

@@ -125,6 +125,15 @@ fn how_far_values_are_apart_is_measured() {
     let by = &found["tensors"]["changed"][0]["by"];
     assert_eq!([&by["norm_before"], &by["norm_of_difference"], &by["largest_difference"]], [5.0, 1.0, 1.0]);
     assert_eq!(found["tensors"]["bytes"], "measured");
+    assert_eq!(found["tensors"]["changed"][0].get("rank"), None);
+    // A vector has no rank; the matrix has one row that differs.
+    let matrix = r#"{ add_tensor: { name: "model.square.weight", shape: [4, 4], dtype: "F32" } }"#;
+    let poke = r#"{ poke: { tensor: "model.square.weight", at: 16, bytes: [{ hex: "00004040" }] } }"#;
+    make(room.path(), "one", "llama", &format!("[{matrix}]"));
+    make(room.path(), "other", "llama", &format!("[{matrix}, {poke}]"));
+    let found = text(room.path(), &["one", "other", "--stats=rank"], 1);
+    let line = found.lines().find(|line| line.contains("model.square.weight: ")).unwrap_or_default();
+    assert!(line.ends_with(", rank 1"), "{found}");
 }
 
 #[test]

@@ -259,6 +259,8 @@ never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s V -l version -d 'Print version'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l stats -d 'Compare all bytes, and print how far the values of tensors are from each other that differ; with =rank also the rank of the difference of two matrices, above rounding errors' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
+rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
@@ -266,9 +268,10 @@ always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l bytes -d 'Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l stats -d 'Compare all bytes, and print how far the values of tensors are from each other that differ'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -s V -l version -d 'Print version'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l stats -d 'Compare all bytes, and print how far the values of tensors are from each other that differ; with =rank also the rank of the difference of two matrices, above rounding errors' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
+rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
@@ -276,7 +279,6 @@ always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l bytes -d 'Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l stats -d 'Compare all bytes, and print how far the values of tensors are from each other that differ'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand expect" -l for -d 'Version of transformers that builds the class, as 4.57.3 or transformers==4.57.3, or @FILE for the one that a lock file pins; the nearest known version that has the class is used [default: the version that the config names]' -r
