@@ -132,9 +132,9 @@ pub(super) fn distance(
             break;
         }
         for (a, b) in here.iter().zip(&there) {
-            sums.before = a.mul_add(*a, sums.before);
-            sums.after = b.mul_add(*b, sums.after);
-            sums.difference = (b - a).mul_add(b - a, sums.difference);
+            sums.before += a * a;
+            sums.after += b * b;
+            sums.difference += (b - a) * (b - a);
             sums.largest = sums.largest.max((b - a).abs());
         }
     }

@@ -40,7 +40,7 @@ pub(crate) fn rank(sources: [&Source; 2], one: (&Shard, &Tensor), other: (&Shard
     each_row(sources, one, other, columns, |number, difference, after| {
         noise += after.iter().map(|value| rounding(*value, other.1.dtype)).sum::<f64>();
         for (sum, sign) in spanned.iter_mut().zip(signs(number)) {
-            sum.iter_mut().zip(difference).for_each(|(sum, value)| *sum = sign.mul_add(*value, *sum));
+            sum.iter_mut().zip(difference).for_each(|(sum, value)| *sum += sign * value);
         }
     })?;
     orthonormal(&mut spanned);
@@ -48,7 +48,7 @@ pub(crate) fn rank(sources: [&Source; 2], one: (&Shard, &Tensor), other: (&Shard
     each_row(sources, one, other, columns, |_, difference, _| {
         let projected: Vec<f64> = spanned.iter().map(|axis| dot(axis, difference)).collect();
         for (line, one) in squares.iter_mut().zip(&projected) {
-            line.iter_mut().zip(&projected).for_each(|(sum, other)| *sum = one.mul_add(*other, *sum));
+            line.iter_mut().zip(&projected).for_each(|(sum, other)| *sum += one * other);
         }
     })?;
     let [m, n] = [u32::try_from(rows).ok()?, u32::try_from(columns).ok()?].map(f64::from);
@@ -123,7 +123,7 @@ fn orthonormal(vectors: &mut Vec<Vec<f64>>) {
             let before = dot(&vector, &vector).sqrt();
             for axis in &done {
                 let share = dot(axis, &vector);
-                vector.iter_mut().zip(axis).for_each(|(value, axis)| *value = (-share).mul_add(*axis, *value));
+                vector.iter_mut().zip(axis).for_each(|(value, axis)| *value -= share * axis);
             }
             let length = dot(&vector, &vector).sqrt();
             if length > before * 1e-12 && length > 0.0 {
@@ -142,7 +142,7 @@ fn dot(one: &[f64], other: &[f64]) -> f64 {
     let mut sums = [0.0_f64; 8];
     let (ones, others) = (one.as_chunks::<8>(), other.as_chunks::<8>());
     for (a, b) in ones.0.iter().zip(others.0) {
-        sums.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum = a.mul_add(*b, *sum));
+        sums.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a * b);
     }
     let rest: f64 = ones.1.iter().zip(others.1).map(|(a, b)| a * b).sum();
     sums.iter().sum::<f64>() + rest
