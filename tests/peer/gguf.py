@@ -83,7 +83,7 @@ CASES = {
     "class-unknown": (edit("config.json", lambda c: c.update(architectures=["LlamaForVision"])), ["SRV004"]),
     "no-class": (edit("config.json", lambda c: c.pop("architectures")), ["SRV004"]),
     "other-name": (rename("weights.safetensors"), ["SRV001"]),
-    "index-lists-more": (with_index(more=["model.layers.2.mlp.up_proj.weight"]), ["IDX009"]),
+    "index-lists-more": (with_index(more=["model.layers.2.mlp.up_proj.weight"]), ["IDX019"]),
     "index-lists-less": (with_index(less=["model.norm.weight"]), ["IDX010"]),
 }
 
