@@ -45,9 +45,7 @@ pub mod tokenizer;
 mod untold;
 pub(crate) mod work;
 
-pub(crate) use contents::Distance;
-pub(crate) use contents::rank::DifferenceRank;
-pub use contents::{HashedFiles, Progress, ReadOptions, TensorContents, TensorStats};
+pub use contents::{DifferenceRank, Distance, HashedFiles, Progress, ReadOptions, TensorContents, TensorStats};
 pub use digest::HashAlgorithm;
 pub use discover::{ForeignFiles, Found, find_checkpoints, is_checkpoint};
 pub use document::Document;
@@ -304,11 +302,8 @@ impl Checkpoint {
         if (one.1.dtype, &one.1.shape) != (other.1.dtype, &other.1.shape) {
             return Some(false);
         }
-        if self.deep {
-            return contents::same_bytes([&self.source; 2], one, other);
-        }
-        let sample = |(shard, tensor)| contents::sample(&self.source, shard, tensor);
-        (sample(one)? != sample(other)?).then_some(false)
+        let equal = self.bytes_equal(one, self, other, self.deep)?;
+        (self.deep || !equal).then_some(equal)
     }
 
     /// Whether a tensor of this checkpoint has the same bytes as one of another checkpoint, of the same type and shape: all of
@@ -320,11 +315,17 @@ impl Checkpoint {
         other: (&Shard, &Tensor),
         all: bool,
     ) -> Option<bool> {
-        let sources = [&self.source, &beside.source];
         if all {
-            return contents::same_bytes(sources, one, other);
+            return contents::same_bytes([&self.source, &beside.source], one, other);
         }
-        Some(contents::sample(sources[0], one.0, one.1)? == contents::sample(sources[1], other.0, other.1)?)
+        let sample = |source, (shard, tensor)| contents::sample(source, shard, tensor);
+        Some(sample(&self.source, one)? == sample(&beside.source, other)?)
+    }
+
+    /// Whether a file at the top of both checkpoints has the same bytes; the error of the one that cannot be read, or has more
+    /// than `cap` bytes.
+    pub(crate) fn file_equal(&self, name: &str, beside: &Self, cap: u64) -> Result<bool, OpenError> {
+        Ok(self.source.read_own(name, cap)? == beside.source.read_own(name, cap)?)
     }
 
     /// How far the values of a tensor are from those of a tensor of another checkpoint, of the same shape. `None` when they
@@ -341,7 +342,18 @@ impl Checkpoint {
         beside: &Self,
         other: (&Shard, &Tensor),
     ) -> Option<DifferenceRank> {
-        contents::rank::rank([&self.source, &beside.source], one, other)
+        contents::rank([&self.source, &beside.source], one, other)
+    }
+
+    /// The float of 16 bits or more that most bytes of the checkpoint have; `None` without such tensors.
+    #[must_use]
+    pub fn float_of_most_bytes(&self) -> Option<Dtype> {
+        let mut bytes: BTreeMap<Dtype, u64> = BTreeMap::new();
+        for (_, tensor) in self.tensors().filter(|(_, tensor)| tensor.dtype.float_name().is_some()) {
+            let sum = bytes.entry(tensor.dtype).or_default();
+            *sum = sum.saturating_add(tensor.len());
+        }
+        bytes.into_iter().max_by_key(|(_, bytes)| *bytes).map(|(dtype, _)| dtype)
     }
 
     /// The numbers of a small tensor of floats in this shard; `None` when they cannot be read.

@@ -6,14 +6,14 @@ use serde::Serialize;
 use serde_json::Value;
 
 use crate::checkpoint::tokenizer::Comparison as Tokens;
-use crate::checkpoint::{Checkpoint, Dtype, EntryKind, Index, Shard, Tensor, files};
+use crate::checkpoint::{Checkpoint, DifferenceRank, Distance, EntryKind, Index, Shard, Tensor, files};
 use crate::knowledge::Library;
 
 mod converted;
 mod renamings;
 mod values;
 
-/// Maximum number of bytes of another file that is compared; of larger ones, only the sizes are.
+/// Maximum number of bytes of another file that is compared. Of a larger one, only another size is found.
 const FILE_CAP: u64 = 64 << 20;
 
 /// What differs between a first and a second checkpoint.
@@ -48,7 +48,7 @@ pub struct TensorDifferences {
     /// The bytes that were compared of tensors with the same type and shape.
     pub bytes: ComparedBytes,
     /// Prefixes of names that differ; the tensors are the same otherwise, unless they are listed below.
-    pub renamed: Vec<Renaming>,
+    pub renamed: Vec<PrefixChange>,
     /// Tensors that a loader makes the same tensors of: fused, split, tied or under names without one prefix for all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub converted: Option<Converted>,
@@ -69,7 +69,7 @@ pub struct TensorDifferences {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum ComparedBytes {
-    /// The first, middle and last 4096: tensors that were trained differ in them, and nearly always.
+    /// The first, middle and last 4096. A change of others, such as some rows of an embedding, is not found.
     #[default]
     Sampled,
     /// All.
@@ -83,7 +83,7 @@ pub enum ComparedBytes {
 /// A prefix of names that the second checkpoint has in place of another one.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
-pub struct Renaming {
+pub struct PrefixChange {
     /// In the first checkpoint; empty when the second one adds a prefix.
     pub from: String,
     /// In the second checkpoint.
@@ -140,7 +140,7 @@ pub struct Recast {
     pub after: String,
     /// By how much its values differ; missing unless it was asked for, and for values that are no finite floats.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub by: Option<Magnitude>,
+    pub by: Option<Distance>,
 }
 
 /// A tensor with other bytes.
@@ -151,61 +151,10 @@ pub struct Changed {
     pub name: String,
     /// By how much; missing unless it was asked for, and for values that are no finite floats.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub by: Option<Magnitude>,
+    pub by: Option<Distance>,
     /// Rank of the difference above rounding errors; missing unless it was asked for, and for all but matrices.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub rank: Option<ChangedRank>,
-}
-
-/// The rank of a difference: 16 for a merged LoRA of that rank.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-pub struct ChangedRank {
-    /// The rank.
-    pub rank: usize,
-    /// Whether it may be larger.
-    pub at_least: bool,
-}
-
-/// How far the values of a tensor are from those of another one. The norms are Euclidean ones of all values.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema))]
-pub struct Magnitude {
-    /// Norm of the first tensor.
-    pub norm_before: f64,
-    /// Norm of the second tensor.
-    pub norm_after: f64,
-    /// Norm of the difference.
-    pub norm_of_difference: f64,
-    /// The largest difference of two values.
-    pub largest_difference: f64,
-}
-
-impl Magnitude {
-    /// That of several tensors together.
-    #[must_use]
-    pub fn and(self, other: Self) -> Self {
-        Self {
-            norm_before: self.norm_before.hypot(other.norm_before),
-            norm_after: self.norm_after.hypot(other.norm_after),
-            norm_of_difference: self.norm_of_difference.hypot(other.norm_of_difference),
-            largest_difference: self.largest_difference.max(other.largest_difference),
-        }
-    }
-
-    /// The norm of the difference, as a share of the first norm; `None` when that is zero.
-    #[must_use]
-    pub fn relative(self) -> Option<f64> {
-        (self.norm_before > 0.0).then(|| self.norm_of_difference / self.norm_before)
-    }
-
-    /// The cosine of the angle between both; `None` when one norm is zero.
-    #[must_use]
-    pub fn cosine(self) -> Option<f64> {
-        let (a, b, d) = (self.norm_before, self.norm_after, self.norm_of_difference);
-        // That is (a² + b² − d²) / 2ab, without the difference of large squares.
-        (a > 0.0 && b > 0.0).then(|| 1.0 - (d - (a - b).abs()) * (d + (a - b).abs()) / (2.0 * a * b))
-    }
+    pub rank: Option<DifferenceRank>,
 }
 
 /// A JSON document that differs.
@@ -249,7 +198,7 @@ pub struct TokenChange {
     pub after: Option<u64>,
 }
 
-/// Files at the top of two directories that are neither documents nor weights, and documents of one alone.
+/// Files and folders at the top of two directories, without weights, indexes, and documents of both.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct FileChanges {
@@ -267,8 +216,7 @@ type Placed<'c> = (&'c Shard, &'c Tensor);
 /// The tensors of one side that have no partner yet, by name.
 type Unpaired<'c> = BTreeMap<&'c str, Placed<'c>>;
 
-/// Compares two checkpoints, for `diff`. With [`ComparedBytes::All`] it reads the tensors that have the same type and shape in
-/// both.
+/// Compares two checkpoints, for `diff`; `bytes` says what is read of the tensors that have the same shape in both.
 #[must_use]
 pub fn compare(one: &Checkpoint, other: &Checkpoint, library: &Library, bytes: ComparedBytes) -> Differences {
     let mut unknown: Vec<String> = [one, other].into_iter().flat_map(unread).collect();
@@ -289,8 +237,7 @@ pub fn compare(one: &Checkpoint, other: &Checkpoint, library: &Library, bytes: C
 /// Files of tensors that were not read whole.
 fn unread(checkpoint: &Checkpoint) -> Vec<String> {
     let root = checkpoint.source.path().display().to_string();
-    let partial = |shard: &&Shard| shard.unread || shard.further > 0 || !shard.unreadable.is_empty();
-    let shards = checkpoint.shards.values().filter(partial);
+    let shards = checkpoint.shards.values().filter(|shard| shard.lacks_tensors());
     let mut unread: Vec<String> =
         shards.map(|shard| format!("{root}: not all tensors of {} could be read", shard.name)).collect();
     if checkpoint.is_partial() {
@@ -299,11 +246,15 @@ fn unread(checkpoint: &Checkpoint) -> Vec<String> {
     unread
 }
 
+/// Each tensor in the file that [`Checkpoint::tensor`] finds it in.
 fn placed(checkpoint: &Checkpoint) -> Unpaired<'_> {
-    // Of a name in two files, the loader's is that of `Checkpoint::tensor`; the first one stands for it here.
+    let mapped = |name: &str| checkpoint.index.as_ref().and_then(|index| index.weight_map.get(name));
     let mut found = Unpaired::new();
     for (shard, tensor) in checkpoint.tensors() {
-        found.entry(&tensor.name).or_insert((shard, tensor));
+        let place = found.entry(tensor.name.as_str()).or_insert((shard, tensor));
+        if mapped(&tensor.name).is_some_and(|file| **file == *shard.name) {
+            *place = (shard, tensor);
+        }
     }
     found
 }
@@ -326,16 +277,10 @@ fn tensors(
     let mut found = TensorDifferences { before, after, bytes, renamed, ..TensorDifferences::default() };
     let sides = converted::sides(one, other, library, &left, &right);
     (found.converted, found.removed, found.added) = (sides.converted, sides.removed, sides.added);
-    let by = |before, after| {
-        let is_measured = matches!(bytes, ComparedBytes::Measured | ComparedBytes::Ranked);
-        let measured = is_measured.then(|| one.distance(before, other, after)).flatten();
-        measured.map(|found| Magnitude {
-            norm_before: found.before,
-            norm_after: found.after,
-            norm_of_difference: found.difference,
-            largest_difference: found.largest,
-        })
-    };
+    let is_measured = matches!(bytes, ComparedBytes::Measured | ComparedBytes::Ranked);
+    let by = |before, after| is_measured.then(|| one.distance(before, other, after)).flatten();
+    let is_ranked = bytes == ComparedBytes::Ranked;
+    let rank = |before, after| is_ranked.then(|| one.difference_rank(before, other, after)).flatten();
     for (before, after) in pairs {
         let name = || before.1.name.clone();
         if before.1.shape != after.1.shape {
@@ -343,15 +288,12 @@ fn tensors(
             found.reshaped.push(Reshaped { name: name(), before, after });
         } else if before.1.dtype != after.1.dtype {
             let by = by(before, after);
-            let [before, after] = [before, after].map(|(_, tensor)| dtype(tensor.dtype));
+            let [before, after] = [before, after].map(|(_, tensor)| tensor.dtype.to_string());
             found.recast.push(Recast { name: name(), before, after, by });
         } else {
             match one.bytes_equal(before, other, after, bytes != ComparedBytes::Sampled) {
                 Some(false) => {
-                    let ranked = || one.difference_rank(before, other, after);
-                    let rank = (bytes == ComparedBytes::Ranked).then(ranked).flatten();
-                    let rank = rank.map(|found| ChangedRank { rank: found.rank, at_least: found.at_least });
-                    found.changed.push(Changed { name: name(), by: by(before, after), rank });
+                    found.changed.push(Changed { name: name(), by: by(before, after), rank: rank(before, after) });
                 }
                 Some(true) => found.equal = found.equal.saturating_add(1),
                 None => unknown.push(format!("the bytes of {} could not be compared", before.1.name)),
@@ -359,10 +301,6 @@ fn tensors(
         }
     }
     found
-}
-
-fn dtype(dtype: Dtype) -> String {
-    dtype.to_string()
 }
 
 /// Documents of both that differ. The values of an index follow from the tensors.
@@ -396,12 +334,9 @@ fn tokens(one: &Checkpoint, other: &Checkpoint) -> Option<TokenChange> {
 
 fn file_changes(one: &Checkpoint, other: &Checkpoint, unknown: &mut Vec<String>) -> FileChanges {
     let names = |checkpoint: &Checkpoint| -> BTreeSet<String> {
-        let is_file = |name: &&String| {
-            checkpoint.entries.get(*name).is_some_and(|entry| entry.kind != EntryKind::Directory)
-                && !checkpoint.shards.contains_key(*name)
-                && !is_index(name)
-        };
-        checkpoint.entries.keys().filter(is_file).cloned().collect()
+        let is_other =
+            |name: &&String| !checkpoint.shards.contains_key(*name) && !is_index(name) && !name.starts_with('.');
+        checkpoint.entries.keys().filter(is_other).cloned().collect()
     };
     let (here, there) = (names(one), names(other));
     let mut changes = FileChanges {
@@ -410,16 +345,17 @@ fn file_changes(one: &Checkpoint, other: &Checkpoint, unknown: &mut Vec<String>)
         changed: Vec::new(),
     };
     for name in here.intersection(&there).filter(|name| !one.documents.contains_key(*name)) {
-        let size = |checkpoint: &Checkpoint| checkpoint.entries.get(name).map(|entry| entry.size);
-        if size(one) != size(other) {
+        let [Some(before), Some(after)] = [one, other].map(|checkpoint| checkpoint.entries.get(name)) else { continue };
+        if before.kind == EntryKind::Directory && after.kind == EntryKind::Directory {
+            unknown.push(format!("the folder {name} was not compared"));
+        } else if (before.kind, before.size) != (after.kind, after.size) {
             changes.changed.push(name.clone());
-            continue;
-        }
-        let read = |checkpoint: &Checkpoint| checkpoint.source.read_own(name, FILE_CAP);
-        match (read(one), read(other)) {
-            (Ok(before), Ok(after)) if before == after => {}
-            (Ok(_), Ok(_)) => changes.changed.push(name.clone()),
-            (Err(error), _) | (_, Err(error)) => unknown.push(format!("{name} was not compared: {error}")),
+        } else {
+            match one.file_equal(name, other, FILE_CAP) {
+                Ok(true) => {}
+                Ok(false) => changes.changed.push(name.clone()),
+                Err(error) => unknown.push(format!("{name} was not compared: {error}")),
+            }
         }
     }
     changes

@@ -11,7 +11,7 @@ use serde_json::{Map, Value};
 
 use super::load::{self, Stored};
 use super::votes::{self, Fit, Votes, vote};
-use crate::checkpoint::{Checkpoint, Dtype, Tensor, pointer};
+use crate::checkpoint::{Checkpoint, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
 use crate::knowledge::{Architecture, Library, Loader};
 
@@ -221,13 +221,7 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
 fn memory(checkpoint: &Checkpoint, stored: &Stored, library: &Library, cache: CacheInput) -> Option<Memory> {
     let config = checkpoint.config().filter(|c| !c.get("quantization_config").is_some_and(Value::is_object))?;
     let expected = load::build(by_config(library, config, stored)?, config, stored).ok()?;
-    let mut elements: BTreeMap<Dtype, u64> = BTreeMap::new();
-    for (_, tensor) in checkpoint.tensors().filter(|(_, tensor)| !tensor.dtype.is_integer()) {
-        let own = elements.entry(tensor.dtype).or_default();
-        *own = own.saturating_add(tensor.shape.iter().fold(1_u64, |n, d| n.saturating_mul(*d)));
-    }
-    let (dtype, _) = elements.into_iter().max_by_key(|(_, count)| *count)?;
-    memory::of(&expected, dtype, cache)
+    memory::of(&expected, checkpoint.float_of_most_bytes()?, cache)
 }
 
 /// The class that config.json names, under the loader it names or else another.

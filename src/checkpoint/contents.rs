@@ -1,25 +1,29 @@
-//! What the bytes of the tensors reveal, and their comparison; read only for `check --deep`.
+//! What the bytes of the tensors reveal, and their comparison; read only for `check --deep` and `diff`.
 //!
 //! Every byte of every shard is read once, through windows of a memory map, so that memory does not depend on the size of the
 //! weights; holes of sparse files, which are zeros, are not read. A file that shrinks during the read gives a fault instead of
 //! a signal (`platform/mapped.rs`). Positioned reads take its place where a file cannot be mapped, and on Windows: they take
 //! about twice as long where the page cache has large pages (`cargo bench --bench contents` compares the two).
 
-use super::source::SourceFile;
 use super::{Dtype, Shard, Source, Tensor};
 
 #[cfg(feature = "cli")]
 pub(crate) mod digests;
+mod distance;
 mod formats;
 mod git_index;
 pub(super) mod hashes;
 mod pieces;
-pub(super) mod rank;
+mod rank;
 mod read;
 mod tally;
 
+pub use distance::Distance;
+pub(super) use distance::distance;
 pub use hashes::HashedFiles;
 use pieces::{Piece, each_piece};
+pub use rank::DifferenceRank;
+pub(super) use rank::rank;
 pub(super) use read::read;
 pub use read::{Progress, ReadOptions, TensorContents, TensorStats};
 use tally::{BLOCK, as_u64};
@@ -100,81 +104,6 @@ pub(super) fn sample(source: &Source, shard: &Shard, tensor: &Tensor) -> Option<
         bytes.append(&mut block);
     }
     Some(bytes)
-}
-
-/// How the values of one tensor differ from those of another one: Euclidean norms, and the largest difference.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct Distance {
-    pub(crate) before: f64,
-    pub(crate) after: f64,
-    pub(crate) difference: f64,
-    pub(crate) largest: f64,
-}
-
-/// Values that [`distance`] reads at a time.
-const VALUES: usize = 1 << 16;
-
-/// How far the values of two tensors of the same shape are from each other; the types may differ. `None` for types that are
-/// no floats of 16 bits or more, for values that are not finite, and when the values cannot be read.
-pub(super) fn distance(
-    [source, beside]: [&Source; 2],
-    one: (&Shard, &Tensor),
-    other: (&Shard, &Tensor),
-) -> Option<Distance> {
-    let (mut before, mut after) = (Values::of(source, one)?, Values::of(beside, other)?);
-    let mut sums = Distance::default();
-    loop {
-        let (here, there) = (before.next()?, after.next()?);
-        if here.len() != there.len() {
-            return None;
-        }
-        if here.is_empty() {
-            break;
-        }
-        for (a, b) in here.iter().zip(&there) {
-            sums.before += a * a;
-            sums.after += b * b;
-            sums.difference += (b - a) * (b - a);
-            sums.largest = sums.largest.max((b - a).abs());
-        }
-    }
-    let Distance { before, after, difference, largest } = sums;
-    let found = Distance { before: before.sqrt(), after: after.sqrt(), difference: difference.sqrt(), largest };
-    [found.before, found.after, found.difference].iter().all(|norm| norm.is_finite()).then_some(found)
-}
-
-/// The values of a tensor, block by block.
-struct Values {
-    file: SourceFile,
-    dtype: Dtype,
-    width: u64,
-    at: u64,
-    left: u64,
-}
-
-impl Values {
-    fn of(source: &Source, (shard, tensor): (&Shard, &Tensor)) -> Option<Self> {
-        let width = match tensor.dtype {
-            Dtype::F64 => 8,
-            Dtype::F32 => 4,
-            Dtype::BF16 | Dtype::F16 => 2,
-            _ => return None,
-        };
-        let file = source.open_regular(&shard.name, u64::MAX).ok()?;
-        let is_whole = file.len() == shard.file_len && !shard.unread && shard.is_contiguous(&tensor.name);
-        let at = shard.data_start.checked_add(tensor.begin).filter(|_| is_whole)?;
-        Some(Self { file, dtype: tensor.dtype, width, at, left: tensor.len().checked_div(width)? })
-    }
-
-    /// The next values; empty at the end, `None` when they cannot be read.
-    fn next(&mut self) -> Option<Vec<f64>> {
-        let count = self.left.min(as_u64(VALUES));
-        let mut bytes = vec![0; usize::try_from(count.checked_mul(self.width)?).ok()?];
-        self.file.read_exact_at(&mut bytes, self.at).ok()?;
-        self.at = self.at.checked_add(as_u64(bytes.len()))?;
-        self.left = self.left.checked_sub(count)?;
-        decoded(self.dtype, &bytes)
-    }
 }
 
 /// Maximum number of bytes of a tensor whose numbers are read: statistics have some hundred.

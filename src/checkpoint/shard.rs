@@ -144,6 +144,12 @@ impl Shard {
         !self.unread && self.faults.iter().all(|fault| fault.kind == FaultKind::OddTensorName)
     }
 
+    /// Whether some of the tensors in the file could not be read, whatever their names.
+    #[must_use]
+    pub(crate) fn lacks_tensors(&self) -> bool {
+        self.unread || self.further > 0 || !self.unreadable.is_empty()
+    }
+
     /// Whether the file has the bytes of every tensor that its header lists.
     #[must_use]
     pub(crate) fn is_whole(&self) -> bool {

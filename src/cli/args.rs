@@ -154,7 +154,7 @@ pub struct InspectArgs {
     /// List the tensors, or those whose names match GLOB (`*` is any text): shape, dtype, bytes, and place in the files
     #[arg(long, value_name = "GLOB", num_args = 0..=1, require_equals = true, default_missing_value = "*")]
     pub tensors: Option<String>,
-    /// Tokens of the cache whose memory is told [default: the longest input that the config names]
+    /// Tokens of the cache whose memory is estimated [default: the longest input that the config names]
     #[arg(long, value_name = "TOKENS")]
     pub context: Option<u64>,
     /// Sequences of that cache
@@ -180,8 +180,7 @@ pub struct DiffArgs {
     /// Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones
     #[arg(long)]
     pub bytes: bool,
-    /// Compare all bytes, and print how far the values of tensors are from each other that differ; with =rank also the rank of
-    /// the difference of two matrices, above rounding errors
+    /// Compare all bytes, and measure tensors that differ; with =rank also the rank of the difference of two matrices
     #[arg(long, value_name = "WHAT", num_args = 0..=1, require_equals = true, default_missing_value = "values")]
     pub stats: Option<DiffStats>,
     /// Output format

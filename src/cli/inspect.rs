@@ -58,8 +58,7 @@ pub(super) fn open(path: &Path) -> anyhow::Result<Checkpoint> {
 /// The tensors that match a pattern; fails if there is none, unless the pattern matches all. Names the files of which tensors
 /// are missing.
 fn list(checkpoint: &Checkpoint, path: &Path, pattern: &str) -> anyhow::Result<Vec<InspectedTensor>> {
-    let partial = |shard: &&Shard| shard.unread || shard.further > 0 || !shard.unreadable.is_empty();
-    for shard in checkpoint.shards.values().filter(partial) {
+    for shard in checkpoint.shards.values().filter(|shard| shard.lacks_tensors()) {
         output::note(&output::safe(&format!("note: {}: not all tensors could be read", shard.name)));
     }
     let listed = tensors(checkpoint, pattern);

@@ -51,7 +51,7 @@ pub struct CacheSize {
     full: u64,
     /// Layers that cache a window of tokens.
     windowed: u64,
-    /// Tokens of that window.
+    /// Tokens that these keep.
     window: u64,
     /// Whether some layers may cache less, which the config does not tell.
     pub is_bound: bool,
@@ -108,7 +108,8 @@ impl CacheKeys {
             elements,
             full: layers,
             windowed: 0,
-            window: number(&self.window).unwrap_or(u64::MAX),
+            // The newest token of the window is not cached yet when a pass begins: `DynamicSlidingWindowLayer.update`.
+            window: number(&self.window).map_or(u64::MAX, |window| window.saturating_sub(1)),
             is_bound: number(&self.window).is_some(),
         };
         let Some(kinds) = text.get(&self.kinds).and_then(Value::as_array) else { return Some(size) };
@@ -139,7 +140,7 @@ mod tests {
         assert_eq!(elements(&shared, 10), Some((3 * 2 * 2 * 16 * 10, false)));
         let kinds = json!({ "num_hidden_layers": 3, "num_attention_heads": 4, "head_dim": 8, "sliding_window": 4,
             "layer_types": ["full_attention", "sliding_attention", "sliding_attention"] });
-        assert_eq!(elements(&kinds, 10), Some(((10 + 4 + 4) * 2 * 4 * 8, false)));
+        assert_eq!(elements(&kinds, 10), Some(((10 + 3 + 3) * 2 * 4 * 8, false)));
         let unsaid = json!({ "num_hidden_layers": 3, "num_attention_heads": 4, "head_dim": 8, "sliding_window": 4 });
         assert_eq!(elements(&unsaid, 10), Some((3 * 10 * 2 * 4 * 8, true)));
         let latent = json!({ "num_hidden_layers": 3, "num_attention_heads": 4, "hidden_size": 32,

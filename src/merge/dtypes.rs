@@ -1,45 +1,17 @@
 //! Floating-point types of donors and results.
 
-use std::collections::BTreeMap;
-
 use serde_json::Value;
 
-use crate::checkpoint::{Checkpoint, Dtype};
+use crate::checkpoint::Dtype;
 use crate::surgery::values;
 
 /// The types to which values can be cast, as torch names them.
 pub(super) const FLOAT_NAMES: [&str; 4] = ["bfloat16", "float16", "float32", "float64"];
 
-/// The type that torch gives this name; only types to which values can be cast.
-pub(super) fn from_name(name: &str) -> Option<Dtype> {
-    [Dtype::BF16, Dtype::F16, Dtype::F32, Dtype::F64].into_iter().find(|dtype| float_name(*dtype) == Some(name))
-}
-
-/// The name in torch of a type to which values can be cast.
-fn float_name(dtype: Dtype) -> Option<&'static str> {
-    match dtype {
-        Dtype::BF16 => Some("bfloat16"),
-        Dtype::F16 => Some("float16"),
-        Dtype::F32 => Some("float32"),
-        Dtype::F64 => Some("float64"),
-        _ => None,
-    }
-}
-
 /// A number rounded to the type that torch gives this name, as `torch.tensor(number, dtype=…)` rounds it; unchanged without
 /// a type.
 pub(super) fn round(number: f64, name: Option<&str>) -> f64 {
-    name.and_then(from_name).map_or(number, |dtype| values::round(dtype, number))
-}
-
-/// The floating-point type of most bytes of a checkpoint, as torch names it; `None` without such tensors.
-pub(super) fn of_most_bytes(checkpoint: &Checkpoint) -> Option<&'static str> {
-    let mut bytes: BTreeMap<Dtype, u64> = BTreeMap::new();
-    for (_, tensor) in checkpoint.tensors().filter(|(_, t)| float_name(t.dtype).is_some()) {
-        let sum = bytes.entry(tensor.dtype).or_default();
-        *sum = sum.saturating_add(tensor.len());
-    }
-    bytes.into_iter().max_by_key(|(_, bytes)| *bytes).and_then(|(dtype, _)| float_name(dtype))
+    name.and_then(Dtype::of_float_name).map_or(number, |dtype| values::round(dtype, number))
 }
 
 /// Sets every `torch_dtype` and `dtype` of a config and of the configs in it, except null; adds `torch_dtype` to the top if

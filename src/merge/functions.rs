@@ -14,7 +14,7 @@ use crate::knowledge::{Loader, Scope};
 pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
-        .filter_map(|donor| Some((donor.role.clone(), dtypes::of_most_bytes(&donor.checkpoint)?)))
+        .filter_map(|donor| Some((donor.role.clone(), donor.checkpoint.float_of_most_bytes()?.float_name()?)))
         .collect();
     let of_role = dtypes.clone();
     scope.function1("dtype", move |role| of_role.get(role).map_or(Value::Null, |name| json!(name)));

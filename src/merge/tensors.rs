@@ -9,7 +9,6 @@ use super::adapter::MergedAdapter;
 use super::context::Context;
 use super::documents::MergedDocument;
 use super::draft::MergeDraft;
-use super::dtypes;
 use super::error::MergeError;
 use super::explain;
 use super::fit::Fit;
@@ -349,7 +348,7 @@ fn parse_scale(value: &Value) -> Result<Option<f64>, &'static str> {
 fn parse_dtype(value: &Value) -> Result<Option<Dtype>, &'static str> {
     match value {
         Value::Null => Ok(None),
-        Value::String(name) => dtypes::from_name(name).map(Some).ok_or("bfloat16, float16, float32 or float64"),
+        Value::String(name) => Dtype::of_float_name(name).map(Some).ok_or("bfloat16, float16, float32 or float64"),
         _ => Err("bfloat16, float16, float32 or float64"),
     }
 }

@@ -11,10 +11,8 @@ use super::format::{more, name, plural, sentence, shape, shortened, wrap};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::paint::Paint;
-use crate::check::compare::{
-    ChangedRank, ComparedBytes, Differences, DocumentChange, Magnitude, OneSided, Renaming, TensorDifferences,
-};
-use crate::checkpoint::escape;
+use crate::check::compare::{ComparedBytes, Differences, DocumentChange, OneSided, PrefixChange, TensorDifferences};
+use crate::checkpoint::{DifferenceRank, Distance, escape};
 
 /// Columns before a line that goes on with the one above.
 const INDENT: usize = 6;
@@ -46,10 +44,11 @@ pub fn json(before: &str, after: &str, differences: &Differences) -> String {
 pub fn full(before: &str, after: &str, differences: &Differences, style: Style) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
-    let verdict = match (differences.differ, differences.unknown.is_empty()) {
+    let is_whole = differences.unknown.is_empty() && differences.tensors.bytes != ComparedBytes::Sampled;
+    let verdict = match (differences.differ, is_whole) {
         (true, _) => " differ",
         (false, true) => ": no difference found",
-        (false, false) => ": no difference found in what could be compared",
+        (false, false) => ": no difference found in what was compared",
     };
     let _ok = writeln!(out, "{} and {}{verdict}", paint.strong(&name(before)), paint.strong(&name(after)));
     tensors(&mut out, &differences.tensors, style);
@@ -85,7 +84,7 @@ fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
     let lines =
         [counts, format!("{} {read}", found.equal)].into_iter().filter(|_| (found.before, found.after) != (0, 0));
     section(out, "tensors", lines, 0, style);
-    let renamed = found.renamed.iter().map(|Renaming { from, to, tensors }| {
+    let renamed = found.renamed.iter().map(|PrefixChange { from, to, tensors }| {
         let change = match (name(from), name(to)) {
             (from, _) if to.is_empty() => format!("{from} removed"),
             (_, to) if from.is_empty() => format!("{to} added"),
@@ -134,20 +133,18 @@ type Apart<'n> = (&'n str, Option<Distances>);
 /// How far tensors are apart, and the ranks of their differences, if all were told: the smallest and the largest.
 #[derive(Clone, Copy)]
 struct Distances {
-    by: Magnitude,
-    ranks: Option<[ChangedRank; 2]>,
+    by: Distance,
+    ranks: Option<[DifferenceRank; 2]>,
 }
 
 impl Distances {
-    fn of(by: Option<Magnitude>, rank: Option<ChangedRank>) -> Option<Self> {
+    fn of(by: Option<Distance>, rank: Option<DifferenceRank>) -> Option<Self> {
         Some(Self { by: by?, ranks: rank.map(|rank| [rank; 2]) })
     }
 
     fn and(self, other: Self) -> Self {
-        let ranks = self.ranks.zip(other.ranks).map(|([least, most], [low, high])| {
-            let larger = |one: ChangedRank, other: ChangedRank| (one.rank, one.at_least) > (other.rank, other.at_least);
-            [if larger(least, low) { low } else { least }, if larger(most, high) { most } else { high }]
-        });
+        let ranks = self.ranks.zip(other.ranks);
+        let ranks = ranks.map(|([least, most], [low, high])| [least.min(low), most.max(high)]);
         Self { by: self.by.and(other.by), ranks }
     }
 }
@@ -176,20 +173,19 @@ fn measured<'n>(
     })
 }
 
-/// `0.0012 of the norm, at most 0.03, cosine 0.999999`.
+/// `relative 0.012, largest 0.030, cosine 0.999928, rank 16`, as docs/inspecting.md explains them.
 fn amount(Distances { by, ranks }: Distances) -> String {
-    let share =
-        by.relative().map_or_else(|| "all of the norm".to_owned(), |share| format!("{} of the norm", figures(share)));
+    let relative = by.relative().map(|share| format!("relative {}, ", figures(share))).unwrap_or_default();
     let cosine = by.cosine().map(|cosine| format!(", cosine {cosine:.6}")).unwrap_or_default();
-    let rank = |rank: ChangedRank| format!("{}{}", if rank.at_least { "≥ " } else { "" }, rank.rank);
+    let rank = |rank: DifferenceRank| format!("{}{}", if rank.at_least { "≥ " } else { "" }, rank.rank);
     let rank = ranks.map(|[least, most]| match (rank(least), rank(most)) {
         (least, most) if least == most => format!(", rank {most}"),
         (least, most) => format!(", rank {least} to {most}"),
     });
-    format!("{share}, at most {}{cosine}{}", figures(by.largest_difference), rank.unwrap_or_default())
+    format!("{relative}largest {}{cosine}{}", figures(by.largest_difference), rank.unwrap_or_default())
 }
 
-/// A number with three significant digits.
+/// A number with three decimals, or with an exponent where these would tell little.
 fn figures(number: f64) -> String {
     if number == 0.0 || (0.001..1000.0).contains(&number) { format!("{number:.3}") } else { format!("{number:.2e}") }
 }

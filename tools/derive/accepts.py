@@ -172,7 +172,7 @@ def read_by(cls, config):
         asked[id(self)].append(key)
         raise AttributeError(f"'{type(self).__name__}' object has no attribute '{key}'")
 
-    base = transformers.PretrainedConfig
+    base, model = transformers.PretrainedConfig, None
     before = base.__dict__.get("__getattr__")
     try:
         base.__getattr__ = lacks
@@ -183,7 +183,7 @@ def read_by(cls, config):
             del base.__getattr__
         else:
             base.__getattr__ = before
-    if "model" not in locals():
+    if model is None:
         return {}, []
     found, classes = {}, {type(module) for module in model.modules()}
     for path, part in configs_in(model.config):

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{Converted, OneSided, Unpaired, dtype};
+use super::{Converted, OneSided, Unpaired};
 use crate::check::load::{self, Stored};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::{Evidence, Expected, Library, Loader};
@@ -50,7 +50,7 @@ fn stored(unpaired: &Unpaired<'_>) -> Vec<OneSided> {
     let one = |(name, (_, tensor)): (&&str, &super::Placed<'_>)| OneSided {
         name: (*name).to_owned(),
         shape: Some(tensor.shape.clone()),
-        dtype: Some(dtype(tensor.dtype)),
+        dtype: Some(tensor.dtype.to_string()),
     };
     unpaired.iter().map(one).collect()
 }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::{Placed, Renaming, Unpaired};
+use super::{Placed, PrefixChange, Unpaired};
 
 /// Maximum number of prefixes that are found.
 const RULES: usize = 16;
@@ -17,12 +17,12 @@ pub(super) fn pair<'c>(
     left: &mut Unpaired<'c>,
     right: &mut Unpaired<'c>,
     pairs: &mut Vec<(Placed<'c>, Placed<'c>)>,
-) -> Vec<Renaming> {
-    let mut found: Vec<Renaming> = Vec::new();
+) -> Vec<PrefixChange> {
+    let mut found: Vec<PrefixChange> = Vec::new();
     while found.len() < RULES && !left.is_empty() && !right.is_empty() {
         let Some((from, to)) = best(left, right) else { break };
         let tensors = apply(&from, &to, left, right, pairs);
-        found.push(Renaming { from, to, tensors });
+        found.push(PrefixChange { from, to, tensors });
     }
     found
 }

@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use super::{DocumentChange, ValueChange};
-use crate::checkpoint::{files, pointer};
+use crate::checkpoint::pointer;
 
 /// Maximum number of values that are listed for a document.
 const MOST: usize = 500;
@@ -18,10 +18,6 @@ const LARGE: usize = 2_000;
 pub(super) fn changes(file: &str, before: &Value, after: &Value) -> Option<DocumentChange> {
     let mut walk = Walk { values: Vec::new(), further: 0 };
     walk.compare(&mut String::new(), before, after);
-    // Added tokens are compared as tokens.
-    if file == files::TOKENIZER {
-        walk.values.retain(|change| !change.pointer.starts_with("/added_tokens"));
-    }
     let Walk { values, further } = walk;
     (!values.is_empty()).then(|| DocumentChange { file: file.to_owned(), values, further })
 }

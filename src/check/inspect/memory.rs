@@ -63,11 +63,5 @@ pub(super) fn of(expected: &Expected, stored: Dtype, input: CacheInput) -> Optio
 /// The type that a config names for its weights.
 fn declared(config: &Value) -> Option<Dtype> {
     let name = ["dtype", "torch_dtype"].iter().find_map(|key| config.get(key)?.as_str())?;
-    match name.trim_start_matches("torch.") {
-        "float32" => Some(Dtype::F32),
-        "bfloat16" => Some(Dtype::BF16),
-        "float16" => Some(Dtype::F16),
-        "float64" => Some(Dtype::F64),
-        _ => None,
-    }
+    Dtype::of_float_name(name.strip_prefix("torch.").unwrap_or(name))
 }

@@ -5,7 +5,9 @@
 //! 2011. The second time, the rows are projected onto that space, and the singular values of the projections are counted that
 //! are larger than those of rounding errors.
 
-use super::Values;
+use serde::Serialize;
+
+use super::distance::ValueReader;
 use crate::checkpoint::{Dtype, Shard, Source, Tensor};
 
 /// Sums of rows, and so the largest rank that is told: more than the ranks of adapters.
@@ -17,17 +19,23 @@ const ELEMENTS: usize = 8 << 20;
 /// How much larger than the largest singular value of rounding errors a counted one is.
 const MARGIN: f64 = 1.25;
 
-/// The rank of a difference.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct DifferenceRank {
-    pub(crate) rank: usize,
+/// The rank of a difference: 16 for a merged LoRA of that rank.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct DifferenceRank {
+    /// The rank.
+    pub rank: usize,
     /// Whether it may be larger.
-    pub(crate) at_least: bool,
+    pub at_least: bool,
 }
 
 /// The rank of the difference of two matrices of the same shape; of more dimensions, all but the first are one. `None` where
-/// [`super::distance`] is, for vectors, and for rows that are too long.
-pub(crate) fn rank(sources: [&Source; 2], one: (&Shard, &Tensor), other: (&Shard, &Tensor)) -> Option<DifferenceRank> {
+/// [`super::distance()`] is, for vectors, and for rows that are too long.
+pub(in crate::checkpoint) fn rank(
+    sources: [&Source; 2],
+    one: (&Shard, &Tensor),
+    other: (&Shard, &Tensor),
+) -> Option<DifferenceRank> {
     let [rows, rest @ ..] = one.1.shape.as_slice() else { return None };
     let rows = usize::try_from(*rows).ok()?;
     let columns = rest.iter().try_fold(1_usize, |n, dim| n.checked_mul(usize::try_from(*dim).ok()?))?;
@@ -65,7 +73,7 @@ fn each_row(
     columns: usize,
     mut visit: impl FnMut(u64, &[f64], &[f64]),
 ) -> Option<()> {
-    let (mut before, mut after) = (Values::of(source, one)?, Values::of(beside, other)?);
+    let (mut before, mut after) = (ValueReader::of(source, one)?, ValueReader::of(beside, other)?);
     let mut number = 0;
     let (mut ahead, mut there) = (Vec::new(), Vec::new());
     loop {

@@ -79,6 +79,24 @@ impl Dtype {
         Self::U64,
     ];
 
+    /// The name in torch of a float of 16 bits or more.
+    #[must_use]
+    pub const fn float_name(self) -> Option<&'static str> {
+        match self {
+            Self::BF16 => Some("bfloat16"),
+            Self::F16 => Some("float16"),
+            Self::F32 => Some("float32"),
+            Self::F64 => Some("float64"),
+            _ => None,
+        }
+    }
+
+    /// The float of 16 bits or more that torch gives this name.
+    #[must_use]
+    pub fn of_float_name(name: &str) -> Option<Self> {
+        [Self::BF16, Self::F16, Self::F32, Self::F64].into_iter().find(|dtype| dtype.float_name() == Some(name))
+    }
+
     /// Width of one element in bits; sub-byte types are narrower than eight.
     #[must_use]
     pub const fn bits(self) -> u64 {

@@ -67,10 +67,10 @@ fn a_checkpoint_has_no_difference_from_its_copy() {
     make(room.path(), "before", "llama", "[]");
     // Two shards and an index in place of one file.
     make(room.path(), "after", "llama-sharded", "[]");
-    for bytes in [&[][..], &["--bytes"]] {
-        let found = text(room.path(), &[&["before", "after"], bytes].concat(), 0);
-        assert!(found.starts_with("before and after: no difference found\n"), "{found}");
-    }
+    let found = text(room.path(), &["before", "after"], 0);
+    assert!(found.starts_with("before and after: no difference found in what was compared\n"), "{found}");
+    let found = text(room.path(), &["before", "after", "--bytes"], 0);
+    assert!(found.starts_with("before and after: no difference found\n"), "{found}");
     let found = text(room.path(), &["before", "before"], 0);
     assert!(found.contains("equal in type, shape, and their first, middle and last bytes"), "{found}");
 }
@@ -118,7 +118,7 @@ fn how_far_values_are_apart_is_measured() {
     make(room.path(), "before", "llama", &with(four));
     make(room.path(), "after", "llama", &with(five));
     let found = text(room.path(), &["before", "after", "--stats"], 1);
-    assert!(found.contains("    model.pair.weight: 0.200 of the norm, at most 1.000, cosine 0.994692\n"), "{found}");
+    assert!(found.contains("    model.pair.weight: relative 0.200, largest 1.000, cosine 0.994692\n"), "{found}");
     let found: Value =
         serde_json::from_str(&text(room.path(), &["before", "after", "--stats", "--output-format", "json"], 1))
             .unwrap();
@@ -137,12 +137,56 @@ fn how_far_values_are_apart_is_measured() {
 }
 
 #[test]
+fn what_stands_beside_tensors_and_configs_is_compared_or_named() {
+    let room = TempDir::new().unwrap();
+    let with = |flag: bool| {
+        format!(
+            r#"[{{ set: {{ file: "tokenizer.json", at: "/added_tokens/0/lstrip", to: {flag} }} }},
+                {{ write: {{ file: ".gitattributes", bytes: "{flag}" }} }}, {{ folder: "onnx" }}]"#
+        )
+    };
+    make(room.path(), "before", "llama", &with(false));
+    make(room.path(), "after", "llama", &with(true));
+    let found = text(room.path(), &["before", "after", "--bytes"], 1);
+    assert!(found.contains("tokenizer.json\n    /added_tokens/0/lstrip: false -> true\n"), "{found}");
+    assert!(found.contains("not compared\n    the folder onnx was not compared\n"), "{found}");
+    assert!(!found.contains(".gitattributes"), "{found}");
+    assert!(text(room.path(), &["before", "before", "--bytes"], 2).contains("in what was compared"));
+}
+
+/// The loader opens the file that the index names; the other copy is no difference.
+#[test]
+fn a_tensor_in_two_files_is_that_of_the_index() {
+    let room = TempDir::new().unwrap();
+    let copy = r#"{ add_tensor: { name: "model.twice.weight", shape: [2], dtype: "F32", file: "model-00002-of-00002.safetensors" } }"#;
+    let poke = r#"{ poke: { tensor: "model.twice.weight", at: 0, bytes: "x" } }"#;
+    make(room.path(), "before", "llama-sharded", &format!("[{copy}]"));
+    let after = make(room.path(), "after", "llama-sharded", &format!("[{copy}, {poke}]"));
+    // The first file of both has the same bytes under the name; the index names the second.
+    for dir in ["before", "after"] {
+        let first = room.path().join(dir).join("model-00001-of-00002.safetensors");
+        let bytes = fs::read(&first).unwrap();
+        let (header, data) = crate::support::weights::split(&bytes);
+        let length = data.len();
+        let entry = format!(
+            r#","model.twice.weight":{{"dtype":"F32","shape":[2],"data_offsets":[{length},{}]}}}}"#,
+            length + 8
+        );
+        let header = header.trim_end().strip_suffix('}').unwrap().to_owned() + &entry;
+        fs::write(&first, crate::support::weights::join(header.as_bytes(), &[data, &[0; 8]].concat())).unwrap();
+    }
+    assert!(after.exists());
+    let found = text(room.path(), &["before", "after"], 1);
+    assert!(found.contains("tensors with other bytes\n    model.twice.weight\n"), "{found}");
+}
+
+#[test]
 fn what_could_not_be_read_is_said_and_exits_with_2() {
     let room = TempDir::new().unwrap();
     make(room.path(), "before", "llama", "[]");
     make(room.path(), "after", "llama", r#"[{ cut: { file: "model.safetensors", bytes: 4 } }]"#);
     let found = text(room.path(), &["before", "after"], 2);
-    assert!(found.contains("no difference found in what could be compared"), "{found}");
+    assert!(found.contains("no difference found in what was compared"), "{found}");
     assert!(found.contains("\n  not compared\n"), "{found}");
     let output = diff(project(), &["fixtures/donors", "fixtures/donors/llava3d-tiny"]);
     assert_eq!(output.status.code(), Some(2));

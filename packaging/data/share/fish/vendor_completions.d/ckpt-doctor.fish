@@ -249,7 +249,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -s h -l 
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l depth -d 'Print the tree of modules to N levels, 0 for all; without it, as many as stay short. JSON has all' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l tensors -d 'List the tensors, or those whose names match GLOB (`*` is any text): shape, dtype, bytes, and place in the files' -r
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l context -d 'Tokens of the cache whose memory is told [default: the longest input that the config names]' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l context -d 'Tokens of the cache whose memory is estimated [default: the longest input that the config names]' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l batch -d 'Sequences of that cache' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
@@ -259,7 +259,7 @@ never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s V -l version -d 'Print version'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l stats -d 'Compare all bytes, and print how far the values of tensors are from each other that differ; with =rank also the rank of the difference of two matrices, above rounding errors' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l stats -d 'Compare all bytes, and measure tensors that differ; with =rank also the rank of the difference of two matrices' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
 rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
@@ -270,7 +270,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l rules -
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l bytes -d 'Compare all bytes of tensors that have the same type and shape, not only the first, middle and last ones'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -s V -l version -d 'Print version'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l stats -d 'Compare all bytes, and print how far the values of tensors are from each other that differ; with =rank also the rank of the difference of two matrices, above rounding errors' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l stats -d 'Compare all bytes, and measure tensors that differ; with =rank also the rank of the difference of two matrices' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
 rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
