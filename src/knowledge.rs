@@ -8,6 +8,7 @@ pub mod directories;
 pub mod embeddings;
 pub mod evidence;
 pub mod expression;
+mod fixed_parts;
 pub mod initial;
 pub mod library;
 pub mod lists;

@@ -19,7 +19,7 @@ use super::tokens::OpenedTokenizer;
 use super::variables::{self, declared};
 use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
 use super::view::{Asked, FilesView, VersionsView};
-use super::{directory, index, inspect, judge, policy, processor, robots, tokens};
+use super::{directory, index, inspect, judge, policy, processor, refusals, robots, tokens};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
@@ -401,6 +401,14 @@ fn bind_run(
     scope.bind("named", &(!versions.is_empty()).into());
     let groups_heads = |name: &str| knowledge.library.speaks_of(name, "c.num_key_value_heads");
     scope.bind("groups_heads", &architecture.is_none_or(groups_heads).into());
+    let classes: Vec<_> = architecture
+        .map(|name| targets.iter().filter_map(|target| knowledge.library.class(name, target.loader)).collect())
+        .unwrap_or_default();
+    let is_part = |pointer: &String| {
+        classes.is_empty() || classes.iter().any(|class| class.is_part(pointer.trim_start_matches('/')))
+    };
+    let parts = config.into_iter().flat_map(refusals::sub_configs).filter(is_part);
+    scope.bind("configs", &std::iter::once(String::new()).chain(parts).collect());
 }
 
 /// Adds to the fault of an unknown class the known one that has its tensor names.

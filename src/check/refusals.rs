@@ -13,14 +13,18 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
-use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, Heads, Lengths, RefusedValues, ValueKind, Words};
+use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, GENERATES, Heads, Lengths, RefusedValues, Ropes, ValueKind, Words};
 use crate::knowledge::source;
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
 
-/// Keys that the config class of a part refuses as that of the whole does.
-const LABELS: [&str; 2] = ["/id2label", "/label2id"];
+/// Keys that the config class of a part refuses as that of the whole does: tried with every part of every config class of
+/// transformers 4.47.0, 4.57.6 and 5.23.0. Of the dtypes those that are no value at all.
+const OF_PARTS: [&str; 5] = ["id2label", "label2id", "problem_type", "torch_dtype", "dtype"];
+
+/// The exception of a dtype that is neither a text nor a number. The other exceptions are those of the whole.
+const NO_DTYPE: &str = "IndexError";
 
 /// A value that a loader refuses.
 struct Rejection {
@@ -49,10 +53,12 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
         let class = knowledge.library.named_class(config).or_else(|| auto_class(knowledge, config, target));
         let refused = class.map(|class| refusals(knowledge, config, target, class)).unwrap_or_default();
         let mut found = of_class(knowledge, &configs, &refused, target.version());
-        found.extend(dtypes(knowledge, config, target, class));
+        let parts = parts_of(knowledge, config, target, class);
+        let places = std::iter::once("").chain(parts.iter().map(String::as_str));
+        found.extend(places.filter_map(|at| dtype(knowledge, config, at, target.version())));
         found.extend(rope_form(knowledge, config, target.version()));
         found.retain(|rejection| !is_overridden(config, &rejection.pointer));
-        let mut own = of_kinds(knowledge, &configs, &refused, target.version());
+        let mut own = of_kinds(knowledge, &configs, &refused, target.version(), &parts);
         own.retain(|rejection| {
             !is_non_finite(checkpoint, &rejection.pointer) && !is_overridden(config, &rejection.pointer)
         });
@@ -89,7 +95,10 @@ fn auto_class<'k>(knowledge: &'k Knowledge, config: &Value, target: &Target) -> 
 fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str) -> ClassRefusals {
     let of_class = |class: &str| knowledge.refusals.of_class(target.version(), class).unwrap_or_default();
     let architecture = knowledge.library.class(class, target.loader);
-    sub_configs(config).fold(of_class(class), |refused, pointer| {
+    let parts = sub_configs(config).filter(|pointer| {
+        architecture.is_none_or(|architecture| !architecture.is_fixed_part(pointer.trim_start_matches('/')))
+    });
+    parts.fold(of_class(class), |refused, pointer| {
         let key = pointer.trim_start_matches('/');
         let named = config.pointer(&format!("{pointer}/model_type")).and_then(Value::as_str);
         let tried = architecture.and_then(|architecture| architecture.sub_config_type(key));
@@ -184,29 +193,48 @@ fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusal
     found.extend(refused.words.iter().filter_map(|words| unknown_word(config, words)));
     found.extend(refused.lengths.iter().filter_map(|lengths| other_length(configs, lengths)));
     found.extend(refused.values().iter().flat_map(|values| rope_text(config, values)));
+    for row in &refused.ropes {
+        let of_row = ropes(config, &row.0).into_iter().filter_map(|rope| unfit_rope(config, row, rope));
+        found = of_row.fold(found, with_other_pointer);
+    }
     for key in rope_factor {
         found.extend(ropes(config, key).into_iter().filter_map(|(pointer, rope)| rope_without_factor(pointer, rope)));
     }
     found
 }
 
-/// Values that do not fit a width, and values of kinds that the model class refuses, or every class.
-fn of_kinds(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusals, version: &str) -> Vec<Rejection> {
+/// Values that do not fit a width, and values of kinds that the model class refuses, or every class. `parts` are the pointers of
+/// the configs of the parts.
+fn of_kinds(
+    knowledge: &Knowledge,
+    configs: &Configs<'_>,
+    refused: &ClassRefusals,
+    version: &str,
+    parts: &[String],
+) -> Vec<Rejection> {
     let config = configs.written;
     let of_every = knowledge.refusals.of_class(version, EVERY_CLASS).unwrap_or_default();
     let heads = refused.heads.iter().filter_map(|heads| undivided(configs, heads, &refused.defaults));
     let mut found: Vec<Rejection> = heads.collect();
     found.extend(refused.values().iter().flat_map(|values| of_kind(config, "", values)));
     found.extend(of_every.values().iter().flat_map(|values| of_kind(config, "", values)));
-    for at in sub_configs(config) {
-        let labels = of_every.values().iter().flat_map(|values| of_kind(config, &at, values));
-        found.extend(labels.filter(|rejection| LABELS.iter().any(|key| rejection.pointer.ends_with(key))));
+    if refused.generates {
+        let of_generation = knowledge.refusals.of_class(version, GENERATES).unwrap_or_default();
+        let own = of_generation.values().iter().flat_map(|values| of_kind(config, "", values));
+        found = own.fold(found, with_other_pointer);
+    }
+    for at in parts {
+        let of_part = of_every.values().iter().flat_map(|values| of_kind(config, at, values));
+        found.extend(of_part.filter(|rejection| {
+            let key = rejection.pointer.rsplit('/').next().unwrap_or_default();
+            OF_PARTS.contains(&key) && (rejection.raises == NO_DTYPE || !key.ends_with("dtype"))
+        }));
     }
     found
 }
 
-/// Pointers of the configs of the parts.
-fn sub_configs(config: &Value) -> impl Iterator<Item = String> {
+/// Pointers of the configs of the parts, as far as their names tell.
+pub(super) fn sub_configs(config: &Value) -> impl Iterator<Item = String> {
     let parts =
         config.as_object().into_iter().flatten().filter(|(key, value)| key.ends_with("_config") && value.is_object());
     parts.map(|(key, _)| format!("/{key}")).filter(|pointer| pointer != "/quantization_config")
@@ -313,6 +341,27 @@ fn rope_text(config: &Value, values: &RefusedValues) -> Vec<Rejection> {
     keys.filter_map(rejection).collect()
 }
 
+/// A type of rope that the class refuses, or for want of a key beside it.
+fn unfit_rope(
+    config: &Value,
+    Ropes(_, raises, types, needs): &Ropes,
+    (pointer, rope): (String, &Map<String, Value>),
+) -> Option<Rejection> {
+    let (_, name) = rope_type(rope).filter(|(_, name)| types.iter().any(|refused| refused == name))?;
+    let needed = config.pointer(&format!("{}/{needs}", parent(&pointer)));
+    if !needs.is_empty() && needed.is_some_and(|value| !value.is_null()) {
+        return None;
+    }
+    let because = if needs.is_empty() { "which the class refuses".to_owned() } else { format!("which needs {needs}") };
+    Some(Rejection {
+        value: format!("of type {name}").into(),
+        because,
+        raises: raises.clone(),
+        similar: None,
+        pointer,
+    })
+}
+
 fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rejection> {
     let (_, name) = rope_type(rope)?;
     let is_refused = ROPE_WITH_FACTOR.contains(&name) && !rope.contains_key("factor");
@@ -377,14 +426,11 @@ fn undivided(
     })
 }
 
-/// Types that torch does not have, of the config and of the parts for which the class has a config class: each builds its own.
-fn dtypes(knowledge: &Knowledge, config: &Value, target: &Target, class: Option<&str>) -> Vec<Rejection> {
+/// Pointers of the objects that the config class of the model makes configs of.
+fn parts_of(knowledge: &Knowledge, config: &Value, target: &Target, class: Option<&str>) -> Vec<String> {
     let architecture = class.and_then(|class| knowledge.library.class(class, target.loader));
-    let is_config = |pointer: &String| {
-        architecture.is_some_and(|class| class.sub_config_type(pointer.trim_start_matches('/')).is_some())
-    };
-    let places = std::iter::once(String::new()).chain(sub_configs(config).filter(is_config));
-    places.filter_map(|at| dtype(knowledge, config, &at, target.version())).collect()
+    let is_config = |pointer: &String| architecture.is_some_and(|class| class.is_part(pointer.trim_start_matches('/')));
+    sub_configs(config).filter(is_config).collect()
 }
 
 /// A dtype that torch does not have, in the config at a pointer. Versions since 4.56 prefer `dtype` to `torch_dtype`.

@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 use indexmap::IndexMap;
 use serde_json::Value;
 
-pub(crate) use blueprint::{Blueprint, Class};
+pub(crate) use blueprint::{Blueprint, Class, SubConfig};
 pub use conversion_rows::Conversion;
 pub use doubt::Doubt;
 #[cfg(test)]
@@ -108,6 +108,18 @@ impl<'l> Architecture<'l> {
     #[must_use]
     pub fn sub_config_type(&self, key: &str) -> Option<String> {
         self.file.sub_config_type(key, self.loader)
+    }
+
+    /// Whether the config class of this loader makes a config of the object under `key`, whether or not this class builds it.
+    #[must_use]
+    pub fn is_part(&self, key: &str) -> bool {
+        self.sub_config_type(key).is_some() || self.is_fixed_part(key)
+    }
+
+    /// Whether the config class of this loader opens the part under `key` as one class, whatever its `model_type` is.
+    #[must_use]
+    pub fn is_fixed_part(&self, key: &str) -> bool {
+        self.library.is_fixed_part(self.file, key, self.loader)
     }
 
     /// The type that the config class of this loader declares for a key, given by its path without the first slash: of the

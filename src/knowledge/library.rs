@@ -5,12 +5,13 @@ mod index;
 mod scan;
 
 use std::borrow::Cow;
-use std::sync::OnceLock;
+use std::sync::{LazyLock, OnceLock};
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::Loader;
-use super::architecture::{Architecture, Blueprint, Class};
+use super::architecture::{Architecture, Blueprint, Class, SubConfig};
+use super::fixed_parts::FixedParts;
 use super::source::{self, DataError};
 
 /// What `AutoModel…` mappings are asked for when a config names a model type and no class, in this order.
@@ -23,6 +24,8 @@ pub struct Library {
     files: Vec<File>,
     /// Number of added files.
     added: usize,
+    /// Parts of configs whose class does not follow their model type.
+    fixed_parts: LazyLock<FixedParts>,
 }
 
 struct File {
@@ -43,7 +46,9 @@ impl Library {
         };
         let mut files: Vec<File> = source::embedded_bytes("architectures", ".json5").map(file).collect();
         files.sort_by(|a, b| a.stem.cmp(&b.stem));
-        Self { files, added: 0 }
+        // A test reads the built-in file.
+        let parse: fn() -> FixedParts = || FixedParts::embedded().unwrap_or_else(|error| panic!("{error}"));
+        Self { files, added: 0, fixed_parts: LazyLock::new(parse) }
     }
 
     /// Adds an architecture file, or replaces the one of the same name.
@@ -220,6 +225,31 @@ impl Library {
     fn all_of_model_type(&self, model_type: &str) -> impl Iterator<Item = &Blueprint> {
         let files = self.candidates(index::with_model_type(model_type));
         files.filter(move |f| f.model_types.iter().any(|t| t == model_type))
+    }
+
+    /// The model type of the config under `key` in a config of the file `owner`: its own, or the one that the class gives it.
+    ///
+    /// A config that bears the model type of the whole is of the class that the whole gives it: `vision_config` of Qwen2-VL and
+    /// Qwen3-VL on the hub. Some classes give every config its class, whatever it bears.
+    pub(super) fn part_type<'s>(
+        &self,
+        owner: &Blueprint,
+        (key, spec): (&str, &'s SubConfig),
+        config: &'s Map<String, Value>,
+        loader: Loader,
+    ) -> Option<&'s str> {
+        let given = spec.model_type.as_deref();
+        let Some(own) = config.get("model_type").and_then(Value::as_str) else { return given };
+        if given == Some(own) || self.is_fixed_part(owner, key, loader) {
+            return given;
+        }
+        let is_of_whole = owner.model_types.iter().any(|whole| whole == own);
+        if is_of_whole { given.or(Some(own)) } else { Some(own) }
+    }
+
+    /// Whether the config class of a file opens the part under `key` as a class of its own choice.
+    pub(super) fn is_fixed_part(&self, owner: &Blueprint, key: &str, loader: Loader) -> bool {
+        owner.model_types.iter().any(|model_type| self.fixed_parts.has(loader, model_type, key))
     }
 
     /// The file with the conversions of this class or model type: where it is described, or any other.

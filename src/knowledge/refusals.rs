@@ -22,6 +22,8 @@ pub struct ClassRefusals {
     pub rope_type: Vec<String>,
     /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
     pub rope_factor: Vec<String>,
+    /// Types of rope that raise with sound parameters.
+    pub ropes: Vec<Ropes>,
     /// Keys of which only a few words load.
     pub words: Vec<Words>,
     /// Lists that must have as many elements as others beside them.
@@ -30,6 +32,8 @@ pub struct ClassRefusals {
     pub defaults: BTreeMap<String, u64>,
     /// The exception that a parameter raises that is stored as integers.
     pub integers: Option<String>,
+    /// Whether the class can generate: a generation config is made of its config, which refuses [`GENERATES`] as well.
+    pub generates: bool,
     /// Kinds of values that raise whatever else the config has.
     values: Option<Values>,
 }
@@ -37,6 +41,10 @@ pub struct ClassRefusals {
 /// A count of attention heads, the key beside it that it has to divide, and the exception otherwise.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Heads(pub String, pub String, pub String);
+
+/// A key of rope parameters, the exception of some types of rope, these types, and a key beside it that they need; empty for none.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Ropes(pub String, pub String, pub Vec<String>, pub String);
 
 /// A key that holds a word, the exception that an unknown word raises, and the words that load.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -139,6 +147,8 @@ impl ClassRefusals {
         self.words.retain(|Words(pointer, ..)| !pointer.starts_with(&under));
         self.words
             .extend(part.words.iter().cloned().map(|Words(at, raises, load)| Words(under.clone() + &at, raises, load)));
+        self.ropes.retain(|Ropes(pointer, ..)| !pointer.starts_with(&under));
+        self.ropes.extend(part.ropes.iter().cloned().map(|row| Ropes(under.clone() + &row.0, row.1, row.2, row.3)));
         self.lengths.retain(|Lengths(group, _)| !group.iter().any(|pointer| pointer.starts_with(&under)));
         self.lengths.extend(
             part.lengths.iter().cloned().map(|Lengths(group, raises)| Lengths(replaced(Vec::new(), group), raises)),
@@ -183,6 +193,7 @@ impl ClassRefusals {
         };
         Self {
             words: self.words.into_iter().filter_map(words).collect(),
+            ropes: self.ropes.into_iter().filter(|row| other.ropes.iter().any(|o| o.2 == row.2 && o.3 == row.3)).collect(),
             lengths: self.lengths.into_iter().filter(|row| other.lengths.iter().any(|o| o.0 == row.0)).collect(),
             activation: both(self.activation, &other.activation),
             heads: self.heads.into_iter().filter(|Heads(key, ..)| other.heads.iter().any(|o| o.0 == *key)).collect(),
@@ -191,6 +202,7 @@ impl ClassRefusals {
             rope_factor: both(self.rope_factor, &other.rope_factor),
             defaults: self.defaults,
             integers: self.integers.filter(|_| other.integers.is_some()),
+            generates: self.generates && other.generates,
             values,
         }
     }
@@ -198,6 +210,9 @@ impl ClassRefusals {
 
 /// The entry with what every class refuses.
 pub const EVERY_CLASS: &str = "*";
+
+/// The entry with what every class refuses that can generate.
+pub const GENERATES: &str = "*generates";
 
 /// `rules/refused/<version>.json`, which `tools/derive_architectures.py accepts` writes by trying every class. An entry is
 /// one line, and only the lines that a check needs are parsed.

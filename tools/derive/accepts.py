@@ -65,6 +65,9 @@ KINDS = {
     "object": [{}, {"x": 1}],
 }
 FIRST = ("null", "text", "negative", "zero", "object")
+# The entry of the values that every class refuses that can generate, and those that a key is tried beside.
+GENERATES = "*generates"
+BESIDE = ({}, {"num_beams": 4}, {"do_sample": True}, {"num_beams": 4, "num_beam_groups": 2, "diversity_penalty": 0.5})
 # Keys of every config whose values matter to some classes only.
 TRIED = {"pad_token_id", "is_decoder", "add_cross_attention", "tie_word_embeddings", "is_encoder_decoder", "use_cache"}
 SAMPLE = 10  # every so many families are tried with all keys of every config
@@ -75,6 +78,7 @@ CUSTOM = {
         "SpatialVLAForConditionalGeneration": {"text_config": "Gemma2ForCausalLM", "vision_config": "SiglipVisionModel"},
     },
 }
+ABSENT = object()  # stands for a key that is taken out
 MISMATCH = re.compile(r"size mismatch|ignore_mismatched_sizes")
 
 
@@ -307,6 +311,77 @@ def special(small):
     return found
 
 
+def ropes(small):
+    """[(pointer, exception, types of rope, key that has to be given or "")] of the types that raise with sound parameters.
+
+    A type is tried with its parameters under both names of its key, beside `head_dim` as it is, null and given. With the fourth
+    element it raises only where that key is null.
+    """
+    for path, part in nested(small.config):
+        if path and not {ROPE, "rope_theta", "rope_scaling"} & part.keys():
+            continue
+        head = part.get("head_dim") or whole(part.get("hidden_size"), part.get("num_attention_heads")) or 8
+        given = [{}, {"head_dim": head}] if part.get("head_dim") else [{"head_dim": head}] if "head_dim" in part else [{}]
+        # The class may compute one that is absent, and refuse null alone.
+        unset = [{"head_dim": None}, {"head_dim": ABSENT}] if "head_dim" in part else []
+        if any(small.outcome(with_beside(small.config, path, beside)) for beside in unset):
+            unset = []
+        rows = collections.defaultdict(list)
+        for rope_type, forms in rope_forms(head, part.get("partial_rotary_factor")).items():
+            said = [[rope_outcome(small, path, rope_type, forms, beside) for beside in group] for group in (given, unset)]
+            is_head = not all(said[0]) and said[1] and all(said[1])
+            if all(said[0]) and all(said[1]):
+                rows[said[0][0].split(":", 1)[0], ""].append(rope_type)
+            elif is_head:
+                rows[said[1][0].split(":", 1)[0], "head_dim"].append(rope_type)
+        for (raised, needs), types in rows.items():
+            yield "/".join((*path, ROPE)), raised, types, needs
+
+
+def whole(width, heads):
+    return width // heads if isinstance(width, int) and isinstance(heads, int) and heads > 0 else None
+
+
+def rope_forms(head, share):
+    """{type of rope: objects of its parameters}, those of longrope with lists for each share of the head that may rotate."""
+    rotating = [head, head // 2, head // 4, *([int(head * share)] if isinstance(share, float) else [])]
+    lists = [[1.0] * n for n in sorted({(n + 1) // 2 for n in rotating} | {max(n // 2, 1) for n in rotating})]
+    old = {"original_max_position_embeddings": 16}
+    return {
+        "linear": [{"factor": 2.0}],
+        "dynamic": [{"factor": 2.0}],
+        "yarn": [{"factor": 2.0, **old}, {"factor": 2.0, "beta_fast": 32, "beta_slow": 1, **old}],
+        "llama3": [{"factor": 8.0, "low_freq_factor": 1.0, "high_freq_factor": 4.0, **old}],
+        "longrope": [
+            {"short_factor": each, "long_factor": each, **more}
+            for each in lists
+            for more in ({}, old, {"factor": 2.0}, {"factor": 2.0, **old})
+        ],
+    }
+
+
+def rope_outcome(small, path, rope_type, forms, beside):
+    """The exception of a type of rope in every form, or None."""
+    said = None
+    for form in forms:
+        for key in ("rope_type", "type"):
+            config = changed(small.config, (*path, ROPE), {key: rope_type, **form, **({"rope_theta": 10000.0} if NEW else {})})
+            said = small.outcome(with_beside(config, path, beside))
+            if said is None:
+                return None
+    return said
+
+
+def with_beside(config, path, beside):
+    config = copy.deepcopy(config)
+    part = at(config, path)
+    for key, value in beside.items():
+        part.pop(key, None)
+        if value is not ABSENT:
+            part[key] = value
+    return config
+
+
 def words(small, known=None):
     """[(pointer, exception, words that load)] of the keys of which an unknown word raises.
 
@@ -465,6 +540,7 @@ def family(args):
             entry = collections.defaultdict(list)
             for kind, pointer in sorted(special(models[0])):
                 entry[kind].append(pointer)
+            entry["ropes"] = [list(row) for row in ropes(models[0])]
             for pointer, width, raised in heads(models[0]):
                 entry["heads"].append([pointer, width, raised])
             if raised := integers(models[0]):
@@ -556,6 +632,54 @@ def general(classes, sampled):
     return table({((pointer,), kind): raised for raised, kind, pointer in shared})
 
 
+def of_generation():
+    """The table of the values in a config that every class refuses that can generate: a generation config is made of it.
+
+    Two classes are tried with every key of generation, alone and beside others; a kind counts where all of its values raise.
+    """
+    sizes = {"num_hidden_layers": 1, "num_attention_heads": 2, "hidden_size": 8, "intermediate_size": 8, "vocab_size": 32}
+    tried = (
+        (transformers.LlamaForCausalLM, sizes),
+        (transformers.T5ForConditionalGeneration, {"num_layers": 1, "d_model": 8, "d_ff": 8, "num_heads": 2, "vocab_size": 32}),
+    )
+    keys = sorted(set(transformers.GenerationConfig().to_dict()) - {"transformers_version", "_from_model_config"})
+    found = []
+    for cls, config in tried:
+        with tempfile.TemporaryDirectory() as folder:
+            small = Small(cls, config, folder)
+            (small.folder / "generation_config.json").unlink(missing_ok=True)
+            found.append({(key,): each for key in keys if (each := of_generation_key(small, key))})
+    both = [(pointer, kind, raised) for pointer, kinds in found[0].items() for kind, raised in kinds.items()]
+    both = [(pointer, kind, raised) for pointer, kind, raised in both if found[1].get(pointer, {}).get(kind) == raised]
+    # The type of a field is that of the two config classes.
+    return table({(pointer, kind): raised for pointer, kind, raised in both if not raised.startswith("StrictDataclass")})
+
+
+def of_generation_key(small, key):
+    """{kind: exception} of the kinds of values that raise whatever stands beside the key."""
+    more = {"list": [[1], [1, 2], [[1, 2]]], "object": [{"1": 1.0}], "text": ["never", "auto", "static", *small.literals]}
+    found = {}
+    for kind, values in KINDS.items():
+        said = None
+        for value in [*values, *more.get(kind, [])]:
+            for beside in BESIDE:
+                others = {other: known for other, known in beside.items() if other != key}
+                said = small.outcome({**small.config, **others, key: value})
+                if said is None:
+                    break
+            if said is None:
+                break
+        if said:
+            found[kind] = said.split(":", 1)[0]
+    return found
+
+
+def generates(name):
+    """Whether a class can generate."""
+    cls = catalogue.find_class(name)
+    return bool(getattr(cls, "can_generate", lambda: False)())
+
+
 def composed(entries, parts):
     """The entry of a class that builds other classes from sub-configs."""
     out = collections.defaultdict(list)
@@ -569,7 +693,7 @@ def composed(entries, parts):
                 out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
             elif kind == "integers":
                 out[kind] = found
-            elif kind == "words":
+            elif kind in ("words", "ropes"):
                 out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
             elif kind == "lengths":
                 out[kind] += [[[under + pointer for pointer in group], raised] for group, raised in found]
@@ -596,9 +720,11 @@ def main(args):
     file = OUT / f"{version}.json"
     kept = json.loads(file.read_text()) if args.only and file.exists() else {}
     shared = general(classes, sampled)
+    for name, entry in classes.items():
+        entry["generates"] = generates(name)
     # A few families do not tell what every class refuses.
     entries = (
-        {"*": {"values": shared}} | kept | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
+        {"*": {"values": shared}, GENERATES: {"values": of_generation()}} | kept | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
     )
     entries |= {name: composed(entries, parts) for name, parts in CUSTOM.get(version, {}).items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in sorted(entries.items()))

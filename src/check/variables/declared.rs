@@ -33,6 +33,11 @@ pub const VARIABLES: &[Variable] = &[
     variable("chat_templates", Map(&Text), "the default chat template by file"),
     variable("complete", Flag, "whether nothing suggests that a tensor was lost; `why` of IDX014 lists the signs"),
     variable("config", Any, "config.json; null when missing or unreadable, as the other documents"),
+    variable(
+        "configs",
+        List(&Text),
+        "pointers to the configs in config.json that its class opens: the empty one, and `/text_config` and such",
+    ),
     variable("directory", Text, "the name of the directory"),
     variable("generation", Any, files::GENERATION_CONFIG),
     variable("groups_heads", Flag, "whether the class reads `num_key_value_heads`, or is unknown"),

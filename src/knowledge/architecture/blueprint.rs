@@ -181,17 +181,6 @@ pub(crate) struct SubConfig {
     pub computed: Vec<(String, Computed)>,
 }
 
-impl SubConfig {
-    /// The model type of a config under this key: its own, or the one that the class gives it.
-    ///
-    /// Called with the file of the config around it. A config that bears the model type of the whole is of the class that
-    /// the whole gives it: `vision_config` of Qwen2-VL and Qwen3-VL on the hub.
-    pub fn model_type_of<'s>(&'s self, owner: &Blueprint, config: &'s Map<String, Value>) -> Option<&'s str> {
-        let own = config.get("model_type").and_then(Value::as_str);
-        own.filter(|own| !owner.model_types.iter().any(|t| t == own)).or(self.model_type.as_deref()).or(own)
-    }
-}
-
 /// How a config class computes a key: an expression, for when the key is absent or null, or `{ unless_given: … }`,
 /// for when it is absent, or `{ always: … }`, over whatever is given.
 #[derive(Debug, Clone, Deserialize)]

@@ -129,8 +129,8 @@ fn walk<'c>(
     }
     for (key, spec) in &class.configs {
         let Some((key, Value::Object(sub))) = config.get_key_value(key) else { continue };
-        let inner = spec
-            .model_type_of(file, sub)
+        let inner = library
+            .part_type(file, (key, spec), sub, loader)
             .and_then(|t| library.of_model_type(t, loader))
             .filter(|f| !std::ptr::eq(*f, file));
         if let Some(inner) = inner {

@@ -132,9 +132,11 @@ impl Resolver<'_> {
             (None | Some(Value::Null), None) => return Ok(None),
             (Some(_), _) => return Err(Refusal::setting(key, given)),
         };
-        if let Some(model_type) = spec.model_type_of(owner, &sub).map(str::to_owned) {
-            sub.insert("model_type".to_owned(), model_type.into());
-        }
+        match self.library.part_type(owner, (key, spec), &sub, self.loader).map(str::to_owned) {
+            Some(model_type) => sub.insert("model_type".to_owned(), model_type.into()),
+            // Of a fixed class without a model type.
+            None => sub.get("model_type").is_some_and(Value::is_string).then(|| sub.remove("model_type")).flatten(),
+        };
         sub.extend(evaluated(&spec.set, scope)?);
         fill(&mut sub, &spec.defaults);
         let file =
@@ -160,7 +162,7 @@ impl Resolver<'_> {
     pub fn unknown_sub_config(&self, file: &Blueprint, config: &Map<String, Value>) -> Option<UnknownPart> {
         file.config(self.loader).configs.iter().find_map(|(key, spec)| {
             let sub = config.get(key)?.as_object()?;
-            let model_type = spec.model_type_of(file, sub)?;
+            let model_type = self.library.part_type(file, (key, spec), sub, self.loader)?;
             let is_known = spec.model_type.as_deref() == Some(model_type)
                 || self.library.of_model_type(model_type, self.loader).is_some();
             let part = || UnknownPart { config: key.clone(), model_type: Some(model_type.to_owned()), class: None };
