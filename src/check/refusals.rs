@@ -13,7 +13,9 @@ use crate::knowledge::Knowledge;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
-use crate::knowledge::refusals::{ClassRefusals, EVERY_CLASS, GENERATES, Heads, Lengths, RefusedValues, Ropes, ValueKind, Words};
+use crate::knowledge::refusals::{
+    ClassRefusals, EVERY_CLASS, GENERATES, Heads, Lengths, RefusedValues, Ropes, ValueKind, Words,
+};
 use crate::knowledge::source;
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
@@ -95,6 +97,10 @@ fn auto_class<'k>(knowledge: &'k Knowledge, config: &Value, target: &Target) -> 
 fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str) -> ClassRefusals {
     let of_class = |class: &str| knowledge.refusals.of_class(target.version(), class).unwrap_or_default();
     let architecture = knowledge.library.class(class, target.loader);
+    // The class of a part, in the directory of the whole.
+    if let Some(key) = architecture.and_then(|architecture| architecture.own_key(config)) {
+        return of_class(class).inside(key);
+    }
     let parts = sub_configs(config).filter(|pointer| {
         architecture.is_none_or(|architecture| !architecture.is_fixed_part(pointer.trim_start_matches('/')))
     });
@@ -353,13 +359,7 @@ fn unfit_rope(
         return None;
     }
     let because = if needs.is_empty() { "which the class refuses".to_owned() } else { format!("which needs {needs}") };
-    Some(Rejection {
-        value: format!("of type {name}").into(),
-        because,
-        raises: raises.clone(),
-        similar: None,
-        pointer,
-    })
+    Some(Rejection { value: format!("of type {name}").into(), because, raises: raises.clone(), similar: None, pointer })
 }
 
 fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rejection> {

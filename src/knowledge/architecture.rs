@@ -98,16 +98,28 @@ impl<'l> Architecture<'l> {
     #[must_use]
     pub fn misses_text_config(&self, config: &Value) -> bool {
         let generates = ["ForCausalLM", "ForConditionalGeneration", "LMHeadModel"];
+        self.leaves_text_config(config) && generates.iter().any(|end| self.class().ends_with(end))
+    }
+
+    /// Whether `text_config` stays an object. Heads of some classes take their width from it, and raise; others do not ask.
+    #[must_use]
+    pub fn leaves_text_config(&self, config: &Value) -> bool {
         config.get("text_config").is_some_and(Value::is_object)
             && self.has_auto()
             && !self.builds_config("text_config")
-            && generates.iter().any(|end| self.class().ends_with(end))
+            && self.own_key(config).is_none()
     }
 
     /// The model type of the config under a key that names none.
     #[must_use]
     pub fn sub_config_type(&self, key: &str) -> Option<String> {
         self.file.sub_config_type(key, self.loader)
+    }
+
+    /// The key of the config inside config.json that the config class reads, where the class is a part of a larger model.
+    #[must_use]
+    pub fn own_key<'c>(&self, config: &'c Value) -> Option<&'c str> {
+        build::own_key(self.file, self.loader, config.as_object()?)
     }
 
     /// Whether the config class of this loader makes a config of the object under `key`, whether or not this class builds it.

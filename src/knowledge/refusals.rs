@@ -170,6 +170,12 @@ impl ClassRefusals {
         }
     }
 
+    /// The same for the class of a part whose config stands under `key` of a larger one.
+    #[must_use]
+    pub fn inside(self, key: &str) -> Self {
+        Self { integers: self.integers.clone(), ..Self::default() }.with_part(key, self)
+    }
+
     /// What both refuse; the key of rope parameters has another name since transformers 5.
     fn and(self, other: &Self) -> Self {
         let old = |key: &String| key.replace("rope_parameters", "rope_scaling");
@@ -193,7 +199,11 @@ impl ClassRefusals {
         };
         Self {
             words: self.words.into_iter().filter_map(words).collect(),
-            ropes: self.ropes.into_iter().filter(|row| other.ropes.iter().any(|o| o.2 == row.2 && o.3 == row.3)).collect(),
+            ropes: self
+                .ropes
+                .into_iter()
+                .filter(|row| other.ropes.iter().any(|o| o.2 == row.2 && o.3 == row.3))
+                .collect(),
             lengths: self.lengths.into_iter().filter(|row| other.lengths.iter().any(|o| o.0 == row.0)).collect(),
             activation: both(self.activation, &other.activation),
             heads: self.heads.into_iter().filter(|Heads(key, ..)| other.heads.iter().any(|o| o.0 == *key)).collect(),

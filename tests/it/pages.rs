@@ -225,6 +225,7 @@ fn the_page_of_data_files_is_fresh() {
          | `recipes/` | merges, with the Python modules that they write |\n\
          | `initial-values.json` | values that each version gives to the tensors of a new model, written by `tools/loader_initial.py` |\n\
          | `ropes.json` | rope keys that config classes read before transformers 5, written by `tools/loader_ropes.py` |\n\
+         | `fixed-parts.json` | parts of configs that are of one class whatever they name, written by `tools/loader_parts.py` |\n\
          | `rope-forms.json5` | forms of `rope_scaling` that config classes before transformers 5 accept |\n\
          | `names.json` | names that each version of transformers accepts in config.json, written by `tools/loader_names.py` |\n\
          | `classes.json` | tokenizer and processor classes that each version opens by name, written by `tools/loader_classes.py` |\n\

@@ -68,6 +68,10 @@ fn with_flat_config(inputs: &Inputs<'_>, architecture: &Architecture<'_>) -> Res
     if architecture.misses_text_config(inputs.config) {
         return Err(Refusal::Raises(NESTED.to_owned()));
     }
+    if architecture.leaves_text_config(inputs.config) {
+        let reason = "text_config is an object that this class makes no config of";
+        return Err(Refusal::NotCovered(vec![Doubt::Corner(reason.to_owned())]));
+    }
     inputs.build(*architecture)
 }
 

@@ -87,20 +87,22 @@ pub(super) fn build(
 /// The part of a config.json that the config class of `file` reads: all of it, or, for a part of a larger model, the
 /// config inside it that is of this class (`PretrainedConfig.from_pretrained`).
 fn own_config<'c>(file: &Blueprint, loader: Loader, config: &'c Map<String, Value>) -> &'c Map<String, Value> {
-    let inside = file.config(loader).inside.as_ref().and_then(|key| config.get(key)).and_then(Value::as_object);
-    if let Some(inside) = inside {
-        return inside;
+    let inside = own_key(file, loader, config).and_then(|key| config.get(key)).and_then(Value::as_object);
+    inside.unwrap_or(config)
+}
+
+/// The key of the config inside config.json that the config class of `file` reads; `None` when it reads all of it.
+pub(super) fn own_key<'c>(file: &Blueprint, loader: Loader, config: &'c Map<String, Value>) -> Option<&'c str> {
+    let class = file.config(loader);
+    let fixed = class.inside.as_ref().and_then(|key| config.get_key_value(key)).filter(|(_, value)| value.is_object());
+    if let Some((key, _)) = fixed {
+        return Some(key);
     }
     let model_type = |config: &'c Map<String, Value>| config.get("model_type").and_then(Value::as_str);
     let is_mine = |named: &str| file.model_types.iter().any(|t| t == named);
-    match model_type(config) {
-        Some(named) if !is_mine(named) => {
-            let mut inner =
-                config.values().filter_map(Value::as_object).filter(|sub| model_type(sub).is_some_and(is_mine));
-            inner.next_back().unwrap_or(config)
-        }
-        _ => config,
-    }
+    model_type(config).filter(|named| !is_mine(named))?;
+    let is_own = |value: &'c Value| value.as_object().and_then(model_type).is_some_and(is_mine);
+    config.iter().filter(|(_, value)| is_own(value)).map(|(key, _)| key.as_str()).next_back()
 }
 
 struct Builder<'l> {
