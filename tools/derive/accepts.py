@@ -724,7 +724,9 @@ def main(args):
         entry["generates"] = generates(name)
     # A few families do not tell what every class refuses.
     entries = (
-        {"*": {"values": shared}, GENERATES: {"values": of_generation()}} | kept | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
+        {"*": {"values": shared}, GENERATES: {"values": of_generation()}}
+        | kept
+        | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
     )
     entries |= {name: composed(entries, parts) for name, parts in CUSTOM.get(version, {}).items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in sorted(entries.items()))

@@ -41,3 +41,51 @@ fn a_list_of_another_length_than_those_beside_it_is_refused() {
     assert_eq!(refused(&with(&[8, 8, 8], &[5, 2])), ["/conv_dim"]);
     assert_eq!(refused(&with(&[8, 8], &[5])), ["/conv_stride"]);
 }
+
+/// `Qwen2_5_VLConfig` opens its parts as its own classes, `LlavaConfig` as the class that the part names.
+#[test]
+fn a_part_of_a_fixed_class_refuses_what_that_class_does() {
+    let with = |model_type: &str, class: &str, part: &str| {
+        json!({ "architectures": [class], "model_type": model_type, "transformers_version": "4.57.6",
+            "text_config": { "model_type": part, "problem_type": true }, "vision_config": {} })
+    };
+    for (model_type, class) in
+        [("qwen2_5_vl", "Qwen2_5_VLForConditionalGeneration"), ("llava", "LlavaForConditionalGeneration")]
+    {
+        assert_eq!(refused(&with(model_type, class, "bert")), ["/text_config/problem_type"], "{class}");
+    }
+    // Not a config, but an object that the class keeps.
+    assert_eq!(refused(&with("bert", "BertModel", "bert")), [] as [&str; 0]);
+}
+
+/// A generation config is made of the config of a class that can generate: `GenerationConfig.from_model_config`.
+#[test]
+fn values_of_generation_are_refused_by_classes_that_generate() {
+    let with = |class: &str, value: Value| json!({ "architectures": [class], "model_type": "llama", "transformers_version": "4.57.6", "early_stopping": value });
+    assert_eq!(refused(&with("LlamaForCausalLM", json!(1.5))), ["/early_stopping"]);
+    assert_eq!(refused(&with("LlamaForCausalLM", json!("never"))), [] as [&str; 0]);
+    assert_eq!(refused(&with("LlamaModel", json!(1.5))), [] as [&str; 0]);
+}
+
+/// The frequencies of `yarn` are computed of `head_dim`, which `MixtralConfig` leaves at `None` (4.57.6 and 5.23.0).
+#[test]
+fn a_type_of_rope_may_need_a_key() {
+    let with = |head_dim: Value| {
+        json!({ "architectures": ["MixtralForCausalLM"], "model_type": "mixtral", "transformers_version": "4.57.6",
+            "head_dim": head_dim, "rope_scaling": { "rope_type": "yarn", "factor": 2.0 } })
+    };
+    assert_eq!(refused(&with(Value::Null)), ["/rope_scaling"]);
+    assert_eq!(refused(&with(json!(128))), [] as [&str; 0]);
+}
+
+/// `AutoModel` opens the language model in the directory of the whole: the values outside `text_config` are not its own.
+#[test]
+fn the_class_of_a_part_reads_the_config_inside() {
+    let with = |whole: Value, part: Value| {
+        json!({ "architectures": ["MllamaTextModel"], "model_type": "mllama", "transformers_version": "4.57.6",
+            "hidden_size": whole, "vision_config": {},
+            "text_config": { "model_type": "mllama_text_model", "hidden_size": part } })
+    };
+    assert_eq!(refused(&with(json!("x"), json!(64))), [] as [&str; 0]);
+    assert_eq!(refused(&with(json!(64), json!("x"))), ["/text_config/hidden_size"]);
+}
