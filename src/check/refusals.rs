@@ -101,16 +101,15 @@ fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str)
     if let Some(key) = architecture.and_then(|architecture| architecture.own_key(config)) {
         return of_class(class).inside(key);
     }
-    let parts = sub_configs(config).filter(|pointer| {
-        architecture.is_none_or(|architecture| !architecture.is_fixed_part(pointer.trim_start_matches('/')))
-    });
-    parts.fold(of_class(class), |refused, pointer| {
+    let is_fixed = |key: &str| architecture.is_some_and(|architecture| architecture.is_fixed_part(key));
+    sub_configs(config).fold(of_class(class), |refused, pointer| {
         let key = pointer.trim_start_matches('/');
         let named = config.pointer(&format!("{pointer}/model_type")).and_then(Value::as_str);
         let tried = architecture.and_then(|architecture| architecture.sub_config_type(key));
         // A part that names the whole is of the class that the whole has for it: `qwen3_vl` in its vision_config.
         let is_whole = |named: &str| config.get("model_type").and_then(Value::as_str) == Some(named);
-        match named.filter(|named| !is_whole(named) && tried.is_some_and(|tried| tried != *named)) {
+        let is_other = |named: &&str| !is_whole(named) && tried.as_ref().is_some_and(|tried| tried != named);
+        match named.filter(is_other).filter(|_| !is_fixed(key)) {
             Some(named) => {
                 let part = knowledge.library.auto_class(named, "model", target.loader).map(of_class);
                 refused.with_part(key, part.unwrap_or_default())
