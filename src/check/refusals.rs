@@ -195,7 +195,7 @@ fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusal
         let of_key = ropes(config, key).into_iter();
         found.extend(of_key.filter_map(|(pointer, rope)| unknown_rope(knowledge, version, config, (&pointer, rope))));
     }
-    found.extend(refused.words.iter().filter_map(|words| unknown_word(config, words)));
+    found.extend(refused.words.iter().filter_map(|words| unknown_word(config, "", words)));
     found.extend(refused.lengths.iter().filter_map(|lengths| other_length(configs, lengths)));
     found.extend(refused.values().iter().flat_map(|values| rope_text(config, values)));
     for row in &refused.ropes {
@@ -228,7 +228,11 @@ fn of_kinds(
         let own = of_generation.values().iter().flat_map(|values| of_kind(config, "", values));
         found = own.fold(found, with_other_pointer);
     }
+    let words =
+        |at: &str| of_every.words.iter().filter_map(|words| unknown_word(config, at, words)).collect::<Vec<_>>();
+    found.extend(words(""));
     for at in parts {
+        found.extend(words(at));
         let of_part = of_every.values().iter().flat_map(|values| of_kind(config, at, values));
         found.extend(of_part.filter(|rejection| {
             let key = rejection.pointer.rsplit('/').next().unwrap_or_default();
@@ -373,9 +377,9 @@ fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rej
     })
 }
 
-/// A word that is none of those that the class takes.
-fn unknown_word(config: &Value, Words(key, raises, load): &Words) -> Option<Rejection> {
-    let pointer = format!("/{key}");
+/// A word that is none of those that the class takes, in the config at a pointer.
+fn unknown_word(config: &Value, at: &str, Words(key, raises, load): &Words) -> Option<Rejection> {
+    let pointer = format!("{at}/{key}");
     let word = config.pointer(&pointer)?.as_str().filter(|word| load.iter().all(|known| known != word))?;
     Some(Rejection {
         value: word.into(),

@@ -16,6 +16,7 @@ import collections
 import contextlib
 import copy
 import gzip
+import inspect
 import json
 import multiprocessing
 import re
@@ -632,6 +633,27 @@ def general(classes, sampled):
     return table({((pointer,), kind): raised for raised, kind, pointer in shared})
 
 
+def of_every_config():
+    """[(key, exception, words)] of the keys of every config of which only a few words load."""
+    base, found = transformers.PretrainedConfig, []
+    literals = sorted(set(re.findall(r"[\"'](\w{3,60})[\"']", inspect.getsource(base.__init__))))
+    for key in base().to_dict():
+        said = {word: why_not(base, {key: word}) for word in ("swoosh", "xyzzy", *literals)}
+        loads = [word for word, why in said.items() if why is None]
+        if said["swoosh"] and said["xyzzy"] and 1 < len(loads) < len(literals) / 2 and "dtype" not in key:
+            found.append([key, said["swoosh"], loads])
+    return found
+
+
+def why_not(config_class, values):
+    """Name of the exception of a config class with these values, or None."""
+    try:
+        config_class(**values)
+    except Exception as error:
+        return type(error).__name__
+    return None
+
+
 def of_generation():
     """The table of the values in a config that every class refuses that can generate: a generation config is made of it.
 
@@ -724,7 +746,7 @@ def main(args):
         entry["generates"] = generates(name)
     # A few families do not tell what every class refuses.
     entries = (
-        {"*": {"values": shared}, GENERATES: {"values": of_generation()}}
+        {"*": {"values": shared, "words": of_every_config()}, GENERATES: {"values": of_generation()}}
         | kept
         | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
     )

@@ -42,20 +42,24 @@ fn a_list_of_another_length_than_those_beside_it_is_refused() {
     assert_eq!(refused(&with(&[8, 8], &[5])), ["/conv_stride"]);
 }
 
-/// `Qwen2_5_VLConfig` opens its parts as its own classes, `LlavaConfig` as the class that the part names.
+/// Config classes refuse a `problem_type` that they do not know, in their parts as well: `PretrainedConfig.__init__` of 4.57.6.
 #[test]
-fn a_part_of_a_fixed_class_refuses_what_that_class_does() {
-    let with = |model_type: &str, class: &str, part: &str| {
+fn a_part_refuses_what_every_config_does() {
+    let with = |model_type: &str, class: &str, value: &Value| {
         json!({ "architectures": [class], "model_type": model_type, "transformers_version": "4.57.6",
-            "text_config": { "model_type": part, "problem_type": true }, "vision_config": {} })
+            "text_config": { "model_type": "bert", "problem_type": value }, "vision_config": {} })
     };
-    for (model_type, class) in
-        [("qwen2_5_vl", "Qwen2_5_VLForConditionalGeneration"), ("llava", "LlavaForConditionalGeneration")]
-    {
-        assert_eq!(refused(&with(model_type, class, "bert")), ["/text_config/problem_type"], "{class}");
+    let classes = [("qwen2_5_vl", "Qwen2_5_VLForConditionalGeneration"), ("llava", "LlavaForConditionalGeneration")];
+    for (model_type, class) in classes {
+        for value in [json!(true), json!("x")] {
+            assert_eq!(refused(&with(model_type, class, &value)), ["/text_config/problem_type"], "{class} {value}");
+        }
+        for value in [json!(null), json!("regression")] {
+            assert_eq!(refused(&with(model_type, class, &value)), [] as [&str; 0], "{class} {value}");
+        }
     }
     // Not a config, but an object that the class keeps.
-    assert_eq!(refused(&with("bert", "BertModel", "bert")), [] as [&str; 0]);
+    assert_eq!(refused(&with("bert", "BertModel", &json!(true))), [] as [&str; 0]);
 }
 
 /// A generation config is made of the config of a class that can generate: `GenerationConfig.from_model_config`.
