@@ -38,6 +38,7 @@ mod robots;
 mod ropes;
 pub mod size;
 mod statistics;
+mod sub_configs;
 mod suppressions;
 mod templates;
 mod tokenizer_json;

@@ -12,6 +12,7 @@ use super::bounded::bounded;
 use super::evaluate::{Context, has_faults, pinpoint, run_rules};
 use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
+use super::model_type::class_of;
 use super::observe::{explain, observe_files, observe_versions};
 use super::options::RunOptions;
 use super::outcome::Outcome;
@@ -19,7 +20,7 @@ use super::tokens::OpenedTokenizer;
 use super::variables::{self, declared};
 use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
 use super::view::{Asked, FilesView, VersionsView};
-use super::{directory, index, inspect, judge, policy, processor, refusals, robots, tokens};
+use super::{directory, index, inspect, judge, policy, processor, robots, sub_configs, tokens};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::embeddings::TokenEmbedding;
 use crate::knowledge::loader::Requirements;
@@ -116,7 +117,7 @@ impl LoaderView<'_> {
     /// debug builds verify in every run.
     fn differences(&self, other: &Self) -> Vec<&'static str> {
         // They follow from the versions and their loads.
-        let always = ["stays_random", "complete", "loaders", "named"];
+        let always = ["stays_random", "complete", "loaders", "named", "configs"];
         let (one, two) = (&self.outcome, &other.outcome);
         let same_class = one.architecture == two.architecture;
         let same_tokenizer = match (&self.opened, &other.opened) {
@@ -295,24 +296,28 @@ impl<'a> CheckFacts<'a> {
         let rules = run.filter(|code| !shown.contains(code) && !stopped.contains(code)).collect();
         let unmet = Unmet { reading, rules };
         let targets = &reading.context.targets;
-        let alone = |target: &Target| {
+        let alone = |target: &Target, version: &String| {
             // A run for one version is read as it was.
-            let is_alone = targets.len() == 1 && target.versions == named;
-            let again = if is_alone { None } else { Some(self.read(&target.versions, Purpose::Verdicts)) };
+            let is_alone = targets.len() == 1 && std::slice::from_ref(version) == named;
+            let again = (!is_alone).then(|| self.read(std::slice::from_ref(version), Purpose::Verdicts));
             let mut loads = self.judged(again.as_ref().unwrap_or(reading), &unmet, &[]).into_iter();
             let PredictedLoad { objects, verdict, tensors, .. } =
                 loads.find(|load| load.loader == target.loader.version())?;
             let objects = objects.into_iter().map(|object| with_shown_causes(object, &shown)).collect();
-            Some(PredictedLoad {
-                loader: target.loader.version().to_owned(),
-                stands_for: target.stands_for.clone(),
-                leads: target.leads,
-                verdict,
-                objects,
-                tensors,
-            })
+            let loader = target.loader.version().to_owned();
+            let stands_for = (*version != loader).then(|| version.clone());
+            Some(PredictedLoad { loader, stands_for, leads: target.leads_for(version), verdict, objects, tensors })
         };
-        let mut loads: Vec<PredictedLoad> = targets.iter().filter_map(alone).collect();
+        let mut loads: Vec<PredictedLoad> = Vec::new();
+        for target in targets {
+            for version in &target.versions {
+                let load = alone(target, version);
+                // One that nobody named is said where it differs from the one before it.
+                let is_told =
+                    |load: &PredictedLoad| load.leads || loads.iter().all(|other| !says_the_same(load, other));
+                loads.extend(load.filter(is_told));
+            }
+        }
         if let Some(served) = served {
             let all = self.judged(served, &unmet, self.programs);
             loads.extend(all.into_iter().filter(|load| is_program(&load.loader)));
@@ -330,7 +335,17 @@ impl<'a> CheckFacts<'a> {
         let rules = rules.filter(|rule| !unmet.covers(rule, reading, &differing));
         run_rules(rules, context, faults, scope, &mut outcome);
         outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
-        verdicts(self.checkpoint, context, programs, faults, &outcome, unpredicted)
+        let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
+        let architecture = outcome.architecture.as_deref();
+        let basis = Basis {
+            checkpoint: self.checkpoint,
+            program: program.and_then(|fault| fault.detail.get("program")?.as_str()),
+            findings: &outcome.findings,
+            loads: &outcome.loads,
+            has_processor: architecture.is_some_and(|class| self.knowledge.processor_of(class).is_some()),
+            unpredicted,
+        };
+        basis.verdicts(&context.targets, programs)
     }
 }
 
@@ -339,10 +354,17 @@ fn is_of_programs(rule: &Rule) -> bool {
     rule.affects == Affected::Programs
 }
 
+/// Whether two versions that one loader stands for do the same with every object.
+fn says_the_same(one: &PredictedLoad, other: &PredictedLoad) -> bool {
+    one.loader == other.loader && one.objects == other.objects
+}
+
 /// Whether a verdict is as bad as an effect that a finding states. Causes are searched under the leading loaders, and another
 /// loader may not have them.
 fn is_borne_out(effect: &FindingEffect, verdicts: &[PredictedLoad]) -> bool {
-    let Some(load) = verdicts.iter().find(|load| load.loader == effect.loader) else { return true };
+    let mut loads = verdicts.iter().filter(|load| load.loader == effect.loader);
+    let Some(first) = loads.clone().next() else { return true };
+    let load = loads.find(|load| load.stands_for == effect.stands_for).unwrap_or(first);
     let object = load.objects.iter().find(|object| object.object == effect.object);
     object.is_some_and(|object| object.verdict >= effect.outcome.into())
 }
@@ -367,26 +389,6 @@ fn with_shown_causes(mut object: ObjectVerdict, shown: &BTreeSet<&str>) -> Objec
     object
 }
 
-/// What each loader does with each object, by the findings of all rules and the predicted loads.
-fn verdicts(
-    checkpoint: &Checkpoint,
-    context: &Context<'_>,
-    programs: &[AskedProgram<'_>],
-    faults: &[Fault],
-    outcome: &Outcome,
-    unpredicted: &[(&'static str, String)],
-) -> Vec<PredictedLoad> {
-    let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
-    let basis = Basis {
-        checkpoint,
-        program: program.and_then(|fault| fault.detail.get("program")?.as_str()),
-        findings: &outcome.findings,
-        loads: &outcome.loads,
-        unpredicted,
-    };
-    basis.verdicts(&context.targets, programs)
-}
-
 /// Binds what the run asks for, and what is known of the class.
 fn bind_run(
     scope: &mut Scope<'_>,
@@ -401,13 +403,13 @@ fn bind_run(
     scope.bind("named", &(!versions.is_empty()).into());
     let groups_heads = |name: &str| knowledge.library.speaks_of(name, "c.num_key_value_heads");
     scope.bind("groups_heads", &architecture.is_none_or(groups_heads).into());
-    let classes: Vec<_> = architecture
-        .map(|name| targets.iter().filter_map(|target| knowledge.library.class(name, target.loader)).collect())
-        .unwrap_or_default();
-    let is_part = |pointer: &String| {
-        classes.is_empty() || classes.iter().any(|class| class.is_part(pointer.trim_start_matches('/')))
+    let class = |config, target: &Target| knowledge.library.class(class_of(knowledge, config, target)?, target.loader);
+    let classes = |config| targets.iter().filter_map(move |target| class(config, target)).collect::<Vec<_>>();
+    let parts: BTreeSet<String> = match config.map(|config| (config, classes(config))) {
+        Some((config, known)) if known.is_empty() => sub_configs::pointers(config).collect(),
+        Some((config, known)) => known.into_iter().flat_map(|class| sub_configs::opened(config, class)).collect(),
+        None => BTreeSet::new(),
     };
-    let parts = config.into_iter().flat_map(refusals::sub_configs).filter(is_part);
     scope.bind("configs", &std::iter::once(String::new()).chain(parts).collect());
 }
 

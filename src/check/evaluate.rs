@@ -205,19 +205,31 @@ fn from_faults(
         for fault in all.iter().take(PLACES) {
             caused.add(rule, context, &fault.loaders, &finding_scope(check, scope, fault, count));
         }
-        return vec![finding(rule, context, &inner, caused, places, evidence, fix)];
+        let found = finding(rule, &inner, rule.message.render(&inner), places, evidence, fix);
+        return vec![caused.give(rule, context, found)];
     }
-    let mut out = Vec::new();
+    let mut listed: Vec<(&Fault, Finding, Caused)> = Vec::new();
     let mut more = 0_u64;
     for fault in matching.by_ref().take(CAP) {
-        let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
         more = more.saturating_add(fault.hidden);
         let inner = finding_scope(check, scope, fault, 1);
+        let message = rule.message.render(&inner);
+        let same = |(one, found, _): &&mut (&Fault, Finding, Caused)| {
+            is_of_other_loaders(one, fault) && found.message == message
+        };
+        if let Some((.., caused)) = listed.iter_mut().find(same) {
+            caused.add(rule, context, &fault.loaders, &inner);
+            continue;
+        }
+        let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
         let fix = hint(rule, context, fault, &inner);
+        let found = finding(rule, &inner, message, locate(&places), fault.detail.clone(), fix);
         let mut caused = Caused::default();
         caused.add(rule, context, &fault.loaders, &inner);
-        out.push(finding(rule, context, &inner, caused, locate(&places), fault.detail.clone(), fix));
+        listed.push((fault, found, caused));
     }
+    let mut out: Vec<Finding> =
+        listed.into_iter().map(|(_, found, caused)| caused.give(rule, context, found)).collect();
     // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
     for fault in matching {
         more = more.saturating_add(fault.hidden).saturating_add(1);
@@ -233,6 +245,12 @@ fn from_faults(
         last.hidden = more;
     }
     out
+}
+
+/// Whether two faults tell of one place what different loaders do there, each in its own words.
+fn is_of_other_loaders(one: &Fault, other: &Fault) -> bool {
+    let are_told = !one.loaders.is_empty() && !other.loaders.is_empty();
+    are_told && one.places == other.places && other.loaders.iter().all(|loader| !one.loaders.contains(loader))
 }
 
 /// The variables of a finding for one of `count` faults: those of the fault, and those that the check binds.
@@ -306,7 +324,8 @@ fn one_assert<'r>(
     let fix = fix::hint(&rule.fixes, &Site { bench: &context.bench, fault: None, scope });
     let mut caused = Caused::default();
     caused.add(rule, context, &[], scope);
-    Ok(Some(finding(rule, context, scope, caused, locate(&places), Map::new(), fix)))
+    let found = finding(rule, scope, rule.message.render(scope), locate(&places), Map::new(), fix);
+    Ok(Some(caused.give(rule, context, found)))
 }
 
 fn place(at: &At, scope: &Scope<'_>) -> Place {
@@ -330,28 +349,22 @@ fn together(first: Option<FixHint>, next: Option<FixHint>) -> Option<FixHint> {
     Some(FixHint { edits, ..first })
 }
 
+/// A finding without the effects that [`Caused::give`] adds.
 fn finding(
     rule: &Rule,
-    context: &Context<'_>,
     scope: &Scope<'_>,
-    caused: Caused,
+    message: String,
     locations: Vec<Location>,
     evidence: Map<String, Value>,
     fix: Option<FixHint>,
 ) -> Finding {
-    let file = locations.first().and_then(|location| location.file.as_deref());
-    let is_set_aside = file.is_some_and(|file| context.is_set_aside(file));
     Finding {
         code: rule.code.clone(),
         name: rule.name.clone(),
-        severity: if is_set_aside && caused.effects.is_empty() {
-            rule.severity_unopened()
-        } else {
-            rule.severity_given(caused.leads(), caused.ahead)
-        },
-        message: rule.message.render(scope),
+        severity: rule.severity_given(false, false),
+        message,
         details: rule.details.iter().filter_map(|detail| detail.try_render(scope).ok()).collect(),
-        effects: caused.effects,
+        effects: Vec::new(),
         locations,
         evidence,
         fix,
@@ -389,6 +402,18 @@ impl Caused {
         matches!((self.leading, self.certain), (Leading::Yes, _) | (Leading::Perhaps, true))
     }
 
+    /// The finding with these effects, and the severity that follows from them.
+    fn give(self, rule: &Rule, context: &Context<'_>, finding: Finding) -> Finding {
+        let file = finding.locations.first().and_then(|location| location.file.as_deref());
+        let is_set_aside = file.is_some_and(|file| context.is_set_aside(file));
+        let severity = if is_set_aside && self.effects.is_empty() {
+            rule.severity_unopened()
+        } else {
+            rule.severity_given(self.leads(), self.ahead)
+        };
+        Finding { severity, effects: self.effects, ..finding }
+    }
+
     /// Adds the effects of `rule` under the loaders of a fault; all of the run if `loaders` is empty.
     fn add(&mut self, rule: &Rule, context: &Context<'_>, loaders: &[&str], scope: &Scope<'_>) {
         for effect in &rule.effects {
@@ -414,20 +439,19 @@ impl Caused {
                 let same = |e: &FindingEffect| {
                     (e.object, e.outcome, e.loader.as_str()) == (object, effect.consequence, loader)
                 };
-                let is_hit = target.versions.iter().any(|version| effect.loaders.contains(version));
-                if !is_meant || !is_hit || self.effects.iter().any(same) {
-                    continue;
-                }
+                let hit = target.versions.iter().find(|version| effect.loaders.contains(version));
+                let Some(hit) = hit.filter(|_| is_meant && !self.effects.iter().any(same)) else { continue };
+                let leads = target.leads_for(hit);
                 let is_stated = loaders.is_empty();
                 let leading = if is_stated || target.is_certain() { Leading::Yes } else { Leading::Perhaps };
-                self.leading = self.leading.max(if target.leads { leading } else { Leading::No });
+                self.leading = self.leading.max(if leads { leading } else { Leading::No });
                 self.ahead |=
-                    target.leads || context.targets.iter().all(|other| !other.leads || other.loader <= target.loader);
+                    leads || context.targets.iter().all(|other| !other.leads || other.loader <= target.loader);
                 self.certain |= target.is_certain() || context.fails_for_certain;
                 self.effects.push(FindingEffect {
                     object,
                     loader: loader.to_owned(),
-                    stands_for: target.stands_for.clone(),
+                    stands_for: (hit != loader).then(|| hit.clone()),
                     outcome: effect.consequence,
                     text: effect.text.render(scope),
                 });

@@ -25,6 +25,15 @@ pub(super) fn short(value: &Value) -> Value {
     }
 }
 
+/// The class that config.json names, or else the one that `AutoModel` builds.
+pub(super) fn class_of<'k>(knowledge: &'k Knowledge, config: &'k Value, target: &Target) -> Option<&'k str> {
+    let auto = || {
+        let model_type = config.get("model_type").and_then(Value::as_str)?;
+        knowledge.library.auto_class(model_type, "model", target.loader)
+    };
+    knowledge.library.named_class(config).or_else(auto)
+}
+
 /// Whether config.json is one of transformers: that of timm, diffusers or `LeRobot` names no model type and no class, and that of
 /// a sentence encoder whose own module is a table of embeddings is model2vec's.
 pub(super) fn is_of_transformers(checkpoint: &Checkpoint) -> bool {

@@ -6,7 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Map, Value};
 
 use super::load::Target;
-use super::model_type::{CAP, has_code, is_model, short};
+use super::model_type::{CAP, class_of, has_code, is_model, short};
+use super::sub_configs;
 use super::view::{Asked, ExplainingFacts, Observation, VersionsView};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
@@ -14,19 +15,12 @@ use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
 use crate::knowledge::refusals::{
-    ClassRefusals, EVERY_CLASS, GENERATES, Heads, Lengths, RefusedValues, Ropes, ValueKind, Words,
+    Below, ClassRefusals, EVERY_CLASS, GENERATES, Heads, Lengths, OF_PARTS, RefusedValues, Ropes, ValueKind, Words,
 };
 use crate::knowledge::source;
 
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
-
-/// Keys that the config class of a part refuses as that of the whole does: tried with every part of every config class of
-/// transformers 4.47.0, 4.57.6 and 5.23.0. Of the dtypes those that are no value at all.
-const OF_PARTS: [&str; 5] = ["id2label", "label2id", "problem_type", "torch_dtype", "dtype"];
-
-/// The exception of a dtype that is neither a text nor a number. The other exceptions are those of the whole.
-const NO_DTYPE: &str = "IndexError";
 
 /// A value that a loader refuses.
 struct Rejection {
@@ -52,10 +46,12 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     for target in asked.targets {
         let loader = target.loader.version();
         let configs = Configs { written: config, filled };
-        let class = knowledge.library.named_class(config).or_else(|| auto_class(knowledge, config, target));
+        let class = class_of(knowledge, config, target);
         let refused = class.map(|class| refusals(knowledge, config, target, class)).unwrap_or_default();
         let mut found = of_class(knowledge, &configs, &refused, target.version());
-        let parts = parts_of(knowledge, config, target, class);
+        let architecture = class.and_then(|class| knowledge.library.class(class, target.loader));
+        let parts: Vec<String> =
+            architecture.map(|class| sub_configs::opened(config, class).collect()).unwrap_or_default();
         let places = std::iter::once("").chain(parts.iter().map(String::as_str));
         found.extend(places.filter_map(|at| dtype(knowledge, config, at, target.version())));
         found.extend(rope_form(knowledge, config, target.version()));
@@ -86,12 +82,6 @@ pub(super) fn explain(facts: &ExplainingFacts, fault: Fault) -> Option<Fault> {
     (!is_explained).then_some(fault)
 }
 
-/// The class that `AutoModel` builds where config.json names none.
-fn auto_class<'k>(knowledge: &'k Knowledge, config: &Value, target: &Target) -> Option<&'k str> {
-    let model_type = config.get("model_type").and_then(Value::as_str)?;
-    knowledge.library.auto_class(model_type, "model", target.loader)
-}
-
 /// What a class refuses with its parts. The class was tried with parts of the model types that it builds where none is named;
 /// a part of another type refuses what the class of that type does.
 fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str) -> ClassRefusals {
@@ -102,7 +92,7 @@ fn refusals(knowledge: &Knowledge, config: &Value, target: &Target, class: &str)
         return of_class(class).inside(key);
     }
     let is_fixed = |key: &str| architecture.is_some_and(|architecture| architecture.is_fixed_part(key));
-    sub_configs(config).fold(of_class(class), |refused, pointer| {
+    sub_configs::pointers(config).fold(of_class(class), |refused, pointer| {
         let key = pointer.trim_start_matches('/');
         let named = config.pointer(&format!("{pointer}/model_type")).and_then(Value::as_str);
         let tried = architecture.and_then(|architecture| architecture.sub_config_type(key));
@@ -221,32 +211,25 @@ fn of_kinds(
     let of_every = knowledge.refusals.of_class(version, EVERY_CLASS).unwrap_or_default();
     let heads = refused.heads.iter().filter_map(|heads| undivided(configs, heads, &refused.defaults));
     let mut found: Vec<Rejection> = heads.collect();
+    found.extend(refused.below.iter().filter_map(|below| not_below(configs, below, &refused.defaults)));
     found.extend(refused.values().iter().flat_map(|values| of_kind(config, "", values)));
-    found.extend(of_every.values().iter().flat_map(|values| of_kind(config, "", values)));
+    found.extend(of_config(config, "", &of_every));
     if refused.generates {
         let of_generation = knowledge.refusals.of_class(version, GENERATES).unwrap_or_default();
         let own = of_generation.values().iter().flat_map(|values| of_kind(config, "", values));
         found = own.fold(found, with_other_pointer);
     }
-    let words =
-        |at: &str| of_every.words.iter().filter_map(|words| unknown_word(config, at, words)).collect::<Vec<_>>();
-    found.extend(words(""));
-    for at in parts {
-        found.extend(words(at));
-        let of_part = of_every.values().iter().flat_map(|values| of_kind(config, at, values));
-        found.extend(of_part.filter(|rejection| {
-            let key = rejection.pointer.rsplit('/').next().unwrap_or_default();
-            OF_PARTS.contains(&key) && (rejection.raises == NO_DTYPE || !key.ends_with("dtype"))
-        }));
+    if !parts.is_empty() {
+        let of_parts = knowledge.refusals.of_class(version, OF_PARTS).unwrap_or_default();
+        found.extend(parts.iter().flat_map(|at| of_config(config, at, &of_parts)));
     }
     found
 }
 
-/// Pointers of the configs of the parts, as far as their names tell.
-pub(super) fn sub_configs(config: &Value) -> impl Iterator<Item = String> {
-    let parts =
-        config.as_object().into_iter().flatten().filter(|(key, value)| key.ends_with("_config") && value.is_object());
-    parts.map(|(key, _)| format!("/{key}")).filter(|pointer| pointer != "/quantization_config")
+/// Values and words that the config at a pointer refuses.
+fn of_config(config: &Value, at: &str, refused: &ClassRefusals) -> Vec<Rejection> {
+    let words = refused.words.iter().filter_map(|words| unknown_word(config, at, words));
+    refused.values().iter().flat_map(|values| of_kind(config, at, values)).chain(words).collect()
 }
 
 /// Whether config.json has NaN or an infinity at a pointer, which Python reads and strict JSON has no value for.
@@ -429,11 +412,23 @@ fn undivided(
     })
 }
 
-/// Pointers of the objects that the config class of the model makes configs of.
-fn parts_of(knowledge: &Knowledge, config: &Value, target: &Target, class: Option<&str>) -> Vec<String> {
-    let architecture = class.and_then(|class| knowledge.library.class(class, target.loader));
-    let is_config = |pointer: &String| architecture.is_some_and(|class| class.is_part(pointer.trim_start_matches('/')));
-    sub_configs(config).filter(is_config).collect()
+/// A number that is not smaller than the one beside it that has to be larger.
+fn not_below(
+    configs: &Configs<'_>,
+    Below(key, other, raises): &Below,
+    defaults: &BTreeMap<String, u64>,
+) -> Option<Rejection> {
+    let pointer = format!("/{key}");
+    let value = configs.read_or(&pointer, defaults)?;
+    let limit = configs.read_or(&format!("{}/{other}", parent(&pointer)), defaults)?;
+    let is_below = value.as_f64().zip(limit.as_f64()).is_none_or(|(value, limit)| value < limit);
+    (!is_below).then(|| Rejection {
+        pointer,
+        value,
+        because: format!("which is not smaller than {other} {limit}"),
+        raises: raises.clone(),
+        similar: None,
+    })
 }
 
 /// A dtype that torch does not have, in the config at a pointer. Versions since 4.56 prefer `dtype` to `torch_dtype`.

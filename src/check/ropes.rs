@@ -11,6 +11,7 @@ use serde_json::{Map, Value, json};
 
 use super::load::Target;
 use super::model_type::{is_model, short};
+use super::sub_configs;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place};
 use crate::knowledge::Knowledge;
 use crate::knowledge::ropes::RopeForm;
@@ -38,11 +39,8 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, targets: &[
 
 /// The config and the configs of its parts, with their pointers.
 fn configs(config: &Value) -> impl Iterator<Item = (String, &Map<String, Value>)> {
-    let whole = config.as_object();
-    let parts =
-        whole.into_iter().flatten().filter(|(key, _)| key.ends_with("_config") && *key != "quantization_config");
-    let parts = parts.filter_map(|(key, part)| Some((format!("/{key}"), part.as_object()?)));
-    whole.map(|whole| (String::new(), whole)).into_iter().chain(parts)
+    let pointers = std::iter::once(String::new()).chain(sub_configs::pointers(config));
+    pointers.filter_map(|pointer| Some((pointer.clone(), config.pointer(&pointer)?.as_object()?)))
 }
 
 /// The values of `rope_parameters` that a class with these keys takes from elsewhere; `form` is the one that it accepts, if it

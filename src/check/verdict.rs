@@ -125,6 +125,8 @@ pub(super) struct Basis<'a> {
     pub(super) findings: &'a [Finding],
     /// The predicted load reports.
     pub(super) loads: &'a [LoadReport],
+    /// Whether the class has a processor: then config.json repeats ids of its tokenizer.
+    pub(super) has_processor: bool,
     /// For a loader without a report, the reason.
     pub(super) unpredicted: &'a [(&'static str, String)],
 }
@@ -165,18 +167,25 @@ impl Basis<'_> {
         self.checkpoint.shards.values().any(|shard| shard.tells_all_tensors() || !shard.tensors.is_empty())
     }
 
-    /// The first file that transformers opens for an object, beside config.json, and that was not read, and why. Of a file that
-    /// the loader cannot read either, findings tell what it does.
+    /// The first file that an object rests on, beside config.json, and that was not read, and why. Of a file that the loader
+    /// cannot read either, findings tell what it does.
     fn unread(&self, object: Object) -> Option<(&str, NotRead)> {
         let is_model = object == Object::Model;
         let index = self.checkpoint.index.iter().map(|index| index.document.as_str());
         let of_model = index.chain([files::ADAPTER_CONFIG, files::GENERATION_CONFIG]).filter(|_| is_model);
         let own = self.checkpoint.documents.keys().map(String::as_str);
-        let own = own.filter(|name| !is_model && Object::reading(name) == Some(object));
+        let concerns = |name: &str| match Object::reading(name) {
+            Some(Object::Tokenizer | Object::Processor) if is_model => self.has_processor,
+            reading => !is_model && reading == Some(object),
+        };
+        let own = own.filter(|name| concerns(name));
         let documents = of_model.chain(own).filter_map(|name| self.checkpoint.document(name));
         let documents = documents.map(|document| (document.name.as_str(), document.not_read));
         let shards = self.checkpoint.shards.values();
-        let opened = shards.filter(|shard| is_model && index::is_opened(self.checkpoint, &shard.name));
+        let opened = shards.filter(|shard| match object {
+            Object::Model => index::is_opened(self.checkpoint, &shard.name),
+            object => Object::reading(&shard.name) == Some(object),
+        });
         let opened = opened.map(|shard| (shard.name.as_str(), shard.not_read));
         let mut unread = documents.chain(opened).filter_map(|(name, not_read)| Some((name, not_read?)));
         unread.find(|(_, not_read)| *not_read != NotRead::Unreadable)

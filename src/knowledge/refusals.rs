@@ -22,13 +22,15 @@ pub struct ClassRefusals {
     pub rope_type: Vec<String>,
     /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
     pub rope_factor: Vec<String>,
+    /// Numbers that have to be smaller than others.
+    pub below: Vec<Below>,
     /// Types of rope that raise with sound parameters.
     pub ropes: Vec<Ropes>,
     /// Keys of which only a few words load.
     pub words: Vec<Words>,
     /// Lists that must have as many elements as others beside them.
     pub lengths: Vec<Lengths>,
-    /// Defaults of keys of heads and padding ids, by pointer.
+    /// Defaults of keys that are compared with others, by pointer.
     pub defaults: BTreeMap<String, u64>,
     /// The exception that a parameter raises that is stored as integers.
     pub integers: Option<String>,
@@ -41,6 +43,10 @@ pub struct ClassRefusals {
 /// A count of attention heads, the key beside it that it has to divide, and the exception otherwise.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Heads(pub String, pub String, pub String);
+
+/// A key, the key beside it that has to hold a larger number, and the exception otherwise.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Below(pub String, pub String, pub String);
 
 /// A key of rope parameters, the exception of some types of rope, these types, and a key beside it that they need; empty for none.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -147,6 +153,8 @@ impl ClassRefusals {
         self.words.retain(|Words(pointer, ..)| !pointer.starts_with(&under));
         self.words
             .extend(part.words.iter().cloned().map(|Words(at, raises, load)| Words(under.clone() + &at, raises, load)));
+        self.below.retain(|Below(pointer, ..)| !pointer.starts_with(&under));
+        self.below.extend(part.below.iter().cloned().map(|row| Below(under.clone() + &row.0, row.1, row.2)));
         self.ropes.retain(|Ropes(pointer, ..)| !pointer.starts_with(&under));
         self.ropes.extend(part.ropes.iter().cloned().map(|row| Ropes(under.clone() + &row.0, row.1, row.2, row.3)));
         self.lengths.retain(|Lengths(group, _)| !group.iter().any(|pointer| pointer.starts_with(&under)));
@@ -170,7 +178,7 @@ impl ClassRefusals {
         }
     }
 
-    /// The same for the class of a part whose config stands under `key` of a larger one.
+    /// The same for the class of a part whose config stands under `key` of a larger one. Its values of generation are not judged.
     #[must_use]
     pub fn inside(self, key: &str) -> Self {
         Self { integers: self.integers.clone(), ..Self::default() }.with_part(key, self)
@@ -199,6 +207,11 @@ impl ClassRefusals {
         };
         Self {
             words: self.words.into_iter().filter_map(words).collect(),
+            below: self
+                .below
+                .into_iter()
+                .filter(|row| other.below.iter().any(|o| (&o.0, &o.1) == (&row.0, &row.1)))
+                .collect(),
             ropes: self
                 .ropes
                 .into_iter()
@@ -220,6 +233,9 @@ impl ClassRefusals {
 
 /// The entry with what every class refuses.
 pub const EVERY_CLASS: &str = "*";
+
+/// The entry with what the config class of nearly every part refuses of that.
+pub const OF_PARTS: &str = "*parts";
 
 /// The entry with what every class refuses that can generate.
 pub const GENERATES: &str = "*generates";

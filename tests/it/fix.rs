@@ -2,6 +2,7 @@
 
 mod cli;
 mod edits;
+mod elsewhere;
 mod foreign;
 mod journal;
 mod named;

@@ -333,14 +333,13 @@ fn no_source_spells_a_class_or_a_model_type() {
 }
 
 /// Config keys that sources may spell, and why they are no knowledge of `rules/`.
-const SPELLED_KEYS: [(&str, &[&str], &str); 18] = [
+const SPELLED_KEYS: [(&str, &[&str], &str); 17] = [
     ("src/check/adapter/lora.rs", &["bias"], "a field of adapter_config.json"),
     ("src/check/built_tokenizer.rs", &["decoder"], "a field of tokenizer.json"),
     ("src/check/fix/repairs/configs.rs", &["text_config", "tie_word_embeddings"], "the keys that a repair moves"),
     ("src/check/judge/integers.rs", &["bias"], "the end of a tensor's name"),
     ("src/check/load/convert.rs", &["dim", "num_attention_heads"], "arguments of conversions, by their code"),
     ("src/check/load/keys.rs", &["bias"], "the end of a tensor's name"),
-    ("src/check/refusals.rs", &["id2label"], "the one key whose keys become integers"),
     (
         "src/check/size.rs",
         &["head_dim", "intermediate_size", "mm_vision_tower", "num_key_value_heads", "vision_config", "vocab_size"],

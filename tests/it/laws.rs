@@ -22,12 +22,12 @@ use std::sync::LazyLock;
 use tempfile::TempDir;
 
 /// Number of cases of a test: `few` in a plain `cargo test`.
-fn cases(few: u64) -> u64 {
+pub fn cases(few: u64) -> u64 {
     std::env::var("CKPT_DOCTOR_LAWS").map_or(few, |n| n.parse().expect("a number"))
 }
 
 /// The seed of a test: `own` unless the environment has another.
-fn seed(own: u64) -> u64 {
+pub fn seed(own: u64) -> u64 {
     std::env::var("CKPT_DOCTOR_SEED").map_or(own, |seed| seed.parse().expect("a number"))
 }
 

@@ -66,8 +66,9 @@ KINDS = {
     "object": [{}, {"x": 1}],
 }
 FIRST = ("null", "text", "negative", "zero", "object")
-# The entry of the values that every class refuses that can generate, and those that a key is tried beside.
-GENERATES = "*generates"
+# Entries of no class: what every class refuses, what the config of every part does, and what every class does that can generate.
+EVERY, OF_PARTS, GENERATES = "*", "*parts", "*generates"
+# What a key of generation is tried beside.
 BESIDE = ({}, {"num_beams": 4}, {"do_sample": True}, {"num_beams": 4, "num_beam_groups": 2, "diversity_penalty": 0.5})
 # Keys of every config whose values matter to some classes only.
 TRIED = {"pad_token_id", "is_decoder", "add_cross_attention", "tie_word_embeddings", "is_encoder_decoder", "use_cache"}
@@ -446,6 +447,25 @@ def lengths(small):
                 yield ["/".join((*path, each)) for each in group], raised[key].split(":", 1)[0]
 
 
+def below(config_class):
+    """[(key, key beside it that has to be larger, exception)] of a config class, by building it alone."""
+    with contextlib.suppress(Exception):
+        base = json.loads(json.dumps(config_class().to_dict(), default=str))
+        general = set(transformers.PretrainedConfig().to_dict())
+        counts = [key for key, value in base.items() if type(value) is int and value >= 0 and key not in general]
+        said = {key: why_not(config_class, {**base, key: 10**6}) for key in counts}
+        for key in filter(said.get, counts):
+            for other in counts:
+                size, more = base[other], {**base, other: base[other] + 4}
+                # Two neighbours on each side: a count that only has to be odd is no order.
+                high = [{**base, key: size}, {**base, key: size + 1}, {**more, key: size + 4}, {**more, key: size + 5}]
+                low = [{**base, key: max(size - 1, 0)}, {**more, key: size + 2}, {**more, key: size + 3}]
+                raised = key != other and why_not(config_class, high[0])
+                if raised and not any(why_not(config_class, config) for config in low):
+                    if all(why_not(config_class, config) for config in high):
+                        yield key, other, raised
+
+
 def heads(small):
     """[(pointer of a count of heads, name of the width that it has to divide, exception)]."""
     for path, part in nested(small.config):
@@ -542,6 +562,7 @@ def family(args):
             for kind, pointer in sorted(special(models[0])):
                 entry[kind].append(pointer)
             entry["ropes"] = [list(row) for row in ropes(models[0])]
+            entry["below"] = [list(row) for row in below(catalogue.find_class(name).config_class)]
             for pointer, width, raised in heads(models[0]):
                 entry["heads"].append([pointer, width, raised])
             if raised := integers(models[0]):
@@ -597,6 +618,7 @@ def finished(entry, config_class):
     with contextlib.suppress(Exception):
         defaults = config_class().to_dict()
         compared = [*entry["padding"], *(row[0] for row in entry["heads"])]
+        compared += [key for row in entry["below"] for key in row[:2]]
         entry["defaults"] = {key: defaults[key] for key in compared if isinstance(defaults.get(key), int)}
     return entry
 
@@ -645,10 +667,33 @@ def of_every_config():
     return found
 
 
+def of_every_part(every):
+    """What the configs of nearly all parts refuse of what every class refuses, tried with each part of each config class."""
+    tried, raised = 0, collections.Counter()
+    rows = [(row["raises"], kind, key) for row in every["values"] for kind in row["kinds"] for key in row["keys"]]
+    words = [(row[1], tuple(row[2]), row[0]) for row in every.get("words", [])]
+    for model_type in transformers.CONFIG_MAPPING:
+        with contextlib.suppress(Exception):  # a config class without defaults
+            config_class = transformers.CONFIG_MAPPING[model_type]
+            whole = config_class()
+            parts = [path[0] for path, _ in configs_in(whole) if len(path) == 1]
+            for part in parts:
+                tried += 1
+                for raises, kind, key in [*rows, *words]:
+                    values = KINDS.get(kind, ["swoosh", "xyzzy"])
+                    if all(why_not(config_class, changed(whole.to_dict(), (part, key), value)) == raises for value in values):
+                        raised[raises, kind, key] += 1
+    usual = {row for row, n in raised.items() if n >= 0.9 * tried}
+    return {
+        "values": table({((key,), kind): raises for raises, kind, key in rows if (raises, kind, key) in usual}),
+        "words": [[key, raises, list(loads)] for raises, loads, key in words if (raises, loads, key) in usual],
+    }
+
+
 def why_not(config_class, values):
-    """Name of the exception of a config class with these values, or None."""
+    """Name of the exception of a config class with these values, also to write it down, or None."""
     try:
-        config_class(**values)
+        config_class.from_dict(dict(values)).to_json_string()
     except Exception as error:
         return type(error).__name__
     return None
@@ -715,7 +760,7 @@ def composed(entries, parts):
                 out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
             elif kind == "integers":
                 out[kind] = found
-            elif kind in ("words", "ropes"):
+            elif kind in ("words", "ropes", "below"):
                 out[kind] += [[under + pointer, *rest] for pointer, *rest in found]
             elif kind == "lengths":
                 out[kind] += [[[under + pointer for pointer in group], raised] for group, raised in found]
@@ -744,9 +789,10 @@ def main(args):
     shared = general(classes, sampled)
     for name, entry in classes.items():
         entry["generates"] = generates(name)
+    every = {"values": shared, "words": of_every_config()}
     # A few families do not tell what every class refuses.
     entries = (
-        {"*": {"values": shared, "words": of_every_config()}, GENERATES: {"values": of_generation()}}
+        {EVERY: every, OF_PARTS: of_every_part(every), GENERATES: {"values": of_generation()}}
         | kept
         | {name: {k: v for k, v in entry.items() if v} for name, entry in classes.items()}
     )

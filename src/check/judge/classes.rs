@@ -69,7 +69,7 @@ fn with_flat_config(inputs: &Inputs<'_>, architecture: &Architecture<'_>) -> Res
         return Err(Refusal::Raises(NESTED.to_owned()));
     }
     if architecture.leaves_text_config(inputs.config) {
-        let reason = "text_config is an object that this class makes no config of";
+        let reason = "text_config is an object, and what this class makes of it is not described";
         return Err(Refusal::NotCovered(vec![Doubt::Corner(reason.to_owned())]));
     }
     inputs.build(*architecture)

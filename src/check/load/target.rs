@@ -11,7 +11,7 @@ pub struct Target {
     pub loader: Loader,
     /// The version, where it is not the loader's own.
     pub stands_for: Option<String>,
-    /// All versions that it is judged for.
+    /// All versions that it is judged for. Without named ones, the first may be the one that wrote config.json.
     pub versions: Vec<String>,
     /// Whether the checkpoint must load there. For another target, only the fact that it does not load is reported.
     pub leads: bool,
@@ -33,6 +33,13 @@ impl Target {
         Self { loader, stands_for, versions: vec![version.to_owned()], leads, named, of_transformers: true }
     }
 
+    /// Judges one more version by this loader.
+    fn also(&mut self, version: &str) {
+        if !self.versions.iter().any(|one| one == version) {
+            self.versions.push(version.to_owned());
+        }
+    }
+
     /// Whether what fails here is an error: the user named the version, or the prediction is for the loader's own version
     /// and not only near to it.
     pub(in crate::check) fn is_certain(&self) -> bool {
@@ -40,6 +47,11 @@ impl Target {
             || self.stands_for.is_none()
             || !self.of_transformers
             || self.versions.iter().any(|version| version == self.loader.version())
+    }
+
+    /// Whether the checkpoint must load with this one of its versions.
+    pub(in crate::check) fn leads_for(&self, version: &str) -> bool {
+        self.leads && (self.named || version == self.version())
     }
 
     /// Lets it lead in place of the loader of the version that wrote config.json, which does not know the class. It is still
@@ -74,7 +86,7 @@ pub(in crate::check) fn wanted(config: Option<&Value>, named: &[String]) -> Vec<
     for (version, leads) in versions(config, named) {
         let loader = Loader::nearest(version);
         match targets.iter_mut().find(|target| target.loader == loader) {
-            Some(target) => target.versions.push(version.to_owned()),
+            Some(target) => target.also(version),
             None => targets.push(Target::new(loader, version, leads, !named.is_empty())),
         }
     }
@@ -115,7 +127,7 @@ pub fn targets<'l>(
     for (version, leads) in versions(Some(config), named) {
         let Some((loader, architecture)) = library.stands_for(version, config, names) else { continue };
         match known.iter_mut().find(|(target, _)| target.loader == loader) {
-            Some((target, _)) => target.versions.push(version.to_owned()),
+            Some((target, _)) => target.also(version),
             None => known.push((Target::new(loader, version, leads, !named.is_empty()), architecture)),
         }
     }

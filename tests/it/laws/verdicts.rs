@@ -59,7 +59,10 @@ pub(super) fn holds(part: usize, look: impl Fn(&Case, &Path) -> Vec<String> + Sy
 /// Law *company*: what differs between the verdicts by default, with all loaders, and with each alone.
 pub(super) fn company(case: &Case, made: &Path, knowledge: &Knowledge) -> Vec<String> {
     let mut found = Vec::new();
-    for (named, words) in [(&[] as &[&str], "by default"), (&Loader::ALL.map(Loader::version), "with all")] {
+    let known = Loader::ALL.map(Loader::version);
+    let between = ["4.49", "4.55", "5.1"];
+    let all = [&known[..], &between].concat();
+    for (named, words) in [(&[] as &[&str], "by default"), (&all, "with others")] {
         for among in verdicts(made, case, named, knowledge) {
             let judged = among.stands_for.as_ref().unwrap_or(&among.loader);
             let alone = verdicts(made, case, &[judged], knowledge);
@@ -76,6 +79,32 @@ pub(super) fn company(case: &Case, made: &Path, knowledge: &Knowledge) -> Vec<St
 fn a_verdict_does_not_depend_on_the_other_loaders_of_the_run() {
     let knowledge = knowledge();
     holds(8, |case, made| company(case, made, &knowledge), &knowledge);
+}
+
+/// A loader that stands for several versions gives each its own verdict, where a rule tells them apart.
+#[test]
+fn versions_that_one_loader_stands_for_are_told_apart() {
+    let knowledge = knowledge();
+    let room = tempfile::tempdir().unwrap();
+    crate::support::make_base("gemma3", room.path());
+    let path = room.path().join("config.json");
+    let mut config: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    config["transformers_version"] = "4.55.0".into();
+    config["text_config"]["layer_types"] = vec!["full_attention"; 9].into();
+    std::fs::write(&path, config.to_string()).unwrap();
+    let told = |named: &[&str]| {
+        let named: Vec<String> = named.iter().map(|version| (*version).to_owned()).collect();
+        let (_, outcome) = open(room.path(), false, &named, &knowledge);
+        let loads = outcome.verdicts.iter().map(|load| (load.version(), load.verdict, load.leads));
+        loads.collect::<Vec<_>>()
+    };
+    let stands_for = |version: &str| format!("{version} (judged as 4.57.6)");
+    let newest = |leads| ("5.23.0".to_owned(), LoadVerdict::Raises, leads);
+    let (loads, raises) = (LoadVerdict::Loads, LoadVerdict::Raises);
+    let by_default = [(stands_for("4.55.0"), loads, true), ("4.57.6".to_owned(), raises, false), newest(false)];
+    assert_eq!(told(&[]), by_default);
+    let named = [(stands_for("4.55"), loads, true), (stands_for("4.57.2"), raises, true), newest(true)];
+    assert_eq!(told(&["4.55", "4.57.2", "5.23.0"]), named);
 }
 
 /// Law *ignorance*: what becomes better where a drawn file is not read, because it leads out of the directory.

@@ -183,6 +183,19 @@ fn a_part_of_a_fixed_class_may_have_another_model_type() {
     assert_eq!(shapes("davit"), shapes("florence_vision"));
 }
 
+/// `LlamaForTokenClassification` of 5.23.0 raises with such an object, and `LlamaModel` does not: neither is predicted.
+#[test]
+fn a_text_config_that_stays_an_object_is_told_apart() {
+    let library = Library::embedded();
+    let config = |model_type: &str| json!({ "model_type": model_type, "text_config": { "hidden_size": 8 } });
+    let leaves = |class: &str, model_type: &str| {
+        let class = library.class(class, Loader::V5_23_0).expect("known");
+        class.leaves_text_config(&config(model_type))
+    };
+    assert!(leaves("LlamaForTokenClassification", "llama") && leaves("LlamaModel", "llama"));
+    assert!(!leaves("LlavaForConditionalGeneration", "llava"));
+}
+
 #[test]
 fn the_class_decides_unless_the_model_type_is_of_another() {
     let library = Library::embedded();

@@ -10,10 +10,15 @@ use crate::support::knowledge;
 
 /// Pointers of the values that are refused.
 fn refused(config: &Value) -> Vec<String> {
+    reported(config, "CFG026")
+}
+
+/// Pointers of the findings of a rule.
+fn reported(config: &Value, code: &str) -> Vec<String> {
     let files = [("config.json".to_owned(), config.to_string().into_bytes())];
     let checkpoint = Checkpoint::read(Source::Memory(MemoryFiles::new("model", files))).unwrap();
     let outcome = check(&Arc::new(checkpoint), &knowledge());
-    let own = outcome.findings.into_iter().filter(|finding| finding.code == "CFG026");
+    let own = outcome.findings.into_iter().filter(|finding| finding.code == code);
     own.flat_map(|finding| finding.locations).filter_map(|location| location.pointer).collect()
 }
 
@@ -92,4 +97,37 @@ fn the_class_of_a_part_reads_the_config_inside() {
     };
     assert_eq!(refused(&with(json!("x"), json!(64))), [] as [&str; 0]);
     assert_eq!(refused(&with(json!(64), json!("x"))), ["/text_config/hidden_size"]);
+    let mut config = with(json!(64), json!(64));
+    config["text_config"]["torch_dtype"] = "swoosh".into();
+    assert_eq!(refused(&config), ["/text_config/torch_dtype"]);
+}
+
+/// `JambaConfig._check_supported_offset` of transformers 4.57.6; the period is 8 where the config has none.
+#[test]
+fn a_number_that_has_to_be_smaller_than_another_is_refused() {
+    let with = |offset: u64, period: Value| {
+        let mut config = json!({ "architectures": ["JambaForCausalLM"], "model_type": "jamba",
+            "transformers_version": "4.57.6", "attn_layer_offset": offset });
+        if period.is_number() {
+            config["attn_layer_period"] = period;
+        }
+        config
+    };
+    for (offset, period) in [(4, json!(8)), (7, json!(null)), (9, json!(10))] {
+        assert_eq!(refused(&with(offset, period.clone())), [] as [&str; 0], "{offset} {period}");
+    }
+    for (offset, period) in [(4, json!(4)), (8, json!(null)), (11, json!(10))] {
+        assert_eq!(refused(&with(offset, period.clone())), ["/attn_layer_offset"], "{offset} {period}");
+    }
+}
+
+/// transformers 5 compares `layer_types` in every config that it makes. An object that `BertConfig` keeps is none.
+#[test]
+fn layer_types_are_counted_in_configs_alone() {
+    let with = |model_type: &str, class: &str| {
+        json!({ "architectures": [class], "model_type": model_type, "transformers_version": "5.23.0",
+            "text_config": { "model_type": "llama", "num_hidden_layers": 2, "layer_types": ["full_attention"] } })
+    };
+    assert_eq!(reported(&with("llava", "LlavaForConditionalGeneration"), "CFG040").len(), 2);
+    assert_eq!(reported(&with("bert", "BertModel"), "CFG040"), [] as [&str; 0]);
 }
