@@ -103,7 +103,7 @@ class Small:
         written = json.loads(self.file.read_text())
         # Every key that the config has, with its value; keys that the hub has and the class writes otherwise as well.
         whole = json.loads(json.dumps(cls.config_class.from_dict(copy.deepcopy(config)).to_dict(), default=str))
-        self.config = {**whole, **written}
+        self.config = over(whole, written)
         if self.outcome(self.config) is not None:
             self.config = written
             if said := self.outcome(written):
@@ -168,6 +168,18 @@ class Small:
         single = [value] if isinstance(value, (int, float, str)) else [1, 0, 2, 0.5, *self.words.get(pointer[-1], [])[:4]]
         fits = [[each] * n for each in single for n in lengths if n <= LONGEST]
         return fits + lists + [each[-1:] for each in lists] + [[1, 2], [0, 1]]
+
+
+def over(whole, written):
+    """A config with the keys of another; 4.47 writes of a part what differs from its defaults."""
+    inside = {
+        key: over(whole[key], written[key]) for key in whole.keys() & written.keys() if is_object(whole[key], written[key])
+    }
+    return {**whole, **written, **inside}
+
+
+def is_object(*values):
+    return all(isinstance(value, dict) for value in values)
 
 
 def read_by(cls, config):

@@ -35,6 +35,17 @@ fn a_part_that_another_one_replaces_refuses_nothing() {
     assert_eq!(refused(&config), [] as [&str; 0]);
 }
 
+/// 4.47 writes of a part what differs from its defaults; the activation is looked up all the same.
+#[test]
+fn the_activation_of_a_part_is_looked_up_in_every_version() {
+    for version in ["4.47.0", "4.57.6", "5.23.0"] {
+        let config = json!({ "architectures": ["Idefics3ForConditionalGeneration"], "model_type": "idefics3",
+            "transformers_version": version, "text_config": { "model_type": "llama", "hidden_act": "swoosh" },
+            "vision_config": { "hidden_act": "gelu" } });
+        assert_eq!(refused(&config), ["/text_config/hidden_act"], "{version}");
+    }
+}
+
 /// `HubertModel` of transformers 4.47.0 raises where its three lists of convolutions differ in length.
 #[test]
 fn a_list_of_another_length_than_those_beside_it_is_refused() {
