@@ -43,7 +43,7 @@ impl Answer {
         };
         let verdict = |load: &PredictedLoad| {
             let object = |object: &ObjectVerdict| {
-                let why = object.why.as_deref().filter(|_| with_places).unwrap_or_default();
+                let why = object.why.as_deref().filter(|_| with_places).map(apart_from_order).unwrap_or_default();
                 format!("{}: {} {:?} {why} {:?}", load.version(), object.object.name(), object.verdict, object.findings)
             };
             load.objects.iter().map(object).collect::<Vec<_>>()
@@ -99,6 +99,11 @@ pub(super) fn copy_whole(from: &Path, to: &Path) -> bool {
             _ => false,
         }
     })
+}
+
+/// A reason without the keyword that Python's `TypeError` names: the first of the call, which is the first in the file.
+fn apart_from_order(why: &str) -> &str {
+    why.split_once("unexpected keyword argument").map_or(why, |(start, _)| start)
 }
 
 /// Another order of the members of all objects, and the characters of strings as escapes. Lists stay.

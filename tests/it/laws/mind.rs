@@ -166,7 +166,8 @@ fn repaired(number: u64, grounds: &Grounds, knowledge: &Knowledge) -> Option<Vec
         return None;
     }
     match ckpt_doctor::surgery::journal::write(&repair, &crate::support::user(), &|_| {}) {
-        Err(RepairError::Linked { .. } | RepairError::ForeignJournal { .. }) => return None,
+        // What an interrupted run left is not touched.
+        Err(RepairError::Linked { .. } | RepairError::ForeignJournal { .. } | RepairError::Busy { .. }) => return None,
         other => drop(other.unwrap()),
     }
     let written = look(&made, false, knowledge);
