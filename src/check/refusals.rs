@@ -22,6 +22,9 @@ use crate::knowledge::source;
 /// Types of rope that need a factor: `rope_config_validation` of transformers 4.47.0 to 5.23.0.
 const ROPE_WITH_FACTOR: [&str; 3] = ["linear", "dynamic", "yarn"];
 
+/// Types of rope that need the length of the training before them: `_validate_yarn_rope_parameters` and others of 5.23.0.
+const ROPE_WITH_LENGTH: [&str; 3] = ["yarn", "llama3", "longrope"];
+
 /// A value that a loader refuses.
 struct Rejection {
     pointer: String,
@@ -158,7 +161,7 @@ fn rope_form(knowledge: &Knowledge, config: &Value, version: &str) -> Option<Rej
 /// Values that the model class refuses, by rules of their own.
 fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusals, version: &str) -> Vec<Rejection> {
     let config = configs.written;
-    let ClassRefusals { activation, padding, rope_type, rope_factor, .. } = refused;
+    let ClassRefusals { activation, padding, rope_type, rope_factor, rope_length, .. } = refused;
     let mut found = Vec::new();
     for key in activation {
         let pointer = format!("/{key}");
@@ -192,8 +195,13 @@ fn of_class(knowledge: &Knowledge, configs: &Configs<'_>, refused: &ClassRefusal
         let of_row = ropes(config, &row.0).into_iter().filter_map(|rope| unfit_rope(config, row, rope));
         found = of_row.fold(found, with_other_pointer);
     }
-    for key in rope_factor {
-        found.extend(ropes(config, key).into_iter().filter_map(|(pointer, rope)| rope_without_factor(pointer, rope)));
+    for (keys, needed, types) in [
+        (rope_factor, "factor", &ROPE_WITH_FACTOR),
+        (rope_length, "original_max_position_embeddings", &ROPE_WITH_LENGTH),
+    ] {
+        let all = keys.iter().flat_map(|key| ropes(config, key));
+        let lacking = all.filter_map(|(pointer, rope)| rope_without(needed, types, pointer, rope));
+        found = lacking.fold(found, with_other_pointer);
     }
     found
 }
@@ -348,13 +356,14 @@ fn unfit_rope(
     Some(Rejection { value: format!("of type {name}").into(), because, raises: raises.clone(), similar: None, pointer })
 }
 
-fn rope_without_factor(pointer: String, rope: &Map<String, Value>) -> Option<Rejection> {
+/// Rope parameters of one of these types that lack a key.
+fn rope_without(needed: &str, types: &[&str], pointer: String, rope: &Map<String, Value>) -> Option<Rejection> {
     let (_, name) = rope_type(rope)?;
-    let is_refused = ROPE_WITH_FACTOR.contains(&name) && !rope.contains_key("factor");
+    let is_refused = types.contains(&name) && !rope.contains_key(needed);
     is_refused.then(|| Rejection {
         value: format!("of type {name}").into(),
-        because: "which needs a factor".to_owned(),
-        raises: format!("KeyError: Missing required keys for 'rope_type'='{name}': {{'factor'}}"),
+        because: format!("which needs {needed}"),
+        raises: format!("KeyError: Missing required keys for 'rope_type'='{name}': {{'{needed}'}}"),
         similar: None,
         pointer,
     })

@@ -22,6 +22,9 @@ pub struct ClassRefusals {
     pub rope_type: Vec<String>,
     /// Keys of rope parameters: a type that needs a factor and has none raises `KeyError`.
     pub rope_factor: Vec<String>,
+    /// Keys of rope parameters that nothing fills in: a type that needs `original_max_position_embeddings` raises `KeyError`
+    /// without it.
+    pub rope_length: Vec<String>,
     /// Numbers that have to be smaller than others.
     pub below: Vec<Below>,
     /// Types of rope that raise with sound parameters.
@@ -173,6 +176,7 @@ impl ClassRefusals {
             padding: replaced(self.padding, part.padding),
             rope_type: replaced(self.rope_type, part.rope_type),
             rope_factor: replaced(self.rope_factor, part.rope_factor),
+            rope_length: replaced(self.rope_length, part.rope_length),
             values: Some(Values::Own(values)),
             ..self
         }
@@ -223,6 +227,7 @@ impl ClassRefusals {
             padding: both(self.padding, &other.padding),
             rope_type: both(self.rope_type, &other.rope_type),
             rope_factor: both(self.rope_factor, &other.rope_factor),
+            rope_length: both(self.rope_length, &other.rope_length),
             defaults: self.defaults,
             integers: self.integers.filter(|_| other.integers.is_some()),
             generates: self.generates && other.generates,

@@ -299,6 +299,9 @@ def integers(small):
     return said and said.split(":", 1)[0]
 
 
+LENGTH = "original_max_position_embeddings"  # that a config class without a rope of its own does not fill in
+
+
 def special(small):
     """{(name, pointer)} of replacements with a rule of their own: unknown names, and values that have to fit others."""
     found = set()
@@ -322,6 +325,7 @@ def special(small):
             {"rope_type": "linear", "rope_theta": 10000.0},
             'KeyError: "Missing required keys in `',
         )
+        put("rope-length", (*path, ROPE), {"rope_type": "yarn", "factor": 2.0, "rope_theta": 10000.0}, LENGTH)
     return found
 
 

@@ -35,6 +35,18 @@ fn a_part_that_another_one_replaces_refuses_nothing() {
     assert_eq!(refused(&config), [] as [&str; 0]);
 }
 
+/// `PreTrainedConfig.validate_rope` of transformers 5.23.0: a class without a rope does not fill in the length.
+#[test]
+fn a_rope_of_a_class_without_one_needs_its_length() {
+    let with = |class: &str, model_type: &str, rope: Value| json!({ "architectures": [class], "model_type": model_type, "transformers_version": "5.23.0", "rope_scaling": rope });
+    let yarn = json!({ "rope_type": "yarn", "factor": 4.0 });
+    let whole = json!({ "rope_type": "yarn", "factor": 4.0, "original_max_position_embeddings": 32 });
+    assert_eq!(refused(&with("GPT2LMHeadModel", "gpt2", yarn.clone())), ["/rope_scaling"]);
+    assert_eq!(refused(&with("GPT2LMHeadModel", "gpt2", json!({ "rope_type": "yarn" }))), ["/rope_scaling"]);
+    assert_eq!(refused(&with("GPT2LMHeadModel", "gpt2", whole)), [] as [&str; 0]);
+    assert_eq!(refused(&with("LlamaForCausalLM", "llama", yarn)), [] as [&str; 0]);
+}
+
 /// 4.47 writes of a part what differs from its defaults; the activation is looked up all the same.
 #[test]
 fn the_activation_of_a_part_is_looked_up_in_every_version() {
