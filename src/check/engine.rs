@@ -117,7 +117,7 @@ impl LoaderView<'_> {
     /// debug builds verify in every run.
     fn differences(&self, other: &Self) -> Vec<&'static str> {
         // They follow from the versions and their loads.
-        let always = ["stays_random", "complete", "loaders", "named", "configs"];
+        let always = ["stays_random", "complete", "loaders", "named"];
         let (one, two) = (&self.outcome, &other.outcome);
         let same_class = one.architecture == two.architecture;
         let same_tokenizer = match (&self.opened, &other.opened) {
@@ -129,7 +129,9 @@ impl LoaderView<'_> {
             if same_class && one.config == two.config { &[] } else { &["model", "text", "program"] };
         let by_processor: &[&str] =
             if same_class && same_tokenizer { &[] } else { &["tokens", "missing_attributes", "placeholders"] };
-        let found = [&always[..], by_class, by_config, by_processor].concat();
+        let same_parts = self.scope.get("configs") == other.scope.get("configs");
+        let by_parts: &[&str] = if same_parts { &[] } else { &["configs"] };
+        let found = [&always[..], by_class, by_config, by_processor, by_parts].concat();
         debug_assert_eq!(declared::difference(&self.scope, &other.scope, &found), None);
         found
     }
