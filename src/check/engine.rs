@@ -314,7 +314,7 @@ impl<'a> CheckFacts<'a> {
         for target in targets {
             for version in &target.versions {
                 let load = alone(target, version);
-                // One that nobody named is said where it differs from the one before it.
+                // A version that need not load is told where the loader does not do the same for another one.
                 let is_told =
                     |load: &PredictedLoad| load.leads || loads.iter().all(|other| !says_the_same(load, other));
                 loads.extend(load.filter(is_told));
@@ -364,9 +364,7 @@ fn says_the_same(one: &PredictedLoad, other: &PredictedLoad) -> bool {
 /// Whether a verdict is as bad as an effect that a finding states. Causes are searched under the leading loaders, and another
 /// loader may not have them.
 fn is_borne_out(effect: &FindingEffect, verdicts: &[PredictedLoad]) -> bool {
-    let mut loads = verdicts.iter().filter(|load| load.loader == effect.loader);
-    let Some(first) = loads.clone().next() else { return true };
-    let load = loads.find(|load| load.stands_for == effect.stands_for).unwrap_or(first);
+    let Some(load) = PredictedLoad::of(verdicts, &effect.loader, effect.stands_for.as_deref()) else { return true };
     let object = load.objects.iter().find(|object| object.object == effect.object);
     object.is_some_and(|object| object.verdict >= effect.outcome.into())
 }
@@ -375,7 +373,8 @@ fn is_borne_out(effect: &FindingEffect, verdicts: &[PredictedLoad]) -> bool {
 /// load with: one that transformers 5 wrote is not rewritten for 4.57.
 fn defer_fix(finding: &mut Finding, verdicts: &[PredictedLoad]) {
     let is_other = |effect: &FindingEffect| {
-        verdicts.iter().any(|load| load.loader == effect.loader && !load.leads && !is_program(&load.loader))
+        let load = PredictedLoad::of(verdicts, &effect.loader, effect.stands_for.as_deref());
+        load.is_some_and(|load| !load.leads && !is_program(&load.loader))
     };
     let Some(first) = finding.effects.first().filter(|_| finding.effects.iter().all(is_other)) else { return };
     if finding.severity < Severity::Error {

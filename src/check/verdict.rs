@@ -114,6 +114,13 @@ impl PredictedLoad {
     pub fn version(&self) -> String {
         version(&self.loader, self.stands_for.as_deref())
     }
+
+    /// The load of a version among others: its own, or else that of another version that the loader stands for, which does the
+    /// same.
+    pub(crate) fn of<'l>(loads: &'l [Self], loader: &str, stands_for: Option<&str>) -> Option<&'l Self> {
+        let own = |load: &&Self| load.loader == loader && load.stands_for.as_deref() == stands_for;
+        loads.iter().find(own).or_else(|| loads.iter().find(|load| load.loader == loader))
+    }
 }
 
 /// What verdicts are made from.

@@ -4,11 +4,12 @@
     restored.py FOLDER... [--classes N] [--only REGEX] [--seed S] [--list]
 
 Each FOLDER has one version of transformers, for the Python that runs this. Small models of the classes of wrapped.py are saved by
-their real class, whole and in shards, with a tokenizer, an image processor and a generation config. `cargo test` makes every case
-of such a rule out of each of them. `check --for V --fix --unsafe-fixes` repairs those of N drawn classes in which the rule offers
-edits, and the loader of that version opens what comes out. A checkpoint that the program calls good (exit 0, and the model loads)
-has the logits, tensors and ids of the original, and its tokenizer writes the same ids, but for what the damage changed and no fix
-touched; that is counted as unseen. What is called fixed is not found again.
+their real class, whole and in shards, with a generation config. A tokenizer and an image processor of our own stand beside those
+in which the program finds no fault with them; composed models have neither. `cargo test` makes every case of such a rule out of
+each model. `check --for V --fix --unsafe-fixes` repairs those of N drawn classes in which the rule offers edits, and the loader of
+that version opens what comes out. A checkpoint that the program calls good (exit 0, and the model loads) has the logits, tensors
+and ids of the original, and its tokenizer writes the same ids. What the damage changed and no fix touched is counted as unseen.
+What is called fixed is not found again.
 """
 
 import argparse
@@ -48,7 +49,6 @@ TEST = "fix::elsewhere::a_fix_ends_its_finding_in_any_checkpoint"
 
 
 # The undamaged models.
-
 
 SPECIAL = ["<pad>", "<s>", "</s>", "<unk>"]
 # The tokens at the ids 90 to 93 of the composed models.
@@ -166,7 +166,7 @@ def told_of(folder, version, cls, sound):
         return {**told, "result": "refused", "wrong": []}
     model, why = opened(cls, folder)
     if not model:
-        return {**told, "result": "WRONG", "wrong": [why]}
+        return {**told, "result": "raises", "wrong": [why]}
     unlike = differences(cls, folder, model, sound)
     # What the damage changed, and no fix after it, is not the work of a fix.
     by_fix = sorted(unlike - differences(cls, before, opened(cls, before)[0], sound)) if unlike else []
@@ -267,7 +267,8 @@ def main():
                 said = f"{one['result']}, fixed {one['fixed']}, left {one['left']}, {one['wrong']}"
                 if a.list:
                     print(f"{what}: {said}", flush=True)
-                tally.expect(one["result"] != "WRONG" or one["case"] in STATED, what, said)
+                is_stated = one["result"] == "WRONG" and one["case"] in STATED
+                tally.expect(is_stated or one["result"] not in ("WRONG", "raises"), what, said)
                 tally.expect(not one["again"], what, f"called fixed and found again: {one['again']}")
     print(f"{sum(counts.values())} directories of {len(reached)} rules: {dict(sorted(counts.items()))}")
     tally.expect(counts["equal"], "no damaged model was repaired")

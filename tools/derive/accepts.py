@@ -66,6 +66,8 @@ KINDS = {
     "object": [{}, {"x": 1}],
 }
 FIRST = ("null", "text", "negative", "zero", "object")
+# The key of rope parameters that a config class without a rope of its own does not fill in.
+LENGTH = "original_max_position_embeddings"
 # Entries of no class: what every class refuses, what the config of every part does, and what every class does that can generate.
 EVERY, OF_PARTS, GENERATES = "*", "*parts", "*generates"
 # What a key of generation is tried beside.
@@ -297,9 +299,6 @@ def integers(small):
     said = small.outcome(small.config)
     weights.write_bytes(stored)
     return said and said.split(":", 1)[0]
-
-
-LENGTH = "original_max_position_embeddings"  # that a config class without a rope of its own does not fill in
 
 
 def special(small):

@@ -63,9 +63,7 @@ fn tensors(n: usize) -> String {
 /// loader that raised before it, or one whose class is unknown and of which a rule alone said that it loads wrong.
 fn worse_verdict(before: &Outcome, after: &Outcome) -> Option<String> {
     after.verdicts.iter().find_map(|load| {
-        let mut all = before.verdicts.iter().filter(|was| was.loader == load.loader);
-        let first = all.clone().next()?;
-        let was = all.find(|was| was.stands_for == load.stands_for).unwrap_or(first);
+        let was = PredictedLoad::of(&before.verdicts, &load.loader, load.stands_for.as_deref())?;
         let was_compared = before.loads.iter().any(|report| report.loader == load.loader);
         load.objects.iter().find_map(|object| {
             let old = was.objects.iter().find(|old| old.object == object.object);
