@@ -12,7 +12,7 @@ use super::bounded::bounded;
 use super::evaluate::{Context, has_faults, pinpoint, run_rules};
 use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
-use super::model_type::class_of;
+use super::model_type::{class_of, has_code};
 use super::observe::{explain, observe_files, observe_versions};
 use super::options::RunOptions;
 use super::outcome::Outcome;
@@ -124,7 +124,7 @@ impl LoaderView<'_> {
             (Some(one), Some(two)) => Rc::ptr_eq(one, two),
             (one, two) => one.is_none() && two.is_none(),
         };
-        let by_class: &[&str] = if same_class { &[] } else { &["arch", "groups_heads", "opened"] };
+        let by_class: &[&str] = if same_class { &[] } else { &["arch", "groups_heads", "opened", "tried"] };
         let by_config: &[&str] =
             if same_class && one.config == two.config { &[] } else { &["model", "text", "program"] };
         let by_processor: &[&str] =
@@ -404,6 +404,12 @@ fn bind_run(
     scope.bind("named", &(!versions.is_empty()).into());
     let groups_heads = |name: &str| knowledge.library.speaks_of(name, "c.num_key_value_heads");
     scope.bind("groups_heads", &architecture.is_none_or(groups_heads).into());
+    let is_tried = |config, target| {
+        let class = class_of(knowledge, config, target).filter(|_| !has_code(config));
+        class.is_some_and(|class| knowledge.refusals.is_tried(class))
+    };
+    let tried = config.is_some_and(|config| targets.iter().any(|target| is_tried(config, target)));
+    scope.bind("tried", &tried.into());
     let class = |config, target: &Target| knowledge.library.class(class_of(knowledge, config, target)?, target.loader);
     let classes = |config| targets.iter().filter_map(move |target| class(config, target)).collect::<Vec<_>>();
     let parts: BTreeSet<String> = match config.map(|config| (config, classes(config))) {

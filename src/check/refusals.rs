@@ -11,6 +11,7 @@ use super::sub_configs;
 use super::view::{Asked, ExplainingFacts, Observation, VersionsView};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
 use crate::knowledge::Knowledge;
+use crate::knowledge::lists::listed;
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::quantization::{DeclaredScheme, block, declared_scheme};
@@ -313,7 +314,10 @@ fn unknown_rope(
     let of_part = config.pointer(&format!("{}/model_type", parent(pointer)));
     let model_type = of_part.or_else(|| config.get("model_type")).and_then(Value::as_str);
     let is_sectioned = rope.get("type").is_some_and(|name| name == "mrope")
-        && model_type.is_some_and(|model_type| knowledge.rope_forms.has_sections(model_type));
+        && model_type.is_some_and(|model_type| {
+            let types = listed("mrope-model-types").and_then(Value::as_array);
+            types.is_some_and(|types| types.iter().any(|name| name == model_type))
+        });
     (!is_sectioned && knowledge.names.lacks(version, NameKind::RopeType, name)).then(|| Rejection {
         pointer: format!("{pointer}/{key}"),
         value: name.into(),

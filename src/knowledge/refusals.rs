@@ -273,6 +273,12 @@ impl Refusals {
         self.entry(version, class).or_else(between)
     }
 
+    /// Whether the class was built with values of every kind under some version, so that what it refuses is in its entry.
+    #[must_use]
+    pub fn is_tried(&self, class: &str) -> bool {
+        self.versions.keys().any(|version| self.line(version, class).is_some())
+    }
+
     fn entry(&self, version: &str, class: &str) -> Option<ClassRefusals> {
         let mut entry = self.line(version, class)?;
         if let Some(Values::Of(other)) = &entry.values {

@@ -36,14 +36,11 @@ impl RopeKeys {
     }
 }
 
-/// `rules/rope-forms.json5`: the classes that accept one form of `rope_scaling` alone, or one that others refuse.
+/// `rules/rope-forms.json5`: the classes that accept one form of `rope_scaling` alone.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RopeForms {
     forms: Vec<RopeForm>,
-    /// `model_type` of configs that read the type `mrope` as `default`. Source: `Qwen2VLConfig` of transformers 4.47.0, and
-    /// `Qwen2VLTextConfig` and `Qwen2_5_VLTextConfig` of 4.57.6 and 5.23.0.
-    sections: Vec<String>,
 }
 
 /// The form of `rope_scaling` that some config classes accept.
@@ -74,12 +71,6 @@ impl RopeForms {
     pub fn embedded() -> Result<Self, DataError> {
         let file = "rope-forms.json5";
         source::parse_embedded(&format!("rules/{file}"), source::text(file).unwrap_or_default())
-    }
-
-    /// Whether the config class reads the type `mrope` as `default`.
-    #[must_use]
-    pub fn has_sections(&self, model_type: &str) -> bool {
-        self.sections.iter().any(|name| name == model_type)
     }
 
     /// The form of a config class; `None` when it accepts every form.

@@ -12,6 +12,7 @@ there with another number, saved with weights, and loaded; what `check` foresees
 """
 
 import argparse
+import copy
 import hashlib
 import json
 import os
@@ -122,6 +123,8 @@ def shrunk(config, scale):
             "rope_parameters",
         ):
             out[key] = shrunk(value, scale)
+        elif isinstance(value, dict):
+            out[key] = copy.deepcopy(value)
         elif whole and LAYERS.match(key) and value > 2:
             out[key] = 2
         elif whole and VOCAB.match(key) and value > 512:
@@ -148,7 +151,54 @@ def shrunk(config, scale):
             out[key] = min(value, 3) if whole else None if value is None else value
         else:
             out[key] = value
+    fit_sections(out)
     return out
+
+
+def fit_sections(config):
+    """Gives mrope_section the sum that the head of a config made small has."""
+    rope = next((config[key] for key in ("rope_scaling", "rope_parameters") if isinstance(config.get(key), dict)), {})
+    width, heads = config.get("hidden_size"), config.get("num_attention_heads")
+    if "mrope_section" in rope and width and heads:
+        half = (config.get("head_dim") or width // heads) // 2
+        rope["mrope_section"] = [half // 4, (half - half // 4) // 2, half - half // 4 - (half - half // 4) // 2]
+
+
+def load_small(cls, name, config, folder):
+    """Saves the model of a config that is made small below `folder`, and loads it: the lists of the loader, or why it has none."""
+    import torch
+
+    told = {}
+    for scale in (16, 8, 4, 2, 1):
+        small = shrunk(config, scale)
+        small.pop("quantization_config", None)
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+            with torch.device("meta"):
+                parameters = sum(p.numel() for p in cls(read(cls, small)).parameters())
+            if parameters > PARAMETERS:
+                continue
+            model = cls(read(cls, small))
+            model.save_pretrained(folder, safe_serialization=True)
+            del model
+            # A config without a class stands for the one that `AutoModel` gives.
+            (folder / "config.json").write_text(json.dumps({**small, "architectures": [name]}))
+            _, info = cls.from_pretrained(folder, output_loading_info=True, ignore_mismatched_sizes=True)
+            # 4.57 reports names without shapes.
+            mismatched = [
+                [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])]
+                for m in info.get("mismatched_keys", [])
+            ]
+            return {
+                "load": {
+                    "missing": sorted(info["missing_keys"]),
+                    "unexpected": sorted(info["unexpected_keys"]),
+                    "mismatched": mismatched,
+                }
+            }
+        except Exception as e:  # it may only be that it was made too small
+            told["error"] = f"{type(e).__name__}: {e}"[:200]
+    return told
 
 
 def load(rows, out, work):
@@ -158,41 +208,9 @@ def load(rows, out, work):
     torch.set_num_threads(1)
     with open(out, "w") as file:
         for row in rows:
-            told = {"number": row["number"]}
             folder = Path(work) / f"{row['number']}"
-            cls, name = class_of(row["config"])
-            for scale in (16, 8, 4, 2, 1):
-                small = shrunk(row["config"], scale)
-                small.pop("quantization_config", None)
-                try:
-                    shutil.rmtree(folder, ignore_errors=True)
-                    with torch.device("meta"):
-                        parameters = sum(p.numel() for p in cls(read(cls, small)).parameters())
-                    if parameters > PARAMETERS:
-                        continue
-                    model = cls(read(cls, small))
-                    model.save_pretrained(folder, safe_serialization=True)
-                    del model
-                    # A config without a class stands for the one that `AutoModel` gives.
-                    (folder / "config.json").write_text(json.dumps({**small, "architectures": [name]}))
-                    _, info = cls.from_pretrained(folder, output_loading_info=True, ignore_mismatched_sizes=True)
-                    # 4.57 reports names without shapes.
-                    mismatched = [
-                        [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])]
-                        for m in info.get("mismatched_keys", [])
-                    ]
-                    told.update(
-                        folder=str(folder),
-                        load={
-                            "missing": sorted(info["missing_keys"]),
-                            "unexpected": sorted(info["unexpected_keys"]),
-                            "mismatched": mismatched,
-                        },
-                    )
-                    break
-                except Exception as e:  # it may only be that it was made too small
-                    told["error"] = f"{type(e).__name__}: {e}"[:200]
-            file.write(json.dumps(told) + "\n")
+            told = load_small(*class_of(row["config"]), row["config"], folder)
+            file.write(json.dumps({"number": row["number"], "folder": str(folder), **told}) + "\n")
             file.flush()
 
 

@@ -1,24 +1,30 @@
 #!/usr/bin/env python3
 """Sound checkpoints of unusual shapes: really saved, really opened, and no error of `check`.
 
-    sound.py FOLDER... [--only REGEX] [--list]
+    sound.py FOLDER... [--drawn N] [--seed S] [--configs FILE] [--only REGEX] [--list]
 
 Each FOLDER has one version of transformers, for the Python that runs this. Each shape is saved by the real class in every
 version that has it, and opened again by that class: nothing is missing, unexpected or of another shape. `check --for` that version
 must say `loads` or `not predicted`, with no error. After `check --fix --unsafe-fixes` on a copy the real class opens it as before.
 Shapes that must be predicted, because the description covers them, say so.
+
+`--drawn` adds N configs in each version on both sides of what the constructors of drawn classes compare values with (as
+`families.py --branches` draws them), and `--configs` those of FILE (as in hub_configs.py), made small.
 """
 
 import argparse
 import json
 import os
+import random
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-from peer import Tally, doctor, errors, workplace
+from peer import ROOT, Tally, doctor, errors, workplace
+
+sys.path.insert(0, str(ROOT / "tools"))
 
 # Cases.
 
@@ -174,6 +180,111 @@ def rows():
 
 # Under one version.
 
+PARAMETERS = 12_000_000  # of a model that is saved
+PER_CLASS = 6  # configs drawn for it
+
+
+def save_all(out, cases):
+    """Saves each (name, class, config) that the class can be built from and that is small; prints a line for each, loaded.
+
+    A model is sound where its class opens what it saved, and runs on the class's dummy inputs if it can.
+    """
+    import torch
+    import transformers
+    from derive import build as made
+    from differential import forward
+    from hub_configs import read
+    from transformers.models.auto.configuration_auto import CONFIG_MAPPING
+
+    made.without_initialisation()
+    torch.set_num_threads(1)
+    for name, cls, config in cases:
+        model_class = getattr(transformers, cls)
+        if config.get("model_type") not in CONFIG_MAPPING:
+            continue
+        config = with_small_ids(config, smallest(config, "vocab_size"))
+        folder = str(out / re.sub(r"\W", "-", name))
+        told = {"name": name, "class": cls, "predicted": False, "folder": folder}
+        try:
+            with torch.device("meta"):
+                count = sum(p.numel() for p in model_class(read(model_class, config)).parameters())
+            if count > PARAMETERS:
+                continue
+            model = model_class(read(model_class, config))
+            for tensor in (*model.parameters(), *model.buffers()):
+                if tensor.is_floating_point():
+                    torch.nan_to_num_(tensor.data, 0.0, 0.0, 0.0).clamp_(-1, 1)
+            if model.main_input_name == "input_ids" and (why := forward(model)):
+                print(json.dumps({**told, "absent": f"forward raises {why}"}), flush=True)
+                continue
+            model.save_pretrained(folder)
+            loaded = load(model_class, folder)
+            told["absent" if isinstance(loaded, str) else "load"] = loaded
+        except Exception as error:  # a config that this version does not build
+            told["absent"] = f"{type(error).__name__}: {error}"[:200]
+        print(json.dumps(told), flush=True)
+
+
+def smallest(config, name):
+    """The smallest value of a key in a config and its parts."""
+    parts = [smallest(value, name) for value in config.values() if isinstance(value, dict)]
+    own = [config[name]] if isinstance(config.get(name), int) else []
+    return min([*own, *(part for part in parts if part)], default=None)
+
+
+def with_small_ids(config, rows):
+    """A config whose ids of tokens stand for one of so many rows each."""
+    if not rows:
+        return config
+    whole = {key for key, value in config.items() if isinstance(value, int) and key.endswith(("token_id", "token_index"))}
+    ids = {key: min(config[key], rows - 1 - at) for at, key in enumerate(sorted(whole))}
+    parts = {key: with_small_ids(value, rows) for key, value in config.items() if isinstance(value, dict)}
+    return {**config, **parts, **ids}
+
+
+def draw_shapes(out, count, seed, version):
+    """Saves configs on both sides of comparisons in the source, of classes in a drawn order, until there are `count`."""
+    import torch  # noqa: F401
+    from derive import branches, catalogue, trace
+    from derive.build import without_initialisation
+    from derive.table import provenance
+
+    without_initialisation()
+    trace.install()
+    names = sorted(provenance()[0][version])
+    rng, left = random.Random(f"{seed} {version}"), int(count)
+    for name in rng.sample(names, len(names)):
+        if left <= 0:
+            break
+        try:
+            drawn = [row for row in branches.drawn(catalogue.find_class(name), int(seed))[0] if "error" not in row]
+        except Exception:  # whatever a model raises
+            continue
+        some = rng.sample(drawn, min(PER_CLASS, len(drawn), left))
+        left -= len(some)
+        save_all(out, ((f"{name} {number} {row.get('place')}", name, row["config"]) for number, row in enumerate(some)))
+
+
+def fetched_shapes(out, file):
+    """Saves the configs of a file, made as small as their class allows."""
+    from hub_configs import class_of, load_small
+
+    rows = [{**json.loads(line), "number": number} for number, line in enumerate(Path(file).read_text().splitlines())]
+    for row in rows:
+        try:
+            cls, name = class_of(row["config"])
+        except Exception:  # a model type that this version does not have
+            continue
+        # A class under another model type is not the one that `AutoModel` gives.
+        if cls is None or cls.config_class.model_type != row["config"].get("model_type"):
+            continue
+        told = {"name": f"{row['id']} {name}", "class": name, "predicted": False, "folder": str(out / str(row["number"]))}
+        loaded = load_small(cls, name, row["config"], Path(told["folder"]))
+        lengths = [len(each) for each in loaded["load"].values()] if "load" in loaded else None
+        print(
+            json.dumps({**told, **({"load": lengths} if lengths else {"absent": loaded.get("error", "too large")})}), flush=True
+        )
+
 
 def build(out, only):
     """Saves each shape and opens it again; prints a line for each."""
@@ -224,7 +335,7 @@ def reopen(folders):
 
     transformers.utils.logging.set_verbosity(50)
     transformers.utils.logging.disable_progress_bar()
-    for line in Path(folders).read_text().splitlines():
+    for line in folders.read_text().splitlines():
         row = json.loads(line)
         print(json.dumps({**row, "load": load(getattr(transformers, row["class"]), row["folder"])}), flush=True)
 
@@ -272,9 +383,13 @@ def judge(tally, row, version, verdicts):
 def main():
     if sys.argv[1:2] == ["--worker"]:
         mode, where, *only = sys.argv[2:]
-        return build(Path(where), only[0]) if mode == "build" else reopen(where)
+        works = {"build": build, "drawn": draw_shapes, "fetched": fetched_shapes, "reopen": reopen}
+        return works[mode](Path(where), *only)
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("folders", nargs="*")
+    p.add_argument("--drawn", type=int, help="add so many configs on both sides of comparisons in the source")
+    p.add_argument("--seed", type=int, default=1)
+    p.add_argument("--configs", type=Path, help="add the configs of this file")
     p.add_argument("--only", default="", help="regular expression on names of shapes")
     p.add_argument("--list", action="store_true", help="print every verdict")
     args = p.parse_args()
@@ -284,6 +399,10 @@ def main():
             version = version_of(folder)
             out = place / version
             built = under(folder, "build", out, args.only)
+            if args.drawn:
+                built += under(folder, "drawn", out / "drawn", args.drawn, args.seed, version)
+            if args.configs:
+                built += under(folder, "fetched", out / "fetched", args.configs)
             sound = [row for row in built if row.get("load") == [0, 0, 0]]
             absent += sum("absent" in row for row in built)
             for row in built:

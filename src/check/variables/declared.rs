@@ -105,6 +105,7 @@ pub const VARIABLES: &[Variable] = &[
         OrNull(&TOKENS),
         "ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and `scattered`",
     ),
+    variable("tried", Flag, "whether what the class refuses is known, because it was built with values of every kind"),
 ];
 
 /// A function of every rule.

@@ -244,7 +244,15 @@ impl<'l> Builder<'l> {
         let Some(((index, count), inner)) = repeats.split_first() else {
             return self.member(name, member, member.when.as_ref(), around, scope, place);
         };
+        // A condition on anything but the index is that of the whole repetition, and decides whether the count is read.
+        let whole = member
+            .when
+            .as_ref()
+            .filter(|when| inner.is_empty() && !when.variables().iter().any(|variable| variable == index));
         if let Some(negative) = count.eval(scope)?.as_i64().filter(|n| *n < 0) {
+            if !holds(whole, scope)? {
+                return Ok(());
+            }
             let words = around.origin.words(count, &negative.into());
             return Err(Refusal::impossible(format!("{words}: no layer is built")));
         }
@@ -254,9 +262,7 @@ impl<'l> Builder<'l> {
             return Err(self.too_many(format!("{words}, more than {} tensors", self.cap)));
         }
         // Of the experts of a layer one condition decides, which costs more than the tensors of one.
-        let shared = member.when.as_ref().filter(|when| {
-            inner.is_empty() && count_of > 1 && !when.variables().iter().any(|variable| variable == index)
-        });
+        let shared = whole.filter(|_| count_of > 1);
         if !holds(shared, scope)? {
             return Ok(());
         }

@@ -410,6 +410,29 @@ fn computed_keys_say_when_they_are() {
     assert_reshaped(json!({ "words": ["x"] }), [8, 4], &["c"]);
 }
 
+/// Source: `Qwen2MoeDecoderLayer` of transformers 4.47.0 and 4.57.6, which has experts where `num_experts > 0`.
+#[test]
+fn a_count_of_what_the_class_leaves_out_may_be_negative() {
+    let none = |count: i64| shapes(&expect(&json!({ "model_type": "qwen2_moe", "num_experts": count }), &Map::new()));
+    assert_same(&none(-1), &none(0), "-1 experts");
+    assert!(none(-1).contains_key("model.layers.0.mlp.gate_proj.weight"));
+}
+
+/// Source: `XmodOutput` of transformers 4.47.0 and 5.23.0.
+#[test]
+fn a_list_of_the_config_names_modules() {
+    let languages = |list: Value| {
+        let expected = expect(&json!({ "model_type": "xmod", "languages": list }), &Map::new());
+        let names =
+            expected.tensors.keys().filter(|name| name.contains(".layer.3.") && name.contains("adapter_modules."));
+        names
+            .map(|name| name.rsplit('.').nth(2).expect("a language").to_owned())
+            .collect::<std::collections::BTreeSet<_>>()
+    };
+    assert_eq!(languages(json!(["en_XX", "de_DE"])), ["de_DE", "en_XX"].map(str::to_owned).into());
+    assert_eq!(languages(json!([])), std::collections::BTreeSet::new());
+}
+
 #[test]
 fn a_part_of_a_larger_model_reads_its_own_config() {
     let inner = json!({ "width": 20, "words": [], "adapter": false });
