@@ -32,7 +32,7 @@ from fresh import version_in
 from hub_configs import class_of, read, shrunk
 from mutations import differences, predicted_report
 from peer import INDEX, ROOT, Tally, check, read_shard, workplace, write_shard
-from recorded import as_detailed
+from recorded import as_detailed, as_lists
 from verdicts import is_equal
 
 CONFIGS = ROOT / "tests" / "data" / "hub-configs" / "configs.jsonl"
@@ -164,18 +164,6 @@ def lists_of(folder, auto, error):
         return as_lists(auto.from_pretrained(folder, output_loading_info=True, ignore_mismatched_sizes=True)[1])
     except Exception:
         return None
-
-
-def as_lists(info):
-    # 4.57 reports names without shapes.
-    mismatched = [
-        [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])] for m in info.get("mismatched_keys", [])
-    ]
-    return {
-        "missing": sorted(info["missing_keys"]),
-        "unexpected": sorted(info["unexpected_keys"]),
-        "mismatched": sorted(mismatched),
-    }
 
 
 # Mutations. Each changes the files of a folder, and returns what it did.

@@ -12,7 +12,6 @@ there with another number, saved with weights, and loaded; what `check` foresees
 """
 
 import argparse
-import copy
 import hashlib
 import json
 import os
@@ -28,7 +27,7 @@ from families import keep
 from fresh import version_in
 from mutations import differences, predicted_report
 from peer import ROOT, Tally, check, workplace
-from recorded import as_detailed
+from recorded import as_detailed, as_lists
 
 sys.path.insert(0, str(ROOT / "tools"))
 
@@ -123,8 +122,6 @@ def shrunk(config, scale):
             "rope_parameters",
         ):
             out[key] = shrunk(value, scale)
-        elif isinstance(value, dict):
-            out[key] = copy.deepcopy(value)
         elif whole and LAYERS.match(key) and value > 2:
             out[key] = 2
         elif whole and VOCAB.match(key) and value > 512:
@@ -151,32 +148,38 @@ def shrunk(config, scale):
             out[key] = min(value, 3) if whole else None if value is None else value
         else:
             out[key] = value
-    fit_sections(out)
-    return out
+    return with_sections(out)
 
 
-def fit_sections(config):
-    """Gives mrope_section the sum that the head of a config made small has."""
-    rope = next((config[key] for key in ("rope_scaling", "rope_parameters") if isinstance(config.get(key), dict)), {})
+def with_sections(config):
+    """A config made small, with the sum of mrope_section that its head has."""
     width, heads = config.get("hidden_size"), config.get("num_attention_heads")
-    if "mrope_section" in rope and width and heads:
-        half = (config.get("head_dim") or width // heads) // 2
-        rope["mrope_section"] = [half // 4, (half - half // 4) // 2, half - half // 4 - (half - half // 4) // 2]
+    for key in ("rope_scaling", "rope_parameters"):
+        rope = config.get(key)
+        if isinstance(rope, dict) and "mrope_section" in rope and width and heads:
+            half = (config.get("head_dim") or width // heads) // 2
+            sections = [half // 4, half * 3 // 8]
+            config = {**config, key: {**rope, "mrope_section": [*sections, half - sum(sections)]}}
+    return config
+
+
+def parameters(cls, config):
+    """How many parameters the class has with a config."""
+    import torch
+
+    with torch.device("meta"):
+        return sum(p.numel() for p in cls(read(cls, config)).parameters())
 
 
 def load_small(cls, name, config, folder):
     """Saves the model of a config that is made small below `folder`, and loads it: the lists of the loader, or why it has none."""
-    import torch
-
     told = {}
     for scale in (16, 8, 4, 2, 1):
         small = shrunk(config, scale)
         small.pop("quantization_config", None)
         try:
             shutil.rmtree(folder, ignore_errors=True)
-            with torch.device("meta"):
-                parameters = sum(p.numel() for p in cls(read(cls, small)).parameters())
-            if parameters > PARAMETERS:
+            if parameters(cls, small) > PARAMETERS:
                 continue
             model = cls(read(cls, small))
             model.save_pretrained(folder, safe_serialization=True)
@@ -184,18 +187,7 @@ def load_small(cls, name, config, folder):
             # A config without a class stands for the one that `AutoModel` gives.
             (folder / "config.json").write_text(json.dumps({**small, "architectures": [name]}))
             _, info = cls.from_pretrained(folder, output_loading_info=True, ignore_mismatched_sizes=True)
-            # 4.57 reports names without shapes.
-            mismatched = [
-                [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])]
-                for m in info.get("mismatched_keys", [])
-            ]
-            return {
-                "load": {
-                    "missing": sorted(info["missing_keys"]),
-                    "unexpected": sorted(info["unexpected_keys"]),
-                    "mismatched": mismatched,
-                }
-            }
+            return {"load": as_lists(info)}
         except Exception as e:  # it may only be that it was made too small
             told["error"] = f"{type(e).__name__}: {e}"[:200]
     return told

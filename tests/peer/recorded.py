@@ -64,6 +64,19 @@ def loads(what, record):
             yield f"{what} {mutation['kind']}", record, changed(record["saved"], mutation), mutation["load"]
 
 
+def as_lists(info):
+    """The lists of the loading info of a `from_pretrained`."""
+    # 4.57 reports names without shapes.
+    mismatched = [
+        [m, None, None] if isinstance(m, str) else [m[0], list(m[1]), list(m[2])] for m in info.get("mismatched_keys", [])
+    ]
+    return {
+        "missing": sorted(info["missing_keys"]),
+        "unexpected": sorted(info["unexpected_keys"]),
+        "mismatched": sorted(mismatched),
+    }
+
+
 def as_detailed(got, want):
     """A prediction without the shapes of mismatched tensors, if the loader's report has none, as that of 4.57."""
     if any(shape is None for _, shape, _ in want["mismatched"]):

@@ -244,15 +244,14 @@ impl<'l> Builder<'l> {
         let Some(((index, count), inner)) = repeats.split_first() else {
             return self.member(name, member, member.when.as_ref(), around, scope, place);
         };
-        // A condition on anything but the index is that of the whole repetition, and decides whether the count is read.
-        let whole = member
-            .when
-            .as_ref()
-            .filter(|when| inner.is_empty() && !when.variables().iter().any(|variable| variable == index));
+        // A condition on anything but the index is that of the whole repetition: where it does not hold, the count is not read,
+        // and for the experts of a layer it is evaluated once.
+        let is_whole = |when: &&Expression| !when.variables().iter().any(|variable| variable == index);
+        let whole = member.when.as_ref().filter(|_| inner.is_empty()).filter(is_whole);
+        if !holds(whole, scope)? {
+            return Ok(());
+        }
         if let Some(negative) = count.eval(scope)?.as_i64().filter(|n| *n < 0) {
-            if !holds(whole, scope)? {
-                return Ok(());
-            }
             let words = around.origin.words(count, &negative.into());
             return Err(Refusal::impossible(format!("{words}: no layer is built")));
         }
@@ -261,15 +260,10 @@ impl<'l> Builder<'l> {
             let words = around.origin.words(count, &count_of.into());
             return Err(self.too_many(format!("{words}, more than {} tensors", self.cap)));
         }
-        // Of the experts of a layer one condition decides, which costs more than the tensors of one.
-        let shared = whole.filter(|_| count_of > 1);
-        if !holds(shared, scope)? {
-            return Ok(());
-        }
         for i in 0..count_of {
             let mut scope = scope.child();
             scope.bind_int(index, i);
-            if shared.is_some() {
+            if whole.is_some() {
                 self.member(name, member, None, around, &scope, place)?;
             } else {
                 self.repeat(name, member, inner, around, &scope, place)?;

@@ -35,6 +35,9 @@ pub(super) struct Grounds {
 /// Largest number of elements of a tensor, and of all tensors.
 pub(super) const ELEMENTS: [u64; 2] = [1 << 20, 1 << 22];
 
+/// Bytes of a document that is changed.
+const LARGEST: u64 = 1 << 26;
+
 /// Keys with a number of layers or of experts.
 const COUNTS: [&str; 7] = ["layers", "n_layer", "depth", "blocks", "experts", "num_stages", "n_head_kv"];
 
@@ -203,9 +206,16 @@ fn retyped(value: &Value, draw: &mut Draw) -> Value {
     draw.one(&all.each_ref()).clone()
 }
 
+/// A document of a checkpoint, as bytes. A case may have one without an end, such as a link to a device.
+fn document(dir: &Path, name: &str) -> Option<Vec<u8>> {
+    let path = dir.join(name);
+    let is_small = fs::metadata(&path).is_ok_and(|about| about.is_file() && about.len() <= LARGEST);
+    is_small.then(|| fs::read(path).ok()).flatten()
+}
+
 /// Changes a document at a drawn place.
 pub(super) fn change_document(dir: &Path, name: &str, draw: &mut Draw) -> Option<String> {
-    let mut document: Value = serde_json::from_slice(&fs::read(dir.join(name)).ok()?).ok()?;
+    let mut document: Value = serde_json::from_slice(&document(dir, name)?).ok()?;
     let all = pointers(&document, 2);
     if all.is_empty() {
         return None;
@@ -246,7 +256,7 @@ pub(super) fn change_document(dir: &Path, name: &str, draw: &mut Draw) -> Option
 /// Adds a key that another config has.
 pub(super) fn add_key(dir: &Path, grounds: &Grounds, draw: &mut Draw) -> Option<String> {
     let path = dir.join("config.json");
-    let mut config: Map<String, Value> = serde_json::from_slice(&fs::read(&path).ok()?).ok()?;
+    let mut config: Map<String, Value> = serde_json::from_slice(&document(dir, "config.json")?).ok()?;
     let (_, other) = &grounds.configs[draw.below(grounds.configs.len())];
     let keys: Vec<(&String, &Value)> =
         other.as_object()?.iter().filter(|(key, _)| !config.contains_key(*key)).collect();
