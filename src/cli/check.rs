@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
-use super::look::{CheckRun, Checked, Looked, Stop, judge_by};
+use super::look::{Answer, CheckRun, Looked, Preview, Stop};
 use super::paths::{self, Targets};
 use super::{baseline, fix, interpreter, output, pins, signals, skipped, workers};
 use crate::check::unused_suppressions;
@@ -34,8 +34,9 @@ pub fn run(mut args: CheckArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     if args.fix.diff {
         return run.show_diffs(&dirs, results.unchecked);
     }
-    for (dir, look) in dirs.iter().zip(run.look_at(&dirs)) {
-        results.add(dir, look)?;
+    for (dir, look) in dirs.iter().zip(run.ask(&dirs)) {
+        let looked = results.had(args, dir, look)?.map(|looked| (dir.clone(), looked));
+        results.looked.extend(looked);
     }
     note_unchecked(&results.unchecked);
     run.report(results)
@@ -48,15 +49,15 @@ struct Results {
 }
 
 impl Results {
-    /// Adds what became of a directory. Fails with what ends the run.
-    fn add(&mut self, dir: &Path, look: Result<Looked, Stop>) -> anyhow::Result<()> {
-        match look {
-            Ok(looked) => self.looked.push((dir.to_owned(), looked)),
+    /// The answer on a directory, or `None` where it has none and is noted instead. Fails with what ends the run.
+    fn had<T>(&mut self, args: &CheckArgs, dir: &Path, answer: Result<T, Stop>) -> anyhow::Result<Option<T>> {
+        match answer {
+            Ok(answer) => return Ok(Some(answer)),
             Err(Stop::Directory(reason)) => self.unchecked.push(UncheckedPath { path: shown(dir), reason }),
             Err(Stop::Run(reason)) => return Err(anyhow::Error::msg(reason)),
-            Err(Stop::Interrupted(error)) => return Err(error),
+            Err(Stop::Interrupted) => return Err(fix::interrupted(args.fix.output.as_deref().unwrap_or(dir))),
         }
-        Ok(())
+        Ok(None)
     }
 
     /// Adds a finding for each suppression that suppressed nothing.
@@ -83,14 +84,14 @@ impl Results {
 }
 
 impl CheckRun<'_> {
-    /// Checks the directories; the results in their order.
-    fn look_at<'d>(&'d self, dirs: &'d [PathBuf]) -> Box<dyn Iterator<Item = Result<Looked, Stop>> + 'd> {
+    /// Asks for each directory; the answers in their order.
+    fn ask<'d, T: Answer + 'd>(&'d self, dirs: &'d [PathBuf]) -> Box<dyn Iterator<Item = Result<T, Stop>> + 'd> {
         let threads = self.args.jobs.map_or_else(parallel::threads, |jobs| jobs.get().into());
         match dirs {
+            [_] | [] => Box::new(dirs.iter().map(|dir| T::of(self, dir))),
             // A repair that was interrupted stops the run before the next one begins.
-            [_] | [] => Box::new(dirs.iter().map(|dir| self.look(dir))),
-            _ if self.args.fix.writes() => Box::new(dirs.iter().map(|dir| self.look(dir))),
-            _ => Box::new(workers::look(self, dirs, if self.is_long() { 1 } else { threads }).into_iter()),
+            _ if self.args.fix.writes() => workers::ask_in_turn(self, dirs),
+            _ => Box::new(workers::ask(self, dirs, if self.is_long() { 1 } else { threads }).into_iter()),
         }
     }
 
@@ -102,17 +103,17 @@ impl CheckRun<'_> {
     /// Shows what the fixes would change.
     fn show_diffs(&self, dirs: &[PathBuf], unchecked: Vec<UncheckedPath>) -> anyhow::Result<u8> {
         let mut results = Results { looked: Vec::new(), unchecked };
-        let mut shown: Vec<Checked> = Vec::new();
-        for dir in dirs {
-            match self.check(dir) {
-                Ok(checked) => shown.push(checked),
-                Err(stop) => results.add(dir, Err(stop))?,
-            }
+        let mut previews: Vec<Preview> = Vec::new();
+        for (dir, preview) in dirs.iter().zip(self.ask(dirs)) {
+            previews.extend(results.had(self.args, dir, preview)?);
         }
         note_unchecked(&results.unchecked);
-        let fix = &self.args.fix;
-        let changes = shown.iter().map(|c| fix::show(fix, &c.dir, &c.checkpoint, &c.outcome, &judge_by(self.by)));
-        let changes = changes.sum::<anyhow::Result<usize>>()?;
+        let mut changes = 0_usize;
+        for Preview { diff, fixes, files } in previews {
+            output::print(&diff)?;
+            output::note(&fixes::would(fixes, files));
+            changes = changes.saturating_add(files);
+        }
         Ok(results.exit(changes > 0))
     }
 

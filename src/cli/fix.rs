@@ -6,6 +6,7 @@ use std::sync::Arc;
 use anyhow::bail;
 
 use super::args::FixArgs;
+use super::look::Preview;
 use super::output;
 use super::progress::Meter;
 use crate::check::Outcome;
@@ -13,7 +14,7 @@ use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, escape};
 use crate::report::model::{Fixed, Withdrawn};
-use crate::report::{diff, fixes};
+use crate::report::diff;
 use crate::surgery::repair::{Repair, plan};
 use crate::surgery::{ApplyError, Leftover, Recovered, Recovery, RepairError, RepairWritten, Trust, journal, overlay};
 
@@ -110,7 +111,7 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
     let meter = Meter::new("writing");
     let progress = |bytes: u64| meter.add("", bytes, total);
     if let Some(out) = &args.output {
-        let copy = overlay(repair, out, &progress).map_err(|error| name_interrupted(error, out))?;
+        let copy = overlay(repair, out, &progress)?;
         if let Some(cleared) = &copy.cleared {
             let cleared = output::safe(&cleared.display().to_string());
             output::note(&format!("{cleared}, which an ended run had left, was removed"));
@@ -118,8 +119,7 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         warn(copy.leftover.as_ref());
         return Ok(Some(out.clone()));
     }
-    let written = journal::write(repair, &StateFolder::of_user(), &progress);
-    let RepairWritten { leftover, unsigned } = written.map_err(|error| name_interrupted(error, dir))?;
+    let RepairWritten { leftover, unsigned } = journal::write(repair, &StateFolder::of_user(), &progress)?;
     warn(leftover.as_ref());
     if let Some(why) = unsigned {
         let text = format!("{}: only `undo --adopt-journal` undoes this repair: {why}", dir.display());
@@ -128,24 +128,19 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
     Ok(Some(dir.to_owned()))
 }
 
-/// Names the directory that was not written because of a signal: earlier ones may already be repaired.
-fn name_interrupted(error: RepairError, dir: &Path) -> anyhow::Error {
-    match error {
-        RepairError::Apply(ApplyError::Interrupted) => anyhow::Error::new(error).context(dir.display().to_string()),
-        other => other.into(),
-    }
-}
-
-/// Shows the changes that the fixes would make; returns the number of changed files.
-pub fn show(
+/// What the fixes would change.
+pub fn preview(
     args: &FixArgs,
     dir: &Path,
     checkpoint: &Arc<Checkpoint>,
-    outcome: &Outcome,
+    outcome: Outcome,
     judge: CheckFn<'_>,
-) -> anyhow::Result<usize> {
-    let repair = plan(checkpoint, outcome.clone(), args.unsafe_fixes, judge);
-    output::print(&diff::render(&shown(dir), &repair))?;
-    output::note(&fixes::would(repair.fixed.len(), repair.changes.len()));
-    Ok(repair.changes.len())
+) -> Preview {
+    let repair = plan(checkpoint, outcome, args.unsafe_fixes, judge);
+    Preview { diff: diff::render(&shown(dir), &repair), fixes: repair.fixed.len(), files: repair.changes.len() }
+}
+
+/// The end of a run by a signal. It names the directory that was not written: earlier ones may already be repaired.
+pub fn interrupted(dir: &Path) -> anyhow::Error {
+    anyhow::Error::new(RepairError::Apply(ApplyError::Interrupted)).context(dir.display().to_string())
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::args::CheckArgs;
@@ -20,10 +21,10 @@ use crate::report::model::{CheckpointReport, Fixed, Fixing, Overrides, Withdrawn
 use crate::surgery::repair::tried;
 
 /// A checkpoint, and the result of checking it.
-pub struct Checked {
-    pub dir: PathBuf,
-    pub checkpoint: Arc<Checkpoint>,
-    pub outcome: Outcome,
+struct Checked {
+    dir: PathBuf,
+    checkpoint: Arc<Checkpoint>,
+    outcome: Outcome,
     /// Applied fixes, and fixes that were rolled back.
     repaired: (Vec<Fixed>, Vec<Withdrawn>),
 }
@@ -36,6 +37,35 @@ pub struct Looked {
     pub skipped: Vec<Skipped>,
 }
 
+/// What the fixes of a directory would change, for `--diff`. A worker sends it.
+#[derive(Serialize, Deserialize)]
+pub struct Preview {
+    /// The changes, as they are printed.
+    pub diff: String,
+    /// Numbers of fixes and of files that they change.
+    pub fixes: usize,
+    pub files: usize,
+}
+
+/// What a run asks for each directory, of itself or of a worker.
+pub trait Answer: Serialize + DeserializeOwned + Send {
+    /// Looks at the directory.
+    fn of(run: &CheckRun<'_>, dir: &Path) -> Result<Self, Stop>;
+}
+
+impl Answer for Looked {
+    fn of(run: &CheckRun<'_>, dir: &Path) -> Result<Self, Stop> {
+        run.look(dir)
+    }
+}
+
+impl Answer for Preview {
+    fn of(run: &CheckRun<'_>, dir: &Path) -> Result<Self, Stop> {
+        let Checked { dir, checkpoint, outcome, .. } = run.check(dir)?;
+        Ok(fix::preview(&run.args.fix, &dir, &checkpoint, outcome, &judge_by(run.by)))
+    }
+}
+
 /// Why a directory has no report.
 #[derive(Serialize, Deserialize)]
 pub enum Stop {
@@ -43,14 +73,13 @@ pub enum Stop {
     Directory(String),
     /// The run cannot go on: a rule of the user is unusable.
     Run(String),
-    /// A signal ended the run.
-    #[serde(skip)]
-    Interrupted(anyhow::Error),
+    /// A signal ended the run while it repaired this directory.
+    Interrupted,
 }
 
 impl From<anyhow::Error> for Stop {
     fn from(error: anyhow::Error) -> Self {
-        if super::interrupted(&error) { Self::Interrupted(error) } else { Self::Directory(super::causes(&error)) }
+        if super::interrupted(&error) { Self::Interrupted } else { Self::Directory(super::causes(&error)) }
     }
 }
 
@@ -93,7 +122,7 @@ impl<'a> CheckRun<'a> {
     }
 
     /// Reads, checks and, if the arguments ask for it, repairs a checkpoint; its report.
-    pub fn look(&self, dir: &Path) -> Result<Looked, Stop> {
+    fn look(&self, dir: &Path) -> Result<Looked, Stop> {
         let checked = self.repaired(self.check(dir)?)?;
         let Checked { dir, checkpoint, outcome, repaired } = &checked;
         let mut report = CheckpointReport::new(shown(dir), None, checkpoint, outcome);
@@ -107,7 +136,7 @@ impl<'a> CheckRun<'a> {
     }
 
     /// Reads and checks a checkpoint.
-    pub fn check(&self, dir: &Path) -> Result<Checked, Stop> {
+    fn check(&self, dir: &Path) -> Result<Checked, Stop> {
         let read = || {
             fix::recover(&self.args.fix, dir)?;
             self.open(dir)
@@ -152,7 +181,7 @@ fn check_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
 }
 
 /// Checks a checkpoint without a try of its fixes.
-pub fn judge_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
+fn judge_by(by: &Resolved) -> impl Fn(&Arc<Checkpoint>) -> Outcome {
     |checkpoint| check_for(checkpoint, &by.knowledge, &by.options)
 }
 

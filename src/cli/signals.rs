@@ -34,6 +34,11 @@ pub fn install() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The signal that arrived since [`install`].
+pub fn received() -> Option<i32> {
+    i32::try_from(SIGNAL.load(Ordering::Relaxed)).ok().filter(|signal| *signal != 0)
+}
+
 /// The exit code that shells expect after a signal: 130 for Ctrl-C, 143 for SIGTERM.
 pub fn exit_code() -> u8 {
     u8::try_from(SIGNAL.load(Ordering::Relaxed)).map_or(u8::MAX, |signal| signal.saturating_add(128))

@@ -1,11 +1,14 @@
 //! What the command line asks the system, on Unix; `system_windows.rs` takes its place on Windows.
 
+use std::os::fd::AsFd;
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
-use std::process::ExitStatus;
+use std::process::{Child, ExitStatus};
 use std::time::Duration;
 
-use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use rustix::time::{ClockId, clock_gettime};
 
 /// Width of the terminal at standard output, in columns; `None` when it does not tell.
@@ -44,6 +47,22 @@ pub fn limit(seconds: u64, memory: u64) -> std::io::Result<()> {
 pub fn taken() -> Option<Duration> {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     Some(Duration::new(u64::try_from(time.tv_sec).ok()?, u32::try_from(time.tv_nsec).ok()?))
+}
+
+/// Sends a signal to a child, which may have ended.
+pub fn send(child: &Child, signal: i32) {
+    let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
+    let _sent = pid.zip(Signal::from_named_raw(signal)).map(|(pid, signal)| kill_process(pid, signal));
+}
+
+/// Whether reading would not block, after waiting for at most `time`. A signal ends the wait.
+pub fn is_readable(pipe: impl AsFd, time: Duration) -> std::io::Result<bool> {
+    let time = Timespec { tv_sec: 0, tv_nsec: time.subsec_nanos().into() };
+    match poll(&mut [PollFd::new(&pipe, PollFlags::IN)], Some(&time)) {
+        Ok(ready) => Ok(ready > 0),
+        Err(Errno::INTR) => Ok(false),
+        Err(error) => Err(error.into()),
+    }
 }
 
 /// What ended a process: `SIGKILL`, with what sends it unasked, or `exit code 101`.

@@ -102,6 +102,61 @@ fn workers(parent: u32) -> Vec<String> {
     all
 }
 
+/// Every file below a directory except the state of repairs, with its bytes.
+fn files(dir: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut all = Vec::new();
+    let mut open = vec![dir.to_owned()];
+    while let Some(folder) = open.pop() {
+        for entry in fs::read_dir(folder).unwrap().map(Result::unwrap) {
+            let path = entry.path();
+            match entry.file_type().unwrap() {
+                kind if kind.is_dir() && entry.file_name() != ".ckpt-doctor" => open.push(path),
+                kind if kind.is_file() => {
+                    all.push((path.strip_prefix(dir).unwrap().to_owned(), fs::read(&path).unwrap()));
+                }
+                _ => (),
+            }
+        }
+    }
+    all.sort();
+    all
+}
+
+#[test]
+fn repairs_of_a_zoo_are_those_of_single_runs() {
+    let (_room, together) = zoo();
+    let (_other, alone) = zoo();
+    let fix = ["--fix", "--unsafe-fixes", "--output-format", "json"];
+    let report = json(&check(&together, &fix));
+    let mut fixed = 0;
+    for (at, (one, dir)) in together.iter().zip(&alone).enumerate() {
+        let single = json(&check(std::slice::from_ref(dir), &fix));
+        let [of_zoo, of_one] = [&report["checkpoints"][at], &single["checkpoints"][0]];
+        assert_eq!(of_zoo["fixed"], of_one["fixed"], "{}", dir.display());
+        assert_eq!(of_zoo["findings"].as_array().unwrap().len(), of_one["findings"].as_array().unwrap().len());
+        assert!(files(one) == files(dir), "{}", dir.display());
+        fixed += of_one["fixed"].as_array().map_or(0, Vec::len);
+    }
+    assert!(fixed > 0);
+}
+
+#[test]
+fn differences_of_a_zoo_are_those_of_single_runs() {
+    let (_room, dirs) = zoo();
+    let [together, each] = [check(&dirs, &["--diff", "--unsafe-fixes"]), {
+        let mut each = check(&dirs[..1], &["--diff", "--unsafe-fixes"]);
+        for dir in &dirs[1..] {
+            let one = check(std::slice::from_ref(dir), &["--diff", "--unsafe-fixes"]);
+            each.stdout.extend(one.stdout);
+            each.stderr.extend(one.stderr);
+        }
+        each
+    }];
+    assert!(!together.stdout.is_empty());
+    assert_eq!(String::from_utf8_lossy(&together.stdout), String::from_utf8_lossy(&each.stdout));
+    assert_eq!(String::from_utf8_lossy(&together.stderr), String::from_utf8_lossy(&each.stderr));
+}
+
 #[cfg(target_os = "linux")]
 #[test]
 fn a_killed_worker_costs_one_directory() {
@@ -151,6 +206,78 @@ fn a_worker_that_runs_out_of_memory_costs_one_directory() {
     let expected =
         format!("{}: the process that checked it ended with SIGABRT: memory allocation of ", large.display());
     assert!(unchecked.len() == 1 && unchecked[0].starts_with(&expected), "{unchecked:#?}");
+}
+
+/// Repairs of a zoo, which is sent a signal: either the run, or the worker alone, once there is one.
+#[cfg(target_os = "linux")]
+fn repaired_until(signal: &str, is_for_the_run: bool) -> (TempDir, Vec<PathBuf>, Output) {
+    let (room, dirs) = zoo();
+    let mut command = program();
+    command.args(["check", "--isolated", "--fix", "--unsafe-fixes", "--output-format", "json"]).args(&dirs);
+    let mut run = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let worker = loop {
+        assert!(run.try_wait().unwrap().is_none(), "the run ended before a worker was seen");
+        if let Some(worker) = workers(run.id()).pop() {
+            break worker;
+        }
+    };
+    // Not before it has installed its handlers, which it does after it has read the rules.
+    let ready = || fs::read_to_string(format!("/proc/{worker}/status")).is_ok_and(|status| handles(&status, 15));
+    while !ready() {
+        assert!(run.try_wait().unwrap().is_none(), "the run ended before its worker was ready");
+    }
+    let to = if is_for_the_run { run.id().to_string() } else { worker };
+    let _status = Command::new("kill").args([signal, &to]).stderr(Stdio::null()).status().unwrap();
+    (room, dirs, run.wait_with_output().unwrap())
+}
+
+/// Whether a process has a handler of the signal. Source: `proc_pid_status(5)`, `SigCgt`.
+#[cfg(target_os = "linux")]
+fn handles(status: &str, signal: u32) -> bool {
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).unwrap_or_default();
+    u64::from_str_radix(mask.trim(), 16).is_ok_and(|mask| mask >> (signal - 1) & 1 == 1)
+}
+
+/// A run after another one completes what that began: every directory is as if nothing had happened.
+#[cfg(target_os = "linux")]
+fn assert_completed(dirs: &[PathBuf]) {
+    let (_room, whole) = zoo();
+    for zoo in [dirs, &whole] {
+        check(zoo, &["--fix", "--unsafe-fixes"]);
+    }
+    for (one, other) in dirs.iter().zip(&whole) {
+        assert!(files(one) == files(other), "{}", one.display());
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_signal_ends_the_repair_of_a_zoo() {
+    let ended = || Some(repaired_until("-TERM", true)).filter(|(_, _, output)| output.status.code() == Some(143));
+    let (_room, dirs, output) = (0..20).find_map(|_| ended()).expect("a run that is stopped");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.trim_end().ends_with(": interrupted; nothing was written"), "{said}");
+    assert_completed(&dirs);
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_worker_that_ends_in_a_repair_costs_one_directory() {
+    for (signal, why) in [
+        ("-TERM", "the process that repaired it was told to stop; nothing was written"),
+        (
+            "-KILL",
+            "the process that checked it ended with SIGKILL, which the kernel sends when memory or time runs out; \
+             what it wrote is finished or taken back by the next `check --fix` or `undo`",
+        ),
+    ] {
+        let ended = || Some(repaired_until(signal, false)).filter(|(_, _, output)| output.status.code() == Some(2));
+        let (_room, dirs, output) = (0..20).find_map(|_| ended()).expect("a worker that is stopped");
+        let (unchecked, checked) = unchecked(&json(&output));
+        assert_eq!((unchecked.len(), checked), (1, dirs.len() - 1), "{unchecked:#?}");
+        assert!(unchecked[0].ends_with(why), "{unchecked:#?}");
+        assert_completed(&dirs);
+    }
 }
 
 #[test]
