@@ -56,4 +56,5 @@ pub use outcome::Outcome;
 pub use suppressions::{SuppressionUse, suppression_uses, unused_suppressions};
 #[cfg(feature = "internals")]
 pub use templates::rendered_in_process;
+pub(crate) use templates::default_template;
 pub use templates::{RenderJob, Rendering, render_elsewhere};

@@ -65,6 +65,11 @@ fn templates(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
     found
 }
 
+/// The template that is used unless a user asks for another. Called by a merge for a donor.
+pub(crate) fn default_template(checkpoint: &Checkpoint) -> Option<&str> {
+    templates(checkpoint).into_iter().find(|template| template.is_default).map(|template| template.text)
+}
+
 /// The value of `chat_templates` in expressions: the default template by the file that holds it.
 pub(super) fn by_file(checkpoint: &Checkpoint) -> Value {
     let default = templates(checkpoint).into_iter().filter(|template| template.is_default);

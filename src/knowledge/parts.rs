@@ -31,6 +31,10 @@ pub struct ModelParts {
     /// Tokens that the processor needs in the tokenizer, in the order in which a merge adds them.
     #[serde(default)]
     pub tokens: Vec<TokenRun>,
+    /// What a chat template writes for an image, which the processor replaces by a token for each feature. Without it, the
+    /// processor takes images without a word in the text.
+    #[serde(default)]
+    pub image_turn: Option<String>,
     /// Name of the processor in `rules/processors/` that adds its tokens itself, instead of `tokens`.
     #[serde(default)]
     pub processor: Option<String>,

@@ -15,7 +15,7 @@ mod edits;
 mod files;
 
 pub use edits::{DocumentEdit, FollowEdit, GraftEdit, PartEdit, TokensForm};
-pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
+pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 
 /// A recipe, as read from its file in `rules/recipes/`.
 ///
@@ -29,6 +29,8 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
 /// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host, under the
 ///   version that wrote it, when its class has the guest's language model; `with` and `without` list the versions of
 ///   transformers, of `--for` or all, that need the factor, or none.
+/// - `chat_template(guest, host)`: the guest's chat template, made to write what the host's processor needs for an image
+///   (`image_turn` of its parts); null when the guest has none;
 /// - `part(role, name)`: a part of a donor: its config with defaults (`config`), as it is written (`stored`), its JSON pointer
 ///   (`at`), its model type (`type`), the types that may stand there (`takes`), and the names of its `embedding` and `head`.
 ///

@@ -14,7 +14,7 @@ use super::{CARD, REPORT, manifest};
 use crate::check::modules::{entries, relative_modules};
 use crate::checkpoint::open::TOKENIZER_CAP;
 use crate::checkpoint::{Document, FileName, FilePattern};
-use crate::knowledge::recipe::{CopySpec, FileSpec, ModulesSpec, TemplateSpec};
+use crate::knowledge::recipe::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 use crate::report::model::MergedFile;
 use crate::surgery::plan::PlannedFile;
 
@@ -44,6 +44,11 @@ pub(super) fn plan(
             FileSpec::Template(template) => {
                 if context.holds(template.when.as_ref(), "files")? {
                     files.push(fill_template(context, template)?);
+                }
+            }
+            FileSpec::Text(text) => {
+                if context.holds(text.when.as_ref(), "files")? {
+                    files.push(text_of(context, text)?);
                 }
             }
         }
@@ -200,6 +205,15 @@ fn fill_template(context: &Context<'_>, spec: &TemplateSpec) -> Result<PlannedFi
         bytes: text.into_bytes().into(),
         origin: "alias of the recipe".to_owned(),
     })
+}
+
+fn text_of(context: &Context<'_>, spec: &TextSpec) -> Result<PlannedFile, MergeError> {
+    let value = spec.is.eval(&context.scope).map_err(context.at(&*spec.name))?;
+    let Some(text) = value.as_str() else {
+        let recipe = &context.recipe.recipe;
+        return Err(MergeError::Recipe(format!("{recipe}: {}: the value of `is` is not a text", spec.name)));
+    };
+    Ok(PlannedFile { name: spec.name.clone(), bytes: text.as_bytes().into(), origin: "generated".to_owned() })
 }
 
 /// The index; `None` for a single shard, which needs no index.

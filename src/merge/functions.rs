@@ -6,11 +6,12 @@ use std::sync::Arc;
 use serde_json::{Value, json};
 
 use super::dtypes;
-use super::parts::Donor;
+use super::parts::{Donor, DonorParts};
+use crate::check::default_template;
 use crate::knowledge::scales::Scales;
-use crate::knowledge::{Loader, Scope};
+use crate::knowledge::{Loader, Scope, source};
 
-/// Adds `dtype`, `image_fold` and `row_scale`; `versions` are those of transformers that the result is for, or none.
+/// Adds `dtype`, `image_fold`, `row_scale` and `chat_template`; `versions` are those of transformers that the result is for, or none.
 pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
@@ -26,6 +27,18 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
     scope.function2("image_fold", move |host, guest| match (of_roles.get(host), of_roles.get(guest)) {
         (Some(host), Some(guest)) => image_fold(&of_models, host, guest, &loaders),
         _ => Value::Null,
+    });
+    let templates: BTreeMap<String, String> = donors
+        .iter()
+        .filter_map(|donor| Some((donor.role.clone(), default_template(&donor.checkpoint)?.to_owned())))
+        .collect();
+    let turns: BTreeMap<String, String> = donors
+        .iter()
+        .filter_map(|donor| Some((donor.role.clone(), donor.parts.as_ref().map(DonorParts::model)?.image_turn.clone()?)))
+        .collect();
+    scope.function2("chat_template", move |guest, host| {
+        let with_image = |template: &String| turns.get(host).map_or_else(|| template.clone(), |turn| with_image_turn(template, turn));
+        templates.get(guest).map_or(Value::Null, |template| json!(with_image(template)))
     });
     let of_models = scales.clone();
     scope.function1("row_scale", move |role| {
@@ -50,6 +63,14 @@ fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) 
     let versions = |loaders: &[Loader]| loaders.iter().map(|loader| loader.version()).collect::<Vec<_>>();
     let common = with.first().map_or(1.0, |loader| factor(*loader));
     json!({ "factor": common, "with": versions(&with), "without": versions(&without) })
+}
+
+/// A chat template in front of which messages with parts become messages of text, with `turn` in place of each image. Templates
+/// of language models take text alone, and processors look for the text of an image in what a template writes.
+fn with_image_turn(template: &str, turn: &str) -> String {
+    let before = source::text("image-turn.jinja").unwrap_or_default();
+    // A string of JSON is one of Jinja.
+    [before.trim_end().replace("IMAGE_TURN", &json!(turn).to_string()).as_str(), template].concat()
 }
 
 #[cfg(test)]

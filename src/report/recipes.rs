@@ -203,6 +203,7 @@ fn files(recipe: &Recipe) -> Vec<String> {
                 format!("{} and what they import: of {}", names.join(", "), modules.from.join(" or "))
             }
             FileSpec::Template(template) => format!("{}: a file of the recipe", template.name),
+            FileSpec::Text(text) => format!("{}: generated, if needed", text.name),
         });
     }
     lines

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::leftover::Leftover;
 use crate::checkpoint::journal::JournalDistrust;
+use crate::checkpoint::platform::is_out_of_descriptors;
 
 /// Why a plan was not written. The target then does not exist, except with [`ApplyError::Unsynced`].
 #[derive(Debug, thiserror::Error)]
@@ -70,7 +71,7 @@ pub enum ApplyError {
         limit: String,
     },
     /// A donor's file cannot be opened, because too many files are open.
-    #[error("{path}: opening: {error}; raise the limit on open files (`ulimit -n`); nothing was written", path = path.display())]
+    #[error("{path}: opening: {error}{more}; nothing was written", path = path.display(), more = more_descriptors(error))]
     Descriptors {
         /// The donor's file.
         path: PathBuf,
@@ -92,7 +93,7 @@ pub enum ApplyError {
     #[error("interrupted; nothing was written")]
     Interrupted,
     /// Any other error of the system.
-    #[error("{path}: {doing}: {error}", path = path.display())]
+    #[error("{path}: {doing}: {error}{more}", path = path.display(), more = more_descriptors(error))]
     Io {
         /// The file.
         path: PathBuf,
@@ -263,6 +264,11 @@ impl RepairError {
             None => self,
         }
     }
+}
+
+/// What helps against an error of the system, for the end of its message.
+fn more_descriptors(error: &io::Error) -> &'static str {
+    if is_out_of_descriptors(error) { "; raise the limit on open files (`ulimit -n`)" } else { "" }
 }
 
 /// Turns an error of the system into [`ApplyError::Io`]; `doing` names the operation on `path`.

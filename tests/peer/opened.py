@@ -114,6 +114,34 @@ def run(model, processor, host):
     return wrong
 
 
+def see(model, processor, host):
+    """Another picture gives other logits."""
+    import torch
+    from PIL import ImageOps
+
+    text = TEXT if host == "spatialvla" else IMAGE_IN_TEXT.get(host, "<image>") + TEXT
+    with torch.no_grad():
+        one, other = (
+            model(**processor(images=[image], text=[text], return_tensors="pt").to(model.dtype)).logits
+            for image in (picture(), ImageOps.invert(picture()))
+        )
+    return [] if (one - other).abs().max() > 0 else ["the picture changes no logit"]
+
+
+def listen(model, processor):
+    """A chat with a picture, as this version writes it, has the place of the picture, and the model takes it."""
+    import torch
+
+    chat = [{"role": "user", "content": [{"type": "image"}, {"type": "text", "text": TEXT}]}]
+    text = processor.apply_chat_template(chat, add_generation_prompt=True, tokenize=False)
+    if TEXT not in text or "{" in text:
+        return [f"the chat is {text!r}"]
+    inputs = processor(images=[picture()], text=[text], return_tensors="pt").to(model.dtype)
+    with torch.no_grad():
+        logits = model(**inputs).logits
+    return [] if torch.isfinite(logits).all() else ["logits of a chat are not finite"]
+
+
 def as_guest(model, tokenizer, host, guest_dir, dtype):
     """Text alone gives the ids and, in float32, the logits that the language model alone gives."""
     import torch
@@ -147,7 +175,12 @@ def whole(cell, cls):
         yield f"load {dtype}", wrong
         yield f"run {dtype}"
         yield f"run {dtype}", run(model, processor, cell["host"])
+        if dtype == torch.float32:
+            yield "see"
+            yield "see", see(model, processor, cell["host"])
         if dtype == torch.float32 and cell.get("guest_dir"):
+            yield "listen"
+            yield "listen", listen(model, processor)
             yield "text"
             yield "text", as_guest(model, processor.tokenizer, cell["host"], cell["guest_dir"], cell["stored"])
 

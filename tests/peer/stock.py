@@ -20,6 +20,11 @@ DTYPES = {"f32": "float32", "bf16": "bfloat16", "f16": "float16"}
 
 # Tokenizers.
 
+TEXT_TEMPLATE = (
+    "{% for message in messages %}{{ '[' + message['role'] + '] ' + message['content'] + '\\n' }}{% endfor %}"
+    "{% if add_generation_prompt %}[assistant] {% endif %}"
+)
+
 
 def sentences():
     rng = random.Random(7)
@@ -172,6 +177,8 @@ def save_guest(kind, width, dtype, path, work):
         **text_config(kind, width, tokenizer)
     )
     save_model(getattr(transformers, f"{name}ForCausalLM")(config), dtype, path)
+    # Templates of language models take text alone.
+    tokenizer.chat_template = TEXT_TEMPLATE
     tokenizer.save_pretrained(path)
 
 

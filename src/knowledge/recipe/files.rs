@@ -18,6 +18,8 @@ pub enum FileSpec {
     Modules(ModulesSpec),
     /// Writes a file of the recipe.
     Template(TemplateSpec),
+    /// Writes a text that an expression gives.
+    Text(TextSpec),
 }
 
 /// Copies files; a JSON file loses the keys that make a loader run code.
@@ -66,6 +68,20 @@ pub struct TemplateSpec {
     /// Values of placeholders: `{{key}}` becomes the value of the expression.
     #[serde(default)]
     pub fill: BTreeMap<String, Expression>,
+    /// Condition for this entry.
+    #[serde(default)]
+    pub when: Option<Expression>,
+}
+
+/// Writes a text that an expression gives.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct TextSpec {
+    /// File name in the result; it ends in `.jinja`.
+    pub name: FileName,
+    /// The text.
+    pub is: Expression,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,

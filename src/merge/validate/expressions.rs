@@ -14,7 +14,7 @@ use crate::merge::fit::Fit;
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
 
 /// Functions of a merge's scope, with a role as the first argument.
-const ROLE_FUNCTIONS: [&str; 6] = ["shape", "has", "dtype", "part", "row_scale", "image_fold"];
+const ROLE_FUNCTIONS: [&str; 7] = ["shape", "has", "dtype", "part", "row_scale", "image_fold", "chat_template"];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
@@ -102,6 +102,10 @@ impl Validator<'_> {
                 FileSpec::Template(text) => {
                     some("when", text.when.as_ref())?;
                     text.fill.values().try_for_each(|expression| check("fill", expression))?;
+                }
+                FileSpec::Text(text) => {
+                    some("when", text.when.as_ref())?;
+                    check("is", &text.is)?;
                 }
             }
         }

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use super::Validator;
 use crate::checkpoint::module::is_dotted_name;
 use crate::checkpoint::{FileName, FilePattern};
-use crate::knowledge::recipe::{CopySpec, DocumentSpec, FileSpec, ModulesSpec, TemplateSpec};
+use crate::knowledge::recipe::{CopySpec, DocumentSpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 use crate::knowledge::source::{self, DataError};
 use crate::merge::files::is_own;
 
@@ -27,6 +27,12 @@ impl Validator<'_> {
                     self.template(template)?;
                     if template.when.is_none() && !always.insert(template.name.to_lowercase()) {
                         return Err(self.twice(&template.name));
+                    }
+                }
+                FileSpec::Text(text) => {
+                    self.text(text)?;
+                    if text.when.is_none() && !always.insert(text.name.to_lowercase()) {
+                        return Err(self.twice(&text.name));
                     }
                 }
             }
@@ -73,6 +79,15 @@ impl Validator<'_> {
                 let reason = format!("`{root}` is not the name of a Python module; write it without folder and `.py`");
                 return Err(self.wrong("roots", root, reason));
             }
+        }
+        Ok(())
+    }
+
+    fn text(&self, text: &TextSpec) -> Result<(), DataError> {
+        self.free("name", &text.name)?;
+        if !text.name.ends_with(".jinja") {
+            let reason = format!("{} is a chat template, so its name must end in .jinja", text.name);
+            return Err(self.wrong("name", &text.name, reason));
         }
         Ok(())
     }

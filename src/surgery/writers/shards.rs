@@ -16,7 +16,7 @@ use super::jobs::{Job, jobs};
 use super::out::Out;
 use super::system::{KernelCopy, create, reserve};
 use super::verify::accepted_by_safetensors;
-use crate::checkpoint::open::open_regular;
+use crate::checkpoint::open::{OpenError, open_regular};
 use crate::checkpoint::{HashAlgorithm, hex, parallel};
 use crate::surgery::donor::OpenDonors;
 use crate::surgery::error::{ApplyError, io_at};
@@ -98,7 +98,10 @@ impl ShardFile<'_> {
         file.sync_all().map_err(io_at(self.path, "syncing"))?;
         // The file is write-only and opened again for the verification.
         let written = open_regular(self.path, u64::MAX);
-        let written = written.map_err(|e| io_at(self.path, "opening")(io::Error::other(e)))?;
+        let written = written.map_err(|error| match error {
+            OpenError::Io { source, .. } => io_at(self.path, "opening")(source),
+            other => io_at(self.path, "opening")(io::Error::other(other)),
+        })?;
         accepted_by_safetensors(&written.file).map_err(io_at(self.path, "verifying"))
     }
 }
