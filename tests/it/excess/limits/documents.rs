@@ -1,6 +1,8 @@
 //! Limits on JSON documents, vocabularies and Python modules.
 
-use super::{Files, Limit, config, numbered, repeated};
+use serde_json::Value;
+
+use super::{Files, Limit, base, config, findings, numbered, repeated};
 
 /// A Git LFS pointer of so many bytes.
 fn pointer(n: usize) -> Vec<u8> {
@@ -129,6 +131,16 @@ pub(super) const LIMITS: &[Limit] = &[
         says: "auto_map",
     },
     Limit {
+        of: "classes of an entry of an auto_map",
+        at: "src/check/modules.rs MAX_ENTRIES",
+        most: 1000,
+        file: "config.json",
+        write: |n, files| {
+            config(files, &format!("\"auto_map\": {{\"AutoTokenizer\": [null{}]}}", ", null".repeat(n - 1)))
+        },
+        says: "auto_map.AutoTokenizer is a list",
+    },
+    Limit {
         of: "tokens of a vocabulary",
         at: "src/checkpoint/tokenizer/vocabulary.rs MAX_TOKENS",
         most: 1_500_000,
@@ -150,4 +162,18 @@ pub(super) const LIMITS: &[Limit] = &[
 fn nodes(n: usize) -> Vec<u8> {
     // The module, a statement and a name are three; each minus is two.
     format!("{}a{}", "-".repeat((n - 3) / 2), if n.is_multiple_of(2) { ";" } else { "" }).into_bytes()
+}
+
+/// Parts of a tokenizer have no limit of their own: 62 sequences and a document take 125 levels.
+#[test]
+fn parts_of_a_tokenizer_are_read_at_any_depth() {
+    let mut files = base();
+    let (open, close) = (r#"{"type": "Sequence", "pretokenizers": ["#, "]}");
+    let part = format!("{}{{\"type\": \"Nothing\"}}{}", open.repeat(62), close.repeat(62));
+    let mut value: Value = serde_json::from_slice(&files["tokenizer.json"]).unwrap();
+    value["pre_tokenizer"] = Value::String("PART".to_owned());
+    let text = value.to_string().replace("\"PART\"", &part);
+    files.insert("tokenizer.json".to_owned(), text.into_bytes());
+    let found = findings(files);
+    assert!(found.iter().any(|finding| finding.contains("Nothing")), "{found:?}");
 }
