@@ -23,8 +23,12 @@ const REASONS: &[(&[&str], &str)] = &[
         "Only what a report shows: a text is shortened, or the others of a list are counted.",
     ),
     (
-        &["src/checkpoint/fault.rs NON_FINITE_CAP", "src/checkpoint/fault.rs COMPARISON_CAP"],
+        &["src/checkpoint/fault.rs NON_FINITE_CAP"],
         "Fewer findings are listed, and the others counted: src/check/evaluate.rs CAP.",
+    ),
+    (
+        &["src/checkpoint/fault.rs COMPARISON_CAP"],
+        "NOT TOLD: an effect that only a later fault of the same kind has, as beyond src/check/evaluate.rs CAP.",
     ),
     (
         &["src/checkpoint/document/read/duplicates.rs FOUND_CAP"],
