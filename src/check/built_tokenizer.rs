@@ -25,8 +25,8 @@ const GENERIC: [&str; 4] = ["TokenizersBackend", "PythonBackend", "PreTrainedTok
 /// Types of models between which a vocabulary gives much the same tokens: both look up whole words.
 const OF_WORDS: [&str; 2] = ["WordLevel", "WordPiece"];
 
-/// Depth of sequences of post-processors that is read.
-const MAX_DEPTH: usize = 8;
+/// Depth of sequences of post-processors that is read; each takes two levels of a document, which has at most 127.
+const MAX_DEPTH: usize = 64;
 
 /// Tokens before and after text.
 type Around<'v> = (Vec<&'v str>, Vec<&'v str>);

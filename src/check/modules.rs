@@ -105,6 +105,9 @@ impl AutoMaps {
             // A list has the slow and the fast tokenizer; null for none.
             let targets = match target {
                 Value::Array(items) => {
+                    if items.len() > MAX_ENTRIES {
+                        self.malformed(file, base.clone(), key, target);
+                    }
                     let items = items.iter().enumerate().take(MAX_ENTRIES);
                     items.map(|(i, item)| (format!("{base}/{i}"), item)).collect()
                 }

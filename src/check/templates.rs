@@ -41,9 +41,17 @@ impl Template<'_> {
     }
 }
 
-/// The templates of a checkpoint: `chat_template.jinja`, and the key of the JSON documents, which may hold a list of named
-/// templates. Source: `apply_chat_template` of tokenizers and processors in transformers 4.47.0 to 5.23.0.
+/// The templates that are read.
 fn templates(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
+    let mut found = listed(checkpoint);
+    found.truncate(MAX_TEMPLATES);
+    found
+}
+
+/// The templates of a checkpoint, and perhaps more than are read: `chat_template.jinja`, and the key of the JSON documents,
+/// which may hold a list of named templates. Source: `apply_chat_template` of tokenizers and processors in transformers 4.47.0
+/// to 5.23.0.
+fn listed(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
     let texts = checkpoint.texts.iter();
     let own = texts.map(|(file, text)| Template { text, file, pointer: None, is_default: true });
     let mut found: Vec<Template<'_>> = own.collect();
@@ -54,14 +62,14 @@ fn templates(checkpoint: &Checkpoint) -> Vec<Template<'_>> {
         if let Some(text) = value.as_str() {
             found.push(Template { text, file, pointer: Some("/chat_template".to_owned()), is_default: true });
         }
-        for (i, item) in value.as_array().into_iter().flatten().enumerate().take(MAX_TEMPLATES) {
+        let items = value.as_array().into_iter().flatten().enumerate();
+        let texts = items.filter_map(|(i, item)| Some((i, item, item.get("template")?.as_str()?)));
+        for (i, item, text) in texts.take(MAX_TEMPLATES.saturating_add(1)) {
             let pointer = Some(format!("/chat_template/{i}/template"));
             let is_default = item.get("name").and_then(Value::as_str) == Some("default");
-            let text = item.get("template").and_then(Value::as_str);
-            found.extend(text.map(|text| Template { text, file, pointer, is_default }));
+            found.push(Template { text, file, pointer, is_default });
         }
     }
-    found.truncate(MAX_TEMPLATES);
     found
 }
 
@@ -99,6 +107,10 @@ pub(super) fn faults(checkpoint: &Checkpoint) -> Vec<Fault> {
             Err(reason) => faults.push(not_rendered(FaultKind::TemplateNeedsProcess, reason)),
         }
     }
+    faults.extend(listed(checkpoint).get(MAX_TEMPLATES).map(|next| {
+        let reason = format!("the files have more than {MAX_TEMPLATES}");
+        Fault::new(FaultKind::TemplateNotRendered).at(next.place()).with("reason", reason)
+    }));
     faults
 }
 

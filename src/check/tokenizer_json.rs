@@ -16,8 +16,8 @@ use crate::knowledge::tokenizer_parts::TokenizerPart;
 /// Version of transformers whose `tokenizers`, 0.20, is the first that reads merges as pairs.
 const READS_PAIRS: [u64; 2] = [4, 45];
 
-/// Depth of sequences in sequences that is read.
-const MAX_DEPTH: usize = 8;
+/// Depth of sequences in sequences that is read; each takes two levels of a document, which has at most 127.
+const MAX_DEPTH: usize = 64;
 
 /// The file, unless the tokenizer is built from another one.
 fn document(checkpoint: &Checkpoint) -> Option<&Document> {

@@ -25,7 +25,7 @@ fn none(wrong: &[String]) {
 }
 
 /// Path below the project, and text, of every Rust file in `src`.
-fn sources() -> Vec<(String, String)> {
+pub fn sources() -> Vec<(String, String)> {
     let read = |path: std::path::PathBuf| {
         let name = path.strip_prefix(project()).expect("inside").to_string_lossy().into_owned();
         (name, fs::read_to_string(path).expect("text"))
@@ -257,7 +257,7 @@ fn no_stage_imports_from_a_later_one() {
 }
 
 /// The text before its module of tests, without comments: tests may use later stages.
-fn without_tests(text: &str) -> String {
+pub fn without_tests(text: &str) -> String {
     let tests =
         Regex::new(r"#\[cfg\(test\)\]\s*(?:#\[[^\]]*\]\s*)*(?:pub(?:\(\w+\))? )?mod \w+ \{").expect("a pattern");
     let code = tests.splitn(text, 2).next().unwrap_or_default();

@@ -34,6 +34,10 @@ const MAX_INDENT: u64 = 8;
 /// Start of the detail of an error that stops a rendering because of what it would cost.
 const COSTLY: &str = "costly: ";
 
+/// The engine's words for what is nested deeper than [`MAX_DEPTH`], and part of its parser's for what is nested too deeply.
+const TOO_DEEP: &str = "recursion limit exceeded";
+const PARSED_TOO_DEEP: &str = "maximum recursion";
+
 /// What the messages say, so that their places in the text are known.
 const USER: &str = "qhGxUser1wVk";
 const ASSISTANT: &str = "qhGxAssistant2wVk";
@@ -41,7 +45,7 @@ const ASSISTANT: &str = "qhGxAssistant2wVk";
 /// Reasons of the parser for templates that Jinja2 takes: statements that need a loader of templates, letters outside ASCII
 /// in names, tuples without parentheses, signs without a number, empty subscripts; and its own limits. They are those of
 /// mutated templates in `tests/peer/templates.py`.
-const LIMITS: [&str; 12] = [
+const LIMITS: [&str; 11] = [
     "unknown statement include",
     "unknown statement import",
     "unknown statement from",
@@ -52,7 +56,6 @@ const LIMITS: [&str; 12] = [
     "unexpected `,`, expected end of",
     "unexpected `+`",
     "unexpected `]`",
-    "recursion",
     "too many",
 ];
 
@@ -120,6 +123,9 @@ impl Rendering {
 
     fn of_error(error: &Error) -> Self {
         let reason = error.detail().unwrap_or_default();
+        if reason.contains(PARSED_TOO_DEEP) {
+            return Self::Refused("it is nested more deeply than is parsed".to_owned());
+        }
         if error.kind() != ErrorKind::SyntaxError || LIMITS.iter().any(|limit| reason.contains(limit)) {
             return Self::Unknown;
         }
@@ -131,6 +137,8 @@ impl Rendering {
 fn excess(error: &Error, fuel: u64) -> Option<String> {
     let own = error.detail().and_then(|detail| detail.strip_prefix(COSTLY)).map(str::to_owned);
     let is_long = error.kind() == ErrorKind::OutOfFuel;
+    let is_deep = error.detail() == Some(TOO_DEEP);
+    let own = own.or_else(|| is_deep.then(|| format!("its calls and loops are nested more than {MAX_DEPTH} deep")));
     own.or_else(|| is_long.then(|| format!("a conversation of two messages takes more than {fuel} steps")))
 }
 
