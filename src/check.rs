@@ -54,7 +54,7 @@ pub use finding::{Finding, Location, Severity};
 pub use fix::{Edit, FixHint, clamped, renamed};
 pub use outcome::Outcome;
 pub use suppressions::{SuppressionUse, suppression_uses, unused_suppressions};
+pub(crate) use templates::default_template;
 #[cfg(feature = "internals")]
 pub use templates::rendered_in_process;
-pub(crate) use templates::default_template;
 pub use templates::{RenderJob, Rendering, render_elsewhere};

@@ -25,6 +25,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+NO_MUTANT = "does not compile"
 SWITCH = """
 /// Whether this mutant is the one that CKPT_DOCTOR_MUTANT names.
 pub(crate) fn mutant(number: u32) -> bool {
@@ -113,11 +114,15 @@ def woven(text, mutants):
     return "".join([*parts, text[at:]])
 
 
-def compiled(copy, texts, found, environment):
-    """Builds the tests; drops mutants that do not compile. The executables."""
+def compiled(copy, texts, found, environment, results):
+    """Builds the tests; notes which mutants do not compile, and drops them. The executables."""
     while True:
+        for source in found:
+            found[source] = [mutant for mutant in found[source] if results.get(mutant["name"]) != NO_MUTANT]
         for source, text in texts.items():
-            (copy / source).write_text(woven(text, found[source]))
+            text = woven(text, found[source])
+            if (copy / source).read_text() != text:
+                (copy / source).write_text(text)
         command = ["cargo", "test", "--no-run", "--lib", "--test", "it", "--message-format", "json"]
         done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
         messages = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
@@ -144,8 +149,7 @@ def compiled(copy, texts, found, environment):
         if not bad:
             sys.exit("\n".join(elsewhere[:5]) or done.stderr[-3000:])
         print(f"{len(bad)} mutants do not compile", flush=True)
-        for source in found:
-            found[source] = [mutant for mutant in found[source] if mutant["number"] not in bad]
+        results |= {m["name"]: NO_MUTANT for mutants in found.values() for m in mutants if m["number"] in bad}
 
 
 def noticed(executables, stage, number, limit, environment, copy):
@@ -184,26 +188,31 @@ def main():
     for source, mutants in found.items():
         drawn = random.Random(f"{options.seed}/{source}")
         found[source] = [mutant for mutant in mutants if drawn.randrange(of) < part and not mutant["impl"]]
+    seen = collections.Counter()
     for mutants in found.values():
         for mutant in mutants:
             number += 1
             mutant["number"] = number
+            seen[mutant["name"]] += 1
+            mutant["name"] += f" ({seen[mutant['name']]})" if seen[mutant["name"]] > 1 else ""
     copy = options.work / "copy"
     copy.mkdir(parents=True, exist_ok=True)
     listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True).stdout
-    for file in filter(None, listing.split("\0")):
+    for file in set(filter(None, listing.split("\0"))) - {source for source in options.sources if (copy / source).exists()}:
         (copy / file).parent.mkdir(parents=True, exist_ok=True)
-        if not (copy / file).exists() or (copy / file).read_bytes() != (ROOT / file).read_bytes():
-            shutil.copyfile(ROOT / file, copy / file, follow_symlinks=False)
+        original = (ROOT / file).read_bytes() + (SWITCH.encode() if file == "src/lib.rs" else b"")
+        if not (copy / file).exists() or (copy / file).read_bytes() != original:
+            (copy / file).write_bytes(original)
             shutil.copymode(ROOT / file, copy / file, follow_symlinks=False)
-    with (copy / "src/lib.rs").open("a") as library:
-        library.write(SWITCH)
     environment = {
         **os.environ, "RUSTFLAGS": "-Awarnings", "CARGO_TARGET_DIR": str(options.work / "target"), "CARGO_PROFILE_DEV_OPT_LEVEL": "1",
         "TMPDIR": str(options.work), "INSTA_UPDATE": "no", "INSTA_FORCE_PASS": "0", "RUST_BACKTRACE": "0",
     }  # fmt: skip
     texts = {source: (ROOT / source).read_text() for source in found}
-    executables = compiled(copy, texts, found, environment)
+    kept = options.work / "results.json"
+    results = json.loads(kept.read_text()) if kept.exists() else {}
+    executables = compiled(copy, texts, found, environment, results)
+    kept.write_text(json.dumps(results, indent=1))
     # Filters of the unit tests, and of those of `it`.
     stages = [(options.unit, options.tests)] + [(None, options.then)] * bool(options.then)
     for stage in stages:
@@ -211,8 +220,6 @@ def main():
         if noticed(executables, stage, 0, 3600, environment, copy):
             sys.exit(f"the tests {stage} fail without a mutant")
         print(f"{stage}: {time.monotonic() - begun:.1f} s without a mutant", flush=True)
-    kept = options.work / "results.json"
-    results = json.loads(kept.read_text()) if kept.exists() else {}
     mutants = [mutant for source in found for mutant in found[source]]
 
     def run(mutant):

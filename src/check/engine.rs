@@ -81,6 +81,8 @@ struct CheckFacts<'a> {
     memo: judge::Memo,
     /// The tokenizer as the processor of a class opens it in a version, for those that were asked for.
     opened: RefCell<Vec<OpenedBy<'a>>>,
+    /// Why one of them could not be opened.
+    unopened: RefCell<Option<String>>,
 }
 
 /// A tokenizer as the processor of a class opens it; `None` when its ids are not known.
@@ -182,6 +184,7 @@ impl<'a> CheckFacts<'a> {
             faults,
             memo: judge::Memo::default(),
             opened: RefCell::default(),
+            unopened: RefCell::default(),
         }
     }
 
@@ -198,7 +201,11 @@ impl<'a> CheckFacts<'a> {
         let config = self.checkpoint.document(files::PROCESSOR_CONFIG).and_then(|d| d.value.as_ref());
         let open = |processor| {
             let config = config.unwrap_or(&Value::Null);
-            tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, with).ok().flatten()
+            let opened = tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, with);
+            opened.unwrap_or_else(|error| {
+                self.unopened.replace(Some(format!("the tokens of the processor are not known: {}", error.cause)));
+                None
+            })
         };
         let tokenizer = processor.and_then(open).map(Rc::new);
         self.opened.borrow_mut().push(OpenedBy { class: class.to_owned(), with, tokenizer: tokenizer.clone() });
@@ -338,6 +345,8 @@ impl<'a> CheckFacts<'a> {
         run_rules(rules, context, faults, scope, &mut outcome);
         outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
         let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
+        let mut unjudged = faults.iter().filter_map(|fault| fault.detail.get("not_judged")?.as_str());
+        let unopened = self.unopened.borrow();
         let architecture = outcome.architecture.as_deref();
         let basis = Basis {
             checkpoint: self.checkpoint,
@@ -345,6 +354,7 @@ impl<'a> CheckFacts<'a> {
             findings: &outcome.findings,
             loads: &outcome.loads,
             has_processor: architecture.is_some_and(|class| self.knowledge.processor_of(class).is_some()),
+            unjudged: unjudged.next().or(unopened.as_deref()).or(outcome.unjudged.first().map(String::as_str)),
             unpredicted,
         };
         basis.verdicts(&context.targets, programs)

@@ -15,7 +15,7 @@ use crate::checkpoint::document::Locator;
 use crate::checkpoint::{Checkpoint, Fault, Place, pointer};
 use crate::knowledge::expression::within;
 use crate::knowledge::program::AskedProgram;
-use crate::knowledge::rule::{Assert, At, Check, Effect, FaultCheck, Object, Rule};
+use crate::knowledge::rule::{Assert, At, Check, Consequence, Effect, FaultCheck, Object, Rule};
 use crate::knowledge::{EvalError, Expression, Knowledge, Scope};
 
 mod lets;
@@ -28,6 +28,9 @@ const STEPS: u64 = 2_000_000;
 
 /// Places of one finding that are kept, for the same reason.
 const PLACES: usize = 1000;
+
+/// Faults of one rule whose effects are looked for: findings of the first are kept, of the others their effects.
+const JUDGED: usize = 20_000;
 
 /// What every rule of a run sees.
 pub(super) struct Context<'a> {
@@ -82,6 +85,9 @@ pub(super) fn run_rules<'r>(
             Some(_) => within(STEPS, || evaluate(rule, context, faults, scope, architecture.as_deref())),
             None => (evaluate(rule, context, faults, scope, architecture.as_deref()), false),
         };
+        if faults.len() > JUDGED && !rule.effects.is_empty() && number_of(rule, faults) > JUDGED {
+            outcome.unjudged.push(format!("{} found more than {JUDGED} faults", rule.code));
+        }
         if stopped {
             let why = "exceeded the evaluation limit; iterate over fewer elements".to_owned();
             outcome.unusable.push(Skipped { code: rule.code.clone(), why });
@@ -141,6 +147,14 @@ fn evaluate(
     run(rule, context, faults, scope).map_err(|(expression, error)| cannot(expression, &error))
 }
 
+/// How many of these faults are of a kind that the rule reports.
+fn number_of(rule: &Rule, faults: &[Fault]) -> usize {
+    match &rule.check {
+        Check::Fault(check) => faults.iter().filter(|fault| check.kinds.contains(&fault.kind)).count(),
+        Check::Assert(_) => 0,
+    }
+}
+
 /// Whether the rule reports a kind of these faults, or needs none.
 pub(super) fn has_faults(rule: &Rule, faults: &[Fault]) -> bool {
     match &rule.check {
@@ -163,14 +177,16 @@ fn run<'r>(
     }
     let mut inner = scope.child();
     lets::bind(&rule.lets, &mut inner);
-    let mut findings = match &rule.check {
-        Check::Fault(check) => from_faults(rule, check, context, faults, &inner),
-        Check::Assert(check) => {
-            from_assert(rule, check, context, &inner).map_err(|failed| lets::cause(&rule.lets, failed, &inner))?
-        }
+    let check = match &rule.check {
+        Check::Fault(check) => return Ok(from_faults(rule, check, context, faults, &inner)),
+        Check::Assert(check) => check,
     };
+    let found = from_assert(rule, check, context, &inner);
+    let mut findings = found.map_err(|failed| lets::cause(&rule.lets, failed, &inner))?;
     let more = findings.len().saturating_sub(CAP);
     if more > 0 {
+        // Those with an effect are not the ones that are left out.
+        findings.sort_by_key(|finding| finding.effects.is_empty());
         findings.truncate(CAP);
         if let Some(last) = findings.last_mut() {
             last.hidden = last.hidden.saturating_add(more as u64);
@@ -191,23 +207,13 @@ fn from_faults(
         .filter(|f| check.kinds.contains(&f.kind))
         .filter(|f| check.only.as_ref().is_none_or(|only| only.eval_bool(&fault_scope(scope, f, 1)).unwrap_or(false)));
     if check.group {
-        let all: Vec<&Fault> = matching.collect();
-        let Some(first) = all.first() else { return Vec::new() };
-        let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
-        let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
-        let mut evidence = first.detail.clone();
-        evidence.insert("count".to_owned(), json!(count));
-        let fix = all.iter().map(|f| hint(rule, context, f, &finding_scope(check, scope, f, count)));
-        let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
-        let mut inner = finding_scope(check, scope, first, count);
-        inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
-        let mut caused = Caused::default();
-        for fault in all.iter().take(PLACES) {
-            caused.add(rule, context, &fault.loaders, &finding_scope(check, scope, fault, count));
-        }
-        let found = finding(rule, &inner, rule.message.render(&inner), places, evidence, fix);
-        return vec![caused.give(rule, context, found)];
+        return grouped(rule, check, context, &matching.collect::<Vec<_>>(), scope).into_iter().collect();
     }
+    let found = |fault: &Fault, inner: &Scope<'_>, message: String| {
+        let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
+        let fix = hint(rule, context, fault, inner);
+        finding(rule, inner, message, locate(&places), fault.detail.clone(), fix)
+    };
     let mut listed: Vec<(&Fault, Finding, Caused)> = Vec::new();
     let mut more = 0_u64;
     for fault in matching.by_ref().take(CAP) {
@@ -221,30 +227,73 @@ fn from_faults(
             caused.add(rule, context, &fault.loaders, &inner);
             continue;
         }
-        let places: Vec<Place> = fault.places.iter().take(PLACES).cloned().collect();
-        let fix = hint(rule, context, fault, &inner);
-        let found = finding(rule, &inner, message, locate(&places), fault.detail.clone(), fix);
         let mut caused = Caused::default();
         caused.add(rule, context, &fault.loaders, &inner);
-        listed.push((fault, found, caused));
+        listed.push((fault, found(fault, &inner, message), caused));
     }
-    let mut out: Vec<Finding> =
-        listed.into_iter().map(|(_, found, caused)| caused.give(rule, context, found)).collect();
-    // The others are only counted. Edits of text are added to the last finding, so that one run repairs all.
-    for fault in matching {
+    // The others are only counted, but for those that cause what none before them does. Edits of text are added to the last
+    // finding, so that one run repairs all.
+    let last_at = listed.len().saturating_sub(1);
+    let mut known: BTreeSet<_> =
+        listed.iter().flat_map(|(.., caused)| caused.effects.iter().map(consequence)).collect();
+    for (number, fault) in matching.enumerate() {
+        let inner = || finding_scope(check, scope, fault, 1);
+        if number < JUDGED && may_cause(rule, context, fault) {
+            let inner = inner();
+            let mut caused = Caused::default();
+            caused.add(rule, context, &fault.loaders, &inner);
+            let before = known.len();
+            known.extend(caused.effects.iter().map(consequence));
+            if known.len() > before {
+                listed.push((fault, found(fault, &inner, rule.message.render(&inner)), caused));
+                continue;
+            }
+        }
         more = more.saturating_add(fault.hidden).saturating_add(1);
-        let last = out.last_mut().and_then(|last| last.fix.as_mut());
+        let last = listed.get_mut(last_at).and_then(|(_, last, _)| last.fix.as_mut());
         if let Some(last) = last.filter(|fix| matches!(fix.edits.last(), Some(Edit::Splice { .. })))
-            && let Some(fix) = hint(rule, context, fault, &finding_scope(check, scope, fault, 1))
+            && let Some(fix) = hint(rule, context, fault, &inner())
             && fix.safety == last.safety
         {
             last.edits.extend(fix.edits);
         }
     }
-    if let Some(last) = out.last_mut() {
+    if let Some((_, last, _)) = listed.get_mut(last_at) {
         last.hidden = more;
     }
-    out
+    listed.into_iter().map(|(_, found, caused)| caused.give(rule, context, found)).collect()
+}
+
+/// The one finding for all faults.
+fn grouped(
+    rule: &Rule,
+    check: &FaultCheck,
+    context: &Context<'_>,
+    all: &[&Fault],
+    scope: &Scope<'_>,
+) -> Option<Finding> {
+    let first = all.first()?;
+    let places: Vec<Place> = all.iter().flat_map(|f| &f.places).take(PLACES).cloned().collect();
+    let count = all.iter().fold(0_u64, |n, fault| n.saturating_add(fault.hidden).saturating_add(1));
+    let mut evidence = first.detail.clone();
+    evidence.insert("count".to_owned(), json!(count));
+    let fix = all.iter().map(|f| hint(rule, context, f, &finding_scope(check, scope, f, count)));
+    let (fix, places) = (fix.reduce(together).flatten(), locate(&places));
+    let mut inner = finding_scope(check, scope, first, count);
+    inner.bind("faults", &all.iter().map(|fault| Value::Object(variables(fault))).collect());
+    let mut caused = Caused::default();
+    for fault in all.iter().take(JUDGED).filter(|fault| may_cause(rule, context, fault)) {
+        caused.add(rule, context, &fault.loaders, &finding_scope(check, scope, fault, count));
+    }
+    let found = finding(rule, &inner, rule.message.render(&inner), places, evidence, fix);
+    Some(caused.give(rule, context, found))
+}
+
+/// Whether a fault is in something that an effect of the rule is on: what no loader opens has none.
+fn may_cause(rule: &Rule, context: &Context<'_>, fault: &Fault) -> bool {
+    let file = fault.places.first().and_then(|place| place.file.as_deref());
+    let reader = || file.and_then(|file| context.object_reading(file));
+    rule.effects.iter().any(|effect| effect.object.or_else(reader).is_some())
 }
 
 /// Whether two faults tell of one place what different loaders do there, each in its own words.
@@ -371,6 +420,11 @@ fn finding(
         hidden: 0,
         note: rule.note,
     }
+}
+
+/// What an effect is, whatever its words.
+fn consequence(effect: &FindingEffect) -> (Object, Consequence, String) {
+    (effect.object, effect.outcome, effect.loader.clone())
 }
 
 /// Whether a leading version has an effect.

@@ -134,6 +134,8 @@ pub(super) struct Basis<'a> {
     pub(super) loads: &'a [LoadReport],
     /// Whether the class has a processor: then config.json repeats ids of its tokenizer.
     pub(super) has_processor: bool,
+    /// What was not judged of the checkpoint, if anything.
+    pub(super) unjudged: Option<&'a str>,
     /// For a loader without a report, the reason.
     pub(super) unpredicted: &'a [(&'static str, String)],
 }
@@ -271,6 +273,9 @@ impl Basis<'_> {
         }
         if let Some(verdict) = not_read() {
             return verdict;
+        }
+        if let Some(why) = self.unjudged {
+            return (LoadVerdict::NotPredicted, Some(why.to_owned()));
         }
         match self.report(loader) {
             Some(_) if !self.was_read() => {

@@ -13,8 +13,8 @@ use crate::check::Outcome;
 use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, escape};
-use crate::report::model::{Fixed, Withdrawn};
 use crate::report::diff;
+use crate::report::model::{Fixed, Withdrawn};
 use crate::surgery::repair::{Repair, plan};
 use crate::surgery::{ApplyError, Leftover, Recovered, Recovery, RepairError, RepairWritten, Trust, journal, overlay};
 

@@ -153,7 +153,8 @@ impl Worker {
         let lines = words.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with("note:"));
         let said = lines.take(2).collect::<Vec<_>>().join(" ");
         let said = if said.is_empty() { said } else { format!(": {}", output::safe(&said)) };
-        let next = if writes { "; what it wrote is finished or taken back by the next `check --fix` or `undo`" } else { "" };
+        let next =
+            if writes { "; what it wrote is finished or taken back by the next `check --fix` or `undo`" } else { "" };
         format!("the process that checked it ended with {ended}{said}{next}")
     }
 }

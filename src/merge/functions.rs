@@ -34,10 +34,14 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
         .collect();
     let turns: BTreeMap<String, String> = donors
         .iter()
-        .filter_map(|donor| Some((donor.role.clone(), donor.parts.as_ref().map(DonorParts::model)?.image_turn.clone()?)))
+        .filter_map(|donor| {
+            Some((donor.role.clone(), donor.parts.as_ref().map(DonorParts::model)?.image_turn.clone()?))
+        })
         .collect();
     scope.function2("chat_template", move |guest, host| {
-        let with_image = |template: &String| turns.get(host).map_or_else(|| template.clone(), |turn| with_image_turn(template, turn));
+        let with_image = |template: &String| {
+            turns.get(host).map_or_else(|| template.clone(), |turn| with_image_turn(template, turn))
+        };
         templates.get(guest).map_or(Value::Null, |template| json!(with_image(template)))
     });
     let of_models = scales.clone();

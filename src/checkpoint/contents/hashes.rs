@@ -20,7 +20,8 @@ use crate::checkpoint::{
 const RECORDS: [&str; 3] = [".cache", ".cache/huggingface", ".cache/huggingface/download"];
 /// Maximum number of bytes of such a record: three short lines.
 const RECORD_CAP: u64 = 4096;
-/// Largest weights that are compared with git as a file of their own. Larger ones are in Git LFS, where git has a pointer.
+/// Largest weights that are hashed as a file of git in the same reading. Larger ones are nearly always in Git LFS, where git has a
+/// pointer, and are read again where that differs.
 const PLAIN_CAP: u64 = 64 << 20;
 
 /// What a record says of a file.
@@ -206,7 +207,9 @@ fn compare(files: &Source, file: &Stated<'_>, buffer: &mut [u8], zeros: u64, rea
         Record::Git(stated) => ("git hash", stated, found.git.unwrap_or_default()),
         Record::GitOrPointer(stated) => {
             let pointer = pointer_hash(&found.sha256.unwrap_or_default(), size);
-            ("git hash", stated, found.git.filter(|git| git == stated).unwrap_or(pointer))
+            let again = || Hashes::of(&opened, &Record::Git(stated.clone()), buffer, zeros, &|_| ()).ok()??.git;
+            let git = if pointer == *stated { None } else { found.git.or_else(again) };
+            ("git hash", stated, git.filter(|git| git == stated).unwrap_or(pointer))
         }
     };
     if found == *stated {

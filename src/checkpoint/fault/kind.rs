@@ -339,7 +339,7 @@ fault_kinds! {
         TemplateNeedsProcess = "template-needs-process" { reason: Text },
         TemplateNotRendered = "template-not-rendered" { reason: Text },
         TemplateSyntax = "template-syntax" { line: Integer, reason: Text },
-        TensorInTwoShards = "tensor-in-two-shards" { other: Text, mapped: Text, taken: Text, differs: OrNull(&Flag) },
+        TensorInTwoShards = "tensor-in-two-shards" { other: Text, mapped: Text, taken: Text, differs: OrNull(&Flag), not_judged?: Text },
         TiedOver = "tied-over" { tensor: Text, by: Text, under?: Text },
         TiedOverAnother = "tied-over-another" { tensor: Text, by: Text, under?: Text },
         TokenAboveRows = "token-above-rows" {

@@ -19,6 +19,20 @@ const ROLE_FUNCTIONS: [&str; 7] = ["shape", "has", "dtype", "part", "row_scale",
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
 
+/// Calls `check` with each expression of a file, and the key that it is the value of.
+fn of_file<'e>(
+    file: &'e FileSpec,
+    check: &impl Fn(&'static str, &'e Expression) -> Result<(), DataError>,
+) -> Result<(), DataError> {
+    let (when, others): (_, Vec<(&'static str, &'e Expression)>) = match file {
+        FileSpec::Copy(copy) => (&copy.when, Vec::new()),
+        FileSpec::Modules(modules) => (&modules.when, Vec::new()),
+        FileSpec::Template(text) => (&text.when, text.fill.values().map(|value| ("fill", value)).collect()),
+        FileSpec::Text(text) => (&text.when, vec![("is", &text.is)]),
+    };
+    when.iter().map(|when| ("when", when)).chain(others).try_for_each(|(key, expression)| check(key, expression))
+}
+
 impl Validator<'_> {
     pub(super) fn expressions(&self) -> Result<(), DataError> {
         let mut variables: BTreeSet<&str> = self.role_names().into_iter().collect();
@@ -95,20 +109,7 @@ impl Validator<'_> {
             tensor.rename.as_ref().map_or(Ok(()), |rename| template("as", rename))?;
             tensor.part.as_ref().map_or(Ok(()), |part| template("part", part))?;
         }
-        for file in &self.recipe.files {
-            match file {
-                FileSpec::Copy(copy) => some("when", copy.when.as_ref())?,
-                FileSpec::Modules(modules) => some("when", modules.when.as_ref())?,
-                FileSpec::Template(text) => {
-                    some("when", text.when.as_ref())?;
-                    text.fill.values().try_for_each(|expression| check("fill", expression))?;
-                }
-                FileSpec::Text(text) => {
-                    some("when", text.when.as_ref())?;
-                    check("is", &text.is)?;
-                }
-            }
-        }
+        self.recipe.files.iter().try_for_each(|file| of_file(file, &check))?;
         self.recipe.notes.iter().try_for_each(|note| {
             check("when", &note.when)?;
             template("say", &note.say)
