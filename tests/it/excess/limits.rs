@@ -9,6 +9,7 @@ mod reasons;
 mod shards;
 mod sources;
 mod templates;
+mod verdicts;
 
 use std::collections::BTreeMap;
 use std::fs;

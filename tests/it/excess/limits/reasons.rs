@@ -81,7 +81,7 @@ const REASONS: &[(&[&str], &str)] = &[
         "The steps of a template are those of the engine; src/check/templates/render.rs MAX_STRING ends in the same finding.",
     ),
     (&["src/check/compare.rs FILE_CAP"], "`diff` lists the file among what was not compared."),
-    (&["src/check/tokens.rs MAX_ADDED"], "NOT TOLD: what depends on the ids of the tokens that the processor adds."),
+    (&["src/check/tokens.rs MAX_ADDED"], "Nothing is predicted of the model."),
     (
         &[
             "src/checkpoint/contents/git_index.rs CAP",
@@ -92,7 +92,7 @@ const REASONS: &[(&[&str], &str)] = &[
     ),
     (
         &["src/checkpoint/contents/hashes.rs PLAIN_CAP"],
-        "NOT TOLD: a larger file that git has itself, without Git LFS, is said to differ from its hash.",
+        "Larger files are read twice where their pointer has another hash.",
     ),
     (
         &["src/checkpoint/adapter.rs MAX_SHARDS"],
@@ -138,8 +138,14 @@ const REASONS: &[(&[&str], &str)] = &[
         &["src/checkpoint/work.rs BASE", "src/checkpoint/work.rs PER_BYTE"],
         "A measure of cost; what exceeds it ends a pickle: tests/it/readers/pickles.rs bombs_of_the_stack_machine_are_refused.",
     ),
-    (&["src/check/evaluate.rs PLACES"], "NOT TOLD: an effect that only a later fault of a group has."),
-    (&["src/check/index.rs COMPARED"], "NOT TOLD: whether further tensors that two shards hold differ."),
+    (
+        &["src/check/evaluate.rs PLACES"],
+        "Fewer places are listed; the effects of all are looked for: src/check/evaluate.rs JUDGED.",
+    ),
+    (
+        &["src/check/index.rs COMPARED"],
+        "Nothing is predicted: tests/it/excess/limits/verdicts.rs a_tensor_behind_a_thousand_equal_ones_does_not_load.",
+    ),
     (&["src/check/statistics.rs MAX_SETS"], "NOT TOLD: further sets of statistics."),
     (
         &["src/check/variables.rs DOCUMENT_BYTES", "src/check/variables.rs NAMES_MATCHED"],
