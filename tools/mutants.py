@@ -60,6 +60,8 @@ def listed(sources):
             opening = re.compile(rf"\bfn\s+{re.escape(name)}\b").search(text, signature, end)
             if opening is None:
                 continue
+            if any(known["name"] == mutant["name"] for known in found[source]):
+                continue  # cargo-mutants lists what several targets have for each
             found[source].append({
                 "name": mutant["name"], "genre": mutant["genre"], "replacement": mutant["replacement"],
                 "at": offset(mutant["span"]["start"]), "end": offset(mutant["span"]["end"]),
@@ -188,13 +190,10 @@ def main():
     for source, mutants in found.items():
         drawn = random.Random(f"{options.seed}/{source}")
         found[source] = [mutant for mutant in mutants if drawn.randrange(of) < part and not mutant["impl"]]
-    seen = collections.Counter()
     for mutants in found.values():
         for mutant in mutants:
             number += 1
             mutant["number"] = number
-            seen[mutant["name"]] += 1
-            mutant["name"] += f" ({seen[mutant['name']]})" if seen[mutant["name"]] > 1 else ""
     copy = options.work / "copy"
     copy.mkdir(parents=True, exist_ok=True)
     listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True).stdout

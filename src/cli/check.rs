@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use super::args::CheckArgs;
 use super::exit::{CLEAN, FAILED, FINDINGS};
-use super::look::{Answer, CheckRun, Looked, Preview, Stop};
+use super::fix::Preview;
+use super::look::{Answer, CheckRun, Looked, Stop};
 use super::paths::{self, Targets};
 use super::{baseline, fix, interpreter, output, pins, signals, skipped, workers};
 use crate::check::unused_suppressions;

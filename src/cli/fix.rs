@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::bail;
+use serde::{Deserialize, Serialize};
 
 use super::args::FixArgs;
-use super::look::Preview;
 use super::output;
 use super::progress::Meter;
 use crate::check::Outcome;
@@ -126,6 +126,16 @@ fn write(args: &FixArgs, dir: &Path, repair: &Repair) -> anyhow::Result<Option<P
         output::note(&output::safe(&text));
     }
     Ok(Some(dir.to_owned()))
+}
+
+/// What the fixes of a directory would change, for `--diff`. A worker sends it.
+#[derive(Serialize, Deserialize)]
+pub struct Preview {
+    /// The changes, as they are printed.
+    pub diff: String,
+    /// Numbers of fixes and of files that they change.
+    pub fixes: usize,
+    pub files: usize,
 }
 
 /// What the fixes would change.

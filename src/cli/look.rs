@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::args::CheckArgs;
+use super::fix::Preview;
 use super::progress::Meter;
 use super::settings::{Resolved, Typed, resolve};
 use super::{fix, output};
@@ -35,16 +36,6 @@ pub struct Looked {
     pub report: CheckpointReport,
     pub uses: Vec<SuppressionUse>,
     pub skipped: Vec<Skipped>,
-}
-
-/// What the fixes of a directory would change, for `--diff`. A worker sends it.
-#[derive(Serialize, Deserialize)]
-pub struct Preview {
-    /// The changes, as they are printed.
-    pub diff: String,
-    /// Numbers of fixes and of files that they change.
-    pub fixes: usize,
-    pub files: usize,
 }
 
 /// What a run asks for each directory, of itself or of a worker.

@@ -14,7 +14,8 @@ use clap::Parser as _;
 
 use super::args::{Cli, Command as Subcommand};
 use super::exit::{CLEAN, FAILED};
-use super::look::{Answer, CheckRun, Looked, Preview, Stop};
+use super::fix::Preview;
+use super::look::{Answer, CheckRun, Looked, Stop};
 use super::{output, signals, system};
 use crate::checkpoint::{parallel, telling_all};
 

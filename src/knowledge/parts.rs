@@ -31,8 +31,8 @@ pub struct ModelParts {
     /// Tokens that the processor needs in the tokenizer, in the order in which a merge adds them.
     #[serde(default)]
     pub tokens: Vec<TokenRun>,
-    /// What a chat template writes for an image, which the processor replaces by a token for each feature. Without it, the
-    /// processor takes images without a word in the text.
+    /// What a chat template writes for an image, which the processor replaces by a token for each feature: nothing where the
+    /// processor puts the tokens in front. Without the key, chats have no images.
     #[serde(default)]
     pub image_turn: Option<String>,
     /// Name of the processor in `rules/processors/` that adds its tokens itself, instead of `tokens`.

@@ -29,6 +29,8 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 /// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host, under the
 ///   version that wrote it, when its class has the guest's language model; `with` and `without` list the versions of
 ///   transformers, of `--for` or all, that need the factor, or none.
+/// - `head_factor(role)`: the `factor` on logits that the class of a language model alone has, and the `key` of its config that
+///   states it; 1 and an empty key where none is known;
 /// - `chat_template(guest, host)`: the guest's chat template, made to write what the host's processor needs for an image
 ///   (`image_turn` of its parts); null when the guest has none;
 /// - `part(role, name)`: a part of a donor: its config with defaults (`config`), as it is written (`stored`), its JSON pointer

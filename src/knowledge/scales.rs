@@ -1,4 +1,4 @@
-//! Factors between embeddings and the first layer: `rules/scales.json5`.
+//! Factors between embeddings and the first layer, and on logits: `rules/scales.json5`.
 
 use serde::Deserialize;
 use serde_json::Value;
@@ -36,9 +36,21 @@ struct ModelScales {
     /// Factor on the features of images, after the projector.
     #[serde(default)]
     image: Option<Expression>,
+    /// Factor on logits, in the class of the language model alone.
+    #[serde(default)]
+    logits: Option<LogitScale>,
     /// Code that was read.
     #[allow(dead_code, reason = "for readers of the file")]
     sources: Vec<String>,
+}
+
+/// The factor of a class on what its head puts out.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LogitScale {
+    /// The key of the config that states it; with 1 there, the factor is 1.
+    key: String,
+    factor: Expression,
 }
 
 impl Scales {
@@ -70,6 +82,18 @@ impl Scales {
         }
         let image = self.factor(&composition, loader, |model| model.image.as_ref());
         image * self.factor(text, loader, |model| model.inputs.as_ref())
+    }
+
+    /// The factor on logits in the class of a language model alone, with the key of its config that states it; `None` where none
+    /// is known. Classes around it apply the head alone, since transformers 4.52.
+    #[must_use]
+    pub fn of_logits(&self, config: &Value) -> Option<(f64, &str)> {
+        let text = text_part(config);
+        let factor = self.factor(text, Loader::NEWEST, |model| Some(&model.logits.as_ref()?.factor));
+        let model_type = text.get("model_type").and_then(Value::as_str)?;
+        let of_type = self.models.iter().filter(|model| model.model_types.iter().any(|name| name == model_type));
+        let key = of_type.filter_map(|model| model.logits.as_ref()).map(|logits| logits.key.as_str()).next()?;
+        ((factor - 1.0).abs() > f64::EPSILON).then_some((factor, key))
     }
 
     /// Whether this version of transformers loads a class of the model.
@@ -120,5 +144,14 @@ mod tests {
         let llava = json!({ "model_type": "llava", "text_config": llama });
         assert!((scales.of_images(&llava, &gemma, Loader::V4_47_0) - 2048_f64.sqrt()).abs() < 1e-12);
         assert!((scales.of_images(&llava, &gemma, Loader::V5_23_0) - 1.0).abs() < 1e-12);
+        let granite = json!({ "model_type": "granite", "embedding_multiplier": 12.0, "logits_scaling": 8.0 });
+        assert_eq!(scales.of_logits(&granite), Some((0.125, "logits_scaling")));
+        assert_eq!(
+            scales.of_logits(&json!({ "model_type": "cohere", "logit_scale": 0.0625 })),
+            Some((0.0625, "logit_scale"))
+        );
+        assert_eq!(scales.of_logits(&json!({ "model_type": "cohere", "logit_scale": 1.0 })), None);
+        assert_eq!(scales.of_logits(&llama), None);
+        assert!((scales.of_images(&llava, &granite, Loader::V4_57_6) - 12.0).abs() < 1e-12);
     }
 }

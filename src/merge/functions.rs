@@ -11,7 +11,7 @@ use crate::check::default_template;
 use crate::knowledge::scales::Scales;
 use crate::knowledge::{Loader, Scope, source};
 
-/// Adds `dtype`, `image_fold`, `row_scale` and `chat_template`; `versions` are those of transformers that the result is for, or none.
+/// Adds `dtype`, `image_fold`, `row_scale`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
 pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
@@ -43,6 +43,12 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
             turns.get(host).map_or_else(|| template.clone(), |turn| with_image_turn(template, turn))
         };
         templates.get(guest).map_or(Value::Null, |template| json!(with_image(template)))
+    });
+    let (of_roles, of_models) = (Arc::clone(&configs), scales.clone());
+    scope.function1("head_factor", move |role| {
+        let stated = of_roles.get(role).and_then(|config| of_models.of_logits(config));
+        let (factor, key) = stated.unwrap_or((1.0, ""));
+        json!({ "factor": factor, "key": key })
     });
     let of_models = scales.clone();
     scope.function1("row_scale", move |role| {

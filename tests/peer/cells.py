@@ -80,6 +80,8 @@ class Cell:
         for name, stored in donors[1].items():
             copies = list(in_dtypes(stored, to))
             kept = any(copy in there for copy in copies) or any(end.startswith(data) for end in ends for _, data in copies)
+            # A factor on logits is folded into the head.
+            kept |= name == "lm_head.weight" and any(other.endswith(name) for other in changed)
             tally.expect(kept or not self.must_keep(name), f"{self.name}: {name} of the guest is lost")
 
     def may_change(self, name):

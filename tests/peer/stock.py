@@ -131,6 +131,7 @@ def guest_tokenizer(kind, work):
         "qwen2": lambda: qwen2(work),
         "qwen3": lambda: qwen2(work, ["<think>", "</think>"]),
         "phi3": lambda: llama(work, more=["<|endoftext|>", "<|assistant|>", "<|end|>", "<|user|>"]),
+        "granite": lambda: llama3(work),
         "gemma": lambda: gemma(work),
         "gemma2": lambda: gemma(work),
         "gemma3_text": lambda: gemma(work, ["<start_of_image>", "<end_of_image>"]),
@@ -157,6 +158,8 @@ def text_config(kind, width, tokenizer):
         config["head_dim"] = 16
     if kind in ("gemma2", "gemma3_text"):
         config |= dict(query_pre_attn_scalar=16, sliding_window=64)
+    if kind == "granite":
+        config |= dict(logits_scaling=8.0, embedding_multiplier=12.0, attention_multiplier=0.25, residual_multiplier=0.5)
     if kind == "phi3":
         config |= dict(original_max_position_embeddings=512, sliding_window=64)
     return config
@@ -164,7 +167,7 @@ def text_config(kind, width, tokenizer):
 
 GUESTS = {
     "llama": "Llama", "llama3": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "qwen3": "Qwen3", "phi3": "Phi3", "gemma2": "Gemma2",
-    "gemma3_text": "Gemma3",
+    "gemma3_text": "Gemma3", "granite": "Granite",
 }  # fmt: skip
 
 

@@ -41,6 +41,11 @@ REFUSED = [
         "the host was saved by 4.47, which cannot generate with this language model",
     ),
     (
+        r"(llava|llava_next|llava_onevision|paligemma2?) x granite .*",
+        "4.47 cannot run",
+        "the host was saved by 4.47, which cannot run this language model",
+    ),
+    (
         r".* sees with siglip2",
         "",
         "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP",
