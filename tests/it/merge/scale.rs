@@ -5,6 +5,7 @@ use std::path::Path;
 
 use ckpt_doctor::knowledge::{Knowledge, Loader};
 use ckpt_doctor::{Merge, MergeStage};
+use minijinja::context;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -119,4 +120,77 @@ fn the_last_layer_of_each_projector_is_one_of_its_class() {
         let is_compared = !outputs.is_empty() && classes.peek().is_some();
         assert!(!is_compared || classes.any(|class| class.tensors.keys().any(is_last)), "{}", model.model);
     }
+}
+
+/// The guest `llama` of these donors, as a Granite with a chat template of text alone.
+fn as_granite(dir: &Path, is_tied: bool) -> String {
+    let file = |name: &str| -> Value { serde_json::from_slice(&fs::read(dir.join(name)).unwrap()).unwrap() };
+    let mut config = file("config.json");
+    config["model_type"] = json!("granite");
+    config["architectures"] = json!(["GraniteForCausalLM"]);
+    config["logits_scaling"] = json!(8.0);
+    config["embedding_multiplier"] = json!(12.0);
+    config["tie_word_embeddings"] = json!(is_tied);
+    fs::write(dir.join("config.json"), config.to_string()).unwrap();
+    tensors(dir, 1, &knowledge());
+    let template = "{% for m in messages %}[{{ m['role'] }}] {{ m['content'] }}{% endfor %}";
+    let mut tokenizer = file("tokenizer_config.json");
+    tokenizer["chat_template"] = json!(template);
+    fs::write(dir.join("tokenizer_config.json"), tokenizer.to_string()).unwrap();
+    template.to_owned()
+}
+
+#[test]
+fn a_factor_on_logits_is_folded_into_a_head_of_its_own() {
+    for is_tied in [false, true] {
+        let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+        write(all.path());
+        as_granite(&all.path().join("llama"), is_tied);
+        let out = work.path().join("out");
+        let mut merge = Merge::new(&out).recipe("swap-language-model").option("scale", "keep");
+        merge = merge.donor("vision", all.path().join("internvl")).donor("language", all.path().join("llama"));
+        let merge = merge.option("projector", "reinit").loader("4.57.6").unwrap();
+        let report = merge.run().unwrap_or_else(|e| panic!("{e}")).merge.unwrap();
+        assert_eq!(report.stage, Some(MergeStage::Written), "{:?}", report.seams);
+        let config: Value = serde_json::from_slice(&fs::read(out.join("config.json")).unwrap()).unwrap();
+        let stated = config["text_config"]["logits_scaling"].as_f64();
+        let note = report.notes.iter().any(|note| note.contains("temperature=8"));
+        assert_eq!((stated, note), (Some(if is_tied { 8.0 } else { 1.0 }), is_tied));
+        let (before, after) = (read(&all.path().join("llama")), read(&out));
+        if !is_tied {
+            let head = |tensors: &Tensors| {
+                let (_, (dtype, _, bytes)) = tensors.iter().find(|(name, _)| name.ends_with("lm_head.weight")).unwrap();
+                values(dtype, bytes).unwrap()
+            };
+            let (before, after) = (head(&before), head(&after));
+            assert!(
+                before.iter().zip(&after).all(|(before, after)| (before / 8.0 - after).abs() <= after.abs() / 256.0)
+            );
+        }
+    }
+}
+
+#[test]
+fn a_chat_template_writes_what_the_processor_needs_for_an_image() {
+    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    write(all.path());
+    let template = as_granite(&all.path().join("llama"), false);
+    let out = work.path().join("out");
+    let merge = Merge::new(&out).recipe("swap-language-model").option("projector", "reinit").option("scale", "keep");
+    let merge = merge.donor("vision", all.path().join("internvl")).donor("language", all.path().join("llama"));
+    written(&merge.loader("5.23.0").unwrap(), &out);
+    let text = fs::read_to_string(out.join("chat_template.jinja")).unwrap();
+    assert!(text.ends_with(&template) && text.contains(r#"turn.text ~ "<IMG_CONTEXT>\n""#), "{text}");
+    for name in ["chat_template.json", "tokenizer_config.json"] {
+        let document: Value = serde_json::from_slice(&fs::read(out.join(name)).unwrap()).unwrap();
+        assert_eq!(document["chat_template"], text, "{name}");
+    }
+    let mut engine = minijinja::Environment::new();
+    engine
+        .set_syntax(minijinja::syntax::SyntaxConfig::builder().trim_blocks(true).lstrip_blocks(true).build().unwrap());
+    let parts = vec![context! { type => "image" }, context! { type => "text", text => "what is it?" }];
+    let first = context! { role => "system", content => "be brief" };
+    let chat = context! { messages => vec![first, context! { role => "user", content => parts }] };
+    let written = engine.render_str(&text, chat).unwrap();
+    assert_eq!(written, "[system] be brief[user] <IMG_CONTEXT>\nwhat is it?");
 }
