@@ -17,6 +17,8 @@ const MAX_ADDED: u64 = 1_000_000;
 pub struct OpenedTokenizer {
     /// `len(tokenizer)` afterwards.
     pub length: u64,
+    /// `tokenizer.vocab_size`: tokens of the base vocabulary, without added ones.
+    pub vocabulary: u64,
     /// Ids of the named tokens, and the values that the processor's `let` computes.
     pub named: BTreeMap<String, Value>,
     /// The tokens that the processor adds, by id; those the tokenizer had are not among them.
@@ -42,6 +44,7 @@ impl OpenedTokenizer {
     pub fn summary(&self) -> Value {
         let mut map: Map<String, Value> = self.named.clone().into_iter().collect();
         map.insert("length".to_owned(), json!(self.length));
+        map.insert("vocabulary".to_owned(), json!(self.vocabulary));
         map.insert("scattered".to_owned(), json!(self.scattered));
         Value::Object(map)
     }
@@ -65,7 +68,8 @@ pub fn open_tokenizer(
     let Some(length) = tokenizer.length() else { return Ok(None) };
     let mut scope = Scope::new();
     scope.bind("processor", config);
-    let mut out = OpenedTokenizer { length, ..OpenedTokenizer::default() };
+    let vocabulary = tokenizer.vocab_size().unwrap_or(length);
+    let mut out = OpenedTokenizer { length, vocabulary, ..OpenedTokenizer::default() };
     for item in &processor.lets {
         let value = item.is.eval(&scope)?;
         scope.bind(&item.name, &value);

@@ -249,6 +249,12 @@ impl Tokenizer {
         self.length
     }
 
+    /// `tokenizer.vocab_size` in transformers: tokens of the base vocabulary; `None` when it could not be read.
+    #[must_use]
+    pub fn vocab_size(&self) -> Option<u64> {
+        self.base().map(Vocabulary::len)
+    }
+
     /// The id of a token after loading.
     #[must_use]
     pub fn id_of(&self, token: &str) -> Option<u64> {

@@ -103,7 +103,7 @@ pub const VARIABLES: &[Variable] = &[
     variable(
         "tokens",
         OrNull(&TOKENS),
-        "ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length` and `scattered`",
+        "ids of the tokens that the processor adds, under the names in `rules/processors/`, with `length`, `vocabulary` and `scattered`",
     ),
     variable("tried", Flag, "whether what the class refuses is known, because it was built with values of every kind"),
 ];

@@ -175,7 +175,7 @@ impl Validator<'_> {
         let processor = self.recipe.processor(&self.knowledge.processors);
         let lets = processor.iter().flat_map(|p| &p.lets).map(|item| item.name.as_str());
         let runs = processor.iter().flat_map(|p| &p.add).filter_map(|run| run.name.as_deref());
-        ["length", "scattered"].into_iter().chain(lets).chain(runs).collect()
+        ["length", "vocabulary", "scattered"].into_iter().chain(lets).chain(runs).collect()
     }
 
     /// Fails unless the strings that may be the value of an expression are among the known words of a kind.
