@@ -206,11 +206,16 @@ impl PickleReader<'_> {
             self.pickle.format = PickleFormat::Zip;
             return zip::read(self, file, work);
         }
-        if head.starts_with(&legacy::MAGIC) {
+        // torch.save writes protocol 2 unless it is asked for another one; with protocol 4, torch.load refuses the file.
+        let mut named = head.clone();
+        if let Some(protocol) = named.get_mut(1).filter(|protocol| **protocol == 3) {
+            *protocol = 2;
+        }
+        if named.starts_with(&legacy::MAGIC) {
             self.pickle.format = PickleFormat::Legacy;
             return legacy::read(self, file, work);
         }
-        if head.len() < legacy::MAGIC.len() && legacy::MAGIC.starts_with(&head) {
+        if named.len() < legacy::MAGIC.len() && legacy::MAGIC.starts_with(&named) {
             return Err(Problem::Cut("the first pickle".to_owned(), None));
         }
         // Pickles of protocol 0 are text, so any file may be one.

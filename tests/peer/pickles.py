@@ -7,6 +7,10 @@ fault, torch refuses; where the reader is in doubt, either may be.
 
     cargo build --example read_pickles
     python tests/peer/pickles.py target/debug/examples/read_pickles [--dicts 300] [--mutations 3000] [--seed 1]
+                                 [--answers tests/data/torch-pickles [--found FOLDER...]]
+
+With `--answers`, torch is asked again about a saved corpus, whose answers `tests/it/readers/pickles.rs` holds the reader to without
+Python; CKPT_DOCTOR_WRITE=1 draws the corpus anew, with the files of the folders.
 """
 
 import argparse
@@ -14,6 +18,7 @@ import collections
 import hashlib
 import io
 import json
+import os
 import pathlib
 import random
 import shutil
@@ -286,12 +291,63 @@ def compare_odd(dump, folder):
     return problems, counts
 
 
+def inputs(rng, more):
+    """Files for the saved corpus: state dicts in every protocol and format, odd containers, files of `more`, and mutants of all."""
+    made = []
+    for n in range(60):
+        legacy = n % 2 == 1
+        state, _ = state_dict(rng, OLD if legacy else list(DTYPES))
+        file = io.BytesIO()
+        options = {"_use_new_zipfile_serialization": not legacy, "pickle_protocol": 2 + n // 2 % 4}
+        torch.save(state if n % 5 else [state], file, **options)
+        made.append((f"{'legacy' if legacy else 'zip'} {n}", file.getvalue()))
+    made += [(f"odd {name}", data) for name, data in odd().items()]
+    seen = [(f"found {file.name}", file.read_bytes()) for folder in more for file in sorted(folder.iterdir())]
+    made += seen
+    made += [(f"mutant {n}", mutated(rng, rng.choice(made)[1])) for n in range(150)]
+    return [(name, data) for name, data in made if len(data) < 6000]
+
+
+def answer(data, folder):
+    """What torch reads for transformers: the tensors of a dict, `other` for another value, null where it raises."""
+    # torch keeps a map of the file.
+    path = pathlib.Path(tempfile.mkdtemp(dir=folder), "pytorch_model.bin")
+    path.write_bytes(data)
+    value, error = opened_by_transformers(path)
+    if error:
+        return None
+    try:
+        return expected(value) if isinstance(value, dict) else "other"
+    except (KeyError, AttributeError):
+        return "other"
+
+
+def saved_answers(base, seed, folders):
+    """Compares the answers of a saved corpus with torch's; with CKPT_DOCTOR_WRITE, draws the corpus anew."""
+    index, data = base.with_suffix(".json"), base.with_suffix(".bin")
+    with tempfile.TemporaryDirectory() as folder:
+        if os.environ.get("CKPT_DOCTOR_WRITE"):
+            whole, lines = bytearray(), []
+            for name, file in inputs(random.Random(seed), folders):
+                lines.append({"name": name, "at": len(whole), "len": len(file), "torch": answer(file, folder)})
+                whole += file
+            data.write_bytes(whole)
+            index.write_text("[\n" + ",\n".join(json.dumps(line) for line in lines) + "\n]\n")
+        whole, wrong = data.read_bytes(), []
+        for line in json.loads(index.read_text()):
+            found = answer(whole[line["at"] : line["at"] + line["len"]], folder)
+            wrong += [] if found == line["torch"] else [f"{line['name']}: torch now says {found}"]
+    return wrong
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("dump")
     parser.add_argument("--dicts", type=int, default=300)
     parser.add_argument("--mutations", type=int, default=3000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--answers", type=pathlib.Path, help="saved corpus, without the endings .json and .bin")
+    parser.add_argument("--found", type=pathlib.Path, nargs="*", default=[], help="folders with more files for it")
     args = parser.parse_args()
     rng = random.Random(args.seed)
     problems, whole, files = [], 0, []
@@ -316,6 +372,8 @@ def main():
                 if differences:
                     pathlib.Path(tempfile.gettempdir(), f"pickle-{args.seed}-{name}").write_bytes(data)
                 problems += differences
+        if args.answers:
+            problems += saved_answers(args.answers, args.seed, args.found)
         odd_problems, counts = compare_odd(args.dump, folder)
         problems += odd_problems
     print(f"{len(sound)} state dicts, half in each format; {len(files)} mutated files, {whole} of them whole")

@@ -102,6 +102,11 @@ pub(super) fn read(reader: &mut PickleReader<'_>, file: &SourceFile, work: &mut 
         reader.pickle.unread = beside::unread(&reader.shard.name, &machine, stop, false);
     }
     let value = result.map_err(|stop| Problem::of(stop, machine.offset, None))?;
+    if claimed(&machine).is_err() {
+        // With a map of the file, as transformers asks for, torch takes the first size; without one it raises.
+        reader.pickle.doubt = Some("one storage has two sizes".to_owned());
+        return Ok(());
+    }
     let storages = storages(reader, file, &archive, &machine)?;
     state_dict::read(reader, &mut machine, value, &storages)
 }

@@ -2,7 +2,10 @@
 
 use std::sync::LazyLock;
 
-use ckpt_doctor::checkpoint::{Dtype, FaultKind, Shard};
+use ckpt_doctor::checkpoint::{Dtype, FaultKind, Shard, Tensor, hex};
+use ckpt_doctor::knowledge::pickles::Pickles;
+use serde_json::json;
+use sha2::{Digest as _, Sha256};
 
 use super::{Case, hold};
 use crate::support::invariants;
@@ -291,4 +294,52 @@ fn a_stop_where_python_goes_on_is_no_end() {
     assert_eq!(unread(b"Um texto em portugu\xc3\xaas."), None);
     let imports: Vec<u8> = (0..1001).flat_map(|n| format!("cm{n}\nf\n0").into_bytes()).collect();
     assert_eq!(unread(&imports), Some(FaultKind::PickleTooLarge));
+}
+
+/// A file of the saved corpus, which `tests/peer/pickles.py --answers` made and asked torch about.
+#[derive(serde::Deserialize)]
+struct Asked {
+    name: String,
+    at: usize,
+    len: usize,
+    /// Null where torch raises, `other` for a value that is no dict of tensors, or by name: dtype, shape, and the digest of a
+    /// contiguous tensor.
+    torch: serde_json::Value,
+}
+
+/// Name, dtype, shape and digest of the tensors, as torch's answers have them.
+fn tensors(shard: &Shard, bytes: &[u8]) -> serde_json::Value {
+    let strided = &shard.pickle().unwrap().strided;
+    let digest = |tensor: &Tensor| {
+        let range = usize::try_from(tensor.begin).unwrap()..usize::try_from(tensor.end).unwrap();
+        (!strided.contains(&tensor.name)).then(|| hex(&Sha256::digest(&bytes[range])))
+    };
+    let line = |t: &Tensor| (t.name.clone(), json!([t.dtype.to_string(), t.shape, digest(t)]));
+    shard.tensors.iter().map(line).collect::<serde_json::Map<_, _>>().into()
+}
+
+/// What is called whole, torch opens, with the same tensors, and torch raises on what has a fault; in doubt, either may be.
+#[test]
+fn answers_of_torch() {
+    let asked: Vec<Asked> = serde_json::from_str(include_str!("../../data/torch-pickles.json")).unwrap();
+    let accepted = Pickles::embedded().unwrap();
+    let corpus = include_bytes!("../../data/torch-pickles.bin");
+    let (mut wrong, mut whole) = (Vec::new(), 0);
+    for Asked { name, at, len, torch } in asked {
+        let bytes = &corpus[at..at + len];
+        let shard = read(bytes);
+        let pickle = shard.pickle().unwrap();
+        let is_accepted = pickle.opcodes.keys().all(|opcode| accepted.accepts_opcode(opcode))
+            && pickle.globals.iter().all(|global| accepted.accepts_import(global));
+        let is_whole = is_accepted && shard.faults.is_empty() && pickle.doubt.is_none() && !shard.unread;
+        whole += usize::from(is_whole);
+        let found = tensors(&shard, bytes);
+        // A dict without a tensor is no state dict.
+        let opens = torch.as_object().is_some_and(|tensors| !tensors.is_empty());
+        let fits = if is_whole { torch == found } else { pickle.doubt.is_some() || !opens };
+        if !fits {
+            wrong.push(format!("{name}: {:?} {:?}\n  {found}\n  {torch}", kinds(bytes), pickle.doubt));
+        }
+    }
+    assert!(whole > 20 && wrong.is_empty(), "{whole}\n{}", wrong.join("\n"));
 }
