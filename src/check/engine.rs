@@ -9,14 +9,14 @@ use std::sync::Arc;
 use serde_json::{Value, json};
 
 use super::bounded::bounded;
-use super::evaluate::{Context, has_faults, pinpoint, run_rules};
+use super::evaluate::{Context, has_faults, has_too_many, pinpoint, run_rules};
 use super::finding::{Finding, FindingEffect, Severity, Skipped};
 use super::load::{self, LoadReport, Stored, Target};
 use super::model_type::{class_of, has_code};
 use super::observe::{explain, observe_files, observe_versions};
 use super::options::RunOptions;
 use super::outcome::Outcome;
-use super::tokens::OpenedTokenizer;
+use super::tokens::{OpenedTokenizer, Unopened};
 use super::variables::{self, declared};
 use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
 use super::view::{Asked, FilesView, VersionsView};
@@ -81,8 +81,6 @@ struct CheckFacts<'a> {
     memo: judge::Memo,
     /// The tokenizer as the processor of a class opens it in a version, for those that were asked for.
     opened: RefCell<Vec<OpenedBy<'a>>>,
-    /// Why one of them could not be opened.
-    unopened: RefCell<Option<String>>,
 }
 
 /// A tokenizer as the processor of a class opens it; `None` when its ids are not known.
@@ -91,6 +89,8 @@ struct OpenedBy<'a> {
     /// The tokenizer class of the processor of a version of transformers; `None` for that of the tokenizer itself.
     with: Option<&'a OpensWith>,
     tokenizer: Option<Rc<OpenedTokenizer>>,
+    /// Why nothing that depends on it is judged, if anything does.
+    not_judged: Option<String>,
 }
 
 /// What a reading is for.
@@ -184,7 +184,6 @@ impl<'a> CheckFacts<'a> {
             faults,
             memo: judge::Memo::default(),
             opened: RefCell::default(),
-            unopened: RefCell::default(),
         }
     }
 
@@ -201,15 +200,30 @@ impl<'a> CheckFacts<'a> {
         let config = self.checkpoint.document(files::PROCESSOR_CONFIG).and_then(|d| d.value.as_ref());
         let open = |processor| {
             let config = config.unwrap_or(&Value::Null);
-            let opened = tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, with);
-            opened.unwrap_or_else(|error| {
-                self.unopened.replace(Some(format!("the tokens of the processor are not known: {}", error.cause)));
-                None
-            })
+            tokens::open_tokenizer(&self.checkpoint.tokenizer, processor, config, with)
         };
-        let tokenizer = processor.and_then(open).map(Rc::new);
-        self.opened.borrow_mut().push(OpenedBy { class: class.to_owned(), with, tokenizer: tokenizer.clone() });
+        let (tokenizer, not_judged) = match processor.map(open) {
+            Some(Ok(tokenizer)) => (tokenizer.map(Rc::new), None),
+            Some(Err(error @ Unopened::TooMany(_))) => (None, Some(error.to_string())),
+            // Rules tell of a value that is missing.
+            Some(Err(Unopened::Value(_))) | None => (None, None),
+        };
+        let class = class.to_owned();
+        self.opened.borrow_mut().push(OpenedBy { class, with, tokenizer: tokenizer.clone(), not_judged });
         tokenizer
+    }
+
+    /// What limits kept from being judged of a model of this class, if anything.
+    fn not_judged(&self, class: Option<&str>, faults: &[Fault]) -> Option<String> {
+        let of_faults = faults.iter().find_map(|fault| fault.detail.get("not_judged")?.as_str().map(str::to_owned));
+        let opened = self.opened.borrow();
+        let mut of_class = opened.iter().filter(|one| Some(one.class.as_str()) == class);
+        let of_class = of_class.find_map(|one| one.not_judged.clone());
+        of_faults.or(of_class).or_else(|| {
+            let mut rules = self.knowledge.rules.all().filter(|rule| rule.affects != Affected::Nothing);
+            let rule = rules.find(|rule| has_too_many(rule, faults))?;
+            Some(format!("not all faults of {} were judged", rule.code))
+        })
     }
 
     /// The value of `opened`: by version of transformers, the tokenizer as the version's processor opens it, and the class.
@@ -345,16 +359,15 @@ impl<'a> CheckFacts<'a> {
         run_rules(rules, context, faults, scope, &mut outcome);
         outcome.findings.sort_by(|a, b| position(a).cmp(&position(b)));
         let program = faults.iter().find(|fault| fault.kind == FaultKind::QuantizedForAnotherLoader);
-        let mut unjudged = faults.iter().filter_map(|fault| fault.detail.get("not_judged")?.as_str());
-        let unopened = self.unopened.borrow();
         let architecture = outcome.architecture.as_deref();
+        let not_judged = self.not_judged(architecture, faults);
         let basis = Basis {
             checkpoint: self.checkpoint,
             program: program.and_then(|fault| fault.detail.get("program")?.as_str()),
             findings: &outcome.findings,
             loads: &outcome.loads,
             has_processor: architecture.is_some_and(|class| self.knowledge.processor_of(class).is_some()),
-            unjudged: unjudged.next().or(unopened.as_deref()).or(outcome.unjudged.first().map(String::as_str)),
+            not_judged: not_judged.as_deref(),
             unpredicted,
         };
         basis.verdicts(&context.targets, programs)

@@ -26,8 +26,6 @@ pub struct Outcome {
     pub suppressed: Vec<Suppressed>,
     /// Rules that were skipped, with the reason.
     pub skipped: Vec<Skipped>,
-    /// Why nothing is said of the load of a model whose class is known: limits were reached before all was judged.
-    pub unjudged: Vec<String>,
     /// Rules of the user that cannot be used, with the reason: one exceeds the evaluation limit, or names an unknown variable.
     pub unusable: Vec<Skipped>,
 }

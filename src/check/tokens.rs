@@ -50,6 +50,17 @@ impl OpenedTokenizer {
     }
 }
 
+/// Why the ids of a processor's tokens are not known.
+#[derive(Debug, thiserror::Error)]
+pub enum Unopened {
+    /// A value of the processor's config is missing or of another type.
+    #[error(transparent)]
+    Value(#[from] EvalError),
+    /// It asks for so many tokens, which are not counted.
+    #[error("the processor adds {0} tokens, more than any tokenizer has")]
+    TooMany(u64),
+}
+
 /// Adds a processor's tokens as `add_tokens` does: a known token keeps its id, a new one gets the next.
 ///
 /// With the tokenizer class of a version's processor ([`Processor::opens_with`]), that class opens it, with its special tokens;
@@ -62,7 +73,7 @@ pub fn open_tokenizer(
     processor: &Processor,
     config: &Value,
     with: Option<&OpensWith>,
-) -> Result<Option<OpenedTokenizer>, EvalError> {
+) -> Result<Option<OpenedTokenizer>, Unopened> {
     let reopened = with.map(|class| tokenizer.with_defaults(&class.special));
     let tokenizer = reopened.as_ref().unwrap_or(tokenizer);
     let Some(length) = tokenizer.length() else { return Ok(None) };
@@ -78,9 +89,7 @@ pub fn open_tokenizer(
     for run in &processor.add {
         let count = run.count.as_ref().map_or(Ok(1), |e| e.eval_u64(&scope))?;
         if count > MAX_ADDED {
-            let source_text = run.content.source().to_owned();
-            let cause = format!("{count} tokens: more than any tokenizer has");
-            return Err(EvalError { source_text, cause, expression: None });
+            return Err(Unopened::TooMany(count));
         }
         let mut expected = None;
         for i in 0..count {

@@ -135,7 +135,7 @@ pub(super) struct Basis<'a> {
     /// Whether the class has a processor: then config.json repeats ids of its tokenizer.
     pub(super) has_processor: bool,
     /// What was not judged of the checkpoint, if anything.
-    pub(super) unjudged: Option<&'a str>,
+    pub(super) not_judged: Option<&'a str>,
     /// For a loader without a report, the reason.
     pub(super) unpredicted: &'a [(&'static str, String)],
 }
@@ -274,7 +274,7 @@ impl Basis<'_> {
         if let Some(verdict) = not_read() {
             return verdict;
         }
-        if let Some(why) = self.unjudged {
+        if let Some(why) = self.not_judged {
             return (LoadVerdict::NotPredicted, Some(why.to_owned()));
         }
         match self.report(loader) {

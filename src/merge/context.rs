@@ -11,7 +11,7 @@ use super::error::MergeError;
 use super::options::{self, Options};
 use super::parts::{Donor, DonorParts, PartOf, value_of};
 use super::{explain, functions};
-use crate::check::tokens::{OpenedTokenizer, open_tokenizer};
+use crate::check::tokens::{OpenedTokenizer, Unopened, open_tokenizer};
 use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor, TokenSpec};
@@ -151,7 +151,10 @@ impl Context<'_> {
                 .ok_or_else(|| MergeError::Recipe(format!("{}: no {} donor", self.recipe.recipe, spec.base)))?;
             let config = document(self.donors, files::PROCESSOR_CONFIG).unwrap_or_default();
             let opened = open_tokenizer(&donor.checkpoint.tokenizer, &processor, &config, None)
-                .map_err(self.at(format!("processor {}", processor.processor)))?
+                .map_err(|error| match error {
+                    Unopened::Value(error) => self.at(format!("processor {}", processor.processor))(error),
+                    Unopened::TooMany(_) => MergeError::Donor(format!("the {} donor: {error}", spec.base)),
+                })?
                 .ok_or_else(|| {
                     MergeError::Donor(format!(
                         "the {} donor has no vocabulary file (tokenizer.model or tokenizer.json), so the ids of the added tokens are unknown; put its tokenizer files beside its config.json",

@@ -1,9 +1,13 @@
 //! What lies behind a limit makes no verdict better.
 
+use std::fs;
+use std::path::Path;
 use std::sync::Arc;
 
 use ckpt_doctor::check::check_for;
 use ckpt_doctor::check::options::RunOptions;
+use ckpt_doctor::check::verdict::LoadVerdict;
+use ckpt_doctor::knowledge::rule::Object;
 use serde_json::{Value, json};
 
 use super::{Files, base, config, read};
@@ -81,4 +85,39 @@ fn a_tensor_behind_a_thousand_equal_ones_does_not_load() {
     for (n, expected) in [(1, "loads wrong"), (999, "loads wrong"), (1000, "not predicted"), (1001, "not predicted")] {
         assert_eq!(verdict(behind_equal_tensors(n)), expected, "{n}");
     }
+}
+
+/// The tiny SpatialVLA, whose processor adds as many tokens as its document says.
+fn spatialvla() -> Files {
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors/spatialvla-tiny");
+    let entries = fs::read_dir(dir).unwrap().map(Result::unwrap).filter(|entry| entry.path().is_file());
+    entries.map(|e| (e.file_name().into_string().unwrap(), fs::read(e.path()).unwrap())).collect()
+}
+
+fn model_of_4_47(files: Files) -> (LoadVerdict, Option<String>) {
+    let outcome = check_for(&Arc::new(read(files)), &knowledge(), &RunOptions::default());
+    let load = outcome.verdicts.into_iter().find(|load| load.loader == "4.47.0").unwrap();
+    let model = load.objects.into_iter().find(|object| object.object == Object::Model).unwrap();
+    (model.verdict, model.why)
+}
+
+#[test]
+fn a_processor_with_too_many_tokens_is_not_counted() {
+    let mut files = spatialvla();
+    // A statistic is infinite, which JSON cannot say.
+    let text = String::from_utf8(files["processor_config.json"].clone()).unwrap().replace("Infinity", "1.0");
+    let mut config: Value = serde_json::from_str(&text).unwrap();
+    config["action_config"]["num_bins"]["gripper"] = json!(5_000_000);
+    files.insert("processor_config.json".to_owned(), config.to_string().into_bytes());
+    let (verdict, why) = model_of_4_47(files);
+    assert_eq!(verdict, LoadVerdict::NotPredicted);
+    assert!(why.as_ref().is_some_and(|why| why.contains("more than any tokenizer has")), "{why:?}");
+}
+
+/// What is missing is told by rules, and is none of the model's.
+#[test]
+fn a_model_without_its_processor_loads() {
+    let mut files = spatialvla();
+    files.remove("processor_config.json").unwrap();
+    assert_eq!(model_of_4_47(files), (LoadVerdict::Loads, None));
 }
