@@ -301,7 +301,8 @@ def inputs(rng, more):
         options = {"_use_new_zipfile_serialization": not legacy, "pickle_protocol": 2 + n // 2 % 4}
         torch.save(state if n % 5 else [state], file, **options)
         made.append((f"{'legacy' if legacy else 'zip'} {n}", file.getvalue()))
-    made += [(f"odd {name}", data) for name, data in odd().items()]
+    # For a member that is a folder torch reads memory that nobody wrote, so its answer differs from run to run.
+    made += [(f"odd {name}", data) for name, data in odd().items() if not name.startswith("folder ")]
     seen = [(f"found {file.name}", file.read_bytes()) for folder in more for file in sorted(folder.iterdir())]
     made += seen
     made += [(f"mutant {n}", mutated(rng, rng.choice(made)[1])) for n in range(150)]
