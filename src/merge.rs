@@ -36,6 +36,7 @@ mod seams;
 mod switches;
 mod taken;
 mod tensors;
+mod tokens_used;
 mod training;
 mod usage;
 mod validate;
@@ -122,7 +123,12 @@ pub fn run(
     let planned = format!("{} tensors, {} bytes in {shards}", run.record.tensors, run.record.bytes);
     run.note("plan", &planned);
 
-    if !run.check(Role::Planned, &request.out, draft.preview(&out), knowledge, &recipe.tolerates) {
+    let preview = draft.preview(&out);
+    run.record.tokens_used = tokens_used::tokens_used(&preview, draft.opened.as_ref());
+    if let Some(training) = &mut run.record.training {
+        training::name_in_models(training, &preview, knowledge, &request.versions);
+    }
+    if !run.check(Role::Planned, &request.out, preview, knowledge, &recipe.tolerates) {
         return Ok(run.end(MergeStage::Planned));
     }
     publish::check(recipe, &draft)?;

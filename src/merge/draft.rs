@@ -7,6 +7,7 @@ use std::sync::Arc;
 use super::error::MergeError;
 use super::named::Changeable;
 use super::switches::{self, Removed};
+use crate::check::tokens::OpenedTokenizer;
 use crate::checkpoint::tokenizer::VOCABULARY_FILES;
 use crate::checkpoint::{Checkpoint, Document, Entry, FileName, Parts, PythonModule, Vocabulary};
 use crate::report::model::{ChangedTensor, Dropped, MergedFile, Seam};
@@ -29,6 +30,10 @@ pub(super) struct MergeDraft {
     pub(super) changeable: Changeable,
     /// Donor tensors that are not in the result.
     pub(super) dropped: Vec<Dropped>,
+    /// What the host's prompts have for an image; see `image_turn` of its parts.
+    pub(super) image_turn: Option<String>,
+    /// The tokenizer with the tokens of the processor, where the recipe opens it.
+    pub(super) opened: Option<OpenedTokenizer>,
     /// Repairs of donor documents.
     pub(super) repairs: Vec<String>,
     /// Notes for the report.

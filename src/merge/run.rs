@@ -114,11 +114,11 @@ impl MergeRun {
         let record = &mut self.record;
         record.seams.clone_from(&draft.seams);
         record.changed.clone_from(&draft.changed);
-        let names = draft.plan.tensors().map(|(_, tensor)| tensor.name.as_str());
-        record.training = Some(training(names, &draft.train));
+        record.training = Some(training(draft.plan.tensors().map(|(_, tensor)| tensor), &draft.train));
         self.usage = Usage::find(draft);
         let record = &mut self.record;
         record.usage = self.usage.statements(&record.out);
+        record.prompt = self.usage.prompt(draft.image_turn.as_deref());
         record.dropped.clone_from(&draft.dropped);
         record.repairs.clone_from(&draft.repairs);
         record.notes.clone_from(&draft.notes);

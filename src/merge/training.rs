@@ -1,15 +1,78 @@
 //! The tensors of a result that must be trained, and one regular expression for their names.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
-use crate::report::model::Training;
+use crate::check::load::{self, Stored, targets};
+use crate::checkpoint::{Checkpoint, files};
+use crate::knowledge::{Evidence, Knowledge};
+use crate::report::model::{NewRows, TrainedTensor, Training};
+use crate::surgery::expr::TensorTransform;
+use crate::surgery::planned_tensor::PlannedTensor;
 
-/// The training record of a result with the tensors `names`, of which those in `train` must be trained.
-pub(super) fn training<'n>(names: impl Iterator<Item = &'n str>, train: &BTreeSet<String>) -> Training {
-    let (train, freeze): (Vec<&str>, Vec<&str>) = names.partition(|name| train.contains(*name));
+/// Adds what the models of the versions call the tensors to train: those that a run for `versions` judges, which have the class.
+pub(super) fn name_in_models(
+    training: &mut Training,
+    planned: &Checkpoint,
+    knowledge: &Knowledge,
+    versions: &[String],
+) {
+    let Some(config) = planned.document(files::CONFIG).and_then(|document| document.value.as_ref()) else { return };
+    let stored = Stored::of(planned);
+    let train: BTreeSet<String> = training.train.iter().cloned().collect();
+    let without = |names: &BTreeSet<String>| stored.replacing(names, BTreeMap::new());
+    let frozen = without(&train);
+    let mut named: [BTreeSet<String>; 2] = [train, training.freeze.iter().cloned().collect()];
+    let names: Vec<&str> = training.train.iter().chain(&training.freeze).map(String::as_str).collect();
+    for (target, class) in targets(&knowledge.library, config, &names, versions) {
+        let Ok(built) = load::build(class, config, &stored) else { continue };
+        let in_model = |stored: &Stored| names_of(&load::in_model(&built, stored));
+        let (all, freeze) = (in_model(&stored), in_model(&frozen));
+        let train: BTreeSet<String> = all.difference(&freeze).cloned().collect();
+        for rows in training.sizes.iter_mut() {
+            let Some(new_rows) = &mut rows.new_rows else { continue };
+            let others = in_model(&without(&BTreeSet::from([rows.name.clone()])));
+            let own = all.difference(&others).filter(|name| **name != rows.name && !new_rows.in_models.contains(*name));
+            let own: Vec<String> = own.cloned().collect();
+            new_rows.in_models.extend(own);
+        }
+        training.versions.extend(target.versions);
+        named.iter_mut().zip([train, freeze]).for_each(|(all, more)| all.extend(more));
+    }
+    let [train, freeze] = &named;
+    let frozen: Vec<&str> = freeze.difference(train).map(String::as_str).collect();
+    training.pattern =
+        (!train.is_empty()).then(|| pattern(&train.iter().map(String::as_str).collect::<Vec<_>>(), &frozen));
+}
+
+fn names_of(evidence: &Evidence) -> BTreeSet<String> {
+    evidence.iter().map(|(name, _)| name.to_owned()).collect()
+}
+
+/// The training record of a result with `tensors`, of which those named in `train` must be trained.
+pub(super) fn training<'n>(tensors: impl Iterator<Item = &'n PlannedTensor>, train: &BTreeSet<String>) -> Training {
+    let (trained, frozen): (Vec<_>, Vec<_>) = tensors.partition(|tensor| train.contains(&tensor.name));
+    let names = |of: &[&'n PlannedTensor]| of.iter().map(|tensor| tensor.name.as_str()).collect::<Vec<_>>();
+    let (train, freeze) = (names(&trained), names(&frozen));
     let pattern = (!train.is_empty()).then(|| pattern(&train, &freeze));
     let owned = |names: Vec<&str>| names.into_iter().map(str::to_owned).collect();
-    Training { pattern, train: owned(train), freeze: owned(freeze) }
+    let sizes = trained.into_iter().map(size).collect();
+    Training { pattern, versions: Vec::new(), train: owned(train), freeze: owned(freeze), sizes }
+}
+
+/// How large a tensor is, and which of its rows were appended.
+fn size(tensor: &PlannedTensor) -> TrainedTensor {
+    let count = |shape: &[u64]| shape.iter().fold(1_u64, |n, dim| n.saturating_mul(*dim));
+    let grows = matches!(tensor.transform(), TensorTransform::GrowRows | TensorTransform::SampleRows);
+    let rows = tensor.shape.first().copied().unwrap_or_default();
+    let first = tensor.source.main().shape.first().copied().unwrap_or_default();
+    let width = count(tensor.shape.get(1..).unwrap_or_default());
+    let new_rows = (grows && first < rows).then(|| NewRows {
+        first,
+        last: rows.saturating_sub(1),
+        values: rows.saturating_sub(first).saturating_mul(width),
+        in_models: Vec::new(),
+    });
+    TrainedTensor { name: tensor.name.clone(), values: count(&tensor.shape), new_rows }
 }
 
 /// An anchored regular expression that matches every name of `train` and none of `freeze`, in the syntax that Rust and
@@ -37,6 +100,9 @@ mod tests {
     use regex::Regex;
 
     use super::*;
+    use crate::checkpoint::Dtype;
+    use crate::surgery::expr::TensorExpr;
+    use crate::surgery::tensor_ref::TensorRef;
 
     /// The names that the pattern matches are exactly those to train.
     fn check(train: &[&str], freeze: &[&str]) -> String {
@@ -64,8 +130,27 @@ mod tests {
     }
 
     #[test]
-    fn without_names_there_is_no_pattern() {
-        let none = training(["a", "b"].into_iter(), &BTreeSet::new());
-        assert_eq!((none.pattern, none.train.len(), none.freeze.len()), (None, 0, 2));
+    fn sizes_tell_the_rows_that_were_appended() {
+        let of = |rows: u64| TensorRef {
+            donor: "language".to_owned(),
+            path: "model.safetensors".into(),
+            name: "x".to_owned(),
+            dtype: Dtype::F32,
+            shape: vec![rows, 4],
+            offset: 0,
+            len: rows * 16,
+            slice: None,
+        };
+        let grown = TensorExpr::GrowRows { of: of(3), rows: 5 }.converted(Dtype::F32, Some(2.0), Dtype::BF16);
+        let whole = TensorExpr::Stored(of(5));
+        let tensors = [("a", grown), ("b", whole.clone()), ("c", whole)]
+            .map(|(name, source)| PlannedTensor::new(name.to_owned(), source).unwrap());
+        let trained = training(tensors.iter(), &["a".to_owned(), "c".to_owned()].into());
+        assert_eq!((trained.values(), trained.new_values(), trained.freeze), (40, 8, vec!["b".to_owned()]));
+        let rows: Vec<_> =
+            trained.sizes.iter().map(|size| size.new_rows.as_ref().map(|rows| (rows.first, rows.last))).collect();
+        assert_eq!(rows, [Some((3, 4)), None]);
+        let none = training(tensors.iter(), &BTreeSet::new());
+        assert_eq!((none.pattern, none.train.len(), none.freeze.len()), (None, 0, 3));
     }
 }

@@ -26,6 +26,8 @@ const PROCESSOR_DOCUMENTS: [&str; 2] = [files::PROCESSOR_CONFIG, files::PREPROCE
 pub(super) struct Usage {
     model: Option<Loaded>,
     processor: Option<Loaded>,
+    /// Whether a document has a chat template.
+    has_template: bool,
 }
 
 /// A class of transformers that loads a part of the result.
@@ -54,7 +56,10 @@ impl Usage {
             }
             (true, false) => None,
         };
-        Self { model: document(files::CONFIG).and_then(model), processor }
+        let of_tokenizer = document(files::TOKENIZER_CONFIG).is_some_and(|d| d.get("/chat_template").is_some());
+        let has_template =
+            of_tokenizer || has(|name| name == files::CHAT_TEMPLATE || name == files::CHAT_TEMPLATE_JSON);
+        Self { model: document(files::CONFIG).and_then(model), processor, has_template }
     }
 
     /// The statements that load the result from `dir`; empty without a known class.
@@ -70,6 +75,34 @@ impl Usage {
             let code = if part.has_code { ", trust_remote_code=True" } else { "" };
             format!("{} = {}.from_pretrained({dir}{dtype}{code})", part.variable, part.class)
         }));
+        out
+    }
+}
+
+/// What a prompt asks in the statements of a report.
+const QUESTION: &str = "What is in the picture?";
+
+impl Usage {
+    /// The statements that ask the result about a picture; empty unless a processor takes one. `turn` is what its prompts have for
+    /// an image: nothing where the processor puts its tokens in front.
+    pub(super) fn prompt(&self, turn: Option<&str>) -> Vec<String> {
+        let (Some(processor), Some(turn)) = (&self.processor, turn) else { return Vec::new() };
+        if processor.variable != "processor" || self.model.is_none() {
+            return Vec::new();
+        }
+        let mut out = vec!["from PIL import Image".to_owned(), "image = Image.open(\"picture.png\")".to_owned()];
+        if self.has_template {
+            let question = Value::from(QUESTION);
+            out.push(format!(
+                "chat = [{{\"role\": \"user\", \"content\": [{{\"type\": \"image\"}}, {{\"type\": \"text\", \"text\": {question}}}]}}]"
+            ));
+            out.push("text = processor.apply_chat_template(chat, add_generation_prompt=True)".to_owned());
+        } else {
+            // A JSON string is a Python string.
+            out.push(format!("text = {}", Value::from([turn, QUESTION].concat())));
+        }
+        out.push("inputs = processor(images=image, text=text, return_tensors=\"pt\").to(model.dtype)".to_owned());
+        out.push("output = model.generate(**inputs, max_new_tokens=20)".to_owned());
         out
     }
 }

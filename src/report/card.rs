@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 
 use super::format::{name, plural, sentence};
-use super::markdown::{code, sentences, table, text, text_name, training, usage};
+use super::markdown::{code, sentences, table, text, text_name, tokens_used, training, usage};
 use super::model::MergeReport;
 
 /// The facts of a model card that the record of the merge does not contain.
@@ -68,6 +68,7 @@ pub(crate) fn render(card: &Card, merge: &MergeReport) -> String {
     table(&mut out, ["donor", "repository", "revision", "licence", "supplies"], &rows, usize::MAX);
     usage(&mut out, merge);
     training(&mut out, merge);
+    tokens_used(&mut out, merge);
     sentences(&mut out, "Notes", &merge.notes, usize::MAX);
     let _ok = writeln!(
         out,

@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::collapse::{NameGroup, collapse};
-use super::model::{CheckpointReport, Counts, MergeReport, MergeStage, Report};
+use super::collapse::{NameGroup, collapse, collapse_with};
+use super::model::{CheckpointReport, Counts, MergeReport, MergeStage, NewRows, Report, TokenIds, Training};
 use crate::check::finding::Object;
 use crate::check::load::{LoadReport, SilentReason};
 use crate::check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad, is_program};
@@ -132,6 +132,27 @@ pub fn changed(merge: &MergeReport) -> impl Iterator<Item = [String; 4]> {
         let to = typed(changed.cast.as_ref().map(|cast| cast.to), &changed.to);
         [name(&changed.name), changed.how(), changed.from.as_ref().map_or_else(|| "new".to_owned(), from), to]
     })
+}
+
+/// Name pattern, number of values, and ids of new rows of the tensors to train.
+pub fn trained(training: &Training) -> Vec<[String; 3]> {
+    let sizes = training.sizes.iter().map(|size| (size.name.as_str(), (size.values, size.new_rows.as_ref())));
+    let groups = collapse_with(sizes, |(one, rows), (other, _)| (one.saturating_add(other), rows));
+    let row = |(group, (values, rows)): (NameGroup, (u64, Option<&NewRows>))| {
+        let new = rows.map(|rows| format!("{} to {}", rows.first, rows.last)).unwrap_or_default();
+        [name(&group.pattern), values.to_string(), new]
+    };
+    groups.into_iter().map(row).collect()
+}
+
+/// Text, ids and use of the tokens that prompts and training code name.
+pub fn tokens_used(merge: &MergeReport) -> Vec<[String; 3]> {
+    let row = |used: &TokenIds| {
+        let ids =
+            if used.first == used.last { used.first.to_string() } else { format!("{} to {}", used.first, used.last) };
+        [used.text.as_deref().map(name).unwrap_or_default(), ids, sentence(&used.used_as.join(", "))]
+    };
+    merge.tokens_used.iter().map(row).collect()
 }
 
 /// Name pattern, stored shape and expected shape of mismatched tensors, grouped by shapes.

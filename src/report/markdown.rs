@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use super::collapse::{NameGroup, collapse};
 use super::format::{self, advice, bytes, capped, details, more, name, plural, sentence, shape, summary, tensors};
-use super::model::{CheckpointReport, MergeReport, Report, ShapedName};
+use super::model::{CheckpointReport, MergeReport, NewRows, Report, ShapedName, Training};
 use super::overview::Overview;
 use crate::check::load::LoadReport;
 use crate::check::verdict::{LoadVerdict, PredictedLoad, is_program};
@@ -215,6 +215,7 @@ fn merged(out: &mut String, merge: &MergeReport, cap: usize) {
     sentences(out, "Repaired", &merge.repairs, cap);
     sentences(out, "Notes", &merge.notes, usize::MAX);
     training(out, merge);
+    tokens_used(out, merge);
     usage(out, merge);
     if !merge.files.is_empty() {
         let rows: Vec<_> = merge.files.iter().map(|f| [code(&name(&f.name)), text(&sentence(&f.origin))]).collect();
@@ -254,23 +255,67 @@ pub(super) fn training(out: &mut String, merge: &MergeReport) {
     let (train, all) = (training.train.len(), plural(merge.tensors, "tensor"));
     let _ok = writeln!(
         out,
-        "\n## Training\n\n{train} of {all} have new values, or meet tensors of another donor, and must be trained. The \
-         others can be frozen meanwhile.\n"
+        "\n## Training\n\n{train} of {all}, with {} parameters, have new values, or meet tensors of another donor, and must \
+         be trained. The others can be frozen meanwhile.",
+        training.values()
     );
-    for group in collapse(training.train.iter().map(String::as_str)) {
-        let _ok = writeln!(out, "- {}", code(&name(&group.pattern)));
-    }
+    let rows: Vec<_> =
+        format::trained(training).into_iter().map(|[names, values, new]| [code(&names), values, new]).collect();
+    table(out, ["tensor", "parameters", "new rows"], &rows, usize::MAX);
     let lines = [
         "import re".to_owned(),
         format!("train = re.compile({})", python_string(pattern)),
         "for name, p in model.named_parameters(): p.requires_grad_(train.match(name) is not None)".to_owned(),
     ];
     block(out, &lines);
+    let models = match training.versions.as_slice() {
+        [] => String::new(),
+        versions => format!(", and those in models of transformers {}", format::and(versions)),
+    };
     let _ok = writeln!(
         out,
-        "\nThe names are those in the files. Where a version of transformers renames tensors when it loads them, compare \
-         them with `model.named_parameters()` first."
+        "\nThe names are those in the files{models}. Another version may rename tensors when it loads them: compare them with \
+         `model.named_parameters()` first."
     );
+    new_rows(out, training);
+}
+
+/// The lines of Python that train no other rows of a tensor than the new ones.
+fn new_rows(out: &mut String, training: &Training) {
+    let names = |(name, rows): (&str, &NewRows)| {
+        let names = std::iter::once(name).chain(rows.in_models.iter().map(String::as_str));
+        names.map(|name| format!("{}: {}", python_string(name), rows.first)).collect::<Vec<_>>()
+    };
+    let first: Vec<String> = training.with_new_rows().flat_map(names).collect();
+    if first.is_empty() {
+        return;
+    }
+    let _ok = writeln!(
+        out,
+        "\n{} of the parameters are in new rows. To keep the other rows of these tensors as they are, train with weight decay \
+         0 for them, and run this first:",
+        training.new_values()
+    );
+    let lines = [
+        "import torch".to_owned(),
+        format!("first_new = {{{}}}", first.join(", ")),
+        "for name, p in model.named_parameters():".to_owned(),
+        "    if name in first_new: p.register_hook(lambda grad, n=first_new[name]: grad.index_fill(0, torch.arange(n, device=grad.device), 0))".to_owned(),
+    ];
+    block(out, &lines);
+}
+
+/// The tokens that prompts and training code name.
+pub(super) fn tokens_used(out: &mut String, merge: &MergeReport) {
+    if merge.tokens_used.is_empty() {
+        return;
+    }
+    out.push_str("\n## Tokens\n");
+    let rows: Vec<_> = format::tokens_used(merge)
+        .into_iter()
+        .map(|[token, ids, used_as]| [if token.is_empty() { token } else { code(&token) }, ids, text(&used_as)])
+        .collect();
+    table(out, ["token", "id", "used as"], &rows, usize::MAX);
 }
 
 /// A string as Python spells it: raw if that is possible. Names of tensors in it may be chosen to end the string.
@@ -297,6 +342,10 @@ pub(super) fn usage(out: &mut String, merge: &MergeReport) {
     if !merge.usage.is_empty() {
         out.push_str("\n## Load it like this\n");
         block(out, &merge.usage);
+    }
+    if !merge.prompt.is_empty() {
+        out.push_str("\n## Ask about a picture\n");
+        block(out, &merge.prompt);
     }
 }
 

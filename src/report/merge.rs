@@ -36,6 +36,10 @@ pub struct MergeReport {
     pub training: Option<Training>,
     /// Python code that loads the result, one statement each; empty when nothing is known about its class.
     pub usage: Vec<String>,
+    /// Python code that asks the result about a picture, one statement each; empty where no processor takes one.
+    pub prompt: Vec<String>,
+    /// The tokens that prompts and training code name, by their ids.
+    pub tokens_used: Vec<TokenIds>,
     /// What a dry run says in addition; missing for other runs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dry_run: Option<DryRun>,
@@ -223,13 +227,76 @@ pub struct Cast {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[cfg_attr(not(feature = "internals"), non_exhaustive)]
 pub struct Training {
-    /// An anchored regular expression that matches the names in `train` and no other name of the result; null without
-    /// any.
+    /// An anchored regular expression that matches the names in `train`, what the models of `versions` call them, and no other
+    /// name of the result; null without any.
     pub pattern: Option<String>,
+    /// Versions of transformers whose names of the parameters are known.
+    pub versions: Vec<String>,
     /// Tensors with new values, and those that meet tensors of another donor.
     pub train: Vec<String>,
     /// All others.
     pub freeze: Vec<String>,
+    /// How large the tensors in `train` are, in the same order.
+    pub sizes: Vec<TrainedTensor>,
+}
+
+impl Training {
+    /// Number of values in the tensors of `train`.
+    #[must_use]
+    pub fn values(&self) -> u64 {
+        self.sizes.iter().fold(0, |sum, tensor| sum.saturating_add(tensor.values))
+    }
+
+    /// Number of values in new rows.
+    #[must_use]
+    pub fn new_values(&self) -> u64 {
+        self.with_new_rows().fold(0, |sum, (_, rows)| sum.saturating_add(rows.values))
+    }
+
+    /// The tensors that got rows.
+    pub fn with_new_rows(&self) -> impl Iterator<Item = (&str, &NewRows)> {
+        self.sizes.iter().filter_map(|tensor| Some((tensor.name.as_str(), tensor.new_rows.as_ref()?)))
+    }
+}
+
+/// A tensor to train.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct TrainedTensor {
+    /// Its name.
+    pub name: String,
+    /// Number of its values.
+    pub values: u64,
+    /// The rows that were appended to a donor's; null where there are none.
+    pub new_rows: Option<NewRows>,
+}
+
+/// Rows that no donor has: those of the tokens that were added.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct NewRows {
+    /// The first one, from 0: the id of its token.
+    pub first: u64,
+    /// The last one.
+    pub last: u64,
+    /// Number of values in them.
+    pub values: u64,
+    /// What the models of [`Training::versions`] call the tensor, where it is not the name in the files.
+    pub in_models: Vec<String>,
+}
+
+/// A token of the result that a training or a prompt names, or a run of numbered ones.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+pub struct TokenIds {
+    /// Text of the token, or of the first one of a run; null where no file of the result has its id.
+    pub text: Option<String>,
+    /// Its id.
+    pub first: u64,
+    /// The id of the last one of a run, else the same.
+    pub last: u64,
+    /// What it is: the keys of documents that have its id, such as `image_token_index`, or the name that the processor gives it.
+    pub used_as: Vec<String>,
 }
 
 /// The facts of a dry run.

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 pub use super::merge::{
-    Cast, ChangedTensor, ConfigChange, Dropped, DryRun, MergeReport, MergeStage, MergedFile, PlannedShardSize, Role,
-    Seam, ShapedName, StageOutcome, Training,
+    Cast, ChangedTensor, ConfigChange, Dropped, DryRun, MergeReport, MergeStage, MergedFile, NewRows, PlannedShardSize,
+    Role, Seam, ShapedName, StageOutcome, TokenIds, TrainedTensor, Training,
 };
 use crate::check::finding::Suppressed;
 use crate::check::verdict::PredictedLoad;

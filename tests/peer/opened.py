@@ -7,7 +7,9 @@ what failed in it, stage by stage: an empty list when everything holds, null whe
 import importlib
 import inspect
 import json
+import re
 import sys
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -142,6 +144,46 @@ def listen(model, processor):
     return [] if torch.isfinite(logits).all() else ["logits of a chat are not finite"]
 
 
+def lines_of(path):
+    """The blocks of Python in merge-report.md, by section."""
+    sections = (Path(path) / "merge-report.md").read_text().split("\n## ")[1:]
+    return {part.partition("\n")[0]: re.findall(r"^```python\n(.*?)^```", part, re.M | re.S) for part in sections}
+
+
+def follow(model, processor, path):
+    """The lines of the report ask about a picture, and train what the report counts: of tensors with new rows, these alone."""
+    import torch
+
+    lines, wrong = lines_of(path), []
+    names = {"model": model, "processor": processor}
+    (question,) = lines["Ask about a picture"]
+    with tempfile.NamedTemporaryFile(suffix=".png") as file:
+        picture().save(file)
+        file.flush()
+        exec(question.replace('"picture.png"', repr(file.name)), names)
+    for block in lines["Training"]:
+        exec(block, names)
+    trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    sizes = json.loads((Path(path) / "merge-manifest.json").read_text())["training"]["sizes"]
+    told, found = sum(size["values"] for size in sizes), sum(p.numel() for p in trained.values())
+    if told != found:
+        wrong.append(f"{told} parameters to train, the model has {found}: {sorted(trained)[:5]}")
+    model(**names["inputs"]).logits.logsumexp(-1).mean().backward()
+    first = names.get("first_new", {})
+    for name, p in trained.items():
+        # New rows and the spatial embedding are of tokens that this text has not: images and actions.
+        if name not in first and not name.startswith("spatial_embed") and (p.grad is None or not p.grad.any()):
+            wrong.append(f"{name} gets no gradient")
+        elif name in first and p.grad is not None and p.grad[: first[name]].any():
+            wrong.append(f"{name}: old rows get a gradient")
+    if any(size["new_rows"] for size in sizes) and not first.keys() & trained.keys():
+        wrong.append(f"no tensor with new rows is found: {sorted(first)}")
+    for p in model.parameters():
+        p.requires_grad_(False)
+        p.grad = None
+    return wrong
+
+
 def as_guest(model, tokenizer, host, guest_dir, dtype):
     """Text alone gives the ids and, in float32, the logits that the language model alone gives."""
     import torch
@@ -181,6 +223,8 @@ def whole(cell, cls):
         if dtype == torch.float32 and cell.get("guest_dir"):
             yield "listen"
             yield "listen", listen(model, processor)
+            yield "follow"
+            yield "follow", follow(model, processor, cell["out"])
             yield "text"
             yield "text", as_guest(model, processor.tokenizer, cell["host"], cell["guest_dir"], cell["stored"])
 

@@ -6,7 +6,8 @@
 Each FOLDER has one version of transformers, oldest first, for the Python that runs this. Tiny models are saved by the oldest
 version that has their class (stock.py). The tool exchanges language models and vision towers, and takes parts out and puts them
 back (cells.py). Every version then opens each result (opened.py): processor, load in float32, bfloat16 and "auto", forward and
-generate with an image, and text alone as the guest alone.
+generate with an image, and text alone as the guest alone. The lines of Python in the report are run: they ask about the picture,
+and train what the report counts.
 
 A result that `check` calls sound for a version runs there, and one that it calls broken does not. A refusal has to be one of
 REFUSED. The tensors are the donors', apart from those that the report names. `--all` tries every pair in every variant; without

@@ -3,9 +3,8 @@
 use std::fmt::Write as _;
 
 use super::super::Style;
-use super::super::collapse::collapse;
 use super::super::diff;
-use super::super::format::{self, bytes, more, name, plural, sentence, shape, wrap};
+use super::super::format::{self, bytes, more, name, plural, sentence, shape, tokens_used, trained, wrap};
 use super::super::model::{DryRun, MergeReport, Seam, ShapedName, Verdict};
 use super::load::table;
 use super::paint::Paint;
@@ -70,19 +69,23 @@ fn next_steps(out: &mut String, merge: &MergeReport, style: Style) {
         && !training.train.is_empty()
     {
         let (train, all) = (training.train.len(), plural(merge.tensors, "tensor"));
-        let _ok = writeln!(out, "\n  train {train} of {all} (names and pattern: merge-report.md)");
-        let groups = collapse(training.train.iter().map(String::as_str));
-        for group in groups.iter().take(style.cap) {
-            let _ok = writeln!(out, "    - {}", name(&group.pattern));
-        }
-        if let Some(more) = more(groups.len(), style.cap) {
-            let _ok = writeln!(out, "    {more}");
+        let new = match training.new_values() {
+            0 => String::new(),
+            new => format!(", {new} of them in new rows"),
+        };
+        let values = training.values();
+        let _ok = writeln!(out, "\n  train {train} of {all}, {values} parameters{new} (pattern: merge-report.md)");
+        table(out, ["tensor", "parameters", "new rows"], &trained(training), style);
+        let tokens = tokens_used(merge);
+        if !tokens.is_empty() {
+            out.push_str("\n  tokens\n");
+            table(out, ["token", "id", "used as"], &tokens, style);
         }
     }
     if !merge.usage.is_empty() {
         out.push_str("\n  load it like this\n");
     }
-    for line in &merge.usage {
+    for line in merge.usage.iter().chain(&merge.prompt) {
         let _ok = writeln!(out, "    {}", sentence(line));
     }
 }

@@ -8,8 +8,8 @@ use ckpt_doctor::check::verdict::{LoadVerdict, PredictedLoad};
 use ckpt_doctor::check::{Edit, Finding, FixHint, Location, Safety, Severity};
 use ckpt_doctor::report::Report;
 use ckpt_doctor::report::model::{
-    ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, Role, Seam, ShapedName,
-    StageOutcome, Training, UncheckedPath,
+    ChangedTensor, CheckpointReport, Counts, Dropped, MergeReport, MergeStage, MergedFile, NewRows, Role, Seam,
+    ShapedName, StageOutcome, TokenIds, TrainedTensor, Training, UncheckedPath,
 };
 use ckpt_doctor::surgery::expr::TensorTransform;
 use serde_json::{Map, Value, json};
@@ -406,11 +406,32 @@ fn merge() -> MergeReport {
             },
         ],
         training: Some(Training {
+            versions: vec!["5.23.0".to_owned()],
             pattern: Some(r"^(?:fresh\.weight|language_model\.lm_head\.weight)$".to_owned()),
             train: vec!["fresh.weight".to_owned(), "language_model.lm_head.weight".to_owned()],
             freeze: vec!["vision_tower.x".to_owned()],
+            sizes: vec![
+                TrainedTensor { name: "fresh.weight".to_owned(), values: 64, new_rows: None },
+                TrainedTensor {
+                    name: "language_model.lm_head.weight".to_owned(),
+                    values: 640,
+                    new_rows: Some(NewRows {
+                        first: 8,
+                        last: 9,
+                        values: 128,
+                        in_models: vec!["lm_head.weight".to_owned()],
+                    }),
+                },
+            ],
         }),
         usage: vec!["from transformers import AutoModel".to_owned()],
+        prompt: vec!["from PIL import Image".to_owned()],
+        tokens_used: vec![TokenIds {
+            text: Some("<image>".to_owned()),
+            first: 8,
+            last: 8,
+            used_as: vec!["image_token_index".to_owned()],
+        }],
         dry_run: None,
         dropped: vec![Dropped {
             donor: "language".to_owned(),
