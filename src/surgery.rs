@@ -14,6 +14,7 @@ pub mod planned_tensor;
 mod product;
 pub mod repair;
 mod retry;
+pub mod rms;
 mod stop;
 mod stream;
 pub mod tensor_ref;

@@ -25,6 +25,8 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 /// - `shape(role, tensor)`, and `has(role, prefix)`: whether the donor has a tensor with the prefix;
 /// - `dtype(role)`: the floating-point type of most bytes of a donor as torch names it, `'bfloat16'`;
 /// - `id_of(token)`: the id in the tokenizer of the result, null when it has no such token;
+/// - `rms(role, tensor)`: the root of the mean square of a donor's tensor, whose values are read for it; null where the donor has
+///   no such tensor, or only values that are not computed;
 /// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;
 /// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host, under the
 ///   version that wrote it, when its class has the guest's language model; `with` and `without` list the versions of
@@ -181,6 +183,8 @@ pub enum OptionKind {
     Size,
     /// An integer; expressions see a number.
     Integer,
+    /// A positive number; expressions see it.
+    Number,
     /// Any text of one line; expressions see a string.
     Text,
 }
@@ -193,6 +197,7 @@ impl OptionKind {
             Self::Choice => "choice",
             Self::Size => "size",
             Self::Integer => "integer",
+            Self::Number => "number",
             Self::Text => "text",
         }
     }

@@ -88,6 +88,10 @@ impl<'a> Context<'a> {
                 opt.insert(name.clone(), json!(options::parse_integer(name, value)?));
                 continue;
             }
+            if kind == Some(OptionKind::Number) {
+                opt.insert(name.clone(), json!(options::parse_number(name, value)?));
+                continue;
+            }
             if kind == Some(OptionKind::Text) {
                 opt.insert(name.clone(), json!(value));
                 continue;

@@ -8,10 +8,13 @@ use serde_json::{Value, json};
 use super::dtypes;
 use super::parts::{Donor, DonorParts};
 use crate::check::default_template;
+use crate::checkpoint::Checkpoint;
 use crate::knowledge::scales::Scales;
 use crate::knowledge::{Loader, Scope, source};
+use crate::surgery::rms::rms;
+use crate::surgery::tensor_ref::TensorRef;
 
-/// Adds `dtype`, `image_fold`, `row_scale`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
+/// Adds `dtype`, `image_fold`, `row_scale`, `rms`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
 pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
@@ -50,11 +53,24 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
         let (factor, key) = stated.unwrap_or((1.0, ""));
         json!({ "factor": factor, "key": key })
     });
+    let checkpoints: BTreeMap<String, Arc<Checkpoint>> =
+        donors.iter().map(|donor| (donor.role.clone(), Arc::clone(&donor.checkpoint))).collect();
+    scope.function2("rms", move |role, name| {
+        let rms = checkpoints.get(role).and_then(|checkpoint| rms_of(role, checkpoint, name));
+        rms.map_or(Value::Null, |rms| json!(rms))
+    });
     let of_models = scales.clone();
     scope.function1("row_scale", move |role| {
         let scale = configs.get(role).map(|config| of_models.of_rows(config, Loader::NEWEST));
         scale.map_or(Value::Null, |scale| json!(dtypes::round(scale, dtypes.get(role).copied())))
     });
+}
+
+/// How large the values of a donor's tensor are; `None` where that cannot be told.
+fn rms_of(role: &str, checkpoint: &Checkpoint, name: &str) -> Option<f64> {
+    let (shard, tensor) = checkpoint.tensor(name)?;
+    let of = TensorRef::new(role, checkpoint.source.path(), shard, tensor, None).ok()?;
+    rms(&of).ok().flatten()
 }
 
 /// The factor that keeps image features as large as in the host when its class has the language model of the guest, with those

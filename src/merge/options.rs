@@ -44,6 +44,7 @@ pub(super) fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
     match spec.kind() {
         OptionKind::Size => return parse_size(&spec.name, value).map(drop),
         OptionKind::Integer => return parse_integer(&spec.name, value).map(drop),
+        OptionKind::Number => return parse_number(&spec.name, value).map(drop),
         OptionKind::Text => return check_text(&spec.name, value),
         OptionKind::Choice => {}
     }
@@ -66,6 +67,15 @@ pub(super) fn check(spec: &OptionSpec, value: &str) -> Result<(), MergeError> {
 /// [`MergeError::Option`] for anything else.
 pub(super) fn parse_integer(name: &str, text: &str) -> Result<i64, MergeError> {
     text.parse().map_err(|_| MergeError::Option(format!("{name}={text} is not an integer")))
+}
+
+/// The value of an option of kind `number`.
+///
+/// # Errors
+/// [`MergeError::Option`] for anything else.
+pub(super) fn parse_number(name: &str, text: &str) -> Result<f64, MergeError> {
+    let number = text.parse().ok().filter(|number: &f64| number.is_normal() && *number > 0.0);
+    number.ok_or_else(|| MergeError::Option(format!("{name}={text} is not a number above 0 such as 0.25")))
 }
 
 /// Longest value of an option of kind `text`, in bytes.
@@ -116,6 +126,14 @@ mod tests {
         assert_eq!(parse_size("o", "300").unwrap(), 300);
         for bad in ["", "GB", "0", "-1", "5 parsecs", "99999999999TB"] {
             assert!(parse_size("o", bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn numbers() {
+        assert_eq!(["0.25", "1", "1e-3"].map(|text| parse_number("o", text).unwrap()), [0.25, 1.0, 0.001]);
+        for bad in ["", "0", "-1", "inf", "nan", "1e-320", "0.25x", "1e999"] {
+            assert!(parse_number("o", bad).is_err(), "{bad}");
         }
     }
 

@@ -147,6 +147,24 @@ class Language(Cell):
         return "language" not in name and ".text_model." not in name
 
 
+class AsText(Language):
+    """`swap-language-model` with `scale=text` for one version, which opened.py measures in it."""
+
+    what = "as text"
+
+    def __init__(self, host, guest, variant, version):
+        super().__init__(host, guest, variant)
+        self.version = version
+        self.name += " as text"
+
+    def words(self):
+        words = [word for word in super().words() if word != "scale=keep"]
+        return [*words, *(() if words[-1] == "--set" else ("--set",)), "scale=text", "--for", self.version]
+
+    def line(self):
+        return json.dumps({**json.loads(super().line()), "version": self.version})
+
+
 class Tower(Cell):
     """`swap-vision-tower`: one host with another tower."""
 
@@ -231,6 +249,17 @@ OWN = {"qwen2_vl": ["qwen2"], "qwen2_5_vl": ["qwen2"], "gemma3": ["gemma3_text"]
 TOWER_HOSTS = ("llava", "llava_next", "llava_onevision", "paligemma", "idefics3")
 
 
+AS_TEXT = [
+    ("llava", "qwen2", "pad", "5.23.0"),
+    ("idefics3", "gemma2", "pad", "4.57.6"),
+    ("gemma3", "gemma3_text", "same", "5.23.0"),
+    ("paligemma", "llama", "pad", "4.57.6"),
+    ("paligemma", "llama3", "same", "5.23.0"),
+    ("qwen2_vl", "qwen2", "same", "4.57.6"),
+    (SPATIALVLA, "llama", "pad", "4.47.0"),
+]
+
+
 def all_cells(every_variant, towers):
     """The cells of the three tables; one variant of each pair, or all."""
     variants = list(VARIANTS)
@@ -239,6 +268,8 @@ def all_cells(every_variant, towers):
             some = dict.fromkeys([*(["same"] if guest in OWN.get(host, ()) else []), variants[(row + column) % len(variants)]])
             for variant in variants if every_variant else some:
                 yield Language(host, guest, variant)
+    for cell in AS_TEXT:
+        yield AsText(*cell)
     for host in TOWER_HOSTS:
         for tower in towers:
             yield Tower(host, tower)

@@ -13,7 +13,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from peer import quiet
+from peer import quiet, read_tensors
 from stock import IMAGE_IN_TEXT, allow_without_num2words
 
 TEXT = "pick the red cup"
@@ -229,6 +229,72 @@ def whole(cell, cls):
             yield "text", as_guest(model, processor.tokenizer, cell["host"], cell["guest_dir"], cell["stored"])
 
 
+class EnoughError(Exception):
+    """Ends a forward whose inputs are known."""
+
+
+def entering(model, inputs):
+    """What enters the first layer of the language model."""
+    import torch
+
+    layers = [m for n, m in model.named_modules() if n.endswith("layers.0") and not re.search("vision|visual|encoder|zoe", n)]
+    seen = []
+
+    def keep(module, args, kwargs):
+        seen.append(args[0] if args else kwargs["hidden_states"])
+        raise EnoughError
+
+    handle = layers[0].register_forward_pre_hook(keep, with_kwargs=True)
+    try:
+        with torch.no_grad():
+            model(**inputs)
+    except EnoughError:
+        pass
+    finally:
+        handle.remove()
+    return seen[0][0]
+
+
+def rows_of(path):
+    """Rows of the embedding in a directory."""
+    tensors = read_tensors(Path(path)).items()
+    return next(shape[0] for name, (_, shape, _) in tensors if name.endswith("embed_tokens.weight") and "vision" not in name)
+
+
+@cache
+def proportion(path, host, tokens):
+    """The norm of image features by that of the rows of the first tokens, as they enter the first layer."""
+    import torch
+
+    processor = processor_of(path)
+    model, _ = load(class_of(path, host), path, torch.float32)
+    text = TEXT if host == "spatialvla" else IMAGE_IN_TEXT.get(host, "<image>") + TEXT
+    inputs = processor(images=[picture()], text=[text], return_tensors="pt").to(model.dtype)
+    config, ids = model.config, inputs["input_ids"]
+    image = next(getattr(config, key) for key in ("image_token_id", "image_token_index") if hasattr(config, key))
+    rows = [i for i in range(tokens) if i != image]
+    more = torch.tensor([rows])
+    longer = {key: value for key, value in inputs.items() if value.shape == ids.shape and key != "input_ids"}
+    longer = {key: torch.cat([value, value[:, -1:].expand(1, len(rows))], 1) for key, value in longer.items()}
+    hidden = entering(model, {**inputs, **longer, "input_ids": torch.cat([ids, more], 1)})
+    sizes = hidden[: ids.shape[1]][ids[0] == image], hidden[ids.shape[1] :]
+    of_image, of_text = (size.square().sum(-1).mean().sqrt().item() for size in sizes)
+    return of_image / of_text
+
+
+def as_text(cell, cls):
+    """`scale=text` makes image features a quarter as large, by the size of text, as they are in the host."""
+    import transformers
+
+    if transformers.__version__ == cell["version"]:
+        yield "size"
+        # Rows that were appended are no text.
+        stored = (rows_of(cell[of]) for of in ("host_dir", "guest_dir"))
+        host, result = (proportion(cell[of], cell["host"], rows) for of, rows in zip(("host_dir", "out"), stored, strict=True))
+        print(f"{cell['name']}: image features {host:.3g} of text in the host, {result:.3g} in the result", file=sys.stderr)
+        yield "size", [] if abs(result / host / 0.25 - 1) < 0.03 else [f"{result:.4g} of text, in the host {host:.4g}"]
+
+
 def language_part(cell, cls):
     """A language model that was taken out gives what its host gives for text alone."""
     import torch
@@ -266,7 +332,7 @@ def open_cell(cell):
     cls, wrong, stage = class_of(cell["out"], cell["host"]), [], "class"
     if cls is None:
         return None
-    how = {"part language": language_part, "part vision": vision_part}.get(cell["what"], whole)
+    how = {"as text": as_text, "part language": language_part, "part vision": vision_part}.get(cell["what"], whole)
     try:
         for told in how(cell, cls):
             if isinstance(told, str):

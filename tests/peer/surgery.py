@@ -210,7 +210,7 @@ part gives the files of the host again, byte for byte.
 def page(cells, outcomes):
     parts = [HEAD]
     for kind, text in TABLES.items():
-        of_kind = [cell for cell in cells if isinstance(cell, kind)]
+        of_kind = [cell for cell in cells if type(cell) is kind]
         parts.append(text)
         parts.append(matrix(of_kind, outcomes))
     return "\n".join(parts)

@@ -14,8 +14,8 @@ use crate::merge::fit::Fit;
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
 
 /// Functions of a merge's scope, with a role as the first argument.
-const ROLE_FUNCTIONS: [&str; 8] =
-    ["shape", "has", "dtype", "part", "row_scale", "image_fold", "head_factor", "chat_template"];
+const ROLE_FUNCTIONS: [&str; 9] =
+    ["shape", "has", "dtype", "part", "rms", "row_scale", "image_fold", "head_factor", "chat_template"];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
