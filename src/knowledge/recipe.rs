@@ -360,6 +360,9 @@ pub struct TensorSpec {
     /// tensor with padded, appended or new values is always one to train.
     #[serde(default)]
     pub train: bool,
+    /// Donor tensor whose rows the new ones of `mean-rows` and `sampled-rows` are like.
+    #[serde(default)]
+    pub like: Option<SeamTensor>,
     /// Donor tensor that it must match, for the message.
     #[serde(default)]
     pub meets: Option<SeamTensor>,

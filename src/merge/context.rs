@@ -80,27 +80,7 @@ impl<'a> Context<'a> {
         knowledge: &'a Knowledge,
     ) -> Result<Self, MergeError> {
         let mut scope = Scope::new();
-        let mut opt = Map::new();
-        let mut arg = Map::new();
-        for (name, value) in options {
-            let kind = recipe.options.iter().find(|spec| spec.name == *name).map(OptionSpec::kind);
-            if kind == Some(OptionKind::Integer) {
-                opt.insert(name.clone(), json!(options::parse_integer(name, value)?));
-                continue;
-            }
-            if kind == Some(OptionKind::Number) {
-                opt.insert(name.clone(), json!(options::parse_number(name, value)?));
-                continue;
-            }
-            if kind == Some(OptionKind::Text) {
-                opt.insert(name.clone(), json!(value));
-                continue;
-            }
-            // In `forward:PACKAGE`, `forward` is the value and `PACKAGE` its argument.
-            let (head, tail) = value.split_once(':').unwrap_or((value, ""));
-            opt.insert(name.clone(), json!(head));
-            arg.insert(name.clone(), json!(tail));
-        }
+        let (opt, arg) = option_values(recipe, options)?;
         scope.bind("opt", &Value::Object(opt));
         scope.bind("arg", &Value::Object(arg));
         for donor in donors {
@@ -175,6 +155,27 @@ impl Context<'_> {
         }
         Ok(())
     }
+}
+
+/// The values of options, and the arguments behind a colon, as expressions see them.
+fn option_values(recipe: &Recipe, options: &Options) -> Result<(Map<String, Value>, Map<String, Value>), MergeError> {
+    let (mut opt, mut arg) = (Map::new(), Map::new());
+    for (name, value) in options {
+        let kind = recipe.options.iter().find(|spec| spec.name == *name).map(OptionSpec::kind);
+        let seen = match kind {
+            Some(OptionKind::Integer) => json!(options::parse_integer(name, value)?),
+            Some(OptionKind::Number) => json!(options::parse_number(name, value)?),
+            Some(OptionKind::Text) => json!(value),
+            _ => {
+                // In `forward:PACKAGE`, `forward` is the value and `PACKAGE` its argument.
+                let (head, tail) = value.split_once(':').unwrap_or((value, ""));
+                arg.insert(name.clone(), json!(tail));
+                json!(head)
+            }
+        };
+        opt.insert(name.clone(), seen);
+    }
+    Ok((opt, arg))
 }
 
 /// Whether an expression can be evaluated only after the tokenizer of the result is opened.

@@ -9,6 +9,10 @@ pub(super) enum Fit {
     GrowRows,
     /// Random rows with mean and covariance of the others.
     SampleRows,
+    /// Rows with the mean of those of the tensor that `like` names, in place of the donor's.
+    MeanRows,
+    /// As that, random rows with their covariance.
+    SampledRows,
     /// Zeros up to the shape.
     Pad,
     /// New values for each module of which a tensor has another shape.
@@ -19,8 +23,16 @@ pub(super) enum Fit {
 
 impl Fit {
     /// All values.
-    pub(super) const ALL: [Self; 6] =
-        [Self::Copy, Self::Pad, Self::GrowRows, Self::SampleRows, Self::Reinit, Self::ReinitAlways];
+    pub(super) const ALL: [Self; 8] = [
+        Self::Copy,
+        Self::Pad,
+        Self::GrowRows,
+        Self::SampleRows,
+        Self::MeanRows,
+        Self::SampledRows,
+        Self::Reinit,
+        Self::ReinitAlways,
+    ];
 
     /// The name in a recipe.
     pub(super) const fn name(self) -> &'static str {
@@ -28,6 +40,8 @@ impl Fit {
             Self::Copy => "copy",
             Self::GrowRows => "grow-rows",
             Self::SampleRows => "sample-rows",
+            Self::MeanRows => "mean-rows",
+            Self::SampledRows => "sampled-rows",
             Self::Pad => "pad",
             Self::Reinit => "reinit",
             Self::ReinitAlways => "reinit-always",

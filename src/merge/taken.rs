@@ -11,6 +11,7 @@ use super::named::{AnnouncedCast, MergedRoles, NamedTensors};
 use super::parts::{Donor, PartOf};
 use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
+use crate::surgery::tensor_ref::TensorRef;
 use crate::surgery::values::can_compute;
 
 /// A tensor spec with its parts evaluated once.
@@ -23,6 +24,8 @@ pub(super) struct TensorRule<'a> {
     pub(super) scale: Option<f64>,
     pub(super) dtype: Option<Dtype>,
     pub(super) adapter: Option<MergedAdapter>,
+    /// The tensor whose rows new ones are like.
+    pub(super) like: Option<TensorRef>,
     /// The part that the tensors belong to, and the one whose place they take.
     pub(super) part: Option<PartOf<'a>>,
     pub(super) into: Option<PartOf<'a>>,
@@ -154,7 +157,7 @@ impl StartedModules {
         match taken.rule.fit {
             Fit::ReinitAlways => true,
             Fit::Reinit => self.modules.contains(&key(taken)),
-            Fit::Copy | Fit::GrowRows | Fit::SampleRows | Fit::Pad => false,
+            Fit::Copy | Fit::GrowRows | Fit::SampleRows | Fit::MeanRows | Fit::SampledRows | Fit::Pad => false,
         }
     }
 }

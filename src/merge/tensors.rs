@@ -18,7 +18,7 @@ use super::run::count;
 use super::taken::{StartedModules, TakenTensor, TensorRule};
 use crate::checkpoint::Dtype;
 use crate::knowledge::quantization;
-use crate::knowledge::recipe::TensorSpec;
+use crate::knowledge::recipe::{SeamTensor, TensorSpec};
 use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
 use crate::surgery::expr::{NewValues, TensorExpr, TensorTransform};
@@ -210,9 +210,11 @@ fn record(taken: &TakenTensor<'_>, planned: &PlannedTensor, draft: &mut MergeDra
     let transform = planned.transform();
     let has_new_values = match transform {
         TensorTransform::Copy | TensorTransform::Convert | TensorTransform::AddProduct => false,
-        TensorTransform::GrowRows | TensorTransform::SampleRows | TensorTransform::Pad | TensorTransform::Reinit => {
-            true
-        }
+        TensorTransform::GrowRows
+        | TensorTransform::SampleRows
+        | TensorTransform::NewRows
+        | TensorTransform::Pad
+        | TensorTransform::Reinit => true,
     };
     if has_new_values || taken.rule.spec.train {
         draft.train.insert(planned.name.clone());
@@ -286,6 +288,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             names,
             rename,
             adapter: adapter(context, spec)?,
+            like: spec.like.as_ref().and_then(|like| like_of(context, like)),
             part,
             into,
             slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
@@ -297,6 +300,13 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         out.push(rule);
     }
     Ok(out)
+}
+
+/// The tensor whose rows new ones should be like; `None` where the donor lacks it.
+fn like_of(context: &Context<'_>, like: &SeamTensor) -> Option<TensorRef> {
+    let donor = context.donor(&like.from)?;
+    let (shard, tensor) = donor.checkpoint.tensor(&like.name)?;
+    TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, None).ok()
 }
 
 /// The adapter that an entry merges, with its tensors placed.
@@ -329,7 +339,7 @@ fn parse_slice(value: &Value) -> Result<Option<[u64; 2]>, &'static str> {
 
 fn parse_fit(value: &Value) -> Result<Fit, &'static str> {
     let known = |name: &str| Fit::ALL.into_iter().find(|fit| fit.name() == name);
-    let expected = "copy, pad, grow-rows, sample-rows, reinit or reinit-always";
+    let expected = "copy, pad, grow-rows, sample-rows, mean-rows, sampled-rows, reinit or reinit-always";
     match value {
         Value::Null => Ok(Fit::Copy),
         value => value.as_str().and_then(known).ok_or(expected),
@@ -392,7 +402,8 @@ fn source(
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);
     let changes = scale.is_some() || taken.dtype() != tensor.dtype;
-    let fits = of.shape == shape && !starts;
+    let is_replaced = matches!(rule.fit, Fit::MeanRows | Fit::SampledRows);
+    let fits = of.shape == shape && !starts && !is_replaced;
     if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
     }
@@ -406,6 +417,15 @@ fn source(
         Fit::Pad if !nests => return Err(CANNOT_SHRINK.to_owned()),
         Fit::GrowRows | Fit::SampleRows if !grows => return Err("only rows can be added".to_owned()),
         Fit::Pad => TensorExpr::Pad { of, shape },
+        Fit::MeanRows | Fit::SampledRows => {
+            let like = rule.like.clone().ok_or("the tensor that its rows should be like is missing")?;
+            if like.shape.len() != shape.len() || !like.shape.iter().skip(1).eq(shape.iter().skip(1)) {
+                return Err(format!("rows of {}, {:?}, do not fit", like.name, like.shape));
+            }
+            let from = like.dtype;
+            let made = TensorExpr::NewRows { like, rows, sampled: rule.fit == Fit::SampledRows, instead_of: of };
+            return Ok(made.converted(from, scale, dtype));
+        }
         Fit::GrowRows => TensorExpr::GrowRows { of, rows },
         Fit::SampleRows => TensorExpr::SampleRows { of, rows },
         // New values have the size that the class gives them.

@@ -28,7 +28,7 @@ pub(super) fn name_in_models(
         let in_model = |stored: &Stored| names_of(&load::in_model(&built, stored));
         let (all, freeze) = (in_model(&stored), in_model(&frozen));
         let train: BTreeSet<String> = all.difference(&freeze).cloned().collect();
-        for rows in training.sizes.iter_mut() {
+        for rows in &mut training.sizes {
             let Some(new_rows) = &mut rows.new_rows else { continue };
             let others = in_model(&without(&BTreeSet::from([rows.name.clone()])));
             let own = all.difference(&others).filter(|name| **name != rows.name && !new_rows.in_models.contains(*name));

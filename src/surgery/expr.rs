@@ -36,6 +36,18 @@ pub enum TensorExpr<S> {
         /// Number of rows in the result.
         rows: u64,
     },
+    /// Rows with the mean of another tensor's rows, in place of a donor's tensor.
+    #[serde(rename_all = "kebab-case")]
+    NewRows {
+        /// The other tensor.
+        like: S,
+        /// Number of rows in the result.
+        rows: u64,
+        /// Whether they are seeded random rows, which have the covariance of those rows times 1e-9, too.
+        sampled: bool,
+        /// The donor tensor that is not used.
+        instead_of: S,
+    },
     /// The donor's values in the leading corner, zeros elsewhere.
     Pad {
         /// The donor's values.
@@ -170,6 +182,8 @@ pub enum TensorTransform {
     GrowRows,
     /// The donor's rows, then seeded random rows with their mean and, times 1e-9, their covariance.
     SampleRows,
+    /// Rows with the mean of another tensor's rows, perhaps random ones, in place of the donor's.
+    NewRows,
     /// The donor's values in the leading corner, zeros elsewhere.
     Pad,
     /// The values that the class gives to a new model.
@@ -187,6 +201,7 @@ impl TensorTransform {
             Self::Convert => "convert",
             Self::GrowRows => "grow-rows",
             Self::SampleRows => "sample-rows",
+            Self::NewRows => "new-rows",
             Self::Pad => "pad",
             Self::Reinit => "reinit",
             Self::AddProduct => "add-product",
@@ -229,6 +244,7 @@ impl<S> TensorExpr<S> {
             | Self::SampleRows { of, .. }
             | Self::Pad { of, .. }
             | Self::Initialise { instead_of: of, .. } => vec![of],
+            Self::NewRows { like, instead_of, .. } => vec![instead_of, like],
             Self::Cast { of, .. } | Self::Scale { of, .. } => of.sources(),
             Self::AddProduct { to, product } => {
                 let mut sources = to.sources();
@@ -245,7 +261,8 @@ impl<S> TensorExpr<S> {
             | Self::GrowRows { of, .. }
             | Self::SampleRows { of, .. }
             | Self::Pad { of, .. }
-            | Self::Initialise { instead_of: of, .. } => of,
+            | Self::Initialise { instead_of: of, .. }
+            | Self::NewRows { instead_of: of, .. } => of,
             Self::Cast { of, .. } | Self::Scale { of, .. } | Self::AddProduct { to: of, .. } => of.main(),
         }
     }
@@ -265,6 +282,7 @@ impl<S> TensorExpr<S> {
             Self::Stored(_) => TensorTransform::Copy,
             Self::GrowRows { .. } => TensorTransform::GrowRows,
             Self::SampleRows { .. } => TensorTransform::SampleRows,
+            Self::NewRows { .. } => TensorTransform::NewRows,
             Self::Pad { .. } => TensorTransform::Pad,
             Self::Initialise { .. } => TensorTransform::Reinit,
             Self::AddProduct { .. } => TensorTransform::AddProduct,
@@ -282,6 +300,16 @@ impl<S> TensorExpr<S> {
             Self::Scale { by, .. } => Some(*by),
             Self::AddProduct { product, .. } => Some(product.scale),
             Self::Cast { of, .. } => of.scale(),
+            _ => None,
+        }
+    }
+
+    /// Number of seeded random rows; `None` without any.
+    fn sampled_rows_of(&self, rows_of: &impl Fn(&S) -> u64) -> Option<u64> {
+        match self {
+            Self::SampleRows { of, rows } => Some(rows.saturating_sub(rows_of(of))),
+            Self::NewRows { rows, sampled: true, .. } => Some(*rows),
+            Self::Cast { of, .. } | Self::Scale { of, .. } => of.sampled_rows_of(rows_of),
             _ => None,
         }
     }
@@ -304,6 +332,10 @@ impl<S> TensorExpr<S> {
             Self::Stored(of) => TensorExpr::Stored(to(of)?),
             Self::GrowRows { of, rows } => TensorExpr::GrowRows { of: to(of)?, rows: *rows },
             Self::SampleRows { of, rows } => TensorExpr::SampleRows { of: to(of)?, rows: *rows },
+            Self::NewRows { like, rows, sampled, instead_of } => {
+                let instead_of = to(instead_of)?;
+                TensorExpr::NewRows { like: to(like)?, rows: *rows, sampled: *sampled, instead_of }
+            }
             Self::Pad { of, shape } => TensorExpr::Pad { of: to(of)?, shape: shape.clone() },
             Self::Initialise { values, dtype, shape, instead_of } => TensorExpr::Initialise {
                 values: *values,
@@ -339,6 +371,12 @@ impl<S> TensorExpr<S> {
 pub type Typed = (Dtype, Vec<u64>);
 
 impl TensorExpr<TensorRef> {
+    /// Number of seeded random rows; `None` without any.
+    #[must_use]
+    pub(super) fn sampled_rows(&self) -> Option<u64> {
+        self.sampled_rows_of(&|of| of.shape.first().copied().unwrap_or_default())
+    }
+
     /// Type and shape of the values.
     ///
     /// # Errors
@@ -353,6 +391,12 @@ impl TensorExpr<TensorRef> {
                 let first = shape.first_mut().filter(|first| **first <= *rows);
                 *first.ok_or_else(|| format!("{:?} cannot grow to {rows} rows", of.shape))? = *rows;
                 Ok((of.dtype, shape))
+            }
+            Self::NewRows { like, rows, .. } => {
+                computable(like.dtype)?;
+                let mut shape = like.shape.clone();
+                *shape.first_mut().ok_or("a number has no rows")? = *rows;
+                Ok((like.dtype, shape))
             }
             Self::Pad { of, shape } => {
                 computable(of.dtype)?;

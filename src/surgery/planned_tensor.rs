@@ -45,6 +45,14 @@ impl PlannedTensor {
         self.source.transform()
     }
 
+    /// Number of values in sampled rows; `None` for a tensor without such rows.
+    #[must_use]
+    pub(crate) fn sampled_values(&self) -> Option<u64> {
+        let (rows, all) = (self.source.sampled_rows()?, self.shape.first().copied()?);
+        let values = byte_len(Dtype::U8, &self.shape)?;
+        values.checked_div(all)?.checked_mul(rows)
+    }
+
     /// Number of bytes in the result.
     ///
     /// Shapes of a plan come from checked headers and architectures with limits; an overflow is counted as the largest

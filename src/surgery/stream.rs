@@ -3,13 +3,12 @@
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use super::convert::CastLosses;
 use super::donor::{DonorFile, OpenDonors};
 use super::error::{ApplyError, io_at};
 use super::planned_tensor::PlannedTensor;
 use super::stop::interrupted;
 use super::tensor_ref::TensorRef;
-use super::transform;
+use super::transform::{self, ValueFacts};
 use crate::checkpoint::HashAlgorithm;
 use crate::checkpoint::digest::Hasher;
 
@@ -19,8 +18,8 @@ const BLOCK: usize = 256 * 1024;
 /// Facts about a streamed tensor; the default is that of a byte copy.
 #[derive(Debug, Default)]
 pub(super) struct Streamed {
-    /// Values of the donor that scaling and casting could not keep.
-    pub(super) losses: CastLosses,
+    /// What is known of its values.
+    pub(super) facts: ValueFacts,
     /// Digests of the donors' tensors, in the order of the expression's sources; `None` for one of which no bytes were read, or
     /// without an algorithm. Empty for a byte copy.
     pub(super) source_digests: Vec<Option<String>>,
@@ -60,17 +59,17 @@ pub(super) fn stream(
             source.add(at, buf);
             Ok(())
         };
-        let losses = transform::write(&mut read, tensor, &mut writer);
-        losses.and_then(|losses| writer.flush().map(|()| losses))
+        let facts = transform::write(&mut read, tensor, &mut writer);
+        facts.and_then(|facts| writer.flush().map(|()| facts))
     };
     interrupted()?;
     if let Some(error) = failed_read {
         return Err(error);
     }
-    let losses = result.map_err(io_at(path, "writing"))?;
+    let facts = result.map_err(io_at(path, "writing"))?;
     let is_hashed = hash != HashAlgorithm::None;
     let digests = sources.into_iter().map(|source| if is_hashed { source.finish() } else { Ok(None) });
-    Ok(Streamed { losses, source_digests: digests.collect::<Result<_, _>>()? })
+    Ok(Streamed { facts, source_digests: digests.collect::<Result<_, _>>()? })
 }
 
 /// A donor's tensor and the digest of what is read of it, usually once and in order.

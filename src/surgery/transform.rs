@@ -23,24 +23,33 @@ const SAMPLE_VARIANCE: f64 = 1e-9;
 /// Donor rows that a sampled row combines.
 const SAMPLE_TERMS: u32 = 64;
 
-/// Writes the bytes of a planned tensor; returns the values that its casts could not keep.
+/// What is known of the values of a tensor once they are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ValueFacts {
+    /// Values of the donor that scaling and casting could not keep.
+    pub losses: CastLosses,
+    /// Values of sampled rows that differ from the mean of the others, as they are stored.
+    pub distinct: u64,
+}
+
+/// Writes the bytes of a planned tensor; returns what is known of its values then.
 ///
 /// `read` reads the parts of the donors' tensors that are used. The expression must have the type and the shape of the tensor.
 ///
 /// # Errors
 /// Errors of reading or writing; [`io::ErrorKind::InvalidInput`] for operands that do not fit.
-pub fn write(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<CastLosses> {
-    let mut losses = CastLosses::default();
-    evaluate(read, &tensor.name, &tensor.source, &mut losses, out)?;
-    Ok(losses)
+pub fn write(read: &mut ReadAt<'_>, tensor: &PlannedTensor, out: &mut dyn Write) -> io::Result<ValueFacts> {
+    let mut facts = ValueFacts::default();
+    evaluate(read, tensor, &tensor.source, &mut facts, out)?;
+    Ok(facts)
 }
 
-/// Writes the values of an expression of the tensor `name`, and adds to the losses.
+/// Writes the values of an expression of a tensor, and adds to the facts.
 fn evaluate(
     read: &mut ReadAt<'_>,
-    name: &str,
+    tensor: &PlannedTensor,
     source: &TensorExpr<TensorRef>,
-    losses: &mut CastLosses,
+    facts: &mut ValueFacts,
     out: &mut dyn Write,
 ) -> io::Result<()> {
     let mut of = |from: &TensorRef, at: u64, buffer: &mut [u8]| read(from, at, buffer);
@@ -50,19 +59,32 @@ fn evaluate(
             grow_rows(&mut |at, buffer| of(from, at, buffer), Table::of(from, *rows), out)
         }
         TensorExpr::SampleRows { of: from, rows } => {
-            sample_rows(&mut |at, buffer| of(from, at, buffer), Table::of(from, *rows), name, out)
+            let stored = (tensor.source.scale(), tensor.dtype);
+            let table = Table::of(from, *rows);
+            facts.distinct = sample_rows(&mut |at, buffer| of(from, at, buffer), table, &tensor.name, stored, out)?;
+            Ok(())
+        }
+        TensorExpr::NewRows { like, rows, sampled, .. } => {
+            let table = Table::like(like, *rows);
+            let mut of = |at: u64, buffer: &mut [u8]| of(like, at, buffer);
+            if *sampled {
+                let stored = (tensor.source.scale(), tensor.dtype);
+                facts.distinct = sample_rows(&mut of, table, &tensor.name, stored, out)?;
+                return Ok(());
+            }
+            grow_rows(&mut of, table, out)
         }
         TensorExpr::Pad { of: from, shape } => {
             pad(&mut |at, buffer| of(from, at, buffer), from.dtype.bits() / 8, &from.shape, shape, out)
         }
-        TensorExpr::Initialise { values, dtype, shape, .. } => new_values(name, *dtype, shape, *values, out),
-        TensorExpr::Cast { of, to } => convert(read, name, of, (None, *to), losses, out),
-        TensorExpr::Scale { of, by, to } => convert(read, name, of, (Some(*by), *to), losses, out),
+        TensorExpr::Initialise { values, dtype, shape, .. } => new_values(&tensor.name, *dtype, shape, *values, out),
+        TensorExpr::Cast { of, to } => convert(read, tensor, of, (None, *to), facts, out),
+        TensorExpr::Scale { of, by, to } => convert(read, tensor, of, (Some(*by), *to), facts, out),
         TensorExpr::AddProduct { to, product } => {
             let (dtype, shape) = to.typed().map_err(|reason| io::Error::new(io::ErrorKind::InvalidInput, reason))?;
             let mut adder = Adder::new(read, product, dtype, &shape, out)?;
-            evaluate(read, name, to, losses, &mut adder)?;
-            losses.add(adder.losses());
+            evaluate(read, tensor, to, facts, &mut adder)?;
+            facts.losses.add(adder.losses());
             Ok(())
         }
     }
@@ -71,16 +93,16 @@ fn evaluate(
 /// Writes values multiplied by a constant, and cast.
 fn convert(
     read: &mut ReadAt<'_>,
-    name: &str,
+    tensor: &PlannedTensor,
     of: &TensorExpr<TensorRef>,
     (scale, to): (Option<f64>, Dtype),
-    losses: &mut CastLosses,
+    facts: &mut ValueFacts,
     out: &mut dyn Write,
 ) -> io::Result<()> {
     let (from, _) = of.typed().map_err(|reason| io::Error::new(io::ErrorKind::InvalidInput, reason))?;
     let mut converter = Converter::new(from, to, scale, out);
-    evaluate(read, name, of, losses, &mut converter)?;
-    losses.add(converter.losses());
+    evaluate(read, tensor, of, facts, &mut converter)?;
+    facts.losses.add(converter.losses());
     Ok(())
 }
 
@@ -172,6 +194,8 @@ pub struct Table {
     pub rows: u64,
     /// Values in a row.
     pub width: u64,
+    /// Whether the donor's rows are in the result.
+    pub keeps: bool,
     /// Rows to append.
     pub more: u64,
 }
@@ -181,7 +205,12 @@ impl Table {
     fn of(from: &TensorRef, rows: u64) -> Self {
         let have = from.shape.first().copied().unwrap_or_default();
         let width = from.shape.iter().skip(1).fold(1_u64, |n, d| n.saturating_mul(*d));
-        Self { dtype: from.dtype, rows: have, width, more: rows.saturating_sub(have) }
+        Self { dtype: from.dtype, rows: have, width, keeps: true, more: rows.saturating_sub(have) }
+    }
+
+    /// `rows` rows like those of a donor, which are not in the result.
+    fn like(from: &TensorRef, rows: u64) -> Self {
+        Self { keeps: false, more: rows, ..Self::of(from, rows) }
     }
 
     /// Bytes of a row.
@@ -189,14 +218,16 @@ impl Table {
         usize::try_from(self.width.saturating_mul(self.dtype.bits() / 8)).map_err(io::Error::other)
     }
 
-    /// Copies the rows and returns their mean; zeros without rows.
+    /// Copies the rows, if they are in the result, and returns their mean; zeros without rows.
     fn copy_rows(self, read: &mut ReadOperand<'_>, codec: &mut Codec, out: &mut dyn Write) -> io::Result<Vec<f64>> {
         let mut row: Vec<u8> = reserved(self.row_len()?)?;
         let mut mean: Vec<f64> = reserved(usize::try_from(self.width).map_err(io::Error::other)?)?;
         let mut at = 0_u64;
         for _ in 0..self.rows {
             read(at, &mut row)?;
-            out.write_all(&row)?;
+            if self.keeps {
+                out.write_all(&row)?;
+            }
             for (sum, value) in mean.iter_mut().zip(codec.decode(self.dtype, &row)) {
                 *sum += *value;
             }
@@ -233,14 +264,33 @@ pub fn grow_rows(read: &mut ReadOperand<'_>, table: Table, out: &mut dyn Write) 
 /// normal numbers `g`. Its mean and covariance are exactly those of transformers, without a matrix of `width` squared
 /// values in memory. The generator is seeded with the name of the tensor.
 ///
+/// Returns how many of the new values differ from the mean once they are multiplied and cast as `stored` says: noise of this size
+/// is mostly lost in 16 bits.
+///
 /// # Errors
 /// Errors of reading or writing.
-pub fn sample_rows(read: &mut ReadOperand<'_>, table: Table, name: &str, out: &mut dyn Write) -> io::Result<()> {
+pub fn sample_rows(
+    read: &mut ReadOperand<'_>,
+    table: Table,
+    name: &str,
+    (scale, dtype): (Option<f64>, Dtype),
+    out: &mut dyn Write,
+) -> io::Result<u64> {
     let mut codec = Codec::default();
     let mean = table.copy_rows(read, &mut codec, out)?;
     let mut rng = seeded(name);
     let factor = (SAMPLE_VARIANCE / f64::from(SAMPLE_TERMS)).sqrt();
     let mut donor_row: Vec<u8> = reserved(table.row_len()?)?;
+    let stored = |values: &[f64]| {
+        let (mut codec, mut bytes) = (Codec::default(), Vec::new());
+        codec.encode_values(table.dtype, values, &mut bytes);
+        let scaled =
+            codec.decode(table.dtype, &bytes).iter().map(|value| value * scale.unwrap_or(1.0)).collect::<Vec<_>>();
+        bytes.clear();
+        codec.encode_values(dtype, &scaled, &mut bytes);
+        codec.decode(dtype, &bytes).clone()
+    };
+    let (mean_stored, mut distinct) = (stored(&mean), 0_u64);
     let mut row = Vec::new();
     for _ in 0..table.more {
         let mut values = mean.clone();
@@ -255,8 +305,11 @@ pub fn sample_rows(read: &mut ReadOperand<'_>, table: Table, name: &str, out: &m
         row.clear();
         codec.encode_values(table.dtype, &values, &mut row);
         out.write_all(&row)?;
+        #[expect(clippy::float_cmp, reason = "as they are stored")]
+        let differ = stored(&values).iter().zip(&mean_stored).filter(|(value, mean)| value != mean).count();
+        distinct = distinct.saturating_add(differ as u64);
     }
-    Ok(())
+    Ok(distinct)
 }
 
 /// The generator for the fresh values of a tensor, seeded with its name, so that merges are reproducible.
@@ -340,9 +393,13 @@ mod tests {
         let values = [1.0_f32, 2.0, 3.0, 6.0];
         let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
         let mut out = Vec::new();
-        let table = Table { dtype: Dtype::F32, rows: 2, width: 2, more: 2 };
-        grow_rows(&mut reader(bytes), table, &mut out).unwrap();
+        let table = Table { dtype: Dtype::F32, rows: 2, width: 2, keeps: true, more: 2 };
+        let mut read = reader(bytes);
+        grow_rows(&mut read, table, &mut out).unwrap();
         assert_eq!(*Codec::default().decode(Dtype::F32, &out), [1.0, 2.0, 3.0, 6.0, 2.0, 4.0, 2.0, 4.0]);
+        out.clear();
+        grow_rows(&mut read, Table { keeps: false, ..table }, &mut out).unwrap();
+        assert_eq!(*Codec::default().decode(Dtype::F32, &out), [2.0, 4.0, 2.0, 4.0]);
     }
 
     #[test]
@@ -350,12 +407,16 @@ mod tests {
         // Two columns of opposite sign, so that their covariance is negative.
         let rows: Vec<[f64; 2]> = (0..100).map(|i| f64::from(i) - 49.5).map(|x| [3.0 + x, 5.0 - 2.0 * x]).collect();
         let bytes: Vec<u8> = rows.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
-        let table = Table { dtype: Dtype::F64, rows: 100, width: 2, more: 4000 };
+        let table = Table { dtype: Dtype::F64, rows: 100, width: 2, keeps: true, more: 4000 };
         let make = |name| {
             let mut out = Vec::new();
-            sample_rows(&mut reader(bytes.clone()), table, name, &mut out).unwrap();
+            let distinct = sample_rows(&mut reader(bytes.clone()), table, name, (None, Dtype::F64), &mut out).unwrap();
+            assert_eq!(distinct, 8000);
             out
         };
+        // In 16 bits the noise is rounded away.
+        let narrow = sample_rows(&mut reader(bytes.clone()), table, "a", (Some(2.0), Dtype::BF16), &mut Vec::new());
+        assert_eq!(narrow.unwrap(), 0);
         let out = make("a");
         assert_eq!(out, make("a"));
         assert_ne!(out, make("b"));
@@ -376,12 +437,16 @@ mod tests {
 
     #[test]
     fn rows_appended_to_none_are_zero() {
-        let table = Table { dtype: Dtype::F16, rows: 0, width: 3, more: 2 };
+        let table = Table { dtype: Dtype::F16, rows: 0, width: 3, keeps: true, more: 2 };
         for sample in [false, true] {
             let mut out = Vec::new();
             let mut read = reader(Vec::new());
-            if sample { sample_rows(&mut read, table, "a", &mut out) } else { grow_rows(&mut read, table, &mut out) }
-                .unwrap();
+            if sample {
+                let distinct = sample_rows(&mut read, table, "a", (None, Dtype::F16), &mut out).unwrap();
+                assert_eq!(distinct, 0);
+            } else {
+                grow_rows(&mut read, table, &mut out).unwrap();
+            }
             assert_eq!(out, [0; 12]);
         }
     }

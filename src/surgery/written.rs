@@ -2,10 +2,10 @@
 
 use sha2::{Digest as _, Sha256};
 
-use super::convert::CastLosses;
 use super::expr::TensorExpr;
 use super::plan::{Plan, PlannedFile};
 use super::planned_tensor::PlannedTensor;
+use super::transform::ValueFacts;
 use crate::checkpoint::{FileName, HashAlgorithm, hex, parallel};
 
 /// How [`super::apply()`] writes a plan. The bytes of the shards do not depend on it.
@@ -44,8 +44,8 @@ pub struct WrittenShard {
 pub struct WrittenTensor {
     /// Digest of its bytes in hexadecimal; `None` with [`HashAlgorithm::None`].
     pub digest: Option<String>,
-    /// Values of the donor that scaling and casting could not keep.
-    pub losses: CastLosses,
+    /// What is known of its values.
+    pub facts: ValueFacts,
     /// Digests of the donors' tensors, in the order of [`TensorExpr::sources`]; `None` for one that was not read, and empty for a
     /// copy, which has the digest of its source.
     pub source_digests: Vec<Option<String>>,
@@ -63,7 +63,7 @@ impl WrittenShard {
             let is_read = !matches!(tensor.source, TensorExpr::Stored(_) | TensorExpr::Initialise { .. });
             let sources = if is_read { tensor.source.sources() } else { Vec::new() };
             let source_digests = sources.into_iter().map(|_| digest()).collect();
-            WrittenTensor { digest: digest(), losses: CastLosses::default(), source_digests }
+            WrittenTensor { digest: digest(), facts: ValueFacts::default(), source_digests }
         };
         let shards = plan.shards.iter();
         let expected = shards.map(|shard| Self {

@@ -96,7 +96,7 @@ fn the_default_merge_is_complete_and_checks_clean() {
         .map(|s| s["name"].as_str().unwrap())
         .collect();
     assert_eq!(stages, ["donors", "recipe", "plan", "check planned", "write", "check written"]);
-    assert_eq!(report["merge"]["transforms"], serde_json::json!({ "copy": 349, "grow-rows": 2, "pad": 3 }));
+    assert_eq!(report["merge"]["transforms"], serde_json::json!({ "copy": 349, "sample-rows": 2, "pad": 3 }));
     let written = report["checkpoints"].as_array().unwrap().last().unwrap().clone();
     assert_eq!(written["counts"]["error"], 0);
     assert_eq!(written["counts"]["warning"], 0);
@@ -179,7 +179,7 @@ fn copied_tensors_are_the_donors_bytes() {
                 assert_eq!(source, result, "{}", entry["name"]);
                 copied += 1;
             }
-            "grow-rows" => assert!(result.2.starts_with(&source.2), "{}", entry["name"]),
+            "sample-rows" => assert!(result.2.starts_with(&source.2), "{}", entry["name"]),
             "pad" => {
                 // A factor of 8 changes only the exponent; that of Gemma 2 is rounded to bfloat16 like its products.
                 let scale = entry["source"]["scale"]["by"].as_f64().unwrap();

@@ -129,8 +129,8 @@ impl Out<'_> {
             let error = io::Error::other(format!("{} is {} bytes too short", tensor.name, place.left));
             return Err(io_at(self.path, "writing")(error));
         }
-        let Streamed { losses, source_digests } = streamed;
-        Ok(WrittenTensor { digest: place.hasher.finish_hex(), losses, source_digests })
+        let Streamed { facts, source_digests } = streamed;
+        Ok(WrittenTensor { digest: place.hasher.finish_hex(), facts, source_digests })
     }
 }
 

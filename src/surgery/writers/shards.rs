@@ -264,7 +264,7 @@ mod tests {
                     assert!(tensor.source_digests.iter().all(|digest| digest.is_some() == is_digest));
                 }
             }
-            let losses: Vec<_> = written.iter().flat_map(|s| &s.tensors).map(|t| t.losses).collect();
+            let losses: Vec<_> = written.iter().flat_map(|s| &s.tensors).map(|t| t.facts).collect();
             let found = (bytes, losses);
             assert!(expected.get_or_insert_with(|| found.clone()) == &found, "{threads} {hash:?}");
         }

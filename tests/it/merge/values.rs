@@ -189,6 +189,30 @@ fn sampled_rows_differ_and_the_former_name_of_mean_works() {
 }
 
 #[test]
+fn a_spatial_embedding_starts_again_with_rows_like_those_of_the_language_model() {
+    let work = TempDir::new().unwrap();
+    let spatial = |name: &str| {
+        let out = work.path().join(name);
+        let written = tiny(&out, &["--set", &format!("spatial={name}"), "--set", "rows=mean"]);
+        assert_eq!(written.status.code(), Some(0), "{}", text(&written));
+        assert!(text(&written).contains("The spatial embedding of the vision donor is not used"), "{}", text(&written));
+        let donors = ["vision=spatialvla-tiny", "language=llava3d-tiny"].map(|d| d.replace('=', "=fixtures/donors/"));
+        let args = ["verify", out.to_str().unwrap(), "--donor", &donors[0], "--donor", &donors[1]];
+        assert_eq!(doctor(&args).status.code(), Some(0));
+        let tensors = tensors(&out);
+        let embedding = &tensors["language_model.model.embed_tokens.weight"];
+        // Without sampling, the last row of the embedding is their mean.
+        let mean = embedding.2[embedding.2.len() - 128..].to_vec();
+        (tensors["spatial_embed_tokens.weight"].clone(), mean)
+    };
+    let ((mean, row), (sampled, _)) = (spatial("mean"), spatial("sampled"));
+    assert_eq!((&mean.1, &sampled.1), (&vec![22, 64], &vec![22, 64]));
+    assert!(mean.2.chunks(128).all(|one| one == row));
+    let different: std::collections::BTreeSet<&[u8]> = sampled.2.chunks(128).collect();
+    assert!(different.len() > 11 && sampled.2.chunks(128).all(|one| one.len() == row.len()));
+}
+
+#[test]
 fn a_factor_of_one_changes_nothing_and_the_projector_keeps_its_bytes() {
     let work = TempDir::new().unwrap();
     let out = work.path().join("out");
@@ -277,7 +301,10 @@ fn slices_scales_and_types_that_do_not_fit_are_refused_in_words() {
         (json!({ "scale": "0" }), "is 0, not a finite number other than 0"),
         (json!({ "dtype": "'int' + '8'" }), "is \"int8\", not bfloat16, float16, float32 or float64"),
         (json!({ "dtype": "'float8'" }), "unknown dtype `float8` in `dtype`"),
-        (json!({ "fit": "'conv' + 'ert'" }), "not copy, pad, grow-rows, sample-rows, reinit or reinit-always"),
+        (
+            json!({ "fit": "'conv' + 'ert'" }),
+            "not copy, pad, grow-rows, sample-rows, mean-rows, sampled-rows, reinit or reinit-always",
+        ),
     ] {
         let refused = narrowed(work.path(), &entry, 64);
         assert!(refused.contains(words), "{entry}: {refused}");

@@ -353,7 +353,7 @@ fn a_manifest_that_cannot_be_used_is_refused() {
 /// A manifest that claims more than the files have: no value of it becomes a size of memory or a place to read.
 #[test]
 fn a_hostile_manifest_is_bounded() {
-    let room = Room::new(&[]);
+    let room = Room::new(&["--set", "rows=mean"]);
     let original = fs::read(room.out.join("merge-manifest.json")).unwrap();
     let huge = json!([u64::MAX, u64::MAX]);
     // A tensor with more rows than its source.
@@ -377,6 +377,7 @@ fn a_hostile_manifest_is_bounded() {
         ("cast", json!({ "cast": { "of": of(source), "to": "I64" } })),
         ("pad", json!({ "pad": { "of": source, "shape": huge } })),
         ("rows", json!({ "grow-rows": { "of": source, "rows": u64::MAX } })),
+        ("like", json!({ "new-rows": { "like": source, "rows": u64::MAX, "sampled": true, "instead-of": source } })),
         (
             "values",
             json!({ "initialise": {

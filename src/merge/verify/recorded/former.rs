@@ -93,7 +93,10 @@ impl OnlySource {
                 return TensorExpr::Initialise { values, dtype: to, shape, instead_of: of };
             }
             // No version before 5 added products.
-            TensorTransform::Copy | TensorTransform::Convert | TensorTransform::AddProduct => TensorExpr::Stored(of),
+            TensorTransform::Copy
+            | TensorTransform::Convert
+            | TensorTransform::NewRows
+            | TensorTransform::AddProduct => TensorExpr::Stored(of),
         };
         match from {
             Some(from) => fitted.converted(from, scale, to),

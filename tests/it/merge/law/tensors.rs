@@ -84,6 +84,7 @@ enum Fit {
     Stored,
     GrowRows,
     SampleRows,
+    NewRows,
     Pad,
 }
 
@@ -96,12 +97,13 @@ fn donor(path: &str, dtype: Dtype, shape: Vec<u64>) -> TensorRef {
 
 fn case(random: &mut Draw) -> Case {
     let (from, to) = (TYPES[random.below(4)], TYPES[random.below(4)]);
-    let fit = [Fit::Stored, Fit::GrowRows, Fit::SampleRows, Fit::Pad][random.below(4)];
+    let fit = [Fit::Stored, Fit::GrowRows, Fit::SampleRows, Fit::NewRows, Fit::Pad][random.below(5)];
     let shape: Vec<u64> = (0..=random.below(3)).map(|_| random.below(6) as u64).collect();
     let mut wanted = shape.clone();
     match fit {
         Fit::Pad => wanted.iter_mut().for_each(|dim| *dim += random.below(4) as u64),
         Fit::GrowRows | Fit::SampleRows => wanted[0] += random.below(4) as u64,
+        Fit::NewRows => wanted[0] = random.below(9) as u64,
         Fit::Stored => {}
     }
     let len = byte_len(from, &shape).unwrap();
@@ -121,6 +123,10 @@ fn case(random: &mut Draw) -> Case {
         Fit::Stored => TensorExpr::Stored(of),
         Fit::GrowRows => TensorExpr::GrowRows { of, rows },
         Fit::SampleRows => TensorExpr::SampleRows { of, rows },
+        Fit::NewRows => {
+            let instead_of = donor("unread", Dtype::U8, vec![3]);
+            TensorExpr::NewRows { like: of, rows, sampled: false, instead_of }
+        }
         Fit::Pad => TensorExpr::Pad { of, shape: wanted.clone() },
     };
     let tensor = PlannedTensor::new("x".to_owned(), fitted.converted(from.dtype, scale, to)).unwrap();
@@ -138,6 +144,9 @@ fn fitted(case: &Case) -> Vec<Option<u64>> {
     let row = to[1..].iter().product::<u64>();
     let total = to.iter().product::<u64>();
     let index = |place: u64| {
+        if *fit == Fit::NewRows {
+            return None;
+        }
         // The place in the donor of a place in the result.
         let (mut rest, mut at, mut stride) = (place, 0, 1);
         for (have, want) in from.shape.iter().zip(to).rev() {
@@ -186,7 +195,7 @@ fn planned_tensors_are_streamed_as_computed_at_once() {
             Ok(())
         };
         let mut out = Vec::new();
-        let losses = transform::write(&mut read, tensor, &mut out).unwrap();
+        let facts = transform::write(&mut read, tensor, &mut out).unwrap();
         assert_eq!(Some(out.len() as u64), byte_len(tensor.dtype, &tensor.shape), "{round}: {tensor:?}");
         let width = usize::try_from(tensor.dtype.bits() / 8).unwrap();
         let got = out.chunks(width).map(|c| c.iter().rev().fold(0_u64, |n, b| n << 8 | u64::from(*b)));
@@ -215,7 +224,7 @@ fn planned_tensors_are_streamed_as_computed_at_once() {
             }
         }
         if !sampled {
-            assert_eq!(losses, want_losses, "{round}: {tensor:?}");
+            assert_eq!(facts.losses, want_losses, "{round}: {tensor:?}");
         }
     }
 }
@@ -267,8 +276,8 @@ fn products_are_added_as_computed_at_once() {
             Ok(())
         };
         let mut out = Vec::new();
-        let losses = transform::write(&mut read, &tensor, &mut out).unwrap();
-        assert_eq!(losses, CastLosses::default(), "{round}");
+        let facts = transform::write(&mut read, &tensor, &mut out).unwrap();
+        assert_eq!(facts.losses, CastLosses::default(), "{round}");
         let single = |of: f64| value(Dtype::F32, nearest(Dtype::F32, of));
         let mut want = Vec::new();
         for (place, base) in base.iter().enumerate() {
