@@ -37,38 +37,3 @@ pub fn rms(of: &TensorRef) -> Result<Option<f64>, ApplyError> {
     let rms = format!("{:.3e}", mean.sqrt()).parse().ok();
     Ok(rms.filter(|rms: &f64| rms.is_finite()))
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::checkpoint::Dtype;
-
-    #[test]
-    fn values_of_every_block_count() {
-        let dir = tempfile::TempDir::new().unwrap();
-        let path = dir.path().join("x");
-        let values = vec![half::f16::from_f32(3.0); BLOCK];
-        let mut bytes: Vec<u8> = vec![0xff; 6];
-        bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
-        bytes.extend([half::f16::from_f32(-4.0).to_le_bytes(); BLOCK].concat());
-        std::fs::write(&path, &bytes).unwrap();
-        let of = |dtype, offset, len| TensorRef {
-            donor: "d".to_owned(),
-            path: path.clone(),
-            name: "x".to_owned(),
-            dtype,
-            shape: vec![len],
-            offset,
-            len,
-            slice: None,
-        };
-        let all = bytes.len() as u64 - 6;
-        assert_eq!(rms(&of(Dtype::F16, 6, all)).unwrap(), Some(3.536));
-        assert_eq!(rms(&of(Dtype::F16, 6, 2)).unwrap(), Some(3.0));
-        assert_eq!(rms(&of(Dtype::F16, 6, 0)).unwrap(), None);
-        assert_eq!(rms(&of(Dtype::U8, 6, all)).unwrap(), None);
-        // All of a NaN.
-        assert_eq!(rms(&of(Dtype::F16, 0, 2)).unwrap(), None);
-        assert!(rms(&of(Dtype::F16, 6, all + 2)).is_err());
-    }
-}

@@ -4,6 +4,9 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ckpt_doctor::checkpoint::Dtype;
+use ckpt_doctor::surgery::rms::rms;
+use ckpt_doctor::surgery::tensor_ref::TensorRef;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -311,4 +314,36 @@ fn slices_scales_and_types_that_do_not_fit_are_refused_in_words() {
     }
     let sliced = narrowed(work.path(), &json!({ "slice": "[8, 32]", "scale": "0.5" }), 32);
     assert!(sliced.contains("scale 0.5") && sliced.contains("[32]"), "{sliced}");
+}
+
+#[test]
+fn the_size_of_a_tensor_counts_the_values_of_every_block() {
+    // More bytes than are read at a time.
+    const COUNT: usize = 1 << 20;
+    let dir = TempDir::new().unwrap();
+    let path = dir.path().join("x");
+    let half = |number: f32| half::f16::from_f32(number).to_le_bytes();
+    let bytes = [vec![0xff; 6], half(3.0).repeat(COUNT), half(-4.0).repeat(COUNT)].concat();
+    fs::write(&path, &bytes).unwrap();
+    let of = |dtype, offset, len| TensorRef {
+        donor: "d".to_owned(),
+        path: path.clone(),
+        name: "x".to_owned(),
+        dtype,
+        shape: vec![len],
+        offset,
+        len,
+        slice: None,
+    };
+    let all = bytes.len() as u64 - 6;
+    for (what, dtype, offset, len, wanted) in [
+        ("all", Dtype::F16, 6, all, Some(3.536)),
+        ("one value", Dtype::F16, 6, 2, Some(3.0)),
+        ("none", Dtype::F16, 6, 0, None),
+        ("a type that is not computed", Dtype::U8, 6, all, None),
+        ("NaN", Dtype::F16, 0, 2, None),
+    ] {
+        assert_eq!(rms(&of(dtype, offset, len)).unwrap(), wanted, "{what}");
+    }
+    assert!(rms(&of(Dtype::F16, 6, all + 2)).is_err());
 }
