@@ -27,6 +27,8 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 /// - `id_of(token)`: the id in the tokenizer of the result, null when it has no such token;
 /// - `rms(role, tensor)`: the root of the mean square of a donor's tensor, whose values are read for it; null where the donor has
 ///   no such tensor, or only values that are not computed;
+/// - `tried(host, part)`: the versions of transformers that ran a host of this model type with a part of this model type in the
+///   tests of the program;
 /// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;
 /// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host, under the
 ///   version that wrote it, when its class has the guest's language model; `with` and `without` list the versions of

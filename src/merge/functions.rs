@@ -14,7 +14,7 @@ use crate::knowledge::{Loader, Scope, source};
 use crate::surgery::rms::rms;
 use crate::surgery::tensor_ref::TensorRef;
 
-/// Adds `dtype`, `image_fold`, `row_scale`, `rms`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
+/// Adds `dtype`, `image_fold`, `row_scale`, `rms`, `tried`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
 pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
@@ -58,6 +58,12 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
     scope.function2("rms", move |role, name| {
         let rms = checkpoints.get(role).and_then(|checkpoint| rms_of(role, checkpoint, name));
         rms.map_or(Value::Null, |rms| json!(rms))
+    });
+    // The pairs that tests/peer/surgery.py ran: versions of transformers by the model types of host and part.
+    let tried: BTreeMap<String, BTreeMap<String, Value>> =
+        source::text("tried-pairs.json").and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
+    scope.function2("tried", move |host, part| {
+        tried.get(host).and_then(|parts| parts.get(part)).cloned().unwrap_or_else(|| json!([]))
     });
     let of_models = scales.clone();
     scope.function1("row_scale", move |role| {

@@ -224,6 +224,7 @@ fn the_page_of_data_files_is_fresh() {
          | `parts/` | the language model, vision tower and projector inside model classes |\n\
          | `recipes/` | merges, with the Python modules that they write |\n\
          | `initial-values.json` | values that each version gives to the tensors of a new model, written by `tools/loader_initial.py` |\n\
+         | `tried-pairs.json` | versions that ran a host with a part of another model in `tests/peer/surgery.py`, which writes it |\n\
          | `ropes.json` | rope keys that config classes read before transformers 5, written by `tools/loader_ropes.py` |\n\
          | `fixed-parts.json` | parts of configs that are of one class whatever they name, written by `tools/loader_parts.py` |\n\
          | `rope-forms.json5` | forms of `rope_scaling` that config classes before transformers 5 accept |\n\

@@ -137,6 +137,7 @@ class Language(Cell):
 
     def words(self):
         self.host_dir, self.guest_dir = map(self.path, self.donors)
+        self.part_dir = self.guest_dir
         options = ["--set", f"projector={self.projector}"] if self.projector else []
         # One result is opened by every version, although some scale image features.
         options += [] if self.host == SPATIALVLA else ["--set", "scale=keep"]
@@ -177,8 +178,8 @@ class Tower(Cell):
         self.name = f"{host} sees with {tower}"
 
     def words(self):
-        self.host_dir, tower_dir = map(self.path, self.donors)
-        return ["build-merged", "--vision", tower_dir, "--language", self.host_dir, "--out", self.out]
+        self.host_dir, self.part_dir = map(self.path, self.donors)
+        return ["build-merged", "--vision", self.part_dir, "--language", self.host_dir, "--out", self.out]
 
     def must_keep(self, name):
         return "head." not in name  # hosts use towers without the pooling head

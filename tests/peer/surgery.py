@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Parts of stock models put together by the tool, opened and run by every version of transformers.
 
-    surgery.py FOLDER... [--all] [--only REGEX] [--page FILE] [--keep DIRECTORY] [--list]
+    surgery.py FOLDER... [--all] [--only REGEX] [--page FILE] [--tried FILE] [--keep DIRECTORY] [--list]
 
 Each FOLDER has one version of transformers, oldest first, for the Python that runs this. Tiny models are saved by the oldest
 version that has their class (stock.py). The tool exchanges language models and vision towers, and takes parts out and puts them
@@ -11,7 +11,8 @@ and train what the report counts.
 
 A result that `check` calls sound for a version runs there, and one that it calls broken does not. A refusal has to be one of
 REFUSED. The tensors are the donors', apart from those that the report names. `--all` tries every pair in every variant; without
-it each pair is tried in one. `--page` compares the tables with a page, and CKPT_DOCTOR_WRITE=1 writes it.
+it each pair is tried in one. `--page` compares the tables with a page, `--tried` the pairs that ran with a file of rules, and
+CKPT_DOCTOR_WRITE=1 writes both.
 """
 
 import argparse
@@ -127,6 +128,7 @@ def main():
     p.add_argument("--all", action="store_true", help="every pair in every variant")
     p.add_argument("--only", default="", help="cells whose name has this regular expression")
     p.add_argument("--page", type=Path)
+    p.add_argument("--tried", type=Path)
     p.add_argument("--keep", type=Path, help="directory for donors and results")
     p.add_argument("--list", action="store_true", help="print every cell")
     p.add_argument("--build", nargs=2, help=argparse.SUPPRESS)
@@ -141,6 +143,8 @@ def main():
             print(f"{cell.name}: {outcomes[cell.name]}")
         if a.page:
             compare_page(tally, a.page, page(cells, outcomes))
+        if a.tried:
+            compare_page(tally, a.tried, json.dumps(tried(cells, outcomes), indent=1) + "\n")
     tally.finish()
 
 
@@ -214,6 +218,23 @@ def page(cells, outcomes):
         parts.append(text)
         parts.append(matrix(of_kind, outcomes))
     return "\n".join(parts)
+
+
+def tried(cells, outcomes):
+    """{model type of the host: {model type of the part: versions that run the pair in every variant}}."""
+    pairs = {}
+    for cell in cells:
+        versions = outcomes[cell.name]
+        if type(cell) in (Language, Tower) and isinstance(versions, list) and cell.host != OPENVLA:
+            host, part = (model_type(path) for path in (cell.host_dir, cell.part_dir))
+            before = pairs.setdefault(host, {}).setdefault(part, versions)
+            pairs[host][part] = [version for version in before if version in versions]
+    return {host: dict(sorted(parts.items())) for host, parts in sorted(pairs.items())}
+
+
+def model_type(path):
+    """The model type in config.json."""
+    return json.loads((Path(path) / "config.json").read_text())["model_type"]
 
 
 def matrix(cells, outcomes):

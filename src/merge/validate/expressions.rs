@@ -20,6 +20,9 @@ const ROLE_FUNCTIONS: [&str; 9] =
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
 
+/// The function that gives the versions of transformers which ran a pair of model types.
+const TRIED: &str = "tried";
+
 /// Calls `check` with each expression of a file, and the key that it is the value of.
 fn of_file<'e>(
     file: &'e FileSpec,
@@ -132,8 +135,11 @@ impl Validator<'_> {
                 }
                 continue;
             }
+            if function == TRIED {
+                continue;
+            }
             if !ROLE_FUNCTIONS.contains(&function.as_str()) && !is_function(function) {
-                let near = nearest(function, ROLE_FUNCTIONS.into_iter().chain([ID_OF]))
+                let near = nearest(function, ROLE_FUNCTIONS.into_iter().chain([ID_OF, TRIED]))
                     .map(|near| format!("; did you mean `{near}`?"));
                 return wrong(format!("unknown function `{function}`{}", near.unwrap_or_default()));
             }
