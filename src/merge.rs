@@ -106,7 +106,8 @@ pub fn run(
     choice::check_roles(recipe, request)?;
     let options = options::resolve(recipe, &request.options)?;
     run.record.options.clone_from(&options);
-    if !donors::are_sound(recipe, &mut run) {
+    let mut tolerated = donors::codes(&request.tolerate, knowledge)?;
+    if !donors::are_sound(recipe, &donors, &options, &tolerated, &mut run)? {
         return Ok(run.end(MergeStage::Donors));
     }
     run.note("recipe", &format!("{}: {}", recipe.recipe, recipe.summary));
@@ -124,11 +125,9 @@ pub fn run(
     run.note("plan", &planned);
 
     let preview = draft.preview(&out);
-    run.record.tokens_used = tokens_used::tokens_used(&preview, draft.opened.as_ref());
-    if let Some(training) = &mut run.record.training {
-        training::name_in_models(training, &preview, knowledge, &request.versions);
-    }
-    if !run.check(Role::Planned, &request.out, preview, knowledge, &recipe.tolerates) {
+    run.record_preview(&preview, &draft, knowledge);
+    tolerated.extend(recipe.tolerates.iter().cloned());
+    if !run.check(Role::Planned, &request.out, preview, knowledge, &tolerated) {
         return Ok(run.end(MergeStage::Planned));
     }
     publish::check(recipe, &draft)?;
@@ -140,8 +139,18 @@ pub fn run(
     }
 
     let cleared = cleared.as_deref();
-    ReadyMerge { request, recipe, donors: &donors, snapshots: &snapshots, draft: &draft, out: &out, cleared, knowledge }
-        .write(run, progress)
+    ReadyMerge {
+        request,
+        recipe,
+        donors: &donors,
+        snapshots: &snapshots,
+        draft: &draft,
+        out: &out,
+        cleared,
+        tolerated: &tolerated,
+        knowledge,
+    }
+    .write(run, progress)
 }
 
 /// A merge of which everything is decided.
@@ -155,6 +164,8 @@ struct ReadyMerge<'m> {
     out: &'m Path,
     /// What an ended run had left of it.
     cleared: Option<&'m Path>,
+    /// Rules whose errors do not stop the merge.
+    tolerated: &'m [String],
     knowledge: &'m Knowledge,
 }
 
@@ -176,7 +187,7 @@ impl ReadyMerge<'_> {
         run.note_files(self.cleared, leftover.as_ref());
         let reopen = |error| PipelineError::Reopen { out: request.out.clone(), error };
         let written = Checkpoint::open(out).map_err(reopen)?;
-        run.check(Role::Written, &request.out, written, self.knowledge, &recipe.tolerates);
+        run.check(Role::Written, &request.out, written, self.knowledge, self.tolerated);
         Ok(run.end(MergeStage::Written))
     }
 }

@@ -23,6 +23,7 @@ use crate::report::Report;
 pub struct Merge {
     parts: ResolvedMergeFile,
     versions: Vec<String>,
+    tolerate: Vec<String>,
     hash: HashAlgorithm,
     hash_donors: bool,
 }
@@ -83,6 +84,14 @@ impl Merge {
         Ok(self)
     }
 
+    /// Lets errors of this rule, by its code or name, not stop the merge, in a donor or the result. Several calls add several
+    /// rules; an unknown one is an error of [`Self::plan`] and [`Self::run`].
+    #[must_use]
+    pub fn tolerate(mut self, rule: impl Into<String>) -> Self {
+        self.tolerate.push(rule.into());
+        self
+    }
+
     /// Sets the algorithm of the digests of tensors in the manifest of the result; BLAKE3 by default.
     #[must_use]
     pub const fn hash(mut self, algorithm: HashAlgorithm) -> Self {
@@ -125,7 +134,8 @@ impl Merge {
         let recipe = self.parts.find_recipe(knowledge)?;
         let ResolvedMergeFile { donors, options, out, .. } = self.parts.clone();
         let (versions, hash, hash_donors) = (self.versions.clone(), self.hash, self.hash_donors);
-        let request = MergeRequest { recipe, donors, options, versions, out, dry_run, hash, hash_donors };
+        let tolerate = self.tolerate.clone();
+        let request = MergeRequest { recipe, donors, options, versions, tolerate, out, dry_run, hash, hash_donors };
         Ok(run(&request, knowledge, &|_, _| {})?.report())
     }
 }

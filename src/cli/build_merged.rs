@@ -34,16 +34,18 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     drop(meter);
     run.notices.iter().for_each(|notice| output::note(&output::safe(notice)));
     let stage = run.record.stage;
-    if let (Some(file), Some(plan)) = (&args.plan, &run.plan) {
+    if let (Some(file), Some(plan)) = (&args.how.plan, &run.plan) {
         output::write(file, &json::pretty(plan)).with_context(|| format!("writing {}", file.display()))?;
     }
-    output::finish(&run.report(), &args.report, false, false).with_context(|| match stage {
+    output::finish(&run.report(), &args.how.report, false, false).with_context(|| match stage {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
         _ => "the report could not be written".to_owned(),
     })?;
     // Only the result counts: errors of a donor that the merge repaired are reported, but do not fail the run.
     Ok(match stage {
-        Some(MergeStage::Written | MergeStage::DryRun) if args.report.exit_zero || !result_fails(&run, args) => CLEAN,
+        Some(MergeStage::Written | MergeStage::DryRun) if args.how.report.exit_zero || !result_fails(&run, args) => {
+            CLEAN
+        }
         Some(MergeStage::Written | MergeStage::DryRun) => FINDINGS,
         _ => FAILED,
     })
@@ -71,7 +73,7 @@ Other options
 }
 
 fn result_fails(run: &MergeRun, args: &BuildMergedArgs) -> bool {
-    let least = args.report.fail_on.map_or(Severity::Error, SeverityName::severity);
+    let least = args.how.report.fail_on.map_or(Severity::Error, SeverityName::severity);
     let result = run.checked.iter().rfind(|c| !matches!(c.role, Role::Donor(_)));
     result.is_some_and(|c| c.outcome.findings.iter().any(|f| f.severity >= least))
 }
@@ -95,15 +97,16 @@ fn request(args: &BuildMergedArgs, knowledge: &Knowledge) -> anyhow::Result<Merg
     }
     // Options of the command line override those of the file; duplicate options on the command line are errors.
     let mut typed = BTreeMap::new();
-    for (name, value) in &args.set {
+    for (name, value) in &args.how.set {
         if typed.insert(name.clone(), value.clone()).is_some() {
             bail!("option {name} is given more than once");
         }
     }
     options.extend(typed);
     let out = out.context("no output directory given; pass --out DIR")?;
-    let versions = expanded(pins::transformers(&args.versions)?);
-    let hash = args.hash.algorithm();
-    let (dry_run, hash_donors) = (args.dry_run, args.hash_donors);
-    Ok(MergeRequest { recipe, donors, options, versions, out, dry_run, hash, hash_donors })
+    let versions = expanded(pins::transformers(&args.how.versions)?);
+    let hash = args.how.hash.algorithm();
+    let (dry_run, hash_donors) = (args.how.dry_run, args.how.hash_donors);
+    let tolerate = args.how.tolerate.clone();
+    Ok(MergeRequest { recipe, donors, options, versions, tolerate, out, dry_run, hash, hash_donors })
 }

@@ -121,6 +121,12 @@ pub struct DonorSpec {
     /// Parts that the donor must not have, for the choice of a recipe.
     #[serde(default)]
     pub no_parts: Vec<String>,
+    /// The part that the result has of the donor: faults of its other parts do not stop the merge. A template, which sees `opt`.
+    #[serde(default)]
+    pub only_part: Option<Template>,
+    /// The part that the result does not have of the donor: its faults do not stop the merge. A template, which sees `opt`.
+    #[serde(default)]
+    pub without_part: Option<Template>,
     /// Whether the donor may be left out.
     #[serde(default)]
     pub optional: bool,

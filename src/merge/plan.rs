@@ -2,6 +2,8 @@
 //!
 //! Nothing is written or checked here: [`super::run`] checks the donors and the preview.
 
+use std::collections::BTreeMap;
+
 use serde_json::Value;
 
 use super::context::Context;
@@ -28,6 +30,19 @@ pub(super) fn plan(
     versions: &[String],
     knowledge: &Knowledge,
 ) -> Result<MergeDraft, MergeError> {
+    let mut draft = plan_once(recipe, donors, options, versions, knowledge)?;
+    offer_what_helps(&mut draft.seams, options, |options| plan_once(recipe, donors, options, versions, knowledge));
+    Ok(draft)
+}
+
+/// [`plan`] with all of the options that seams offer.
+fn plan_once(
+    recipe: &Recipe,
+    donors: &[Donor],
+    options: &Options,
+    versions: &[String],
+    knowledge: &Knowledge,
+) -> Result<MergeDraft, MergeError> {
     let mut draft = MergeDraft::default();
     match fill(&mut draft, recipe, donors, options, versions, knowledge) {
         Err(error) if matches!(error, MergeError::Expression { .. }) || !draft.seams.is_empty() => {
@@ -35,6 +50,33 @@ pub(super) fn plan(
             Ok(draft)
         }
         filled => filled.map(|()| draft),
+    }
+}
+
+/// Leaves out of seams the options with which a plan still has the seam, so that help does not go in circles. `plan` plans the
+/// merge with other options.
+fn offer_what_helps(seams: &mut [Seam], options: &Options, plan: impl Fn(&Options) -> Result<MergeDraft, MergeError>) {
+    let mut plans: BTreeMap<String, Option<Vec<Seam>>> = BTreeMap::new();
+    for seam in seams {
+        let mut offered = std::mem::take(&mut seam.options);
+        let place = |seam: &Seam| seam.tensor.as_ref().map(|tensor| (tensor.donor.clone(), tensor.name.clone()));
+        let is_same = |other: &Seam| match (place(seam), place(other)) {
+            (Some(one), Some(other)) => one == other,
+            _ => seam.message == other.message,
+        };
+        offered.retain(|offer| {
+            let Some((name, value)) = offer.strip_prefix("--set ").and_then(|set| set.split_once('=')) else {
+                return true;
+            };
+            let with = || {
+                let mut options = options.clone();
+                options.insert(name.to_owned(), value.to_owned());
+                plan(&options).ok().map(|draft| draft.seams)
+            };
+            let there = plans.entry(offer.clone()).or_insert_with(with);
+            there.as_ref().is_some_and(|seams| !seams.iter().any(is_same))
+        });
+        seam.options = offered;
     }
 }
 

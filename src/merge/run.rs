@@ -7,7 +7,8 @@ use std::sync::Arc;
 use super::draft::MergeDraft;
 use super::dry_run::PlanDocument;
 use super::parts::DonorParts;
-use super::training::training;
+use super::tokens_used::tokens_used;
+use super::training::{name_in_models, training};
 use super::usage::Usage;
 use crate::check::options::RunOptions;
 use crate::check::{Finding, Outcome, Severity, check_for};
@@ -33,6 +34,8 @@ pub struct MergeRequest {
     pub options: BTreeMap<String, String>,
     /// Versions of transformers that the result is for; empty: any.
     pub versions: Vec<String>,
+    /// Rules whose errors do not stop the merge, by code or name.
+    pub tolerate: Vec<String>,
     /// Directory to create.
     pub out: PathBuf,
     /// Whether to stop before writing.
@@ -133,6 +136,14 @@ impl MergeRun {
         }
     }
 
+    /// Adds to the record what the files of the planned checkpoint say to the next user.
+    pub(super) fn record_preview(&mut self, planned: &Checkpoint, draft: &MergeDraft, knowledge: &Knowledge) {
+        self.record.tokens_used = tokens_used(planned, draft.opened.as_ref());
+        if let Some(training) = &mut self.record.training {
+            name_in_models(training, planned, knowledge, &self.versions);
+        }
+    }
+
     /// Adds to the record what scaling, casting and sampling did to values, as known after writing.
     pub(super) fn record_values(&mut self, plan: &Plan, written: &[WrittenShard]) {
         let tensors = || plan.tensors().zip(written.iter().flat_map(|shard| &shard.tensors));
@@ -172,7 +183,7 @@ impl MergeRun {
         let verdict = match (found(Severity::Error), found(Severity::Warning)) {
             (0, 0) => "clean".to_owned(),
             (0, n) => count(n, "warning", "warnings"),
-            (n, _) if stopping == 0 => format!("{} that the recipe tolerates", count(n, "error", "errors")),
+            (n, _) if stopping == 0 => format!("{}, tolerated", count(n, "error", "errors")),
             (n, _) => count(n, "error", "errors"),
         };
         self.note(&format!("check {role}"), &verdict);

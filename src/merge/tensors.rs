@@ -446,7 +446,7 @@ const CANNOT_SHRINK: &str = "padding cannot shrink a tensor";
 /// The seam for a tensor with a shape mismatch.
 fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why: &str) -> Seam {
     let TakenTensor { name, donor, tensor, rule, .. } = taken;
-    let options = helpful(context, taken, &needed);
+    let options = rule.spec.options.iter().map(|option| format!("--set {option}")).collect();
     Seam {
         message: format!(
             "{} of the {} donor is {:?}, {} must be {needed:?}{}{why}",
@@ -461,25 +461,6 @@ fn misfit(context: &Context<'_>, taken: &TakenTensor<'_>, needed: Vec<u64>, why:
         needed: Some(needed),
         options,
     }
-}
-
-/// The options of the entry that would change how the tensor is made: without the values in effect, and without `pad` where
-/// padding cannot help.
-fn helpful(context: &Context<'_>, taken: &TakenTensor<'_>, shape: &[u64]) -> Vec<String> {
-    let spec = taken.rule.spec;
-    let Some(Value::Object(current)) = context.scope.get("opt") else { return Vec::new() };
-    let helps = |option: &&String| {
-        let Some((name, value)) = option.split_once('=') else { return true };
-        let mut changed = current.clone();
-        if changed.insert(name.to_owned(), value.into()).is_some_and(|old| old == value) {
-            return false;
-        }
-        let mut scope = context.scope.child();
-        scope.bind_map("opt", &changed);
-        let fit = spec.fit.as_ref().and_then(|fit| fit.eval(&scope).ok());
-        fit.is_none_or(|fit| fit != Fit::Pad.name() || nests(&taken.shape(), shape))
-    };
-    spec.options.iter().filter(helps).map(|option| format!("--set {option}")).collect()
 }
 
 /// Whether a tensor has the rank of `shape` and is at most as large in each dimension.

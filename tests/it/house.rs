@@ -296,7 +296,7 @@ const SPELLED: [(&str, &[&str], &str); 10] = [
         "the Auto class of each kind",
     ),
     ("src/merge/context.rs", &["opt"], "a variable of recipes"),
-    ("src/merge/tensors.rs", &["opt"], "a variable of recipes"),
+    ("src/merge/donors.rs", &["opt"], "a variable of recipes"),
     ("src/merge/validate.rs", &["opt"], "a variable of recipes"),
     ("src/merge/validate/expressions.rs", &["opt"], "a variable of recipes"),
     ("src/merge/usage.rs", &["AutoProcessor", "AutoTokenizer"], "Python that a report prints"),

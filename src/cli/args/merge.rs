@@ -12,7 +12,6 @@ use crate::knowledge::loader::parse_requirement_or_all;
 /// Arguments of `build-merged`.
 #[derive(Debug, Args)]
 #[command(disable_help_flag = true)]
-#[expect(clippy::struct_excessive_bools, reason = "one for each flag of the command")]
 #[command(after_help = "Without --recipe, the architectures of the donors determine the recipe.\n\n\
 Exit codes:\n  0  the merged checkpoint is written (or, with --dry-run, planned) without findings at or above --fail-on\n  \
 1  the merged checkpoint is written (or planned), and has findings at or above --fail-on\n  \
@@ -42,28 +41,9 @@ pub struct BuildMergedArgs {
     /// Output directory; it must not exist, or be empty
     #[arg(long, value_name = "DIR", required_unless_present_any = ["file", "print_recipe", "help"])]
     pub out: Option<PathBuf>,
-    /// Set an option of the recipe; may be repeated
-    #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
-    pub set: Vec<(String, String)>,
-    /// Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may
-    /// be repeated. The result is checked for it, and options whose default depends on the version follow it
-    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = or_file(parse_requirement_or_all))]
-    pub versions: Vec<String>,
-    /// Plan and check the merge, and write nothing
-    #[arg(long)]
-    pub dry_run: bool,
-    /// With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON
-    #[arg(long, value_name = "FILE", requires = "dry_run")]
-    pub plan: Option<PathBuf>,
-    /// Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result
-    #[arg(long, value_name = "ALGORITHM", default_value = "blake3")]
-    pub hash: HashName,
-    /// Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers
-    #[arg(long)]
-    pub hash_donors: bool,
-    /// Report formats and the exit code.
+    /// What is merged and reported.
     #[command(flatten)]
-    pub report: ReportArgs,
+    pub how: MergeArgs,
 }
 
 /// Arguments of `verify`.
@@ -98,9 +78,12 @@ pub struct ExtractArgs {
     /// Name of the part, such as language or vision, or the JSON pointer of its config
     #[arg(long, value_name = "PART")]
     pub part: String,
-    /// Output and report.
+    /// Output directory; it must not exist, or be empty
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// What is merged and reported.
     #[command(flatten)]
-    pub write: PartWriteArgs,
+    pub how: MergeArgs,
 }
 
 /// Arguments of `insert`.
@@ -116,9 +99,12 @@ pub struct InsertArgs {
     /// The part as a checkpoint of its own
     #[arg(long, value_name = "DIR")]
     pub from: PathBuf,
-    /// Output and report.
+    /// Output directory; it must not exist, or be empty
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// What is merged and reported.
     #[command(flatten)]
-    pub write: PartWriteArgs,
+    pub how: MergeArgs,
 }
 
 /// Arguments of `merge-adapter`.
@@ -131,23 +117,40 @@ pub struct MergeAdapterArgs {
     /// The adapter: a directory with `adapter_config.json` and `adapter_model.safetensors`
     #[arg(value_name = "ADAPTER")]
     pub adapter: PathBuf,
-    /// Output and report.
-    #[command(flatten)]
-    pub write: PartWriteArgs,
-}
-
-/// What `extract`, `insert` and `merge-adapter` have in common.
-#[derive(Debug, Args)]
-pub struct PartWriteArgs {
     /// Output directory; it must not exist, or be empty
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Set an option of the recipe, such as shard-size=2GB; may be repeated
+    /// What is merged and reported.
+    #[command(flatten)]
+    pub how: MergeArgs,
+}
+
+/// What all commands that write a merged checkpoint have in common.
+#[derive(Debug, Args)]
+pub struct MergeArgs {
+    /// Set an option of the recipe; may be repeated
     #[arg(long, value_name = "OPTION=VALUE", value_parser = parse_pair)]
     pub set: Vec<(String, String)>,
-    /// Plan and check, and write nothing
+    /// Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may
+    /// be repeated. The result is checked for it, and options whose default depends on the version follow it
+    #[arg(long = "for", value_name = "VERSION", value_delimiter = ',', value_parser = or_file(parse_requirement_or_all))]
+    pub versions: Vec<String>,
+    /// Let errors of this rule, in a donor or the result, not stop the merge; they are reported, and the exit code is 1 for one in
+    /// the result. May be repeated
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    pub tolerate: Vec<String>,
+    /// Plan and check the merge, and write nothing
     #[arg(long)]
     pub dry_run: bool,
+    /// With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON
+    #[arg(long, value_name = "FILE", requires = "dry_run")]
+    pub plan: Option<PathBuf>,
+    /// Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result
+    #[arg(long, value_name = "ALGORITHM", default_value = "blake3")]
+    pub hash: HashName,
+    /// Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers
+    #[arg(long)]
+    pub hash_donors: bool,
     /// Report formats and the exit code.
     #[command(flatten)]
     pub report: ReportArgs,
@@ -158,7 +161,7 @@ impl ExtractArgs {
     #[must_use]
     pub fn into_merge(self) -> BuildMergedArgs {
         let donor = vec![("model".to_owned(), self.dir.display().to_string())];
-        self.write.into_merge("extract", Some(self.part), donor)
+        self.how.into_merge("extract", self.out, Some(self.part), donor)
     }
 }
 
@@ -168,7 +171,7 @@ impl InsertArgs {
     pub fn into_merge(self) -> BuildMergedArgs {
         let dirs = [("model", self.dir), ("part", self.from)];
         let donor = dirs.map(|(role, dir)| (role.to_owned(), dir.display().to_string())).to_vec();
-        self.write.into_merge("insert", Some(self.part), donor)
+        self.how.into_merge("insert", self.out, Some(self.part), donor)
     }
 }
 
@@ -178,14 +181,20 @@ impl MergeAdapterArgs {
     pub fn into_merge(self) -> BuildMergedArgs {
         let dirs = [("base", self.base), ("adapter", self.adapter)];
         let donor = dirs.map(|(role, dir)| (role.to_owned(), dir.display().to_string())).to_vec();
-        self.write.into_merge("merge-adapter", None, donor)
+        self.how.into_merge("merge-adapter", self.out, None, donor)
     }
 }
 
-impl PartWriteArgs {
-    fn into_merge(self, recipe: &str, part: Option<String>, donor: Vec<(String, String)>) -> BuildMergedArgs {
-        let mut set = self.set;
-        set.extend(part.map(|part| ("part".to_owned(), part)));
+impl MergeArgs {
+    /// A merge of these donors, each by its role, with a recipe of the program; of a part, if it takes one.
+    fn into_merge(
+        mut self,
+        recipe: &str,
+        out: PathBuf,
+        part: Option<String>,
+        donor: Vec<(String, String)>,
+    ) -> BuildMergedArgs {
+        self.set.extend(part.map(|part| ("part".to_owned(), part)));
         BuildMergedArgs {
             file: None,
             recipe: Some(recipe.to_owned()),
@@ -194,14 +203,8 @@ impl PartWriteArgs {
             donor,
             vision: None,
             language: None,
-            out: Some(self.out),
-            set,
-            versions: Vec::new(),
-            dry_run: self.dry_run,
-            plan: None,
-            hash: HashName::Blake3,
-            hash_donors: false,
-            report: self.report,
+            out: Some(out),
+            how: self,
         }
     }
 }

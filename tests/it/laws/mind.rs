@@ -209,6 +209,7 @@ fn merged(draw: &mut Draw, grounds: &Grounds, knowledge: &Knowledge) -> Option<V
         donors,
         options,
         versions: Vec::new(),
+        tolerate: Vec::new(),
         out: out.clone(),
         dry_run: false,
         hash: HashAlgorithm::default(),

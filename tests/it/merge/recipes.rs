@@ -37,6 +37,7 @@ fn a_plan_that_changes_what_no_entry_names_is_refused() {
             donors: [("from".to_owned(), donor("llava3d-tiny"))].into(),
             options: BTreeMap::new(),
             versions: Vec::new(),
+            tolerate: Vec::new(),
             out: work.path().join("out"),
             dry_run: true,
             hash: HashAlgorithm::None,

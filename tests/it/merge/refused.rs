@@ -1,13 +1,14 @@
 //! Merges that `build-merged` refuses, and content that it does not copy.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::{copy, doctor, donor, merge, names, state, text, tiny};
+use super::{content, copy, doctor, donor, merge, names, state, text, tiny};
+use crate::support::make_base;
 
 #[test]
 fn an_occupied_target_is_refused() {
@@ -285,4 +286,52 @@ fn wrong_inputs_get_one_clear_line() {
         all.push_str(&format!("$ ckpt-doctor {typed}\n{shown}\n\n"));
     }
     snapshot!("merge-wrong-inputs", all);
+}
+
+/// A model one of whose tensors of the vision tower, or of the language model, has another name than its class gives it.
+fn with_a_renamed_tensor(work: &Path, name: &str, old: &str) -> PathBuf {
+    let dir = work.join(name);
+    make_base("paligemma", &dir);
+    let new = format!("{}x", &old[..old.len() - 1]);
+    for (file, bytes) in content(&dir) {
+        let found = bytes.windows(old.len()).position(|window| window == old.as_bytes());
+        if let Some(at) = found.filter(|_| file.contains("safetensors")) {
+            let mut bytes = bytes;
+            bytes[at..at + old.len()].copy_from_slice(new.as_bytes());
+            fs::write(dir.join(file), bytes).unwrap();
+        }
+    }
+    dir
+}
+
+#[test]
+fn faults_of_parts_that_are_not_used_do_not_stop_a_merge() {
+    let work = TempDir::new().unwrap();
+    let out = work.path().join("out");
+    let run = |dir: &Path, more: &[&str]| {
+        let mut args = vec!["extract", dir.to_str().unwrap(), "--out", out.to_str().unwrap(), "--part"];
+        args.extend(more);
+        let done = doctor(&args);
+        let written = out.exists();
+        drop(fs::remove_dir_all(&out));
+        (done.status.code(), written, text(&done))
+    };
+    let tower = "vision_tower.vision_model.post_layernorm.weight";
+    let damaged = with_a_renamed_tensor(work.path(), "tower", tower);
+    let (code, written, said) = run(&damaged, &["language"]);
+    assert_eq!((code, written), (Some(0), true), "{said}");
+    assert!(said.contains("model has 1 error in parts that are not used"), "{said}");
+    let (code, written, said) = run(&damaged, &["vision"]);
+    assert_eq!((code, written), (Some(2), false), "{said}");
+    // Who knows better goes on; what the result lacks is an error of the result.
+    for rule in ["ARC003", "tensors-missing"] {
+        let (code, written, said) = run(&damaged, &["vision", "--tolerate", rule]);
+        assert_eq!((code, written), (Some(1), true), "{said}");
+        assert!(said.contains("model has 1 error that --tolerate allows"), "{said}");
+    }
+    let (code, _, said) = run(&damaged, &["vision", "--tolerate", "tensors-mising"]);
+    assert!(code == Some(2) && said.contains("did you mean"), "{said}");
+    let (code, _, said) =
+        run(&with_a_renamed_tensor(work.path(), "text", "language_model.model.norm.weight"), &["language"]);
+    assert_eq!(code, Some(2), "{said}");
 }

@@ -151,6 +151,7 @@ fn merge(out: &Path, options: &[(&str, &str)], knowledge: &Knowledge) {
             .into(),
         options: options.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
         versions: Vec::new(),
+        tolerate: Vec::new(),
         out: out.to_owned(),
         dry_run: false,
         hash: HashAlgorithm::default(),

@@ -105,6 +105,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l out -d 'Output directory; it must not exist, or be empty' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l set -d 'Set an option of the recipe; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l tolerate -d 'Let errors of this rule, in a donor or the result, not stop the merge; they are reported, and the exit code is 1 for one in the result. May be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
 blake3\t'BLAKE3'
@@ -139,6 +140,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l langua
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l out -d 'Output directory; it must not exist, or be empty' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l set -d 'Set an option of the recipe; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l tolerate -d 'Let errors of this rule, in a donor or the result, not stop the merge; they are reported, and the exit code is 1 for one in the result. May be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
 blake3\t'BLAKE3'
@@ -168,7 +170,13 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l exit-z
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l part -d 'Name of the part, such as language or vision, or the JSON pointer of its config' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l out -d 'Output directory; it must not exist, or be empty' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l set -d 'Set an option of the recipe, such as shard-size=2GB; may be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l set -d 'Set an option of the recipe; may be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l tolerate -d 'Let errors of this rule, in a donor or the result, not stop the merge; they are reported, and the exit code is 1 for one in the result. May be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
+blake3\t'BLAKE3'
+sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
 concise\t''
 json\t''
@@ -186,14 +194,21 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l colo
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l dry-run -d 'Plan and check, and write nothing'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l dry-run -d 'Plan and check the merge, and write nothing'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l hash-donors -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l part -d 'Name of the part, such as language or vision, or the JSON pointer of its config' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l from -d 'The part as a checkpoint of its own' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l out -d 'Output directory; it must not exist, or be empty' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l set -d 'Set an option of the recipe, such as shard-size=2GB; may be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l set -d 'Set an option of the recipe; may be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l tolerate -d 'Let errors of this rule, in a donor or the result, not stop the merge; they are reported, and the exit code is 1 for one in the result. May be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
+blake3\t'BLAKE3'
+sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
 concise\t''
 json\t''
@@ -211,12 +226,19 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l color
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l dry-run -d 'Plan and check, and write nothing'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l dry-run -d 'Plan and check the merge, and write nothing'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l hash-donors -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l out -d 'Output directory; it must not exist, or be empty' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l set -d 'Set an option of the recipe, such as shard-size=2GB; may be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l set -d 'Set an option of the recipe; may be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l for -d 'Version of transformers that the result is for: 4.57, transformers==4.57.3, all, or @FILE for what a lock file pins; may be repeated. The result is checked for it, and options whose default depends on the version follow it' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l tolerate -d 'Let errors of this rule, in a donor or the result, not stop the merge; they are reported, and the exit code is 1 for one in the result. May be repeated' -r
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l plan -d 'With --dry-run: write the plan, every tensor with its shard and source, to this file as JSON' -r -F
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l hash -d 'Algorithm of the digests of tensors in the manifest, with which `ckpt-doctor verify` compares the result' -r -f -a "none\t'No digests; the donors are needed to verify the result'
+blake3\t'BLAKE3'
+sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
 concise\t''
 json\t''
@@ -234,7 +256,8 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l dry-run -d 'Plan and check, and write nothing'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l dry-run -d 'Plan and check the merge, and write nothing'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l hash-donors -d 'Record the SHA-256 of whole donor files in the manifest, not only of documents and shard headers'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -s V -l version -d 'Print version'
