@@ -49,6 +49,7 @@ mod view;
 pub mod votes;
 
 pub use crate::knowledge::rule::Safety;
+pub(crate) use built_tokenizer::building_class;
 pub use engine::{check, check_for};
 pub use finding::{Finding, Location, Severity};
 pub use fix::{Edit, FixHint, clamped, renamed};

@@ -14,10 +14,10 @@ use super::model_type::CAP;
 use super::view::Asked;
 use crate::checkpoint::tokenizer::content;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, escape};
-use crate::knowledge::Knowledge;
 use crate::knowledge::classes::ClassKind;
 use crate::knowledge::names::NameKind;
 use crate::knowledge::tokenizers::{BuiltTokenizer, BuiltTokenizers};
+use crate::knowledge::{Knowledge, Loader};
 
 /// Classes that open tokenizer.json as it is.
 const GENERIC: [&str; 4] = ["TokenizersBackend", "PythonBackend", "PreTrainedTokenizer", "MistralCommonBackend"];
@@ -51,6 +51,16 @@ pub(super) fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, asked: &Ask
         faults.extend(found.into_iter().map(|fault| fault.with("class", name).under(version)));
     }
     faults
+}
+
+/// The class that `AutoTokenizer` of a version opens, if it builds the tokenizer itself; `None` where tokenizer.json is opened as
+/// it is, or is not what is opened. A merge compares that of a donor with that of its result.
+pub(crate) fn building_class(checkpoint: &Checkpoint, knowledge: &Knowledge, loader: Loader) -> Option<String> {
+    if checkpoint.tokenizer.source.as_deref() != Some(files::TOKENIZER) {
+        return None;
+    }
+    let built = knowledge.tokenizers.of(loader.version())?;
+    class_of(checkpoint, knowledge, built, loader.version()).map(|(name, _)| name.to_owned())
 }
 
 /// The class that `AutoTokenizer` opens, if it builds the tokenizer itself.

@@ -117,6 +117,7 @@ fn fill(
     files::plan(&context, documents, draft)?;
     draft.image_turn = donors.iter().find_map(|donor| donor.parts.as_ref()?.model().image_turn.clone());
     draft.opened.clone_from(&context.tokens);
+    draft.tokenizer_of = recipe.tokens.as_ref().map(|tokens| tokens.base.clone());
     for note in &recipe.notes {
         if context.holds(Some(&note.when), "a note")? {
             draft.notes.push(note.say.render(&context.scope));

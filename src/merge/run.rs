@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::draft::MergeDraft;
 use super::dry_run::PlanDocument;
 use super::parts::DonorParts;
-use super::tokens_used::tokens_used;
+use super::tokens_used::{opened_otherwise, tokens_used};
 use super::training::{name_in_models, training};
 use super::usage::Usage;
 use crate::check::options::RunOptions;
@@ -139,6 +139,10 @@ impl MergeRun {
     /// Adds to the record what the files of the planned checkpoint say to the next user.
     pub(super) fn record_preview(&mut self, planned: &Checkpoint, draft: &MergeDraft, knowledge: &Knowledge) {
         self.record.tokens_used = tokens_used(planned, draft.opened.as_ref());
+        if let Some(donor) = draft.tokenizer_of.as_ref().and_then(|role| self.donor(role)) {
+            let notes = opened_otherwise(&donor.checkpoint, planned, knowledge, &self.versions);
+            self.record.notes.extend(notes);
+        }
         if let Some(training) = &mut self.record.training {
             name_in_models(training, planned, knowledge, &self.versions);
         }

@@ -4,8 +4,10 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
+use crate::check::building_class;
 use crate::check::tokens::{NewToken, OpenedTokenizer};
 use crate::checkpoint::{Checkpoint, files};
+use crate::knowledge::{Knowledge, Loader};
 use crate::report::model::TokenIds;
 
 /// The tokens whose ids the config and the generation config of a planned result have, and those that its processor names.
@@ -45,6 +47,31 @@ pub(super) fn tokens_used(planned: &Checkpoint, opened: Option<&OpenedTokenizer>
         used_as,
     };
     used.into_iter().map(row).collect()
+}
+
+/// Notes on versions that open the tokenizer of the result in another way than that of the `donor` alone. `versions` are those
+/// that the result is for, or none.
+pub(super) fn opened_otherwise(
+    donor: &Checkpoint,
+    planned: &Checkpoint,
+    knowledge: &Knowledge,
+    versions: &[String],
+) -> Vec<String> {
+    let asked: Vec<Loader> = versions.iter().map(|version| Loader::nearest(version)).collect();
+    let loaders = Loader::ALL.into_iter().filter(|loader| asked.is_empty() || asked.contains(loader));
+    let note = |loader: Loader| {
+        let [alone, here] = [donor, planned].map(|checkpoint| building_class(checkpoint, knowledge, loader));
+        let words = |class: Option<String>| class.map_or_else(|| "as it is".to_owned(), |class| format!("as {class}"));
+        (alone != here).then(|| {
+            format!(
+                "transformers {} opens tokenizer.json {}, and {} in the language donor, so ids of text may differ: compare processor.tokenizer with the donor's tokenizer.",
+                loader.version(),
+                words(here),
+                words(alone)
+            )
+        })
+    };
+    loaders.filter_map(note).collect()
 }
 
 /// The ids that a key of a config states.

@@ -194,3 +194,23 @@ fn a_chat_template_writes_what_the_processor_needs_for_an_image() {
     let written = engine.render_str(&text, chat).unwrap();
     assert_eq!(written, "[system] be brief[user] <IMG_CONTEXT>\nwhat is it?");
 }
+
+/// LLaVA's processor opens tokenizer.json as it is in transformers 5, and a Qwen2 alone builds its tokenizer itself.
+#[test]
+fn a_tokenizer_that_a_version_opens_in_another_way_is_told() {
+    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    write(all.path());
+    let notes = |host: &str, version: &str| {
+        let out = work.path().join("out");
+        let merge =
+            Merge::new(&out).recipe("swap-language-model").option("projector", "reinit").option("scale", "keep");
+        let merge = merge.donor("vision", all.path().join(host)).donor("language", all.path().join("qwen2-vl"));
+        let report = merge.loader(version).unwrap().plan().unwrap();
+        let notes = report.merge.unwrap().notes;
+        notes.into_iter().filter(|note| note.contains("opens tokenizer.json")).collect::<Vec<_>>()
+    };
+    assert_eq!(notes("llava", "4.57.6"), Vec::<String>::new());
+    let told = notes("llava", "5.23.0");
+    assert!(told.len() == 1 && told[0].contains("as it is, and as Qwen2Tokenizer in the language donor"), "{told:?}");
+    assert_eq!(notes("qwen2.5-vl", "5.23.0"), Vec::<String>::new());
+}
