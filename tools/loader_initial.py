@@ -70,6 +70,7 @@ HOSTS = {
     "qwen2_5_vl": ["merger"],
     "internvl": ["multi_modal_projector"],
     "gemma3": ["multi_modal_projector"],
+    "mistral3": ["multi_modal_projector"],
 }
 # The range of each config that a class may read, far enough from the others to be told from its values.
 RANGES = {"": 0.6, "text_config.": 0.05, "vision_config.": 0.3}

@@ -429,6 +429,21 @@ def gemma3(work):
     return "Gemma3", config, Gemma3Processor(images, tokenizer, image_seq_length=TOKENS), "gemma3_text"
 
 
+def mistral3(work):
+    from transformers import PixtralImageProcessor, PixtralProcessor
+
+    tokenizer = llama(work)
+    tokenizer.add_special_tokens({"pad_token": "<pad>", "additional_special_tokens": ["[IMG]", "[IMG_BREAK]", "[IMG_END]"]})
+    images = PixtralImageProcessor(size={"longest_edge": 2 * SIDE}, patch_size={"height": PATCH, "width": PATCH})
+    processor = PixtralProcessor(images, tokenizer, patch_size=PATCH, spatial_merge_size=2)
+    tower = dict(
+        model_type="pixtral", hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=2, image_size=2 * SIDE, patch_size=PATCH
+    )  # fmt: skip
+    image = tokenizer.convert_tokens_to_ids("[IMG]")
+    config = dict(vision_config=tower, image_token_index=image, vision_feature_layer=-1, spatial_merge_size=2)
+    return "Mistral3", config, processor, "mistral"
+
+
 HOSTS = {
     "llava": llava,
     "llava_next": llava_next,
@@ -441,12 +456,13 @@ HOSTS = {
     "qwen2_5_vl": qwen_vl("qwen2_5_vl"),
     "internvl": internvl,
     "gemma3": gemma3,
+    "mistral3": mistral3,
 }
 
 # What a user writes before the text of a prompt, so that the processor puts the image there.
 IMAGE_IN_TEXT = {
     "qwen2_vl": "<|vision_start|><|image_pad|><|vision_end|>", "qwen2_5_vl": "<|vision_start|><|image_pad|><|vision_end|>",
-    "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>",
+    "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>", "mistral3": "[IMG]",
 }  # fmt: skip
 
 

@@ -52,9 +52,18 @@ fn parts_stand_where_the_architectures_build_them() {
             }
         }
     }
-    for model in
-        ["gemma3", "idefics3", "internvl", "llava", "llava_onevision", "paligemma", "qwen2_5_vl", "qwen2_vl", "clip"]
-    {
+    for model in [
+        "gemma3",
+        "idefics3",
+        "internvl",
+        "llava",
+        "llava_onevision",
+        "mistral3",
+        "paligemma",
+        "qwen2_5_vl",
+        "qwen2_vl",
+        "clip",
+    ] {
         assert!(changed.get(model).is_some_and(|count| *count > 10), "{model}: {changed:?}");
     }
 }
