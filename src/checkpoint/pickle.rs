@@ -137,13 +137,7 @@ impl Shard {
 
 /// Reads an open file, for [`Shard::read_pickle`].
 fn read(name: &str, file: &SourceFile, budget: &mut Budget) -> Shard {
-    let shard = Shard {
-        name: name.to_owned(),
-        file_len: file.len(),
-        unread: true,
-        format: ShardFormat::unread_pickle(),
-        ..Shard::default()
-    };
+    let shard = Shard { name: name.to_owned(), file_len: file.len(), unread: true, ..Shard::default() };
     // The machine holds the work while the reader holds the rest of the budget.
     let mut work = std::mem::take(&mut budget.work);
     let mut reader = PickleReader { shard, pickle: Pickle::default(), faults: Faults::default(), budget };

@@ -5,6 +5,7 @@ mod quantised;
 mod recorded_all;
 mod recorded_sample;
 mod remote_code;
+mod verdicts;
 mod votes;
 
 use std::fs;

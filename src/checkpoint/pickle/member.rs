@@ -12,18 +12,15 @@ const MAX_NAME: usize = 200;
 impl Machine<'_> {
     /// The member `name` of the global `class`, for a call of the global `getattr`.
     pub(super) fn member(&mut self, getattr: u32, class: u32, name: Span) -> Result<Value, Stop> {
-        if self.slice(name).len() > MAX_NAME {
-            return Ok(self.unmodelled_call(Value::Global(getattr), Value::None));
-        }
         if self.doubt.is_none() {
             self.doubt = Some(format!("it calls {}", self.path(getattr)));
         }
-        let text = self.text(name);
+        // Long names are not looked at: a pickle can use one again and again.
         let owner = self.globals.get(class as usize).filter(|owner| {
-            let length = owner.module.len().saturating_add(owner.name.len()).saturating_add(text.len());
+            let length = owner.module.len().saturating_add(owner.name.len()).saturating_add(self.slice(name).len());
             length <= MAX_NAME
         });
-        let names = owner.map(|owner| (owner.module.clone(), format!("{}.{text}", owner.name)));
+        let names = owner.map(|owner| (owner.module.clone(), format!("{}.{}", owner.name, self.text(name))));
         let Some((module, member)) = names else {
             return Ok(self.unmodelled_call(Value::Global(getattr), Value::None));
         };

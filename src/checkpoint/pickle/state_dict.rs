@@ -193,7 +193,7 @@ fn check_unnamed(
         // A storage that is missing was reported.
         let Some(stored) = storages.by_key.get(key) else { continue };
         let shape = machine.heap.counts(tensor.shape).unwrap_or_default();
-        if shape.iter().filter(|size| **size > 0).try_fold(1_u64, |n, size| n.checked_mul(*size)).is_none() {
+        if shape.iter().try_fold(1_u64, |n, size| n.checked_mul(*size)).is_none() {
             return Err(Problem::Malformed(
                 "a tensor has more elements than can be counted".to_owned(),
                 storage.offset,

@@ -430,3 +430,25 @@ impl<'t> HeaderReader<'_, 't, '_> {
             .push(Fault::new(FaultKind::OddTensorName).at(place).with("reason", reason).with("bytes", name.len()));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tensors_of_a_header_that_is_not_read_are_counted() {
+        for (header, expected) in [
+            (r"{}", 0),
+            (r#"{"a":{"shape":[1,[2]]},"b":{}}"#, 2),
+            (r#"{"__metadata__":{"a":"{"},"b":{"dtype":"}"}}"#, 1),
+            // Braces, quotes and backslashes inside of names.
+            (r#"{"{":{"x":1},"b":{}}"#, 2),
+            (r#"{"a\"{":{},"b\\":{},"c\\\"":{}}"#, 3),
+            // A header that ends early.
+            (r#"{"a":{"shape":[1]},"b":{"sh"#, 2),
+            (r#"{"a":{},"b"#, 1),
+        ] {
+            assert_eq!(count(header.as_bytes()), expected, "{header}");
+        }
+    }
+}

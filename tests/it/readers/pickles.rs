@@ -11,6 +11,11 @@ use super::{Case, hold};
 use crate::support::invariants;
 use crate::support::pickle::{LEGACY_HEAD, PickledTensor, Pickler, StateDict, archive};
 
+mod containers;
+mod machine;
+#[cfg(unix)]
+mod places;
+
 fn read(bytes: &[u8]) -> Shard {
     invariants::pickle::hold(bytes);
     Shard::parse_pickle("pytorch_model.bin", bytes)
@@ -107,7 +112,8 @@ fn every_changed_byte_keeps_the_invariants() {
 
 #[test]
 fn bombs_of_the_stack_machine_are_refused() {
-    // A stack, marks, a memo, nested tuples and dicts that would fill the memory.
+    // A stack, marks, a memo, nested tuples and dicts that would fill the memory; a long key that is hashed again and again.
+    let long = [b"\x80\x02}X\0\0\x10\0", "x".repeat(1 << 20).as_bytes(), b"q\x000"].concat();
     let repeated = |start: &[u8], part: &[u8], times: usize| legacy(&[start, &part.repeat(times)].concat());
     for (label, bytes) in [
         ("stack", repeated(b"\x80\x02", b"N", 2_000_000)),
@@ -116,6 +122,7 @@ fn bombs_of_the_stack_machine_are_refused() {
         ("lists", repeated(b"\x80\x02", b"]0", 5_000_000)),
         ("tuples", repeated(b"\x80\x02N", b"\x85", 6_000_000)),
         ("memo", repeated(b"\x80\x04N", b"\x94", 3_000_000)),
+        ("keys", repeated(&long, b"h\x00Ns", 1000)),
     ] {
         assert_eq!(kinds(&bytes), [FaultKind::PickleTooLarge], "{label}");
     }
@@ -147,16 +154,17 @@ fn hostile_values_are_reported() {
 #[test]
 fn sizes_that_overflow_are_reported() {
     let mut state = small();
-    for (offset, shape, strides) in [
-        (u64::MAX >> 1, vec![1], vec![1]),
-        (0, vec![1 << 62, 1 << 62], vec![1, 1]),
-        (0, vec![2], vec![u64::MAX >> 1]),
-        (3, vec![4], vec![1]),
+    for (offset, shape, strides, kind) in [
+        (u64::MAX >> 1, vec![1], vec![1], FaultKind::PickleTensorOutOfRange),
+        (0, vec![1 << 62, 1 << 62], vec![1, 1], FaultKind::PickleMalformed),
+        (0, vec![2], vec![u64::MAX >> 1], FaultKind::PickleTensorOutOfRange),
+        (3, vec![4], vec![1], FaultKind::PickleTensorOutOfRange),
     ] {
         state.tensors[1] = PickledTensor { name: "b".into(), storage: 1, offset, shape, strides };
         for bytes in [state.zip(), state.legacy()] {
             let shard = read(&bytes);
-            assert!(!shard.faults.is_empty() && shard.tensor("b").is_none(), "{:?}", shard.faults);
+            assert_eq!(kinds(&bytes), [kind]);
+            assert!(shard.tensor("b").is_none(), "{:?}", shard.faults);
         }
     }
 }

@@ -295,3 +295,111 @@ fn big_endian_lengths_are_recognised() {
     bytes[..8].fill(0xfe);
     assert_eq!(read(&bytes).faults[0].detail["big_endian"], json!(false));
 }
+
+/// What each fault of an entry, and of the layout, says besides its kind.
+#[test]
+fn faults_state_what_is_wrong() {
+    let dup = |key: &str| of(&entry("a", "U8", "[1]", 0, 1).replacen('{', &format!("{{{key},"), 1), 1);
+    let reason = |reason: &str| json!({ "reason": reason });
+    let u8s = |begin, end| entry("a", "U8", "[4]", begin, end);
+    let after =
+        |text: &str| read(&file(format!("{{\"__metadata__\":{{\"format\":\"pt\"}}}}{text}").as_bytes(), 0)).faults;
+    for (label, faults, kind, detail) in [
+        ("hole", of(&u8s(3, 7), 7), FaultKind::DataHole, json!({"begin": 0, "end": 3, "bytes": 3})),
+        (
+            "overlap",
+            of(&[u8s(0, 4), entry("b", "U8", "[4]", 3, 7)].join(","), 7),
+            FaultKind::TensorsOverlap,
+            json!({"begin": 3, "bytes": 1}),
+        ),
+        ("rest", of(&u8s(0, 4), 6), FaultKind::TrailingBytes, json!({"count": 2})),
+        ("order", of(&u8s(4, 0), 0), FaultKind::OffsetsOutOfOrder, json!({"begin": 4, "end": 0})),
+        (
+            "size",
+            of(&entry("a", "U16", "[4]", 0, 4), 4),
+            FaultKind::ShapeByteMismatch,
+            json!({"dtype": "U16", "shape": [4], "computed": 8, "stored": 4}),
+        ),
+        (
+            "bits",
+            of(&entry("a", "F4", "[3]", 0, 2), 2),
+            FaultKind::SubByteMisaligned,
+            json!({"dtype": "F4", "shape": [3], "bits": 12}),
+        ),
+        ("two dtypes", dup(r#""dtype":"U8""#), FaultKind::DuplicateHeaderKey, json!({"key": "dtype"})),
+        ("two shapes", dup(r#""shape":[1]"#), FaultKind::DuplicateHeaderKey, json!({"key": "shape"})),
+        ("two offsets", dup(r#""data_offsets":[0,1]"#), FaultKind::DuplicateHeaderKey, json!({"key": "data_offsets"})),
+        ("NUL", after("\0"), FaultKind::HeaderPaddingNotSpaces, json!({"what": "NUL bytes"})),
+        ("object", after("{}"), FaultKind::HeaderPaddingNotSpaces, json!({"what": "a second object"})),
+        ("text", after("x"), FaultKind::HeaderPaddingNotSpaces, json!({"what": "other bytes"})),
+        ("no object", of(r#""a":1"#, 0), FaultKind::EntryMalformed, reason("it is not an object")),
+        (
+            "three offsets",
+            of(r#""a":{"dtype":"U8","shape":[1],"data_offsets":[0,1,2]}"#, 0),
+            FaultKind::EntryMalformed,
+            reason("`data_offsets` is not two natural numbers"),
+        ),
+        (
+            "a negative size",
+            of(r#""a":{"dtype":"U8","shape":[-1,1],"data_offsets":[0,1]}"#, 1),
+            FaultKind::EntryMalformed,
+            reason("`shape` is not a list of natural numbers"),
+        ),
+    ] {
+        let [fault] = faults.as_slice() else { panic!("{label}: {faults:?}") };
+        assert_eq!((fault.kind, serde_json::Value::from(fault.detail.clone())), (kind, detail), "{label}");
+    }
+    let lacking = of(r#""a":{}"#, 0);
+    let reasons: Vec<_> = lacking.iter().map(|fault| fault.detail["reason"].as_str().unwrap()).collect();
+    assert_eq!(reasons, ["it has no `dtype`", "it has no `shape`", "it has no `data_offsets`"]);
+}
+
+#[test]
+fn numbers_and_truth_values_of_the_metadata_are_kept_as_text() {
+    let shard = read(&file(br#"{"__metadata__":{"format":"pt","n":1.50,"b":true,"l":[1],"z":null}}"#, 0));
+    let metadata = shard.metadata().unwrap().iter().map(|(key, value)| (key.as_str(), value.as_str()));
+    assert_eq!(metadata.collect::<Vec<_>>(), [("b", "true"), ("format", "pt"), ("n", "1.50")]);
+    let said: Vec<_> = shard.faults.iter().map(|fault| (fault.kind, fault.detail["key"].as_str().unwrap())).collect();
+    assert_eq!(said, ["n", "b", "l", "z"].map(|key| (FaultKind::MetadataNotStrings, key)));
+    let scalars: Vec<_> = shard.faults.iter().map(|fault| fault.detail["scalar"].clone()).collect();
+    assert_eq!(scalars, [true, true, false, false].map(serde_json::Value::from));
+}
+
+/// A header of more bytes than the first read of the file has, and one that is larger than the file.
+#[test]
+fn a_long_header_is_read_whole() {
+    for names in [1, 40, 4000] {
+        let entries: Vec<_> = (0..names).map(|n| entry(&format!("layer.{n:04}"), "U8", "[1]", n, n + 1)).collect();
+        let header = format!("{{\"__metadata__\":{{\"format\":\"pt\"}},{}}}", entries.join(","));
+        let bytes = file(header.as_bytes(), usize::try_from(names).unwrap());
+        let found = super::open_with("model.safetensors", &bytes);
+        let shard = &found.shards["model.safetensors"];
+        assert_eq!((shard.tensors.len() as u64, shard.unread), (names, false), "{:?}", shard.faults);
+        let cut = super::open_with("model.safetensors", &bytes[..header.len()]);
+        let cut = &cut.shards["model.safetensors"];
+        let kinds: Vec<_> = cut.faults.iter().map(|fault| fault.kind).collect();
+        assert_eq!((kinds, cut.unread), (vec![FaultKind::HeaderLengthOutOfRange], true));
+    }
+}
+
+#[test]
+fn text_in_place_of_a_header_is_quoted_and_other_bytes_are_not() {
+    for (bytes, what) in [
+        (&b"[1, 2, 3]\n"[..], Some("a JSON document: [1, 2, 3]")),
+        (b"{ \"a\": 1 }", Some("a JSON document: { \"a\": 1 }")),
+        (b"Not Found here", Some("a text file: Not Found here")),
+        (b"{ \"a\": 1 \xff }", None),
+        (b"Not Found \xff here", None),
+    ] {
+        let fault = &read(bytes).faults[0];
+        assert_eq!(fault.detail.get("what").and_then(|what| what.as_str()), what);
+        assert_eq!(fault.kind == FaultKind::NotSafetensors, what.is_some(), "{:?}", fault.kind);
+    }
+}
+
+#[test]
+fn a_name_of_more_than_a_kibibyte_is_odd() {
+    let kinds =
+        |len: usize| of(&entry(&"x".repeat(len), "U8", "[1]", 0, 1), 1).iter().map(|f| f.kind).collect::<Vec<_>>();
+    assert_eq!((kinds(1024), kinds(1025)), (vec![], vec![FaultKind::OddTensorName]));
+}
