@@ -152,7 +152,6 @@ def lines_of(path):
 
 def follow(model, processor, path):
     """The lines of the report ask about a picture, and train what the report counts: of tensors with new rows, these alone."""
-    import torch
 
     lines, wrong = lines_of(path), []
     names = {"model": model, "processor": processor}
