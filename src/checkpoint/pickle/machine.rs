@@ -277,9 +277,13 @@ impl<'p> Machine<'p> {
                 let len = u64::from_le_bytes(self.take()?);
                 self.text_span(len)?
             }
-            b'S' | b'V' => {
+            b'S' => {
                 let span = self.line()?;
-                self.unquoted(span)
+                self.words(self.unquoted(span))
+            }
+            b'V' => {
+                let span = self.line()?;
+                self.words(span)
             }
             b'T' | b'B' => {
                 let len = u32::from_le_bytes(self.take()?);
@@ -299,14 +303,14 @@ impl<'p> Machine<'p> {
     }
 
     /// A string of protocol 0 without its quotes; escapes stay as they are.
-    fn unquoted(&self, span: Span) -> Value {
+    fn unquoted(&self, span: Span) -> Span {
         let text = self.slice(span);
         let is_quoted = text.len() >= 2 && matches!(text.first(), Some(b'\'' | b'"')) && text.first() == text.last();
-        let span = if is_quoted {
-            Span { start: span.start.saturating_add(1), end: span.end.saturating_sub(1) }
-        } else {
-            span
-        };
+        if is_quoted { Span { start: span.start.saturating_add(1), end: span.end.saturating_sub(1) } } else { span }
+    }
+
+    /// A line of text, or of bytes where it is not UTF-8.
+    fn words(&self, span: Span) -> Value {
         if std::str::from_utf8(self.slice(span)).is_ok() { Value::Text(span) } else { Value::Bytes(span) }
     }
 
