@@ -246,7 +246,13 @@ class Part(Cell):
 
 
 # Hosts that build one kind of language model, with the guests that are of this kind.
-OWN = {"qwen2_vl": ["qwen2"], "qwen2_5_vl": ["qwen2"], "gemma3": ["gemma3_text"], SPATIALVLA: ["llama", "gemma2"]}
+OWN = {
+    "qwen2_vl": ["qwen2"],
+    "qwen2_5_vl": ["qwen2"],
+    "qwen3_vl": ["qwen3"],
+    "gemma3": ["gemma3_text"],
+    SPATIALVLA: ["llama", "gemma2"],
+}
 TOWER_HOSTS = ("llava", "llava_next", "llava_onevision", "paligemma", "idefics3")
 
 

@@ -390,6 +390,23 @@ def qwen_vl(kind):
     return make
 
 
+def qwen3_vl(work):
+    import transformers
+    from transformers import Qwen2VLImageProcessor
+
+    names = ["<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"]
+    tokenizer = qwen2(work, names)
+    images = Qwen2VLImageProcessor(min_pixels=56 * 56, max_pixels=56 * 56)
+    vision = dict(
+        depth=2, hidden_size=32, intermediate_size=48, num_heads=4, in_channels=3, patch_size=PATCH, spatial_merge_size=2,
+        temporal_patch_size=2, out_hidden_size=WIDTH, num_position_embeddings=16, deepstack_visual_indexes=[0],
+    )  # fmt: skip
+    keys = ("vision_start_token_id", "vision_end_token_id", "image_token_id", "video_token_id")
+    ids = {key: tokenizer.convert_tokens_to_ids(token) for key, token in zip(keys, names, strict=True)}
+    processor = transformers.Qwen3VLProcessor(images, tokenizer, transformers.Qwen3VLVideoProcessor())
+    return "Qwen3VL", dict(vision_config=vision, **ids), processor, "qwen3"
+
+
 def internvl(work):
     from transformers import GotOcr2ImageProcessor, InternVLProcessor, InternVLVideoProcessor
 
@@ -454,6 +471,7 @@ HOSTS = {
     "smolvlm": splitting("smolvlm"),
     "qwen2_vl": qwen_vl("qwen2_vl"),
     "qwen2_5_vl": qwen_vl("qwen2_5_vl"),
+    "qwen3_vl": qwen3_vl,
     "internvl": internvl,
     "gemma3": gemma3,
     "mistral3": mistral3,
@@ -462,6 +480,7 @@ HOSTS = {
 # What a user writes before the text of a prompt, so that the processor puts the image there.
 IMAGE_IN_TEXT = {
     "qwen2_vl": "<|vision_start|><|image_pad|><|vision_end|>", "qwen2_5_vl": "<|vision_start|><|image_pad|><|vision_end|>",
+    "qwen3_vl": "<|vision_start|><|image_pad|><|vision_end|>",
     "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>", "mistral3": "[IMG]",
 }  # fmt: skip
 
@@ -475,6 +494,9 @@ def save_host(kind, dtype, path, work):
         config |= text
     else:
         config["text_config"] = dict(text, model_type=language)
+    if kind == "qwen3_vl":
+        sections = dict(rope_type="default", mrope_interleaved=True, mrope_section=[4, 2, 2])
+        config["text_config"] |= dict(model_type="qwen3_vl_text", rope_scaling=sections)
     # Gemma models share one matrix for both ends; so do their hosts.
     config["tie_word_embeddings"] = language.startswith("gemma")
     made = getattr(transformers, f"{classes}Config")(**config)

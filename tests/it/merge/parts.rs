@@ -62,6 +62,7 @@ fn parts_stand_where_the_architectures_build_them() {
         "paligemma",
         "qwen2_5_vl",
         "qwen2_vl",
+        "qwen3_vl",
         "clip",
     ] {
         assert!(changed.get(model).is_some_and(|count| *count > 10), "{model}: {changed:?}");
