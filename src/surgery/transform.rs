@@ -20,6 +20,8 @@ use crate::checkpoint::reserve::reserved;
 
 /// Factor on the covariance of sampled rows. Source: `_init_added_embeddings_weights_with_mean` in transformers 4.47 to 5.23.
 const SAMPLE_VARIANCE: f64 = 1e-9;
+/// Largest table, in bytes, that is kept in memory while rows are sampled from it.
+const KEPT: u64 = 16 << 20;
 /// Donor rows that a sampled row combines.
 const SAMPLE_TERMS: u32 = 64;
 
@@ -218,15 +220,26 @@ impl Table {
         usize::try_from(self.width.saturating_mul(self.dtype.bits() / 8)).map_err(io::Error::other)
     }
 
-    /// Copies the rows, if they are in the result, and returns their mean; zeros without rows.
-    fn copy_rows(self, read: &mut ReadOperand<'_>, codec: &mut Codec, out: &mut dyn Write) -> io::Result<Vec<f64>> {
+    /// Copies the rows, if they are in the result, and returns their mean, zeros without rows; `keep` gets the bytes of a table of
+    /// at most [`KEPT`] bytes, so that rows need not be read again one by one.
+    fn copy_rows(
+        self,
+        read: &mut ReadOperand<'_>,
+        codec: &mut Codec,
+        out: &mut dyn Write,
+        keep: Option<&mut Vec<u8>>,
+    ) -> io::Result<Vec<f64>> {
         let mut row: Vec<u8> = reserved(self.row_len()?)?;
         let mut mean: Vec<f64> = reserved(usize::try_from(self.width).map_err(io::Error::other)?)?;
+        let mut keep = keep.filter(|_| (row.len() as u64).saturating_mul(self.rows) <= KEPT);
         let mut at = 0_u64;
         for _ in 0..self.rows {
             read(at, &mut row)?;
             if self.keeps {
                 out.write_all(&row)?;
+            }
+            if let Some(keep) = &mut keep {
+                keep.extend_from_slice(&row);
             }
             for (sum, value) in mean.iter_mut().zip(codec.decode(self.dtype, &row)) {
                 *sum += *value;
@@ -248,7 +261,7 @@ impl Table {
 /// Errors of reading or writing.
 pub fn grow_rows(read: &mut ReadOperand<'_>, table: Table, out: &mut dyn Write) -> io::Result<()> {
     let mut codec = Codec::default();
-    let mean = table.copy_rows(read, &mut codec, out)?;
+    let mean = table.copy_rows(read, &mut codec, out, None)?;
     let mut row = Vec::new();
     codec.encode_values(table.dtype, &mean, &mut row);
     for _ in 0..table.more {
@@ -277,7 +290,8 @@ pub fn sample_rows(
     out: &mut dyn Write,
 ) -> io::Result<u64> {
     let mut codec = Codec::default();
-    let mean = table.copy_rows(read, &mut codec, out)?;
+    let mut kept = Vec::new();
+    let mean = table.copy_rows(read, &mut codec, out, Some(&mut kept))?;
     let mut rng = seeded(name);
     let factor = (SAMPLE_VARIANCE / f64::from(SAMPLE_TERMS)).sqrt();
     let mut donor_row: Vec<u8> = reserved(table.row_len()?)?;
@@ -297,7 +311,12 @@ pub fn sample_rows(
         for _ in 0..if table.rows == 0 { 0 } else { SAMPLE_TERMS } {
             let g: f64 = StandardNormal.sample(&mut rng);
             let weight = factor * g;
-            read(below(&mut rng, table.rows).saturating_mul(donor_row.len() as u64), &mut donor_row)?;
+            let at = below(&mut rng, table.rows).saturating_mul(donor_row.len() as u64);
+            let from = usize::try_from(at).ok().and_then(|at| kept.get(at..at.checked_add(donor_row.len())?));
+            match from {
+                Some(bytes) => donor_row.copy_from_slice(bytes),
+                None => read(at, &mut donor_row)?,
+            }
             for ((value, x), mean) in values.iter_mut().zip(codec.decode(table.dtype, &donor_row)).zip(&mean) {
                 *value += weight * (*x - mean);
             }
