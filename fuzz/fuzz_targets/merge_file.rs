@@ -25,5 +25,5 @@ fuzz_target!(|data: &[u8]| {
     let Ok(file) = ResolvedMergeFile::read(&path) else { return };
     let Ok(recipe) = file.find_recipe(&KNOWLEDGE) else { return };
     let ResolvedMergeFile { donors, options, out, .. } = file;
-    hold(&MergeRequest { recipe, donors, options, versions: Vec::new(), out, dry_run: true, hash: Default::default(), hash_donors: false });
+    hold(&MergeRequest { recipe, donors, options, versions: Vec::new(), tolerate: Vec::new(), out, dry_run: true, hash: Default::default(), hash_donors: false });
 });
