@@ -22,5 +22,5 @@ fuzz_target!(|data: &[u8]| {
     let donors = roles.zip(["a", "b"].into_iter().cycle()).map(|(role, name)| (role, PLACE.join(name))).collect();
     let dry_run = mode % 4 != 0;
     let (out, options) = (PLACE.join("out"), BTreeMap::new());
-    hold(&MergeRequest { recipe: Some(recipe), donors, options, versions: Vec::new(), out, dry_run, hash: Default::default(), hash_donors: mode % 8 == 0 });
+    hold(&MergeRequest { recipe: Some(recipe), donors, options, versions: Vec::new(), tolerate: Vec::new(), out, dry_run, hash: Default::default(), hash_donors: mode % 8 == 0 });
 });
