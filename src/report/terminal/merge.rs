@@ -74,7 +74,8 @@ fn next_steps(out: &mut String, merge: &MergeReport, style: Style) {
             new => format!(", {new} of them in new rows"),
         };
         let values = training.values();
-        let _ok = writeln!(out, "\n  train {train} of {all}, {values} parameters{new} (pattern: merge-report.md)");
+        let line = format!("train {train} of {all}, {values} parameters{new} (pattern: merge-report.md)");
+        let _ok = writeln!(out, "\n  {}", hang(&line, 2, style));
         table(out, ["tensor", "parameters", "new rows"], &trained(training), style);
         let tokens = tokens_used(merge);
         if !tokens.is_empty() {
