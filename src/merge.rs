@@ -36,7 +36,7 @@ mod seams;
 mod switches;
 mod taken;
 mod tensors;
-mod tokens_used;
+mod tokenizer;
 mod training;
 mod usage;
 mod validate;

@@ -25,8 +25,8 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 /// - `shape(role, tensor)`, and `has(role, prefix)`: whether the donor has a tensor with the prefix;
 /// - `dtype(role)`: the floating-point type of most bytes of a donor as torch names it, `'bfloat16'`;
 /// - `id_of(token)`: the id in the tokenizer of the result, null when it has no such token;
-/// - `rms(role, tensor)`: the root of the mean square of a donor's tensor, whose values are read for it; null where the donor has
-///   no such tensor, or only values that are not computed;
+/// - `row_norm(role)`: the norm of rows of a donor's embedding as they enter the first layer, for which all of its values are read:
+///   the root of the mean of their squares; null where they are zeros, or cannot be read or computed;
 /// - `tried(host, part)`: the versions of transformers that ran a host of this model type with a part of this model type in the
 ///   tests of the program;
 /// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;
@@ -368,7 +368,7 @@ pub struct TensorSpec {
     /// tensor with padded, appended or new values is always one to train.
     #[serde(default)]
     pub train: bool,
-    /// Donor tensor whose rows the new ones of `mean-rows` and `sampled-rows` are like.
+    /// Donor tensor whose rows the new ones of `mean-like` and `sampled-like` are like.
     #[serde(default)]
     pub like: Option<SeamTensor>,
     /// Donor tensor that it must match, for the message.

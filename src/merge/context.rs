@@ -80,7 +80,7 @@ impl<'a> Context<'a> {
         knowledge: &'a Knowledge,
     ) -> Result<Self, MergeError> {
         let mut scope = Scope::new();
-        let [opt, arg] = option_values(recipe, options)?;
+        let (opt, arg) = option_values(recipe, options)?;
         scope.bind("opt", &Value::Object(opt));
         scope.bind("arg", &Value::Object(arg));
         for donor in donors {
@@ -157,8 +157,11 @@ impl Context<'_> {
     }
 }
 
+/// Values by the names of options.
+type OptionMap = Map<String, Value>;
+
 /// The values of options, and the arguments behind a colon, as expressions see them.
-fn option_values(recipe: &Recipe, options: &Options) -> Result<[Map<String, Value>; 2], MergeError> {
+pub(super) fn option_values(recipe: &Recipe, options: &Options) -> Result<(OptionMap, OptionMap), MergeError> {
     let (mut opt, mut arg) = (Map::new(), Map::new());
     for (name, value) in options {
         let kind = recipe.options.iter().find(|spec| spec.name == *name).map(OptionSpec::kind);
@@ -175,7 +178,7 @@ fn option_values(recipe: &Recipe, options: &Options) -> Result<[Map<String, Valu
         };
         opt.insert(name.clone(), seen);
     }
-    Ok([opt, arg])
+    Ok((opt, arg))
 }
 
 /// Whether an expression can be evaluated only after the tokenizer of the result is opened.

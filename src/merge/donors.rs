@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use serde_json::{Value, json};
+use serde_json::Value;
 
+use super::context::option_values;
 use super::error::{MergeError, PipelineError};
 use super::options::Options;
 use super::parts::{Donor, DonorParts, PartOf};
@@ -65,6 +66,8 @@ pub(super) fn are_sound(
     tolerated: &[String],
     run: &mut MergeRun,
 ) -> Result<bool, MergeError> {
+    let mut scope = Scope::new();
+    scope.bind("opt", &Value::Object(option_values(recipe, options)?.0));
     let (mut judged, mut unsound, mut spared, mut unjudged) = (0_usize, Vec::new(), Vec::new(), Vec::new());
     for spec in &recipe.donors {
         let Some(checked) = run.donor(&spec.role) else { continue };
@@ -74,7 +77,7 @@ pub(super) fn are_sound(
         }
         judged = judged.saturating_add(1);
         let unused =
-            donors.iter().find(|donor| donor.role == spec.role).map(|donor| UnusedParts::of(donor, spec, options));
+            donors.iter().find(|donor| donor.role == spec.role).map(|donor| UnusedParts::of(donor, spec, &scope));
         let unused = unused.transpose()?.unwrap_or_default();
         let errors = checked.outcome.findings.iter().filter(|f| f.severity == Severity::Error);
         let (aside, errors): (Vec<_>, Vec<_>) = errors.partition(|finding| unused.has(finding));
@@ -112,11 +115,9 @@ struct UnusedParts<'d> {
 
 impl<'d> UnusedParts<'d> {
     /// Those of a donor, by what its entry in the recipe says.
-    fn of(donor: &'d Donor, spec: &DonorSpec, options: &Options) -> Result<Self, MergeError> {
-        let mut scope = Scope::new();
-        scope.bind("opt", &json!(options));
+    fn of(donor: &'d Donor, spec: &DonorSpec, scope: &Scope<'_>) -> Result<Self, MergeError> {
         let named = |part: &Option<Template>| {
-            let name = part.as_ref().map(|part| part.try_render(&scope)).transpose();
+            let name = part.as_ref().map(|part| part.try_render(scope)).transpose();
             let name = name.map_err(|error| MergeError::Recipe(format!("part of the {} donor: {error}", spec.role)))?;
             Ok::<_, MergeError>(name.and_then(|name| PartOf::find(donor, &name)))
         };

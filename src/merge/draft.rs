@@ -30,8 +30,6 @@ pub(super) struct MergeDraft {
     pub(super) changeable: Changeable,
     /// Donor tensors that are not in the result.
     pub(super) dropped: Vec<Dropped>,
-    /// What the host's prompts have for an image; see `image_turn` of its parts.
-    pub(super) image_turn: Option<String>,
     /// Role of the donor whose tokenizer the result has, where it has new tokens.
     pub(super) tokenizer_of: Option<String>,
     /// The tokenizer with the tokens of the processor, where the recipe opens it.

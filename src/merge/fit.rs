@@ -10,9 +10,9 @@ pub(super) enum Fit {
     /// Random rows with mean and covariance of the others.
     SampleRows,
     /// Rows with the mean of those of the tensor that `like` names, in place of the donor's.
-    MeanRows,
+    MeanLike,
     /// As that, random rows with their covariance.
-    SampledRows,
+    SampledLike,
     /// Zeros up to the shape.
     Pad,
     /// New values for each module of which a tensor has another shape.
@@ -28,8 +28,8 @@ impl Fit {
         Self::Pad,
         Self::GrowRows,
         Self::SampleRows,
-        Self::MeanRows,
-        Self::SampledRows,
+        Self::MeanLike,
+        Self::SampledLike,
         Self::Reinit,
         Self::ReinitAlways,
     ];
@@ -40,8 +40,8 @@ impl Fit {
             Self::Copy => "copy",
             Self::GrowRows => "grow-rows",
             Self::SampleRows => "sample-rows",
-            Self::MeanRows => "mean-rows",
-            Self::SampledRows => "sampled-rows",
+            Self::MeanLike => "mean-like",
+            Self::SampledLike => "sampled-like",
             Self::Pad => "pad",
             Self::Reinit => "reinit",
             Self::ReinitAlways => "reinit-always",

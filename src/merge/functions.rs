@@ -6,15 +6,14 @@ use std::sync::Arc;
 use serde_json::{Value, json};
 
 use super::dtypes;
-use super::parts::{Donor, DonorParts};
+use super::parts::{Donor, DonorParts, PartOf};
 use crate::check::default_template;
-use crate::checkpoint::Checkpoint;
 use crate::knowledge::scales::Scales;
 use crate::knowledge::{Loader, Scope, source};
 use crate::surgery::rms::rms;
 use crate::surgery::tensor_ref::TensorRef;
 
-/// Adds `dtype`, `image_fold`, `row_scale`, `rms`, `tried`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
+/// Adds `dtype`, `image_fold`, `row_scale`, `row_norm`, `tried`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
 pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
@@ -53,11 +52,15 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
         let (factor, key) = stated.unwrap_or((1.0, ""));
         json!({ "factor": factor, "key": key })
     });
-    let checkpoints: BTreeMap<String, Arc<Checkpoint>> =
-        donors.iter().map(|donor| (donor.role.clone(), Arc::clone(&donor.checkpoint))).collect();
-    scope.function2("rms", move |role, name| {
-        let rms = checkpoints.get(role).and_then(|checkpoint| rms_of(role, checkpoint, name));
-        rms.map_or(Value::Null, |rms| json!(rms))
+    let embeddings: BTreeMap<String, (TensorRef, f64)> = donors
+        .iter()
+        .filter_map(|donor| {
+            Some((donor.role.clone(), (embedding(donor)?, scales.of_rows(&donor.config, Loader::NEWEST))))
+        })
+        .collect();
+    scope.function1("row_norm", move |role| {
+        let norm = embeddings.get(role).and_then(|(of, scale)| row_norm(of, *scale));
+        norm.map_or(Value::Null, |norm| json!(norm))
     });
     // The pairs that tests/peer/surgery.py ran: versions of transformers by the model types of host and part.
     let tried: BTreeMap<String, BTreeMap<String, Value>> =
@@ -72,11 +75,20 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
     });
 }
 
-/// How large the values of a donor's tensor are; `None` where that cannot be told.
-fn rms_of(role: &str, checkpoint: &Checkpoint, name: &str) -> Option<f64> {
-    let (shard, tensor) = checkpoint.tensor(name)?;
-    let of = TensorRef::new(role, checkpoint.source.path(), shard, tensor, None).ok()?;
-    rms(&of).ok().flatten()
+/// The embedding of a donor's language model.
+fn embedding(donor: &Donor) -> Option<TensorRef> {
+    let name = PartOf::find(donor, "language")?.name_of("model.embed_tokens.weight")?;
+    let (shard, tensor) = donor.checkpoint.tensor(&name)?;
+    TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, None).ok()
+}
+
+/// The norm of rows of an embedding of which the class multiplies each by `scale`, to four digits; `None` where it cannot be told,
+/// or is 0.
+fn row_norm(of: &TensorRef, scale: f64) -> Option<f64> {
+    let width = u32::try_from(*of.shape.get(1)?).ok()?;
+    let norm = rms(of).ok().flatten()? * f64::from(width).sqrt() * scale;
+    // Enough for a size, and reports stay short.
+    format!("{norm:.3e}").parse().ok().filter(|norm: &f64| norm.is_normal())
 }
 
 /// The factor that keeps image features as large as in the host when its class has the language model of the guest, with those
@@ -108,6 +120,15 @@ fn with_image_turn(template: &str, turn: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pairs_that_were_tried_have_versions() {
+        let text = source::text("tried-pairs.json").unwrap();
+        let pairs: BTreeMap<String, BTreeMap<String, Vec<String>>> = serde_json::from_str(text).unwrap();
+        let known = |versions: &Vec<String>| versions.iter().all(|v| Loader::ALL.iter().any(|l| l.version() == v));
+        assert!(pairs.values().flat_map(BTreeMap::values).all(|versions| !versions.is_empty() && known(versions)));
+        assert!(pairs["llava"].contains_key("qwen2") && !pairs["llava"].contains_key("llava"));
+    }
 
     #[test]
     fn image_features_stay_as_large_as_they_were_trained() {

@@ -115,7 +115,6 @@ fn fill(
         options.get("shard-size").map_or(Ok(options::DEFAULT_SHARD), |s| options::parse_size("shard-size", s))?;
     tensors::plan(&context, &documents, knowledge, limit, draft)?;
     files::plan(&context, documents, draft)?;
-    draft.image_turn = donors.iter().find_map(|donor| donor.parts.as_ref()?.model().image_turn.clone());
     draft.opened.clone_from(&context.tokens);
     draft.tokenizer_of = recipe.tokens.as_ref().map(|tokens| tokens.base.clone());
     for note in &recipe.notes {

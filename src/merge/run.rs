@@ -7,13 +7,15 @@ use std::sync::Arc;
 use super::draft::MergeDraft;
 use super::dry_run::PlanDocument;
 use super::parts::DonorParts;
-use super::tokens_used::{opened_otherwise, tokens_used};
+use super::tokenizer::{opened_otherwise, tokens_used};
 use super::training::{name_in_models, training};
 use super::usage::Usage;
+use crate::check::load::targets;
 use crate::check::options::RunOptions;
 use crate::check::{Finding, Outcome, Severity, check_for};
-use crate::checkpoint::{Checkpoint, HashAlgorithm};
+use crate::checkpoint::{Checkpoint, HashAlgorithm, files};
 use crate::knowledge::Knowledge;
+use crate::knowledge::parts::ModelParts;
 use crate::knowledge::recipe::Recipe;
 use crate::report::Report;
 use crate::report::model::{ChangedTensor, CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
@@ -122,7 +124,6 @@ impl MergeRun {
         self.usage = Usage::find(draft);
         let record = &mut self.record;
         record.usage = self.usage.statements(&record.out);
-        record.prompt = self.usage.prompt(draft.image_turn.as_deref());
         record.dropped.clone_from(&draft.dropped);
         record.repairs.clone_from(&draft.repairs);
         record.notes.clone_from(&draft.notes);
@@ -138,13 +139,24 @@ impl MergeRun {
 
     /// Adds to the record what the files of the planned checkpoint say to the next user.
     pub(super) fn record_preview(&mut self, planned: &Checkpoint, draft: &MergeDraft, knowledge: &Knowledge) {
-        self.record.tokens_used = tokens_used(planned, draft.opened.as_ref());
-        if let Some(donor) = draft.tokenizer_of.as_ref().and_then(|role| self.donor(role)) {
-            let notes = opened_otherwise(&donor.checkpoint, planned, knowledge, &self.versions);
-            self.record.notes.extend(notes);
+        let record = &mut self.record;
+        record.tokens_used = tokens_used(planned, draft.opened.as_ref());
+        let names: Vec<&str> = planned.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+        let config = planned.document(files::CONFIG).and_then(|document| document.value.as_ref());
+        let classes =
+            config.map(|config| targets(&knowledge.library, config, &names, &self.versions)).unwrap_or_default();
+        let is_of = |model: &&ModelParts| {
+            classes.iter().any(|(_, class)| model.architectures.iter().any(|a| a == class.name()))
+        };
+        record.prompt =
+            self.usage.prompt(knowledge.parts.iter().find(is_of).and_then(|model| model.image_turn.as_deref()));
+        if let Some(training) = &mut record.training {
+            name_in_models(training, planned, &classes);
         }
-        if let Some(training) = &mut self.record.training {
-            name_in_models(training, planned, knowledge, &self.versions);
+        if let Some(donor) = draft.tokenizer_of.as_ref().and_then(|role| self.donor(role)) {
+            let loaders = classes.iter().map(|(target, _)| target.loader);
+            let notes = opened_otherwise(&donor.checkpoint, planned, knowledge, loaders);
+            self.record.notes.extend(notes);
         }
     }
 

@@ -157,7 +157,7 @@ impl StartedModules {
         match taken.rule.fit {
             Fit::ReinitAlways => true,
             Fit::Reinit => self.modules.contains(&key(taken)),
-            Fit::Copy | Fit::GrowRows | Fit::SampleRows | Fit::MeanRows | Fit::SampledRows | Fit::Pad => false,
+            Fit::Copy | Fit::GrowRows | Fit::SampleRows | Fit::MeanLike | Fit::SampledLike | Fit::Pad => false,
         }
     }
 }

@@ -339,7 +339,7 @@ fn parse_slice(value: &Value) -> Result<Option<[u64; 2]>, &'static str> {
 
 fn parse_fit(value: &Value) -> Result<Fit, &'static str> {
     let known = |name: &str| Fit::ALL.into_iter().find(|fit| fit.name() == name);
-    let expected = "copy, pad, grow-rows, sample-rows, mean-rows, sampled-rows, reinit or reinit-always";
+    let expected = "copy, pad, grow-rows, sample-rows, mean-like, sampled-like, reinit or reinit-always";
     match value {
         Value::Null => Ok(Fit::Copy),
         value => value.as_str().and_then(known).ok_or(expected),
@@ -402,7 +402,7 @@ fn source(
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);
     let changes = scale.is_some() || taken.dtype() != tensor.dtype;
-    let is_replaced = matches!(rule.fit, Fit::MeanRows | Fit::SampledRows);
+    let is_replaced = matches!(rule.fit, Fit::MeanLike | Fit::SampledLike);
     let fits = of.shape == shape && !starts && !is_replaced;
     if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
@@ -417,13 +417,13 @@ fn source(
         Fit::Pad if !nests => return Err(CANNOT_SHRINK.to_owned()),
         Fit::GrowRows | Fit::SampleRows if !grows => return Err("only rows can be added".to_owned()),
         Fit::Pad => TensorExpr::Pad { of, shape },
-        Fit::MeanRows | Fit::SampledRows => {
+        Fit::MeanLike | Fit::SampledLike => {
             let like = rule.like.clone().ok_or("the tensor that its rows should be like is missing")?;
             if like.shape.len() != shape.len() || !like.shape.iter().skip(1).eq(shape.iter().skip(1)) {
                 return Err(format!("rows of {}, {:?}, do not fit", like.name, like.shape));
             }
             let from = like.dtype;
-            let made = TensorExpr::NewRows { like, rows, sampled: rule.fit == Fit::SampledRows, instead_of: of };
+            let made = TensorExpr::NewRows { like, rows, sampled: rule.fit == Fit::SampledLike, instead_of: of };
             return Ok(made.converted(from, scale, dtype));
         }
         Fit::GrowRows => TensorExpr::GrowRows { of, rows },

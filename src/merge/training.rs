@@ -2,29 +2,23 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
-use crate::check::load::{self, Stored, targets};
+use crate::check::load::{self, Stored, Target};
 use crate::checkpoint::{Checkpoint, files};
-use crate::knowledge::{Evidence, Knowledge};
+use crate::knowledge::{Architecture, Evidence};
 use crate::report::model::{NewRows, TrainedTensor, Training};
 use crate::surgery::expr::TensorTransform;
 use crate::surgery::planned_tensor::PlannedTensor;
 
-/// Adds what the models of the versions call the tensors to train: those that a run for `versions` judges, which have the class.
-pub(super) fn name_in_models(
-    training: &mut Training,
-    planned: &Checkpoint,
-    knowledge: &Knowledge,
-    versions: &[String],
-) {
+/// Adds what models of these classes call the tensors to train; each is the class of the result in a version.
+pub(super) fn name_in_models(training: &mut Training, planned: &Checkpoint, classes: &[(Target, Architecture<'_>)]) {
     let Some(config) = planned.document(files::CONFIG).and_then(|document| document.value.as_ref()) else { return };
     let stored = Stored::of(planned);
     let train: BTreeSet<String> = training.train.iter().cloned().collect();
     let without = |names: &BTreeSet<String>| stored.replacing(names, BTreeMap::new());
     let frozen = without(&train);
     let mut named: [BTreeSet<String>; 2] = [train, training.freeze.iter().cloned().collect()];
-    let names: Vec<&str> = training.train.iter().chain(&training.freeze).map(String::as_str).collect();
-    for (target, class) in targets(&knowledge.library, config, &names, versions) {
-        let Ok(built) = load::build(class, config, &stored) else { continue };
+    for (target, class) in classes {
+        let Ok(built) = load::build(*class, config, &stored) else { continue };
         let in_model = |stored: &Stored| names_of(&load::in_model(&built, stored));
         let (all, freeze) = (in_model(&stored), in_model(&frozen));
         let train: BTreeSet<String> = all.difference(&freeze).cloned().collect();
@@ -35,7 +29,8 @@ pub(super) fn name_in_models(
             let own: Vec<String> = own.cloned().collect();
             new_rows.in_models.extend(own);
         }
-        training.versions.extend(target.versions);
+        // A version that the loader stands for may have other names.
+        training.versions.push(target.loader.version().to_owned());
         named.iter_mut().zip([train, freeze]).for_each(|(all, more)| all.extend(more));
     }
     let [train, freeze] = &named;

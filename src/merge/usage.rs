@@ -56,7 +56,8 @@ impl Usage {
             }
             (true, false) => None,
         };
-        let of_tokenizer = document(files::TOKENIZER_CONFIG).is_some_and(|d| d.get("/chat_template").is_some());
+        let of_tokenizer = document(files::TOKENIZER_CONFIG)
+            .is_some_and(|d| d.get("/chat_template").is_some_and(|template| !template.is_null()));
         let has_template =
             of_tokenizer || has(|name| name == files::CHAT_TEMPLATE || name == files::CHAT_TEMPLATE_JSON);
         Self { model: document(files::CONFIG).and_then(model), processor, has_template }

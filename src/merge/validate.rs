@@ -16,7 +16,7 @@ use super::named::{MAX_ENTRIES, MAX_PATTERN, pattern, starts_literally};
 use super::options;
 use crate::checkpoint::escape;
 use crate::knowledge::Knowledge;
-use crate::knowledge::recipe::{ANY, OptionKind, OptionSpec, Recipe, SeamTensor, TensorSpec};
+use crate::knowledge::recipe::{ANY, DonorSpec, OptionKind, OptionSpec, Recipe, SeamTensor, TensorSpec};
 use crate::knowledge::source::{DataError, hint};
 
 /// Names of the scope of expressions that no role and no `let` may take.
@@ -87,9 +87,27 @@ impl Validator<'_> {
             for part in donor.parts.iter().chain(&donor.no_parts) {
                 self.part("parts", part)?;
             }
+            self.used_parts(donor)?;
             self.tolerated(&donor.tolerates)?;
         }
         self.tolerated(&self.recipe.tolerates)
+    }
+
+    /// The parts that the result has, or does not have, of a donor: one of both is named.
+    fn used_parts(&self, donor: &DonorSpec) -> Result<(), DataError> {
+        let (key, part) = match (&donor.only_part, &donor.without_part) {
+            (None, None) => return Ok(()),
+            (Some(only), None) => ("only_part", only),
+            (None, Some(without)) => ("without_part", without),
+            (Some(_), Some(without)) => {
+                let reason = "a donor has either `only_part` or `without_part`, not both";
+                return Err(self.wrong("without_part", without.source(), reason));
+            }
+        };
+        match part.expressions().next() {
+            None => self.part(key, part.source()),
+            Some(_) => part.expressions().try_for_each(|e| self.expression(key, e, &BTreeSet::from(["opt"]))),
+        }
     }
 
     fn tolerated(&self, codes: &[String]) -> Result<(), DataError> {
@@ -224,6 +242,7 @@ impl Validator<'_> {
                 }
             }
             self.seam_tensor(tensor.meets.as_ref())?;
+            self.seam_tensor(tensor.like.as_ref())?;
             self.named(tensor)?;
             if let Err(why) = pattern(&tensor.names) {
                 let reason = format!("`{}` {why}", escape(&tensor.names, 80));

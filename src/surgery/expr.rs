@@ -304,16 +304,6 @@ impl<S> TensorExpr<S> {
         }
     }
 
-    /// Number of seeded random rows; `None` without any.
-    fn sampled_rows_of(&self, rows_of: &impl Fn(&S) -> u64) -> Option<u64> {
-        match self {
-            Self::SampleRows { of, rows } => Some(rows.saturating_sub(rows_of(of))),
-            Self::NewRows { rows, sampled: true, .. } => Some(*rows),
-            Self::Cast { of, .. } | Self::Scale { of, .. } => of.sampled_rows_of(rows_of),
-            _ => None,
-        }
-    }
-
     /// The values that it starts again with.
     #[must_use]
     pub const fn values(&self) -> Option<NewValues> {
@@ -374,7 +364,12 @@ impl TensorExpr<TensorRef> {
     /// Number of seeded random rows; `None` without any.
     #[must_use]
     pub(super) fn sampled_rows(&self) -> Option<u64> {
-        self.sampled_rows_of(&|of| of.shape.first().copied().unwrap_or_default())
+        match self {
+            Self::SampleRows { of, rows } => Some(rows.saturating_sub(of.shape.first().copied().unwrap_or_default())),
+            Self::NewRows { rows, sampled: true, .. } => Some(*rows),
+            Self::Cast { of, .. } | Self::Scale { of, .. } => of.sampled_rows(),
+            _ => None,
+        }
     }
 
     /// Type and shape of the values.

@@ -8,10 +8,10 @@ use super::values::{Codec, can_compute};
 /// Bytes that are read at a time; a multiple of the size of every value.
 const BLOCK: usize = 1 << 20;
 
-/// The root of the mean square of a tensor's values to four digits, summed in binary64 in their order; `None` without values, or
-/// where they cannot be computed.
+/// The root of the mean square of a tensor's values, summed in binary64 in their order; `None` without values, or where they
+/// cannot be computed.
 ///
-/// A recipe calls it for the embeddings of both donors, which the projector is scaled by.
+/// `row_norm` of recipes calls it for embeddings, by which a projector is scaled.
 ///
 /// # Errors
 /// [`ApplyError`] when the file cannot be opened or read.
@@ -33,7 +33,5 @@ pub fn rms(of: &TensorRef) -> Result<Option<f64>, ApplyError> {
     }
     #[expect(clippy::cast_precision_loss, reason = "a tensor has far fewer than 2^52 values")]
     let mean = sum / count.max(1) as f64;
-    // Four digits are enough for a size, and keep reports short.
-    let rms = format!("{:.3e}", mean.sqrt()).parse().ok();
-    Ok(rms.filter(|rms: &f64| rms.is_finite()))
+    Ok(Some(mean.sqrt()).filter(|rms| rms.is_finite()))
 }

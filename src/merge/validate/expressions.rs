@@ -15,7 +15,7 @@ const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "nul
 
 /// Functions of a merge's scope, with a role as the first argument.
 const ROLE_FUNCTIONS: [&str; 9] =
-    ["shape", "has", "dtype", "part", "rms", "row_scale", "image_fold", "head_factor", "chat_template"];
+    ["shape", "has", "dtype", "part", "row_norm", "row_scale", "image_fold", "head_factor", "chat_template"];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
@@ -120,7 +120,12 @@ impl Validator<'_> {
         })
     }
 
-    fn expression(&self, key: &str, expression: &Expression, variables: &BTreeSet<&str>) -> Result<(), DataError> {
+    pub(super) fn expression(
+        &self,
+        key: &str,
+        expression: &Expression,
+        variables: &BTreeSet<&str>,
+    ) -> Result<(), DataError> {
         let wrong = |reason: String| Err(self.wrong(key, expression.source(), reason));
         let References { paths, calls, .. } = expression.references();
         for path in &paths {

@@ -87,6 +87,7 @@ fn roles() -> Vec<(&'static str, Value)> {
         ("role of a graft", edit(&json!({ "graft": { "at": "/text_config", "from": "form" } }))),
         ("role of tensors", json!({ "tensors": [{ "from": "form", "names": "." }] })),
         ("role of a seam", tensors(("meets", json!({ "from": "form", "name": "x" })))),
+        ("role of a pattern for rows", tensors(("like", json!({ "from": "form", "name": "x" })))),
         ("role of a copy", file(&json!({ "copy": { "from": "form", "names": ["tokenizer.model"] } }))),
         ("role of modules", file(&json!({ "modules": { "from": ["form"], "roots": ["x"] } }))),
         ("role of tokens", json!({ "tokens": { "base": "form", "processor": "paligemma" } })),
@@ -110,6 +111,8 @@ fn names() -> Vec<(&'static str, Value)> {
     vec![
         ("architecture", donor("architectures", json!(["lama"]))),
         ("rule", donor("tolerates", json!(["ARC099"]))),
+        ("part that is used", donor("only_part", json!("langauge"))),
+        ("part that is not used", donor("without_part", json!("{otp.part}"))),
         ("processor", json!({ "tokens": { "base": "from", "processor": "paligema" } })),
         ("template", file(&json!({ "template": { "name": "x.py", "text": "nope.py" } }))),
         ("option", set("/x", "opt.row")),

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use ckpt_doctor::knowledge::{Knowledge, Loader};
+use ckpt_doctor::report::model::MergeReport;
 use ckpt_doctor::{Merge, MergeStage};
 use minijinja::context;
 use serde_json::{Value, json};
@@ -195,22 +196,52 @@ fn a_chat_template_writes_what_the_processor_needs_for_an_image() {
     assert_eq!(written, "[system] be brief[user] <IMG_CONTEXT>\nwhat is it?");
 }
 
+/// The plan of a host of `all` with the language model of another model there.
+fn planned(all: &Path, host: &str, guest: &str, version: &str) -> MergeReport {
+    let out = all.join("out");
+    let merge = Merge::new(&out).recipe("swap-language-model").option("projector", "reinit").option("scale", "keep");
+    let merge = merge.donor("vision", all.join(host)).donor("language", all.join(guest));
+    merge.loader(version).unwrap().plan().unwrap().merge.unwrap()
+}
+
 /// LLaVA's processor opens tokenizer.json as it is in transformers 5, and a Qwen2 alone builds its tokenizer itself.
 #[test]
 fn a_tokenizer_that_a_version_opens_in_another_way_is_told() {
-    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    let all = TempDir::new().unwrap();
     write(all.path());
     let notes = |host: &str, version: &str| {
-        let out = work.path().join("out");
-        let merge =
-            Merge::new(&out).recipe("swap-language-model").option("projector", "reinit").option("scale", "keep");
-        let merge = merge.donor("vision", all.path().join(host)).donor("language", all.path().join("qwen2-vl"));
-        let report = merge.loader(version).unwrap().plan().unwrap();
-        let notes = report.merge.unwrap().notes;
+        let notes = planned(all.path(), host, "qwen2-vl", version).notes;
         notes.into_iter().filter(|note| note.contains("opens tokenizer.json")).collect::<Vec<_>>()
     };
     assert_eq!(notes("llava", "4.57.6"), Vec::<String>::new());
     let told = notes("llava", "5.23.0");
-    assert!(told.len() == 1 && told[0].contains("as it is, and as Qwen2Tokenizer in the language donor"), "{told:?}");
+    assert!(
+        told.len() == 1 && told[0].contains("as it is in the result, and as Qwen2Tokenizer in its donor"),
+        "{told:?}"
+    );
     assert_eq!(notes("qwen2.5-vl", "5.23.0"), Vec::<String>::new());
+}
+
+/// The language model may come from a model that sees, too; prompts are those of the host.
+#[test]
+fn a_prompt_is_written_for_the_host() {
+    let all = TempDir::new().unwrap();
+    write(all.path());
+    for (host, text) in [("llava", r#"text = "<image>\nWhat is in the picture?""#), ("paligemma", r#"text = "What is"#)]
+    {
+        let prompt = planned(all.path(), host, "qwen2-vl", "4.57.6").prompt;
+        assert!(prompt.iter().any(|line| line.starts_with(text)), "{host}: {prompt:?}");
+    }
+}
+
+#[test]
+fn a_pair_that_no_test_runs_was_not_tried() {
+    let all = TempDir::new().unwrap();
+    write(all.path());
+    let is_noted = |host: &str| {
+        let notes = planned(all.path(), host, "llama", "5.23.0").notes;
+        assert!(!notes.is_empty(), "{host} was not planned");
+        notes.iter().any(|note| note.starts_with("Not tried"))
+    };
+    assert_eq!(["llava", "vipllava"].map(is_noted), [false, true]);
 }

@@ -1,4 +1,4 @@
-//! The tokens of a result that prompts and training code name, by their ids.
+//! The tokenizer of a result: the tokens that prompts and training code name, and the versions that open it in another way.
 
 use std::collections::BTreeMap;
 
@@ -49,22 +49,19 @@ pub(super) fn tokens_used(planned: &Checkpoint, opened: Option<&OpenedTokenizer>
     used.into_iter().map(row).collect()
 }
 
-/// Notes on versions that open the tokenizer of the result in another way than that of the `donor` alone. `versions` are those
-/// that the result is for, or none.
+/// Notes on loaders that open the tokenizer of the result in another way than that of the `donor` that it is of.
 pub(super) fn opened_otherwise(
     donor: &Checkpoint,
     planned: &Checkpoint,
     knowledge: &Knowledge,
-    versions: &[String],
+    loaders: impl Iterator<Item = Loader>,
 ) -> Vec<String> {
-    let asked: Vec<Loader> = versions.iter().map(|version| Loader::nearest(version)).collect();
-    let loaders = Loader::ALL.into_iter().filter(|loader| asked.is_empty() || asked.contains(loader));
     let note = |loader: Loader| {
         let [alone, here] = [donor, planned].map(|checkpoint| building_class(checkpoint, knowledge, loader));
         let words = |class: Option<String>| class.map_or_else(|| "as it is".to_owned(), |class| format!("as {class}"));
         (alone != here).then(|| {
             format!(
-                "transformers {} opens tokenizer.json {}, and {} in the language donor, so ids of text may differ: compare processor.tokenizer with the donor's tokenizer.",
+                "transformers {} opens tokenizer.json {} in the result, and {} in its donor: ids of text may differ. Compare processor.tokenizer with the donor's tokenizer.",
                 loader.version(),
                 words(here),
                 words(alone)
