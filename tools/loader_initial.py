@@ -72,6 +72,10 @@ HOSTS = {
     "internvl": ["multi_modal_projector"],
     "gemma3": ["multi_modal_projector"],
     "mistral3": ["multi_modal_projector"],
+    "llava_next_video": ["multi_modal_projector", "image_newline"],
+    "video_llava": ["multi_modal_projector"],
+    "aya_vision": ["multi_modal_projector"],
+    "deepseek_vl": ["aligner"],
 }
 # The range of each config that a class may read, far enough from the others to be told from its values.
 RANGES = {"": 0.6, "text_config.": 0.05, "vision_config.": 0.3}

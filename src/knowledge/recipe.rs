@@ -340,10 +340,14 @@ pub struct TensorSpec {
     /// Whether the tensors get the names that they have in a model of the part alone.
     #[serde(default)]
     pub alone: bool,
+    /// Whether a later entry may take the same tensors, so that each is there twice.
+    #[serde(default)]
+    pub also: bool,
     /// Condition for this entry.
     #[serde(default)]
     pub when: Option<Expression>,
-    /// Name in the result: a template, in which `$1` is the first group of `names`. The name of the donor when missing.
+    /// Name in the result: a template, in which `$1` is the first group of `names`. The name of the donor when missing. With
+    /// `into`, it is the name inside the part.
     #[serde(rename = "as", default)]
     pub rename: Option<Template>,
     /// First row and number of rows of the donor that are used: a list of two integers. All rows when missing or null.

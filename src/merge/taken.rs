@@ -101,13 +101,14 @@ impl TensorRule<'_> {
 
     /// The name of a donor tensor in the result; `None` when the place of its part has none for it.
     pub(super) fn name(&self, tensor: &Tensor) -> Option<String> {
-        if let Some(to) = &self.rename {
-            return Some(self.names.replace(&tensor.name, to.as_str()).into_owned());
-        }
+        let renamed = |name: String| match &self.rename {
+            Some(to) => self.names.replace(&name, to.as_str()).into_owned(),
+            None => name,
+        };
         match (self.part.and_then(|part| part.inside(&tensor.name)), self.into) {
-            (Some(inside), Some(place)) => place.name_of(&inside),
+            (Some(inside), Some(place)) => place.name_of(&renamed(inside)),
             (Some(inside), None) if self.spec.alone => Some(inside),
-            _ => Some(tensor.name.clone()),
+            _ => Some(renamed(tensor.name.clone())),
         }
     }
 }

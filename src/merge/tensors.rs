@@ -16,7 +16,7 @@ use super::named::{AnnouncedCast, Bounds, Changeable, pattern};
 use super::parts::Donor;
 use super::run::count;
 use super::taken::{StartedModules, TakenTensor, TensorRule};
-use crate::checkpoint::Dtype;
+use crate::checkpoint::{Dtype, Tensor};
 use crate::knowledge::quantization;
 use crate::knowledge::recipe::{SeamTensor, TensorSpec};
 use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
@@ -176,32 +176,38 @@ fn take<'a>(
     let mut dropped: BTreeMap<(String, String, String), usize> = BTreeMap::new();
     for donor in donors {
         for (shard, tensor) in donor.checkpoint.tensors() {
-            let rule = rules.iter().find(|rule| rule.takes(donor, tensor));
-            match rule {
-                Some(rule) if rule.spec.drop.is_none() => {
-                    let name = rule.name(tensor).ok_or_else(|| {
-                        MergeError::Donor(format!(
-                            "{} of the {} donor has no place in the model of the {} donor",
-                            tensor.name,
-                            donor.role,
-                            rule.spec.into.as_deref().unwrap_or_default()
-                        ))
-                    })?;
+            let mut last = None;
+            for rule in rules.iter().filter(|rule| rule.takes(donor, tensor)) {
+                last = Some(rule);
+                if rule.spec.drop.is_none() {
+                    let name = rule.name(tensor).ok_or_else(|| has_no_place(rule, donor, tensor))?;
                     taken.push(TakenTensor { name, donor, shard, tensor, rule });
                 }
-                other => {
-                    let (pattern, why) = other.map_or(("", "no entry of the recipe matches them"), |r| {
-                        (r.pattern(), r.spec.drop.as_deref().unwrap_or_default())
-                    });
-                    let key = (donor.role.clone(), pattern.to_owned(), why.to_owned());
-                    let count = dropped.entry(key).or_default();
-                    *count = count.saturating_add(1);
+                if !rule.spec.also {
+                    break;
                 }
+            }
+            if last.is_none_or(|rule| rule.spec.drop.is_some()) {
+                let (pattern, why) = last.map_or(("", "no entry of the recipe matches them"), |rule| {
+                    (rule.pattern(), rule.spec.drop.as_deref().unwrap_or_default())
+                });
+                let key = (donor.role.clone(), pattern.to_owned(), why.to_owned());
+                let count = dropped.entry(key).or_default();
+                *count = count.saturating_add(1);
             }
         }
     }
     let dropped = dropped.into_iter();
     Ok((taken, dropped.map(|((donor, pattern, why), count)| Dropped { donor, pattern, count, why }).collect()))
+}
+
+fn has_no_place(rule: &TensorRule<'_>, donor: &Donor, tensor: &Tensor) -> MergeError {
+    MergeError::Donor(format!(
+        "{} of the {} donor has no place in the model of the {} donor",
+        tensor.name,
+        donor.role,
+        rule.spec.into.as_deref().unwrap_or_default()
+    ))
 }
 
 /// Lists a tensor that is not a byte copy of a whole donor tensor as changed, and one that must be trained.

@@ -253,7 +253,9 @@ OWN = {
     "gemma3": ["gemma3_text"],
     SPATIALVLA: ["llama", "gemma2"],
 }
-TOWER_HOSTS = ("llava", "llava_next", "llava_onevision", "paligemma", "idefics3")
+TOWER_HOSTS = (
+    "llava", "llava_next", "llava_onevision", "paligemma", "idefics3", "llava_next_video", "aya_vision", "deepseek_vl",
+)  # fmt: skip
 
 
 AS_TEXT = [

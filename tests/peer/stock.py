@@ -123,15 +123,20 @@ def named(tokenizer, **tokens):
 # Guests: configs of language models, by model type.
 
 
+# Families with a byte-level tokenizer, for which that of Llama 3 stands.
+BYTE_LEVEL = ("granite", "cohere", "cohere2", "olmo2", "smollm3", "falcon", "glm4", "qwen3_moe")
+
+
 def guest_tokenizer(kind, work):
     make = {
         "llama": lambda: llama(work),
         "llama3": lambda: llama3(work),
         "mistral": lambda: llama(work),
+        "mixtral": lambda: llama(work),
         "qwen2": lambda: qwen2(work),
         "qwen3": lambda: qwen2(work, ["<think>", "</think>"]),
         "phi3": lambda: llama(work, more=["<|endoftext|>", "<|assistant|>", "<|end|>", "<|user|>"]),
-        "granite": lambda: llama3(work),
+        **dict.fromkeys(BYTE_LEVEL, lambda: llama3(work)),
         "gemma": lambda: gemma(work),
         "gemma2": lambda: gemma(work),
         "gemma3_text": lambda: gemma(work, ["<start_of_image>", "<end_of_image>"]),
@@ -160,6 +165,16 @@ def text_config(kind, width, tokenizer):
         config |= dict(query_pre_attn_scalar=16, sliding_window=64)
     if kind == "granite":
         config |= dict(logits_scaling=8.0, embedding_multiplier=12.0, attention_multiplier=0.25, residual_multiplier=0.5)
+    if kind.startswith("cohere"):
+        config |= dict(logit_scale=0.25, layer_norm_eps=1e-5)
+    if kind in ("glm4", "qwen3_moe"):
+        config["head_dim"] = 16
+    if kind == "mixtral":
+        config |= dict(num_local_experts=4, num_experts_per_tok=2)
+    if kind == "qwen3_moe":
+        config |= dict(num_experts=4, num_experts_per_tok=2, moe_intermediate_size=32, decoder_sparse_step=1, norm_topk_prob=True)
+    if kind == "falcon":
+        config |= dict(new_decoder_architecture=True, num_kv_heads=KEYS, bias=False, ffn_hidden_size=2 * width)
     if kind == "phi3":
         config |= dict(original_max_position_embeddings=512, sliding_window=64)
     return config
@@ -168,6 +183,8 @@ def text_config(kind, width, tokenizer):
 GUESTS = {
     "llama": "Llama", "llama3": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "qwen3": "Qwen3", "phi3": "Phi3", "gemma2": "Gemma2",
     "gemma3_text": "Gemma3", "granite": "Granite",
+    "cohere": "Cohere", "cohere2": "Cohere2", "olmo2": "Olmo2", "smollm3": "SmolLM3", "falcon": "Falcon", "mixtral": "Mixtral",
+    "qwen3_moe": "Qwen3Moe", "glm4": "Glm4",
 }  # fmt: skip
 
 
@@ -461,9 +478,65 @@ def mistral3(work):
     return "Mistral3", config, processor, "mistral"
 
 
+def aya_vision(work):
+    from transformers import AyaVisionProcessor, GotOcr2ImageProcessor
+
+    tokenizer = llama3(work)
+    names = ["<|START_OF_IMG|>", "<|END_OF_IMG|>", "<|IMG_PATCH|>", "TILE_GLOBAL"]
+    tokenizer.pad_token = "<|finetune_right_pad_id|>"
+    tokenizer.add_special_tokens({"additional_special_tokens": names})
+    images = GotOcr2ImageProcessor(size={"height": 2 * SIDE, "width": 2 * SIDE}, max_patches=1)
+    processor = AyaVisionProcessor(images, tokenizer, patch_size=PATCH, img_size=2 * SIDE, downsample_factor=2)
+    image = tokenizer.convert_tokens_to_ids("<|IMG_PATCH|>")
+    config = dict(vision_config=siglip(2 * SIDE), image_token_index=image, downsample_factor=2, alignment_intermediate_size=48)
+    return "AyaVision", config, processor, "cohere2"
+
+
+def deepseek_vl(work):
+    from transformers import DeepseekVLImageProcessor, DeepseekVLProcessor
+
+    tokenizer = named(llama3(work), image_token="<image_placeholder>")
+    tokenizer.pad_token = "<|finetune_right_pad_id|>"
+    images = DeepseekVLImageProcessor(size={"height": SIDE, "width": SIDE})
+    config = dict(vision_config=siglip(), image_token_id=tokenizer.image_token_id)
+    return "DeepseekVL", config, DeepseekVLProcessor(images, tokenizer, num_image_tokens=TOKENS), "llama"
+
+
+def llava_next_video(work):
+    import transformers
+
+    tokenizer = named(llama(work), image_token="<image>", video_token="<video>")
+    tokenizer.add_special_tokens({"pad_token": "<pad>"})
+    points = [[SIDE, 2 * SIDE], [2 * SIDE, SIDE], [2 * SIDE, 2 * SIDE]]
+    sizes = dict(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
+    images = transformers.LlavaNextImageProcessor(**sizes, image_grid_pinpoints=points)
+    processor = transformers.LlavaNextVideoProcessor(
+        transformers.LlavaNextVideoImageProcessor(**sizes, image_grid_pinpoints=points), images, tokenizer, patch_size=PATCH,
+        vision_feature_select_strategy="default", num_additional_image_tokens=1,
+    )  # fmt: skip
+    ids = {f"{kind}_token_index": tokenizer.convert_tokens_to_ids(f"<{kind}>") for kind in ("image", "video")}
+    config = dict(vision_config=clip(), image_grid_pinpoints=points, image_seq_length=TOKENS, **ids)
+    return "LlavaNextVideo", config, processor, "llama"
+
+
+def video_llava(work):
+    from transformers import VideoLlavaImageProcessor, VideoLlavaProcessor
+
+    tokenizer = named(llama(work), image_token="<image>", video_token="<video>")
+    tokenizer.add_special_tokens({"pad_token": "<pad>"})
+    images = VideoLlavaImageProcessor(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
+    processor = VideoLlavaProcessor(
+        images, tokenizer, patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1
+    )
+    ids = {f"{kind}_token_index": tokenizer.convert_tokens_to_ids(f"<{kind}>") for kind in ("image", "video")}
+    return "VideoLlava", dict(vision_config=clip(), image_seq_length=TOKENS, **ids), processor, "llama"
+
+
 HOSTS = {
     "llava": llava,
     "llava_next": llava_next,
+    "llava_next_video": llava_next_video,
+    "video_llava": video_llava,
     "llava_onevision": llava_onevision,
     "paligemma": paligemma_of("gemma"),
     "paligemma2": paligemma_of("gemma2"),
@@ -475,6 +548,8 @@ HOSTS = {
     "internvl": internvl,
     "gemma3": gemma3,
     "mistral3": mistral3,
+    "aya_vision": aya_vision,
+    "deepseek_vl": deepseek_vl,
 }
 
 # What a user writes before the text of a prompt, so that the processor puts the image there.
@@ -482,6 +557,7 @@ IMAGE_IN_TEXT = {
     "qwen2_vl": "<|vision_start|><|image_pad|><|vision_end|>", "qwen2_5_vl": "<|vision_start|><|image_pad|><|vision_end|>",
     "qwen3_vl": "<|vision_start|><|image_pad|><|vision_end|>",
     "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>", "mistral3": "[IMG]",
+    "deepseek_vl": "<image_placeholder>",
 }  # fmt: skip
 
 
@@ -497,8 +573,8 @@ def save_host(kind, dtype, path, work):
     if kind == "qwen3_vl":
         sections = dict(rope_type="default", mrope_interleaved=True, mrope_section=[4, 2, 2])
         config["text_config"] |= dict(model_type="qwen3_vl_text", rope_scaling=sections)
-    # Gemma models share one matrix for both ends; so do their hosts.
-    config["tie_word_embeddings"] = language.startswith("gemma")
+    # Gemma and Cohere models share one matrix for both ends; so do their hosts.
+    config["tie_word_embeddings"] = language.startswith(("gemma", "cohere"))
     made = getattr(transformers, f"{classes}Config")(**config)
     save_model(getattr(transformers, f"{classes}ForConditionalGeneration")(made), dtype, path)
     processor.save_pretrained(path)

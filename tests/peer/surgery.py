@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Parts of stock models put together by the tool, opened and run by every version of transformers.
 
-    surgery.py FOLDER... [--all] [--only REGEX] [--page FILE] [--tried FILE] [--keep DIRECTORY] [--list]
+    surgery.py FOLDER... [--all] [--only REGEX] [--drawn 1/N [--seed N]] [--page FILE] [--tried FILE] [--keep DIRECTORY] [--list]
 
 Each FOLDER has one version of transformers, oldest first, for the Python that runs this. Tiny models are saved by the oldest
 version that has their class (stock.py). The tool exchanges language models and vision towers, and takes parts out and puts them
@@ -11,13 +11,14 @@ and train what the report counts.
 
 A result that `check` calls sound for a version runs there, and one that it calls broken does not. A refusal has to be one of
 REFUSED. The tensors are the donors', apart from those that the report names. `--all` tries every pair in every variant; without
-it each pair is tried in one. `--page` compares the tables with a page, `--tried` the pairs that ran with a file of rules, and
-CKPT_DOCTOR_WRITE=1 writes both.
+it each pair is tried in one. `--drawn` tries a part of the pairs, drawn with the seed. `--page` compares the tables with a page,
+`--tried` the pairs that ran with a file of rules, and CKPT_DOCTOR_WRITE=1 writes both, from all pairs.
 """
 
 import argparse
 import json
 import os
+import random
 import re
 import subprocess
 import sys
@@ -44,9 +45,19 @@ REFUSED = [
         "the host was saved by 4.47, which cannot generate with this language model",
     ),
     (
-        r"(llava|llava_next|llava_onevision|paligemma2?) x granite .*",
+        r"(llava|llava_next|llava_next_video|video_llava|llava_onevision|paligemma2?) x granite .*",
         "4.47 cannot run",
         "the host was saved by 4.47, which cannot run this language model",
+    ),
+    (
+        r"paligemma2? x mixtral .*",
+        "4.47 cannot run",
+        "the host was saved by 4.47, which cannot run this language model",
+    ),
+    (
+        r".* x falcon .*",
+        "names tensors in another way",
+        "Falcon's class has its layers in `transformer`, and the hosts have those of a `model`",
     ),
     (
         r".* sees with siglip2",
@@ -54,7 +65,7 @@ REFUSED = [
         "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP",
     ),
     (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
-    (r"llava_next sees with siglip", "4.47 cannot see", "the host was saved by 4.47, which wants a class token of the tower"),
+    (r"llava_next(_video)? sees with siglip", "4.47 cannot see", "the host was saved by 4.47, which wants a class token of the tower"),
     (
         r"llava_onevision sees with (clip|dinov2)",
         "builds its own",
@@ -128,6 +139,8 @@ def main():
     p.add_argument("folder", nargs="+")
     p.add_argument("--all", action="store_true", help="every pair in every variant")
     p.add_argument("--only", default="", help="cells whose name has this regular expression")
+    p.add_argument("--drawn", default="1/1", help="share of the pairs")
+    p.add_argument("--seed", type=int, default=1)
     p.add_argument("--page", type=Path)
     p.add_argument("--tried", type=Path)
     p.add_argument("--keep", type=Path, help="directory for donors and results")
@@ -136,17 +149,25 @@ def main():
     a = p.parse_args()
     if a.build:
         return build(json.loads(a.build[0]), Path(a.build[1]))
+    if os.environ.get("CKPT_DOCTOR_WRITE"):
+        a.drawn = "1/1"
     tally = Tally()
     with workplace() as temporary:
-        cells = [cell for cell in all_cells(a.all, TOWERS) if re.search(a.only, cell.name)]
+        cells = [cell for cell in all_cells(a.all, TOWERS) if re.search(a.only, cell.name) and is_drawn(cell, a.drawn, a.seed)]
         outcomes = run(tally, cells, a.folder, (a.keep or temporary).resolve())
         for cell in cells if a.list else []:
             print(f"{cell.name}: {outcomes[cell.name]}")
         if a.page:
-            compare_page(tally, a.page, page(cells, outcomes))
+            keep(tally, a.page, page(cells, outcomes), fields, a.drawn)
         if a.tried:
-            compare_page(tally, a.tried, json.dumps(tried(cells, outcomes), indent=1) + "\n")
+            keep(tally, a.tried, json.dumps(tried(cells, outcomes), indent=1) + "\n", pairs, a.drawn)
     tally.finish()
+
+
+def is_drawn(cell, share, seed):
+    """Whether the pair of a cell is in a share of all, for example 1/4."""
+    part, of = map(int, share.split("/"))
+    return random.Random(f"{seed} {type(cell).__name__} {cell.row} {cell.column}").randrange(of) < part
 
 
 def run(tally, cells, folders, work):
@@ -256,10 +277,30 @@ def matrix(cells, outcomes):
     return "\n".join(lines).rstrip() + "\n"
 
 
-def compare_page(tally, path, text):
+def fields(text):
+    """{(table, row, column): the field of a page, with the reason in place of a letter}."""
+    found = {}
+    for table in text.split("\n## ")[1:]:
+        rows = [[field.strip() for field in line.strip("|").split("|")] for line in table.splitlines() if line.startswith("|")]
+        reasons = dict(re.findall(r"^- (\w): (.*)$", table, re.M))
+        for row in rows[2:]:
+            named = zip(rows[0][1:], row[1:], strict=True)
+            found |= {(table.split("\n")[0], row[0], column): reasons.get(field, field) for column, field in named if field}
+    return found
+
+
+def pairs(text):
+    return {(host, part): versions for host, parts in json.loads(text).items() for part, versions in parts.items()}
+
+
+def keep(tally, path, text, read, share):
+    """Writes a page, or compares what it says of the pairs that were drawn."""
     if os.environ.get("CKPT_DOCTOR_WRITE"):
         path.write_text(text)
-    tally.expect(path.exists() and path.read_text() == text, f"{path} is not current: CKPT_DOCTOR_WRITE=1 .ci/run peer-surgery")
+    known, found = (read(t) for t in (path.read_text(), text))
+    other = {pair: (known.get(pair), now) for pair, now in found.items() if known.get(pair) != now}
+    complete = share != "1/1" or path.read_text() == text
+    tally.expect(complete and not other, f"{path} is not current: CKPT_DOCTOR_WRITE=1 .ci/run peer-surgery", other)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ fn part_of(model: &ModelParts, name: &str) -> Option<String> {
     model.all_layouts().find_map(|layout| layout.locate(name).map(|(part, _)| part.to_owned()))
 }
 
-/// Each tensor of a class belongs to a part, and a config of a part that changes changes the tensors of that part alone.
+/// Each tensor of a class belongs to a part, and a config of a part that changes changes the tensors of that part alone, or of
+/// parts without a config of their own.
 #[test]
 fn parts_stand_where_the_architectures_build_them() {
     let knowledge = Knowledge::embedded().unwrap();
@@ -44,8 +45,9 @@ fn parts_stand_where_the_architectures_build_them() {
                     *config.pointer_mut(&pointer).unwrap() = json!(size + 1);
                     let after = shapes(class, &config).unwrap_or_default();
                     for (tensor, _) in after.iter().filter(|(tensor, shape)| before.get(*tensor) != Some(shape)) {
-                        let own = part_of(model, tensor);
-                        assert_eq!(own.as_ref(), Some(name), "{architecture} {loader} {pointer}: {tensor}");
+                        let own = part_of(model, tensor).unwrap_or_default();
+                        let has_none = model.parts.get(&own).is_some_and(|part| part.config.is_empty());
+                        assert!(own == *name || has_none, "{architecture} {loader} {pointer}: {tensor} is of {own}");
                         *changed.entry(&model.model).or_default() += 1;
                     }
                 }
@@ -53,16 +55,20 @@ fn parts_stand_where_the_architectures_build_them() {
         }
     }
     for model in [
+        "aya_vision",
+        "deepseek_vl",
         "gemma3",
         "idefics3",
         "internvl",
         "llava",
+        "llava_next_video",
         "llava_onevision",
         "mistral3",
         "paligemma",
         "qwen2_5_vl",
         "qwen2_vl",
         "qwen3_vl",
+        "video_llava",
         "clip",
     ] {
         assert!(changed.get(model).is_some_and(|count| *count > 10), "{model}: {changed:?}");
