@@ -172,7 +172,9 @@ def text_config(kind, width, tokenizer):
     if kind == "mixtral":
         config |= dict(num_local_experts=4, num_experts_per_tok=2)
     if kind == "qwen3_moe":
-        config |= dict(num_experts=4, num_experts_per_tok=2, moe_intermediate_size=32, decoder_sparse_step=1, norm_topk_prob=True)
+        config |= dict(
+            num_experts=4, num_experts_per_tok=2, moe_intermediate_size=32, decoder_sparse_step=1, norm_topk_prob=True
+        )
     if kind == "falcon":
         config |= dict(new_decoder_architecture=True, num_kv_heads=KEYS, bias=False, ffn_hidden_size=2 * width)
     if kind == "phi3":

@@ -65,7 +65,11 @@ REFUSED = [
         "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP",
     ),
     (r"paligemma sees with (clip|dinov2)", "", "the host's image processor is SigLIP's, and it has no place for a class token"),
-    (r"llava_next(_video)? sees with siglip", "4.47 cannot see", "the host was saved by 4.47, which wants a class token of the tower"),
+    (
+        r"llava_next(_video)? sees with siglip",
+        "4.47 cannot see",
+        "the host was saved by 4.47, which wants a class token of the tower",
+    ),
     (
         r"llava_onevision sees with (clip|dinov2)",
         "builds its own",
