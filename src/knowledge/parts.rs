@@ -93,14 +93,14 @@ pub struct Own {
     /// Classes by model type, where Auto classes do not name the one that has the tensors of the part.
     #[serde(default)]
     pub class: BTreeMap<String, String>,
-    /// Keys to leave out of its config: exact names, or prefixes that end in `*`.
+    /// Keys to leave out of its config: exact names, prefixes that end in `*`, or JSON pointers.
     #[serde(default)]
     pub without: Vec<String>,
 }
 
 /// A value that follows from a part. Expressions see `part` (its config with defaults), `host` (the config of the model
-/// around it, with defaults), `host_stored` (the same as written), `host_preprocessor` and
-/// `part_preprocessor` (the `preprocessor_config.json` of either donor), the names in `let`, and the variables of the recipe.
+/// around it, with defaults), `part_stored` and `host_stored` (the same as written), `host_preprocessor` and
+/// `part_preprocessor` (the config of the image processor of either donor), the names in `let`, and the variables of the recipe.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 
 use super::error::MergeError;
 use super::options::{self, Options};
-use super::parts::{Donor, DonorParts, PartOf, value_of};
+use super::parts::{Donor, DonorParts, PartOf, image_processor, value_of};
 use super::{explain, functions};
 use crate::check::tokens::{OpenedTokenizer, Unopened, open_tokenizer};
 use crate::checkpoint::Checkpoint;
@@ -91,9 +91,9 @@ impl<'a> Context<'a> {
             (donor.role.clone(), config.unwrap_or_default())
         };
         scope.bind("stored", &Value::Object(donors.iter().map(stored).collect()));
-        for (name, file) in [("processor", files::PROCESSOR_CONFIG), ("preprocessor", files::PREPROCESSOR_CONFIG)] {
-            scope.bind(name, &document(donors, file).unwrap_or_default());
-        }
+        scope.bind("processor", &document(donors, files::PROCESSOR_CONFIG).unwrap_or_default());
+        let images = donors.iter().find_map(|donor| image_processor(&donor.checkpoint));
+        scope.bind("preprocessor", images.unwrap_or(&Value::Null));
         let base = recipe.tokens.as_ref().and_then(|tokens| donors.iter().find(|donor| donor.role == tokens.base));
         let tokenizer = base.and_then(|donor| value_of(&donor.checkpoint, files::TOKENIZER_CONFIG));
         scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));

@@ -7,12 +7,12 @@ use super::context::Context;
 use super::draft::MergeDraft;
 use super::dtypes;
 use super::error::MergeError;
-use super::parts::{PartOf, is_of_model, value_of};
+use super::parts::{PartOf, image_processor, is_of_model, value_of};
 use super::switches::{self, Removed};
 use super::validate::misplaced;
 use crate::check::clamped;
 use crate::check::tokens::OpenedTokenizer;
-use crate::checkpoint::{Document, FaultKind, FileName, Vocabulary, pointer};
+use crate::checkpoint::{Checkpoint, Document, FaultKind, FileName, Vocabulary, pointer};
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::recipe::{AUTO_MAP, DocumentEdit, DocumentSpec, FollowEdit, GraftEdit, PartEdit, TokensForm};
 use crate::knowledge::{Expression, Template};
@@ -249,11 +249,21 @@ fn followed(context: &Context<'_>, spec: &DocumentSpec, edit: &FollowEdit) -> Re
     let place = context.part(&edit.into, &name)?;
     let scope = context.of_place(place, context.part(&edit.from, &name)?)?;
     let mut values = Vec::new();
-    for follow in place.part.follows.iter().filter(|follow| follow.document == spec.name) {
+    // Transformers 5 saves the image processor in the config of the processor.
+    let host = &place.donor().checkpoint;
+    let is_inside = &*spec.name == files::PROCESSOR_CONFIG
+        && host.document(files::PREPROCESSOR_CONFIG).is_none()
+        && image_processor(host).is_some();
+    for follow in &place.part.follows {
+        let inside = match &*follow.document {
+            name if name == &*spec.name => "",
+            files::PREPROCESSOR_CONFIG if is_inside => "/image_processor",
+            _ => continue,
+        };
         let error = || context.at(format!("{}{} of {}", spec.name, follow.at.source(), place.name));
         if follow.when.as_ref().map_or(Ok(true), |when| when.eval_bool(&scope)).map_err(error())? {
             let to = follow.to.as_ref().map(|to| to.eval(&scope)).transpose().map_err(error())?;
-            values.push((follow.at.try_render(&scope).map_err(error())?, to));
+            values.push((format!("{inside}{}", follow.at.try_render(&scope).map_err(error())?), to));
         }
     }
     Ok(values)
@@ -267,7 +277,11 @@ fn added(context: &Context<'_>, tokens: &OpenedTokenizer, form: TokensForm) -> V
         TokensForm::Decoder => {
             let stated =
                 base.and_then(|c| c.document(files::TOKENIZER_CONFIG)?.get("/added_tokens_decoder")?.as_object());
-            map.extend(stated.into_iter().flatten().map(|(k, v)| (k.clone(), v.clone())));
+            match stated {
+                Some(stated) => map.extend(stated.clone()),
+                // Transformers 5 writes them into tokenizer.json alone, and adds no others where it finds some here.
+                None => map.extend(base.into_iter().flat_map(|base| in_tokenizer_json(base))),
+            }
             for (id, token) in &tokens.new {
                 let entry = json!({
                     "content": token.content, "lstrip": false, "normalized": token.normalized, "rstrip": false,
@@ -285,6 +299,18 @@ fn added(context: &Context<'_>, tokens: &OpenedTokenizer, form: TokensForm) -> V
         }
     }
     Value::Object(map)
+}
+
+/// The added tokens in tokenizer.json, as `added_tokens_decoder` has them.
+fn in_tokenizer_json(checkpoint: &Checkpoint) -> Vec<(String, Value)> {
+    let document = checkpoint.document(files::TOKENIZER);
+    let tokens = document.and_then(|document| document.get("/added_tokens")?.as_array());
+    let entry = |token: &Value| {
+        let mut token = token.as_object()?.clone();
+        let id = token.remove("id")?.as_u64()?;
+        Some((id.to_string(), Value::Object(token)))
+    };
+    tokens.into_iter().flatten().filter_map(entry).collect()
 }
 
 fn not_there(context: &Context<'_>, spec: &DocumentSpec, pointer: &str) -> MergeError {

@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 use super::error::MergeError;
 use super::switches;
 use crate::check::Outcome;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, pointer};
 use crate::knowledge::parts::{Layout, ModelParts, Own, Part};
 use crate::knowledge::{Knowledge, Library, Loader};
 
@@ -245,6 +245,9 @@ impl<'a> PartOf<'a> {
             own.insert("tie_word_embeddings".to_owned(), true.into());
         }
         let mut own = Value::Object(own);
+        for at in self.part.own.without.iter().filter(|at| at.starts_with('/')) {
+            pointer::remove(&mut own, at);
+        }
         switches::strip(files::CONFIG, &mut own);
         Ok(own.as_object().cloned().unwrap_or_default())
     }
@@ -253,6 +256,15 @@ impl<'a> PartOf<'a> {
 /// The content of a document.
 pub(super) fn value_of<'d>(checkpoint: &'d Checkpoint, name: &str) -> Option<&'d Value> {
     checkpoint.document(name)?.value.as_ref()
+}
+
+/// The key of a processor's config in which transformers 5 saves that of its image processor.
+pub(super) const IMAGE_PROCESSOR: &str = "image_processor";
+
+/// The config of the image processor, in its own file or in that of the processor.
+pub(super) fn image_processor(checkpoint: &Checkpoint) -> Option<&Value> {
+    value_of(checkpoint, files::PREPROCESSOR_CONFIG)
+        .or_else(|| value_of(checkpoint, files::PROCESSOR_CONFIG)?.get(IMAGE_PROCESSOR))
 }
 
 /// Whether a key of a config speaks of the model.

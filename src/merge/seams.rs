@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use super::context::Context;
 use super::error::MergeError;
 use super::explain;
-use super::parts::{PartOf, value_of};
+use super::parts::{PartOf, image_processor, value_of};
 use crate::checkpoint::files;
 use crate::knowledge::Scope;
 use crate::report::model::Seam;
@@ -20,9 +20,11 @@ impl Context<'_> {
         scope.bind("at", &json!(at));
         scope.bind("part", new.config());
         scope.bind("host", place.host());
+        let stored = new.stored().map_or(Value::Null, |(_, stored)| json!(stored));
+        scope.bind("part_stored", &stored);
         scope.bind("host_stored", value_of(&host.checkpoint, files::CONFIG).unwrap_or(&Value::Null));
         for (name, donor) in [("host_preprocessor", host), ("part_preprocessor", new.donor())] {
-            scope.bind(name, value_of(&donor.checkpoint, files::PREPROCESSOR_CONFIG).unwrap_or(&json!({})));
+            scope.bind(name, image_processor(&donor.checkpoint).unwrap_or(&json!({})));
         }
         for item in &place.part.lets {
             let value = item.is.eval(&scope).map_err(self.at(format!("{} of the part {}", item.name, place.name)))?;

@@ -339,10 +339,20 @@ def vision_part(cell, cls):
         model(**given)
 
 
+@cache
+def opens(guest_dir, dtype):
+    """Whether this version opens a guest alone."""
+    try:
+        guest_of(guest_dir, dtype)
+    except Exception:
+        return False
+    return True
+
+
 def open_cell(cell):
-    """What failed under this version, each with its stage."""
+    """What failed under this version, each with its stage; None for a class, or a guest, that it does not open."""
     cls, wrong, stage = class_of(cell["out"], cell["host"]), [], "class"
-    if cls is None:
+    if cls is None or cell.get("guest_dir") and not opens(cell["guest_dir"], cell["stored"]):
         return None
     how = {"as text": as_text, "part language": language_part, "part vision": vision_part}.get(cell["what"], whole)
     try:

@@ -7,6 +7,9 @@ same width, or the guest has WIDE.
 
 import json
 import random
+import shutil
+import tempfile
+from pathlib import Path
 
 from peer import doctor, tiny_sentencepiece, write_holes
 
@@ -44,11 +47,24 @@ def byte_level(size, start=()):
     return core
 
 
+def of_files(cls, work, vocab_file, merges_file=None, **more):
+    """A tokenizer from the files of its class, which from version 5 on only from_pretrained reads."""
+    import transformers
+
+    files = {"vocab_file": vocab_file} | ({"merges_file": merges_file} if merges_file else {})
+    if transformers.__version__.startswith("4"):
+        return cls(**{key: str(path) for key, path in files.items()}, **more)
+    with tempfile.TemporaryDirectory(dir=work) as folder:
+        for key, path in files.items():
+            shutil.copy(path, Path(folder) / cls.vocab_files_names.get(key, Path(path).name))
+        return cls.from_pretrained(folder, **more)
+
+
 def llama(work, pad=None, more=()):
     from transformers import LlamaTokenizerFast
 
     model = tiny_sentencepiece(work, "llama", 340, unk_id=0, bos_id=1, eos_id=2, pad_id=-1)
-    tokenizer = LlamaTokenizerFast(vocab_file=model, add_prefix_space=True, **({"pad_token": pad} if pad else {}))
+    tokenizer = of_files(LlamaTokenizerFast, work, model, add_prefix_space=True, **({"pad_token": pad} if pad else {}))
     tokenizer.add_special_tokens({"additional_special_tokens": list(more)}) if more else None
     return tokenizer
 
@@ -60,7 +76,7 @@ def gemma(work, more=()):
         pad_id=0, eos_id=1, bos_id=2, unk_id=3, pad_piece="<pad>", eos_piece="<eos>", bos_piece="<bos>", unk_piece="<unk>"
     )
     model = tiny_sentencepiece(work, "gemma", 400, add_dummy_prefix=False, user_defined_symbols=["<mask>", *more], **pieces)
-    return GemmaTokenizerFast(vocab_file=model)
+    return of_files(GemmaTokenizerFast, work, model)
 
 
 def llama3(work):
@@ -94,7 +110,7 @@ def qwen2(work, more=()):
     merges.write_text(
         "#version: 0.2\n" + "".join(" ".join(m) + "\n" if isinstance(m, list) else m + "\n" for m in model["merges"])
     )
-    tokenizer = Qwen2TokenizerFast(vocab_file=str(vocabulary), merges_file=str(merges), bos_token=None)
+    tokenizer = of_files(Qwen2TokenizerFast, work, vocabulary, merges, bos_token=None)
     tokenizer.add_special_tokens({"additional_special_tokens": ["<|im_start|>", "<|im_end|>", *more]})
     return tokenizer
 
@@ -114,8 +130,11 @@ def smollm(work):
 
 def named(tokenizer, **tokens):
     """Adds special tokens that a processor finds by an attribute of the tokenizer, as published tokenizers have them."""
-    tokenizer.add_special_tokens({"additional_special_tokens": [*tokenizer.additional_special_tokens, *tokens.values()]})
-    tokenizer.extra_special_tokens = tokens
+    # Transformers 5 has another name for the list.
+    known = getattr(tokenizer, "additional_special_tokens", None) or getattr(tokenizer, "extra_special_tokens", [])
+    tokenizer.add_special_tokens({"additional_special_tokens": [*known, *tokens.values()]})
+    if hasattr(tokenizer, "additional_special_tokens"):
+        tokenizer.extra_special_tokens = tokens
     tokenizer._set_model_specific_special_tokens(special_tokens=tokens)
     return tokenizer
 
@@ -387,7 +406,7 @@ def qwen_vl(kind):
         names = ["<|vision_start|>", "<|vision_end|>", "<|vision_pad|>", "<|image_pad|>", "<|video_pad|>"]
         tokenizer = qwen2(work, names)
         parts = [Qwen2VLImageProcessor(min_pixels=56 * 56, max_pixels=56 * 56), tokenizer]
-        if kind == "qwen2_5_vl":
+        if hasattr(transformers, "Qwen2VLVideoProcessor"):
             parts.append(transformers.Qwen2VLVideoProcessor())
         vision = dict(
             depth=2, num_heads=4, in_channels=3, patch_size=PATCH, spatial_merge_size=2, temporal_patch_size=2, model_type=kind
@@ -512,24 +531,28 @@ def llava_next_video(work):
     points = [[SIDE, 2 * SIDE], [2 * SIDE, SIDE], [2 * SIDE, 2 * SIDE]]
     sizes = dict(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
     images = transformers.LlavaNextImageProcessor(**sizes, image_grid_pinpoints=points)
-    processor = transformers.LlavaNextVideoProcessor(
-        transformers.LlavaNextVideoImageProcessor(**sizes, image_grid_pinpoints=points), images, tokenizer, patch_size=PATCH,
-        vision_feature_select_strategy="default", num_additional_image_tokens=1,
-    )  # fmt: skip
+    if hasattr(transformers, "LlavaNextVideoVideoProcessor"):
+        videos = transformers.LlavaNextVideoVideoProcessor(**sizes)
+    else:
+        videos = transformers.LlavaNextVideoImageProcessor(**sizes, image_grid_pinpoints=points)
+    more = dict(patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1)
+    processor = transformers.LlavaNextVideoProcessor(videos, images, tokenizer, **more)
     ids = {f"{kind}_token_index": tokenizer.convert_tokens_to_ids(f"<{kind}>") for kind in ("image", "video")}
     config = dict(vision_config=clip(), image_grid_pinpoints=points, image_seq_length=TOKENS, **ids)
     return "LlavaNextVideo", config, processor, "llama"
 
 
 def video_llava(work):
-    from transformers import VideoLlavaImageProcessor, VideoLlavaProcessor
+    import transformers
 
     tokenizer = named(llama(work), image_token="<image>", video_token="<video>")
     tokenizer.add_special_tokens({"pad_token": "<pad>"})
-    images = VideoLlavaImageProcessor(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
-    processor = VideoLlavaProcessor(
-        images, tokenizer, patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1
-    )
+    sizes = dict(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
+    parts = dict(image_processor=transformers.VideoLlavaImageProcessor(**sizes), tokenizer=tokenizer)
+    if hasattr(transformers, "VideoLlavaVideoProcessor"):
+        parts["video_processor"] = transformers.VideoLlavaVideoProcessor(**sizes)
+    more = dict(patch_size=PATCH, vision_feature_select_strategy="default", num_additional_image_tokens=1)
+    processor = transformers.VideoLlavaProcessor(**parts, **more)
     ids = {f"{kind}_token_index": tokenizer.convert_tokens_to_ids(f"<{kind}>") for kind in ("image", "video")}
     return "VideoLlava", dict(vision_config=clip(), image_seq_length=TOKENS, **ids), processor, "llama"
 
@@ -580,7 +603,7 @@ def save_host(kind, dtype, path, work):
     made = getattr(transformers, f"{classes}Config")(**config)
     save_model(getattr(transformers, f"{classes}ForConditionalGeneration")(made), dtype, path)
     processor.save_pretrained(path)
-    if kind.startswith("qwen2"):
+    if kind.startswith("qwen2") and transformers.__version__.startswith("4"):
         flatten(path / "config.json", config, f"{classes}ForConditionalGeneration")
 
 

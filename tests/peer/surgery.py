@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Parts of stock models put together by the tool, opened and run by every version of transformers.
 
-    surgery.py FOLDER... [--all] [--only REGEX] [--drawn 1/N [--seed N]] [--page FILE] [--tried FILE] [--keep DIRECTORY] [--list]
+    surgery.py FOLDER... [--all] [--only REGEX] [--drawn 1/N [--seed N]] [--saved-by VERSION] [--page FILE] [--tried FILE]
+               [--keep DIRECTORY] [--list]
 
-Each FOLDER has one version of transformers, oldest first, for the Python that runs this. Tiny models are saved by the oldest
-version that has their class (stock.py). The tool exchanges language models and vision towers, and takes parts out and puts them
+Each FOLDER has one version of transformers, oldest first, for the Python that runs this. Tiny models are saved by the version of
+--saved-by, or else by the oldest one that has their class (stock.py). The tool exchanges language models and vision towers, and takes parts out and puts them
 back (cells.py). Every version then opens each result (opened.py): processor, load in float32, bfloat16 and "auto", forward and
 generate with an image, and text alone as the guest alone. The lines of Python in the report are run: they ask about the picture,
 and train what the report counts.
@@ -145,6 +146,7 @@ def main():
     p.add_argument("--only", default="", help="cells whose name has this regular expression")
     p.add_argument("--drawn", default="1/1", help="share of the pairs")
     p.add_argument("--seed", type=int, default=1)
+    p.add_argument("--saved-by", default="", help="version of transformers, for example 5.23")
     p.add_argument("--page", type=Path)
     p.add_argument("--tried", type=Path)
     p.add_argument("--keep", type=Path, help="directory for donors and results")
@@ -158,7 +160,8 @@ def main():
     tally = Tally()
     with workplace() as temporary:
         cells = [cell for cell in all_cells(a.all, TOWERS) if re.search(a.only, cell.name) and is_drawn(cell, a.drawn, a.seed)]
-        outcomes = run(tally, cells, a.folder, (a.keep or temporary).resolve())
+        folders = sorted(a.folder, key=lambda folder: not version_in(folder).startswith(a.saved_by))
+        outcomes = run(tally, cells, folders, (a.keep or temporary).resolve())
         for cell in cells if a.list else []:
             print(f"{cell.name}: {outcomes[cell.name]}")
         if a.page:
@@ -200,6 +203,8 @@ def run(tally, cells, folders, work):
         elif cell.reason is None:
             cell.compare(tally)
             outcomes[cell.name] = judge(tally, cell, happened)
+        elif getattr(cell, "version", None) in happened and happened[cell.version][cell.host] != []:
+            outcomes[cell.name] = f"{cell.version} does not run the host alone"
         else:
             outcomes[cell.name] = refusal(tally, cell)
     print(f"{len(cells)} cells, {len(written)} written")
