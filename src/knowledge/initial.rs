@@ -135,7 +135,7 @@ impl ModelType {
 fn home<'c>(parts: &[ModelParts], config: &'c Value, name: &str) -> (&'c Value, String) {
     let whole = || (config, name.to_owned());
     let Some(model_type) = config.get("model_type").and_then(Value::as_str) else { return whole() };
-    let Some(model) = parts.iter().find(|model| model.architectures.iter().any(|a| a == model_type)) else {
+    let Some(model) = ModelParts::of(parts, model_type, config) else {
         return whole();
     };
     let located = model.all_layouts().find_map(|layout| {

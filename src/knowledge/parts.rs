@@ -21,6 +21,9 @@ pub struct ModelParts {
     pub model: String,
     /// Architectures that have these parts.
     pub architectures: Vec<String>,
+    /// Model type of the vision tower for which these parts stand before others of the architecture.
+    #[serde(default)]
+    pub tower: Option<String>,
     /// Sources of the facts.
     pub sources: Vec<String>,
     /// The parts, by name.
@@ -140,6 +143,15 @@ impl ModelParts {
     /// [`DataError`] for a malformed file; the tests parse all of them.
     pub fn embedded() -> Result<Vec<Self>, DataError> {
         source::embedded("parts").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
+    }
+
+    /// The parts of an architecture with this config, among all.
+    #[must_use]
+    pub fn of<'p>(all: &'p [Self], architecture: &str, config: &Value) -> Option<&'p Self> {
+        let tower = config.pointer("/vision_config/model_type").and_then(Value::as_str);
+        let named = |model: &&Self| model.architectures.iter().any(|name| name == architecture);
+        let special = all.iter().filter(named).find(|model| model.tower.is_some() && model.tower.as_deref() == tower);
+        special.or_else(|| all.iter().filter(named).find(|model| model.tower.is_none()))
     }
 
     /// A checkpoint that is one part as a whole: its tensor names and its config are those of the part.

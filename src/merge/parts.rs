@@ -38,10 +38,8 @@ pub(super) struct DonorParts {
 impl DonorParts {
     /// The parts of a checkpoint: those that `rules/parts/` gives its architecture; a causal language model is one part.
     pub(super) fn of(checkpoint: &Checkpoint, outcome: &Outcome, knowledge: &Knowledge) -> Option<Self> {
-        let described = outcome
-            .architecture
-            .as_ref()
-            .and_then(|architecture| knowledge.parts.iter().find(|model| model.architectures.contains(architecture)));
+        let architecture = outcome.architecture.as_ref();
+        let described = architecture.and_then(|name| ModelParts::of(&knowledge.parts, name, &outcome.config));
         let alone = || part_alone(checkpoint, knowledge).map(|(name, own)| ModelParts::whole(name, own));
         let model = described.cloned().or_else(alone)?;
         let names: Vec<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();

@@ -145,11 +145,8 @@ impl MergeRun {
         let config = planned.document(files::CONFIG).and_then(|document| document.value.as_ref());
         let classes =
             config.map(|config| targets(&knowledge.library, config, &names, &self.versions)).unwrap_or_default();
-        let is_of = |model: &&ModelParts| {
-            classes.iter().any(|(_, class)| model.architectures.iter().any(|a| a == class.name()))
-        };
-        record.prompt =
-            self.usage.prompt(knowledge.parts.iter().find(is_of).and_then(|model| model.image_turn.as_deref()));
+        let host = classes.iter().find_map(|(_, class)| ModelParts::of(&knowledge.parts, class.name(), config?));
+        record.prompt = self.usage.prompt(host.and_then(|model| model.image_turn.as_deref()));
         if let Some(training) = &mut record.training {
             name_in_models(training, planned, &classes);
         }

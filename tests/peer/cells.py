@@ -255,6 +255,7 @@ OWN = {
 }
 TOWER_HOSTS = (
     "llava", "llava_next", "llava_onevision", "paligemma", "idefics3", "llava_next_video", "aya_vision", "deepseek_vl",
+    "vipllava", "pixtral",
 )  # fmt: skip
 
 

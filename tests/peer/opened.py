@@ -70,7 +70,7 @@ def class_of(path, host):
         # The modules of the fixture are written for this version.
         ours = transformers.__version__.startswith("4.47")
         return get_class_from_dynamic_module(config["auto_map"]["AutoModel"], str(path)) if ours else None
-    name, kind = (config.get("architectures") or ["none"])[0], {"paligemma2": "paligemma"}.get(host, host)
+    name, kind = (config.get("architectures") or ["none"])[0], {"paligemma2": "paligemma", "pixtral": "llava"}.get(host, host)
     if kind not in transformers.CONFIG_MAPPING:
         return None
     module = importlib.import_module(f"transformers.models.{kind}.modeling_{kind}")
@@ -316,6 +316,13 @@ def language_part(cell, cls):
     yield "part", as_guest(host, tokenizer, cell["host"], cell["out"], cell["stored"], times)
 
 
+def in_a_row(images):
+    """Images that a processor nests by text, one after another."""
+    if isinstance(images, list):
+        return [image for of_text in images for image in of_text]
+    return images.flatten(0, images.dim() - 4) if images.dim() > 4 else images
+
+
 def vision_part(cell, cls):
     """A tower that was taken out opens in its own class, and sees an image of its own image processor."""
     import torch
@@ -331,7 +338,7 @@ def vision_part(cell, cls):
     if "pixel_values_images" in inputs:  # as the processor of a model with two towers has it
         inputs["pixel_values"] = inputs.pop("pixel_values_images")
     kept = {"pixel_values", "image_grid_thw", "pixel_attention_mask"} & inputs.keys()
-    given = {key: inputs[key].flatten(0, inputs[key].dim() - 4) if inputs[key].dim() > 4 else inputs[key] for key in kept}
+    given = {key: in_a_row(inputs[key]) for key in kept}
     if "image_grid_thw" in given:
         given = {"hidden_states": given["pixel_values"], "grid_thw": given["image_grid_thw"]}
     given = {key: value for key, value in given.items() if key in inspect.signature(model.forward).parameters}

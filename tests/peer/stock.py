@@ -5,6 +5,7 @@ Every parameter is drawn, norms and biases too, so that no two tensors have the 
 same width, or the guest has WIDE.
 """
 
+import inspect
 import json
 import random
 import shutil
@@ -490,7 +491,8 @@ def mistral3(work):
     tokenizer = llama(work)
     tokenizer.add_special_tokens({"pad_token": "<pad>", "additional_special_tokens": ["[IMG]", "[IMG_BREAK]", "[IMG_END]"]})
     images = PixtralImageProcessor(size={"longest_edge": 2 * SIDE}, patch_size={"height": PATCH, "width": PATCH})
-    processor = PixtralProcessor(images, tokenizer, patch_size=PATCH, spatial_merge_size=2)
+    more = {"spatial_merge_size": 2} if "spatial_merge_size" in inspect.signature(PixtralProcessor).parameters else {}
+    processor = PixtralProcessor(images, tokenizer, patch_size=PATCH, **more)
     tower = dict(
         model_type="pixtral", hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=2, image_size=2 * SIDE, patch_size=PATCH
     )  # fmt: skip
@@ -557,8 +559,23 @@ def video_llava(work):
     return "VideoLlava", dict(vision_config=clip(), image_seq_length=TOKENS, **ids), processor, "llama"
 
 
+def vipllava(work):
+    _, config, processor, language = llava(work)
+    config.pop("vision_feature_layer")
+    return "VipLlava", dict(config, vision_feature_layers=[-1, -2]), processor, language
+
+
+def pixtral(work):
+    """LLaVA with the tower of Pixtral."""
+    _, config, processor, language = mistral3(work)
+    processor.spatial_merge_size = 1
+    return "Llava", dict(config, vision_feature_select_strategy="full", image_seq_length=TOKENS), processor, language
+
+
 HOSTS = {
     "llava": llava,
+    "vipllava": vipllava,
+    "pixtral": pixtral,
     "llava_next": llava_next,
     "llava_next_video": llava_next_video,
     "video_llava": video_llava,
@@ -581,7 +598,7 @@ HOSTS = {
 IMAGE_IN_TEXT = {
     "qwen2_vl": "<|vision_start|><|image_pad|><|vision_end|>", "qwen2_5_vl": "<|vision_start|><|image_pad|><|vision_end|>",
     "qwen3_vl": "<|vision_start|><|image_pad|><|vision_end|>",
-    "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>", "mistral3": "[IMG]",
+    "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>", "mistral3": "[IMG]", "pixtral": "[IMG]",
     "deepseek_vl": "<image_placeholder>",
 }  # fmt: skip
 

@@ -41,12 +41,12 @@ REFUSED = [
     (r"openvla x (?!llama|mistral).*", "builds its own", OWN),
     (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
     (
-        r"(llava|llava_next) x gemma2 .*",
+        r"(llava|llava_next|vipllava|pixtral) x gemma2 .*",
         "4.47 cannot generate",
         "the host was saved by 4.47, which cannot generate with this language model",
     ),
     (
-        r"(llava|llava_next|llava_next_video|video_llava|llava_onevision|paligemma2?) x granite .*",
+        r"(llava|llava_next|llava_next_video|video_llava|llava_onevision|vipllava|pixtral|paligemma2?) x granite .*",
         "4.47 cannot run",
         "the host was saved by 4.47, which cannot run this language model",
     ),
@@ -71,6 +71,8 @@ REFUSED = [
         "4.47 cannot see",
         "the host was saved by 4.47, which wants a class token of the tower",
     ),
+    (r"vipllava sees with siglip", "builds its own", "the class of the host drops the first token of the tower"),
+    (r"pixtral sees with .*", "builds its own", "the host's processor writes ends of rows, which other towers do not have"),
     (
         r"llava_onevision sees with (clip|dinov2)",
         "builds its own",

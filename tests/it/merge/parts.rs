@@ -69,6 +69,7 @@ fn parts_stand_where_the_architectures_build_them() {
         "qwen2_vl",
         "qwen3_vl",
         "video_llava",
+        "vipllava",
         "clip",
     ] {
         assert!(changed.get(model).is_some_and(|count| *count > 10), "{model}: {changed:?}");

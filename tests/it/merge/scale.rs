@@ -247,10 +247,12 @@ fn a_prompt_is_written_for_the_host() {
 fn a_pair_that_no_test_runs_was_not_tried() {
     let all = TempDir::new().unwrap();
     write(all.path());
+    // The hosts of 4.47 cannot run it there, and so are not tried with it.
+    as_granite(&all.path().join("llama"), false);
     let is_noted = |host: &str| {
         let notes = planned(all.path(), host, "llama", "5.23.0").notes;
         assert!(!notes.is_empty(), "{host} was not planned");
         notes.iter().any(|note| note.starts_with("Not tried"))
     };
-    assert_eq!(["llava", "vipllava"].map(is_noted), [false, true]);
+    assert_eq!(["internvl", "llava"].map(is_noted), [false, true]);
 }
