@@ -347,7 +347,7 @@ pub struct TensorSpec {
     #[serde(default)]
     pub when: Option<Expression>,
     /// Name in the result: a template, in which `$1` is the first group of `names`. The name of the donor when missing. With
-    /// `into`, it is the name inside the part.
+    /// `into` or `alone`, it is the name inside the part.
     #[serde(rename = "as", default)]
     pub rename: Option<Template>,
     /// First row and number of rows of the donor that are used: a list of two integers. All rows when missing or null.

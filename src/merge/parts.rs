@@ -256,13 +256,10 @@ pub(super) fn value_of<'d>(checkpoint: &'d Checkpoint, name: &str) -> Option<&'d
     checkpoint.document(name)?.value.as_ref()
 }
 
-/// The key of a processor's config in which transformers 5 saves that of its image processor.
-pub(super) const IMAGE_PROCESSOR: &str = "image_processor";
-
-/// The config of the image processor, in its own file or in that of the processor.
+/// The config of the image processor, in its own file or, as transformers 5 saves it, in that of the processor.
 pub(super) fn image_processor(checkpoint: &Checkpoint) -> Option<&Value> {
     value_of(checkpoint, files::PREPROCESSOR_CONFIG)
-        .or_else(|| value_of(checkpoint, files::PROCESSOR_CONFIG)?.get(IMAGE_PROCESSOR))
+        .or_else(|| value_of(checkpoint, files::PROCESSOR_CONFIG)?.get("image_processor"))
 }
 
 /// Whether a key of a config speaks of the model.

@@ -107,7 +107,7 @@ impl TensorRule<'_> {
         };
         match (self.part.and_then(|part| part.inside(&tensor.name)), self.into) {
             (Some(inside), Some(place)) => place.name_of(&renamed(inside)),
-            (Some(inside), None) if self.spec.alone => Some(inside),
+            (Some(inside), None) if self.spec.alone => Some(renamed(inside)),
             _ => Some(renamed(tensor.name.clone())),
         }
     }

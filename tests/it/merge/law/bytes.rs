@@ -97,6 +97,8 @@ pub fn write(root: &Path) {
     let siglip = project().join("fixtures/recipes/donors/siglip");
     changed(&siglip, "siglip", json!({}));
     changed(&siglip, "siglip-wide", json!({ "hidden_size": 24 }));
+    let clip = json!({ "model_type": "clip_vision_model", "architectures": ["CLIPVisionModel"], "hidden_size": 24 });
+    changed(&siglip, "clip-wide", clip);
     for name in ["spatialvla-tiny", "llava3d-tiny"] {
         copy(&project().join("fixtures/donors").join(name), &root.join(name));
     }
@@ -405,7 +407,7 @@ fn reinit_reaches_the_projector_alone_and_norms_start_at_one() {
         }
     }
     // S1b: a norm of the projector starts at 1, and its bias at 0.
-    let out = read(&merge("tower", "swap-vision-tower", "siglip-wide", "vipllava"));
+    let out = read(&merge("tower", "swap-vision-tower", "clip-wide", "vipllava"));
     for (name, want) in [("weight", 1.0), ("bias", 0.0)] {
         let (dtype, shape, bytes) = &out[&format!("multi_modal_projector.projector_layernorm.{name}")];
         assert_eq!(shape, &[48], "{name}");
