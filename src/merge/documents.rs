@@ -15,7 +15,7 @@ use crate::check::tokens::OpenedTokenizer;
 use crate::checkpoint::{Checkpoint, Document, FaultKind, FileName, Vocabulary, pointer};
 use crate::knowledge::loader::version_numbers;
 use crate::knowledge::recipe::{AUTO_MAP, DocumentEdit, DocumentSpec, FollowEdit, GraftEdit, PartEdit, TokensForm};
-use crate::knowledge::{Expression, Template};
+use crate::knowledge::{Expression, Loader, Template};
 
 /// A document of the result and its origin.
 pub(super) struct MergedDocument {
@@ -225,6 +225,7 @@ fn part_config(context: &Context<'_>, edit: &PartEdit) -> Result<Vec<Change>, Me
         written.insert(key.clone(), to.eval(&context.scope).map_err(context.at(format!("{key} of the part {name}")))?);
     }
     let mut changes = newest_version(context, edit, place);
+    changes.extend(class_of_whole(context, place).filter(|_| !edit.changes));
     // A config that stands in the whole among other keys, and one of which only some keys change, keeps the others.
     if at.is_empty() || edit.changes {
         changes.extend(written.into_iter().map(|(key, new)| (pointer::join(at, &key), Some(new))));
@@ -241,6 +242,16 @@ fn newest_version(context: &Context<'_>, edit: &PartEdit, place: PartOf<'_>) -> 
     let host = place.host().get(VERSION).and_then(Value::as_str);
     let is_newer = |part: &&str| host.is_some_and(|host| version_numbers(part) > version_numbers(host));
     part.filter(is_newer).map(|part| (format!("/{VERSION}"), Some(part.into()))).into_iter().collect()
+}
+
+/// `architectures` of a model whose config does not state it: transformers 4.57 writes that of a Qwen2-VL into its text config,
+/// which the part replaces.
+fn class_of_whole(context: &Context<'_>, place: PartOf<'_>) -> Option<Change> {
+    let checkpoint = &place.donor().checkpoint;
+    let config = value_of(checkpoint, files::CONFIG).filter(|config| config.get("architectures").is_none())?;
+    let names = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str());
+    let class = context.library.find(config, names, Loader::of_config(config))?.class();
+    Some(("/architectures".to_owned(), Some(json!([class]))))
 }
 
 /// What follows in a document from the part that comes to stand in a model.

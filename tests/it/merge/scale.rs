@@ -243,6 +243,23 @@ fn a_prompt_is_written_for_the_host() {
     }
 }
 
+/// Transformers 4.57 writes `architectures` of a Qwen2-VL into its text config, which the guest's replaces.
+#[test]
+fn a_result_names_the_class_of_a_host_that_does_not() {
+    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    write(all.path());
+    let path = all.path().join("qwen2.5-vl/config.json");
+    let mut config: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    let class = config.as_object_mut().unwrap().remove("architectures").unwrap();
+    fs::write(&path, config.to_string()).unwrap();
+    let out = work.path().join("out");
+    let mut merge = Merge::new(&out).recipe("swap-language-model").option("projector", "reinit");
+    merge = merge.donor("vision", all.path().join("qwen2.5-vl")).donor("language", all.path().join("qwen2"));
+    written(&merge.loader("4.57.6").unwrap(), &out);
+    let config: Value = serde_json::from_slice(&fs::read(out.join("config.json")).unwrap()).unwrap();
+    assert_eq!(config["architectures"], class);
+}
+
 #[test]
 fn a_pair_that_no_test_runs_was_not_tried() {
     let all = TempDir::new().unwrap();
