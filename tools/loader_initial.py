@@ -69,6 +69,7 @@ HOSTS = {
     "qwen2_vl": ["merger"],
     "qwen2_5_vl": ["merger"],
     "qwen3_vl": ["merger"],
+    "glm4v": ["merger"],
     "internvl": ["multi_modal_projector"],
     "gemma3": ["multi_modal_projector"],
     "mistral3": ["multi_modal_projector"],
@@ -108,6 +109,9 @@ def of_host(model_type, flat=False):
     if model_type == "qwen3_vl":
         text["rope_scaling"] = {"rope_type": "default", "mrope_interleaved": True, "mrope_section": [2, 1, 1]}
         vision |= dict(out_hidden_size=WIDTH, depth=1, num_heads=4, num_position_embeddings=16, deepstack_visual_indexes=[0])
+    if model_type == "glm4v":
+        text["rope_scaling"] = {"rope_type": "default", "mrope_section": [1, 1, 2]}
+        vision |= dict(hidden_size=WIDTH, out_hidden_size=WIDTH, depth=1, num_heads=4)
     if model_type == "internvl":
         vision |= dict(image_size=[SIDE] * 2, patch_size=[PATCH] * 2)
     if model_type == "paligemma":

@@ -46,15 +46,10 @@ pub(super) fn plan(
     let evidence: Evidence = taken.iter().map(|t| (t.name.clone(), Some(t.shape()))).collect();
     let names = taken.iter().map(|t| t.name.as_str());
     let config = documents.iter().find(|b| b.document.name == files::CONFIG).and_then(|b| b.document.value.as_ref());
-    let mut expected = expected_shapes(&knowledge.library, config, names, &evidence);
-    if let Some(place) = rules.iter().find_map(|rule| rule.into) {
-        // The class of a newer version has other names than the checkpoint, which it renames when it loads.
-        let spelled = |(name, shape): (String, _)| Some((place.model_parts().spelled(&name)?, shape));
-        let renamed: Vec<_> = expected.clone().into_iter().filter_map(spelled).collect();
-        for (name, shape) in renamed {
-            expected.entry(name).or_insert(shape);
-        }
-    }
+    // The class of a newer version has other names than the checkpoint, which it renames when it loads.
+    let place = rules.iter().find_map(|rule| rule.into);
+    let spelled = |name: &str| place?.model_parts().spelled(name);
+    let expected = expected_shapes(&knowledge.library, config, names, &evidence, &spelled);
     distinct(context, &taken)?;
     let places: Vec<(usize, Vec<u64>)> =
         taken.iter().map(|t| expected.get(&t.name).cloned().unwrap_or_else(|| (usize::MAX, t.shape()))).collect();
@@ -372,12 +367,14 @@ fn parse_dtype(value: &Value) -> Result<Option<Dtype>, &'static str> {
 /// Position and shape of each tensor that the class has with the planned config.
 ///
 /// Under its names of every loader, those of the loader that the config names first: `save_pretrained` of transformers 4.57
-/// writes names that the classes of 4.47 have. A loader that does not read the text config knows no shape.
+/// writes names that the classes of 4.47 have. `spelled` gives the name in the result of one that the checkpoint's layout has in
+/// another way. A loader that does not read the text config knows no shape.
 fn expected_shapes<'n>(
     library: &Library,
     config: Option<&Value>,
     names: impl Iterator<Item = &'n str>,
     evidence: &Evidence,
+    spelled: &impl Fn(&str) -> Option<String>,
 ) -> HashMap<String, (usize, Vec<u64>)> {
     let Some(config) = config else { return HashMap::new() };
     let names: Vec<&str> = names.collect();
@@ -387,7 +384,9 @@ fn expected_shapes<'n>(
         let class = class.filter(|class| !class.misses_text_config(config));
         let Some(expected) = class.and_then(|class| class.expect_given(config, evidence).ok()) else { continue };
         for (i, (name, tensor)) in expected.tensors.iter().enumerate() {
-            shapes.entry(name.clone()).or_insert_with(|| (i, tensor.shape.clone()));
+            for name in std::iter::once(name.clone()).chain(spelled(name)) {
+                shapes.entry(name).or_insert_with(|| (i, tensor.shape.clone()));
+            }
         }
     }
     shapes

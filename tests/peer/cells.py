@@ -250,6 +250,7 @@ OWN = {
     "qwen2_vl": ["qwen2"],
     "qwen2_5_vl": ["qwen2"],
     "qwen3_vl": ["qwen3"],
+    "glm4v": ["glm4"],
     "gemma3": ["gemma3_text"],
     SPATIALVLA: ["llama", "gemma2"],
 }

@@ -102,6 +102,7 @@ QWEN2_VISION = dict(depth=1, embed_dim=32, hidden_size=32, num_heads=4, patch_si
 QWEN25_VISION = dict(
     depth=2, hidden_size=32, out_hidden_size=32, intermediate_size=48, num_heads=4, patch_size=4, fullatt_block_indexes=[1]
 )
+SHIFTED = "PaliGemma-mixtral"  # counts positions from 1, which a Mixtral of 4.47 does not take
 HEADS = "undivided"  # in the name of a shape: its heads do not divide its width, and its forward pass is run
 CODE = "without-code"  # in the name of a shape: its auto_map names modules that are missing, and AutoModel opens it
 FLAT = "flat"  # in the name of a shape: its config.json is written without text_config, as before transformers 4.52
@@ -341,7 +342,7 @@ def build(out, only):
         try:
             model = model_class(model_class.config_class(**config))
             model.save_pretrained(told["folder"])
-            if HEADS in name:
+            if HEADS in name or name == SHIFTED:
                 told["forward"] = forward(model)
             if FLAT in name:
                 flatten(Path(told["folder"], "config.json"), cls)

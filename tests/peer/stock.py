@@ -187,8 +187,10 @@ def text_config(kind, width, tokenizer):
         config |= dict(logits_scaling=8.0, embedding_multiplier=12.0, attention_multiplier=0.25, residual_multiplier=0.5)
     if kind.startswith("cohere"):
         config |= dict(logit_scale=0.25, layer_norm_eps=1e-5)
-    if kind in ("glm4", "qwen3_moe"):
+    if kind == "qwen3_moe":
         config["head_dim"] = 16
+    if kind == "glm4":
+        config["head_dim"] = width // HEADS
     if kind == "mixtral":
         config |= dict(num_local_experts=4, num_experts_per_tok=2)
     if kind == "qwen3_moe":
@@ -446,6 +448,26 @@ def qwen3_vl(work):
     return "Qwen3VL", dict(vision_config=vision, **ids), processor, "qwen3"
 
 
+def glm4v(work):
+    import transformers
+
+    tokenizer = llama3(work)
+    tokenizer.pad_token = "<|finetune_right_pad_id|>"
+    names = dict(
+        image_start="<|begin_of_image|>", image_end="<|end_of_image|>", video_start="<|begin_of_video|>", video_end="<|end_of_video|>",
+        image="<|image|>", video="<|video|>",
+    )  # fmt: skip
+    tokenizer.add_special_tokens({"additional_special_tokens": list(names.values())})
+    size = {"shortest_edge": 56 * 56, "longest_edge": 56 * 56 * 2}
+    images, videos = transformers.Glm4vImageProcessor(size=size), transformers.Glm4vVideoProcessor()
+    vision = dict(
+        depth=2, hidden_size=32, num_heads=4, in_channels=3, image_size=2 * SIDE, patch_size=PATCH, spatial_merge_size=2, temporal_patch_size=2,
+        out_hidden_size=WIDTH, intermediate_size=48,
+    )  # fmt: skip
+    ids = {f"{key}_token_id": tokenizer.convert_tokens_to_ids(token) for key, token in names.items()}
+    return "Glm4v", dict(vision_config=vision, **ids), transformers.Glm4vProcessor(images, tokenizer, videos), "glm4"
+
+
 def internvl(work):
     from transformers import GotOcr2ImageProcessor, InternVLProcessor, InternVLVideoProcessor
 
@@ -587,6 +609,7 @@ HOSTS = {
     "qwen2_vl": qwen_vl("qwen2_vl"),
     "qwen2_5_vl": qwen_vl("qwen2_5_vl"),
     "qwen3_vl": qwen3_vl,
+    "glm4v": glm4v,
     "internvl": internvl,
     "gemma3": gemma3,
     "mistral3": mistral3,
@@ -597,7 +620,7 @@ HOSTS = {
 # What a user writes before the text of a prompt, so that the processor puts the image there.
 IMAGE_IN_TEXT = {
     "qwen2_vl": "<|vision_start|><|image_pad|><|vision_end|>", "qwen2_5_vl": "<|vision_start|><|image_pad|><|vision_end|>",
-    "qwen3_vl": "<|vision_start|><|image_pad|><|vision_end|>",
+    "qwen3_vl": "<|vision_start|><|image_pad|><|vision_end|>", "glm4v": "<|begin_of_image|><|image|><|end_of_image|>",
     "internvl": "<IMG_CONTEXT>\n", "gemma3": "<start_of_image>", "mistral3": "[IMG]", "pixtral": "[IMG]",
     "deepseek_vl": "<image_placeholder>",
 }  # fmt: skip
@@ -615,6 +638,9 @@ def save_host(kind, dtype, path, work):
     if kind == "qwen3_vl":
         sections = dict(rope_type="default", mrope_interleaved=True, mrope_section=[4, 2, 2])
         config["text_config"] |= dict(model_type="qwen3_vl_text", rope_scaling=sections)
+    if kind == "glm4v":
+        sections = dict(rope_type="default", mrope_section=[0, 1, 1])
+        config["text_config"] |= dict(model_type="glm4v_text", rope_scaling=sections, partial_rotary_factor=0.5)
     # Gemma and Cohere models share one matrix for both ends; so do their hosts.
     config["tie_word_embeddings"] = language.startswith(("gemma", "cohere"))
     made = getattr(transformers, f"{classes}Config")(**config)

@@ -37,6 +37,8 @@ OWN = "the class of the host builds one kind of language model, whatever the con
 REFUSED = [
     (r"(qwen2_vl|qwen2_5_vl) x (?!qwen2 ).*", "builds its own", OWN),
     (r"qwen3_vl x (?!qwen3 ).*", "builds its own", OWN),
+    (r"glm4v x (?!glm4 ).*", "builds its own", OWN),
+    (r"glm4v x glm4 (reinit|pad)", "must be", "layers of the tower are as wide inside as the language model"),
     (r"gemma3 x (?!gemma3_text ).*", "builds its own", OWN),
     (r"openvla x (?!llama|mistral).*", "builds its own", OWN),
     (r"spatialvla x (?!llama|gemma2).*", "builds its own", OWN),
@@ -83,7 +85,7 @@ REFUSED = [
 
 
 # Parts that are opened here by their class, because Auto classes of some versions do not know their model type.
-BY_CLASS = r"vision of (qwen2(_5)?_vl|qwen3_vl|idefics3)"
+BY_CLASS = r"vision of (qwen2(_5)?_vl|qwen3_vl|glm4v|idefics3)"
 
 
 def start(folder, program, *arguments):

@@ -58,6 +58,7 @@ fn parts_stand_where_the_architectures_build_them() {
         "aya_vision",
         "deepseek_vl",
         "gemma3",
+        "glm4v",
         "idefics3",
         "internvl",
         "llava",
