@@ -21,7 +21,8 @@ pub struct ModelParts {
     pub model: String,
     /// Architectures that have these parts.
     pub architectures: Vec<String>,
-    /// Model type of the vision tower for which these parts stand before others of the architecture.
+    /// Model type of the vision tower that a model must have for these parts; others of its architecture have those of a file
+    /// without it.
     #[serde(default)]
     pub tower: Option<String>,
     /// Sources of the facts.
@@ -108,7 +109,7 @@ pub struct Own {
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Follow {
-    /// The document; `config.json` when missing.
+    /// The document; `config.json` when missing. `preprocessor_config.json` is also `image_processor` in `processor_config.json`.
     #[serde(default = "config_json")]
     pub document: FileName,
     /// JSON pointer; `{at}` is that of the part's config.
@@ -145,13 +146,15 @@ impl ModelParts {
         source::embedded("parts").iter().map(|(path, text)| source::parse_embedded(path, text)).collect()
     }
 
-    /// The parts of an architecture with this config, among all.
+    /// The parts of a model of this architecture with this config: those for its vision tower, or else those for any.
     #[must_use]
     pub fn of<'p>(all: &'p [Self], architecture: &str, config: &Value) -> Option<&'p Self> {
-        let tower = config.pointer("/vision_config/model_type").and_then(Value::as_str);
-        let named = |model: &&Self| model.architectures.iter().any(|name| name == architecture);
-        let special = all.iter().filter(named).find(|model| model.tower.is_some() && model.tower.as_deref() == tower);
-        special.or_else(|| all.iter().filter(named).find(|model| model.tower.is_none()))
+        let stated = config.pointer("/vision_config/model_type").and_then(Value::as_str);
+        let fits = |model: &&Self| {
+            model.architectures.iter().any(|name| name == architecture)
+                && model.tower.as_deref().is_none_or(|tower| Some(tower) == stated)
+        };
+        all.iter().filter(fits).max_by_key(|model| model.tower.is_some())
     }
 
     /// A checkpoint that is one part as a whole: its tensor names and its config are those of the part.

@@ -7,7 +7,7 @@ use super::context::Context;
 use super::draft::MergeDraft;
 use super::dtypes;
 use super::error::MergeError;
-use super::parts::{PartOf, image_processor, is_of_model, value_of};
+use super::parts::{PartOf, image_processor_inside, is_of_model, value_of};
 use super::switches::{self, Removed};
 use super::validate::misplaced;
 use crate::check::clamped;
@@ -81,7 +81,10 @@ fn start<'c>(context: &Context<'c>, spec: &DocumentSpec) -> Result<Option<(Value
     let source =
         spec.from.as_ref().and_then(|role| Some((role, context.donor(role)?.checkpoint.document(&spec.name)?)));
     let Some((role, document)) = source else {
-        return Ok((!spec.optional).then(|| (Value::Object(Map::new()), None)));
+        let donor = spec.from.as_ref().and_then(|role| context.donor(role));
+        let is_inside = &*spec.name == files::PREPROCESSOR_CONFIG
+            && donor.is_some_and(|donor| image_processor_inside(&donor.checkpoint).is_some());
+        return Ok((!spec.optional && !is_inside).then(|| (Value::Object(Map::new()), None)));
     };
     match &document.value {
         Some(value) if value.is_object() => Ok(Some((value.clone(), Some(document)))),
@@ -260,11 +263,8 @@ fn followed(context: &Context<'_>, spec: &DocumentSpec, edit: &FollowEdit) -> Re
     let place = context.part(&edit.into, &name)?;
     let scope = context.of_place(place, context.part(&edit.from, &name)?)?;
     let mut values = Vec::new();
-    // Transformers 5 saves the image processor in the config of the processor.
-    let host = &place.donor().checkpoint;
-    let is_inside = &*spec.name == files::PROCESSOR_CONFIG
-        && host.document(files::PREPROCESSOR_CONFIG).is_none()
-        && image_processor(host).is_some();
+    let is_inside =
+        &*spec.name == files::PROCESSOR_CONFIG && image_processor_inside(&place.donor().checkpoint).is_some();
     for follow in &place.part.follows {
         let inside = match &*follow.document {
             name if name == &*spec.name => "",

@@ -256,10 +256,14 @@ pub(super) fn value_of<'d>(checkpoint: &'d Checkpoint, name: &str) -> Option<&'d
     checkpoint.document(name)?.value.as_ref()
 }
 
-/// The config of the image processor, in its own file or, as transformers 5 saves it, in that of the processor.
+/// The config of the image processor, from its own file or else from that of the processor.
 pub(super) fn image_processor(checkpoint: &Checkpoint) -> Option<&Value> {
-    value_of(checkpoint, files::PREPROCESSOR_CONFIG)
-        .or_else(|| value_of(checkpoint, files::PROCESSOR_CONFIG)?.get("image_processor"))
+    value_of(checkpoint, files::PREPROCESSOR_CONFIG).or_else(|| image_processor_inside(checkpoint))
+}
+
+/// The config of the image processor inside that of the processor, where transformers 5 saves it.
+pub(super) fn image_processor_inside(checkpoint: &Checkpoint) -> Option<&Value> {
+    value_of(checkpoint, files::PROCESSOR_CONFIG)?.get("image_processor")
 }
 
 /// Whether a key of a config speaks of the model.

@@ -193,7 +193,7 @@ def follow(model, processor, path):
 
 
 def as_guest(model, tokenizer, host, guest_dir, dtype, times=1.0):
-    """Text alone gives the ids and, in float32, the logits that the language model alone gives, by `times` smaller."""
+    """Text alone gives the ids and, in float32, `times` the logits are those of the language model alone."""
     import torch
 
     own, guest, wrong = guest_of(guest_dir, dtype)

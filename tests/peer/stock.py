@@ -179,7 +179,7 @@ def text_config(kind, width, tokenizer):
         rms_norm_eps=1e-5,
         **ids,
     )
-    if kind.startswith("gemma") or kind == "qwen3":
+    if kind.startswith(("gemma", "qwen3")):
         config["head_dim"] = 16
     if kind in ("gemma2", "gemma3_text"):
         config |= dict(query_pre_attn_scalar=16, sliding_window=64)
@@ -187,8 +187,6 @@ def text_config(kind, width, tokenizer):
         config |= dict(logits_scaling=8.0, embedding_multiplier=12.0, attention_multiplier=0.25, residual_multiplier=0.5)
     if kind.startswith("cohere"):
         config |= dict(logit_scale=0.25, layer_norm_eps=1e-5)
-    if kind == "qwen3_moe":
-        config["head_dim"] = 16
     if kind == "glm4":
         config["head_dim"] = width // HEADS
     if kind == "mixtral":
