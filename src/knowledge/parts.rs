@@ -133,6 +133,10 @@ pub struct Need {
     pub message: Template,
 }
 
+/// Starts of the names of a language model's layers and head inside the part.
+const BODY: &str = "model.";
+const HEAD: &str = "lm_head.";
+
 fn config_json() -> FileName {
     FileName::constant(files::CONFIG)
 }
@@ -181,18 +185,59 @@ impl ModelParts {
         std::iter::once(part).chain(self.parts.iter().filter_map(built))
     }
 
-    /// The layout that names most of these tensors, and among equals the one with the longest starts: `model.` also starts
-    /// the names below `model.visual.`. The first one when none names any.
+    /// The position of the layout that names most of these tensors, and among equals of the one with the longest starts:
+    /// `model.` also starts the names below `model.visual.`. The first one when none names any.
     #[must_use]
-    pub fn layout_of(&self, names: &[&str]) -> Option<Layout> {
+    pub fn layout_of(&self, names: &[&str]) -> Option<usize> {
         let score = |layout: &Layout| {
             let starts = names.iter().filter_map(|name| layout.start(name));
             starts.fold((0_usize, 0_usize), |(count, len), (_, _, start)| {
                 (count.saturating_add(1), len.saturating_add(start.len()))
             })
         };
+        let scores: Vec<_> = self.layouts.iter().map(|layout| score(&Layout::new(layout))).collect();
         // The first of the best: `max_by_key` returns the last.
-        self.all_layouts().max_by_key(score)
+        (0..scores.len()).rev().max_by_key(|at| scores.get(*at))
+    }
+
+    /// The layout at a position that [`Self::layout_of`] gave.
+    #[must_use]
+    pub fn layout(&self, at: usize) -> Layout {
+        self.layouts.get(at).map(Layout::new).unwrap_or_default()
+    }
+
+    /// The names of a language model alone of this model type, where they are not those of Llama: `None` for any other.
+    #[must_use]
+    pub fn alone<'p>(all: &'p [Self], model_type: &str) -> Option<&'p Self> {
+        let is_alone = |model: &&Self| model.parts.get("language").is_some_and(|part| part.config == [""]);
+        all.iter().filter(is_alone).find(|model| model.architectures.iter().any(|name| name == model_type))
+    }
+
+    /// These parts around a language model that names its tensors as `inner` does. Each layout becomes two: in the first, the
+    /// language model has the class with a head, and its layers their own name, as classes of transformers 4.47 save them; in the
+    /// second, it is the body alone, as later ones save it.
+    #[must_use]
+    pub fn around(&self, inner: &Self) -> Self {
+        let own = inner.layouts.first().and_then(|layout| layout.get("language"));
+        let Some((own, own_body)) = own.and_then(|own| Some((own, own.get(BODY)?))) else { return self.clone() };
+        let placed = |layout: &BTreeMap<String, BTreeMap<String, String>>, has_head: bool| {
+            let mut layout = layout.clone();
+            let Some(names) = layout.get_mut("language") else { return layout };
+            let Some(body) = names.get(BODY).cloned() else { return layout };
+            let place = names.get(HEAD).and_then(|head| head.strip_suffix(HEAD)).map(str::to_owned);
+            let whole = place.filter(|place| has_head && body.strip_suffix(BODY) == Some(place));
+            for (inside, stored) in own {
+                let name = match (&whole, stored.strip_prefix(own_body.as_str())) {
+                    (Some(place), _) => format!("{place}{stored}"),
+                    (None, Some(rest)) => format!("{body}{rest}"),
+                    (None, None) => continue,
+                };
+                names.insert(inside.clone(), name);
+            }
+            layout
+        };
+        let layouts = self.layouts.iter().flat_map(|layout| [placed(layout, true), placed(layout, false)]).collect();
+        Self { layouts, ..self.clone() }
     }
 }
 
@@ -286,12 +331,47 @@ mod tests {
         let llava = parts.iter().find(|p| p.model == "llava").expect("llava");
         let new = ["model.language_model.norm.weight", "lm_head.weight", "model.vision_tower.x"];
         for names in [["language_model.model.norm.weight", "language_model.lm_head.weight", "vision_tower.x"], new] {
-            let layout = llava.layout_of(&names).unwrap();
+            let layout = llava.layout(llava.layout_of(&names).unwrap());
             let inside = ["model.norm.weight", "lm_head.weight", "x"];
             for ((name, part), inside) in names.into_iter().zip(["language", "language", "vision"]).zip(inside) {
                 assert_eq!(layout.locate(name), Some((part, inside.to_owned())), "{name}");
                 assert_eq!(layout.stored(part, inside).as_deref(), Some(name));
             }
         }
+    }
+
+    #[test]
+    fn a_language_model_with_names_of_its_own_keeps_them_in_a_host() {
+        let parts = ModelParts::embedded().unwrap();
+        let named = |name: &str| parts.iter().find(|p| p.model == name).expect("parts");
+        let falcon = ModelParts::alone(&parts, "falcon").expect("falcon");
+        assert!(ModelParts::alone(&parts, "llama").is_none() && ModelParts::alone(&parts, "llava").is_none());
+        let rows = [
+            (
+                "model.h.0.x",
+                ["language_model.transformer.h.0.x", "language_model.model.h.0.x", "model.language_model.h.0.x"],
+            ),
+            (
+                "model.embed_tokens.weight",
+                [
+                    "language_model.transformer.word_embeddings.weight",
+                    "language_model.model.word_embeddings.weight",
+                    "model.language_model.word_embeddings.weight",
+                ],
+            ),
+            ("lm_head.weight", ["language_model.lm_head.weight", "language_model.lm_head.weight", "lm_head.weight"]),
+        ];
+        let around = named("llava").around(falcon);
+        for (inside, names) in rows {
+            for (at, name) in [0, 1, 3].into_iter().zip(names) {
+                let layout = around.layout(at);
+                assert_eq!(layout.stored("language", inside).as_deref(), Some(name));
+                assert_eq!(layout.inside("language", &["language"], name).as_deref(), Some(inside));
+            }
+        }
+        // Layouts without a head in the place of the part are equal.
+        let names = ["language_model.transformer.h.0.x", "language_model.model.h.0.x", "model.language_model.h.0.x"];
+        assert_eq!(names.map(|name| around.layout_of(&[name])), [Some(0), Some(1), Some(2)]);
+        assert_eq!(around.layout(3).locate("model.vision_tower.x"), Some(("vision", "x".to_owned())));
     }
 }

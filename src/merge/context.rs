@@ -2,7 +2,7 @@
 
 use crate::checkpoint::files;
 use std::borrow::Cow;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
@@ -16,7 +16,7 @@ use crate::checkpoint::Checkpoint;
 use crate::knowledge::processor::Processor;
 use crate::knowledge::recipe::{OptionKind, OptionSpec, Recipe, SeamTensor, TokenSpec};
 use crate::knowledge::source::nearest;
-use crate::knowledge::{EvalError, Expression, Knowledge, Library, Scope};
+use crate::knowledge::{EvalError, Expression, Knowledge, Library, Loader, Scope};
 use crate::report::model::ShapedName;
 
 /// The donors, and the scope for expressions of the recipe.
@@ -27,6 +27,8 @@ pub(super) struct Context<'a> {
     pub(super) tokens: Option<OpenedTokenizer>,
     processors: &'a [Processor],
     pub(super) library: &'a Library,
+    /// Loaders that the result is for; any when empty.
+    pub(super) asked: BTreeSet<Loader>,
 }
 
 impl<'a> Context<'a> {
@@ -99,7 +101,8 @@ impl<'a> Context<'a> {
         scope.bind("tokenizer_config", tokenizer.unwrap_or(&json!({})));
         let checkpoints: Arc<BTreeMap<String, Arc<Checkpoint>>> =
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
-        functions::register(&mut scope, donors, versions, &knowledge.scales);
+        let asked: BTreeSet<Loader> = versions.iter().map(|version| Loader::nearest(version)).collect();
+        functions::register(&mut scope, donors, &asked, &knowledge.scales);
         let all = Arc::clone(&checkpoints);
         scope.function2("shape", move |role, name| {
             all.get(role).and_then(|c| c.tensor(name)).map_or(Value::Null, |(_, t)| json!(t.shape))
@@ -112,7 +115,7 @@ impl<'a> Context<'a> {
             parts.get(role).and_then(|of| of.get(name)).cloned().unwrap_or(Value::Null)
         });
         let (processors, library) = (&*knowledge.processors, &knowledge.library);
-        let mut context = Self { recipe, donors, scope, tokens: None, processors, library };
+        let mut context = Self { recipe, donors, scope, tokens: None, processors, library, asked };
         for item in &recipe.lets {
             if context.tokens.is_none() && needs_tokens(&item.is) {
                 context.add_tokens()?;

@@ -13,8 +13,9 @@ use crate::knowledge::{Loader, Scope, source};
 use crate::surgery::rms::rms;
 use crate::surgery::tensor_ref::TensorRef;
 
-/// Adds `dtype`, `image_fold`, `row_scale`, `row_norm`, `tried`, `head_factor` and `chat_template`; `versions` are those of transformers that the result is for, or none.
-pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &[String], scales: &Scales) {
+/// Adds `dtype`, `image_fold`, `row_scale`, `row_norm`, `tried`, `head_factor` and `chat_template`; the result is for the loaders
+/// that are `asked` for, or any.
+pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], asked: &BTreeSet<Loader>, scales: &Scales) {
     let dtypes: BTreeMap<String, &'static str> = donors
         .iter()
         .filter_map(|donor| Some((donor.role.clone(), donor.checkpoint.float_of_most_bytes()?.float_name()?)))
@@ -24,7 +25,6 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], versions: &
     let configs: Arc<BTreeMap<String, Value>> =
         Arc::new(donors.iter().map(|donor| (donor.role.clone(), donor.config.clone())).collect());
     let (of_roles, of_models) = (Arc::clone(&configs), scales.clone());
-    let asked: BTreeSet<Loader> = versions.iter().map(|version| Loader::nearest(version)).collect();
     let loaders: Vec<Loader> = Loader::ALL.into_iter().filter(|l| asked.is_empty() || asked.contains(l)).collect();
     scope.function2("image_fold", move |host, guest| match (of_roles.get(host), of_roles.get(guest)) {
         (Some(host), Some(guest)) => image_fold(&of_models, host, guest, &loaders),

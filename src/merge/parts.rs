@@ -1,6 +1,7 @@
 //! Donors and their parts: which of their tensors and configs a recipe means by `part: "language"`.
 
 use crate::checkpoint::files;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
@@ -33,18 +34,44 @@ pub struct Donor {
 pub(super) struct DonorParts {
     model: ModelParts,
     layout: Layout,
+    /// The same with the names of any language model, and the position of the layout there.
+    described: ModelParts,
+    at: usize,
+    /// Whether classes of the version that saved it have a whole language model in the place of the part, and not its body.
+    has_head: bool,
+    /// The names of its language model alone, where they are not those of Llama.
+    language: Option<ModelParts>,
 }
 
 impl DonorParts {
     /// The parts of a checkpoint: those that `rules/parts/` gives its architecture; a causal language model is one part.
     pub(super) fn of(checkpoint: &Checkpoint, outcome: &Outcome, knowledge: &Knowledge) -> Option<Self> {
-        let architecture = outcome.architecture.as_ref();
-        let described = architecture.and_then(|name| ModelParts::of(&knowledge.parts, name, &outcome.config));
+        let (config, architecture) = (&outcome.config, outcome.architecture.as_ref());
+        let described = architecture.and_then(|name| ModelParts::of(&knowledge.parts, name, config));
         let alone = || part_alone(checkpoint, knowledge).map(|(name, own)| ModelParts::whole(name, own));
-        let model = described.cloned().or_else(alone)?;
+        let described = described.cloned().or_else(alone)?;
         let names: Vec<&str> = checkpoint.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
-        let layout = model.layout_of(&names)?;
-        Some(Self { model, layout })
+        let pointer = described.parts.get("language").and_then(|part| part.pointer(config));
+        let stated = pointer.and_then(|at| config.pointer(at)?.get("model_type")?.as_str());
+        let language = stated.and_then(|of| ModelParts::alone(&knowledge.parts, of)).cloned();
+        let model = language.as_ref().map_or_else(|| described.clone(), |own| described.around(own));
+        let found = model.layout_of(&names)?;
+        let at = if language.is_some() { found / 2 } else { found };
+        let has_head = Loader::of_config(config) == Loader::V4_47_0;
+        Some(Self { layout: model.layout(found), model, described, at, has_head, language })
+    }
+
+    /// These parts after a merge for these loaders put the language model of other parts in the place of this one's.
+    pub(super) fn with_language_of(&self, new: &Self, asked: &BTreeSet<Loader>) -> Self {
+        let is_asked = asked.is_empty() || asked.contains(&Loader::V4_47_0);
+        let (model, at) = match &new.language {
+            Some(own) => {
+                let body = usize::from(!(self.has_head && is_asked));
+                (self.described.around(own), self.at.saturating_mul(2).saturating_add(body))
+            }
+            None => (self.described.clone(), self.at),
+        };
+        Self { layout: model.layout(at), model, language: new.language.clone(), ..self.clone() }
     }
 
     /// Names of the parts.
@@ -66,6 +93,11 @@ impl DonorParts {
             let (part, inside) = layout.locate(of_class)?;
             self.layout.stored(part, &inside)
         })
+    }
+
+    /// The name of a tensor inside a part of this name.
+    pub(super) fn name_in(&self, part: &str, inside: &str) -> Option<String> {
+        self.layout.stored(part, inside)
     }
 
     /// What the model's processor needs in the tokenizer.
@@ -177,7 +209,15 @@ impl<'a> PartOf<'a> {
 
     /// The name in this donor's model of a tensor inside the part.
     pub(super) fn name_of(self, inside: &str) -> Option<String> {
-        self.parts.layout.stored(self.name, inside)
+        self.parts.name_in(self.name, inside)
+    }
+
+    /// The name of a tensor inside the part in a model that is the part alone.
+    pub(super) fn name_alone(self, inside: String) -> Option<String> {
+        match self.parts.language.as_ref().filter(|_| self.name == "language") {
+            Some(own) => own.layout(0).stored(self.name, &inside),
+            None => Some(inside),
+        }
     }
 
     /// Why a part cannot stand in this place, by its model type.

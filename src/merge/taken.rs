@@ -8,7 +8,7 @@ use super::adapter::MergedAdapter;
 use super::error::MergeError;
 use super::fit::Fit;
 use super::named::{AnnouncedCast, MergedRoles, NamedTensors};
-use super::parts::{Donor, PartOf};
+use super::parts::{Donor, DonorParts, PartOf};
 use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
 use crate::surgery::tensor_ref::TensorRef;
@@ -26,9 +26,10 @@ pub(super) struct TensorRule<'a> {
     pub(super) adapter: Option<MergedAdapter>,
     /// The tensor whose rows new ones are like.
     pub(super) like: Option<TensorRef>,
-    /// The part that the tensors belong to, and the one whose place they take.
+    /// The part that the tensors belong to.
     pub(super) part: Option<PartOf<'a>>,
-    pub(super) into: Option<PartOf<'a>>,
+    /// The parts of the model that has them in the place of its own, and the name of the part there.
+    pub(super) into: Option<(DonorParts, &'a str)>,
 }
 
 impl TensorRule<'_> {
@@ -105,9 +106,9 @@ impl TensorRule<'_> {
             Some(to) => self.names.replace(&name, to.as_str()).into_owned(),
             None => name,
         };
-        match (self.part.and_then(|part| part.inside(&tensor.name)), self.into) {
-            (Some(inside), Some(place)) => place.name_of(&renamed(inside)),
-            (Some(inside), None) if self.spec.alone => Some(renamed(inside)),
+        match (self.part.and_then(|part| Some((part, part.inside(&tensor.name)?))), &self.into) {
+            (Some((_, inside)), Some((model, place))) => model.name_in(place, &renamed(inside)),
+            (Some((part, inside)), None) if self.spec.alone => part.name_alone(renamed(inside)),
             _ => Some(renamed(tensor.name.clone())),
         }
     }

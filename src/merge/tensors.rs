@@ -13,7 +13,7 @@ use super::error::MergeError;
 use super::explain;
 use super::fit::Fit;
 use super::named::{AnnouncedCast, Bounds, Changeable, pattern};
-use super::parts::Donor;
+use super::parts::{Donor, DonorParts, PartOf};
 use super::run::count;
 use super::taken::{StartedModules, TakenTensor, TensorRule};
 use crate::checkpoint::{Dtype, Tensor};
@@ -47,8 +47,8 @@ pub(super) fn plan(
     let names = taken.iter().map(|t| t.name.as_str());
     let config = documents.iter().find(|b| b.document.name == files::CONFIG).and_then(|b| b.document.value.as_ref());
     // The class of a newer version has other names than the checkpoint, which it renames when it loads.
-    let place = rules.iter().find_map(|rule| rule.into);
-    let spelled = |name: &str| place?.model_parts().spelled(name);
+    let place = rules.iter().find_map(|rule| rule.into.as_ref());
+    let spelled = |name: &str| place?.0.spelled(name);
     let expected = expected_shapes(&knowledge.library, config, names, &evidence, &spelled);
     distinct(context, &taken)?;
     let places: Vec<(usize, Vec<u64>)> =
@@ -278,6 +278,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         let part_of = |role: &str| name.as_ref().map(|name| context.part(role, name)).transpose();
         let part = part_of(&spec.from)?;
         let into = spec.into.as_deref().map_or(Ok(None), part_of)?;
+        let into = into.map(|place| (with_part(context, place, part), place.name));
         let wrong = |key: &str, value: &Value, expected: &str| {
             let recipe = &context.recipe.recipe;
             MergeError::Recipe(format!("{recipe}: {key} of {} is {value}, not {expected}", spec.names))
@@ -301,6 +302,13 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
         out.push(rule);
     }
     Ok(out)
+}
+
+/// The parts of the model around `place` with a donor's part in it.
+fn with_part(context: &Context<'_>, place: PartOf<'_>, part: Option<PartOf<'_>>) -> DonorParts {
+    let host = place.model_parts();
+    let language = part.filter(|_| place.name == "language").map(PartOf::model_parts);
+    language.map_or_else(|| host.clone(), |new| host.with_language_of(new, &context.asked))
 }
 
 /// The tensor whose rows new ones should be like; `None` where the donor lacks it.

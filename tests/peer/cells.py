@@ -92,7 +92,7 @@ class Cell:
 
 
 def is_end(name):
-    return name.endswith(("embed_tokens.weight", "lm_head.weight"))
+    return name.endswith(("embed_tokens.weight", "word_embeddings.weight", "lm_head.weight"))
 
 
 def in_dtypes(stored, dtypes):

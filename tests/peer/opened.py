@@ -266,7 +266,11 @@ def entering(model, inputs):
 def rows_of(path):
     """Rows of the embedding in a directory."""
     tensors = read_tensors(Path(path)).items()
-    return next(shape[0] for name, (_, shape, _) in tensors if name.endswith("embed_tokens.weight") and "vision" not in name)
+    return next(
+        shape[0]
+        for name, (_, shape, _) in tensors
+        if name.endswith(("embed_tokens.weight", "word_embeddings.weight")) and "vision" not in name
+    )
 
 
 @cache

@@ -180,6 +180,45 @@ fn a_factor_on_logits_is_folded_into_a_head_of_its_own() {
     }
 }
 
+/// The guest `llama` of these donors, as a Falcon with a tied head: its tensors have other names.
+fn as_falcon(dir: &Path) {
+    let config = json!({
+        "architectures": ["FalconForCausalLM"], "model_type": "falcon", "transformers_version": "4.57.6", "torch_dtype": "float32",
+        "vocab_size": 300, "hidden_size": 32, "num_hidden_layers": 1, "num_attention_heads": 4, "num_kv_heads": 2,
+        "new_decoder_architecture": true, "bias": false, "tie_word_embeddings": true, "bos_token_id": 1, "eos_token_id": 2,
+    });
+    fs::write(dir.join("config.json"), config.to_string()).unwrap();
+    tensors(dir, 1, &knowledge());
+}
+
+#[test]
+fn a_language_model_keeps_its_own_names_in_a_host_and_out_of_it() {
+    let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    write(all.path());
+    as_falcon(&all.path().join("llama"));
+    let (out, back) = (work.path().join("out"), work.path().join("back"));
+    let merge = Merge::new(&out).recipe("swap-language-model").option("projector", "reinit").option("scale", "keep");
+    let merge = merge.donor("vision", all.path().join("internvl")).donor("language", all.path().join("llama"));
+    let report = merge.clone().loader("4.57.6").unwrap().run().unwrap();
+    let mut findings = report.checkpoints.iter().flat_map(|checkpoint| &checkpoint.findings);
+    assert!(findings.any(|finding| finding.code == "CFG028"));
+    assert_eq!(report.merge.unwrap().stage, Some(MergeStage::Planned));
+    written(&merge.loader("5.23.0").unwrap(), &out);
+    let (guest, result) = (read(&all.path().join("llama")), read(&out));
+    let named = |inside: &str| format!("model.language_model.{inside}");
+    let layer = |tensors: &Tensors, name: &str| tensors.get(name).unwrap_or_else(|| panic!("{name}")).clone();
+    for (name, tensor) in guest.iter().filter(|(name, _)| name.contains(".h.")) {
+        let inside = name.strip_prefix("transformer.").unwrap();
+        assert_eq!(layer(&result, &named(inside)), *tensor, "{name}");
+    }
+    // The head is the embedding, as a tensor of its own.
+    assert_eq!(layer(&result, "lm_head.weight"), layer(&result, &named("word_embeddings.weight")));
+    let extract = Merge::new(&back).recipe("extract").donor("model", &out).option("part", "language");
+    written(&extract.loader("5.23.0").unwrap(), &back);
+    let again = read(&back);
+    assert!(guest.keys().all(|name| again.contains_key(name)), "{:?}", again.keys());
+}
+
 #[test]
 fn a_chat_template_writes_what_the_processor_needs_for_an_image() {
     let (all, work) = (TempDir::new().unwrap(), TempDir::new().unwrap());
