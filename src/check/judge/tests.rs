@@ -1,5 +1,6 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test")]
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde_json::{Value, json};
@@ -131,6 +132,11 @@ fn a_backbone_of_another_model_type_is_not_covered() {
     assert!(class(&detr("resnet")).is_ok());
     let refusal = class(&detr("timm_backbone")).unwrap_err();
     assert!(matches!(refusal, Refusal::NotCovered(_)), "{refusal:?}");
+    let case = detr("timm_backbone");
+    let inputs = case.inputs();
+    let faults = class_faults(&inputs, &build_classes(&inputs, resolve_targets(&inputs)));
+    let [fault] = faults.as_slice() else { panic!("{faults:?}") };
+    assert!(fault.detail["part"].as_str().unwrap().contains("timm_backbone"), "{fault:?}");
 }
 
 #[test]
@@ -180,4 +186,76 @@ fn nothing_stored_is_no_prediction() {
     let inputs = case.inputs();
     let predictions = predict(&inputs, build_classes(&inputs, resolve_targets(&inputs)));
     assert!(predictions.iter().all(|prediction| prediction.report.is_none()));
+}
+
+#[test]
+fn layers_are_compared_where_the_class_is_unknown_alone() {
+    let faults = |mut case: Case| {
+        let layer = |at: usize| (at != 3).then(|| (format!("model.layers.{at}.b.weight"), vec![2]));
+        let layers = (0..8).flat_map(|at| [Some((format!("model.layers.{at}.a.weight"), vec![2])), layer(at)]);
+        case.stored = Stored::from_shapes(layers.flatten().collect());
+        let inputs = case.inputs();
+        kinds(&class_faults(&inputs, &build_classes(&inputs, resolve_targets(&inputs))))
+    };
+    assert_eq!(faults(Case::new("llava3d-tiny")), []);
+    let unknown =
+        Case::new("llava3d-tiny").set("architectures", json!(["NoSuchModel"])).set("model_type", json!("none"));
+    assert_eq!(faults(unknown), [FaultKind::UnknownArchitecture, FaultKind::LayerLacksTensor]);
+}
+
+/// A Llama with the tensors of the donor, those of its vision side left over.
+fn llama(versions: &[&str]) -> Case {
+    let case = Case::new("llava3d-tiny").set("architectures", json!(["LlamaForCausalLM"]));
+    case.set("model_type", json!("llama")).versions(versions)
+}
+
+/// Transformers 4.47 reads the values of a Qwen2-VL at the top, and 5.23 refuses an id that is no number.
+#[test]
+fn a_config_that_several_versions_refuse_is_one_fault_for_each_that_leads() {
+    let faults = |versions: &[&str]| {
+        let case = Case::new("llava3d-tiny").set("architectures", json!(["Qwen2VLForConditionalGeneration"]));
+        let case = case.set("model_type", json!("qwen2_vl")).set("transformers_version", json!("4.47.0"));
+        let case = case.set("text_config", json!({ "model_type": "qwen2_vl_text", "hidden_size": 64 }));
+        let case = case.set("image_token_id", json!("x")).versions(versions);
+        let inputs = case.inputs();
+        let faults = class_faults(&inputs, &build_classes(&inputs, resolve_targets(&inputs)));
+        let refused = faults.iter().filter(|fault| fault.kind == FaultKind::ConfigIncomputable);
+        refused.map(|fault| fault.loaders.clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(faults(&[]), [["4.47.0", "5.23.0"]]);
+    assert_eq!(faults(&["4.47.0", "5.23.0"]), [["4.47.0"], ["5.23.0"]]);
+}
+
+#[test]
+fn loaders_that_agree_have_their_faults_once() {
+    let faults = |case: Case| {
+        let inputs = case.inputs();
+        let loads = explain(&inputs, predict(&inputs, build_classes(&inputs, resolve_targets(&inputs))));
+        let votes = explain::distinct_votes(&loads);
+        let faults = faults::faults(&inputs, &loads, &votes);
+        let missing = faults.iter().filter(|fault| fault.kind == FaultKind::MissingTensors);
+        missing.map(|fault| (fault.loaders.clone(), fault.detail.contains_key("under"))).collect::<Vec<_>>()
+    };
+    let both = || llama(&["4.47.0", "5.23.0"]);
+    assert_eq!(faults(both().rename("lm_head.", "head.")), [(vec!["4.47.0", "5.23.0"], false)]);
+    // 5.23 ignores this name, and 4.47 reports it.
+    let apart = both().rename("model.layers.0.mlp.up_proj.", "model.layers.0.self_attn.rotary_emb.inv_freq.");
+    assert_eq!(faults(apart), [(vec!["4.47.0"], true), (vec!["5.23.0"], true)]);
+}
+
+/// The load itself compares no shape of a tensor that it does not find.
+#[test]
+fn a_shape_behind_a_prefix_is_not_met() {
+    let unmet = |mut case: Case, name: &str| {
+        let added = BTreeMap::from([(name.to_owned(), Some(vec![7]))]);
+        case.stored = case.stored.replacing(&BTreeSet::from([name.to_owned()]), added);
+        let inputs = case.inputs();
+        let loads = explain(&inputs, predict(&inputs, build_classes(&inputs, resolve_targets(&inputs))));
+        let votes = explain::distinct_votes(&loads);
+        let faults = faults::faults(&inputs, &loads, &votes);
+        let shapes = faults.iter().filter(|fault| fault.kind == FaultKind::MismatchedTensor);
+        shapes.map(|fault| fault.detail.contains_key("unmet")).collect::<Vec<_>>()
+    };
+    assert_eq!(unmet(llama(&[]), "model.norm.weight"), [false]);
+    assert_eq!(unmet(llama(&[]).rename("", "module."), "module.model.norm.weight"), [true]);
 }
