@@ -9,6 +9,7 @@ use ckpt_doctor::checkpoint::files::Object;
 use serde_json::{Value, json};
 
 use crate::support::pickle::archive;
+use crate::support::weights::Weights;
 use crate::support::{knowledge, look, make_base};
 
 fn names(names: &[&str]) -> Vec<String> {
@@ -144,6 +145,77 @@ fn an_object_that_is_not_predicted_says_why() {
         assert_eq!(load.verdict, of_model.verdict);
         assert!(load.objects.is_sorted_by_key(|one| std::cmp::Reverse(one.verdict)), "{:?}", load.objects);
     }
+}
+
+/// The base `llama` with its first tensor in one type and all others in another; the verdict on the model by each loader.
+fn retyped(first: &str, others: &str) -> Vec<(String, LoadVerdict, String)> {
+    let dir = tempfile::tempdir().unwrap();
+    make_base("llama", dir.path());
+    let mut weights = Weights::read(dir.path());
+    for tensor in weights.shards.iter_mut().flat_map(|shard| &mut shard.tensors) {
+        let dtype = if tensor.name == "model.embed_tokens.weight" { first } else { others };
+        let width = if dtype == "F32" { 4 } else { 1 };
+        let len = tensor.shape.iter().product::<u64>() * width;
+        (tensor.dtype, tensor.bytes) = (dtype.to_owned(), vec![0; usize::try_from(len).unwrap()]);
+    }
+    weights.write_back(dir.path());
+    let of_model = |load: &PredictedLoad| {
+        let model = load.objects.iter().find(|one| one.object == Object::Model).unwrap();
+        (load.loader.clone(), model.verdict, model.why.clone().unwrap_or_default())
+    };
+    look(dir.path(), false, &knowledge()).verdicts.iter().map(of_model).collect()
+}
+
+/// 4.47.0 makes parameters of the stored tensors where the first has the type of the model, 4.57.6 always does, and 5.23.0
+/// copies their values (src/check/judge/unscaled.rs and integers.rs have the sources).
+#[test]
+fn what_a_loader_makes_of_narrow_types_depends_on_the_first_tensor() {
+    let verdicts =
+        |first, others| retyped(first, others).into_iter().map(|(_, verdict, _)| verdict).collect::<Vec<_>>();
+    let (loads, unknown) = (LoadVerdict::Loads, LoadVerdict::NotPredicted);
+    let (wrong, raises) = (LoadVerdict::LoadsWrong, LoadVerdict::Raises);
+    assert_eq!(verdicts("F8_E4M3", "F8_E4M3"), [unknown, wrong, unknown]);
+    assert_eq!(verdicts("F32", "F8_E4M3"), [wrong, wrong, unknown]);
+    assert_eq!(verdicts("I8", "I8"), [loads, raises, loads]);
+    assert_eq!(verdicts("F32", "I8"), [raises, raises, loads]);
+    let why = "model.layers.0.self_attn.q_proj.weight is stored as F8_E4M3 without a scale: whether its values need one is unknown";
+    assert_eq!(retyped("F32", "F8_E4M3").last().unwrap().2, why);
+}
+
+/// Code of the directory may be another class, but not of tensors that are all as the known one has them.
+#[test]
+fn own_code_makes_a_difference_unknown() {
+    let verdicts = |change: Change<'_>| {
+        let dir = tempfile::tempdir().unwrap();
+        make_base("llama", dir.path());
+        change_config(dir.path(), &|config| {
+            config["auto_map"] = json!({ "AutoModelForCausalLM": "modeling_own.OwnForCausalLM" });
+        });
+        fs::write(dir.path().join("modeling_own.py"), "class OwnForCausalLM:\n    pass\n").unwrap();
+        change(dir.path());
+        let loads = look(dir.path(), false, &knowledge()).verdicts;
+        let load = loads.iter().find(|load| load.loader == "5.23.0").unwrap();
+        let model = load.objects.iter().find(|one| one.object == Object::Model).unwrap();
+        (model.verdict, model.why.clone().unwrap_or_default())
+    };
+    let rename = |from: &'static str, to: &'static str| {
+        move |root: &Path| {
+            let mut weights = Weights::read(root);
+            let tensors = weights.shards.iter_mut().flat_map(|shard| &mut shard.tensors);
+            tensors.filter(|tensor| tensor.name == from).for_each(|tensor| to.clone_into(&mut tensor.name));
+            weights.write_back(root);
+        }
+    };
+    let unknown = "it is not known here: modeling_own.py may differ from the class of transformers";
+    let unknown = (LoadVerdict::NotPredicted, unknown.to_owned());
+    assert_eq!(verdicts(&|_| {}), (LoadVerdict::Loads, String::new()));
+    assert_eq!(verdicts(&rename("model.norm.weight", "model.other.weight")), unknown);
+    let add = |root: &Path| {
+        let mut weights = Weights::read(root);
+        weights.shards[0].add("model.other.weight", "F32", &[2]);
+        weights.write_back(root);
+    };
+    assert_eq!(verdicts(&add), unknown);
 }
 
 /// The file that makes a processor of the directory may be the one that is missing.
