@@ -147,6 +147,24 @@ fn an_object_that_is_not_predicted_says_why() {
     }
 }
 
+/// The config of a class with a processor repeats ids of its tokenizer.
+#[cfg(unix)]
+#[test]
+fn a_model_with_a_processor_rests_on_its_tokenizer() {
+    let elsewhere = tempfile::tempdir().unwrap();
+    let note = elsewhere.path().join("note.json");
+    fs::write(&note, "{}").unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    make_base("paligemma", dir.path());
+    let place = dir.path().join("tokenizer_config.json");
+    fs::remove_file(&place).unwrap();
+    std::os::unix::fs::symlink(&note, &place).unwrap();
+    let loads = look(dir.path(), false, &knowledge()).verdicts;
+    let model = loads[0].objects.iter().find(|one| one.object == Object::Model).unwrap();
+    let why = "tokenizer_config.json is a link out of the directory, and was not read";
+    assert_eq!((model.verdict, model.why.as_deref()), (LoadVerdict::NotPredicted, Some(why)));
+}
+
 /// The base `llama` with its first tensor in one type and all others in another; the verdict on the model by each loader.
 fn retyped(first: &str, others: &str) -> Vec<(String, LoadVerdict, String)> {
     let dir = tempfile::tempdir().unwrap();
