@@ -147,6 +147,64 @@ fn an_object_that_is_not_predicted_says_why() {
     }
 }
 
+/// A directory offers a model by its config or by its weights, and not by its tokenizer.
+#[test]
+fn what_a_directory_offers_follows_from_its_files() {
+    let offered = |removed: &[&str]| {
+        let dir = tempfile::tempdir().unwrap();
+        make_base("llama", dir.path());
+        for name in removed {
+            fs::remove_file(dir.path().join(name)).unwrap();
+        }
+        let loads = look(dir.path(), false, &knowledge()).verdicts;
+        let mut objects: Vec<Object> = loads[0].objects.iter().map(|one| one.object).collect();
+        objects.sort();
+        objects
+    };
+    let all = vec![Object::Model, Object::Tokenizer, Object::Generation];
+    let sorted = |mut objects: Vec<Object>| {
+        objects.sort();
+        objects
+    };
+    assert_eq!(offered(&[]), sorted(all.clone()));
+    assert_eq!(offered(&["config.json"]), sorted(all.clone()));
+    assert_eq!(offered(&["model.safetensors"]), sorted(all));
+    let without = sorted(vec![Object::Tokenizer, Object::Generation]);
+    assert_eq!(offered(&["config.json", "model.safetensors"]), without);
+}
+
+/// The findings of a verdict have its consequence; others of the same object do not count.
+#[test]
+fn a_verdict_names_the_findings_behind_it() {
+    let causes = |change: Change<'_>| {
+        let dir = tempfile::tempdir().unwrap();
+        make_base("llama", dir.path());
+        change(dir.path());
+        let loads = look(dir.path(), false, &knowledge()).verdicts;
+        let load = loads.iter().find(|load| load.loader == "5.23.0").unwrap();
+        let model = load.objects.iter().find(|one| one.object == Object::Model).unwrap();
+        (model.verdict, model.findings.iter().cloned().collect::<Vec<_>>())
+    };
+    let drop = |root: &Path| {
+        let mut weights = Weights::read(root);
+        weights.shards.iter_mut().for_each(|shard| shard.tensors.retain(|tensor| tensor.name != "model.norm.weight"));
+        weights.write_back(root);
+    };
+    let misshape = |root: &Path| {
+        drop(root);
+        let mut weights = Weights::read(root);
+        let tensors = weights.shards.iter_mut().flat_map(|shard| &mut shard.tensors);
+        tensors
+            .filter(|tensor| tensor.name == "model.layers.0.mlp.up_proj.weight")
+            .for_each(|tensor| tensor.shape.reverse());
+        weights.write_back(root);
+    };
+    assert_eq!(causes(&|_| {}), (LoadVerdict::Loads, names(&[])));
+    assert_eq!(causes(&drop), (LoadVerdict::LoadsWrong, names(&["ARC003"])));
+    // The missing tensor is reported, too, and is not why it raises.
+    assert_eq!(causes(&misshape), (LoadVerdict::Raises, names(&["ARC005"])));
+}
+
 /// The config of a class with a processor repeats ids of its tokenizer.
 #[cfg(unix)]
 #[test]
