@@ -180,6 +180,21 @@ fn a_config_value_explains_the_tensors_that_follow_from_it() {
 }
 
 #[test]
+fn a_value_is_voted_on_once_for_all_loads() {
+    let case = llama(&["4.47.0", "5.23.0"]).set("num_hidden_layers", json!(3)).set("vocab_size", json!(341));
+    let inputs = case.inputs();
+    let loads = explain(&inputs, predict(&inputs, build_classes(&inputs, resolve_targets(&inputs))));
+    let pointers = |votes: &[Vote]| votes.iter().map(|vote| vote.pointer.clone()).collect::<Vec<_>>();
+    let distinct = pointers(&explain::distinct_votes(&loads));
+    assert_eq!(
+        distinct.iter().map(String::as_str).collect::<BTreeSet<_>>(),
+        ["/num_hidden_layers", "/vocab_size"].into()
+    );
+    assert_eq!((distinct.len(), loads.len()), (2, 2));
+    assert!(loads.iter().all(|load| pointers(load.votes().unwrap()) == distinct));
+}
+
+#[test]
 fn nothing_stored_is_no_prediction() {
     let mut case = Case::new("llava3d-tiny");
     case.stored = Stored::default();
