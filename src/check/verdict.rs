@@ -3,6 +3,9 @@
 //! A verdict is the worst of the effects of the findings and of the predicted load report. It is never better than what
 //! was read: an object that nothing judges is not predicted.
 
+#[cfg(test)]
+mod tests;
+
 use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
